@@ -1,0 +1,280 @@
+"""The multi-kernel correntropy (MKC) density as pure, broadcasting functions.
+
+The density of an error ``e`` with bandwidth ``sigma``, scale ``d`` and domain ``[-bound, bound]`` is (17) of
+Li et al., "Multi-kernel Correntropy Regression" (2023)::
+
+    p(e) = exp(-energy(e)) / (d Z),    energy(e) = sigma^2 (1 - exp(-e^2 / (2 d^2 sigma^2)))
+
+Everything is computed in ``kappa = 1 / sigma^2`` and ``z = e / d``: ``energy = -expm1(-kappa z^2 / 2) / kappa`` is
+smooth at ``kappa = 0``, where it is exactly the Gaussian ``z^2 / 2``. All functions work under autograd (to any
+order), forward-mode differentiation, ``vmap`` and ``torch.compile``. Half and bfloat16 are computed in float32.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = [
+    "KAPPA_MAX",
+    "energy",
+    "inverse_square",
+    "log_normalizer",
+    "log_partition",
+    "mkc_energy",
+    "mkc_nll",
+    "mkc_weight",
+]
+
+KAPPA_MAX = 400.0
+"""Largest ``1 / sigma^2`` for which the quadrature is specified; it is ``sigma = 0.05``."""
+
+_HEAD_TOLERANCE = 1e-13
+
+
+def _head_quadrature(count: int) -> tuple[Tensor, Tensor]:
+    """Nodes on [0, 1] and weights of an even integrand on [-1, 1]: Gauss-Legendre under sinh(2t), denser near 0."""
+    x, w = np.polynomial.legendre.leggauss(count)
+    t = 0.5 * (x + 1.0)
+    nodes, weights = np.sinh(2.0 * t) / np.sinh(2.0), 2.0 * w * np.cosh(2.0 * t) / np.sinh(2.0)
+    return torch.from_numpy(nodes), torch.from_numpy(weights)
+
+
+_NODES, _WEIGHTS = _head_quadrature(32)
+
+
+def as_computed(*values: Tensor | float) -> tuple[Tensor, ...]:
+    """Tensors of one floating dtype (float32 at least) and one device, from tensors and numbers."""
+    tensors = [v for v in values if isinstance(v, Tensor)]
+    dtype = torch.float32 if tensors else torch.get_default_dtype()
+    for t in tensors:
+        if t.is_complex():
+            raise TypeError(f"Expected real values but got a tensor of dtype {t.dtype}; pass real and imaginary parts.")
+        if t.is_floating_point():
+            dtype = torch.promote_types(dtype, t.dtype)
+    device = next((t.device for t in tensors if t.dim() > 0), tensors[0].device if tensors else None)
+    return tuple(
+        v.to(dtype) if isinstance(v, Tensor) else torch.as_tensor(v, dtype=dtype, device=device) for v in values
+    )
+
+
+def inverse_square(sigma: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """``kappa = 1 / sigma^2``, with value and gradient 0 at ``sigma = inf``."""
+    return sigma.pow(-2)
+
+
+class _Energy(torch.autograd.Function):
+    """Value by expm1 and gradient by exp: each is accurate where the other one's autograd is not."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(z: Tensor, kappa: Tensor) -> Tensor:
+        q = 0.5 * z * z
+        x = kappa * q
+        return torch.where(x > 0, -torch.expm1(-x) / torch.where(kappa > 0, kappa, 1.0), q)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+        ctx.save_for_forward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:  # type: ignore[override]
+        z, kappa = ctx.saved_tensors
+        grad_z = (grad * _energy_dz(z, kappa)).sum_to_size(z.shape) if ctx.needs_input_grad[0] else None
+        grad_kappa = (grad * _energy_dkappa(z, kappa)).sum_to_size(kappa.shape) if ctx.needs_input_grad[1] else None
+        return grad_z, grad_kappa
+
+
+
+class _EnergyWithTangent(_Energy):
+    """The eager form; torch.compile traces only functions without a jvp."""
+
+    @staticmethod
+    def jvp(ctx: Any, tangent_z: Tensor | None, tangent_kappa: Tensor | None) -> Tensor:  # type: ignore[override]
+        z, kappa = ctx.saved_tensors
+        out = torch.zeros_like(z * kappa)
+        if tangent_z is not None:
+            out = out + tangent_z * _energy_dz(z, kappa)
+        if tangent_kappa is not None:
+            out = out + tangent_kappa * _energy_dkappa(z, kappa)
+        return out
+
+
+def _energy_dz(z: Tensor, kappa: Tensor) -> Tensor:
+    return z * torch.exp(-0.5 * kappa * z * z)
+
+
+def _energy_dkappa(z: Tensor, kappa: Tensor) -> Tensor:
+    """``-(1 - exp(-x) (1 + x)) / kappa^2`` with ``x = kappa z^2 / 2``, smooth at ``kappa = 0`` where it is -z^4/8."""
+    q = 0.5 * z * z
+    x = kappa * q
+    small = x < 0.5
+    series_x = torch.where(small, x, 0.0)
+    series = torch.zeros_like(x)
+    for j in range(12, -1, -1):  # sum_j (-x)^j / (j! (j + 2)) in Horner form
+        series = 1.0 / (math.factorial(j) * (j + 2)) - series_x * series
+    # capped, so that 0 times it stays 0 where kappa = 0 and the square overflows
+    series_q = torch.where(small, q, 0.0).clamp(max=math.sqrt(torch.finfo(q.dtype).max))
+    direct_x = torch.where(small, 1.0, x)
+    direct = (1.0 - torch.exp(-direct_x) * (1.0 + direct_x)) / torch.where(small, 1.0, kappa).square()
+    return -torch.where(small, series_q * series_q * series, direct)
+
+
+def energy(z: Float[Tensor, "*batch"], kappa: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """The MKC energy of standardised errors, ``(1 - exp(-kappa z^2 / 2)) / kappa``.
+
+    Args:
+        z: standardised errors ``e / d``, any shape.
+        kappa: ``1 / sigma^2 >= 0``, broadcast against ``z``.
+
+    Returns:
+        The energy, of the broadcast shape; ``z^2 / 2`` exactly where ``kappa`` is 0.
+
+    Example:
+        >>> energy(torch.tensor([1.0, 3.0]), torch.tensor(0.0))
+        tensor([0.5000, 4.5000])
+    """
+    function = _Energy if torch.compiler.is_compiling() else _EnergyWithTangent
+    result: Tensor = function.apply(z, kappa)  # type: ignore[no-untyped-call]
+    return result
+
+
+def tail_density(kappa: Tensor) -> Tensor:
+    """``exp(-1 / kappa)``, the unnormalised density of the flat tail, with value and gradient 0 at ``kappa = 0``."""
+    positive = kappa > 1e-3  # exp(-1000) is 0 in float64
+    return torch.where(positive, torch.exp(-1.0 / torch.where(positive, kappa, 1.0)), 0.0)
+
+
+def head_reach(kappa: Tensor) -> Tensor:
+    """The ``z`` beyond which the density exceeds its flat tail by less than 1e-13; a constant for autograd."""
+    k = kappa.detach().clamp(min=1e-3)
+    excess = k * torch.nn.functional.softplus(1.0 / k + math.log(_HEAD_TOLERANCE), threshold=30.0)
+    return torch.sqrt(-2.0 * torch.log(excess) / k)
+
+
+def head_rule(kappa: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+    """Quadrature on the head: nodes ``u`` in [0, min(length, reach)] and weights for both signs, shape (*, nodes)."""
+    end = torch.minimum(length, head_reach(kappa)).unsqueeze(-1)
+    return end * _NODES.to(end), end * _WEIGHTS.to(end)
+
+
+def log_partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """``log Z``, ``Z`` being the integral of ``exp(-energy(u, kappa))`` over ``|u| <= length``.
+
+    The flat tail ``2 length exp(-1 / kappa)`` is taken analytically and a fixed rule of 32 nodes sits on the head,
+    whose width it knows, so the relative error of ``Z`` stays below 1e-12 in float64 for ``kappa`` in [0, 400] and
+    ``length`` up to 1e7.
+
+    Args:
+        kappa: ``1 / sigma^2`` in [0, 400].
+        length: half-width of the domain in units of ``d``; broadcast against ``kappa``.
+
+    Example:
+        >>> log_partition(torch.tensor(1 / 9.0).double(), torch.tensor(10.0).double()).exp()
+        tensor(2.6348, dtype=torch.float64)
+    """
+    kappa, length = torch.broadcast_tensors(kappa, length)
+    tail = tail_density(kappa)
+    nodes, weights = head_rule(kappa, length)
+    head = torch.exp(-energy(nodes, kappa.unsqueeze(-1))) - tail.unsqueeze(-1)
+    return torch.log(2.0 * length * tail + (weights * head).sum(-1))
+
+
+def mkc_energy(
+    error: Float[Tensor, "*batch"], sigma: Float[Tensor, "*batch"] | float, d: Float[Tensor, "*batch"] | float
+) -> Float[Tensor, "*batch"]:
+    """The MKC loss of each error, ``sigma^2 (1 - exp(-e^2 / (2 d^2 sigma^2)))``, a term of (9) of the paper.
+
+    Args:
+        error: errors ``e``, any shape, in the unit of ``d``.
+        sigma: bandwidth > 0, dimensionless, ``inf`` for the Gaussian ``e^2 / (2 d^2)``; broadcast (per sample too).
+        d: scale > 0 in the unit of ``error``; broadcast.
+
+    Returns:
+        The energy, of the broadcast shape.
+
+    Example:
+        >>> mkc_energy(torch.tensor([0.0, 1.0, 100.0]), sigma=2.0, d=1.0)
+        tensor([0.0000, 0.4700, 4.0000])
+    """
+    error, sigma, d = as_computed(error, sigma, d)
+    return energy(error / d, inverse_square(sigma))
+
+
+def mkc_weight(
+    error: Float[Tensor, "*batch"], sigma: Float[Tensor, "*batch"] | float, d: Float[Tensor, "*batch"] | float
+) -> Float[Tensor, "*batch"]:
+    """The weight of each error in the fixed point (15) of the paper, ``exp(-e^2 / (2 d^2 sigma^2))``, without ``1/d^2``.
+
+    Args:
+        error, sigma, d: as in :func:`mkc_energy`.
+
+    Returns:
+        Weights in [0, 1]; 1 for every error at ``sigma = inf``.
+
+    Example:
+        >>> mkc_weight(torch.tensor([0.0, 1.0, 100.0]), sigma=1.0, d=1.0)
+        tensor([1.0000, 0.6065, 0.0000])
+    """
+    error, sigma, d = as_computed(error, sigma, d)
+    z = error / d
+    return torch.exp(-0.5 * inverse_square(sigma) * z * z)
+
+
+def log_normalizer(
+    sigma: Float[Tensor, "*batch"] | float,
+    d: Float[Tensor, "*batch"] | float,
+    bound: Float[Tensor, "*batch"] | float,
+) -> Float[Tensor, "*batch"]:
+    """``log(d Z(sigma, bound / d))``, so that ``mkc_energy + log_normalizer`` is the negative log-density.
+
+    This is ``-log(c / d)`` of (17) of the paper; the ``log(c - d)`` printed in (29)-(31) is a misprint.
+
+    Args:
+        sigma: bandwidth in [0.05, inf].
+        d: scale > 0.
+        bound: half-width ``a`` > 0 of the domain ``[-a, a]``, in the unit of ``d``.
+
+    Returns:
+        The log-normaliser, of the broadcast shape, differentiable in all three arguments.
+
+    Example:
+        >>> log_normalizer(math.inf, 1.0, 100.0)  # log(sqrt(2 pi))
+        tensor(0.9189)
+    """
+    sigma, d, bound = as_computed(sigma, d, bound)
+    return torch.log(d) + log_partition(inverse_square(sigma), bound / d)
+
+
+def mkc_nll(
+    error: Float[Tensor, "*batch"],
+    sigma: Float[Tensor, "*batch"] | float,
+    d: Float[Tensor, "*batch"] | float,
+    bound: Float[Tensor, "*batch"] | float,
+) -> Float[Tensor, "*batch"]:
+    """The negative log-density of each error, ``mkc_energy + log_normalizer``.
+
+    Beyond ``bound`` the density is 0; the formula is continued there, so that a stray error keeps a finite value and
+    gradient. :meth:`mkc_torch.MKCDistribution.log_prob` is the strict one.
+
+    Args:
+        error, sigma, d: as in :func:`mkc_energy`.
+        bound: half-width of the domain, as in :func:`log_normalizer`.
+
+    Returns:
+        Nats, of the broadcast shape.
+
+    Example:
+        >>> mkc_nll(torch.tensor([0.0, 1.0]), sigma=math.inf, d=1.0, bound=100.0)
+        tensor([0.9189, 1.4189])
+    """
+    return mkc_energy(error, sigma, d) + log_normalizer(sigma, d, bound)

@@ -1,0 +1,63 @@
+"""What every linear estimator shares: parameters shown, one vocabulary of results, prediction."""
+
+from __future__ import annotations
+
+import inspect
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from mkc_torch.linear._problem import LinearProblem
+
+Self = TypeVar("Self", bound="LinearEstimator")
+
+
+class NotFittedError(AttributeError):
+    """A result was asked for before ``fit``."""
+
+
+class LinearEstimator:
+    """Base of the linear estimators: ``fit(X, Y, sample_weight=None)`` returns the estimator itself.
+
+    Attributes, after ``fit`` (``*`` are batch dimensions):
+        coef_: coefficients (*, n).
+        weights_: the weight in [0, 1] with which each value entered the fit, (*, N, m), or (*, N) for one channel.
+    """
+
+    coef_: Float[Tensor, "*batch n"]
+    weights_: Float[Tensor, "*batch N m"]
+
+    def fit(self: Self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> Self:
+        raise NotImplementedError
+
+    def predict(self, X: Float[Tensor, "*batch N m n"]) -> Float[Tensor, "*batch N m"]:
+        """``X coef_`` for X of the shape given to ``fit``: (*, N, m, n) or, for one channel, (*, N, n)."""
+        if X.shape[-1] != self.coef_.shape[-1]:
+            raise ValueError(
+                f"Expected argument `X` with {self.coef_.shape[-1]} columns in its last dimension but got {X.shape[-1]}."
+            )
+        samples = 1 if self._single_channel else 2
+        coef = self.coef_.reshape(*self.coef_.shape[:-1], *(1 for _ in range(samples - 1)), -1, 1)
+        return torch.matmul(X, coef).squeeze(-1)
+
+    def _set_common(self, problem: LinearProblem, beta: Tensor, weights: Tensor) -> None:
+        self._single_channel = problem.single_channel
+        self.coef_ = problem.coefficients(beta)
+        self.weights_ = self._by_channel(weights)
+
+    def _by_channel(self, values: Tensor) -> Tensor:
+        """Drop the channel dimension where the user gave none."""
+        return values.squeeze(-1) if self._single_channel else values
+
+    def __repr__(self) -> str:
+        names = [p for p in inspect.signature(type(self).__init__).parameters if p != "self"]
+        return f"{type(self).__name__}({', '.join(f'{p}={getattr(self, p)!r}' for p in names)})"
+
+    def __getattr__(self, name: str) -> Any:
+        if name.endswith("_") and not name.startswith("_"):
+            raise NotFittedError(f"{type(self).__name__} has no `{name}` yet; call fit(X, Y) first.")
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")

@@ -1,0 +1,257 @@
+"""A linear regression problem, checked once and brought into an orthonormal basis that every estimator works in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+
+class RankDeficientError(ValueError):
+    """The columns of X are linearly dependent, so that the coefficients are not determined."""
+
+
+@dataclass(frozen=True)
+class LinearProblem:
+    """``Y ~ X coef`` over N samples of m channels, with X = basis · to_coef⁻¹ and an orthonormal basis.
+
+    Work in the basis is invariant to the scale and the correlation of the columns of X. The batch dimensions of
+    ``basis`` broadcast against those of ``Y``: one X may serve many Y.
+    """
+
+    basis: Float[Tensor, "*#batch N m n"]
+    to_coef: Float[Tensor, "*#batch n n"]
+    Y: Float[Tensor, "*batch N m"]
+    sample_weight: Float[Tensor, "*batch N m"] | None
+    batch: torch.Size
+    single_channel: bool
+
+    @property
+    def num_samples(self) -> int:
+        return self.Y.shape[-2]
+
+    @property
+    def num_channels(self) -> int:
+        return self.Y.shape[-1]
+
+    @property
+    def num_coefficients(self) -> int:
+        return self.basis.shape[-1]
+
+    def residual(self, beta: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch N m"]:
+        """``Y - X coef`` for coefficients in the basis; ``beta`` may have further leading dimensions."""
+        rows = self.basis.flatten(-3, -2)
+        return self.Y - torch.matmul(rows, beta.unsqueeze(-1)).squeeze(-1).unflatten(-1, self.Y.shape[-2:])
+
+    def weighted_fit(self, weight: Float[Tensor, "*batch N m"]) -> Float[Tensor, "*batch n"]:
+        """The weighted least-squares coefficients in the basis; sample weights are multiplied in."""
+        if self.sample_weight is not None:
+            weight = weight * self.sample_weight
+        rows = self.basis.flatten(-3, -2)
+        weighted = rows * weight.flatten(-2).unsqueeze(-1)
+        gram = torch.matmul(weighted.mT, rows)
+        moment = torch.matmul(weighted.mT, self.Y.flatten(-2).unsqueeze(-1))
+        return solve_gram(gram, moment).squeeze(-1)
+
+    def total_weight(self) -> Float[Tensor, "*batch m"]:
+        """Sum of the sample weights of each channel."""
+        if self.sample_weight is None:
+            return self.Y.new_full((*self.batch, self.num_channels), float(self.num_samples))
+        return self.sample_weight.sum(-2)
+
+    def weighted_mean(self, values: Float[Tensor, "*batch N m"]) -> Float[Tensor, "*batch m"]:
+        """Mean over the samples with the sample weights."""
+        if self.sample_weight is None:
+            return values.mean(-2)
+        return (self.sample_weight * values).sum(-2) / self.sample_weight.sum(-2)
+
+    def coefficients(self, beta: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+        """Coefficients of the user's columns from those in the basis."""
+        return torch.matmul(self.to_coef, beta.unsqueeze(-1)).squeeze(-1)
+
+    def in_basis(self, coef: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+        """Coefficients in the basis from those of the user's columns."""
+        return torch.linalg.solve(self.to_coef, coef.unsqueeze(-1)).squeeze(-1)
+
+    def select(self, index: Tensor) -> LinearProblem:
+        """The problems at ``index`` of a batch of one dimension."""
+        shared = self.basis.shape[0] == 1
+        return LinearProblem(
+            basis=self.basis if shared else self.basis[index],
+            to_coef=self.to_coef if shared else self.to_coef[index],
+            Y=self.Y[index],
+            sample_weight=None if self.sample_weight is None else self.sample_weight[index],
+            batch=torch.Size([index.shape[0]]),
+            single_channel=self.single_channel,
+        )
+
+    def flatten_batch(self) -> LinearProblem:
+        """The same problems with their batch dimensions made one."""
+        shared = all(s == 1 for s in self.basis.shape[:-3])
+        basis, to_coef = self.basis, self.to_coef
+        if shared:
+            basis, to_coef = basis.reshape(1, *basis.shape[-3:]), to_coef.reshape(1, *to_coef.shape[-2:])
+        else:
+            basis = basis.expand(*self.batch, *basis.shape[-3:]).reshape(-1, *basis.shape[-3:])
+            to_coef = to_coef.expand(*self.batch, *to_coef.shape[-2:]).reshape(-1, *to_coef.shape[-2:])
+        weight = self.sample_weight
+        return LinearProblem(
+            basis=basis,
+            to_coef=to_coef,
+            Y=self.Y.reshape(-1, *self.Y.shape[-2:]),
+            sample_weight=None if weight is None else weight.reshape(-1, *weight.shape[-2:]),
+            batch=torch.Size([self.batch.numel()]),
+            single_channel=self.single_channel,
+        )
+
+
+def solve_gram(gram: Float[Tensor, "*batch n n"], moment: Float[Tensor, "*batch n k"]) -> Float[Tensor, "*batch n k"]:
+    """Solve positive semi-definite systems: Cholesky, and the pseudo-inverse where the weights removed a direction."""
+    factor, info = torch.linalg.cholesky_ex(gram)
+    solution = torch.cholesky_solve(moment, factor)
+    diagonal = factor.diagonal(dim1=-2, dim2=-1)
+    eps = torch.finfo(gram.dtype).eps
+    weak = (info > 0) | (diagonal.amin(-1) <= 10 * gram.shape[-1] ** 0.5 * eps**0.5 * diagonal.amax(-1))
+    if weak.any():
+        repaired = torch.matmul(torch.linalg.pinv(gram[weak], hermitian=True, rtol=gram.shape[-1] * eps), moment[weak])
+        solution = solution.clone()
+        solution[weak] = repaired
+    return solution
+
+
+def _check_finite(name: str, value: Tensor) -> None:
+    bad = ~torch.isfinite(value)
+    if bad.any():
+        first = tuple(int(i) for i in bad.nonzero()[0])
+        raise ValueError(
+            f"Expected argument `{name}` to be finite but got {value[first].item()} at index {first} "
+            f"({int(bad.sum())} such values); drop those samples, or give them `sample_weight` 0 and a finite value."
+        )
+
+
+@dataclass(frozen=True)
+class CanonicalShapes:
+    """Checked input: X (*#batch, N, m, n), Y (*batch, N, m) and, where given, weights (*batch, N, m)."""
+
+    X: Float[Tensor, "*#batch N m n"]
+    Y: Float[Tensor, "*batch N m"]
+    sample_weight: Float[Tensor, "*batch N m"] | None
+    batch: torch.Size
+    single_channel: bool
+
+
+def canonical_shapes(
+    X: Float[Tensor, "*batch N m n"],
+    Y: Float[Tensor, "*batch N m"],
+    sample_weight: Float[Tensor, "*batch N"] | None = None,
+) -> CanonicalShapes:
+    """Check types, shapes and values, and give one-channel input its channel dimension.
+
+    Raises:
+        TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
+        ValueError: shapes do not fit, or values are not finite.
+    """
+    for name, value in (("X", X), ("Y", Y)):
+        if not isinstance(value, Tensor) or not value.is_floating_point():
+            got = value.dtype if isinstance(value, Tensor) else type(value).__name__
+            raise TypeError(f"Expected argument `{name}` to be a floating-point tensor but got {got}; use .double().")
+    if X.dtype != Y.dtype or X.device != Y.device:
+        raise TypeError(
+            f"Expected `X` and `Y` to share dtype and device but got {X.dtype} on {X.device} "
+            f"and {Y.dtype} on {Y.device}."
+        )
+    if X.dtype in (torch.float16, torch.bfloat16):
+        raise TypeError(f"Expected `X` of dtype float32 or float64 but got {X.dtype}; use .float().")
+    multichannel = X.dim() >= 3 and Y.dim() >= 2 and X.shape[-3:-1] == Y.shape[-2:]
+    single = not multichannel and X.dim() >= 2 and Y.dim() >= 1 and X.shape[-2] == Y.shape[-1]
+    if not (multichannel or single):
+        raise ValueError(
+            f"Expected `X` of shape (*, N, m, n) with `Y` (*, N, m), or (*, N, n) with (*, N), "
+            f"but got {tuple(X.shape)} and {tuple(Y.shape)}."
+        )
+    if single:
+        X, Y = X.unsqueeze(-2), Y.unsqueeze(-1)
+    if X.shape[-1] == 0 or Y.numel() == 0:
+        raise ValueError(f"Expected at least one sample and one column but got `X` {tuple(X.shape)}.")
+    _check_finite("X", X)
+    _check_finite("Y", Y)
+    batch = torch.broadcast_shapes(X.shape[:-3], Y.shape[:-2])
+    N, m = Y.shape[-2:]
+    weight = None
+    if sample_weight is not None:
+        weight = _as_weight(sample_weight, N, m, single, Y)
+        batch = torch.broadcast_shapes(batch, weight.shape[:-2])
+        weight = weight.expand(*batch, N, m)
+    return CanonicalShapes(X, Y.expand(*batch, N, m), weight, batch, single)
+
+
+def linear_problem(
+    X: Float[Tensor, "*batch N m n"],
+    Y: Float[Tensor, "*batch N m"],
+    sample_weight: Float[Tensor, "*batch N"] | None = None,
+) -> LinearProblem:
+    """Check X, Y and weights, and orthonormalise the columns of X.
+
+    Args:
+        X: (*, N, m, n) with Y (*, N, m), the paper's X_k; or (*, N, n) with Y (*, N) for one channel.
+        Y: targets.
+        sample_weight: non-negative weights (*, N) of samples or (*, N, m) of single values; 0 leaves a sample out.
+
+    Raises:
+        TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
+        ValueError: shapes do not fit, values are not finite, there are fewer values than coefficients.
+        RankDeficientError: columns of X are linearly dependent.
+    """
+    v = canonical_shapes(X, Y, sample_weight)
+    N, m, n = v.X.shape[-3:]
+    if N * m < n:
+        raise ValueError(f"Expected at least {n} values for {n} coefficients but got {N} samples x {m}; add samples.")
+    basis, to_coef = _orthonormalise(v.X, v.sample_weight)
+    return LinearProblem(basis, to_coef, v.Y, v.sample_weight, v.batch, v.single_channel)
+
+
+def _as_weight(sample_weight: Tensor, N: int, m: int, single_channel: bool, Y: Tensor) -> Tensor:
+    weight = torch.as_tensor(sample_weight, dtype=Y.dtype, device=Y.device)
+    if weight.dim() >= 1 and weight.shape[-1] == N and (single_channel or weight.shape[-2:] != (N, m)):
+        weight = weight.unsqueeze(-1)
+    if weight.dim() < 2 or weight.shape[-2] != N or weight.shape[-1] not in (1, m):
+        raise ValueError(
+            f"Expected argument `sample_weight` of shape (*, {N}) or (*, {N}, {m}) but got {tuple(weight.shape)}."
+        )
+    _check_finite("sample_weight", weight)
+    if (weight < 0).any():
+        raise ValueError(f"Expected argument `sample_weight` to be >= 0 but got {weight.min().item()}.")
+    if (weight.sum(-2) <= 0).any():
+        raise ValueError("Expected argument `sample_weight` to be positive somewhere in every channel but got all zeros.")
+    return weight
+
+
+def _orthonormalise(X: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Basis and the matrix that takes its coefficients to those of the columns of X."""
+    n = X.shape[-1]
+    rows = X.flatten(-3, -2)
+    if weight is not None:
+        rows = rows * (weight > 0).flatten(-2).unsqueeze(-1)
+    scale = rows.abs().amax(-2)
+    if (scale == 0).any():
+        column = int((scale == 0).nonzero()[0, -1])
+        raise RankDeficientError(f"Column {column} of `X` is zero on every sample in use; remove it.")
+    _, upper = torch.linalg.qr(rows / scale.unsqueeze(-2), mode="r")
+    _, singular, right = torch.linalg.svd(upper)
+    tolerance = max(rows.shape[-2], n) * torch.finfo(X.dtype).eps
+    # more unknowns than rows leaves fewer singular values than columns
+    ratio = singular[..., -1] / singular[..., 0] if singular.shape[-1] == n else singular.new_zeros(())
+    if (ratio <= tolerance).any():
+        worst = right[..., -1, :].reshape(-1, n)[int(ratio.reshape(-1).argmin())]
+        involved = [i for i in range(n) if float(worst[i].abs()) > 0.1 * float(worst.abs().max())]
+        raise RankDeficientError(
+            f"Expected `X` of full column rank but columns {involved} are linearly dependent "
+            f"(singular value ratio {float(ratio.min()):.1e}); remove one of them."
+        )
+    to_coef = torch.linalg.inv(upper) / scale.unsqueeze(-1)
+    return torch.matmul(X.flatten(-3, -2), to_coef).unflatten(-2, X.shape[-3:-1]), to_coef

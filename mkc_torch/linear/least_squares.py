@@ -1,0 +1,74 @@
+"""Least squares and ridge regression."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.linear._estimator import LinearEstimator
+from mkc_torch.linear._problem import canonical_shapes, linear_problem
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class LeastSquares(LinearEstimator):
+    """Ordinary or weighted least squares, (5) and (7) of Li et al. (2023).
+
+    Example:
+        >>> X = torch.tensor([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]])
+        >>> LeastSquares().fit(X, torch.tensor([1.0, 3.0, 5.0])).coef_
+        tensor([1.0000, 2.0000])
+    """
+
+    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> LeastSquares:
+        """Fit ``Y ~ X coef``.
+
+        Args:
+            X: (*, N, m, n) with Y (*, N, m), or (*, N, n) with Y (*, N).
+            Y: targets.
+            sample_weight: weights (*, N) or (*, N, m), inverse variances up to a factor.
+
+        Returns:
+            The estimator, with ``coef_`` (*, n) and ``weights_``, all ones.
+        """
+        problem = linear_problem(X, Y, sample_weight)
+        ones = torch.ones_like(problem.Y)
+        self._set_common(problem, problem.weighted_fit(ones), ones)
+        return self
+
+
+class Ridge(LinearEstimator):
+    """Least squares with the penalty ``alpha * |coef|^2`` on coefficients (all of them, an intercept column included).
+
+    Args:
+        alpha: penalty >= 0, in units of ``X^2`` summed over samples (scikit-learn's convention).
+
+    Example:
+        >>> X = torch.eye(2)
+        >>> Ridge(alpha=1.0).fit(X, torch.tensor([1.0, 2.0])).coef_
+        tensor([0.5000, 1.0000])
+    """
+
+    def __init__(self, alpha: float = 1.0) -> None:
+        if not alpha >= 0:
+            raise ValueError(f"Expected argument `alpha` to be >= 0 but got {alpha}.")
+        self.alpha = alpha
+
+    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> Ridge:
+        """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. Dependent columns are allowed for alpha > 0."""
+        values = canonical_shapes(X, Y, sample_weight)
+        rows, target = values.X.flatten(-3, -2), values.Y.flatten(-2)
+        if values.sample_weight is not None:
+            root = values.sample_weight.sqrt().flatten(-2)
+            rows, target = rows * root.unsqueeze(-1), target * root
+        n = rows.shape[-1]
+        penalty = (self.alpha**0.5) * torch.eye(n, dtype=rows.dtype, device=rows.device)
+        rows = torch.cat([rows.expand(*values.batch, -1, n), penalty.expand(*values.batch, n, n)], dim=-2)
+        augmented = linear_problem(rows, torch.cat([target, target.new_zeros(*values.batch, n)], dim=-1))
+        self.coef_ = augmented.coefficients(augmented.weighted_fit(torch.ones_like(augmented.Y)))
+        self._single_channel = values.single_channel
+        self.weights_ = self._by_channel(torch.ones_like(values.Y))
+        return self
