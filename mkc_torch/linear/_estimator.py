@@ -31,6 +31,9 @@ class LinearEstimator:
     coef_: Float[Tensor, "*batch n"]
     weights_: Float[Tensor, "*batch N m"]
 
+    def __init__(self) -> None:
+        """No parameters; an estimator with some sets each under its own name."""
+
     def fit(self: Self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> Self:
         raise NotImplementedError
 
