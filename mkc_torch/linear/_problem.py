@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 
+MAX_IMPLIED_CHANNELS = 16
+
+
 class RankDeficientError(ValueError):
     """The columns of X are linearly dependent, so that the coefficients are not determined."""
 
@@ -167,13 +170,12 @@ def canonical_shapes(
         )
     if X.dtype in (torch.float16, torch.bfloat16):
         raise TypeError(f"Expected `X` of dtype float32 or float64 but got {X.dtype}; use .float().")
-    multichannel = X.dim() >= 3 and Y.dim() >= 2 and X.shape[-3:-1] == Y.shape[-2:]
-    single = not multichannel and X.dim() >= 2 and Y.dim() >= 1 and X.shape[-2] == Y.shape[-1]
-    if not (multichannel or single):
+    if X.dim() < 2 or Y.dim() < 1 or X.shape[-2] != Y.shape[-1]:
         raise ValueError(
             f"Expected `X` of shape (*, N, m, n) with `Y` (*, N, m), or (*, N, n) with (*, N), "
             f"but got {tuple(X.shape)} and {tuple(Y.shape)}."
         )
+    single = _last_is_samples(X, Y)
     if single:
         X, Y = X.unsqueeze(-2), Y.unsqueeze(-1)
     if X.shape[-1] == 0 or Y.numel() == 0:
@@ -213,6 +215,14 @@ def linear_problem(
         raise ValueError(f"Expected at least {n} values for {n} coefficients but got {N} samples x {m}; add samples.")
     basis, to_coef = _orthonormalise(v.X, v.sample_weight)
     return LinearProblem(basis, to_coef, v.Y, v.sample_weight, v.batch, v.single_channel)
+
+
+def _last_is_samples(X: Tensor, Y: Tensor) -> bool:
+    """Whether Y is (*, N) rather than (*, N, m); the rule that the docstring of ``mkc_torch.linear`` states."""
+    if X.dim() == 2 or Y.dim() == 1 or X.shape[-3] != Y.shape[-2]:
+        return True
+    before, last = Y.shape[-2:]
+    return last > X.shape[-1] and last > min(before, MAX_IMPLIED_CHANNELS)
 
 
 def _as_weight(sample_weight: Tensor, N: int, m: int, single_channel: bool, Y: Tensor) -> Tensor:

@@ -67,7 +67,8 @@ class Ridge(LinearEstimator):
         n = rows.shape[-1]
         penalty = (self.alpha**0.5) * torch.eye(n, dtype=rows.dtype, device=rows.device)
         rows = torch.cat([rows.expand(*values.batch, -1, n), penalty.expand(*values.batch, n, n)], dim=-2)
-        augmented = linear_problem(rows, torch.cat([target, target.new_zeros(*values.batch, n)], dim=-1))
+        target = torch.cat([target, target.new_zeros(*values.batch, n)], dim=-1)
+        augmented = linear_problem(rows.unsqueeze(-2), target.unsqueeze(-1))
         self.coef_ = augmented.coefficients(augmented.weighted_fit(torch.ones_like(augmented.Y)))
         self._single_channel = values.single_channel
         self.weights_ = self._by_channel(torch.ones_like(values.Y))
