@@ -50,7 +50,7 @@ class LinearEstimator:
     def _set_common(self, problem: LinearProblem, beta: Tensor, weights: Tensor) -> None:
         self._single_channel = problem.single_channel
         self.coef_ = problem.coefficients(beta)
-        self.weights_ = self._by_channel(weights)
+        self.weights_ = self._by_channel(problem.restore(weights))
 
     def _by_channel(self, values: Tensor) -> Tensor:
         """Drop the channel dimension where the user gave none."""

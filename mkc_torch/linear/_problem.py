@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 
 MAX_IMPLIED_CHANNELS = 16
 
+_CHUNK = 1 << 22
+"""Values held at once when outer products of rows are formed."""
+
 
 class RankDeficientError(ValueError):
     """The columns of X are linearly dependent, so that the coefficients are not determined."""
@@ -23,14 +26,15 @@ class RankDeficientError(ValueError):
 class LinearProblem:
     """``Y ~ X coef`` over N samples of m channels, with X = basis · to_coef⁻¹ and an orthonormal basis.
 
-    Work in the basis is invariant to the scale and the correlation of the columns of X. The batch dimensions of
-    ``basis`` broadcast against those of ``Y``: one X may serve many Y.
+    Work in the basis is invariant to the scale and the correlation of the columns of X. The batch dimensions are
+    flattened to one of size B; one X that serves every Y is kept once. ``batch`` remembers the user's dimensions.
+    A stack of S candidates for each problem has its dimension after B.
     """
 
-    basis: Float[Tensor, "*#batch N m n"]
-    to_coef: Float[Tensor, "*#batch n n"]
-    Y: Float[Tensor, "*batch N m"]
-    sample_weight: Float[Tensor, "*batch N m"] | None
+    basis: Float[Tensor, "#B N m n"]
+    to_coef: Float[Tensor, "#B n n"]
+    Y: Float[Tensor, "B N m"]
+    sample_weight: Float[Tensor, "B N m"] | None
     batch: torch.Size
     single_channel: bool
 
@@ -46,84 +50,99 @@ class LinearProblem:
     def num_coefficients(self) -> int:
         return self.basis.shape[-1]
 
-    def residual(self, beta: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch N m"]:
-        """``Y - X coef`` for coefficients in the basis; ``beta`` may have further leading dimensions."""
-        rows = self.basis.flatten(-3, -2)
-        return self.Y - torch.matmul(rows, beta.unsqueeze(-1)).squeeze(-1).unflatten(-1, self.Y.shape[-2:])
+    @property
+    def coefficients_per_channel(self) -> int:
+        """The share of the coefficients that one channel pays for in degrees of freedom."""
+        return -(-self.num_coefficients // self.num_channels)
 
-    def weighted_fit(self, weight: Float[Tensor, "*batch N m"]) -> Float[Tensor, "*batch n"]:
-        """The weighted least-squares coefficients in the basis; sample weights are multiplied in."""
+    def residual(self, beta: Float[Tensor, "B *S n"]) -> Float[Tensor, "B *S N m"]:
+        """``Y - X coef`` for coefficients in the basis, one set or a stack of S for each problem."""
+        stack = beta if beta.dim() == 3 else beta.unsqueeze(-2)
+        rows = self.basis.flatten(-3, -2)
+        fitted = torch.matmul(stack, rows[0].mT if rows.shape[0] == 1 else rows.mT)
+        residual = self.Y.unsqueeze(1) - fitted.unflatten(-1, self.Y.shape[-2:])
+        return residual if beta.dim() == 3 else residual.squeeze(1)
+
+    def weighted_fit(self, weight: Float[Tensor, "B *S N m"]) -> Float[Tensor, "B *S n"]:
+        """Weighted least-squares coefficients in the basis; sample weights are multiplied in."""
+        gram, moment = self.normal_equations(weight)
+        return solve_gram(gram, moment)
+
+    def normal_equations(
+        self, weight: Float[Tensor, "B *S N m"]
+    ) -> tuple[Float[Tensor, "B *S n n"], Float[Tensor, "B *S n"]]:
+        """Gram matrix and moment of the basis under ``weight`` times the sample weights."""
+        stack = weight if weight.dim() == 4 else weight.unsqueeze(1)
         if self.sample_weight is not None:
-            weight = weight * self.sample_weight
-        rows = self.basis.flatten(-3, -2)
-        weighted = rows * weight.flatten(-2).unsqueeze(-1)
-        gram = torch.matmul(weighted.mT, rows)
-        moment = torch.matmul(weighted.mT, self.Y.flatten(-2).unsqueeze(-1))
-        return solve_gram(gram, moment).squeeze(-1)
+            stack = stack * self.sample_weight.unsqueeze(1)
+        n = self.num_coefficients
+        gram = stack.new_zeros(*stack.shape[:2], n * n)
+        moment = stack.new_zeros(*stack.shape[:2], n)
+        step = max(1, _CHUNK // (n * n * self.num_channels * self.basis.shape[0]))
+        for first in range(0, self.num_samples, step):
+            part = slice(first, first + step)
+            rows = self.basis[:, part].flatten(-3, -2)
+            outer = (rows.unsqueeze(-1) * rows.unsqueeze(-2)).flatten(-2)
+            w = stack[:, :, part].flatten(-2)
+            wy = w * self.Y[:, part].flatten(-2).unsqueeze(1)
+            if rows.shape[0] == 1:
+                rows, outer = rows[0], outer[0]
+            gram += torch.matmul(w, outer)
+            moment += torch.matmul(wy, rows)
+        gram = gram.unflatten(-1, (n, n))
+        return (gram, moment) if weight.dim() == 4 else (gram.squeeze(1), moment.squeeze(1))
 
-    def total_weight(self) -> Float[Tensor, "*batch m"]:
-        """Sum of the sample weights of each channel."""
+    def total_weight(self) -> Float[Tensor, "B m"]:
+        """Sum of the sample weights of each channel; the number of samples where none are given."""
         if self.sample_weight is None:
-            return self.Y.new_full((*self.batch, self.num_channels), float(self.num_samples))
+            return self.Y.new_full((self.Y.shape[0], self.num_channels), float(self.num_samples))
         return self.sample_weight.sum(-2)
 
-    def weighted_mean(self, values: Float[Tensor, "*batch N m"]) -> Float[Tensor, "*batch m"]:
-        """Mean over the samples with the sample weights."""
-        if self.sample_weight is None:
-            return values.mean(-2)
-        return (self.sample_weight * values).sum(-2) / self.sample_weight.sum(-2)
+    def coefficients(self, beta: Float[Tensor, "B n"]) -> Float[Tensor, "*batch n"]:
+        """Coefficients of the user's columns, in the user's batch dimensions, from those in the basis."""
+        return self.restore(torch.matmul(self.to_coef, beta.unsqueeze(-1)).squeeze(-1))
 
-    def coefficients(self, beta: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
-        """Coefficients of the user's columns from those in the basis."""
-        return torch.matmul(self.to_coef, beta.unsqueeze(-1)).squeeze(-1)
-
-    def in_basis(self, coef: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
+    def in_basis(self, coef: Float[Tensor, "*batch n"]) -> Float[Tensor, "B n"]:
         """Coefficients in the basis from those of the user's columns."""
-        return torch.linalg.solve(self.to_coef, coef.unsqueeze(-1)).squeeze(-1)
+        flat = coef.expand(*self.batch, self.num_coefficients).reshape(-1, self.num_coefficients, 1)
+        return torch.linalg.solve(self.to_coef, flat).squeeze(-1)
+
+    def restore(self, values: Float[Tensor, "B *rest"]) -> Float[Tensor, "*batch *rest"]:
+        """Give values of the flattened problems the user's batch dimensions."""
+        return values.reshape(*self.batch, *values.shape[1:])
 
     def select(self, index: Tensor) -> LinearProblem:
-        """The problems at ``index`` of a batch of one dimension."""
+        """The problems at ``index``, as a batch of their own."""
         shared = self.basis.shape[0] == 1
-        return LinearProblem(
+        return replace(
+            self,
             basis=self.basis if shared else self.basis[index],
             to_coef=self.to_coef if shared else self.to_coef[index],
             Y=self.Y[index],
             sample_weight=None if self.sample_weight is None else self.sample_weight[index],
             batch=torch.Size([index.shape[0]]),
-            single_channel=self.single_channel,
         )
 
-    def flatten_batch(self) -> LinearProblem:
-        """The same problems with their batch dimensions made one."""
-        shared = all(s == 1 for s in self.basis.shape[:-3])
-        basis, to_coef = self.basis, self.to_coef
-        if shared:
-            basis, to_coef = basis.reshape(1, *basis.shape[-3:]), to_coef.reshape(1, *to_coef.shape[-2:])
-        else:
-            basis = basis.expand(*self.batch, *basis.shape[-3:]).reshape(-1, *basis.shape[-3:])
-            to_coef = to_coef.expand(*self.batch, *to_coef.shape[-2:]).reshape(-1, *to_coef.shape[-2:])
-        weight = self.sample_weight
-        return LinearProblem(
-            basis=basis,
-            to_coef=to_coef,
-            Y=self.Y.reshape(-1, *self.Y.shape[-2:]),
-            sample_weight=None if weight is None else weight.reshape(-1, *weight.shape[-2:]),
-            batch=torch.Size([self.batch.numel()]),
-            single_channel=self.single_channel,
+    def select_samples(self, index: Tensor) -> LinearProblem:
+        """The same problems on the samples at ``index``; the basis is then only nearly orthonormal."""
+        return replace(
+            self,
+            basis=self.basis[:, index],
+            Y=self.Y[:, index],
+            sample_weight=None if self.sample_weight is None else self.sample_weight[:, index],
         )
 
 
-def solve_gram(gram: Float[Tensor, "*batch n n"], moment: Float[Tensor, "*batch n k"]) -> Float[Tensor, "*batch n k"]:
+def solve_gram(gram: Float[Tensor, "*batch n n"], moment: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
     """Solve positive semi-definite systems: Cholesky, and the pseudo-inverse where the weights removed a direction."""
     factor, info = torch.linalg.cholesky_ex(gram)
-    solution = torch.cholesky_solve(moment, factor)
-    diagonal = factor.diagonal(dim1=-2, dim2=-1)
+    solution = torch.cholesky_solve(moment.unsqueeze(-1), factor).squeeze(-1)
+    pivots = factor.diagonal(dim1=-2, dim2=-1)
     eps = torch.finfo(gram.dtype).eps
-    weak = (info > 0) | (diagonal.amin(-1) <= 10 * gram.shape[-1] ** 0.5 * eps**0.5 * diagonal.amax(-1))
+    weak = (info > 0) | ~(pivots.amin(-1) > (gram.shape[-1] * eps) ** 0.5 * pivots.amax(-1))
     if weak.any():
-        repaired = torch.matmul(torch.linalg.pinv(gram[weak], hermitian=True, rtol=gram.shape[-1] * eps), moment[weak])
-        solution = solution.clone()
-        solution[weak] = repaired
+        inverse = torch.linalg.pinv(gram[weak], hermitian=True, rtol=gram.shape[-1] * eps)
+        solution[weak] = torch.matmul(inverse, moment[weak].unsqueeze(-1)).squeeze(-1)
     return solution
 
 
@@ -213,8 +232,13 @@ def linear_problem(
     N, m, n = v.X.shape[-3:]
     if N * m < n:
         raise ValueError(f"Expected at least {n} values for {n} coefficients but got {N} samples x {m}; add samples.")
-    basis, to_coef = _orthonormalise(v.X, v.sample_weight)
-    return LinearProblem(basis, to_coef, v.Y, v.sample_weight, v.batch, v.single_channel)
+    flat = v.batch.numel()
+    # one X for every Y is kept once; weights of 0 that differ between problems give each its own basis
+    shared = v.X.shape[:-3].numel() == 1 and (v.sample_weight is None or bool((v.sample_weight > 0).all()))
+    x_batch = v.X.shape[:-3] if shared else v.batch
+    basis, to_coef = _orthonormalise(v.X.expand(*x_batch, N, m, n).reshape(-1, N, m, n), v.sample_weight)
+    weight = None if v.sample_weight is None else v.sample_weight.reshape(flat, N, m)
+    return LinearProblem(basis, to_coef, v.Y.reshape(flat, N, m), weight, v.batch, v.single_channel)
 
 
 def _last_is_samples(X: Tensor, Y: Tensor) -> bool:
@@ -242,11 +266,11 @@ def _as_weight(sample_weight: Tensor, N: int, m: int, single_channel: bool, Y: T
 
 
 def _orthonormalise(X: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Basis and the matrix that takes its coefficients to those of the columns of X."""
+    """Basis and the matrix that takes its coefficients to those of the columns of X, on the samples in use."""
     n = X.shape[-1]
     rows = X.flatten(-3, -2)
-    if weight is not None:
-        rows = rows * (weight > 0).flatten(-2).unsqueeze(-1)
+    if weight is not None and rows.shape[0] == weight.shape[:-2].numel():
+        rows = rows * (weight > 0).reshape(rows.shape[0], -1, 1)
     scale = rows.abs().amax(-2)
     if (scale == 0).any():
         column = int((scale == 0).nonzero()[0, -1])
