@@ -109,7 +109,7 @@ class LinearProblem:
 
     def restore(self, values: Float[Tensor, "B *rest"]) -> Float[Tensor, "*batch *rest"]:
         """Give values of the flattened problems the user's batch dimensions."""
-        return values.reshape(*self.batch, *values.shape[1:])
+        return values.reshape((*self.batch, *values.shape[1:]))
 
     def select(self, index: Tensor) -> LinearProblem:
         """The problems at ``index``, as a batch of their own."""

@@ -1,0 +1,113 @@
+"""S-regression: the coefficients whose residuals have the smallest M-scale."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+
+import torch
+from torch import Tensor
+
+from mkc_torch.linear._estimator import LinearEstimator
+from mkc_torch.linear._problem import LinearProblem, linear_problem
+from mkc_torch.linear._scale_search import ScaleMinimum, ScaleRule, minimise_scale
+from mkc_torch.linear.least_trimmed_squares import order_statistic
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+BISQUARE_50 = 1.547645
+"""Tukey's bisquare tuning constant for a breakdown point of 1/2 (robustbase, lmrob.control)."""
+
+
+def bisquare_rho(u: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Tukey's bisquare ρ scaled to a maximum of 1, for u = residual / (c · scale)."""
+    return 1.0 - (1.0 - u.square().clamp(max=1.0)).pow(3)
+
+
+def bisquare_weight(u: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """ψ(u) / u of the bisquare, scaled to 1 at 0."""
+    return (1.0 - u.square().clamp(max=1.0)).square()
+
+
+def m_scale(steps: int, c: float = BISQUARE_50) -> ScaleRule:
+    """The scale s with mean ρ(r / (c s)) = (1 - p/N) / 2 by at most ``steps`` Newton iterations, and its weights."""
+
+    def rule(problem: LinearProblem, residual: Tensor) -> tuple[Tensor, Tensor]:
+        weight = problem.sample_weight
+        w = None if weight is None else weight.unsqueeze(1)
+        total = problem.total_weight().unsqueeze(1)
+        half = 0.5 * (total - problem.coefficients_per_channel).clamp(min=1.0)
+        # quantile rather than median, so that a fit through p values does not start at 0
+        h = min(problem.num_samples, (problem.num_samples + problem.coefficients_per_channel + 1) // 2)
+        scale = 1.4826 * order_statistic(residual.abs(), weight, h)
+        tiny = torch.finfo(residual.dtype).tiny
+        for _ in range(steps):
+            u = residual / (c * scale.clamp(min=tiny)).unsqueeze(-2)
+            rho, slope = bisquare_rho(u), 6.0 * u.square() * bisquare_weight(u)
+            if w is not None:
+                rho, slope = w * rho, w * slope
+            # Newton's method in log(scale), kept within a factor of two
+            excess = rho.sum(-2) - half
+            step = (excess / slope.sum(-2).clamp(min=tiny)).clamp(min=-0.7, max=0.7)
+            scale = scale * torch.exp(torch.where(scale > 0, step, 0.0))
+            if bool((step.abs() < 1e-13).all()):
+                break
+        return scale, bisquare_weight(residual / (c * scale.clamp(min=tiny)).unsqueeze(-2))
+
+    return rule
+
+
+def minimise_m_scale(
+    problem: LinearProblem, *, starts: int = 500, candidates: int = 10, max_iter: int = 500, seed: int = 0
+) -> ScaleMinimum:
+    """S-regression with Tukey's bisquare on a checked problem."""
+    return minimise_scale(
+        problem, m_scale(2), m_scale(30), starts=starts, candidates=candidates, max_iter=max_iter, seed=seed
+    )
+
+
+class SRegression(LinearEstimator):
+    """S-estimator of regression with Tukey's bisquare, breakdown point 1/2.
+
+    The scale s solves mean ρ(r / (c s)) = 1/2 with N - p in the denominator, p = ceil(n / m); with m channels the
+    product of the channels' scales is minimised.
+
+    Args:
+        starts: number of elemental starts.
+        seed: of the elemental starts.
+
+    Attributes, after ``fit``:
+        coef_: (*, n).
+        scale_: (*, m), or (*,) for one channel: the M-scale, consistent for Gaussian residuals.
+        weights_: bisquare weights in [0, 1].
+        n_iter_, converged_: steps made, and whether they had come to rest, (*,).
+
+    References:
+        Rousseeuw & Yohai, "Robust regression by means of S-estimators" (1984).
+        Salibian-Barrera & Yohai, "A fast algorithm for S-regression estimates", JCGS 15 (2006) 414-427.
+
+    Example:
+        >>> X = torch.stack([torch.ones(10), torch.arange(10.0)], -1).double()
+        >>> y = 1 + 2 * X[:, 1]
+        >>> y[:4] = 100.0
+        >>> SRegression().fit(X, y).coef_
+        tensor([1.0000, 2.0000], dtype=torch.float64)
+    """
+
+    def __init__(self, *, starts: int = 500, seed: int = 0) -> None:
+        super().__init__()
+        if starts < 1:
+            raise ValueError(f"Expected argument `starts` to be at least 1 but got {starts}.")
+        self.starts = starts
+        self.seed = seed
+
+    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> SRegression:
+        """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. A weight of 2 is a sample that occurs twice."""
+        problem = linear_problem(X, Y, sample_weight)
+        minimum = minimise_m_scale(problem, starts=self.starts, seed=self.seed)
+        self._set_common(problem, minimum.beta, minimum.weight)
+        self.scale_ = self._by_channel(problem.restore(minimum.scale))
+        self.n_iter_ = minimum.n_iter
+        self.converged_ = problem.restore(minimum.converged)
+        return self
