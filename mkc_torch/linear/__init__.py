@@ -7,6 +7,18 @@ unless B exceeds n and also exceeds 16 or A: more channels than that are not mea
 """
 
 from mkc_torch.linear._problem import RankDeficientError
+from mkc_torch.linear.em import MKCRegression
+from mkc_torch.linear.fixed_point import FixedPointLinear
 from mkc_torch.linear.least_squares import LeastSquares, Ridge
+from mkc_torch.linear.least_trimmed_squares import LeastTrimmedSquares
+from mkc_torch.linear.s_regression import SRegression
 
-__all__ = ["LeastSquares", "RankDeficientError", "Ridge"]
+__all__ = [
+    "FixedPointLinear",
+    "LeastSquares",
+    "LeastTrimmedSquares",
+    "MKCRegression",
+    "RankDeficientError",
+    "Ridge",
+    "SRegression",
+]

@@ -9,9 +9,8 @@ S-regression estimates", 2006).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor
@@ -21,8 +20,16 @@ if TYPE_CHECKING:
 
     from mkc_torch.linear._problem import LinearProblem
 
-ScaleRule = Callable[["LinearProblem", Tensor], tuple[Tensor, Tensor]]
-"""From a problem and residuals (B, S, N, m): scales (B, S, m) and weights (B, S, N, m) in [0, 1]."""
+class ScaleRule(Protocol):
+    """A robust scale of residuals (B, S, N, m) and the weights in [0, 1] of a step that lowers it."""
+
+    def scale(self, problem: LinearProblem, residual: Tensor) -> Float[Tensor, "B S m"]: ...
+
+    def weight(self, problem: LinearProblem, residual: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]: ...
+
+
+_CHUNK = 1 << 19
+"""Residuals worked on at once, few enough to stay in a processor's cache."""
 
 _SCREENING_SAMPLES = 1500
 
@@ -65,7 +72,9 @@ def _log_product(scale: Tensor) -> Tensor:
 
 def _step(problem: LinearProblem, beta: Tensor, rule: ScaleRule) -> tuple[Tensor, Tensor]:
     """Coefficients after one concentration step, and the objective before it."""
-    scale, weight = rule(problem, problem.residual(beta))
+    residual = problem.residual(beta)
+    scale = rule.scale(problem, residual)
+    weight = rule.weight(problem, residual, scale)
     objective = _log_product(scale)
     # a channel fitted exactly would have infinite weight; it is given a large one
     floor = torch.finfo(scale.dtype).eps * scale.amax(-1, keepdim=True)
@@ -75,7 +84,7 @@ def _step(problem: LinearProblem, beta: Tensor, rule: ScaleRule) -> tuple[Tensor
 
 
 def _best(problem: LinearProblem, beta: Tensor, rule: ScaleRule, count: int) -> Tensor:
-    scale, _ = rule(problem, problem.residual(beta))
+    scale = rule.scale(problem, problem.residual(beta))
     order = _log_product(scale).topk(min(count, beta.shape[1]), dim=1, largest=False).indices
     return beta.gather(1, order.unsqueeze(-1).expand(-1, -1, beta.shape[-1]))
 
@@ -103,6 +112,28 @@ def minimise_scale(
         max_iter: steps at most.
         seed: of the elemental starts.
     """
+    per_problem = min(problem.num_samples, _SCREENING_SAMPLES) * problem.num_channels * (starts + 1)
+    parts = torch.arange(problem.Y.shape[0], device=problem.Y.device).split(max(1, _CHUNK // per_problem))
+    found = [_minimise(problem.select(i), screening, final, starts, candidates, screening_steps, max_iter, seed) for i in parts]
+    return ScaleMinimum(
+        beta=torch.cat([f.beta for f in found]),
+        scale=torch.cat([f.scale for f in found]),
+        weight=torch.cat([f.weight for f in found]),
+        n_iter=max(f.n_iter for f in found),
+        converged=torch.cat([f.converged for f in found]),
+    )
+
+
+def _minimise(
+    problem: LinearProblem,
+    screening: ScaleRule,
+    final: ScaleRule,
+    starts: int,
+    candidates: int,
+    screening_steps: int,
+    max_iter: int,
+    seed: int,
+) -> ScaleMinimum:
     generator = torch.Generator().manual_seed(seed)
     small = problem
     if problem.num_samples > _SCREENING_SAMPLES:
@@ -123,7 +154,9 @@ def minimise_scale(
         beta = torch.where(moving.unsqueeze(-1), proposal, beta)
         if not moving.any():
             break
-    scale, weight = final(problem, problem.residual(beta))
+    residual = problem.residual(beta)
+    scale = final.scale(problem, residual)
+    weight = final.weight(problem, residual, scale)
     best = _log_product(scale).argmin(1)
     batch = torch.arange(beta.shape[0], device=beta.device)
     return ScaleMinimum(beta[batch, best], scale[batch, best], weight[batch, best], n_iter, ~moving[batch, best])

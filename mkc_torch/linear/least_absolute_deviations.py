@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,7 +12,7 @@ from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import linear_problem, solve_gram
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float, Int
 
 
 class LeastAbsoluteDeviations(LinearEstimator):
@@ -29,7 +29,7 @@ class LeastAbsoluteDeviations(LinearEstimator):
         max_iter: most interior-point iterations, at least 1; 10 to 30 are usual.
 
     Attributes, after ``fit``:
-        coef_: coefficients (*, n). Their gradient in X and Y is that of the solution through the n values.
+        coef_: coefficients (*, n). Their gradient in Y is that of the solution through the n values.
         weights_: ones of the shape of Y; the estimator weighs no value down.
         objective_: the minimum (*,) of ``sum(sample_weight * |Y - X coef|)`` over samples and channels.
         n_iter_: interior-point iterations (*,) of each problem, 0 where least squares already fits exactly.
@@ -38,7 +38,7 @@ class LeastAbsoluteDeviations(LinearEstimator):
     Example:
         >>> X = torch.tensor([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0], [1.0, 3.0]])
         >>> fit = LeastAbsoluteDeviations().fit(X, torch.tensor([1.0, 3.0, 50.0, 7.0]))
-        >>> fit.coef_, fit.objective_
+        >>> fit.coef_.round(decimals=4), fit.objective_.round(decimals=4)
         (tensor([1., 2.]), tensor(45.))
 
     References:
@@ -75,21 +75,18 @@ class LeastAbsoluteDeviations(LinearEstimator):
             RankDeficientError: columns of X are linearly dependent.
         """
         problem = linear_problem(X, Y, sample_weight)
-        flat = problem.flatten_batch()
         # conditioning near the optimum is beyond float32
-        rows = flat.basis.flatten(-3, -2).double()
-        target = flat.Y.flatten(-2).double()
+        rows = problem.basis.flatten(-3, -2).double()
+        target = problem.Y.flatten(-2).double()
         weight = torch.ones_like(target)
-        if flat.sample_weight is not None:
-            weight = flat.sample_weight.flatten(-2).double()
+        if problem.sample_weight is not None:
+            weight = problem.sample_weight.flatten(-2).double()
         with torch.no_grad():
-            start = flat.weighted_fit(torch.ones_like(flat.Y)).double()
+            start = problem.weighted_fit(torch.ones_like(problem.Y)).double()
             scale = weight.amax(-1, keepdim=True)
             relative = weight / scale
-            if flat.sample_weight is None:
-                scaled_rows = rows
-            else:
-                scaled_rows = rows * relative.unsqueeze(-1)
+            # without weights one X that serves many Y stays one
+            scaled_rows = rows if problem.sample_weight is None else rows * relative.unsqueeze(-1)
             # around least squares, so that a large offset costs no digits
             centred = relative * (target - _apply(rows, start))
             floor = 8 * torch.finfo(torch.float64).eps * (relative * target.abs()).sum(-1)
@@ -104,14 +101,10 @@ class LeastAbsoluteDeviations(LinearEstimator):
             objective = torch.where(better, objective, inner_objective)
             converged = objective - bound <= torch.maximum(self.tol * objective, floor)
         beta = torch.where(better.unsqueeze(-1), vertex, inner)
-        self._set_common(
-            problem,
-            beta.to(Y.dtype).reshape(*problem.batch, -1),
-            torch.ones_like(problem.Y),
-        )
-        self.objective_ = (objective * scale.squeeze(-1)).to(Y.dtype).reshape(problem.batch)
-        self.n_iter_ = n_iter.reshape(problem.batch)
-        self.converged_ = converged.reshape(problem.batch)
+        self._set_common(problem, beta.to(Y.dtype), torch.ones_like(problem.Y))
+        self.objective_ = problem.restore((objective * scale.squeeze(-1)).to(Y.dtype))
+        self.n_iter_ = problem.restore(n_iter)
+        self.converged_ = problem.restore(converged)
         return self
 
 
@@ -123,84 +116,106 @@ def _moment(rows: Float[Tensor, "#B R n"], values: Float[Tensor, "B R"]) -> Floa
     return torch.matmul(rows.mT, values.unsqueeze(-1)).squeeze(-1)
 
 
-def _interior_point(
-    rows: Float[Tensor, "#B R n"], target: Float[Tensor, "B R"], floor: Float[Tensor, "B"], tol: float, max_iter: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Minimise ``sum |target - rows beta|``; the dual is ``max target·d`` with ``rowsᵀ d = 0`` and ``|d| <= 1``.
+@dataclass(frozen=True)
+class _Iterate:
+    """Point of the interior: ``beta``, the residual as ``above - below`` and the dual ``d = 1 - upper = lower - 1``.
 
-    The state is ``beta``, the residual's parts ``above - below`` and the dual's slacks ``upper = 1 - d`` and
-    ``lower = 1 + d``, all four positive; at the optimum ``above * upper`` and ``below * lower`` are 0.
-
-    Returns:
-        The coefficients (B, n), a lower bound (B,) of the objective, and the iterations (B,) used.
+    The dual is ``max target·d`` with ``rowsᵀ d = 0`` and ``|d| <= 1``. The last four are positive; at the optimum
+    ``above * upper`` and ``below * lower`` are 0.
     """
-    B, R = target.shape
-    n = rows.shape[-1]
-    solution = target.new_zeros(B, n)
-    bound = torch.zeros_like(floor)
-    n_iter = torch.zeros(B, dtype=torch.long, device=target.device)
-    active = torch.arange(B, device=target.device)
-    beta = solution.clone()
-    spread = target.abs().mean(-1, keepdim=True)
-    above, below = target.clamp(min=0) + spread, (-target).clamp(min=0) + spread
-    upper, lower = torch.ones_like(target), torch.ones_like(target)
-    for iteration in range(max_iter + 1):
-        gap = (above * upper + below * lower).sum(-1)
-        residual = target - _apply(rows, beta)
-        objective = residual.abs().sum(-1)
-        going = gap > torch.maximum(tol * objective, floor)
-        going &= objective > floor
-        done = ~going if iteration < max_iter else torch.ones_like(going)
-        if done.any():
-            at = active[done]
-            solution[at] = beta[done]
-            dual = (lower - upper)[done] / 2
-            # the second term repairs what rounding left of rowsᵀ d = 0
-            finished = rows if rows.shape[0] == 1 else rows[done]
-            slip = (_moment(finished, dual) * beta[done]).sum(-1)
-            bound[at] = (dual * target[done]).sum(-1) - slip
-            n_iter[at] = iteration
-            if done.all():
-                break
-            keep = ~done
-            active, floor = active[keep], floor[keep]
-            rows = rows if rows.shape[0] == 1 else rows[keep]
-            target, residual, beta, gap = target[keep], residual[keep], beta[keep], gap[keep]
-            above, below, upper, lower = above[keep], below[keep], upper[keep], lower[keep]
 
-        inverse = 1 / (above / upper + below / lower)
-        weighted = rows * inverse.unsqueeze(-1)
+    rows: Float[Tensor, "#B R n"]
+    target: Float[Tensor, "B R"]
+    floor: Float[Tensor, " B"]
+    beta: Float[Tensor, "B n"]
+    above: Float[Tensor, "B R"]
+    below: Float[Tensor, "B R"]
+    upper: Float[Tensor, "B R"]
+    lower: Float[Tensor, "B R"]
+
+    @classmethod
+    def first(cls, rows: Tensor, target: Tensor, floor: Tensor) -> _Iterate:
+        spread = target.abs().mean(-1, keepdim=True)
+        above, below = target.clamp(min=0) + spread, (-target).clamp(min=0) + spread
+        ones = torch.ones_like(target)
+        beta = target.new_zeros(target.shape[0], rows.shape[-1])
+        return cls(rows, target, floor, beta, above, below, ones, ones)
+
+    def select(self, keep: Tensor) -> _Iterate:
+        rows = self.rows if self.rows.shape[0] == 1 else self.rows[keep]
+        rest = (self.target, self.floor, self.beta, self.above, self.below, self.upper, self.lower)
+        return _Iterate(rows, *(value[keep] for value in rest))
+
+    def residual(self) -> Float[Tensor, "B R"]:
+        return self.target - _apply(self.rows, self.beta)
+
+    def finished(self, tol: float) -> Bool[Tensor, " B"]:
+        residual = self.residual()
+        size = residual.abs()
+        gap = (residual.clamp(min=0) * self.upper + (-residual).clamp(min=0) * self.lower).sum(-1)
+        # a few vast outliers make the objective; the coefficients are as good as the gap is beside the other values
+        typical = torch.minimum(size.mean(-1), size.median(-1).values) * size.shape[-1]
+        return gap <= torch.maximum(tol * typical, self.floor)
+
+    def bound(self) -> Float[Tensor, " B"]:
+        """Lower bound of the objective; the residual in place of the target covers for rounding in ``rowsᵀ d = 0``."""
+        return ((self.lower - self.upper) / 2 * self.residual()).sum(-1)
+
+    def advance(self) -> _Iterate:
+        """One predictor-corrector step (Portnoy and Koenker 1997, section 4)."""
+        rows, above, below, upper, lower = self.rows, self.above, self.below, self.upper, self.lower
+        stiffness = 1 / (above / upper + below / lower)
+        weighted = rows * stiffness.unsqueeze(-1)
         gram = torch.matmul(weighted.mT, rows)
         slip = _moment(rows, (lower - upper) / 2)
-        drift = residual - (above - below)
+        drift = self.residual() - (above - below)
 
-        def newton(
-            c_above: Tensor,
-            c_below: Tensor,
-            *,
-            _state: tuple[Tensor, ...] = (rows, above, below, upper, lower, inverse, weighted, gram, slip, drift),
-        ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-            rows, above, below, upper, lower, inverse, weighted, gram, slip, drift = _state
-            pull = drift - c_above / upper + c_below / lower
-            d_beta = solve_gram(gram, (_moment(weighted, pull) + slip).unsqueeze(-1)).squeeze(-1)
-            d_dual = inverse * (pull - _apply(rows, d_beta))
-            return d_beta, d_dual, (c_above + above * d_dual) / upper, (c_below - below * d_dual) / lower
+        def newton(to_above: Tensor, to_below: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+            pull = drift - to_above / upper + to_below / lower
+            d_beta = solve_gram(gram, _moment(weighted, pull) + slip)
+            d_dual = stiffness * (pull - _apply(rows, d_beta))
+            return d_beta, d_dual, (to_above + above * d_dual) / upper, (to_below - below * d_dual) / lower
 
+        gap = (above * upper + below * lower).sum(-1, keepdim=True)
         _, d_dual, d_above, d_below = newton(-above * upper, -below * lower)
-        primal = _longest(above, d_above, below, d_below)
-        dual = _longest(upper, -d_dual, lower, d_dual)
-        predicted = (
-            (above + primal * d_above) * (upper - dual * d_dual) + (below + primal * d_below) * (lower + dual * d_dual)
-        ).sum(-1)
-        centre = (gap * (predicted / gap) ** 3 / (2 * R)).unsqueeze(-1)
+        primal, dual = _longest(above, d_above, below, d_below), _longest(upper, -d_dual, lower, d_dual)
+        left = (above + primal * d_above) * (upper - dual * d_dual) + (below + primal * d_below) * (
+            lower + dual * d_dual
+        )
+        centre = gap * (left.sum(-1, keepdim=True) / gap) ** 3 / (2 * above.shape[-1])
         d_beta, d_dual, d_above, d_below = newton(
             centre - above * upper + d_above * d_dual, centre - below * lower - d_below * d_dual
         )
-        primal = _longest(above, d_above, below, d_below)
-        dual = _longest(upper, -d_dual, lower, d_dual)
-        beta = beta + primal * d_beta
-        above, below = above + primal * d_above, below + primal * d_below
-        upper, lower = upper - dual * d_dual, lower + dual * d_dual
+        primal, dual = _longest(above, d_above, below, d_below), _longest(upper, -d_dual, lower, d_dual)
+        return _Iterate(
+            rows,
+            self.target,
+            self.floor,
+            self.beta + primal * d_beta,
+            above + primal * d_above,
+            below + primal * d_below,
+            upper - dual * d_dual,
+            lower + dual * d_dual,
+        )
+
+
+def _interior_point(
+    rows: Float[Tensor, "#B R n"], target: Float[Tensor, "B R"], floor: Float[Tensor, " B"], tol: float, max_iter: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Minimise ``sum |target - rows beta|``: coefficients (B, n), lower bounds (B,) of the sum, iterations (B,)."""
+    solution = target.new_zeros(target.shape[0], rows.shape[-1])
+    bound, n_iter = torch.zeros_like(floor), torch.zeros_like(floor, dtype=torch.long)
+    active = torch.arange(target.shape[0], device=target.device)
+    iterate = _Iterate.first(rows, target, floor)
+    for iteration in range(max_iter + 1):
+        done = iterate.finished(tol) | (iteration == max_iter)
+        if done.any():
+            at, last = active[done], iterate.select(done)
+            solution[at], bound[at], n_iter[at] = last.beta, last.bound(), iteration
+            active, iterate = active[~done], iterate.select(~done)
+            if active.numel() == 0:
+                break
+        iterate = iterate.advance()
     return solution, bound, n_iter
 
 
@@ -208,3 +223,35 @@ def _longest(a: Tensor, d_a: Tensor, b: Tensor, d_b: Tensor) -> Float[Tensor, "B
     """The longest step, at most 1, that keeps ``a`` and ``b`` positive."""
     fastest = torch.maximum((-d_a / a).amax(-1, keepdim=True), (-d_b / b).amax(-1, keepdim=True))
     return torch.where(fastest > 0.9995, 0.9995 / fastest, torch.ones_like(fastest))
+
+
+def _tight_rows(
+    rows: Float[Tensor, "#B R n"], residual: Float[Tensor, "B R"], used: Bool[Tensor, "B R"]
+) -> Int[Tensor, "B n"]:
+    """The n linearly independent rows of the smallest residuals: QR that pivots on ``row / |residual|``.
+
+    Taking the n smallest alone would fail on repeated samples.
+    """
+    eps = torch.finfo(residual.dtype).eps
+    size = residual.abs()
+    size = size.clamp(min=eps * size.median(-1, keepdim=True).values + torch.finfo(size.dtype).tiny ** 0.5)
+    left = rows * used.unsqueeze(-1)
+    dependent = 1e-10 * torch.linalg.vector_norm(left, dim=-1)
+    chosen = []
+    for _ in range(rows.shape[-1]):
+        length = torch.linalg.vector_norm(left, dim=-1)
+        pivot = torch.where(length > dependent, length / size, torch.zeros_like(size)).argmax(-1)
+        chosen.append(pivot)
+        row = left.gather(-2, pivot[:, None, None].expand(-1, 1, rows.shape[-1]))
+        direction = row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)
+        left = left - torch.matmul(left, direction.mT) * direction
+    return torch.stack(chosen, dim=-1)
+
+
+def _solve_through(
+    rows: Float[Tensor, "#B R n"], target: Float[Tensor, "B R"], chosen: Int[Tensor, "B n"]
+) -> Float[Tensor, "B n"]:
+    """The coefficients that fit the chosen rows exactly."""
+    matrix = rows.expand(target.shape[0], -1, -1).gather(-2, chosen.unsqueeze(-1).expand(-1, -1, rows.shape[-1]))
+    solution: Tensor = torch.linalg.solve(matrix, target.gather(-1, chosen))
+    return solution

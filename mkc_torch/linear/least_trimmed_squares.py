@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.linear._scale_search import ScaleMinimum, ScaleRule, minimise_scale
+from mkc_torch.linear._scale_search import minimise_scale
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -32,24 +33,49 @@ def order_statistic(
 
 def default_coverage(problem: LinearProblem) -> int:
     """``(N + p + 1) // 2``, the coverage of highest breakdown point, p being the coefficients of one channel."""
-    return (problem.num_samples + problem.coefficients_per_channel + 1) // 2
+    return min(problem.num_samples, (problem.num_samples + problem.coefficients_per_channel + 1) // 2)
 
 
-def trimmed_scale(h: int) -> ScaleRule:
-    """Root mean square of the h smallest residuals of each channel, and the indicator of those."""
+@dataclass(frozen=True)
+class TrimmedScale:
+    """Root mean square of the smallest ``fraction`` of each channel's residuals, and the indicator of those."""
 
-    def rule(problem: LinearProblem, residual: Tensor) -> tuple[Tensor, Tensor]:
+    fraction: float
+
+    def _count(self, problem: LinearProblem) -> int:
+        return max(1, round(self.fraction * problem.num_samples))
+
+    def scale(self, problem: LinearProblem, residual: Tensor) -> Float[Tensor, "B S m"]:
         square = residual.square()
+        h = self._count(problem)
         weight = problem.sample_weight
+        if weight is None:
+            return torch.sqrt(square.topk(h, dim=-2, largest=False, sorted=False).values.mean(-2))
         threshold = order_statistic(square, weight, h)
-        inside = (square <= threshold.unsqueeze(-2)).to(square.dtype)
-        w = inside if weight is None else inside * weight.unsqueeze(1)
-        total = float(h) if weight is None else h / problem.num_samples * problem.total_weight().unsqueeze(1)
+        w = torch.where(square <= threshold.unsqueeze(-2), weight.unsqueeze(1), 0.0)
+        total = h / problem.num_samples * problem.total_weight().unsqueeze(1)
         # ties beyond h enter once
         trimmed = (w * square).sum(-2) - (w.sum(-2) - total) * threshold
-        return torch.sqrt(trimmed.clamp(min=0.0) / total), inside
+        return torch.sqrt(trimmed.clamp(min=0.0) / total)
 
-    return rule
+    def weight(self, problem: LinearProblem, residual: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:  # noqa: ARG002
+        size = residual.abs()
+        threshold = order_statistic(size, problem.sample_weight, self._count(problem))
+        return (size <= threshold.unsqueeze(-2)).to(size.dtype)
+
+
+@dataclass(frozen=True)
+class QuantileScale:
+    """The absolute residual below which ``fraction`` of them lie: a cheap stand-in for ranking many starts."""
+
+    fraction: float
+
+    def scale(self, problem: LinearProblem, residual: Tensor) -> Float[Tensor, "B S m"]:
+        h = max(1, round(self.fraction * problem.num_samples))
+        return order_statistic(residual.abs(), problem.sample_weight, h)
+
+    def weight(self, problem: LinearProblem, residual: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:  # noqa: ARG002
+        return (residual.abs() <= scale.unsqueeze(-2)).to(residual.dtype)
 
 
 def gaussian_consistency(fraction: float) -> float:
@@ -59,18 +85,6 @@ def gaussian_consistency(fraction: float) -> float:
     q = torch.special.ndtri(torch.tensor((1.0 + fraction) / 2.0, dtype=torch.float64)).item()
     variance = 1.0 - 2.0 * q * math.exp(-0.5 * q * q) / math.sqrt(2.0 * math.pi) / fraction
     return variance**-0.5
-
-
-def minimise_trimmed_squares(
-    problem: LinearProblem, h: int, *, starts: int = 500, candidates: int = 10, seed: int = 0
-) -> ScaleMinimum:
-    """Least trimmed squares of coverage ``h`` on a checked problem."""
-
-    def at_fraction(part: LinearProblem, residual: Tensor) -> tuple[Tensor, Tensor]:
-        count = max(1, round(h * part.num_samples / problem.num_samples))
-        return trimmed_scale(count)(part, residual)
-
-    return minimise_scale(problem, at_fraction, trimmed_scale(h), starts=starts, candidates=candidates, seed=seed)
 
 
 class LeastTrimmedSquares(LinearEstimator):
@@ -120,10 +134,11 @@ class LeastTrimmedSquares(LinearEstimator):
         """
         problem = linear_problem(X, Y, sample_weight)
         N, p = problem.num_samples, problem.coefficients_per_channel
-        h = min(N, default_coverage(problem)) if self.h is None else self.h
+        h = default_coverage(problem) if self.h is None else self.h
         if not min(p + 1, N) <= h <= N:
             raise ValueError(f"Expected argument `h` between {p + 1} and the {N} samples but got {h}.")
-        minimum = minimise_trimmed_squares(problem, h, starts=self.starts, seed=self.seed)
+        rule = TrimmedScale(h / N)
+        minimum = minimise_scale(problem, rule, rule, starts=self.starts, seed=self.seed)
         self._set_common(problem, minimum.beta, minimum.weight)
         scale = problem.restore(minimum.scale)
         total = problem.restore(problem.total_weight())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 
@@ -10,8 +11,8 @@ from torch import Tensor
 
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.linear._scale_search import ScaleMinimum, ScaleRule, minimise_scale
-from mkc_torch.linear.least_trimmed_squares import order_statistic
+from mkc_torch.linear._scale_search import ScaleMinimum, minimise_scale
+from mkc_torch.linear.least_trimmed_squares import default_coverage, order_statistic
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -30,20 +31,23 @@ def bisquare_weight(u: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     return (1.0 - u.square().clamp(max=1.0)).square()
 
 
-def m_scale(steps: int, c: float = BISQUARE_50) -> ScaleRule:
-    """The scale s with mean ρ(r / (c s)) = (1 - p/N) / 2 by at most ``steps`` Newton iterations, and its weights."""
+@dataclass(frozen=True)
+class MScale:
+    """The scale s with mean ρ(r / (c s)) = (1 - p/N) / 2, by at most ``steps`` Newton iterations, and its weights."""
 
-    def rule(problem: LinearProblem, residual: Tensor) -> tuple[Tensor, Tensor]:
+    steps: int
+    c: float = BISQUARE_50
+
+    def scale(self, problem: LinearProblem, residual: Tensor) -> Float[Tensor, "B S m"]:
         weight = problem.sample_weight
         w = None if weight is None else weight.unsqueeze(1)
-        total = problem.total_weight().unsqueeze(1)
-        half = 0.5 * (total - problem.coefficients_per_channel).clamp(min=1.0)
+        p = problem.coefficients_per_channel
+        half = 0.5 * (problem.total_weight().unsqueeze(1) - p).clamp(min=1.0)
         # quantile rather than median, so that a fit through p values does not start at 0
-        h = min(problem.num_samples, (problem.num_samples + problem.coefficients_per_channel + 1) // 2)
-        scale = 1.4826 * order_statistic(residual.abs(), weight, h)
+        scale = 1.4826 * order_statistic(residual.abs(), weight, default_coverage(problem))
         tiny = torch.finfo(residual.dtype).tiny
-        for _ in range(steps):
-            u = residual / (c * scale.clamp(min=tiny)).unsqueeze(-2)
+        for _ in range(self.steps):
+            u = residual / (self.c * scale.clamp(min=tiny)).unsqueeze(-2)
             rho, slope = bisquare_rho(u), 6.0 * u.square() * bisquare_weight(u)
             if w is not None:
                 rho, slope = w * rho, w * slope
@@ -53,18 +57,16 @@ def m_scale(steps: int, c: float = BISQUARE_50) -> ScaleRule:
             scale = scale * torch.exp(torch.where(scale > 0, step, 0.0))
             if bool((step.abs() < 1e-13).all()):
                 break
-        return scale, bisquare_weight(residual / (c * scale.clamp(min=tiny)).unsqueeze(-2))
+        return scale
 
-    return rule
+    def weight(self, problem: LinearProblem, residual: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:  # noqa: ARG002
+        tiny = torch.finfo(residual.dtype).tiny
+        return bisquare_weight(residual / (self.c * scale.clamp(min=tiny)).unsqueeze(-2))
 
 
-def minimise_m_scale(
-    problem: LinearProblem, *, starts: int = 500, candidates: int = 10, max_iter: int = 500, seed: int = 0
-) -> ScaleMinimum:
+def minimise_m_scale(problem: LinearProblem, *, starts: int = 500, max_iter: int = 500, seed: int = 0) -> ScaleMinimum:
     """S-regression with Tukey's bisquare on a checked problem."""
-    return minimise_scale(
-        problem, m_scale(2), m_scale(30), starts=starts, candidates=candidates, max_iter=max_iter, seed=seed
-    )
+    return minimise_scale(problem, MScale(2), MScale(30), starts=starts, max_iter=max_iter, seed=seed)
 
 
 class SRegression(LinearEstimator):

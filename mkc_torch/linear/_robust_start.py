@@ -1,0 +1,85 @@
+"""The start that everything in this package fits from: robust coefficients and the scale of the residuals they leave."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor
+
+from mkc_torch.linear._problem import LinearProblem
+from mkc_torch.linear._scale_search import minimise_scale
+from mkc_torch.linear.least_trimmed_squares import QuantileScale, TrimmedScale, default_coverage, order_statistic
+from mkc_torch.linear.s_regression import minimise_m_scale
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+Start = Literal["lts", "s", "least_squares"]
+
+
+@dataclass(frozen=True)
+class RobustStart:
+    """Coefficients in the basis, the scale of each channel, and whether more than half the values are fitted exactly."""
+
+    beta: Float[Tensor, "B n"]
+    scale: Float[Tensor, "B m"]
+    exact: Float[Tensor, " B"]
+
+
+def elemental_count(num_coefficients: int) -> int:
+    """Elemental sets that hold a clean one with probability 0.999 at 50 % outliers, at most 500."""
+    return min(500, math.ceil(math.log(1e-3) / math.log1p(-(0.5**num_coefficients))))
+
+
+def residual_scale(problem: LinearProblem, residual: Float[Tensor, "B N m"]) -> Float[Tensor, "B m"]:
+    """Scale from the h-th smallest absolute residual, h = (N + p + 1) // 2, with the small-sample factor of LMS.
+
+    The factor 1 + 5 / (N - p) is that of Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987), p. 202.
+    """
+    N, p = problem.num_samples, problem.coefficients_per_channel
+    middle = order_statistic(residual.abs(), problem.sample_weight, default_coverage(problem))
+    return 1.4826 * (1.0 + 5.0 / max(N - p, 1)) * middle
+
+
+def _trimmed_start(problem: LinearProblem, seed: int) -> Float[Tensor, "B n"]:
+    """Least trimmed squares followed a few steps: near its minimum is enough for a start."""
+    fraction = default_coverage(problem) / problem.num_samples
+    # fits through up to three values are good enough to be ranked as they are
+    steps = 0 if problem.num_coefficients <= 3 else 2
+    return minimise_scale(
+        problem,
+        TrimmedScale(fraction) if steps else QuantileScale(fraction),
+        TrimmedScale(fraction),
+        starts=elemental_count(problem.num_coefficients),
+        candidates=2,
+        screening_steps=steps,
+        max_iter=4,
+        seed=seed,
+    ).beta
+
+
+def robust_start(problem: LinearProblem, method: Start | Tensor = "lts", *, seed: int = 0) -> RobustStart:
+    """Coefficients by the named method, or those given, with the scale of their residuals.
+
+    An exact fit has scale 0; the scale returned is then the rounding error of Y, so that what follows needs no special
+    case: the values on the fit keep weight 1 and the others lose theirs.
+    """
+    if isinstance(method, Tensor):
+        beta = problem.in_basis(method.to(problem.Y))
+    elif method == "lts":
+        beta = _trimmed_start(problem, seed)
+    elif method == "s":
+        beta = minimise_m_scale(problem, starts=elemental_count(problem.num_coefficients), seed=seed).beta
+    elif method == "least_squares":
+        beta = problem.weighted_fit(torch.ones_like(problem.Y))
+    else:
+        raise ValueError(
+            f"Expected argument `start` to be 'lts', 's', 'least_squares' or a tensor of coefficients but got {method!r}."
+        )
+    scale = residual_scale(problem, problem.residual(beta))
+    magnitude = problem.Y.abs().amax(-2)
+    floor = 1e3 * torch.finfo(scale.dtype).eps * torch.where(magnitude > 0, magnitude, 1.0)
+    return RobustStart(beta, torch.maximum(scale, floor), (scale <= floor).all(-1))

@@ -1,0 +1,73 @@
+"""Covariance of M-estimated coefficients: sandwich, and its form for autocorrelated samples."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+CovarianceKind = Literal["sandwich", "hac"]
+
+
+def andrews_bandwidth(score: Float[Tensor, "*batch N n"]) -> Float[Tensor, " *batch"]:
+    """Bandwidth in samples of the Bartlett kernel by Andrews' AR(1) rule, 1.1447 (α N)^(1/3), at most N / 4.
+
+    Andrews, "Heteroskedasticity and autocorrelation consistent covariance matrix estimation", Econometrica 59 (1991),
+    (6.2) and (6.4).
+    """
+    N = score.shape[-2]
+    centred = score - score.mean(-2, keepdim=True)
+    power = centred.square().sum(-2)
+    tiny = torch.finfo(score.dtype).tiny
+    rho = ((centred[..., 1:, :] * centred[..., :-1, :]).sum(-2) / power.clamp(min=tiny)).clamp(-0.97, 0.97)
+    share = (power / power.amax(-1, keepdim=True).clamp(min=tiny)).square()
+    top = (4.0 * rho.square() / ((1 - rho).pow(6) * (1 + rho).square()) * share).sum(-1)
+    bottom = (share / (1 - rho).pow(4)).sum(-1).clamp(min=tiny)
+    return (1.1447 * (top / bottom * N).pow(1 / 3)).clamp(max=N / 4)
+
+
+def long_run_covariance(
+    score: Float[Tensor, "*batch N n"], bandwidth: Float[Tensor, " *batch"]
+) -> Float[Tensor, "*batch n n"]:
+    """Sum over lags of the scores' cross-products under the Bartlett kernel; positive semi-definite.
+
+    Newey & West, "A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent covariance
+    matrix", Econometrica 55 (1987).
+    """
+    N = score.shape[-2]
+    total = torch.matmul(score.mT, score)
+    for lag in range(1, min(N - 1, math.floor(float(bandwidth.max()))) + 1):
+        kernel = (1.0 - lag / (bandwidth + 1.0)).clamp(min=0.0)
+        cross = torch.matmul(score[..., lag:, :].mT, score[..., :-lag, :])
+        total = total + kernel[..., None, None] * (cross + cross.mT)
+    return total
+
+
+def sandwich(
+    curvature: Float[Tensor, "*batch n n"],
+    score: Float[Tensor, "*batch N n"],
+    dof: Float[Tensor, " *batch"],
+    kind: CovarianceKind = "sandwich",
+    bandwidth: float | None = None,
+) -> Float[Tensor, "*batch n n"]:
+    """``A⁻¹ B A⁻¹`` with the curvature A of the objective and the covariance B of its scores, times N / (N - n).
+
+    Args:
+        curvature: Hessian of the summed loss with respect to the coefficients.
+        score: gradient of each sample's loss, in the order of time when ``kind`` is "hac".
+        dof: factor for the degrees of freedom used, ``N / (N - n)``.
+        kind: "sandwich" for independent samples, "hac" for a time series.
+        bandwidth: lags in samples that "hac" reaches over; default by :func:`andrews_bandwidth`.
+    """
+    if kind == "hac":
+        lags = andrews_bandwidth(score) if bandwidth is None else score.new_full(score.shape[:-2], bandwidth)
+        middle = long_run_covariance(score, lags)
+    else:
+        middle = torch.matmul(score.mT, score)
+    inverse = torch.linalg.pinv(curvature, hermitian=True)
+    return dof[..., None, None] * torch.matmul(torch.matmul(inverse, middle), inverse)
