@@ -145,7 +145,7 @@ def initial_state(
     kappa: Float[Tensor, "*batch m"] | None = None,
     d: Float[Tensor, "*batch m"] | None = None,
 ) -> DensityState:
-    """The best of a Gaussian and three heavy-tailed densities at the given scale; ``kappa`` or ``d`` given stay fixed."""
+    """The best of a Gaussian and three heavy-tailed densities at the given scale; ``kappa`` or ``d`` given stays."""
     rms = torch.sqrt(_mean(error.square(), weight)).clamp(min=d_min)
     log_bound, log_d_min = torch.log(bound), torch.log(d_min)
     blank = DensityState(rms, rms, log_bound, log_d_min, torch.full_like(rms, 1e-3), rms, kappa is None, d is None)
@@ -199,7 +199,9 @@ def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> De
     longest = torch.maximum(step_s.abs(), step_l.abs())
     shorten = (2.0 / longest.clamp(min=2.0)).nan_to_num(0.0)
     kappa = (chain * torch.exp(shorten * step_s.nan_to_num(0.0)) - _KAPPA_OFFSET).clamp(0.0, KAPPA_MAX)
-    log_d = torch.minimum(torch.maximum(state.log_d + shorten * step_l.nan_to_num(0.0), state.log_d_min), state.log_bound)
+    log_d = torch.minimum(
+        torch.maximum(state.log_d + shorten * step_l.nan_to_num(0.0), state.log_d_min), state.log_bound
+    )
     proposal = replace(
         state,
         kappa=kappa if state.free_kappa else state.kappa,
@@ -229,7 +231,10 @@ class DensityFit:
 
 
 def domain_rule(
-    error: Float[Tensor, "*batch N m"], scale: Float[Tensor, "*batch m"], used: Tensor | None = None
+    error: Float[Tensor, "*batch N m"],
+    scale: Float[Tensor, "*batch m"],
+    used: Tensor | None = None,
+    scales: float = 10.0,
 ) -> Float[Tensor, "*batch m"]:
     """The half-width of the domain: half the range of the residuals of a robust fit, and no less than 10 scales.
 
@@ -242,10 +247,11 @@ def domain_rule(
         error: residuals.
         scale: robust scale of each channel.
         used: boolean mask of the residuals that count.
+        scales: least half-width in scales.
     """
     high = error if used is None else torch.where(used, error, -torch.inf)
     low = error if used is None else torch.where(used, error, torch.inf)
-    return torch.maximum(0.5 * (high.amax(-2) - low.amin(-2)), 10.0 * scale)
+    return torch.maximum(0.5 * (high.amax(-2) - low.amin(-2)), scales * scale)
 
 
 def robust_scale(error: Float[Tensor, "*batch N m"]) -> Float[Tensor, "*batch m"]:
@@ -293,7 +299,9 @@ def fit_density(
     if error.dim() < 2 or error.shape[-2] < 2:
         raise ValueError(f"Expected argument `error` of shape (*, N >= 2, m) but got {tuple(error.shape)}.")
     if not bool(torch.isfinite(error).all()):
-        raise ValueError(f"Expected argument `error` to be finite but got {int((~torch.isfinite(error)).sum())} values that are not.")
+        raise ValueError(
+            f"Expected argument `error` to be finite but got {int((~torch.isfinite(error)).sum())} values that are not."
+        )
     shape = (*error.shape[:-2], error.shape[-1])
 
     def parameter(name: str, value: float | Tensor | None, infinite: bool = False) -> Tensor | None:
@@ -301,7 +309,9 @@ def fit_density(
             return None
         t = torch.as_tensor(value, dtype=error.dtype, device=error.device)
         if not bool(((t > 0) & (torch.isfinite(t) | infinite)).all()):
-            raise ValueError(f"Expected argument `{name}` to be positive{' and finite' if not infinite else ''} but got {value}.")
+            raise ValueError(
+                f"Expected argument `{name}` to be positive{' and finite' if not infinite else ''} but got {value}."
+            )
         return t.expand(shape)
 
     normalised = None
@@ -325,7 +335,8 @@ def fit_density(
     )
     still = torch.zeros(shape, dtype=torch.int64, device=error.device)
     n_iter = 0
-    for n_iter in range(1, max_iter + 1):
+    while n_iter < max_iter:
+        n_iter += 1
         before = state
         state = newton_step(error, normalised, state)
         # a rejected step says nothing; two short ones in a row are rest

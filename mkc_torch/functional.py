@@ -82,24 +82,23 @@ class _Energy(torch.autograd.Function):
         return torch.where(x > 0, -torch.expm1(-x) / torch.where(kappa > 0, kappa, 1.0), q)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # noqa: ARG004
         ctx.save_for_backward(*inputs)
         ctx.save_for_forward(*inputs)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:
         z, kappa = ctx.saved_tensors
         grad_z = (grad * _energy_dz(z, kappa)).sum_to_size(z.shape) if ctx.needs_input_grad[0] else None
         grad_kappa = (grad * _energy_dkappa(z, kappa)).sum_to_size(kappa.shape) if ctx.needs_input_grad[1] else None
         return grad_z, grad_kappa
 
 
-
 class _EnergyWithTangent(_Energy):
     """The eager form; torch.compile traces only functions without a jvp."""
 
     @staticmethod
-    def jvp(ctx: Any, tangent_z: Tensor | None, tangent_kappa: Tensor | None) -> Tensor:  # type: ignore[override]
+    def jvp(ctx: Any, tangent_z: Tensor | None, tangent_kappa: Tensor | None) -> Tensor:
         z, kappa = ctx.saved_tensors
         out = torch.zeros_like(z * kappa)
         if tangent_z is not None:
@@ -144,7 +143,7 @@ def energy(z: Float[Tensor, "*batch"], kappa: Float[Tensor, "*batch"]) -> Float[
         tensor([0.5000, 4.5000])
     """
     function = _Energy if torch.compiler.is_compiling() else _EnergyWithTangent
-    result: Tensor = function.apply(z, kappa)  # type: ignore[no-untyped-call]
+    result: Tensor = function.apply(z, kappa)
     return result
 
 
@@ -213,7 +212,7 @@ def mkc_energy(
 def mkc_weight(
     error: Float[Tensor, "*batch"], sigma: Float[Tensor, "*batch"] | float, d: Float[Tensor, "*batch"] | float
 ) -> Float[Tensor, "*batch"]:
-    """The weight of each error in the fixed point (15) of the paper, ``exp(-e^2 / (2 d^2 sigma^2))``, without ``1/d^2``.
+    """The weight of each error in the fixed point (15), ``exp(-e^2 / (2 d^2 sigma^2))``, without ``1/d^2``.
 
     Args:
         error, sigma, d: as in :func:`mkc_energy`.

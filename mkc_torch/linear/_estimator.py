@@ -41,7 +41,7 @@ class LinearEstimator:
         """``X coef_`` for X of the shape given to ``fit``: (*, N, m, n) or, for one channel, (*, N, n)."""
         if X.shape[-1] != self.coef_.shape[-1]:
             raise ValueError(
-                f"Expected argument `X` with {self.coef_.shape[-1]} columns in its last dimension but got {X.shape[-1]}."
+                f"Expected argument `X` with {self.coef_.shape[-1]} columns in its last dimension but got {X.shape[-1]}"
             )
         samples = 1 if self._single_channel else 2
         coef = self.coef_.reshape(*self.coef_.shape[:-1], *(1 for _ in range(samples - 1)), -1, 1)

@@ -24,16 +24,14 @@ def kernel_weight(
     return torch.exp(rate * residual.square())
 
 
-def fixed_point_step(
-    problem: LinearProblem, residual: Tensor, kappa: Tensor, d: Tensor
-) -> Float[Tensor, "B *S n"]:
+def fixed_point_step(problem: LinearProblem, residual: Tensor, kappa: Tensor, d: Tensor) -> Float[Tensor, "B *S n"]:
     """One application of (15) of the paper."""
     precision = d.pow(-2)
     precision = precision / precision.amax(-1, keepdim=True)
     return problem.weighted_fit(kernel_weight(residual, kappa, d) * precision.unsqueeze(-2))
 
 
-def mean_energy(problem: LinearProblem, residual: Tensor, kappa: Tensor, d: Tensor) -> Float[Tensor, "B *S"]:
+def mean_energy(problem: LinearProblem, residual: Tensor, kappa: Tensor, d: Tensor) -> Float[Tensor, B * S]:
     """The MKC loss (9): the mean energy over the samples, summed over the channels."""
     e = energy(residual / d.unsqueeze(-2), kappa.unsqueeze(-2))
     if problem.sample_weight is None:
@@ -61,7 +59,9 @@ def coefficient_covariance(
     if problem.sample_weight is not None:
         psi = psi * problem.sample_weight
     score = torch.matmul(psi.unsqueeze(-2), problem.basis).squeeze(-2)
-    used = problem.total_weight().sum(-1) if problem.sample_weight is None else (problem.sample_weight > 0).sum((-2, -1))
+    used = (
+        problem.total_weight().sum(-1) if problem.sample_weight is None else (problem.sample_weight > 0).sum((-2, -1))
+    )
     dof = used / (used - problem.num_coefficients).clamp(min=1)
     in_basis = sandwich(curvature, score, dof.to(score.dtype), kind, bandwidth)
     return problem.restore(torch.matmul(torch.matmul(problem.to_coef, in_basis), problem.to_coef.mT))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Float
 
 
 MAX_IMPLIED_CHANNELS = 16
@@ -107,7 +107,7 @@ class LinearProblem:
         flat = coef.expand(*self.batch, self.num_coefficients).reshape(-1, self.num_coefficients, 1)
         return torch.linalg.solve(self.to_coef, flat).squeeze(-1)
 
-    def restore(self, values: Float[Tensor, "B *rest"]) -> Float[Tensor, "*batch *rest"]:
+    def restore(self, values: Float[Tensor, B * rest]) -> Float[Tensor, "*batch *rest"]:
         """Give values of the flattened problems the user's batch dimensions."""
         return values.reshape((*self.batch, *values.shape[1:]))
 
@@ -142,7 +142,8 @@ def solve_gram(gram: Float[Tensor, "*batch n n"], moment: Float[Tensor, "*batch 
     weak = (info > 0) | ~(pivots.amin(-1) > (gram.shape[-1] * eps) ** 0.5 * pivots.amax(-1))
     if weak.any():
         inverse = torch.linalg.pinv(gram[weak], hermitian=True, rtol=gram.shape[-1] * eps)
-        solution[weak] = torch.matmul(inverse, moment[weak].unsqueeze(-1)).squeeze(-1)
+        repaired = torch.matmul(inverse, moment[weak].unsqueeze(-1)).squeeze(-1)
+        solution = solution.masked_scatter(weak.unsqueeze(-1), repaired)
     return solution
 
 
@@ -181,7 +182,7 @@ def canonical_shapes(
     for name, value in (("X", X), ("Y", Y)):
         if not isinstance(value, Tensor) or not value.is_floating_point():
             got = value.dtype if isinstance(value, Tensor) else type(value).__name__
-            raise TypeError(f"Expected argument `{name}` to be a floating-point tensor but got {got}; use .double().")
+            raise TypeError(f"Expected argument `{name}` to be a real floating-point tensor but got {got}.")
     if X.dtype != Y.dtype or X.device != Y.device:
         raise TypeError(
             f"Expected `X` and `Y` to share dtype and device but got {X.dtype} on {X.device} "
@@ -201,12 +202,12 @@ def canonical_shapes(
         raise ValueError(f"Expected at least one sample and one column but got `X` {tuple(X.shape)}.")
     _check_finite("X", X)
     _check_finite("Y", Y)
-    batch = torch.broadcast_shapes(X.shape[:-3], Y.shape[:-2])
+    batch = _common_batch("X", X.shape[:-3], "Y", Y.shape[:-2])
     N, m = Y.shape[-2:]
     weight = None
     if sample_weight is not None:
         weight = _as_weight(sample_weight, N, m, single, Y)
-        batch = torch.broadcast_shapes(batch, weight.shape[:-2])
+        batch = _common_batch("sample_weight", weight.shape[:-2], "Y", batch)
         weight = weight.expand(*batch, N, m)
     return CanonicalShapes(X, Y.expand(*batch, N, m), weight, batch, single)
 
@@ -241,6 +242,16 @@ def linear_problem(
     return LinearProblem(basis, to_coef, v.Y.reshape(flat, N, m), weight, v.batch, v.single_channel)
 
 
+def _common_batch(name: str, shape: torch.Size, other: str, other_shape: torch.Size) -> torch.Size:
+    try:
+        return torch.broadcast_shapes(shape, other_shape)
+    except RuntimeError:
+        raise ValueError(
+            f"Expected batch dimensions of `{name}` and `{other}` that broadcast "
+            f"but got {tuple(shape)} and {tuple(other_shape)}."
+        ) from None
+
+
 def _last_is_samples(X: Tensor, Y: Tensor) -> bool:
     """Whether Y is (*, N) rather than (*, N, m); the rule that the docstring of ``mkc_torch.linear`` states."""
     if X.dim() == 2 or Y.dim() == 1 or X.shape[-3] != Y.shape[-2]:
@@ -250,7 +261,9 @@ def _last_is_samples(X: Tensor, Y: Tensor) -> bool:
 
 
 def _as_weight(sample_weight: Tensor, N: int, m: int, single_channel: bool, Y: Tensor) -> Tensor:
-    weight = torch.as_tensor(sample_weight, dtype=Y.dtype, device=Y.device)
+    if not isinstance(sample_weight, Tensor):
+        raise TypeError(f"Expected argument `sample_weight` to be a tensor but got {type(sample_weight).__name__}.")
+    weight = sample_weight.to(Y)
     if weight.dim() >= 1 and weight.shape[-1] == N and (single_channel or weight.shape[-2:] != (N, m)):
         weight = weight.unsqueeze(-1)
     if weight.dim() < 2 or weight.shape[-2] != N or weight.shape[-1] not in (1, m):
@@ -261,7 +274,9 @@ def _as_weight(sample_weight: Tensor, N: int, m: int, single_channel: bool, Y: T
     if (weight < 0).any():
         raise ValueError(f"Expected argument `sample_weight` to be >= 0 but got {weight.min().item()}.")
     if (weight.sum(-2) <= 0).any():
-        raise ValueError("Expected argument `sample_weight` to be positive somewhere in every channel but got all zeros.")
+        raise ValueError(
+            "Expected argument `sample_weight` to be positive somewhere in every channel but got all zeros."
+        )
     return weight
 
 
@@ -275,7 +290,7 @@ def _orthonormalise(X: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor]:
     if (scale == 0).any():
         column = int((scale == 0).nonzero()[0, -1])
         raise RankDeficientError(f"Column {column} of `X` is zero on every sample in use; remove it.")
-    _, upper = torch.linalg.qr(rows / scale.unsqueeze(-2), mode="r")
+    _, upper = torch.linalg.qr(rows / scale.unsqueeze(-2))
     _, singular, right = torch.linalg.svd(upper)
     tolerance = max(rows.shape[-2], n) * torch.finfo(X.dtype).eps
     # more unknowns than rows leaves fewer singular values than columns

@@ -1,4 +1,4 @@
-"""The start that everything in this package fits from: robust coefficients and the scale of the residuals they leave."""
+"""The start that everything in this package fits from: robust coefficients and the scale of their residuals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Start = Literal["lts", "s", "least_squares"]
 
 @dataclass(frozen=True)
 class RobustStart:
-    """Coefficients in the basis, the scale of each channel, and whether more than half the values are fitted exactly."""
+    """Coefficients in the basis, the scale of each channel, and whether most values are fitted exactly."""
 
     beta: Float[Tensor, "B n"]
     scale: Float[Tensor, "B m"]
@@ -35,13 +35,15 @@ def elemental_count(num_coefficients: int) -> int:
 
 
 def residual_scale(problem: LinearProblem, residual: Float[Tensor, "B N m"]) -> Float[Tensor, "B m"]:
-    """Scale from the h-th smallest absolute residual, h = (N + p + 1) // 2, with the small-sample factor of LMS.
+    """Scale from the h-th smallest absolute residual, h = (N + p + 1) // 2, with small-sample factors.
 
-    The factor 1 + 5 / (N - p) is that of Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987), p. 202.
+    1 + 5 / (N - p) is that of Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987), p. 202;
+    N / (N - p) stands for the degrees of freedom that a search for the smallest residuals uses.
     """
     N, p = problem.num_samples, problem.coefficients_per_channel
     middle = order_statistic(residual.abs(), problem.sample_weight, default_coverage(problem))
-    return 1.4826 * (1.0 + 5.0 / max(N - p, 1)) * middle
+    left = max(N - p, 1)
+    return 1.4826 * (1.0 + 5.0 / left) * (N / left) * middle
 
 
 def _trimmed_start(problem: LinearProblem, seed: int) -> Float[Tensor, "B n"]:
@@ -77,7 +79,7 @@ def robust_start(problem: LinearProblem, method: Start | Tensor = "lts", *, seed
         beta = problem.weighted_fit(torch.ones_like(problem.Y))
     else:
         raise ValueError(
-            f"Expected argument `start` to be 'lts', 's', 'least_squares' or a tensor of coefficients but got {method!r}."
+            f"Expected argument `start` to be 'lts', 's', 'least_squares' or coefficients but got {method!r}."
         )
     scale = residual_scale(problem, problem.residual(beta))
     magnitude = problem.Y.abs().amax(-2)

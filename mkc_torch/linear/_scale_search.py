@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from mkc_torch.linear._problem import LinearProblem
 
+
 class ScaleRule(Protocol):
     """A robust scale of residuals (B, S, N, m) and the weights in [0, 1] of a step that lowers it."""
 
@@ -114,7 +115,10 @@ def minimise_scale(
     """
     per_problem = min(problem.num_samples, _SCREENING_SAMPLES) * problem.num_channels * (starts + 1)
     parts = torch.arange(problem.Y.shape[0], device=problem.Y.device).split(max(1, _CHUNK // per_problem))
-    found = [_minimise(problem.select(i), screening, final, starts, candidates, screening_steps, max_iter, seed) for i in parts]
+    found = [
+        _minimise(problem.select(i), screening, final, starts, candidates, screening_steps, max_iter, seed)
+        for i in parts
+    ]
     return ScaleMinimum(
         beta=torch.cat([f.beta for f in found]),
         scale=torch.cat([f.scale for f in found]),
@@ -147,7 +151,8 @@ def _minimise(
     tolerance = 1e2 * torch.finfo(beta.dtype).eps
     objective = beta.new_full(beta.shape[:2], math.inf)
     n_iter = 0
-    for n_iter in range(1, max_iter + 1):
+    while n_iter < max_iter:
+        n_iter += 1
         proposal, before = _step(problem, beta, final)
         moving = objective - before > tolerance
         objective = torch.minimum(objective, before)

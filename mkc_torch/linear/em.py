@@ -17,7 +17,11 @@ from mkc_torch.linear.covariance import CovarianceKind
 from mkc_torch.linear.fixed_point import channel_parameter
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    pass
+
+
+_FLOOR = 0.3
+"""Least d in robust scales: a scale is at most doubled by outliers, and a fit that interpolates ends far below."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +38,7 @@ def _normalised_weight(problem: LinearProblem) -> Tensor | None:
     return None if w is None else w / w.sum(-2, keepdim=True)
 
 
-def _alternate(
-    problem: LinearProblem, beta: Tensor, state: DensityState, *, max_iter: int, tol: float
-) -> _Maximum:
+def _alternate(problem: LinearProblem, beta: Tensor, state: DensityState, *, max_iter: int, tol: float) -> _Maximum:
     """E-steps and M-steps in turn; problems that have come to rest leave the batch."""
     tol = max(tol, 8 * torch.finfo(beta.dtype).eps)
     size = beta.shape[0]
@@ -80,9 +82,7 @@ def _write(whole: DensityState, index: Tensor, part: DensityState) -> DensitySta
     return DensityState(**fields, free_kappa=whole.free_kappa, free_d=whole.free_d)
 
 
-def _gaussian_candidate(
-    problem: LinearProblem, maximum: _Maximum, *, max_iter: int, tol: float
-) -> _Maximum:
+def _gaussian_candidate(problem: LinearProblem, maximum: _Maximum, *, max_iter: int, tol: float) -> _Maximum:
     """Where a Gaussian density at weighted least squares is likelier than what was found, go on from there instead."""
     state = maximum.state
     beta = problem.weighted_fit(torch.ones_like(problem.Y))
@@ -122,9 +122,9 @@ class MKCRegression(LinearEstimator):
     Newton step on (σ, d), an M-step two applications of the fixed point (15). The fit starts from robust coefficients;
     where the Gaussian likelihood at least squares is higher than what it ends at, it goes on from there.
 
-    The domain ``a`` of each channel is fixed before: half the range of the robust start's residuals, and no less than
-    ten of their scales, or what ``bound`` says. d stays above a tenth of the robust scale, since the likelihood of
-    residuals that a fit interpolates grows without limit.
+    The domain ``a`` of each channel is fixed before, from a rough fit: half the range of its residuals, and no less
+    than ten of its d (:func:`mkc_torch.density_fit.domain_rule` says why), or what ``bound`` says. d stays above a
+    tenth of the robust scale, since the likelihood of residuals that a fit interpolates grows without limit.
 
     Args:
         sigma: None learns σ; a number, (m,) or (*, m) keeps it: ``inf`` is least squares with learned channel weights
@@ -201,27 +201,41 @@ class MKCRegression(LinearEstimator):
         """
         problem = linear_problem(X, Y, sample_weight)
         begin = robust_start(problem, self.start, seed=self.seed)
-        state = self._initial_state(problem, begin)
-        maximum = _alternate(problem, begin.beta, state, max_iter=self.max_iter, tol=self.tol)
+        if self.bound is None:
+            bound, beta, scale = self._domain(problem, begin)
+        else:
+            bound, beta, scale = channel_parameter("bound", self.bound, problem), begin.beta, begin.scale
+        state = self._initial_state(problem, beta, scale, bound, _FLOOR * begin.scale)
+        maximum = _alternate(problem, beta, state, max_iter=self.max_iter, tol=self.tol)
         if state.free_kappa and state.free_d:
             maximum = _gaussian_candidate(problem, maximum, max_iter=self.max_iter, tol=self.tol)
         self._keep(problem, begin, maximum)
         return self
 
-    def _initial_state(self, problem: LinearProblem, begin: RobustStart) -> DensityState:
-        residual = problem.residual(begin.beta)
+    def _domain(self, problem: LinearProblem, begin: RobustStart) -> tuple[Tensor, Tensor, Tensor]:
+        """The domain by its rule, with the coefficients and scales of the rough fit that it was read from.
+
+        A robust start's scale is up to twice that of the head when outliers are many and on one side, so a rough fit
+        on a tight domain finds the head first.
+        """
         used = None if problem.sample_weight is None else problem.sample_weight > 0
+        tight = domain_rule(problem.residual(begin.beta), begin.scale, used, scales=5.0)
+        state = self._initial_state(problem, begin.beta, begin.scale, tight, _FLOOR * begin.scale)
+        rough = _alternate(problem, begin.beta, state, max_iter=self.max_iter, tol=1e-6)
+        d = torch.exp(rough.state.log_d)
+        return domain_rule(problem.residual(rough.beta), d, used), rough.beta, d
+
+    def _initial_state(
+        self, problem: LinearProblem, beta: Tensor, scale: Tensor, bound: Tensor, d_min: Tensor
+    ) -> DensityState:
         d = None if self.d is None else channel_parameter("d", self.d, problem)
         sigma = None if self.sigma is None else channel_parameter("sigma", self.sigma, problem, infinite=True)
-        if self.bound is None:
-            bound = domain_rule(residual, begin.scale, used)
-        else:
-            bound = channel_parameter("bound", self.bound, problem)
-        d_min = 0.1 * begin.scale if d is None else torch.minimum(d, 0.1 * begin.scale)
+        if d is not None:
+            d_min = torch.minimum(d, d_min)
         return initial_state(
-            residual,
+            problem.residual(beta),
             _normalised_weight(problem),
-            begin.scale,
+            scale,
             torch.maximum(bound, 2.0 * d_min),
             d_min,
             kappa=None if sigma is None else sigma.pow(-2),

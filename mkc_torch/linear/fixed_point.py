@@ -33,7 +33,9 @@ def channel_parameter(name: str, value: float | Tensor, problem: LinearProblem, 
 def whitened(X: Tensor, Y: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
     """X and Y multiplied by the inverse Cholesky factor of the channels' noise covariance (m, m)."""
     if X.dim() < 3 or Y.dim() < 2:
-        raise ValueError("Expected `X` (*, N, m, n) and `Y` (*, N, m) with `noise_covariance`; a single channel takes `d`.")
+        raise ValueError(
+            "Expected `X` (*, N, m, n) and `Y` (*, N, m) with `noise_covariance`; a single channel takes `d`."
+        )
     m = Y.shape[-1]
     covariance = covariance.to(Y)
     if covariance.shape != (m, m):
@@ -56,7 +58,7 @@ def descend(
     max_iter: int,
     tol: float,
 ) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """Apply (15) until a step lowers the loss by less than ``tol`` of it; coefficients, convergence, loss at every step."""
+    """Apply (15) until a step lowers the loss by less than ``tol`` of it; with convergence and the losses."""
     tol = max(tol, 4 * torch.finfo(beta.dtype).eps)
     history = []
     previous = beta.new_full(beta.shape[:-1], math.inf)
@@ -163,7 +165,9 @@ class FixedPointLinear(LinearEstimator):
         best = history[-1].argmin(1)
         at = torch.arange(best.shape[0], device=best.device)
         beta = beta[at, best]
-        self._set_common(problem, beta, torch.exp(-0.5 * kappa.unsqueeze(-2) * (problem.residual(beta) / d.unsqueeze(-2)) ** 2))
+        self._set_common(
+            problem, beta, torch.exp(-0.5 * kappa.unsqueeze(-2) * (problem.residual(beta) / d.unsqueeze(-2)) ** 2)
+        )
         self.history_ = torch.stack([problem.restore(h[at, best]) for h in history])
         self.n_iter_ = len(history) - 1
         self.converged_ = problem.restore(converged[at, best])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import torch
@@ -11,7 +12,7 @@ from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import canonical_shapes, linear_problem
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    pass
 
 
 class LeastSquares(LinearEstimator):
@@ -53,8 +54,8 @@ class Ridge(LinearEstimator):
     """
 
     def __init__(self, alpha: float = 1.0) -> None:
-        if not alpha >= 0:
-            raise ValueError(f"Expected argument `alpha` to be >= 0 but got {alpha}.")
+        if not 0 <= alpha < math.inf:
+            raise ValueError(f"Expected argument `alpha` to be >= 0 and finite but got {alpha}.")
         self.alpha = alpha
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> Ridge:

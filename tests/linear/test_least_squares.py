@@ -164,7 +164,7 @@ def test_ridge_of_channels_and_batches():
 
 @pytest.mark.parametrize("alpha", [-1.0, float("nan")])
 def test_ridge_refuses_a_bad_alpha(alpha):
-    with pytest.raises(ValueError, match=f"`alpha` to be >= 0 but got {alpha}"):
+    with pytest.raises(ValueError, match=f"`alpha` to be >= 0 and finite but got {alpha}"):
         Ridge(alpha=alpha)
 
 
