@@ -1,0 +1,20 @@
+"""Multi-kernel correntropy in PyTorch: robust likelihoods, regression and sensor calibration."""
+
+from importlib.metadata import version
+
+from mkc_torch import functional, linear
+from mkc_torch.density_fit import DensityFit, fit_density
+from mkc_torch.ellipsoid import EllipsoidFit, NotIdentifiableError
+from mkc_torch.recording import Recording
+
+__version__ = version("mkc-torch")
+
+__all__ = [
+    "DensityFit",
+    "EllipsoidFit",
+    "NotIdentifiableError",
+    "Recording",
+    "fit_density",
+    "functional",
+    "linear",
+]

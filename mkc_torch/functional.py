@@ -143,7 +143,7 @@ def energy(z: Float[Tensor, "*batch"], kappa: Float[Tensor, "*batch"]) -> Float[
         tensor([0.5000, 4.5000])
     """
     function = _Energy if torch.compiler.is_compiling() else _EnergyWithTangent
-    result: Tensor = function.apply(z, kappa)
+    result: Tensor = function.apply(z, kappa)  # type: ignore[no-untyped-call]
     return result
 
 

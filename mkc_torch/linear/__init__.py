@@ -9,12 +9,14 @@ unless B exceeds n and also exceeds 16 or A: more channels than that are not mea
 from mkc_torch.linear._problem import RankDeficientError
 from mkc_torch.linear.em import MKCRegression
 from mkc_torch.linear.fixed_point import FixedPointLinear
+from mkc_torch.linear.least_absolute_deviations import LeastAbsoluteDeviations
 from mkc_torch.linear.least_squares import LeastSquares, Ridge
 from mkc_torch.linear.least_trimmed_squares import LeastTrimmedSquares
 from mkc_torch.linear.s_regression import SRegression
 
 __all__ = [
     "FixedPointLinear",
+    "LeastAbsoluteDeviations",
     "LeastSquares",
     "LeastTrimmedSquares",
     "MKCRegression",

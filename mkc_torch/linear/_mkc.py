@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.functional import energy
+from mkc_torch.linear._scale_search import relative_precision
 from mkc_torch.linear.covariance import CovarianceKind, sandwich
 
 if TYPE_CHECKING:
@@ -26,9 +27,7 @@ def kernel_weight(
 
 def fixed_point_step(problem: LinearProblem, residual: Tensor, kappa: Tensor, d: Tensor) -> Float[Tensor, "B *S n"]:
     """One application of (15) of the paper."""
-    precision = d.pow(-2)
-    precision = precision / precision.amax(-1, keepdim=True)
-    return problem.weighted_fit(kernel_weight(residual, kappa, d) * precision.unsqueeze(-2))
+    return problem.weighted_fit(kernel_weight(residual, kappa, d) * relative_precision(d).unsqueeze(-2))
 
 
 def mean_energy(problem: LinearProblem, residual: Tensor, kappa: Tensor, d: Tensor) -> Float[Tensor, B * S]:

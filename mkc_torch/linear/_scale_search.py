@@ -71,17 +71,20 @@ def _log_product(scale: Tensor) -> Tensor:
     return torch.log(scale.clamp(min=torch.finfo(scale.dtype).tiny)).sum(-1)
 
 
+def relative_precision(scale: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m"]:
+    """``1 / scale²`` up to a factor, at most 1; a channel fitted exactly gets a finite share."""
+    largest = scale.amax(-1, keepdim=True)
+    ratio = torch.where(largest > 0, scale / largest, 1.0).clamp(min=torch.finfo(scale.dtype).eps)
+    return (ratio.amin(-1, keepdim=True) / ratio).square()
+
+
 def _step(problem: LinearProblem, beta: Tensor, rule: ScaleRule) -> tuple[Tensor, Tensor]:
     """Coefficients after one concentration step, and the objective before it."""
     residual = problem.residual(beta)
     scale = rule.scale(problem, residual)
     weight = rule.weight(problem, residual, scale)
     objective = _log_product(scale)
-    # a channel fitted exactly would have infinite weight; it is given a large one
-    floor = torch.finfo(scale.dtype).eps * scale.amax(-1, keepdim=True)
-    precision = scale.clamp(min=floor.clamp(min=torch.finfo(scale.dtype).tiny)).pow(-2)
-    precision = precision / precision.amax(-1, keepdim=True)
-    return problem.weighted_fit(weight * precision.unsqueeze(-2)), objective
+    return problem.weighted_fit(weight * relative_precision(scale).unsqueeze(-2)), objective
 
 
 def _best(problem: LinearProblem, beta: Tensor, rule: ScaleRule, count: int) -> Tensor:

@@ -14,6 +14,13 @@ if TYPE_CHECKING:
 CovarianceKind = Literal["sandwich", "hac"]
 
 
+def checked_kind(kind: CovarianceKind) -> CovarianceKind:
+    """``kind``, or a clear error."""
+    if kind not in ("sandwich", "hac"):
+        raise ValueError(f"Expected argument `covariance` to be 'sandwich' or 'hac' but got {kind!r}.")
+    return kind
+
+
 def andrews_bandwidth(score: Float[Tensor, "*batch N n"]) -> Float[Tensor, " *batch"]:
     """Bandwidth in samples of the Bartlett kernel by Andrews' AR(1) rule, 1.1447 (α N)^(1/3), at most N / 4.
 

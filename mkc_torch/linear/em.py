@@ -13,7 +13,7 @@ from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._mkc import coefficient_covariance, fixed_point_step, kernel_weight
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import RobustStart, Start, robust_start
-from mkc_torch.linear.covariance import CovarianceKind
+from mkc_torch.linear.covariance import CovarianceKind, checked_kind
 from mkc_torch.linear.fixed_point import channel_parameter
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ class MKCRegression(LinearEstimator):
         >>> y = X.sum(-1) + 0.1 * torch.randn(100, generator=generator, dtype=torch.float64)
         >>> y[:20] += 20.0
         >>> MKCRegression().fit(X, y).coef_
-        tensor([1.0109, 0.9993], dtype=torch.float64)
+        tensor([0.9992, 1.0072], dtype=torch.float64)
     """
 
     def __init__(
@@ -176,15 +176,13 @@ class MKCRegression(LinearEstimator):
         super().__init__()
         if max_iter < 1:
             raise ValueError(f"Expected argument `max_iter` to be at least 1 but got {max_iter}.")
-        if covariance not in ("sandwich", "hac"):
-            raise ValueError(f"Expected argument `covariance` to be 'sandwich' or 'hac' but got {covariance!r}.")
         self.sigma = sigma
         self.d = d
         self.bound = bound
         self.start = start
         self.max_iter = max_iter
         self.tol = tol
-        self.covariance = covariance
+        self.covariance = checked_kind(covariance)
         self.bandwidth = bandwidth
         self.seed = seed
 

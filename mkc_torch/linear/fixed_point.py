@@ -12,7 +12,7 @@ from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._mkc import coefficient_covariance, fixed_point_step, mean_energy
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import Start, robust_start
-from mkc_torch.linear.covariance import CovarianceKind
+from mkc_torch.linear.covariance import CovarianceKind, checked_kind
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -128,15 +128,13 @@ class FixedPointLinear(LinearEstimator):
         super().__init__()
         if max_iter < 1:
             raise ValueError(f"Expected argument `max_iter` to be at least 1 but got {max_iter}.")
-        if covariance not in ("sandwich", "hac"):
-            raise ValueError(f"Expected argument `covariance` to be 'sandwich' or 'hac' but got {covariance!r}.")
         self.sigma = sigma
         self.d = d
         self.noise_covariance = noise_covariance
         self.start = start
         self.max_iter = max_iter
         self.tol = tol
-        self.covariance = covariance
+        self.covariance = checked_kind(covariance)
         self.bandwidth = bandwidth
         self.seed = seed
 

@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from mkc_torch.linear._estimator import LinearEstimator
+from mkc_torch.linear._mkc import coefficient_covariance
 from mkc_torch.linear._problem import canonical_shapes, linear_problem
+from mkc_torch.linear.covariance import CovarianceKind, checked_kind
 
 if TYPE_CHECKING:
     pass
@@ -18,11 +20,20 @@ if TYPE_CHECKING:
 class LeastSquares(LinearEstimator):
     """Ordinary or weighted least squares, (5) and (7) of Li et al. (2023).
 
+    Args:
+        covariance: "sandwich" for independent samples, "hac" for a time series.
+        bandwidth: lags of "hac", in samples; default by Andrews' rule.
+
     Example:
         >>> X = torch.tensor([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]])
         >>> LeastSquares().fit(X, torch.tensor([1.0, 3.0, 5.0])).coef_
         tensor([1.0000, 2.0000])
     """
+
+    def __init__(self, *, covariance: CovarianceKind = "sandwich", bandwidth: float | None = None) -> None:
+        super().__init__()
+        self.covariance = checked_kind(covariance)
+        self.bandwidth = bandwidth
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> LeastSquares:
         """Fit ``Y ~ X coef``.
@@ -33,11 +44,16 @@ class LeastSquares(LinearEstimator):
             sample_weight: weights (*, N) or (*, N, m), inverse variances up to a factor.
 
         Returns:
-            The estimator, with ``coef_`` (*, n) and ``weights_``, all ones.
+            The estimator, with ``coef_`` (*, n), its ``covariance_`` (*, n, n) and ``weights_``, all ones.
         """
         problem = linear_problem(X, Y, sample_weight)
         ones = torch.ones_like(problem.Y)
-        self._set_common(problem, problem.weighted_fit(ones), ones)
+        beta = problem.weighted_fit(ones)
+        self._set_common(problem, beta, ones)
+        unit = torch.ones_like(problem.Y[:, 0])
+        self.covariance_ = coefficient_covariance(
+            problem, beta, torch.zeros_like(unit), unit, self.covariance, self.bandwidth
+        )
         return self
 
 

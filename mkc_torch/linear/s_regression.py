@@ -47,7 +47,7 @@ class MScale:
         tiny = torch.finfo(residual.dtype).tiny
         for _ in range(self.steps):
             u = residual / (self.c * scale.clamp(min=tiny)).unsqueeze(-2)
-            rho, slope = bisquare_rho(u), 6.0 * u.square() * bisquare_weight(u)
+            rho, slope = bisquare_rho(u), 6.0 * u.square().clamp(max=1.0) * bisquare_weight(u)
             if w is not None:
                 rho, slope = w * rho, w * slope
             # Newton's method in log(scale), kept within a factor of two

@@ -214,7 +214,8 @@ def test_predict_before_fit_raises_not_fitted():
 
 
 @pytest.mark.parametrize(
-    ("estimator", "text"), [(LeastSquares(), "LeastSquares()"), (Ridge(alpha=0.25), "Ridge(alpha=0.25)")]
+    ("estimator", "text"),
+    [(LeastSquares(), "LeastSquares(covariance='sandwich', bandwidth=None)"), (Ridge(alpha=0.25), "Ridge(alpha=0.25)")],
 )
 def test_repr_shows_the_parameters(estimator: LinearEstimator, text: str):
     assert repr(estimator) == text

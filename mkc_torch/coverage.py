@@ -1,0 +1,122 @@
+"""Which directions a set of vectors covers, and whether they determine an ellipsoid."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+NEAR_DEGREES = 15.0
+"""A direction counts as covered when a sample lies within this angle of it."""
+
+GAP_DEGREES = 40.0
+"""An empty cap of this radius is named; a full sphere of 30 samples leaves smaller ones."""
+
+_GRID = 2000
+
+
+@dataclass(frozen=True)
+class Gap:
+    """An empty cap of directions: its middle, a unit vector in the sensor's axes, and its radius in degrees."""
+
+    direction: tuple[float, float, float]
+    degrees: float
+
+    def __str__(self) -> str:
+        x, y, z = self.direction
+        return f"{nearest_axis(self.direction)} ({x:+.2f}, {y:+.2f}, {z:+.2f}): no sample within {self.degrees:.0f}°"
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How a set of directions covers the sphere.
+
+    Attributes:
+        fraction: share of all directions with a sample within 15°.
+        gaps: empty caps of more than 40°, largest first.
+        information: what the worst-determined combination of centre and shape is known by, as a share of what an even
+            coverage of the sphere with as many samples would give; 1 is even coverage, 0 undetermined.
+    """
+
+    fraction: float
+    gaps: tuple[Gap, ...]
+    information: float
+
+
+def nearest_axis(direction: tuple[float, float, float]) -> str:
+    """Name of the axes that a direction points along, such as "+z" or "-x+y".
+
+    Example:
+        >>> nearest_axis((0.1, -0.2, 0.97)), nearest_axis((-0.7, 0.7, 0.1))
+        ('+z', '-x+y')
+    """
+    largest = max(abs(v) for v in direction)
+    parts = zip(direction, "xyz", strict=True)
+    return "".join(f"{'+' if v > 0 else '-'}{name}" for v, name in parts if abs(v) > 0.6 * largest)
+
+
+def fibonacci_sphere(count: int, *, dtype: torch.dtype = torch.float64) -> Float[Tensor, "count 3"]:
+    """Evenly spread unit vectors on a spiral."""
+    i = torch.arange(count, dtype=dtype) + 0.5
+    z = 1.0 - 2.0 * i / count
+    angle = math.pi * (1.0 + math.sqrt(5.0)) * i
+    radius = torch.sqrt(1.0 - z * z)
+    return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), z], -1)
+
+
+def _tangents(directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 9"]:
+    """First-order change of the norm with the centre and the shape: the functions u_i and u_i u_j on the sphere."""
+    x, y, z = directions.unbind(-1)
+    root2 = math.sqrt(2.0)
+    return torch.stack([x, y, z, x * x, y * y, z * z, root2 * x * y, root2 * x * z, root2 * y * z], -1)
+
+
+@lru_cache(maxsize=1)
+def _even_information() -> Float[Tensor, "9 9"]:
+    """Cholesky factor of the information of an evenly covered sphere."""
+    rows = _tangents(fibonacci_sphere(20_000))
+    return torch.linalg.cholesky(rows.mT @ rows / rows.shape[0])
+
+
+def coverage(directions: Float[Tensor, "N 3"]) -> Coverage:
+    """Coverage of the sphere by vectors; their lengths do not matter.
+
+    Args:
+        directions: vectors from the centre, in the sensor's axes; none of length 0.
+
+    Example:
+        >>> round(coverage(fibonacci_sphere(500)).fraction, 2)
+        1.0
+        >>> half = fibonacci_sphere(500)
+        >>> print(coverage(half[half[:, 2] > 0]).gaps[0])
+        -z (...): no sample within 8...°
+    """
+    unit = torch.nn.functional.normalize(directions.detach().double().cpu(), dim=-1)
+    grid = fibonacci_sphere(_GRID)
+    nearest = torch.full((_GRID,), -1.0, dtype=torch.float64)
+    for part in unit.split(4096):
+        nearest = torch.maximum(nearest, (grid @ part.mT).amax(-1))
+    angle = torch.rad2deg(torch.acos(nearest.clamp(-1.0, 1.0)))
+    rows = _tangents(unit)
+    half = torch.linalg.solve_triangular(_even_information(), rows.mT @ rows / rows.shape[0], upper=False)
+    relative = torch.linalg.solve_triangular(_even_information(), half.mT, upper=False)
+    gaps: list[Gap] = []
+    left = angle.clone()
+    while float(left.max()) > GAP_DEGREES:
+        worst = int(left.argmax())
+        x, y, z = grid[worst].tolist()
+        gaps.append(Gap((x, y, z), float(left[worst])))
+        apart = torch.rad2deg(torch.acos((grid @ grid[worst]).clamp(-1.0, 1.0)))
+        left[apart < max(60.0, float(left[worst]))] = 0.0
+    return Coverage(
+        fraction=float((angle < NEAR_DEGREES).double().mean()),
+        gaps=tuple(gaps),
+        information=float(torch.linalg.eigvalsh(relative)[0].clamp(min=0.0)),
+    )

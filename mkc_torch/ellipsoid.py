@@ -1,0 +1,319 @@
+"""Ellipsoid fit to points in space, for the calibration of magnetometers and accelerometers.
+
+A triaxial sensor in a constant field that turns through all directions draws an ellipsoid. Its centre is the offset
+(hard iron), its shape the gains and cross-couplings (soft iron). The fit is linear regression on the nine monomials of
+(36) of Li et al., "Multi-kernel Correntropy Regression" (2023), appendix A, by any estimator of ``mkc_torch.linear``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from mkc_torch.coverage import Coverage, coverage
+from mkc_torch.linear import MKCRegression, RankDeficientError
+from mkc_torch.linear._estimator import LinearEstimator
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+MIN_POINTS = 9
+MIN_INFORMATION = 0.003
+"""Least information, as a share of even coverage, that identifies an ellipsoid."""
+
+MAX_STANDARD_ERROR = 0.05
+"""Largest standard error of the centre or a semi-axis, as a share of the radius, that identifies an ellipsoid."""
+
+
+class NotIdentifiableError(ValueError):
+    """The points do not determine an ellipsoid. ``coverage`` says what is missing, where it could be computed."""
+
+    def __init__(self, message: str, coverage: Coverage | None = None) -> None:
+        super().__init__(message)
+        self.coverage = coverage
+
+
+class Ellipsoid(NamedTuple):
+    """``(p - center)ᵀ shape (p - center) = 1``."""
+
+    center: Float[Tensor, "*batch 3"]
+    shape: Float[Tensor, "*batch 3 3"]
+
+
+def monomials(points: Float[Tensor, "*batch N 3"]) -> Float[Tensor, "*batch N 9"]:
+    """x², y², z², xy, xz, yz, x, y, z: the regressors of (36) of the paper.
+
+    Example:
+        >>> monomials(torch.tensor([[1.0, 2.0, 3.0]]))
+        tensor([[1., 4., 9., 2., 3., 6., 1., 2., 3.]])
+    """
+    x, y, z = points.unbind(-1)
+    return torch.stack([x * x, y * y, z * z, x * y, x * z, y * z, x, y, z], -1)
+
+
+def ellipsoid_from_coefficients(coef: Float[Tensor, "*batch 9"]) -> Ellipsoid:
+    """Centre (38) and shape matrix A₁ of the paper's (39) from the coefficients of (36).
+
+    Example:
+        >>> ellipsoid_from_coefficients(torch.tensor([0.25, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])).shape
+        tensor([[0.2500, 0.0000, 0.0000],
+                [0.0000, 1.0000, 0.0000],
+                [0.0000, 0.0000, 1.0000]])
+    """
+    a1, a2, a3, a4, a5, a6 = coef[..., :6].unbind(-1)
+    rows = [a1, a4 / 2, a5 / 2, a4 / 2, a2, a6 / 2, a5 / 2, a6 / 2, a3]
+    A = torch.stack(rows, -1).unflatten(-1, (3, 3))
+    solution, _ = torch.linalg.solve_ex(A, coef[..., 6:])
+    center = -0.5 * solution
+    size = 1.0 + torch.einsum("...i,...ij,...j->...", center, A, center)
+    return Ellipsoid(center, A / size[..., None, None])
+
+
+def coefficients_from_ellipsoid(ellipsoid: Ellipsoid) -> Float[Tensor, "*batch 9"]:
+    """Coefficients of (36); they grow without limit when the surface passes through the origin."""
+    center, shape = ellipsoid
+    moved = torch.einsum("...ij,...j->...i", shape, center)
+    size = 1.0 - torch.einsum("...i,...i->...", center, moved)
+    a = shape
+    terms = [a[..., 0, 0], a[..., 1, 1], a[..., 2, 2], 2 * a[..., 0, 1], 2 * a[..., 0, 2], 2 * a[..., 1, 2]]
+    return torch.cat([torch.stack(terms, -1), -2.0 * moved], -1) / size[..., None]
+
+
+def symmetric_root(shape: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Symmetric square root of positive definite matrices."""
+    values, vectors = torch.linalg.eigh(shape)
+    return vectors @ torch.diag_embed(values.sqrt()) @ vectors.mT
+
+
+def _axes(shape: Tensor) -> tuple[Tensor, Tensor]:
+    """Semi-axes in ascending order and the rotation whose columns they lie along, with determinant +1."""
+    values, vectors = torch.linalg.eigh(shape)
+    vectors = vectors.flip(-1)
+    # each axis points to the side of its largest component, so that the result does not depend on the solver
+    index = vectors.abs().argmax(-2, keepdim=True)
+    vectors = vectors * torch.sign(torch.gather(vectors, -2, index))
+    vectors = torch.cat([vectors[..., :2], vectors[..., 2:] * torch.linalg.det(vectors)[..., None, None]], -1)
+    return values.flip(-1).rsqrt(), vectors
+
+
+class EllipsoidFit:
+    """Ellipsoid through points by robust linear regression: the linear head for magnetometers.
+
+    Args:
+        estimator: any estimator of ``mkc_torch.linear``; default ``MKCRegression()``. Give it ``covariance="hac"``
+            when the points are a time series in the order of time.
+
+    Attributes, after ``fit`` (``*`` batch dimensions, lengths in the unit of the points):
+        center_: (*, 3), the offset.
+        semi_axes_: (*, 3), ascending.
+        rotation_: (*, 3, 3), columns along the semi-axes, determinant +1.
+        calibration_matrix_: (*, 3, 3), symmetric, with ``|calibration_matrix_ @ (p - center_)| = radius_`` on the
+            ellipsoid: applied to points less their centre it makes the ellipsoid a sphere of the same volume.
+        radius_: (*,), geometric mean of the semi-axes.
+        coef_: (*, 9), coefficients of (36) in the points' own coordinates.
+        residual_: (*, N), calibrated norm less ``radius_``.
+        weights_: (*, N), the weight in [0, 1] with which each point entered.
+        center_se_, semi_axes_se_, calibration_matrix_se_: standard errors of the same shapes, where the estimator
+            has a ``covariance_``.
+        coverage_: one :class:`mkc_torch.coverage.Coverage`, or a list of them, of the points in use.
+        estimator_: the fitted estimator; its residual is algebraic, about twice the relative error of the norm.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), appendix A, (36)-(41).
+
+    Example:
+        >>> from mkc_torch.coverage import fibonacci_sphere
+        >>> points = fibonacci_sphere(100) * torch.tensor([40.0, 50.0, 60.0]) + torch.tensor([1.0, 2.0, 3.0])
+        >>> points[:20] += 25.0
+        >>> fit = EllipsoidFit().fit(points.double())
+        >>> [round(v, 3) for v in (*fit.center_.tolist(), *fit.semi_axes_.tolist())]
+        [1.0, 2.0, 3.0, 40.0, 50.0, 60.0]
+    """
+
+    def __init__(self, estimator: LinearEstimator | None = None) -> None:
+        self.estimator = MKCRegression() if estimator is None else estimator
+
+    def __repr__(self) -> str:
+        return f"EllipsoidFit(estimator={self.estimator!r})"
+
+    def fit(
+        self, points: Float[Tensor, "*batch N 3"], sample_weight: Float[Tensor, "*batch N"] | None = None
+    ) -> EllipsoidFit:
+        """Fit an ellipsoid to points.
+
+        Args:
+            points: (*, N, 3) with N >= 9, in any unit of length or field.
+            sample_weight: non-negative weights (*, N); 0 leaves a point out.
+
+        Raises:
+            TypeError: not a floating tensor.
+            ValueError: wrong shape, too few or non-finite points.
+            NotIdentifiableError: the points lie on a plane or cover too few directions; the message names those that
+                are missing.
+        """
+        self._check(points)
+        origin = points.median(-2, keepdim=True).values
+        size = torch.linalg.vector_norm(points - origin, dim=-1).median(-1).values[..., None, None]
+        if bool((size <= 0).any()):
+            raise NotIdentifiableError(_stuck(points))
+        X = monomials((points - origin) / size).unsqueeze(-2)
+        Y = torch.ones_like(X[..., 0])
+        weight = None if sample_weight is None else sample_weight.unsqueeze(-1)
+        try:
+            self.estimator_ = self.estimator.fit(X, Y, weight)
+        except RankDeficientError:
+            raise NotIdentifiableError(_flat(points)) from None
+        local = ellipsoid_from_coefficients(self.estimator_.coef_)
+        self._refuse_unbounded(local, points)
+        scale = size.squeeze(-1)
+        self._keep(points, Ellipsoid(origin.squeeze(-2) + scale * local.center, local.shape / size.square()))
+        self.weights_ = self.estimator_.weights_.squeeze(-1)
+        self._standard_errors(local, scale)
+        self._refuse_uncovered(points, sample_weight)
+        return self
+
+    def calibrate(self, points: Float[Tensor, "*batch M 3"]) -> Float[Tensor, "*batch M 3"]:
+        """``calibration_matrix_ @ (p - center_)`` of each point: the field in the unit of the points."""
+        return torch.einsum("...ij,...kj->...ki", self.calibration_matrix_, points - self.center_.unsqueeze(-2))
+
+    @staticmethod
+    def _check(points: Tensor) -> None:
+        if not isinstance(points, Tensor) or not points.is_floating_point():
+            got = points.dtype if isinstance(points, Tensor) else type(points).__name__
+            raise TypeError(f"Expected argument `points` to be a real floating-point tensor but got {got}.")
+        if points.dim() < 2 or points.shape[-1] != 3:
+            raise ValueError(f"Expected argument `points` of shape (*, N, 3) but got {tuple(points.shape)}.")
+        if points.shape[-2] < MIN_POINTS:
+            raise ValueError(
+                f"Expected at least {MIN_POINTS} points, one for each coefficient of an ellipsoid, "
+                f"but got {points.shape[-2]}."
+            )
+        finite = torch.isfinite(points)
+        if not bool(finite.all()):
+            first = tuple((~finite).nonzero()[0].tolist())
+            raise ValueError(
+                f"Expected argument `points` to be finite but got {points[first].item()} at index {first} "
+                f"({int((~finite).sum())} such values); drop those points."
+            )
+
+    def _refuse_unbounded(self, local: Ellipsoid, points: Tensor) -> None:
+        values = torch.linalg.eigvalsh(local.shape.nan_to_num(0.0, 0.0, 0.0))
+        # a surface a hundred times longer than wide is a cylinder to these points
+        bounded = values[..., 0] > 1e-4 * values[..., -1]
+        if not bool(bounded.all()):
+            found = _coverages(points - _middle(points), None)
+            worst = found[int((~bounded).reshape(-1).nonzero()[0, 0])]
+            raise NotIdentifiableError(
+                "Not identifiable: the quadric that fits the points is no ellipsoid. " + _advice(worst), worst
+            )
+
+    def _keep(self, points: Tensor, ellipsoid: Ellipsoid) -> None:
+        self.center_ = ellipsoid.center
+        self.semi_axes_, self.rotation_ = _axes(ellipsoid.shape)
+        self.radius_ = self.semi_axes_.log().mean(-1).exp()
+        self.calibration_matrix_ = self.radius_[..., None, None] * symmetric_root(ellipsoid.shape)
+        self.coef_ = coefficients_from_ellipsoid(ellipsoid)
+        self.residual_ = torch.linalg.vector_norm(self.calibrate(points), dim=-1) - self.radius_.unsqueeze(-1)
+
+    def _standard_errors(self, local: Ellipsoid, scale: Tensor) -> None:
+        """First-order propagation from the coefficients; the calibration matrix W solves dW W + W dW = dA₁."""
+        covariance = getattr(self.estimator_, "covariance_", None)
+        if covariance is None:
+            return
+
+        def quantities(coef: Tensor) -> Tensor:
+            center, shape = ellipsoid_from_coefficients(coef)
+            axes = torch.linalg.eigvalsh(shape).flip(-1).rsqrt()
+            return torch.cat([center, axes, shape.flatten()])
+
+        flat = self.estimator_.coef_.reshape(-1, 9)
+        jacobian = torch.func.vmap(torch.func.jacrev(quantities))(flat)
+        root = symmetric_root(local.shape).reshape(-1, 3, 3)
+        eye = torch.eye(3, dtype=root.dtype, device=root.device)
+        lyapunov = torch.stack([torch.kron(w, eye) + torch.kron(eye, w) for w in root])
+        d_root = torch.linalg.solve(lyapunov, jacobian[:, 6:])
+        # the matrix is radius · root, and the radius is det(A₁)^(-1/6)
+        inverse = torch.linalg.inv(local.shape.reshape(-1, 3, 3)).flatten(1)
+        d_log_radius = -torch.einsum("bi,bij->bj", inverse, jacobian[:, 6:]) / 6.0
+        radius = torch.linalg.det(local.shape.reshape(-1, 3, 3)).pow(-1 / 6)
+        d_matrix = radius[:, None, None] * (d_root + root.flatten(1).unsqueeze(-1) * d_log_radius.unsqueeze(1))
+        rows = torch.cat([jacobian[:, :6], d_matrix], 1)
+        variance = torch.einsum("bij,bjk,bik->bi", rows, covariance.reshape(-1, 9, 9), rows)
+        errors = variance.clamp(min=0.0).sqrt().reshape(*scale.shape[:-1], 15)
+        self.center_se_ = errors[..., :3] * scale
+        self.semi_axes_se_ = errors[..., 3:6] * scale
+        self.calibration_matrix_se_ = errors[..., 6:].unflatten(-1, (3, 3))
+
+    def _refuse_uncovered(self, points: Tensor, sample_weight: Tensor | None) -> None:
+        in_use = self.weights_ if sample_weight is None else self.weights_ * (sample_weight > 0)
+        found = _coverages(self.calibrate(points), in_use)
+        self.coverage_: Coverage | list[Coverage] = found[0] if points.dim() == 2 else found
+        for index, one in enumerate(found):
+            if one.information < MIN_INFORMATION:
+                raise NotIdentifiableError(
+                    f"Not identifiable: the points tell {one.information:.1e} of what an even coverage of directions "
+                    f"would tell about the worst-determined part of the ellipsoid "
+                    f"(at least {MIN_INFORMATION:g} is needed). " + _advice(one),
+                    one,
+                )
+            if not hasattr(self, "center_se_"):
+                continue
+            radius = self.radius_.reshape(-1)[index]
+            errors = torch.cat([self.center_se_.reshape(-1, 3)[index], self.semi_axes_se_.reshape(-1, 3)[index]])
+            if not float(errors.max()) <= MAX_STANDARD_ERROR * float(radius):
+                raise NotIdentifiableError(
+                    f"Not identifiable: the centre or a semi-axis has a standard error of {float(errors.max()):.3g}, "
+                    f"more than {MAX_STANDARD_ERROR:.0%} of the radius {float(radius):.3g}. " + _advice(one),
+                    one,
+                )
+
+
+def _coverages(vectors: Tensor, weight: Tensor | None) -> list[Coverage]:
+    """Coverage of each problem by the points of at least half the full weight."""
+    flat = vectors.detach().reshape(-1, *vectors.shape[-2:])
+    if weight is None:
+        return [coverage(v) for v in flat]
+    weight = weight.detach().reshape(flat.shape[0], -1)
+    return [coverage(v[w >= 0.5]) for v, w in zip(flat, weight, strict=True)]
+
+
+def _middle(points: Tensor) -> Tensor:
+    return 0.5 * (points.amax(-2, keepdim=True) + points.amin(-2, keepdim=True))
+
+
+def _advice(found: Coverage) -> str:
+    if not found.gaps:
+        return "Turn the sensor through all directions."
+    missing = "; ".join(str(g) for g in found.gaps)
+    return f"Directions not covered: {missing}. Turn the sensor so that the field points there too."
+
+
+def _stuck(points: Tensor) -> str:
+    if bool((points == points[..., :1, :]).all()):
+        return "Not identifiable: all points are equal. Turn the sensor through all directions while recording."
+    return "Not identifiable: more than half of the points are equal. Turn the sensor through all directions."
+
+
+def _flat(points: Tensor) -> str:
+    flat = points.reshape(-1, *points.shape[-2:])
+    centred = flat - flat.mean(-2, keepdim=True)
+    for one in centred:
+        constant = [name for i, name in enumerate("xyz") if not bool(one[:, i].any())]
+        if constant:
+            return (
+                f"Not identifiable: {' and '.join(constant)} never changes, so the points lie in a plane. "
+                "Turn the sensor through all directions, and check that channel."
+            )
+        _, singular, axes = torch.linalg.svd(one, full_matrices=False)
+        if float(singular[2]) < 1e-6 * float(singular[0]):
+            x, y, z = axes[2].tolist()
+            return (
+                f"Not identifiable: the points lie in a plane with normal ({x:+.2f}, {y:+.2f}, {z:+.2f}), so that "
+                "direction is not covered. Turn the sensor about another axis too."
+            )
+    return (
+        "Not identifiable: the points lie on more than one quadric, as points on a few circles or lines do. "
+        "Turn the sensor through all directions."
+    )
