@@ -4,7 +4,9 @@ from importlib.metadata import version
 
 from mkc_torch import functional, linear
 from mkc_torch.density_fit import DensityFit, fit_density
+from mkc_torch.distribution import MKCDistribution
 from mkc_torch.ellipsoid import EllipsoidFit, NotIdentifiableError
+from mkc_torch.losses import MKCLoss
 from mkc_torch.recording import Recording
 
 __version__ = version("mkc-torch")
@@ -12,6 +14,8 @@ __version__ = version("mkc-torch")
 __all__ = [
     "DensityFit",
     "EllipsoidFit",
+    "MKCDistribution",
+    "MKCLoss",
     "NotIdentifiableError",
     "Recording",
     "fit_density",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from mkc_torch.functional import KAPPA_MAX, energy, head_rule, log_partition, tail_density
+from mkc_torch.functional import KAPPA_MAX, energy, head_rule, integrate, log_partition, tail_density
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -86,12 +86,9 @@ def _normaliser_derivatives(kappa: Tensor, log_d: Tensor, log_bound: Tensor) -> 
     _, e, first, second = _energy_terms(0.5 * nodes.square(), kappa.unsqueeze(-1))
     p = torch.exp(-e)
 
-    def integral(values: Tensor, flat: Tensor) -> Tensor:
-        return 2.0 * length * flat + (weights * (values - flat.unsqueeze(-1))).sum(-1)
-
-    z = integral(p, tail)
-    z_k = integral(first * p, tail_1) / z
-    z_kk = integral((first.square() - second) * p, tail_2) / z
+    z = integrate(p, tail, length, weights)
+    z_k = integrate(first * p, tail_1, length, weights) / z
+    z_kk = integrate((first.square() - second) * p, tail_2, length, weights) / z
     w_end, e_end, first_end, _ = _energy_terms(0.5 * length.square(), kappa)
     edge = 2.0 * torch.exp(-e_end) / z
     l_1 = length * edge

@@ -161,9 +161,42 @@ def head_reach(kappa: Tensor) -> Tensor:
 
 
 def head_rule(kappa: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
-    """Quadrature on the head: nodes ``u`` in [0, min(length, reach)] and weights for both signs, shape (*, nodes)."""
-    end = torch.minimum(length, head_reach(kappa)).unsqueeze(-1)
+    """Quadrature on the head: nodes ``u`` in [0, min(length, reach)] and weights for both signs, shape (*, nodes).
+
+    A negative length gives negative nodes and weights, so that integrals are odd in it.
+    """
+    reach = head_reach(kappa)
+    end = torch.maximum(torch.minimum(length, reach), -reach).unsqueeze(-1)
     return end * _NODES.to(end), end * _WEIGHTS.to(end)
+
+
+def integrate(
+    values: Float[Tensor, "*batch nodes"],
+    tail: Float[Tensor, "*batch"],
+    length: Float[Tensor, "*batch"],
+    weights: Float[Tensor, "*batch nodes"],
+) -> Float[Tensor, "*batch"]:
+    """Integral over the domain of a function that is constant on the tail: the tail exactly, the head by quadrature.
+
+    Args:
+        values: the function at the nodes of :func:`head_rule`.
+        tail: its value on the flat tail.
+        length: half-width of the domain.
+        weights: those of :func:`head_rule`.
+    """
+    return 2.0 * length * tail + (weights * (values - tail.unsqueeze(-1))).sum(-1)
+
+
+def partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """``Z``, the integral of ``exp(-energy(u, kappa))`` over ``|u| <= length``; odd in ``length``.
+
+    Args:
+        kappa, length: as in :func:`log_partition`.
+    """
+    kappa, length = torch.broadcast_tensors(kappa, length)
+    tail = tail_density(kappa)
+    nodes, weights = head_rule(kappa, length)
+    return integrate(torch.exp(-energy(nodes, kappa.unsqueeze(-1))), tail, length, weights)
 
 
 def log_partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
@@ -181,11 +214,7 @@ def log_partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"
         >>> log_partition(torch.tensor(1 / 9.0).double(), torch.tensor(10.0).double()).exp()
         tensor(2.6348, dtype=torch.float64)
     """
-    kappa, length = torch.broadcast_tensors(kappa, length)
-    tail = tail_density(kappa)
-    nodes, weights = head_rule(kappa, length)
-    head = torch.exp(-energy(nodes, kappa.unsqueeze(-1))) - tail.unsqueeze(-1)
-    return torch.log(2.0 * length * tail + (weights * head).sum(-1))
+    return torch.log(partition(kappa, length))
 
 
 def mkc_energy(

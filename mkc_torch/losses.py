@@ -1,0 +1,305 @@
+"""The MKC likelihood as a loss module."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from mkc_torch.functional import KAPPA_MAX, as_computed, energy, inverse_square, log_partition
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+Reduction = Literal["none", "mean", "sum"]
+
+DEFAULT_BOUND_IN_D = 100.0
+"""Half-width of the domain, in units of the initial d, where no bound is given."""
+
+DEFAULT_D_MIN_IN_D = 1e-3
+"""Floor under d, in units of the initial d, where none is given."""
+
+
+class MKCLoss(nn.Module):
+    """Multi-kernel correntropy loss with a bandwidth σ and a scale d for each channel.
+
+    With anything learned it is the negative log-likelihood of (17) of Li et al. (2023), ``energy + log_normalizer``;
+    with σ and d fixed it is the paper's loss, ``energy = σ² (1 - exp(-e² / (2 d² σ²)))``, e being input less target.
+    Learning un-normalised σ and d is refused: the energy alone is smallest at σ → 0 or d → ∞, whatever the data.
+
+    Args:
+        num_channels: m, the size of the channel dimension.
+        sigma: initial or fixed bandwidths in [0.05, inf], a number or (m,). ``inf`` is the Gaussian; a σ that is to be
+            learned must start finite, since its gradient is 0 at ``inf``.
+        d: initial or fixed scales > 0 in the unit of the target, a number or (m,).
+        bound: half-width a of the domain of the errors, in the unit of the target, a number or (m,). None means 100
+            times the initial d and stays there while d is learned. The likelihood of σ depends on it: a physical bound
+            is better, and likelihoods compare only at equal bounds. Errors beyond it keep a finite loss and gradient.
+        learn_sigma: whether σ is a parameter.
+        learn_d: whether d is a parameter; it stays in [d_min, bound].
+        normalize: whether to add the log-normaliser; None does so if anything is learned.
+        channel_dim: the dimension of the input that holds the channels.
+        reduction: "none", "mean" (over elements, weighted where weights are given) or "sum".
+        d_min: floor under d, a number or (m,); None means a thousandth of the initial d. The likelihood of a network
+            that interpolates its targets grows without limit as d → 0.
+
+    Attributes:
+        sigma, d: current values (m,), differentiable; assign to set them.
+        bound, d_min: buffers (m,), saved in the state_dict.
+
+    Raises:
+        ValueError: an argument out of range, or learning asked for with ``normalize=False``.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (9) and (17).
+
+    Example:
+        >>> loss = MKCLoss(2, sigma=3.0, d=1.0, bound=50.0)
+        >>> output = torch.zeros(4, 2, requires_grad=True)
+        >>> value = loss(output, torch.tensor([[0.1, -0.2], [0.3, 0.0], [-0.1, 0.2], [0.0, 40.0]]))
+        >>> value.backward()
+        >>> bool(output.grad[3, 1].abs() < 1e-6)  # the outlier pulls at nothing
+        True
+    """
+
+    bound: Tensor
+    d_min: Tensor
+    fixed_kappa: Tensor | None
+    fixed_d: Tensor | None
+
+    def __init__(
+        self,
+        num_channels: int,
+        *,
+        sigma: float | Float[Tensor, " m"] = 3.0,
+        d: float | Float[Tensor, " m"] = 1.0,
+        bound: float | Float[Tensor, " m"] | None = None,
+        learn_sigma: bool = True,
+        learn_d: bool = True,
+        normalize: bool | None = None,
+        channel_dim: int = -1,
+        reduction: Reduction = "mean",
+        d_min: float | Float[Tensor, " m"] | None = None,
+    ) -> None:
+        super().__init__()
+        if isinstance(num_channels, bool) or not isinstance(num_channels, int) or num_channels < 1:
+            raise ValueError(f"Expected argument `num_channels` to be a positive integer but got {num_channels!r}.")
+        if reduction not in ("none", "mean", "sum"):
+            raise ValueError(f"Expected argument `reduction` to be 'none', 'mean' or 'sum' but got {reduction!r}.")
+        learned = learn_sigma or learn_d
+        if normalize is None:
+            normalize = learned
+        if learned and not normalize:
+            raise ValueError(
+                "Expected `learn_sigma=False, learn_d=False` with `normalize=False`: without the normaliser the loss "
+                "is smallest at sigma -> 0 or d -> inf, whatever the data. Drop `normalize=False` to learn them."
+            )
+        self.num_channels = num_channels
+        self.normalize = normalize
+        self.channel_dim = channel_dim
+        self.reduction = reduction
+        d = self._per_channel("d", d, low=0.0)
+        kappa = inverse_square(self._sigma_in_range(sigma))
+        half_width = DEFAULT_BOUND_IN_D * d if bound is None else self._per_channel("bound", bound, low=0.0)
+        floor = DEFAULT_D_MIN_IN_D * d if d_min is None else self._per_channel("d_min", d_min, low=0.0)
+        if not bool((half_width > d).all()):
+            raise ValueError(f"Expected argument `bound` to exceed `d` but got {half_width.tolist()} and {d.tolist()}.")
+        if learn_d and not bool((floor < d).all()):
+            raise ValueError(f"Expected argument `d_min` below `d` but got {floor.tolist()} and {d.tolist()}.")
+        if learn_sigma and bool((kappa == 0).any()):
+            raise ValueError(
+                "Expected a finite `sigma` with `learn_sigma=True` but got inf, where its gradient is 0; "
+                "start large, at 10 say, or pass `learn_sigma=False`."
+            )
+        self.register_buffer("bound", half_width)
+        self.register_buffer("d_min", floor)
+        self.register_buffer("fixed_kappa", None if learn_sigma else kappa)
+        self.register_buffer("fixed_d", None if learn_d else d)
+        self.raw_kappa = nn.Parameter(torch.empty_like(kappa)) if learn_sigma else None
+        self.raw_d = nn.Parameter(torch.empty_like(d)) if learn_d else None
+        self._set_kappa(kappa)
+        self._set_d(d)
+
+    def _per_channel(self, name: str, value: float | Tensor, *, low: float) -> Tensor:
+        t = torch.as_tensor(value, dtype=torch.get_default_dtype() if not isinstance(value, Tensor) else None)
+        (t,) = as_computed(t.detach())
+        if t.dim() > 1 or (t.dim() == 1 and t.shape[0] not in (1, self.num_channels)):
+            raise ValueError(
+                f"Expected argument `{name}` to be a number or of shape ({self.num_channels},) but got {tuple(t.shape)}"
+            )
+        if not bool(((t > low) & torch.isfinite(t)).all()):
+            raise ValueError(f"Expected argument `{name}` to be positive and finite but got {value}.")
+        return t.expand(self.num_channels).clone()
+
+    def _sigma_in_range(self, value: float | Tensor) -> Tensor:
+        t = torch.as_tensor(value, dtype=torch.get_default_dtype() if not isinstance(value, Tensor) else None)
+        (t,) = as_computed(t.detach())
+        least = KAPPA_MAX**-0.5
+        if not bool((t >= least).all()):
+            raise ValueError(f"Expected argument `sigma` in [{least:g}, inf] but got {value}.")
+        finite = self._per_channel("sigma", torch.where(torch.isinf(t), 1.0, t), low=0.0)
+        return torch.where(torch.isinf(t).expand_as(finite), torch.inf, finite)
+
+    @property
+    def kappa(self) -> Float[Tensor, " m"]:
+        """``1 / sigma²`` in [0, 400]."""
+        if self.raw_kappa is None:
+            assert self.fixed_kappa is not None
+            return self.fixed_kappa
+        return KAPPA_MAX * torch.sigmoid(self.raw_kappa)
+
+    @torch.no_grad()
+    def _set_kappa(self, kappa: Tensor) -> None:
+        if self.raw_kappa is not None:
+            self.raw_kappa.copy_(torch.logit(kappa.double() / KAPPA_MAX))
+        elif self.fixed_kappa is not None:
+            self.fixed_kappa.copy_(kappa)
+
+    @property
+    def sigma(self) -> Float[Tensor, " m"]:
+        """Bandwidths; assign a number or (m,) in [0.05, inf] to set them."""
+        return self.kappa.rsqrt()
+
+    @sigma.setter
+    def sigma(self, value: float | Tensor) -> None:
+        self._set_kappa(inverse_square(self._sigma_in_range(value)))
+
+    @property
+    def d(self) -> Float[Tensor, " m"]:
+        """Scales in the unit of the target; assign a number or (m,) in (d_min, bound) to set them."""
+        if self.raw_d is None:
+            assert self.fixed_d is not None
+            return self.fixed_d
+        return self.d_min + (self.bound - self.d_min) * torch.sigmoid(self.raw_d)
+
+    @d.setter
+    def d(self, value: float | Tensor) -> None:
+        d = self._per_channel("d", value, low=0.0).to(self.bound)
+        if self.raw_d is not None and not bool(((d > self.d_min) & (d < self.bound)).all()):
+            raise ValueError(
+                f"Expected `d` between `d_min` {self.d_min.tolist()} and `bound` {self.bound.tolist()} but got {value}."
+            )
+        self._set_d(d)
+
+    @torch.no_grad()
+    def _set_d(self, d: Tensor) -> None:
+        if self.raw_d is not None:
+            low, high = self.d_min.double(), self.bound.double()
+            self.raw_d.copy_(torch.logit((d.double() - low) / (high - low)))
+        elif self.fixed_d is not None:
+            self.fixed_d.copy_(d)
+
+    def log_normalizer(self) -> Float[Tensor, " m"]:
+        """``log(d Z)`` of each channel: what the negative log-likelihood adds to the energy."""
+        kappa, d, bound = as_computed(self.kappa, self.d, self.bound)
+        return torch.log(d) + log_partition(kappa, bound / d)
+
+    def param_groups(self, **options: Any) -> list[dict[str, Any]]:
+        """Optimiser groups of the learned σ and d, without weight decay, which would pull them to arbitrary values.
+
+        Args:
+            options: further options of the group, ``lr=1e-2`` say.
+
+        Example:
+            >>> model, loss = torch.nn.Linear(3, 2), MKCLoss(2)
+            >>> groups = [{"params": model.parameters()}, *loss.param_groups(lr=1e-2)]
+            >>> optimiser = torch.optim.AdamW(groups, weight_decay=0.1)
+        """
+        parameters = [p for p in (self.raw_kappa, self.raw_d) if p is not None]
+        return [{"params": parameters, "weight_decay": 0.0, **options}] if parameters else []
+
+    def forward(
+        self,
+        input: Float[Tensor, "*shape"],
+        target: Float[Tensor, "*shape"],
+        weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
+    ) -> Tensor:
+        """The loss of predictions against targets.
+
+        Args:
+            input: predictions, any shape whose ``channel_dim`` has size m.
+            target: targets of the same shape; nothing is broadcast.
+            weight: non-negative weights, or a boolean mask that is True where an element counts; of the shape of the
+                input, or that shape without the channel dimension. What an element of weight 0 or False holds, NaN
+                included, reaches neither the value nor a gradient.
+
+        Returns:
+            A scalar, or for reduction "none" the shape of the input with 0 where masked; float32 at least. The mean is
+            the weighted mean over elements, and 0 if no element counts.
+
+        Raises:
+            TypeError: integer or complex input or target.
+            ValueError: shapes differ, are empty, or have another number of channels.
+        """
+        axis = self._checked_axis(input, target)
+        error = input.to(_at_least_float32(input)) - target.to(_at_least_float32(target))
+        if weight is not None:
+            weight, counts = self._checked_weight(weight, error, axis)
+            error = torch.where(counts, error, 0.0)
+        shape = [1] * error.dim()
+        shape[axis] = self.num_channels
+        kappa, d = (p.to(torch.promote_types(p.dtype, error.dtype)).view(shape) for p in (self.kappa, self.d))
+        loss = energy(error / d, kappa)
+        norm = self.log_normalizer().to(loss.dtype) if self.normalize else None
+        if self.reduction == "none":
+            if norm is not None:
+                loss = loss + norm.view(shape)
+            return loss if weight is None else weight * loss
+        total = loss.sum() if weight is None else (weight * loss).sum()
+        elements = float(loss.numel()) if weight is None else weight.sum()
+        if norm is not None:
+            if weight is None:
+                total = total + norm.sum() * (elements / self.num_channels)
+            else:
+                others = [i for i in range(error.dim()) if i != axis]
+                total = total + (norm * (weight.sum(others) if others else weight)).sum()
+        if self.reduction == "sum":
+            return total
+        if isinstance(elements, Tensor):
+            return total / torch.where(elements > 0, elements, 1.0)
+        return total / elements
+
+    def _checked_axis(self, input: Tensor, target: Tensor) -> int:
+        for name, value in (("input", input), ("target", target)):
+            if not value.is_floating_point():
+                raise TypeError(f"Expected argument `{name}` to be a real floating-point tensor but got {value.dtype}.")
+        if input.shape != target.shape:
+            raise ValueError(
+                f"Expected `input` and `target` of one shape but got {tuple(input.shape)} and {tuple(target.shape)}."
+            )
+        if not -input.dim() <= self.channel_dim < input.dim():
+            raise ValueError(f"Expected a dimension {self.channel_dim} for the channels but got {tuple(input.shape)}.")
+        axis = self.channel_dim % input.dim()
+        if input.shape[axis] != self.num_channels:
+            raise ValueError(
+                f"Expected {self.num_channels} channels in dimension {self.channel_dim} but got {tuple(input.shape)}."
+            )
+        if input.numel() == 0:
+            raise ValueError(f"Expected at least one element but got shape {tuple(input.shape)}.")
+        return axis
+
+    @staticmethod
+    def _checked_weight(weight: Tensor, error: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+        samples = error.shape[:axis] + error.shape[axis + 1 :]
+        if weight.shape == samples and weight.shape != error.shape:
+            weight = weight.unsqueeze(axis)
+        elif weight.shape != error.shape:
+            raise ValueError(
+                f"Expected argument `weight` of shape {tuple(error.shape)} or {tuple(samples)} "
+                f"but got {tuple(weight.shape)}."
+            )
+        weight = weight.expand(error.shape)
+        counts = weight if weight.dtype == torch.bool else weight != 0
+        return weight.to(error.dtype), counts
+
+    def extra_repr(self) -> str:
+        learned = [n for n, p in (("sigma", self.raw_kappa), ("d", self.raw_d)) if p is not None]
+        return (
+            f"{self.num_channels}, learns={learned}, normalize={self.normalize}, channel_dim={self.channel_dim}, "
+            f"reduction={self.reduction!r}"
+        )
+
+
+def _at_least_float32(value: Tensor) -> torch.dtype:
+    return torch.promote_types(value.dtype, torch.float32)
