@@ -1,0 +1,192 @@
+"""calibration.json: a calibration as JSON text of the schema "mkc-calibration/1", and back."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, NoReturn
+
+from mkc_torch.calibration import Calibration, Matrix, Spread, Vector
+from mkc_torch.coverage import Coverage, Gap, nearest_axis
+from mkc_torch.disturbance import Interval
+
+__all__ = ["SCHEMA", "CalibrationFileError", "calibration_from_json", "calibration_to_json"]
+
+SCHEMA = "mkc-calibration/1"
+
+
+class CalibrationFileError(ValueError):
+    """A text that is no calibration; the sentence says why."""
+
+
+def calibration_to_json(calibration: Calibration) -> str:
+    """The text of calibration.json; see :meth:`mkc_torch.calibration.Calibration.to_json`."""
+    c = calibration
+    content = {
+        "schema": SCHEMA,
+        "recording": c.recording,
+        "samples": c.samples,
+        "unit": c.unit,
+        "center": {"value": c.center, "standard_error": _known(c.center_se)},
+        "semi_axes": {"value": c.semi_axes, "standard_error": _known(c.semi_axes_se)},
+        "rotation": c.rotation,
+        "matrix": {"value": c.matrix, "standard_error": [_known(row) for row in c.matrix_se]},
+        "radius": c.radius,
+        "field_strength": {"value": c.field_strength, "unit": c.field_unit},
+        "noise": {
+            "residual": "(|matrix (measured - center)| / field_strength)^2 - 1",
+            "sigma": "inf" if math.isinf(c.sigma) else c.sigma,
+            "d": c.d,
+            "bound": c.bound,
+        },
+        "residual": {"before": c.before._asdict(), "after": c.after._asdict()},
+        "rejected": {"count": c.rejected, "share": c.rejected_share, "intervals": c.disturbed},
+        "coverage": {
+            "fraction": c.coverage.fraction,
+            "information": c.coverage.information,
+            "gaps": [
+                {"axis": nearest_axis(g.direction), "direction": g.direction, "degrees": g.degrees}
+                for g in c.coverage.gaps
+            ],
+        },
+        "warnings": c.warnings,
+    }
+    text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
+    # lists of numbers on one line; a text in JSON holds no line end, so none is touched
+    return re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda m: "[" + " ".join(m[1].split()) + "]", text) + "\n"
+
+
+def calibration_from_json(text: str) -> Calibration:
+    """The calibration of a text; see :meth:`mkc_torch.calibration.Calibration.from_json`."""
+    try:
+        content = json.loads(text, parse_constant=_no_constant)
+    except json.JSONDecodeError as error:
+        raise CalibrationFileError(
+            f"this is no calibration: line {error.lineno} is not JSON ({error.msg}); give it a calibration.json."
+        ) from error
+    schema = content.get("schema") if isinstance(content, dict) else None
+    if schema != SCHEMA:
+        told = f'its schema is "{schema}", not "{SCHEMA}"' if isinstance(schema, str) else "it names no schema"
+        raise CalibrationFileError(f"this is no calibration: {told}; give it a calibration.json.")
+    c = _Reader(content)
+    return Calibration(
+        recording=c.text("recording"),
+        samples=c.count("samples", least=1),
+        unit=c.text("unit"),
+        center=c.vector("center", "value"),
+        center_se=c.vector("center", "standard_error", unknown=True),
+        semi_axes=c.vector("semi_axes", "value"),
+        semi_axes_se=c.vector("semi_axes", "standard_error", unknown=True),
+        rotation=c.matrix("rotation"),
+        matrix=c.matrix("matrix", "value"),
+        matrix_se=c.matrix("matrix", "standard_error", unknown=True),
+        radius=c.positive("radius"),
+        field_strength=c.positive("field_strength", "value"),
+        field_unit=c.text("field_strength", "unit"),
+        sigma=c.sigma(),
+        d=c.positive("noise", "d"),
+        bound=c.positive("noise", "bound"),
+        before=Spread(c.number("residual", "before", "robust"), c.number("residual", "before", "rms")),
+        after=Spread(c.number("residual", "after", "robust"), c.number("residual", "after", "rms")),
+        rejected=c.count("rejected", "count"),
+        disturbed=tuple(
+            Interval(*c.numbers("rejected", "intervals", i, length=2)) for i in c.each("rejected", "intervals")
+        ),
+        coverage=Coverage(
+            fraction=c.number("coverage", "fraction"),
+            gaps=tuple(
+                Gap(c.vector("coverage", "gaps", i, "direction"), c.number("coverage", "gaps", i, "degrees"))
+                for i in c.each("coverage", "gaps")
+            ),
+            information=c.number("coverage", "information"),
+        ),
+        warnings=tuple(c.text("warnings", i) for i in c.each("warnings")),
+    )
+
+
+def _known(values: Sequence[float]) -> list[float | None]:
+    return [v if math.isfinite(v) else None for v in values]
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise CalibrationFileError(f"this is no calibration: it holds {name}, which is not JSON; calibrate again.")
+
+
+class _Reader:
+    """Values of the file by their path, each checked where it is taken."""
+
+    def __init__(self, content: Mapping[str, Any]) -> None:
+        self.content = content
+
+    def _at(self, *path: str | int) -> Any:
+        value: Any = self.content
+        for key in path:
+            if isinstance(key, str) and not (isinstance(value, Mapping) and key in value):
+                raise CalibrationFileError(f"the calibration has no `{_dotted(path)}`; calibrate again.")
+            value = value[key]
+        return value
+
+    def _wrong(self, path: tuple[str | int, ...], expected: str) -> CalibrationFileError:
+        shown = json.dumps(self._at(*path), ensure_ascii=False)
+        shown = shown if len(shown) <= 40 else shown[:39] + "…"
+        return CalibrationFileError(f"`{_dotted(path)}` of the calibration must be {expected} but is {shown}.")
+
+    def text(self, *path: str | int) -> str:
+        value = self._at(*path)
+        if not isinstance(value, str):
+            raise self._wrong(path, "text")
+        return value
+
+    def number(self, *path: str | int) -> float:
+        value = self._at(*path)
+        if not _is_number(value):
+            raise self._wrong(path, "a number")
+        return float(value)
+
+    def positive(self, *path: str | int) -> float:
+        value = self.number(*path)
+        if value <= 0:
+            raise self._wrong(path, "a positive number")
+        return value
+
+    def count(self, *path: str | int, least: int = 0) -> int:
+        value = self._at(*path)
+        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+            raise self._wrong(path, f"a whole number of at least {least}")
+        return value
+
+    def sigma(self) -> float:
+        return math.inf if self._at("noise", "sigma") == "inf" else self.positive("noise", "sigma")
+
+    def each(self, *path: str | int) -> range:
+        value = self._at(*path)
+        if not isinstance(value, list):
+            raise self._wrong(path, "a list")
+        return range(len(value))
+
+    def numbers(self, *path: str | int, length: int, unknown: bool = False) -> tuple[float, ...]:
+        value = self._at(*path)
+        fine = isinstance(value, list) and len(value) == length
+        if not fine or not all(_is_number(v) or (unknown and v is None) for v in value):
+            raise self._wrong(path, f"a list of {length} numbers")
+        return tuple(math.nan if v is None else float(v) for v in value)
+
+    def vector(self, *path: str | int, unknown: bool = False) -> Vector:
+        x, y, z = self.numbers(*path, length=3, unknown=unknown)
+        return x, y, z
+
+    def matrix(self, *path: str | int, unknown: bool = False) -> Matrix:
+        if len(self.each(*path)) != 3:
+            raise self._wrong(path, "a list of 3 rows")
+        a, b, c = (self.vector(*path, i, unknown=unknown) for i in range(3))
+        return a, b, c
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _dotted(path: tuple[str | int, ...]) -> str:
+    return ".".join(str(key) for key in path)

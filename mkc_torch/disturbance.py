@@ -1,0 +1,68 @@
+"""Intervals of time in which rejected samples stand close together."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["Interval", "disturbed_intervals"]
+
+_WINDOW_SECONDS = 0.25
+_JOIN_SECONDS = 1.0
+_FEWEST = 5  # samples of a window, at least
+
+
+class Interval(NamedTuple):
+    """From the first to the last rejected sample, in s."""
+
+    start: float
+    end: float
+
+
+def disturbed_intervals(time: Float[Tensor, " N"], rejected: Bool[Tensor, " N"]) -> tuple[Interval, ...]:
+    """Where at least half of the samples within a quarter of a second (five samples at least) are rejected.
+
+    Intervals less than a second apart are one. Scattered rejected samples, as heavy-tailed noise has them, belong
+    to none. Where the time begins anew, as between the experiments of one table, an interval ends.
+
+    Args:
+        time: in s, ascending but for such new beginnings.
+        rejected: which samples were rejected.
+
+    Example:
+        >>> time = torch.arange(1000) / 50.0
+        >>> disturbed_intervals(time, (time > 4.0) & (time < 7.0))
+        (Interval(start=4.01..., end=6.98...),)
+    """
+    steps = time.diff()
+    starts = torch.cat([torch.tensor([0]), (steps < 0).nonzero().squeeze(-1) + 1, torch.tensor([len(time)])])
+    forward = steps[steps > 0]
+    if len(forward) == 0:
+        return ()
+    half = int((0.5 * _WINDOW_SECONDS / forward.median()).round().clamp(_FEWEST // 2, 500))
+    join = max(_JOIN_SECONDS, (2 * half + 1) * float(forward.median()))
+    found: list[Interval] = []
+    for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
+        found += _in_one_run(time[begin:end], rejected[begin:end], half, join)
+    return tuple(found)
+
+
+def _in_one_run(time: Tensor, rejected: Tensor, half: int, join: float) -> list[Interval]:
+    count = torch.cat([torch.zeros(1, dtype=torch.int64), rejected.long().cumsum(0)])
+    index = torch.arange(len(time))
+    low, high = (index - half).clamp(min=0), (index + half + 1).clamp(max=len(time))
+    # windows at the ends are compared with their full width, so that one sample there is no disturbance
+    dense = (count[high] - count[low]) >= half + 1
+    hits = (dense & rejected).nonzero().squeeze(-1)
+    found: list[Interval] = []
+    for t in time[hits].tolist():
+        if found and t - found[-1].end <= join:
+            found[-1] = Interval(found[-1].start, t)
+        else:
+            found.append(Interval(t, t))
+    return found

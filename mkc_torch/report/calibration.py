@@ -1,0 +1,107 @@
+"""The calibration report: what was found, how far to trust it, and what to do next, as one self-contained page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup
+
+from mkc_torch.calibration import Calibration, NotCalibratedError, Vector, prepared
+from mkc_torch.coverage import nearest_axis
+from mkc_torch.recording import Recording
+from mkc_torch.report import pictures, wording
+
+__all__ = ["Comparison", "calibration_report", "refusal_report"]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A row of a table that sets results side by side: its name, centre and semi-axes in the recording's unit."""
+
+    name: str
+    center: Vector
+    semi_axes: Vector
+
+
+def calibration_report(
+    calibration: Calibration, recording: Recording, *, note: str = "", comparison: Sequence[Comparison] = ()
+) -> str:
+    """The page for a calibration and the recording it was made from.
+
+    Args:
+        calibration: of ``mkc_torch.calibration.calibrate``.
+        recording: the one it came from.
+        note: a sentence at the top of the page, such as that the data are simulated.
+        comparison: other results, or the truth, to set beside this one.
+
+    Returns:
+        HTML with its pictures in it.
+
+    Example:
+        >>> from mkc_torch.calibration import calibrate
+        >>> from mkc_torch.demo import simulated_recording
+        >>> recording, _ = simulated_recording()
+        >>> calibration_report(calibrate(recording), recording).startswith("<!doctype html>")
+        True
+    """
+    usable = prepared(recording)
+    points = usable.magnetometer()
+    in_use = calibration.corrected(points)[calibration.weight(points) >= 0.5]
+    return _render(
+        "calibration.html.j2",
+        c=calibration,
+        note=note,
+        comparison=comparison,
+        figures={
+            "sphere": Markup(pictures.sphere(calibration, points)),
+            "residual": Markup(pictures.residual(calibration, points, usable.time)),
+            "density": Markup(pictures.density(calibration, points)),
+            "coverage": Markup(pictures.coverage_map(calibration.coverage, in_use)),
+        },
+    )
+
+
+def refusal_report(recording: Recording, error: NotCalibratedError) -> str:
+    """The page for a recording that determines no calibration: which directions are missing, and how to record them.
+
+    Args:
+        recording: the one that was refused.
+        error: the refusal.
+
+    Example:
+        >>> import torch
+        >>> from mkc_torch.calibration import calibrate
+        >>> angle = torch.linspace(0.0, 6.0, 30)
+        >>> flat = Recording({"mag_x": angle.cos(), "mag_y": angle.sin(), "mag_z": 0 * angle}, name="flat")
+        >>> try:
+        ...     calibrate(flat)
+        ... except NotCalibratedError as error:
+        ...     page = refusal_report(flat, error)
+        >>> "not identifiable" in page
+        True
+    """
+    picture = None
+    if error.coverage is not None and error.directions is not None:
+        picture = Markup(pictures.coverage_map(error.coverage, error.directions))
+    return _render(
+        "not_identifiable.html.j2",
+        recording=recording,
+        reason=str(error).removeprefix("Not identifiable: "),
+        coverage=error.coverage,
+        picture=picture,
+    )
+
+
+def _render(template: str, **values: Any) -> str:
+    environment = Environment(
+        loader=PackageLoader("mkc_torch.report"),
+        autoescape=select_autoescape(["html", "html.j2"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals.update(w=wording, nearest_axis=nearest_axis, zip=zip)
+    return environment.get_template(template).render(**values)
