@@ -1,23 +1,33 @@
-"""Recordings: tables of named, timed, unit-bearing columns, and the files they come from."""
+"""Recordings: tables of named, timed, unit-bearing columns."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import os
-import re
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from mkc_torch._files import write_atomically
+from mkc_torch.table_files import (
+    SEPARATORS,
+    MissingColumnError,
+    RecordingError,
+    as_numbers,
+    check_ending,
+    counted,
+    encoded,
+    listed,
+    numbered,
+    read_table,
+    renamed,
+    text_error,
+)
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -43,16 +53,6 @@ DEFAULT_UNITS: Mapping[str, str] = MappingProxyType(
 
 _EXPERIMENT = "experiment"
 _GAP = 10.0  # in median intervals
-_SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab"}
-_MISSING = ["", "na", "n/a", "nan", "-nan", "null"]  # in lower case; C's printf writes -nan
-
-
-class RecordingError(ValueError):
-    """A recording that cannot be used; the sentence says which, why, and what to do."""
-
-
-class MissingColumnError(RecordingError):
-    """A column that a recording does not have."""
 
 
 class Recording:
@@ -124,28 +124,25 @@ class Recording:
             ImportError: the reader's library is not installed.
         """
         path = Path(path)
-        _check_file(path)
-        table = _reader(path)(path)
-        if not any(table.names):
-            raise RecordingError(f"{path}: no column has a name; the first line must hold the column names.")
-        taken, warnings = _renamed(table, columns or {}, path)
+        table = read_table(path)
+        taken, warnings = renamed(table, columns or {}, path)
         asked = set(columns or {}) | set(DEFAULT_UNITS) | {_EXPERIMENT}
         values: dict[str, Tensor] = {}
         labels: dict[str, list[str]] = {}
         for name, series in taken.items():
-            numbers, bad = _as_numbers(series)
+            numbers, bad = as_numbers(series)
             if bad.any():
                 missing = numbers.is_null() & ~bad
                 if name == _EXPERIMENT:
-                    numbers, labels[name] = _numbered(series)
+                    numbers, labels[name] = numbered(series)
                 elif name not in asked and (bad | missing).all():
                     warnings.append(f"Column `{name}` holds no numbers and is left out.")
                     continue
                 else:
-                    raise _text_error(path, table, name, series, int(bad.arg_max()))
+                    raise text_error(path, table, name, series, int(bad.arg_max()))
             values[name] = torch.tensor(numbers.fill_null(math.nan).to_numpy())
         if not values:
-            known = ", ".join(_SEPARATORS.values())
+            known = ", ".join(SEPARATORS.values())
             raise RecordingError(f"{path}: no column holds numbers; separators can be {known}.")
         return cls(values, name=path.stem, warnings=warnings, labels=labels)
 
@@ -237,7 +234,7 @@ class Recording:
             counts += [f"`{name}` {', '.join(found)}"] if found else []
         if not keep.any():
             raise RecordingError(
-                f"{self._in()}no sample has finite values in all of {_listed(names)}: {'; '.join(counts)}. "
+                f"{self._in()}no sample has finite values in all of {listed(names)}: {'; '.join(counts)}. "
                 "Leave out the columns that hold no values."
             )
         dropped = f"Dropped {int((~keep).sum())} of {len(self)} samples that are not finite: {'; '.join(counts)}."
@@ -269,7 +266,7 @@ class Recording:
         kept = order[first]
         found = []
         if backward:
-            found.append(f"The time ran backwards {_counted(backward, 'time')}; the samples were sorted by time.")
+            found.append(f"The time ran backwards {counted(backward, 'time')}; the samples were sorted by time.")
         if not first.all():
             twin, original = order[~first], kept[np.cumsum(first) - 1][~first]
             table = timed.stack(*timed.names).numpy()
@@ -355,7 +352,7 @@ class Recording:
             values = self[_EXPERIMENT].numpy()[self._experiment_numbers() == group[longest]]
             where = f" in experiment {self._experiment_label(float(values[0]))}"
         return [
-            f"The time has {_counted(count, 'gap')} of more than {_GAP:g} median intervals ({median:.4g} s); "
+            f"The time has {counted(count, 'gap')} of more than {_GAP:g} median intervals ({median:.4g} s); "
             f"the longest, {intervals[longest]:.4g} s, begins at {time[longest]:.10g} s{where}."
         ]
 
@@ -373,180 +370,10 @@ def write_table(path: str | os.PathLike[str], columns: Mapping[str, Tensor], *, 
         FileExistsError: the file exists and ``overwrite`` is False.
     """
     path = Path(path)
-    _reader(path)
+    check_ending(path)
     table = Recording(columns, name=path.name)
-    data: str | bytes
-    if path.suffix.lower() == ".parquet":
-        buffer = io.BytesIO()
-        _polars().DataFrame({name: values.numpy() for name, values in table.columns.items()}).write_parquet(buffer)
-        data = buffer.getvalue()
-    else:
-        if all(_is_number(name) for name in table.names):
-            raise RecordingError(
-                f"{path}: a header of numbers alone, {_listed(table.names)}, reads as none; use words."
-            )
-        text = io.StringIO()
-        separator = "\t" if path.suffix.lower() == ".tsv" else ","
-        quoted = any(mark in name for name in table.names for mark in (*_SEPARATORS, '"'))
-        header: Literal[0, 1] = (
-            csv.QUOTE_ALL if quoted else csv.QUOTE_MINIMAL
-        )  # the reader finds the separator outside quotes
-        csv.writer(text, delimiter=separator, lineterminator="\n", quoting=header).writerow(table.names)
-        writer = csv.writer(text, delimiter=separator, lineterminator="\n")
-        # repr, which csv uses for floats, is the shortest text that reads back as the same number
-        writer.writerows(zip(*(values.tolist() for values in table.columns.values()), strict=True))
-        data = text.getvalue()
+    data = encoded(path, {name: values.numpy() for name, values in table.columns.items()})
     write_atomically(path, data, overwrite=overwrite)
-
-
-class _Table(NamedTuple):
-    """A file as read: column names as in the file (empty where there is none), polars Series, where rows came from."""
-
-    names: list[str]
-    series: list[Any]
-    lines: Sequence[int]
-    line: str = "line"
-
-
-def _reader(path: Path) -> Callable[[Path], _Table]:
-    if path.suffix.lower() not in _READERS:
-        kind = f"files ending in {path.suffix}" if path.suffix else "files without an ending"
-        raise RecordingError(f"{path}: {kind} are not known; known are {', '.join(_READERS)}.")
-    return _READERS[path.suffix.lower()]
-
-
-def _polars() -> Any:
-    try:
-        import polars
-    except ImportError as error:
-        raise ImportError('Tables are read with polars; install it with `pip install "mkc-torch[cli]"`.') from error
-    return polars
-
-
-def _check_file(path: Path) -> None:
-    if path.is_dir():
-        raise RecordingError(f"{path}: this is a folder; name the file in it.")
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file.")
-    if path.is_file() and path.stat().st_size == 0:
-        raise RecordingError(f"{path}: the file is empty; it must hold a header line and rows of numbers.")
-
-
-def _read_csv(path: Path) -> _Table:
-    polars = _polars()
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            rows = [(number, line.rstrip("\n")) for number, line in enumerate(file, start=1) if line.strip(" \r\n")]
-    except UnicodeDecodeError as error:
-        raise RecordingError(f"{path}: the file is not UTF-8 text; export it as CSV in UTF-8.") from error
-    if not rows:
-        raise RecordingError(f"{path}: the file is empty; it must hold a header line and rows of numbers.")
-    header = rows.pop(0)[1]
-    separator = max(_SEPARATORS, key=re.sub('"[^"]*"', "", header).count)
-    names = [name.strip() for name in _cells(header, separator)]
-    if all(_is_number(name) for name in names):
-        raise RecordingError(f"{path}: the first line holds numbers; it must hold the column names.")
-    if not rows:
-        raise RecordingError(f"{path}: the file has a header line but no rows of numbers.")
-    for number, line in rows:
-        count = len(_cells(line, separator)) if '"' in line else line.count(separator) + 1
-        if count != len(names):
-            raise RecordingError(
-                f"{path}: line {number} has {_counted(count, 'value')} but the header names "
-                f"{_counted(len(names), 'column')} (the separator is the {_SEPARATORS[separator]}); "
-                "correct or remove that line."
-            )
-    body = "\n".join(line for _, line in rows).encode()
-    try:
-        frame = polars.read_csv(body, separator=separator, has_header=False, infer_schema=False)
-    except polars.exceptions.PolarsError as error:
-        raise RecordingError(f"{path}: the table cannot be read: {str(error).splitlines()[0]}") from error
-    return _Table(names, frame.get_columns(), [number for number, _ in rows])
-
-
-def _cells(line: str, separator: str) -> list[str]:
-    return next(csv.reader([line], delimiter=separator))
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return text.lower() not in _MISSING
-
-
-def _read_parquet(path: Path) -> _Table:
-    polars = _polars()
-    try:
-        frame = polars.read_parquet(io.BytesIO(path.read_bytes()))  # a path would be a pattern
-    except polars.exceptions.PolarsError as error:
-        raise RecordingError(
-            f"{path}: this is no Parquet file, or a damaged one: {str(error).splitlines()[0]}"
-        ) from error
-    if not len(frame):
-        raise RecordingError(f"{path}: the table has no rows.")
-    return _Table([name.strip() for name in frame.columns], frame.get_columns(), range(1, len(frame) + 1), "row")
-
-
-def _renamed(table: _Table, columns: Mapping[str, str], path: Path) -> tuple[dict[str, Any], list[str]]:
-    """The named columns under their new names, and sentences about those left out."""
-    warnings = []
-    repeated = [name for name, count in Counter(table.names).items() if name and count > 1]
-    if repeated:
-        raise RecordingError(f"{path}: the header names {_listed(repeated)} more than once; each name must be unique.")
-    present = {name: series for name, series in zip(table.names, table.series, strict=True) if name}
-    if nameless := len(table.names) - len(present):
-        warnings.append(f"{_counted(nameless, 'column')} without a name left out.")
-    sources = {new: old.strip() for new, old in columns.items()}
-    for new, old in sources.items():
-        if old not in present:
-            raise MissingColumnError(
-                f"{path}: there is no column `{old}` to be `{new}`; the file has {_listed(present)}."
-            )
-    names: dict[str, Any] = {}
-    for name, series in present.items():
-        new_names = [new for new, old in sources.items() if old == name]
-        if not new_names and name in sources:
-            warnings.append(f"Column `{name}` of the file is left out: `{sources[name]}` takes its name.")
-        elif not new_names:
-            new_names = [name]
-        names |= dict.fromkeys(new_names, series)
-    return names, warnings
-
-
-def _as_numbers(series: Any) -> tuple[Any, Any]:
-    """A column as numbers, null where there is none, and where something else than a missing value stands there."""
-    polars = _polars()
-    if series.dtype == polars.String:
-        text = series.str.strip_chars()
-        missing = text.is_null() | text.str.to_lowercase().is_in(_MISSING)
-        numbers = text.cast(polars.Float64, strict=False)
-        return numbers, numbers.is_null() & ~missing
-    if series.dtype.is_numeric() or series.dtype in (polars.Boolean, polars.Null):
-        return series.cast(polars.Float64), polars.repeat(False, len(series), dtype=polars.Boolean, eager=True)
-    return polars.repeat(None, len(series), dtype=polars.Float64, eager=True), series.is_not_null()
-
-
-def _numbered(series: Any) -> tuple[Any, list[str]]:
-    """Labels as 0, 1, … in the order of appearance, and the labels."""
-    polars = _polars()
-    cells = [None if cell is None else str(cell).strip() for cell in series.to_list()]
-    numbers = {label: float(i) for i, label in enumerate(dict.fromkeys(cell for cell in cells if cell))}
-    return polars.Series([numbers.get(cell or "") for cell in cells], dtype=polars.Float64), list(numbers)
-
-
-def _text_error(path: Path, table: _Table, name: str, series: Any, row: int) -> RecordingError:
-    text = str(series[row]).strip()
-    advice = "correct it, or write nan where there is no value"
-    if _is_number(text.replace(",", ".")):
-        advice = "write decimals with a point"
-    elif name == "time":
-        advice = "times are numbers, in seconds"
-    shown = text if len(text) <= 40 else text[:39] + "…"
-    return RecordingError(
-        f'{path}: column `{name}` holds text at {table.line} {table.lines[row]}, "{shown}"; {advice}.'
-    )
 
 
 def _check_columns(columns: Mapping[str, Tensor], name: str) -> None:
@@ -572,22 +399,6 @@ def _check_columns(columns: Mapping[str, Tensor], name: str) -> None:
 def _missing(name: str, present: Iterable[str], recording: str) -> MissingColumnError:
     where = f"{recording}: " if recording else ""
     return MissingColumnError(
-        f"{where}there is no column `{name}`; there are {_listed(present)}. If it is there under another name, say so "
+        f"{where}there is no column `{name}`; there are {listed(present)}. If it is there under another name, say so "
         f'with `--columns {name}=...` (in Python `columns={{"{name}": "..."}}`).'
     )
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(f"`{name}`" for name in names)
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
-
-
-_READERS: dict[str, Callable[[Path], _Table]] = {
-    ".csv": _read_csv,
-    ".tsv": _read_csv,
-    ".txt": _read_csv,
-    ".parquet": _read_parquet,
-}
