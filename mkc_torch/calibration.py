@@ -36,6 +36,7 @@ MAX_REJECTED = 0.2
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 
+_LEAST = 1e-60
 _AXES = ("mag_x", "mag_y", "mag_z")
 
 
@@ -167,7 +168,7 @@ class Calibration:
         Example:
             >>> Calibration.from_json('{"schema": "mkc-model/1"}')
             Traceback (most recent call last):
-            mkc_torch.calibration_file.CalibrationFileError: this is no calibration: its schema is "mkc-model/1", not ...
+            mkc_torch.calibration_file.CalibrationFileError: this is no calibration: its schema is "mkc-model/1", ...
         """
         from mkc_torch.calibration_file import calibration_from_json
 
@@ -179,7 +180,7 @@ def prepared(recording: Recording) -> Recording:
 
     Raises:
         MissingColumnError: no ``mag_x``, ``mag_y`` or ``mag_z``.
-        RecordingError: fewer than nine samples are left.
+        RecordingError: fewer than nine samples are left, or values whose squares no number holds.
 
     Example:
         >>> angle = torch.linspace(0.0, 6.0, 30)
@@ -197,6 +198,13 @@ def prepared(recording: Recording) -> Recording:
         raise RecordingError(
             f"{where}{found} too few, an ellipsoid needs at least {MIN_POINTS}; record while turning the sensor "
             f"through all directions.{' ' + reasons if reasons else ''}"
+        )
+    largest = float(usable.magnetometer().abs().max())
+    if largest > 1.0 / _LEAST or 0.0 < largest < _LEAST:
+        where = f"{recording.name}: " if recording.name else ""
+        raise RecordingError(
+            f"{where}the largest value of {', '.join(_AXES)} is {largest:.3g}, which is no magnetic field in any unit; "
+            "check these columns."
         )
     return usable
 
@@ -235,7 +243,7 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
     radius = float(fit.radius_)
     strength = radius if field_strength is None else field_strength
     scale = strength / radius
-    matrix_se = fit.calibration_matrix_se_ if field_strength is None else strength * _root_se(fit, points)
+    matrix_se = fit.calibration_matrix_se_ if field_strength is None else strength * _root_se(fit)
     density = _density(fit)
     rejected = fit.weights_ < REJECTED_BELOW
     found = fit.coverage_
@@ -299,7 +307,7 @@ def _density(fit: EllipsoidFit) -> tuple[float, float, float]:
     return float(estimator.sigma_), factor * float(estimator.d_), factor * float(estimator.bound_)
 
 
-def _root_se(fit: EllipsoidFit, points: Tensor) -> Tensor:
+def _root_se(fit: EllipsoidFit) -> Tensor:
     """Standard errors (3, 3) of the root W of the shape matrix A₁, in the unit of the points: dW W + W dW = dA₁."""
     estimator = fit.estimator_
     assert isinstance(estimator, MKCRegression)
@@ -317,13 +325,15 @@ def _root_se(fit: EllipsoidFit, points: Tensor) -> Tensor:
 def _warnings(fit: EllipsoidFit, found: Coverage, rejected_share: float) -> list[str]:
     warnings = []
     if rejected_share > MAX_REJECTED:
+        per_cent = f"{100.0 * rejected_share:.0f} %"
         warnings.append(
-            f"{rejected_share:.0%} of the samples do not fit one ellipsoid: the sensor's offset may have changed during "
-            "the recording, or something magnetic was near for long. Record again away from it, or calibrate the parts "
-            "of the recording separately."
+            f"{per_cent} of the samples do not fit one ellipsoid: the sensor's offset may have changed "
+            "during the recording, or something magnetic was near for long. Record again away from it, or calibrate "
+            "the parts of the recording separately."
         )
-    for gap in found.gaps:
-        warnings.append(f"Directions not covered: {gap}. Turn the sensor so that the field points there too.")
+    if found.gaps:
+        missing = "; ".join(str(gap) for gap in found.gaps)
+        warnings.append(f"Directions not covered: {missing}. Turn the sensor so that the field points there too.")
     if not bool(torch.as_tensor(getattr(fit.estimator_, "converged_", True)).all()):
         warnings.append("The fit stopped before it came to rest; its last digits are uncertain.")
     return warnings

@@ -22,12 +22,12 @@ FIELD = 48.0  # µT
 DIP = math.radians(64.0)
 OFFSET = (12.0, -7.5, 21.0)  # µT
 RESPONSE = ((1.06, 0.03, -0.02), (0.03, 0.95, 0.015), (-0.02, 0.015, 1.01))  # gains and cross-axis, no unit
-NOISE = 0.25  # µT, white
+NOISE = 0.5  # µT, white
 RESOLUTION = 0.15  # µT a count
 PASSING = 40.0  # s, when the dipole is nearest
 MOMENT = (1.6, 1.6, -2.4)  # A·m², a large loudspeaker
 NEAREST = 0.17  # m
-SPEED = 0.18  # m/s
+SPEED = 0.24  # m/s
 MU0_OVER_4PI = 0.1  # µT·m³/(A·m²)
 
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.functional import KAPPA_MAX, energy, head_rule, integrate, log_partition, tail_density
+from mkc_torch.order_statistic import robust_scale
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -216,6 +217,11 @@ def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> De
     )
 
 
+def conclusive(before: DensityState, after: DensityState) -> Tensor:
+    """Whether a step says something about rest: it was taken, or no shorter one is worth trying. Shape (*, m)."""
+    return (after.damping <= before.damping) | (after.damping >= 1e3)
+
+
 @dataclass(frozen=True)
 class DensityFit:
     """A fitted MKC density: σ and d (*, m), the mean log-likelihood in nats per residual (*, m), and its domain."""
@@ -250,11 +256,6 @@ def domain_rule(
     high = error if used is None else torch.where(used, error, -torch.inf)
     low = error if used is None else torch.where(used, error, torch.inf)
     return torch.maximum(0.5 * (high.amax(-2) - low.amin(-2)), scales * scale)
-
-
-def robust_scale(error: Float[Tensor, "*batch N m"]) -> Float[Tensor, "*batch m"]:
-    """1.4826 times the median absolute residual of each channel."""
-    return 1.4826 * error.abs().median(-2).values
 
 
 def fit_density(
@@ -315,8 +316,10 @@ def fit_density(
     normalised = None
     if weight is not None:
         weight = weight.to(error).expand_as(error)
+        if not bool(torch.isfinite(weight).all()) or bool((weight < 0).any()) or bool((weight.sum(-2) <= 0).any()):
+            raise ValueError("Expected argument `weight` to be finite, >= 0 and positive somewhere in every channel.")
         normalised = weight / weight.sum(-2, keepdim=True)
-    scale = robust_scale(error)
+    scale = robust_scale(error, weight)
     tiny = torch.finfo(error.dtype).tiny ** 0.5
     scale = torch.where(scale > 0, scale, torch.sqrt(_mean(error.square(), normalised))).clamp(min=tiny)
     floor = parameter("d_min", d_min)
@@ -337,9 +340,9 @@ def fit_density(
         n_iter += 1
         before = state
         state = newton_step(error, normalised, state)
-        # a rejected step says nothing; two short ones in a row are rest
-        rest = (before.value - state.value <= tol) & ((state.damping <= before.damping) | (state.damping >= 1e3))
-        still = torch.where(rest, still + 1, 0)
+        rounding = 8 * torch.finfo(error.dtype).eps * state.value.abs().clamp(min=1.0)
+        improved = before.value - state.value > tol + rounding
+        still = torch.where(improved, 0, still + conclusive(before, state).to(still.dtype))
         if bool((still >= 2).all()):
             break
     return DensityFit(

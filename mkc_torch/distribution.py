@@ -108,7 +108,7 @@ class MKCDistribution(Distribution):
         if self._validate_args:
             self._validate_sample(value)
         error = value - self.loc
-        inside = error.abs() <= self.bound
+        inside = (value >= self.loc - self.bound) & (value <= self.loc + self.bound)
         log_density = -energy(torch.where(inside, error, 0.0) / self.d, self._kappa) - self.log_normalizer()
         return torch.where(inside, log_density, -torch.inf)
 
@@ -130,16 +130,18 @@ class MKCDistribution(Distribution):
         kappa, length = self._kappa, self._length
         value, kappa, length = torch.broadcast_tensors(value.to(kappa), kappa, length)
         u = _quantile(value, kappa, length)
-        if torch.is_grad_enabled() and any(t.requires_grad for t in (value, kappa, length)):
-            density = torch.exp(-energy(u, kappa.detach()) - log_partition(kappa.detach(), length.detach()))
-            u = u - (_cumulative(u, kappa, length) - value) / density
-        return self.loc + self.d * u
+        # implicit differentiation: 0 in value, minus the slope of the distribution function in the tangent
+        density = torch.exp(-energy(u, kappa.detach()) - log_partition(kappa.detach(), length.detach()))
+        residual = _cumulative(u, kappa, length) - value
+        u = u - (residual - residual.detach()) / density.clamp(min=torch.finfo(density.dtype).tiny)
+        quantile = self.loc + self.d * u
+        return torch.minimum(torch.maximum(quantile, self.loc - self.bound), self.loc + self.bound)
 
     def rsample(self, sample_shape: _Shape = torch.Size()) -> Tensor:  # noqa: B008
         """Samples, differentiable in sigma, d, bound and loc; drawn from torch's global generator."""
         shape = self._extended_shape(torch.Size(sample_shape))
         uniform = torch.rand(shape, dtype=self.d.dtype, device=self.d.device)
-        return self.icdf(uniform)
+        return self.icdf(uniform.clamp(min=torch.finfo(uniform.dtype).eps / 4))  # a draw of 0 would be an edge
 
     @property
     def mean(self) -> Tensor:

@@ -154,6 +154,7 @@ class EllipsoidFit:
                 are missing.
         """
         self._check(points)
+        points = points.contiguous()  # torch.median of an expanded tensor returns uninitialised memory
         origin = points.median(-2, keepdim=True).values
         size = torch.linalg.vector_norm(points - origin, dim=-1).median(-1).values[..., None, None]
         if bool((size <= 0).any()):
@@ -220,6 +221,8 @@ class EllipsoidFit:
     def _standard_errors(self, local: Ellipsoid, scale: Tensor) -> None:
         """First-order propagation from the coefficients; the calibration matrix W solves dW W + W dW = dA₁."""
         covariance = getattr(self.estimator_, "covariance_", None)
+        for name in ("center_se_", "semi_axes_se_", "calibration_matrix_se_"):
+            self.__dict__.pop(name, None)
         if covariance is None:
             return
 

@@ -77,9 +77,7 @@ class _Energy(torch.autograd.Function):
 
     @staticmethod
     def forward(z: Tensor, kappa: Tensor) -> Tensor:
-        q = 0.5 * z * z
-        x = kappa * q
-        return torch.where(x > 0, -torch.expm1(-x) / torch.where(kappa > 0, kappa, 1.0), q)
+        return _energy_value(z, kappa)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # noqa: ARG004
@@ -108,13 +106,28 @@ class _EnergyWithTangent(_Energy):
         return out
 
 
+def _energy_value(z: Tensor, kappa: Tensor) -> Tensor:
+    q = 0.5 * z * z
+    x = kappa * q
+    divisor = torch.where(kappa > 0, kappa, 1.0)
+    if not torch.compiler.is_compiling():
+        return torch.where(x > 0, -torch.expm1(-x) / divisor, q)
+    # compiled code computes expm1 as exp - 1 on some processors, which is 0 for small x
+    small = x < 0.5
+    near = torch.where(small, x, 0.0)
+    series = torch.zeros_like(x)
+    for j in range(14, -1, -1):  # sum_j (-x)^j / (j + 1)! in Horner form
+        series = 1.0 / math.factorial(j + 1) - near * series
+    return torch.where(small, q * series, (1.0 - torch.exp(-x)) / divisor)
+
+
 def _energy_dz(z: Tensor, kappa: Tensor) -> Tensor:
     return z * torch.exp(-0.5 * kappa * z * z)
 
 
 def _energy_dkappa(z: Tensor, kappa: Tensor) -> Tensor:
     """``-(1 - exp(-x) (1 + x)) / kappa^2`` with ``x = kappa z^2 / 2``, smooth at ``kappa = 0`` where it is -z^4/8."""
-    q = 0.5 * z * z
+    q = (0.5 * z * z).clamp(max=torch.finfo(z.dtype).max)  # finite, so that 0 times it is 0
     x = kappa * q
     small = x < 0.5
     series_x = torch.where(small, x, 0.0)
@@ -123,7 +136,7 @@ def _energy_dkappa(z: Tensor, kappa: Tensor) -> Tensor:
         series = 1.0 / (math.factorial(j) * (j + 2)) - series_x * series
     # capped, so that 0 times it stays 0 where kappa = 0 and the square overflows
     series_q = torch.where(small, q, 0.0).clamp(max=math.sqrt(torch.finfo(q.dtype).max))
-    direct_x = torch.where(small, 1.0, x)
+    direct_x = torch.where(small, 1.0, x).clamp(max=1e4)  # exp(-1e4) is 0 already
     direct = (1.0 - torch.exp(-direct_x) * (1.0 + direct_x)) / torch.where(small, 1.0, kappa).square()
     return -torch.where(small, series_q * series_q * series, direct)
 
@@ -305,4 +318,5 @@ def mkc_nll(
         >>> mkc_nll(torch.tensor([0.0, 1.0]), sigma=math.inf, d=1.0, bound=100.0)
         tensor([0.9189, 1.4189])
     """
+    error, sigma, d, bound = as_computed(error, sigma, d, bound)
     return mkc_energy(error, sigma, d) + log_normalizer(sigma, d, bound)

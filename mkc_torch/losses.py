@@ -107,11 +107,6 @@ class MKCLoss(nn.Module):
             raise ValueError(f"Expected argument `bound` to exceed `d` but got {half_width.tolist()} and {d.tolist()}.")
         if learn_d and not bool((floor < d).all()):
             raise ValueError(f"Expected argument `d_min` below `d` but got {floor.tolist()} and {d.tolist()}.")
-        if learn_sigma and bool((kappa == 0).any()):
-            raise ValueError(
-                "Expected a finite `sigma` with `learn_sigma=True` but got inf, where its gradient is 0; "
-                "start large, at 10 say, or pass `learn_sigma=False`."
-            )
         self.register_buffer("bound", half_width)
         self.register_buffer("d_min", floor)
         self.register_buffer("fixed_kappa", None if learn_sigma else kappa)
@@ -141,6 +136,9 @@ class MKCLoss(nn.Module):
         finite = self._per_channel("sigma", torch.where(torch.isinf(t), 1.0, t), low=0.0)
         return torch.where(torch.isinf(t).expand_as(finite), torch.inf, finite)
 
+    def _own_dtype(self, value: float | Tensor) -> Tensor:
+        return value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=self.bound.dtype)
+
     @property
     def kappa(self) -> Float[Tensor, " m"]:
         """``1 / sigma²`` in [0, 400]."""
@@ -152,6 +150,11 @@ class MKCLoss(nn.Module):
     @torch.no_grad()
     def _set_kappa(self, kappa: Tensor) -> None:
         if self.raw_kappa is not None:
+            if bool((kappa == 0).any()):
+                raise ValueError(
+                    "Expected a finite `sigma` with `learn_sigma=True` but got inf, where its gradient is 0; "
+                    "start large, at 10 say, or pass `learn_sigma=False`."
+                )
             self.raw_kappa.copy_(torch.logit(kappa.double() / KAPPA_MAX))
         elif self.fixed_kappa is not None:
             self.fixed_kappa.copy_(kappa)
@@ -163,7 +166,7 @@ class MKCLoss(nn.Module):
 
     @sigma.setter
     def sigma(self, value: float | Tensor) -> None:
-        self._set_kappa(inverse_square(self._sigma_in_range(value)))
+        self._set_kappa(inverse_square(self._sigma_in_range(self._own_dtype(value))))
 
     @property
     def d(self) -> Float[Tensor, " m"]:
@@ -175,7 +178,7 @@ class MKCLoss(nn.Module):
 
     @d.setter
     def d(self, value: float | Tensor) -> None:
-        d = self._per_channel("d", value, low=0.0).to(self.bound)
+        d = self._per_channel("d", self._own_dtype(value), low=0.0).to(self.bound)
         if self.raw_d is not None and not bool(((d > self.d_min) & (d < self.bound)).all()):
             raise ValueError(
                 f"Expected `d` between `d_min` {self.d_min.tolist()} and `bound` {self.bound.tolist()} but got {value}."

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from mkc_torch.linear._problem import LinearProblem
 from mkc_torch.linear._scale_search import minimise_scale
-from mkc_torch.linear.least_trimmed_squares import QuantileScale, TrimmedScale, default_coverage, order_statistic
+from mkc_torch.linear.least_trimmed_squares import QuantileScale, TrimmedScale, default_coverage
 from mkc_torch.linear.s_regression import minimise_m_scale
+from mkc_torch.order_statistic import order_statistic
 
 if TYPE_CHECKING:
     from jaxtyping import Float

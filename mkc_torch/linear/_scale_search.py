@@ -84,7 +84,9 @@ def _step(problem: LinearProblem, beta: Tensor, rule: ScaleRule) -> tuple[Tensor
     scale = rule.scale(problem, residual)
     weight = rule.weight(problem, residual, scale)
     objective = _log_product(scale)
-    return problem.weighted_fit(weight * relative_precision(scale).unsqueeze(-2)), objective
+    share = weight if problem.sample_weight is None else weight * problem.sample_weight.unsqueeze(1)
+    spread = (share * residual.square()).sum(-2).sqrt()  # the gradient of log(scale) has its square below
+    return problem.weighted_fit(weight * relative_precision(spread).unsqueeze(-2)), objective
 
 
 def _best(problem: LinearProblem, beta: Tensor, rule: ScaleRule, count: int) -> Tensor:

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.density_fit import DensityState, domain_rule, initial_state, negative_log_likelihood, newton_step
+from mkc_torch.density_fit import (
+    DensityState,
+    conclusive,
+    domain_rule,
+    initial_state,
+    negative_log_likelihood,
+    newton_step,
+)
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._mkc import coefficient_covariance, fixed_point_step, kernel_weight
 from mkc_torch.linear._problem import LinearProblem, linear_problem
@@ -40,7 +47,6 @@ def _normalised_weight(problem: LinearProblem) -> Tensor | None:
 
 def _alternate(problem: LinearProblem, beta: Tensor, state: DensityState, *, max_iter: int, tol: float) -> _Maximum:
     """E-steps and M-steps in turn; problems that have come to rest leave the batch."""
-    tol = max(tol, 8 * torch.finfo(beta.dtype).eps)
     size = beta.shape[0]
     index = torch.arange(size, device=beta.device)
     out_beta, out_state = beta.clone(), state
@@ -51,13 +57,16 @@ def _alternate(problem: LinearProblem, beta: Tensor, state: DensityState, *, max
     quiet = torch.zeros(size, dtype=torch.int64, device=beta.device)
     for _ in range(max_iter):
         residual = problem.residual(beta)
-        state = newton_step(residual, weight, state)
+        before = state
+        state = newton_step(residual, weight, before)
         kappa, d = state.kappa, torch.exp(state.log_d)
         for _ in range(2):
             beta = fixed_point_step(problem, residual, kappa, d)
             residual = problem.residual(beta)
         now = state.value.sum(-1)
-        quiet = torch.where(history[-1][index] - now <= tol * now.abs().clamp(min=1.0), quiet + 1, 0)
+        rounding = 8 * torch.finfo(beta.dtype).eps * now.abs()
+        improved = history[-1][index] - now > tol + rounding
+        quiet = torch.where(improved, 0, quiet + conclusive(before, state).all(-1).to(quiet.dtype))
         current = history[-1].clone()
         current[index] = now
         history.append(current)

@@ -9,13 +9,16 @@ import torch
 from torch import Tensor
 
 from mkc_torch.linear._estimator import LinearEstimator
-from mkc_torch.linear._mkc import coefficient_covariance, fixed_point_step, mean_energy
+from mkc_torch.linear._mkc import coefficient_covariance, fixed_point_step, kernel_weight, mean_energy
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import Start, robust_start
 from mkc_torch.linear.covariance import CovarianceKind, checked_kind
 
 if TYPE_CHECKING:
     from jaxtyping import Float
+
+
+_GRADUATION = 10
 
 
 def channel_parameter(name: str, value: float | Tensor, problem: LinearProblem, *, infinite: bool = False) -> Tensor:
@@ -27,7 +30,12 @@ def channel_parameter(name: str, value: float | Tensor, problem: LinearProblem, 
     if not bool(((t > 0) & (torch.isfinite(t) | infinite)).all()):
         kind = "positive" if infinite else "positive and finite"
         raise ValueError(f"Expected argument `{name}` to be {kind} but got {value}.")
-    return t.expand(*problem.batch, m).reshape(-1, m)
+    try:
+        return t.expand(*problem.batch, m).reshape(-1, m)
+    except RuntimeError:
+        raise ValueError(
+            f"Expected argument `{name}` of shape (m,) or (*, m) = {(*problem.batch, m)} but got {tuple(t.shape)}."
+        ) from None
 
 
 def whitened(X: Tensor, Y: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
@@ -51,9 +59,9 @@ def whitened(X: Tensor, Y: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
 
 def descend(
     problem: LinearProblem,
-    beta: Float[Tensor, "B S n"],
-    kappa: Float[Tensor, "B S m"],
-    d: Float[Tensor, "B S m"],
+    beta: Float[Tensor, "B n"],
+    kappa: Float[Tensor, "B m"],
+    d: Float[Tensor, "B m"],
     *,
     max_iter: int,
     tol: float,
@@ -78,16 +86,15 @@ def descend(
 class FixedPointLinear(LinearEstimator):
     """Linear regression under the MKC loss (13) with given σ and d by the fixed point (15): Algorithm 1 of the paper.
 
-    The loss has many local minima when ``h = σ d`` is small. The fit starts from robust coefficients and from least
-    squares, is led from a large h to the given one, and keeps the end of lower loss.
+    The loss has many local minima when ``h = σ d`` is small, and leverage points can make the lowest a wrong one. The
+    fit starts from robust coefficients and is led from a bandwidth of three robust scales to the given one.
 
     Args:
         sigma: bandwidth of each channel, a number, (m,) or (*, m); ``inf`` is weighted least squares exactly.
         d: scale of each channel, in the unit of Y.
         noise_covariance: covariance (m, m) of the channels' noise where it is not diagonal; X and Y are whitened by it
             and σ and d refer to the whitened channels.
-        start: "lts" (robust, and least squares beside it), "s" (the same from S-regression), "least_squares" alone
-            without being led, as in the paper, or a tensor of coefficients.
+        start: "lts", "s", "least_squares" (as in the paper, not led), or a tensor of coefficients (*, n).
         max_iter: steps at most.
         tol: converged when a step lowers the loss by a smaller share of it.
         covariance: "sandwich" for independent samples, "hac" for a time series.
@@ -154,37 +161,26 @@ class FixedPointLinear(LinearEstimator):
         problem = linear_problem(X, Y, sample_weight)
         kappa = channel_parameter("sigma", self.sigma, problem, infinite=True).pow(-2)
         d = channel_parameter("d", self.d, problem)
-        beta, graduated = self._starts(problem, kappa, d)
-        stack = beta.shape[1]
-        kappa_s, d_s = kappa.unsqueeze(1).expand(-1, stack, -1), d.unsqueeze(1).expand(-1, stack, -1)
-        for wide in graduated:
-            beta = fixed_point_step(problem, problem.residual(beta), kappa_s * wide, d_s)
-        beta, converged, history = descend(problem, beta, kappa_s, d_s, max_iter=self.max_iter, tol=self.tol)
-        best = history[-1].argmin(1)
-        at = torch.arange(best.shape[0], device=best.device)
-        beta = beta[at, best]
-        self._set_common(
-            problem, beta, torch.exp(-0.5 * kappa.unsqueeze(-2) * (problem.residual(beta) / d.unsqueeze(-2)) ** 2)
-        )
-        self.history_ = torch.stack([problem.restore(h[at, best]) for h in history])
+        beta = self._start(problem, kappa, d)
+        beta, converged, history = descend(problem, beta, kappa, d, max_iter=self.max_iter, tol=self.tol)
+        self._set_common(problem, beta, kernel_weight(problem.residual(beta), kappa, d))
+        self.history_ = torch.stack([problem.restore(h) for h in history])
         self.n_iter_ = len(history) - 1
-        self.converged_ = problem.restore(converged[at, best])
+        self.converged_ = problem.restore(converged)
         self.covariance_ = coefficient_covariance(problem, beta, kappa, d, self.covariance, self.bandwidth)
         return self
 
-    def _starts(self, problem: LinearProblem, kappa: Tensor, d: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """A stack of starts, and for each step of the graduation the factors (B, S, 1) on κ."""
-        least_squares = fixed_point_step(problem, problem.Y, torch.zeros_like(kappa), d)
-        if isinstance(self.start, Tensor):
-            return problem.in_basis(self.start.to(problem.Y)).unsqueeze(1), []
-        if self.start == "least_squares" or bool((kappa == 0).all()):
-            return least_squares.unsqueeze(1), []
+    def _start(self, problem: LinearProblem, kappa: Tensor, d: Tensor) -> Float[Tensor, "B n"]:
+        """Coefficients to descend from: given, least squares, or robust ones led from a bandwidth in view of them."""
+        if not isinstance(self.start, Tensor) and (self.start == "least_squares" or bool((kappa == 0).all())):
+            return fixed_point_step(problem, problem.Y, torch.zeros_like(kappa), d)
         robust = robust_start(problem, self.start, seed=self.seed)
-        residual = problem.residual(least_squares)
-        spread = torch.sqrt(mean_energy(problem, residual, torch.zeros_like(kappa), d) * 2.0 / problem.num_channels)
-        h = kappa.clamp(min=torch.finfo(kappa.dtype).tiny).rsqrt()
-        # bandwidths at which the start's own residuals are in view, brought down to the given one
-        view = torch.stack([(3.0 * robust.scale / d / h).amax(-1), (3.0 * spread.unsqueeze(-1) / h).amax(-1)], 1)
-        steps = 10
-        factors = [view.clamp(min=1.0).pow(-2.0 * (1.0 - i / steps)).unsqueeze(-1) for i in range(steps)]
-        return torch.stack([robust.beta, least_squares], 1), factors
+        if isinstance(self.start, Tensor):
+            return robust.beta
+        # three robust scales, in units of the given h = σ d of the channel that is seen worst
+        view = (3.0 * robust.scale / d * kappa.sqrt()).amax(-1, keepdim=True).clamp(min=1.0)
+        beta = robust.beta
+        for step in range(_GRADUATION):
+            wider = view.pow(1.0 - step / _GRADUATION)
+            beta = fixed_point_step(problem, problem.residual(beta), kappa / wider.square(), d)
+        return beta

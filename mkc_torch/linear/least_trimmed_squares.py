@@ -12,23 +12,15 @@ from torch import Tensor
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._scale_search import minimise_scale
+from mkc_torch.order_statistic import order_statistic
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-def order_statistic(
-    values: Float[Tensor, "B *S N m"], weight: Float[Tensor, "B N m"] | None, h: float
-) -> Float[Tensor, "B *S m"]:
-    """The h-th smallest value of each channel; with weights, the value at which their cumulated share reaches h/N."""
-    if weight is None:
-        return values.kthvalue(int(h), dim=-2).values
-    weight = weight if values.dim() == 3 else weight.unsqueeze(1)
-    ordered, index = values.sort(dim=-2)
-    cumulated = weight.expand_as(values).gather(-2, index).cumsum(-2)
-    share = h / values.shape[-2] * cumulated[..., -1:, :]
-    position = (cumulated < share * (1 - 1e-12)).sum(-2, keepdim=True)
-    return ordered.gather(-2, position).squeeze(-2)
+def stacked(weight: Tensor | None) -> Tensor | None:
+    """Sample weights (B, N, m) beside a stack of candidates, (B, 1, N, m)."""
+    return None if weight is None else weight.unsqueeze(1)
 
 
 def default_coverage(problem: LinearProblem) -> int:
@@ -51,7 +43,7 @@ class TrimmedScale:
         weight = problem.sample_weight
         if weight is None:
             return torch.sqrt(square.topk(h, dim=-2, largest=False, sorted=False).values.mean(-2))
-        threshold = order_statistic(square, weight, h)
+        threshold = order_statistic(square, stacked(weight), h)
         w = torch.where(square <= threshold.unsqueeze(-2), weight.unsqueeze(1), 0.0)
         total = h / problem.num_samples * problem.total_weight().unsqueeze(1)
         # ties beyond h enter once
@@ -60,7 +52,7 @@ class TrimmedScale:
 
     def weight(self, problem: LinearProblem, residual: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:  # noqa: ARG002
         size = residual.abs()
-        threshold = order_statistic(size, problem.sample_weight, self._count(problem))
+        threshold = order_statistic(size, stacked(problem.sample_weight), self._count(problem))
         return (size <= threshold.unsqueeze(-2)).to(size.dtype)
 
 
@@ -72,7 +64,7 @@ class QuantileScale:
 
     def scale(self, problem: LinearProblem, residual: Tensor) -> Float[Tensor, "B S m"]:
         h = max(1, round(self.fraction * problem.num_samples))
-        return order_statistic(residual.abs(), problem.sample_weight, h)
+        return order_statistic(residual.abs(), stacked(problem.sample_weight), h)
 
     def weight(self, problem: LinearProblem, residual: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:  # noqa: ARG002
         return (residual.abs() <= scale.unsqueeze(-2)).to(residual.dtype)

@@ -11,7 +11,8 @@ from torch import Tensor
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._scale_search import ScaleMinimum, minimise_scale
-from mkc_torch.linear.least_trimmed_squares import default_coverage, order_statistic
+from mkc_torch.linear.least_trimmed_squares import default_coverage
+from mkc_torch.order_statistic import order_statistic
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -43,7 +44,7 @@ class MScale:
         p = problem.coefficients_per_channel
         half = 0.5 * (problem.total_weight().unsqueeze(1) - p).clamp(min=1.0)
         # quantile rather than median, so that a fit through p values does not start at 0
-        scale = 1.4826 * order_statistic(residual.abs(), weight, default_coverage(problem))
+        scale = 1.4826 * order_statistic(residual.abs(), w, default_coverage(problem))
         tiny = torch.finfo(residual.dtype).tiny
         for _ in range(self.steps):
             u = residual / (self.c * scale.clamp(min=tiny)).unsqueeze(-2)

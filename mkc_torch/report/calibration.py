@@ -9,7 +9,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
-from mkc_torch.calibration import Calibration, NotCalibratedError, Vector, prepared
+from mkc_torch.calibration import MAX_REJECTED, Calibration, NotCalibratedError, Vector, prepared
 from mkc_torch.coverage import nearest_axis
 from mkc_torch.recording import Recording
 from mkc_torch.report import pictures, wording
@@ -53,6 +53,7 @@ def calibration_report(
     return _render(
         "calibration.html.j2",
         c=calibration,
+        doubtful=calibration.rejected_share > MAX_REJECTED or bool(calibration.coverage.gaps),
         note=note,
         comparison=comparison,
         figures={

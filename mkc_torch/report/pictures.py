@@ -21,6 +21,7 @@ from mkc_torch.functional import mkc_nll
 BLUE, ORANGE, INK, GREY, PALE = "#0072B2", "#D55E00", "#222222", "#8A8A8A", "#D7DEE4"
 _SHADE = "#F3D9C6"
 _MOST_POINTS = 20_000
+_BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.9}
 _STYLE = {
     "font.family": "sans-serif",
     "font.size": 10.0,
@@ -36,6 +37,8 @@ _STYLE = {
     "ytick.color": GREY,
     "xtick.labelcolor": INK,
     "ytick.labelcolor": INK,
+    "hatch.color": "#D9B79D",
+    "hatch.linewidth": 0.7,
     "legend.frameon": False,
     "svg.fonttype": "none",
     "svg.hashsalt": "mkc",
@@ -151,7 +154,7 @@ def coverage_map(found: Coverage, directions: Tensor) -> str:
         palette = matplotlib.colors.ListedColormap(["#F6E3D5", "#CFE3F0"])
         ax.pcolormesh(lon, lat, covered, cmap=palette, vmin=0, vmax=1, shading="gouraud", rasterized=True)
         if not covered.all():
-            ax.contourf(lon, lat, covered, levels=[-0.5, 0.5], colors="none", hatches=["////"])
+            ax.contourf(lon, lat, covered, levels=[-0.5, 0.5], colors="none", hatches=["///"])
         unit = torch.nn.functional.normalize(_thinned(directions), dim=-1).numpy()
         ax.plot(*_lon_lat(unit), ".", ms=1.3, color=BLUE, alpha=0.6, rasterized=True)
         for name, vector in (
@@ -166,7 +169,8 @@ def coverage_map(found: Coverage, directions: Tensor) -> str:
             ax.annotate(
                 f"gap {nearest_axis(gap.direction).replace('-', '−')}, {gap.degrees:.0f}°",
                 (float(lon_gap[0]), float(lat_gap[0])),
-                xytext=(0, -16), textcoords="offset points", ha="center", color="#9A4300", weight="bold",
+                xytext=(0, -9), textcoords="offset points", ha="center", va="top",
+                color="#9A4300", weight="bold", bbox=_BOX,
             )  # fmt: skip
         ax.set_xticks([])
         ax.set_yticks([])
@@ -204,7 +208,8 @@ def _square(ax: Any, x: np.ndarray, y: np.ndarray, *, include_origin: bool) -> N
 
 
 def _legend_above(ax: Any) -> None:
-    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, markerscale=4, borderaxespad=0.1, handletextpad=0.1)
+    place = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
+    ax.legend(ncols=2, markerscale=4, handletextpad=0.1, **place)
 
 
 def _thinned(points: Tensor) -> Tensor:
@@ -225,15 +230,14 @@ def _covered(lon: np.ndarray, lat: np.ndarray, directions: Tensor) -> np.ndarray
 
 
 def _label(ax: Any, lon: np.ndarray, lat: np.ndarray, text: str) -> None:
-    box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.9}
-    ax.text(float(lon[0]), float(lat[0]), text, ha="center", va="center", fontsize=10, weight="bold", bbox=box)
+    ax.text(float(lon[0]), float(lat[0]), text, ha="center", va="center", fontsize=10, weight="bold", bbox=_BOX)
 
 
 def _svg(figure: Figure, name: str, description: str) -> str:
     """The figure as an SVG element; its ids get a prefix, so that several can stand on one page."""
     FigureCanvasSVG(figure)
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", dpi=200, metadata={"Date": None, "Creator": None})
+    figure.savefig(buffer, format="svg", dpi=150, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r'(?<= )id="', f'id="{name}-', text)

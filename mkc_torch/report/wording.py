@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from mkc_torch.calibration import Calibration, Spread
+from mkc_torch.calibration import Calibration, Matrix, Spread
 from mkc_torch.disturbance import Interval
 
 _MOST_DECIMALS = 6
@@ -34,17 +34,27 @@ def number(value: float, places: int) -> str:
     return text.replace("-", "−") if float(text) != 0 else text.lstrip("-")
 
 
-def with_error(value: float, error: float) -> str:
-    """A value with its standard error, to the digits that the error leaves.
+def with_errors(values: Sequence[float], errors: Sequence[float]) -> list[str]:
+    """Values with their standard errors, all to the digits that the largest error leaves.
 
     Example:
-        >>> with_error(-0.89431, 0.085), with_error(1.5, math.nan)
-        ('−0.894 ± 0.085', '1.500')
+        >>> with_errors((-0.89431, 44.2), (0.085, 0.0925)), with_errors((1.5,), (math.nan,))
+        (['−0.894 ± 0.085', '44.200 ± 0.092'], ['1.500'])
     """
-    places = decimals(error)
-    if not math.isfinite(error):
-        return number(value, places)
-    return f"{number(value, places)} ± {error:.{places}f}"
+    return _with_places(values, errors, decimals(max(errors)))
+
+
+def matrix_with_errors(matrix: Matrix, errors: Matrix) -> list[list[str]]:
+    """Rows of a matrix with their standard errors, all to the same digits."""
+    places = decimals(max(e for row in errors for e in row))
+    return [_with_places(row, error, places) for row, error in zip(matrix, errors, strict=True)]
+
+
+def _with_places(values: Sequence[float], errors: Sequence[float], places: int) -> list[str]:
+    return [
+        f"{number(v, places)} ± {e:.{places}f}" if math.isfinite(e) else number(v, places)
+        for v, e in zip(values, errors, strict=True)
+    ]
 
 
 def size(value: float) -> str:
@@ -67,19 +77,21 @@ def listed(values: Sequence[float], errors: Sequence[float]) -> str:
         >>> listed((1.234, -2.0, 0.5), (0.1, 0.1, 0.1))
         '1.23, −2.00, 0.50'
     """
-    return ", ".join(number(v, decimals(e)) for v, e in zip(values, errors, strict=True))
+    return ", ".join(number(v, decimals(max(errors))) for v in values)
 
 
 def share(value: float) -> str:
-    """A share in per cent.
+    """A share in per cent; only what is nothing or everything is called so.
 
     Example:
-        >>> share(0.0474), share(0.0), share(0.0004), share(0.45)
-        ('4.7 %', '0 %', '< 0.1 %', '45 %')
+        >>> share(0.0474), share(0.0), share(0.0004), share(0.45), share(0.9985), share(0.9999)
+        ('4.7 %', '0 %', '< 0.1 %', '45 %', '99.9 %', '> 99.9 %')
     """
     if 0 < value < 0.001:
         return "< 0.1 %"
-    return f"{100 * value:.{0 if value == 0 or value >= 0.0995 else 1}f} %"
+    if 0.999 < value < 1:
+        return "> 99.9 %"
+    return f"{100 * value:.{1 if 0 < value < 0.0995 or 0.99 < value < 1 else 0}f} %"
 
 
 def change(before: Spread, after: Spread, unit: str) -> str:
@@ -96,25 +108,22 @@ def when(intervals: Sequence[Interval]) -> str:
     """Intervals of time as one phrase; empty where there are none.
 
     Example:
-        >>> when([Interval(12.13, 15.3)])
-        'between 12.1 s and 15.3 s'
+        >>> when([Interval(12.13, 15.3)]), when([Interval(0, 1), Interval(5, 5.5)])
+        ('between 12.1 s and 15.3 s', 'from 0.0 to 1.0 s and from 5.0 to 5.5 s')
         >>> when([Interval(0, 1), Interval(5, 5.5), Interval(9, 9.5), Interval(20, 24)])
-        'in 4 intervals, the longest from 20.0 s to 24.0 s'
+        'in 4 intervals, the longest from 20.0 to 24.0 s'
     """
-    if not intervals:
-        return ""
-    if len(intervals) <= 3:
-        each = [f"between {i.start:.1f} s and {i.end:.1f} s" for i in intervals]
-        return ", ".join(each[:-1]) + (" and " if len(each) > 1 else "") + each[-1]
-    longest = max(intervals, key=lambda i: i.end - i.start)
-    return f"in {len(intervals)} intervals, the longest from {longest.start:.1f} s to {longest.end:.1f} s"
+    if len(intervals) == 1:
+        return f"between {intervals[0].start:.1f} s and {intervals[0].end:.1f} s"
+    each = [f"from {i.start:.1f} to {i.end:.1f} s" for i in intervals]
+    if len(intervals) > 3:
+        longest = max(range(len(each)), key=lambda k: intervals[k].end - intervals[k].start)
+        return f"in {len(each)} intervals, the longest {each[longest]}"
+    return " and ".join(filter(None, [", ".join(each[:-1]), *each[-1:]]))
 
 
 def rejection(calibration: Calibration) -> str:
-    """What was rejected, and when, as a sentence.
-
-    The samples that stand in no interval are few, or scattered; "most" or "many" says so.
-    """
+    """What was rejected, and when, as a sentence."""
     c = calibration
     if c.rejected == 0:
         return f"None of the {c.samples:,} samples was rejected."
@@ -136,9 +145,9 @@ def headline(calibration: Calibration) -> list[str]:
 def python_code(calibration: Calibration) -> str:
     """Lines that correct measurements, for pasting into a program with numpy."""
     c = calibration
-    rows = ",\n".join(f"    [{', '.join(f'{v:.9g}' for v in row)}]" for row in c.matrix)
+    rows = ",\n".join(f"    [{', '.join(f'{v:.8g}' for v in row)}]" for row in c.matrix)
     return (
-        f"import numpy as np\n\noffset = np.array([{', '.join(f'{v:.9g}' for v in c.center)}])  # {c.unit}\n"
+        f"import numpy as np\n\noffset = np.array([{', '.join(f'{v:.8g}' for v in c.center)}])  # {c.unit}\n"
         f"matrix = np.array([\n{rows},\n])\n\n"
         f"field = (measured - offset) @ matrix.T  # {c.field_unit}, |field| = {size(c.field_strength)}"
     )
@@ -159,5 +168,5 @@ def c_code(calibration: Calibration) -> str:
 
 
 def _c_number(value: float) -> str:
-    text = f"{value:.9g}"
+    text = f"{value:.8g}"
     return text + ("f" if "." in text or "e" in text else ".0f")

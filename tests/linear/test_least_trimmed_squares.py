@@ -1,0 +1,336 @@
+"""Least trimmed squares: the published and the exhaustive optimum, breakdown, equivariance."""
+
+import itertools
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import norm
+from torch import Tensor
+
+from mkc_torch.linear import LeastSquares, LeastTrimmedSquares, RankDeficientError
+from mkc_torch.linear._problem import linear_problem
+from mkc_torch.linear.least_trimmed_squares import TrimmedScale, gaussian_consistency, order_statistic
+from tests.literature import DATA_SETS, REFERENCE
+
+
+def sample(seed: int, *shape: int) -> Tensor:
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def lstsq(X: Tensor, y: Tensor) -> Tensor:
+    return torch.linalg.lstsq(X, y.unsqueeze(-1), driver="gelsd").solution.squeeze(-1)
+
+
+def contaminated_line(seed: int, N: int = 40, n: int = 3, share: float = 0.3) -> tuple[Tensor, Tensor]:
+    """X with an intercept column and y = X 1 + noise, the first rows far off."""
+    X = torch.cat([torch.ones(N, 1).double(), sample(seed, N, n - 1)], 1)
+    y = X.sum(-1) + 0.1 * sample(seed + 1, N)
+    y[: int(share * N)] += 10.0 + sample(seed + 2, int(share * N))
+    return X, y
+
+
+def clustered(seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """300 samples of 6 regressors, 45 % of them in one cluster 8 deviations away in every regressor, y near 40."""
+    X, truth = sample(seed, 300, 6), sample(seed + 1, 6)
+    y = X @ truth + 0.1 * sample(seed + 2, 300)
+    bad = 135
+    X[:bad] = 8.0 + 0.3 * sample(seed + 3, bad, 6)
+    y[:bad] = 40.0 + 0.3 * sample(seed + 4, bad)
+    return X, y, truth
+
+
+def exhaustive(X: Tensor, y: Tensor, h: int) -> tuple[float, Tensor]:
+    subsets = torch.tensor(list(itertools.combinations(range(len(y)), h)))
+    coef = lstsq(X[subsets], y[subsets])
+    sums = (y[subsets] - (X[subsets] @ coef.unsqueeze(-1)).squeeze(-1)).square().sum(-1)
+    best = int(sums.argmin())
+    return float(sums[best]), coef[best]
+
+
+# published and exhaustive optima
+
+
+@pytest.mark.parametrize("name", [n for n in REFERENCE if REFERENCE[n].lts is not None])
+def test_the_published_optimum_is_found(name):
+    X, y = DATA_SETS[name]()
+    reference = REFERENCE[name].lts
+    fit = LeastTrimmedSquares().fit(X, y)
+    assert float(fit.objective_) == pytest.approx(reference.objective, rel=1e-6)
+    torch.testing.assert_close(fit.coef_, torch.tensor(reference.coef, dtype=torch.float64), rtol=1e-5, atol=0)
+    assert int(fit.weights_.sum()) == reference.h
+    assert bool(fit.converged_)
+
+
+@pytest.mark.parametrize("name", [n for n in REFERENCE if REFERENCE[n].lts is not None])
+def test_rows_rejected_at_two_and_a_half_scales_include_the_published_ones(name):
+    X, y = DATA_SETS[name]()
+    fit = LeastTrimmedSquares().fit(X, y)
+    far = (y - fit.predict(X)).abs() / fit.scale_ > 2.5
+    assert {r - 1 for r in REFERENCE[name].lts.rejected} <= set(far.nonzero().flatten().tolist())
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize(("N", "n", "h"), [(9, 2, 6), (10, 3, 7), (8, 1, 5), (11, 2, 8), (12, 3, 12)])
+def test_the_optimum_is_that_of_all_subsets(seed, N, n, h):
+    X, y = sample(seed, N, n), sample(seed + 100, N) * torch.exp(sample(seed + 200, N))
+    objective, coef = exhaustive(X, y, h)
+    fit = LeastTrimmedSquares(h=h).fit(X, y)
+    assert float(fit.objective_) == pytest.approx(objective, rel=1e-9)
+    torch.testing.assert_close(fit.coef_, coef, rtol=1e-6, atol=1e-8)
+
+
+def test_coverage_of_all_samples_is_least_squares():
+    X, y = contaminated_line(0)
+    torch.testing.assert_close(LeastTrimmedSquares(h=40).fit(X, y).coef_, LeastSquares().fit(X, y).coef_)
+
+
+def test_objective_scale_and_weights_belong_to_the_coefficients():
+    X, y = contaminated_line(3)
+    fit = LeastTrimmedSquares(h=25).fit(X, y)
+    square = (y - X @ fit.coef_).square()
+    kept = square.sort().values[:25]
+    assert float(fit.objective_) == pytest.approx(float(kept.sum()), rel=1e-10)
+    torch.testing.assert_close(fit.weights_, (square <= kept[-1]).double())
+    q = norm.ppf(0.5 * (1 + 25 / 40))
+    factor = (1 - 2 * q * norm.pdf(q) / (25 / 40)) ** -0.5
+    assert float(fit.scale_) == pytest.approx(factor * math.sqrt(float(kept.mean())), rel=1e-10)
+
+
+def test_scale_of_gaussian_residuals_is_their_standard_deviation():
+    fit = LeastTrimmedSquares(starts=20).fit(torch.ones(1, 20_000, 1).double(), 3.0 * sample(0, 1, 20_000))
+    assert float(fit.scale_) == pytest.approx(3.0, rel=0.02)
+    assert gaussian_consistency(1.0) == 1.0
+
+
+# order statistics and the trimmed objective
+
+
+def test_order_statistic_counts_ties():
+    values = torch.tensor([3.0, 1.0, 2.0, 2.0, 2.0, 5.0], dtype=torch.float64).reshape(1, 6, 1)
+    assert [float(order_statistic(values, None, h)) for h in range(1, 7)] == [1, 2, 2, 2, 3, 5]
+    ones = torch.ones_like(values)
+    assert [float(order_statistic(values, ones, h)) for h in range(1, 7)] == [1, 2, 2, 2, 3, 5]
+
+
+@settings(derandomize=True, deadline=None, max_examples=20)
+@given(
+    values=st.lists(st.tuples(st.integers(0, 4), st.integers(1, 3)), min_size=3, max_size=8),
+    share=st.floats(0.05, 1.0),
+)
+def test_weighted_order_statistic_is_that_of_repeated_values(values, share):
+    value = torch.tensor([float(v) for v, _ in values], dtype=torch.float64)
+    count = torch.tensor([c for _, c in values])
+    repeated = value.repeat_interleave(count).sort().values
+    h = share * len(values)
+    position = math.ceil(h / len(values) * int(count.sum()) - 1e-9)
+    got = order_statistic(value.reshape(1, -1, 1), count.double().reshape(1, -1, 1), h)
+    assert float(got) == float(repeated[position - 1])
+
+
+@settings(derandomize=True, deadline=None, max_examples=20)
+@given(values=st.lists(st.tuples(st.integers(-3, 3), st.integers(1, 3)), min_size=4, max_size=9), h=st.integers(2, 4))
+def test_trimmed_scale_with_ties_is_that_of_repeated_values(values, h):
+    residual = torch.tensor([float(v) for v, _ in values], dtype=torch.float64)
+    count = torch.tensor([c for _, c in values])
+    N = len(values)
+    problem = linear_problem(torch.ones(N, 1).double(), residual, count.double())
+    got = TrimmedScale(h / N).scale(problem, residual.reshape(1, 1, N, 1))
+    # h / N of the total weight, the last value in part
+    square = residual.repeat_interleave(count).square().sort().values
+    total = h / N * len(square)
+    whole = int(total + 1e-9)
+    expected = float(square[:whole].sum()) + (total - whole) * (float(square[whole]) if whole < len(square) else 0.0)
+    assert float(got) ** 2 == pytest.approx(expected / total, abs=1e-12)
+
+
+def test_weight_is_repetition():
+    X, y = contaminated_line(0)
+    weight = 1.0 + (torch.arange(40) % 2).double()
+    repeated = LeastTrimmedSquares(h=33).fit(X.repeat_interleave(weight.long(), 0), y.repeat_interleave(weight.long()))
+    fit = LeastTrimmedSquares(h=22).fit(X, y, weight)  # 22 / 40 = 33 / 60
+    torch.testing.assert_close(fit.objective_, repeated.objective_, rtol=1e-9, atol=0)
+    torch.testing.assert_close(fit.coef_, repeated.coef_, rtol=1e-9, atol=1e-10)
+
+
+def test_weight_zero_is_removal():
+    X, y = contaminated_line(0, 30)
+    junk_X, junk_y = 5.0 + sample(9, 20, 3), torch.full((20,), 1e3, dtype=torch.float64)
+    weight = torch.cat([torch.ones(30), torch.zeros(20)]).double()
+    fit = LeastTrimmedSquares(h=30).fit(torch.cat([X, junk_X]), torch.cat([y, junk_y]), weight)
+    alone = LeastTrimmedSquares(h=18).fit(X, y)  # 30 / 50 = 18 / 30
+    torch.testing.assert_close(fit.coef_, alone.coef_, rtol=1e-8, atol=1e-10)
+    torch.testing.assert_close(fit.objective_, alone.objective_, rtol=1e-8, atol=0)
+
+
+# equivariance
+
+
+def test_regression_scale_and_affine_equivariance():
+    X, y = contaminated_line(0)
+    coef = LeastTrimmedSquares().fit(X, y).coef_
+    shift = sample(5, 3)
+    torch.testing.assert_close(LeastTrimmedSquares().fit(X, y + X @ shift).coef_, coef + shift, rtol=1e-8, atol=1e-9)
+    for factor in (-2.5, 1e-7, 1e7):
+        fit = LeastTrimmedSquares().fit(X, factor * y)
+        torch.testing.assert_close(fit.coef_, factor * coef, rtol=1e-8, atol=0)
+    A = sample(6, 3, 3)
+    got = LeastTrimmedSquares().fit(X @ A, y).coef_
+    torch.testing.assert_close(A @ got, coef, rtol=1e-7, atol=1e-9)
+
+
+def test_columns_of_very_different_size_do_no_harm():
+    X, y = contaminated_line(0)
+    factor = torch.tensor([1e-8, 1.0, 1e8], dtype=torch.float64)
+    coef = LeastTrimmedSquares().fit(X, y).coef_
+    torch.testing.assert_close(LeastTrimmedSquares().fit(X * factor, y).coef_ * factor, coef, rtol=1e-8, atol=1e-9)
+
+
+def test_the_order_of_the_samples_does_not_matter():
+    X, y = contaminated_line(0)
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(3))
+    fit, moved = LeastTrimmedSquares().fit(X, y), LeastTrimmedSquares().fit(X[order], y[order])
+    torch.testing.assert_close(moved.coef_, fit.coef_, rtol=1e-8, atol=1e-9)
+    torch.testing.assert_close(moved.weights_, fit.weights_[order])
+
+
+def test_batch_equals_loop():
+    problems = [contaminated_line(10 * s, share=0.1 * s) for s in range(5)]
+    X, y = torch.stack([p[0] for p in problems]).unsqueeze(-2), torch.stack([p[1] for p in problems]).unsqueeze(-1)
+    fit = LeastTrimmedSquares().fit(X, y)
+    assert fit.coef_.shape == (5, 3)
+    assert fit.scale_.shape == (5, 1)
+    for i, (X_i, y_i) in enumerate(problems):
+        alone = LeastTrimmedSquares().fit(X_i, y_i)
+        torch.testing.assert_close(fit.coef_[i], alone.coef_, rtol=1e-9, atol=1e-10)
+        torch.testing.assert_close(fit.objective_[i, 0], alone.objective_, rtol=1e-9, atol=0)
+
+
+def test_one_design_serves_many_targets():
+    X, y = contaminated_line(0)
+    Y = torch.stack([y, y.flip(0), 3.0 * y])
+    fit = LeastTrimmedSquares().fit(X, Y)
+    for i in range(3):
+        torch.testing.assert_close(fit.coef_[i], LeastTrimmedSquares().fit(X, Y[i]).coef_, rtol=1e-8, atol=1e-9)
+
+
+# breakdown and exact fits
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_forty_five_per_cent_clustered_outliers_do_not_move_it(seed):
+    X, y, truth = clustered(100 * seed)
+    fit = LeastTrimmedSquares().fit(X, y)
+    assert float((LeastSquares().fit(X, y).coef_ - truth).abs().max()) > 0.3  # the cluster is no help
+    assert float((fit.coef_ - truth).abs().max()) < 0.15
+    assert float(fit.weights_[:135].sum()) == 0.0
+
+
+def test_many_samples_are_screened_on_a_part_and_finished_on_all():
+    X = torch.cat([torch.ones(4000, 1).double(), sample(0, 4000, 2)], 1)
+    y = X.sum(-1) + 0.1 * sample(1, 4000)
+    y[:1600] = 30.0 + 5.0 * sample(2, 1600)
+    fit = LeastTrimmedSquares(starts=50).fit(X, y)
+    torch.testing.assert_close(fit.coef_, torch.ones(3).double(), rtol=0, atol=0.03)
+    kept = (y - X @ fit.coef_).square().sort().values[: int(fit.weights_.sum())]
+    assert float(fit.objective_) == pytest.approx(float(kept.sum()), rel=1e-9)
+    keep = fit.weights_ > 0
+    torch.testing.assert_close(lstsq(X[keep], y[keep]), fit.coef_, rtol=1e-6, atol=1e-8)
+
+
+def test_an_exact_fit_is_found_beside_forty_per_cent_outliers():
+    X = torch.cat([torch.ones(50, 1).double(), sample(0, 50, 2)], 1)
+    y = X @ torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
+    y[:20] = 50.0 + sample(1, 20)
+    fit = LeastTrimmedSquares().fit(X, y)
+    torch.testing.assert_close(fit.coef_, torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64), rtol=1e-12, atol=1e-12)
+    assert float(fit.scale_) < 1e-13
+    assert bool(torch.isfinite(fit.weights_).all())
+    assert float(fit.weights_[:20].sum()) == 0.0
+
+
+def test_targets_of_zero_give_coefficients_of_zero():
+    fit = LeastTrimmedSquares().fit(sample(0, 20, 2), torch.zeros(20).double())
+    assert fit.coef_.tolist() == [0.0, 0.0]
+    assert float(fit.scale_) == 0.0
+
+
+# channels
+
+
+def two_channels(seed: int, factor: float) -> tuple[Tensor, Tensor]:
+    X = torch.stack([torch.cat([torch.ones(60, 1).double(), sample(seed + k, 60, 1)], 1) for k in range(2)], -2)
+    Y = X.sum(-1) + 0.1 * sample(seed + 2, 60, 2)
+    Y[:20, 0] += 9.0
+    Y[30:55, 1] -= 7.0
+    unit = torch.tensor([1.0, factor], dtype=torch.float64)
+    return X * unit.unsqueeze(-1), Y * unit
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+def test_the_unit_of_a_channel_does_not_matter(factor):
+    one, other = LeastTrimmedSquares().fit(*two_channels(0, 1.0)), LeastTrimmedSquares().fit(*two_channels(0, factor))
+    torch.testing.assert_close(other.coef_, one.coef_, rtol=1e-8, atol=1e-9)
+    torch.testing.assert_close(other.scale_, one.scale_ * torch.tensor([1.0, factor]).double(), rtol=1e-7, atol=0)
+    torch.testing.assert_close(other.weights_, one.weights_)
+    torch.testing.assert_close(one.coef_, torch.ones(2).double(), rtol=0, atol=0.1)
+
+
+def test_each_channel_keeps_its_own_samples():
+    fit = LeastTrimmedSquares().fit(*two_channels(0, 1.0))
+    h = int(fit.weights_[:, 0].sum())
+    assert h == (60 + 1 + 1) // 2
+    assert fit.weights_.sum(0).tolist() == [h, h]
+    assert float(fit.weights_[:20, 0].sum()) == 0.0
+    assert float(fit.weights_[30:55, 1].sum()) == 0.0
+
+
+def test_a_channel_fitted_exactly_does_not_blind_the_others():
+    X, Y = two_channels(0, 1.0)
+    Y[:, 0] = X[:, 0].sum(-1)
+    fit = LeastTrimmedSquares().fit(X, Y)
+    torch.testing.assert_close(fit.coef_, torch.ones(2).double(), rtol=0, atol=1e-9)
+    assert bool(torch.isfinite(fit.scale_).all())
+
+
+# parameters
+
+
+@pytest.mark.parametrize("h", [0, 3, 41])
+def test_a_coverage_out_of_range_is_refused(h):
+    with pytest.raises(ValueError, match=r"`h` between 4 and the 40 samples but got"):
+        LeastTrimmedSquares(h=h).fit(*contaminated_line(0))
+
+
+def test_no_starts_are_refused():
+    with pytest.raises(ValueError, match="`starts`"):
+        LeastTrimmedSquares(starts=0)
+
+
+def test_dependent_columns_are_refused():
+    X, y = contaminated_line(0)
+    with pytest.raises(RankDeficientError, match="linearly dependent"):
+        LeastTrimmedSquares().fit(torch.cat([X, X[:, :1]], 1), y)
+
+
+def test_one_seed_gives_one_result():
+    X, y = sample(0, 30, 4), sample(1, 30)
+    state = torch.random.get_rng_state()
+    one, other = LeastTrimmedSquares(starts=3, seed=5).fit(X, y), LeastTrimmedSquares(starts=3, seed=5).fit(X, y)
+    assert torch.equal(one.coef_, other.coef_)
+    assert torch.equal(torch.random.get_rng_state(), state)  # the global generator is left alone
+
+
+def test_the_seed_chooses_the_starts():
+    X, y, _ = clustered(0)
+    found = {float(LeastTrimmedSquares(starts=4, seed=s).fit(X, y).objective_) for s in range(8)}
+    assert len(found) > 1
+
+
+def test_float32_stays_float32():
+    X, y = contaminated_line(0)
+    fit = LeastTrimmedSquares().fit(X.float(), y.float())
+    assert fit.coef_.dtype == fit.scale_.dtype == torch.float32
+    torch.testing.assert_close(fit.coef_.double(), LeastTrimmedSquares().fit(X, y).coef_, rtol=1e-3, atol=1e-3)

@@ -1,0 +1,297 @@
+"""S-regression: the published scales, the equation of the M-scale, the optimum, breakdown, equivariance."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import brentq, minimize
+from torch import Tensor
+
+from mkc_torch.linear import LeastSquares, RankDeficientError, SRegression
+from mkc_torch.linear._problem import linear_problem
+from mkc_torch.linear.s_regression import BISQUARE_50, MScale, bisquare_rho, bisquare_weight
+from tests.literature import DATA_SETS, REFERENCE
+
+WITH_SCALE = [n for n in REFERENCE if REFERENCE[n].mm is not None]
+
+
+def sample(seed: int, *shape: int) -> Tensor:
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def contaminated_line(seed: int, N: int = 40, n: int = 3, share: float = 0.3) -> tuple[Tensor, Tensor]:
+    X = torch.cat([torch.ones(N, 1).double(), sample(seed, N, n - 1)], 1)
+    y = X.sum(-1) + 0.1 * sample(seed + 1, N)
+    y[: int(share * N)] += 10.0 + sample(seed + 2, int(share * N))
+    return X, y
+
+
+def clustered(seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """300 samples of 6 regressors, 45 % of them in one cluster 8 deviations away in every regressor, y near 40."""
+    X, truth = sample(seed, 300, 6), sample(seed + 1, 6)
+    y = X @ truth + 0.1 * sample(seed + 2, 300)
+    bad = 135
+    X[:bad] = 8.0 + 0.3 * sample(seed + 3, bad, 6)
+    y[:bad] = 40.0 + 0.3 * sample(seed + 4, bad)
+    return X, y, truth
+
+
+def m_scale(residual: np.ndarray, p: int, weight: np.ndarray | None = None) -> float:
+    """The root of sum ρ(r / (c s)) = (N - p) / 2, by bisection."""
+    w = np.ones_like(residual) if weight is None else weight
+
+    def excess(log_s: float) -> float:
+        u = np.minimum(np.abs(residual) / (1.547645 * np.exp(log_s)), 1.0)
+        return float((w * (3 * u**2 - 3 * u**4 + u**6)).sum() - 0.5 * (w.sum() - p))
+
+    top = np.log(np.abs(residual).max())
+    return float(np.exp(brentq(excess, top - 40, top + 5, xtol=1e-14)))
+
+
+# published and computed optima
+
+
+@pytest.mark.parametrize("name", WITH_SCALE)
+def test_the_published_scale_is_found(name):
+    X, y = DATA_SETS[name]()
+    fit = SRegression().fit(X, y)
+    assert float(fit.scale_) == pytest.approx(REFERENCE[name].mm.scale, rel=1e-5)
+    assert bool(fit.converged_)
+
+
+@pytest.mark.parametrize("name", DATA_SETS)
+def test_the_scale_solves_its_equation_and_no_simplex_search_lowers_it(name):
+    X, y = DATA_SETS[name]()
+    fit = SRegression().fit(X, y)
+    n = X.shape[1]
+    assert float(fit.scale_) == pytest.approx(m_scale((y - X @ fit.coef_).numpy(), n), rel=1e-9)
+    Q, R = np.linalg.qr(X.numpy())
+    found = minimize(
+        lambda b: m_scale(y.numpy() - Q @ b, n),
+        R @ fit.coef_.numpy(),
+        method="Nelder-Mead",
+        options={"maxiter": 300, "xatol": 1e-9, "fatol": 1e-12},
+    )
+    assert found.fun >= float(fit.scale_) * (1 - 1e-8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_optimum_is_that_of_descents_from_all_elemental_sets(seed):
+    X, y = sample(seed, 12, 2), sample(seed + 100, 12) * torch.exp(sample(seed + 200, 12))
+    best = np.inf
+    starts = []
+    for pair in itertools.combinations(range(12), 2):
+        coef = torch.linalg.solve(X[list(pair)], y[list(pair)]).numpy()
+        starts.append((m_scale((y.numpy() - X.numpy() @ coef), 2), coef))
+    starts.sort(key=lambda s: s[0])
+    for _, coef in starts[:12]:
+        found = minimize(
+            lambda b: m_scale(y.numpy() - X.numpy() @ b, 2),
+            coef,
+            method="Nelder-Mead",
+            options={"xatol": 1e-8, "fatol": 1e-11},
+        )
+        best = min(best, found.fun)
+    fit = SRegression().fit(X, y)
+    assert float(fit.scale_) <= best * (1 + 1e-7)
+    assert float(fit.scale_) == pytest.approx(m_scale((y - X @ fit.coef_).numpy(), 2), rel=1e-9)
+
+
+def test_the_solution_is_a_fixed_point_of_its_own_weights():
+    X, y = contaminated_line(0)
+    fit = SRegression().fit(X, y)
+    u = ((y - X @ fit.coef_) / (1.547645 * fit.scale_)).clamp(-1, 1)
+    weight = (1 - u**2) ** 2
+    torch.testing.assert_close(fit.weights_, weight, rtol=0, atol=1e-10)
+    torch.testing.assert_close(
+        LeastSquares().fit(X, y, weight.clamp(min=1e-300)).coef_, fit.coef_, rtol=1e-5, atol=1e-6
+    )
+
+
+def test_scale_of_gaussian_residuals_is_their_standard_deviation():
+    fit = SRegression(starts=20).fit(torch.ones(20_000, 1).double(), 3.0 * sample(0, 20_000))
+    assert float(fit.scale_) == pytest.approx(3.0, rel=0.02)
+
+
+def test_rho_and_weight_of_the_bisquare():
+    u = torch.linspace(-1.5, 1.5, 31, dtype=torch.float64)
+    inside = u.abs() <= 1
+    expected = torch.where(inside, 3 * u**2 - 3 * u**4 + u**6, 1.0)
+    torch.testing.assert_close(bisquare_rho(u), expected)
+    leaf = u.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(bisquare_rho(leaf).sum(), leaf)
+    torch.testing.assert_close(6.0 * u * bisquare_weight(u) * inside, slope)
+    assert abs(BISQUARE_50 - 1.547645) < 1e-9
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 0.49])
+def test_the_m_scale_of_any_residuals_solves_its_equation(share):
+    residual = sample(0, 50)
+    residual[: int(share * 50)] *= 1e6
+    residual[25:30] = 0.0
+    problem = linear_problem(torch.ones(50, 1).double(), residual)
+    got = MScale(60).scale(problem, residual.reshape(1, 1, 50, 1))
+    assert float(got) == pytest.approx(m_scale(residual.numpy(), 1), rel=1e-10)
+
+
+# weights
+
+
+def test_weight_is_repetition_up_to_the_degrees_of_freedom():
+    X, y = contaminated_line(0)
+    count = 1 + (torch.arange(40) % 2)
+    fit = SRegression().fit(X, y, count.double())
+    repeated = SRegression().fit(X.repeat_interleave(count, 0), y.repeat_interleave(count))
+    torch.testing.assert_close(fit.coef_, repeated.coef_, rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close(fit.scale_, repeated.scale_, rtol=1e-8, atol=0)
+
+
+def test_weight_zero_is_removal():
+    X, y = contaminated_line(0, 30)
+    junk_X, junk_y = 5.0 + sample(9, 20, 3), torch.full((20,), 1e3, dtype=torch.float64)
+    weight = torch.cat([torch.ones(30), torch.zeros(20)]).double()
+    fit = SRegression().fit(torch.cat([X, junk_X]), torch.cat([y, junk_y]), weight)
+    alone = SRegression().fit(X, y)
+    torch.testing.assert_close(fit.coef_, alone.coef_, rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close(fit.scale_, alone.scale_, rtol=1e-8, atol=0)
+
+
+# equivariance
+
+
+def test_regression_scale_and_affine_equivariance():
+    X, y = contaminated_line(0)
+    fit = SRegression().fit(X, y)
+    shift = sample(5, 3)
+    moved = SRegression().fit(X, y + X @ shift)
+    torch.testing.assert_close(moved.coef_, fit.coef_ + shift, rtol=1e-6, atol=1e-7)
+    for factor in (-2.5, 1e-7, 1e7):
+        scaled = SRegression().fit(X, factor * y)
+        torch.testing.assert_close(scaled.coef_, factor * fit.coef_, rtol=1e-6, atol=0)
+        torch.testing.assert_close(scaled.scale_, abs(factor) * fit.scale_, rtol=1e-9, atol=0)
+    A = sample(6, 3, 3)
+    torch.testing.assert_close(A @ SRegression().fit(X @ A, y).coef_, fit.coef_, rtol=1e-6, atol=1e-7)
+
+
+def test_columns_of_very_different_size_do_no_harm():
+    X, y = contaminated_line(0)
+    factor = torch.tensor([1e-8, 1.0, 1e8], dtype=torch.float64)
+    coef = SRegression().fit(X, y).coef_
+    torch.testing.assert_close(SRegression().fit(X * factor, y).coef_ * factor, coef, rtol=1e-6, atol=1e-7)
+
+
+def test_the_order_of_the_samples_does_not_matter():
+    X, y = contaminated_line(0)
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(3))
+    fit, moved = SRegression().fit(X, y), SRegression().fit(X[order], y[order])
+    torch.testing.assert_close(moved.coef_, fit.coef_, rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(moved.weights_, fit.weights_[order], rtol=0, atol=1e-6)
+
+
+def test_batch_equals_loop():
+    problems = [contaminated_line(10 * s, share=0.1 * s) for s in range(5)]
+    X, y = torch.stack([p[0] for p in problems]).unsqueeze(-2), torch.stack([p[1] for p in problems]).unsqueeze(-1)
+    fit = SRegression().fit(X, y)
+    assert fit.coef_.shape == (5, 3)
+    for i, (X_i, y_i) in enumerate(problems):
+        alone = SRegression().fit(X_i, y_i)
+        torch.testing.assert_close(fit.coef_[i], alone.coef_, rtol=1e-6, atol=1e-8)
+        torch.testing.assert_close(fit.scale_[i, 0], alone.scale_, rtol=1e-9, atol=0)
+
+
+# breakdown and exact fits
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_forty_five_per_cent_clustered_outliers_do_not_move_it(seed):
+    X, y, truth = clustered(100 * seed)
+    fit = SRegression().fit(X, y)
+    assert float((fit.coef_ - truth).abs().max()) < 0.15
+    assert float(fit.weights_[:135].max()) == 0.0
+
+
+def test_an_exact_fit_is_found_beside_forty_per_cent_outliers():
+    X = torch.cat([torch.ones(50, 1).double(), sample(0, 50, 2)], 1)
+    y = X @ torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
+    y[:20] = 50.0 + sample(1, 20)
+    fit = SRegression().fit(X, y)
+    torch.testing.assert_close(fit.coef_, torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64), rtol=1e-12, atol=1e-12)
+    assert float(fit.scale_) < 1e-12
+    assert bool(torch.isfinite(fit.weights_).all())
+
+
+def test_targets_of_zero_give_coefficients_of_zero():
+    fit = SRegression().fit(sample(0, 20, 2), torch.zeros(20).double())
+    assert fit.coef_.tolist() == [0.0, 0.0]
+    assert float(fit.scale_) == 0.0
+
+
+# channels
+
+
+def two_channels(seed: int, factor: float) -> tuple[Tensor, Tensor]:
+    X = torch.stack([torch.cat([torch.ones(60, 1).double(), sample(seed + k, 60, 1)], 1) for k in range(2)], -2)
+    Y = X.sum(-1) + 0.1 * sample(seed + 2, 60, 2)
+    Y[:20, 0] += 9.0
+    Y[30:55, 1] -= 7.0
+    unit = torch.tensor([1.0, factor], dtype=torch.float64)
+    return X * unit.unsqueeze(-1), Y * unit
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+def test_the_unit_of_a_channel_does_not_matter(factor):
+    one, other = SRegression().fit(*two_channels(0, 1.0)), SRegression().fit(*two_channels(0, factor))
+    torch.testing.assert_close(other.coef_, one.coef_, rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(other.scale_, one.scale_ * torch.tensor([1.0, factor]).double(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(one.coef_, torch.ones(2).double(), rtol=0, atol=0.1)
+
+
+def test_the_product_of_the_channels_scales_is_minimal():
+    X, Y = two_channels(0, 1.0)
+    fit = SRegression().fit(X, Y)
+
+    def product(coef: np.ndarray) -> float:
+        residual = (Y - X @ torch.from_numpy(coef)).numpy()
+        return m_scale(residual[:, 0], 1) * m_scale(residual[:, 1], 1)
+
+    at = fit.coef_.numpy()
+    assert float(fit.scale_.prod()) == pytest.approx(product(at), rel=1e-9)
+    found = minimize(product, at, method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-13})
+    assert found.fun >= product(at) * (1 - 1e-7)
+
+
+def test_a_channel_fitted_exactly_does_not_blind_the_others():
+    X, Y = two_channels(0, 1.0)
+    Y[:, 0] = X[:, 0].sum(-1)
+    fit = SRegression().fit(X, Y)
+    torch.testing.assert_close(fit.coef_, torch.ones(2).double(), rtol=0, atol=1e-9)
+    assert bool(torch.isfinite(fit.scale_).all())
+    assert bool(torch.isfinite(fit.weights_).all())
+
+
+# parameters
+
+
+def test_no_starts_are_refused():
+    with pytest.raises(ValueError, match="`starts`"):
+        SRegression(starts=0)
+
+
+def test_dependent_columns_are_refused():
+    X, y = contaminated_line(0)
+    with pytest.raises(RankDeficientError, match="linearly dependent"):
+        SRegression().fit(torch.cat([X, X[:, :1]], 1), y)
+
+
+def test_one_seed_gives_one_result():
+    X, y = sample(0, 30, 4), sample(1, 30)
+    one, other = SRegression(starts=3, seed=5).fit(X, y), SRegression(starts=3, seed=5).fit(X, y)
+    assert torch.equal(one.coef_, other.coef_)
+
+
+def test_float32_stays_float32():
+    X, y = contaminated_line(0)
+    fit = SRegression().fit(X.float(), y.float())
+    assert fit.coef_.dtype == fit.scale_.dtype == torch.float32
+    torch.testing.assert_close(fit.coef_.double(), SRegression().fit(X, y).coef_, rtol=1e-3, atol=1e-3)
