@@ -256,9 +256,9 @@ class EllipsoidFit:
         for index, one in enumerate(found):
             if one.information < MIN_INFORMATION:
                 raise NotIdentifiableError(
-                    f"Not identifiable: the points tell {one.information:.1e} of what an even coverage of directions "
-                    f"would tell about the worst-determined part of the ellipsoid "
-                    f"(at least {MIN_INFORMATION:g} is needed). " + _advice(one),
+                    f"Not identifiable: too few directions are covered to tell the offset from the shape "
+                    f"({one.information:.1e} of the information of an even coverage; {MIN_INFORMATION:g} is needed). "
+                    + _advice(one),
                     one,
                 )
             if not hasattr(self, "center_se_"):

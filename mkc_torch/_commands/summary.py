@@ -36,6 +36,7 @@ def show(console: Console, c: Calibration, files: list[Path]) -> None:
         facts.add_row(name, Text(value))
     for warning in c.warnings:
         facts.add_row(Text("warning", style="bold yellow"), Text(warning))
-    for file in files:
-        facts.add_row("written", Text(str(file), style="cyan"))
     console.print(facts)
+    for file in files:
+        # outside the table, where a long path would be broken and could not be copied
+        console.print(Text.assemble("written    ", (str(file), "cyan")), soft_wrap=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -43,16 +42,22 @@ def long_run_covariance(
 ) -> Float[Tensor, "*batch n n"]:
     """Sum over lags of the scores' cross-products under the Bartlett kernel; positive semi-definite.
 
+    With b whole lags the kernel ``1 - lag / (b + 1)`` is the mean product of sums over b + 1 samples in a row.
+
     Newey & West, "A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent covariance
     matrix", Econometrica 55 (1987).
     """
-    N = score.shape[-2]
-    total = torch.matmul(score.mT, score)
-    for lag in range(1, min(N - 1, math.floor(float(bandwidth.max()))) + 1):
-        kernel = (1.0 - lag / (bandwidth + 1.0)).clamp(min=0.0)
-        cross = torch.matmul(score[..., lag:, :].mT, score[..., :-lag, :])
-        total = total + kernel[..., None, None] * (cross + cross.mT)
-    return total
+    N, n = score.shape[-2:]
+    flat = score.reshape(-1, N, n).double()
+    lags = bandwidth.reshape(-1, 1).floor().clamp(min=0, max=N - 1).long()
+    total = torch.nn.functional.pad(flat.cumsum(-2), (0, 0, 1, 0))
+    start = torch.arange(-int(lags.max()), N, device=score.device).expand(flat.shape[0], -1)
+    # a window that ends before the first sample is empty
+    low, high = start.clamp(min=0), (start + lags + 1).clamp(min=0, max=N)
+    batch = torch.arange(flat.shape[0], device=score.device).unsqueeze(-1)
+    sums = total[batch, high] - total[batch, low]
+    products = torch.matmul(sums.mT, sums) / (lags + 1).unsqueeze(-1)
+    return products.to(score.dtype).reshape(*score.shape[:-2], n, n)
 
 
 def sandwich(
@@ -69,7 +74,7 @@ def sandwich(
         score: gradient of each sample's loss, in the order of time when ``kind`` is "hac".
         dof: factor for the degrees of freedom used, ``N / (N - n)``.
         kind: "sandwich" for independent samples, "hac" for a time series.
-        bandwidth: lags in samples that "hac" reaches over; default by :func:`andrews_bandwidth`.
+        bandwidth: whole lags in samples that "hac" reaches over; default by :func:`andrews_bandwidth`.
     """
     if kind == "hac":
         lags = andrews_bandwidth(score) if bandwidth is None else score.new_full(score.shape[:-2], bandwidth)

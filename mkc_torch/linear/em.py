@@ -144,7 +144,7 @@ class MKCRegression(LinearEstimator):
         max_iter: alternations at most.
         tol: converged when two alternations in a row each raise the mean log-likelihood by less (nats per sample).
         covariance: "sandwich" for independent samples, "hac" for a time series.
-        bandwidth: lags of "hac", in samples; default by Andrews' rule.
+        bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
         seed: of the robust start.
 
     Attributes, after ``fit`` (``*`` batch dimensions; without ``m`` for one channel given as (*, N)):

@@ -98,7 +98,7 @@ class FixedPointLinear(LinearEstimator):
         max_iter: steps at most.
         tol: converged when a step lowers the loss by a smaller share of it.
         covariance: "sandwich" for independent samples, "hac" for a time series.
-        bandwidth: lags of "hac", in samples; default by Andrews' rule.
+        bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
         seed: of the robust start.
 
     Attributes, after ``fit`` (``*`` batch dimensions):

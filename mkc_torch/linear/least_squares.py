@@ -22,7 +22,7 @@ class LeastSquares(LinearEstimator):
 
     Args:
         covariance: "sandwich" for independent samples, "hac" for a time series.
-        bandwidth: lags of "hac", in samples; default by Andrews' rule.
+        bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
 
     Example:
         >>> X = torch.tensor([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]])
