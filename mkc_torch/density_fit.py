@@ -6,7 +6,7 @@ method with analytic derivatives in log(κ + 0.02) and log d, κ = 1/σ², which
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -38,22 +38,16 @@ def _energy_terms(q: Tensor, kappa: Tensor) -> tuple[Tensor, Tensor, Tensor, Ten
     x = kappa * q
     w = torch.exp(-x)
     divisor = torch.where(kappa > 0, kappa, 1.0)
-    e = (1.0 - w) / divisor
-    first = (e - q * w) / divisor
-    second = (2.0 * first - q * q * w) / divisor
-    # below this x the differences above lose more digits than five terms of the series leave out
-    series_below = 0.02 if q.dtype == torch.float64 else 0.2
-    if bool((kappa < series_below).any()):
-        small = x < series_below
-        e_sum, first_sum, second_sum = torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x)
-        for j in range(4, -1, -1):  # integrals of t^k exp(-x t) over [0, 1] for k = 0, 1, 2
-            factor = 1.0 / math.factorial(j)
-            e_sum = factor / (j + 1) - x * e_sum
-            first_sum = factor / (j + 2) - x * first_sum
-            second_sum = factor / (j + 3) - x * second_sum
-        e = torch.where(small, q * e_sum, e)
-        first = torch.where(small, q * q * first_sum, first)
-        second = torch.where(small, q * q * q * second_sum, second)
+    qw = q * w
+    e = -torch.expm1(-x) / divisor
+    first = (e - qw) / divisor
+    second = (2.0 * first - q * qw) / divisor
+    # below this x the differences lose more digits than two terms of the series leave out
+    small = x < (1e-5 if q.dtype == torch.float64 else 1e-2)
+    q2 = q * q
+    e = torch.where(small, q - 0.5 * q * x, e)
+    first = torch.where(small, q2 * (0.5 - x / 3.0), first)
+    second = torch.where(small, q * q2 * (1.0 / 3.0 - 0.25 * x), second)
     return w, e, first, second
 
 
@@ -143,16 +137,20 @@ def initial_state(
     *,
     kappa: Float[Tensor, "*batch m"] | None = None,
     d: Float[Tensor, "*batch m"] | None = None,
+    tails: Sequence[float | Tensor] = (0.1, 0.4, 1.5),
 ) -> DensityState:
-    """The best of a Gaussian and three heavy-tailed densities at the given scale; ``kappa`` or ``d`` given stays."""
+    """The likeliest of a Gaussian and of densities with κ from ``tails`` and the given scale.
+
+    ``kappa`` or ``d`` given stays as it is.
+    """
     rms = torch.sqrt(_mean(error.square(), weight)).clamp(min=d_min)
     log_bound, log_d_min = torch.log(bound), torch.log(d_min)
     blank = DensityState(rms, rms, log_bound, log_d_min, torch.full_like(rms, 1e-3), rms, kappa is None, d is None)
     best: DensityState | None = None
-    for start_kappa, start_d in ((0.0, rms), (0.1, scale), (0.4, scale), (1.5, scale)):
+    for start_kappa, start_d in ((0.0, rms), *((tail, scale) for tail in tails)):
         state = replace(
             blank,
-            kappa=torch.full_like(rms, start_kappa) if kappa is None else kappa.expand_as(rms),
+            kappa=torch.as_tensor(start_kappa).to(rms).expand_as(rms) if kappa is None else kappa.expand_as(rms),
             log_d=torch.log(start_d.clamp(min=d_min)) if d is None else torch.log(d).expand_as(rms),
         )
         state = replace(state, value=negative_log_likelihood(error, weight, state))

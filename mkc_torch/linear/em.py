@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -45,8 +46,10 @@ def _normalised_weight(problem: LinearProblem) -> Tensor | None:
     return None if w is None else w / w.sum(-2, keepdim=True)
 
 
-def _alternate(problem: LinearProblem, beta: Tensor, state: DensityState, *, max_iter: int, tol: float) -> _Maximum:
-    """E-steps and M-steps in turn; problems that have come to rest leave the batch."""
+def _alternate(
+    problem: LinearProblem, beta: Tensor, state: DensityState, *, max_iter: int, tol: float, patience: int = 2
+) -> _Maximum:
+    """E-steps and M-steps in turn; a problem leaves the batch after ``patience`` of them without progress."""
     size = beta.shape[0]
     index = torch.arange(size, device=beta.device)
     out_beta, out_state = beta.clone(), state
@@ -70,7 +73,7 @@ def _alternate(problem: LinearProblem, beta: Tensor, state: DensityState, *, max
         current = history[-1].clone()
         current[index] = now
         history.append(current)
-        done = quiet >= 2
+        done = quiet >= patience
         if bool(done.any()) or len(history) > max_iter:
             out_beta[index] = beta
             out_state = _write(out_state, index, state)
@@ -208,32 +211,41 @@ class MKCRegression(LinearEstimator):
         """
         problem = linear_problem(X, Y, sample_weight)
         begin = robust_start(problem, self.start, seed=self.seed)
+        d_min = _FLOOR * begin.scale
         if self.bound is None:
-            bound, beta, scale = self._domain(problem, begin)
+            beta, state = self._on_its_domain(problem, begin, d_min)
         else:
-            bound, beta, scale = channel_parameter("bound", self.bound, problem), begin.beta, begin.scale
-        state = self._initial_state(problem, beta, scale, bound, _FLOOR * begin.scale)
+            beta = begin.beta
+            bound = channel_parameter("bound", self.bound, problem)
+            state = self._initial_state(problem, beta, begin.scale, bound, d_min)
         maximum = _alternate(problem, beta, state, max_iter=self.max_iter, tol=self.tol)
         if state.free_kappa and state.free_d:
             maximum = _gaussian_candidate(problem, maximum, max_iter=self.max_iter, tol=self.tol)
         self._keep(problem, begin, maximum)
         return self
 
-    def _domain(self, problem: LinearProblem, begin: RobustStart) -> tuple[Tensor, Tensor, Tensor]:
-        """The domain by its rule, with the coefficients and scales of the rough fit that it was read from.
+    def _on_its_domain(self, problem: LinearProblem, begin: RobustStart, d_min: Tensor) -> tuple[Tensor, DensityState]:
+        """Coefficients and state to start from on the domain of the rule, which a rough fit gives.
 
-        A robust start's scale is up to twice that of the head when outliers are many and on one side, so a rough fit
-        on a tight domain finds the head first.
+        A robust start's scale is up to twice that of the head when outliers are many and on one side, so the rough fit
+        is made on a tight domain, where it finds the head.
         """
         used = None if problem.sample_weight is None else problem.sample_weight > 0
         tight = domain_rule(problem.residual(begin.beta), begin.scale, used, scales=5.0)
-        state = self._initial_state(problem, begin.beta, begin.scale, tight, _FLOOR * begin.scale)
-        rough = _alternate(problem, begin.beta, state, max_iter=self.max_iter, tol=1e-6)
-        d = torch.exp(rough.state.log_d)
-        return domain_rule(problem.residual(rough.beta), d, used), rough.beta, d
+        state = self._initial_state(problem, begin.beta, begin.scale, tight, d_min)
+        rough = _alternate(problem, begin.beta, state, max_iter=self.max_iter, tol=1e-4, patience=1)
+        kappa, d = rough.state.kappa, torch.exp(rough.state.log_d)
+        bound = domain_rule(problem.residual(rough.beta), d, used)
+        return rough.beta, self._initial_state(problem, rough.beta, d, bound, d_min, tails=(kappa,))
 
     def _initial_state(
-        self, problem: LinearProblem, beta: Tensor, scale: Tensor, bound: Tensor, d_min: Tensor
+        self,
+        problem: LinearProblem,
+        beta: Tensor,
+        scale: Tensor,
+        bound: Tensor,
+        d_min: Tensor,
+        tails: Sequence[float | Tensor] = (0.1, 0.4, 1.5),
     ) -> DensityState:
         d = None if self.d is None else channel_parameter("d", self.d, problem)
         sigma = None if self.sigma is None else channel_parameter("sigma", self.sigma, problem, infinite=True)
@@ -247,6 +259,7 @@ class MKCRegression(LinearEstimator):
             d_min,
             kappa=None if sigma is None else sigma.pow(-2),
             d=d,
+            tails=tails,
         )
 
     def _keep(self, problem: LinearProblem, begin: RobustStart, maximum: _Maximum) -> None:
