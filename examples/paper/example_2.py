@@ -9,6 +9,7 @@ Nelder-Mead from the truth: no estimator that does not know the noise can be exp
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import time
 from collections.abc import Callable
@@ -154,6 +155,29 @@ def rmse(coef: Tensor) -> Tensor:
     return norms(coef).square().mean(-1).sqrt()
 
 
+def ratio(coef: Tensor, best: Tensor, resamples: int = 400) -> tuple[Tensor, Tensor]:
+    """RMSE over that of the oracle, (6,), and its standard error by the paired bootstrap over the draws."""
+    squares = torch.stack([norms(coef).square(), norms(best).square()])
+    draws = squares.shape[-1]
+    index = torch.randint(draws, (resamples, draws), generator=torch.Generator().manual_seed(0))
+    again = torch.stack([squares[..., i].mean(-1) for i in index])
+    return rmse(coef) / rmse(best), (again[:, 0] / again[:, 1]).sqrt().std(0)
+
+
+def hindsight(X: Tensor, Y: Tensor, best: Tensor) -> Tensor:
+    """Smallest ratio to the oracle of any fixed σ on a grid, with the true d and started from the truth, (6,)."""
+    truth = torch.tensor(TRUTH, dtype=torch.float64)
+    d = torch.tensor([0.5, 1.0], dtype=torch.float64)
+    smallest = torch.full((len(CASES),), math.inf, dtype=torch.float64)
+    grid = (1.1, 1.3, 1.6, 2.2, math.inf)
+    for sigma in itertools.product(grid, grid):
+        for i in range(len(CASES)):
+            fit = FixedPointLinear(sigma=torch.tensor(sigma, dtype=torch.float64), d=d, start=truth, tol=1e-9)
+            error = norms(fit.fit(X, Y[i]).coef_).square().mean().sqrt()
+            smallest[i] = torch.minimum(smallest[i], error / rmse(best)[i])
+    return smallest
+
+
 def median_seconds(job: Callable[[], object], repeats: int = 5) -> float:
     job()
     times = []
@@ -169,6 +193,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--scipy", type=int, default=10, help="draws of each case for the SciPy loop's time")
+    parser.add_argument("--hindsight", action="store_true", help="also the best fixed sigma of a grid (minutes)")
     arguments = parser.parse_args()
     console = Console(width=120)
     X, Y = design(), recordings(arguments.draws, arguments.seed)
@@ -191,11 +216,14 @@ def main() -> None:
         table.add_row(str(case), *cells, f"{norms(best)[i].mean():.4f}", sigma)
     console.print(table)
 
-    table = Table(title="RMSE over that of the oracle")
-    for heading in ("case", *fits):
+    table = Table(title="RMSE over that of the oracle, ± standard error")
+    for heading in ("case", *fits, *(["MKC, best sigma"] if arguments.hindsight else [])):
         table.add_column(heading, justify="right")
+    ratios = {name: ratio(f, best) for name, f in fits.items()}
+    least = hindsight(X, Y, best) if arguments.hindsight else None
     for i, case in enumerate(CASES):
-        table.add_row(str(case), *(f"{(rmse(f) / rmse(best))[i]:.3f}" for f in fits.values()))
+        cells = [f"{value[i]:.3f} ± {error[i]:.3f}" for value, error in ratios.values()]
+        table.add_row(str(case), *cells, *([] if least is None else [f"{least[i]:.3f}"]))
     console.print(table)
 
     fitted = Y.shape[0] * Y.shape[1]
