@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from mkc_torch.coverage import Coverage, coverage
+from mkc_torch.coverage import Coverage
 from mkc_torch.disturbance import Interval, disturbed_intervals
 from mkc_torch.ellipsoid import (
     MIN_POINTS,
     EllipsoidFit,
-    NotIdentifiableError,
     ellipsoid_from_coefficients,
     symmetric_root,
 )
 from mkc_torch.functional import mkc_weight
 from mkc_torch.linear import MKCRegression
+from mkc_torch.linear.covariance import CovarianceKind
 from mkc_torch.recording import Recording, RecordingError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Calibration", "NotCalibratedError", "Spread", "calibrate", "prepared"]
+__all__ = ["Calibration", "Spread", "calibrate", "prepared"]
 
 REJECTED_BELOW = 0.5
 """A sample of less than this weight counts as rejected."""
@@ -37,19 +37,8 @@ Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
 
 _LEAST = 1e-60
+FEW_SAMPLES = 50
 _AXES = ("mag_x", "mag_y", "mag_z")
-
-
-class NotCalibratedError(NotIdentifiableError):
-    """A recording that determines no calibration.
-
-    ``coverage`` says what is missing and ``directions`` (K, 3) holds the vectors it was computed from, from the best
-    centre known; both are None where all samples are equal.
-    """
-
-    def __init__(self, message: str, found: Coverage | None, directions: Tensor | None) -> None:
-        super().__init__(message, found)
-        self.directions = directions
 
 
 class Spread(NamedTuple):
@@ -223,7 +212,7 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
     Raises:
         MissingColumnError: a column of the magnetometer is not there.
         RecordingError: fewer than nine usable samples.
-        NotCalibratedError: the samples do not determine an ellipsoid (a NotIdentifiableError).
+        NotIdentifiableError: the samples do not determine an ellipsoid.
         ValueError: a field strength that is not positive.
 
     Example:
@@ -239,7 +228,8 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
         raise ValueError(f"Expected argument `field_strength` to be positive but got {field_strength}.")
     usable = prepared(recording)
     points = usable.magnetometer()
-    fit = _fitted(points, timed=usable.time is not None, seed=seed)
+    kind: CovarianceKind = "sandwich" if usable.time is None else "hac"
+    fit = EllipsoidFit(MKCRegression(covariance=kind, seed=seed)).fit(points)
     radius = float(fit.radius_)
     strength = radius if field_strength is None else field_strength
     scale = strength / radius
@@ -273,26 +263,6 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
         coverage=found,
         warnings=(*usable.warnings, *_warnings(fit, found, float(rejected.double().mean()))),
     )
-
-
-def _fitted(points: Tensor, *, timed: bool, seed: int) -> EllipsoidFit:
-    fit = EllipsoidFit(MKCRegression(covariance="hac" if timed else "sandwich", seed=seed))
-    try:
-        return fit.fit(points)
-    except NotIdentifiableError as error:
-        raise _not_calibrated(error, fit, points) from None
-
-
-def _not_calibrated(error: NotIdentifiableError, fit: EllipsoidFit, points: Tensor) -> NotCalibratedError:
-    """The refusal with the directions it speaks of, for a picture of them."""
-    if hasattr(fit, "weights_") and error.coverage is not None:
-        directions = fit.calibrate(points)[fit.weights_ >= REJECTED_BELOW]
-    else:
-        directions = points - 0.5 * (points.amax(0) + points.amin(0))
-    directions = directions[torch.linalg.vector_norm(directions, dim=-1) > 0]
-    if len(directions) == 0:
-        return NotCalibratedError(str(error), None, None)
-    return NotCalibratedError(str(error), error.coverage or coverage(directions), directions)
 
 
 def _density(fit: EllipsoidFit) -> tuple[float, float, float]:
@@ -330,6 +300,11 @@ def _warnings(fit: EllipsoidFit, found: Coverage, rejected_share: float) -> list
             f"{per_cent} of the samples do not fit one ellipsoid: the sensor's offset may have changed "
             "during the recording, or something magnetic was near for long. Record again away from it, or calibrate "
             "the parts of the recording separately."
+        )
+    if len(fit.weights_) < FEW_SAMPLES:
+        warnings.append(
+            f"{len(fit.weights_)} samples are few for nine unknowns: the true errors can be far larger than the "
+            f"standard errors say. Record {FEW_SAMPLES} at least."
         )
     if found.gaps:
         missing = "; ".join(str(gap) for gap in found.gaps)

@@ -98,7 +98,12 @@ def coverage(directions: Float[Tensor, "N 3"]) -> Coverage:
         >>> print(coverage(half[half[:, 2] > 0]).gaps[0])
         -z (...): no sample within 8...°
     """
-    unit = torch.nn.functional.normalize(directions.detach().double().cpu(), dim=-1)
+    if directions.shape[0] == 0:
+        raise ValueError("Expected at least one direction but got none.")
+    vectors = directions.detach().double().cpu()
+    # scaled first, so that the squares of tiny or huge components stay in range
+    vectors = vectors / vectors.abs().amax(-1, keepdim=True)
+    unit = vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
     grid = fibonacci_sphere(_GRID)
     nearest = torch.full((_GRID,), -1.0, dtype=torch.float64)
     for part in unit.split(4096):

@@ -17,7 +17,7 @@ from mkc_torch.functional import KAPPA_MAX, energy, head_rule, integrate, log_pa
 from mkc_torch.order_statistic import robust_scale
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 _KAPPA_OFFSET = 0.02
 
@@ -228,7 +228,7 @@ class DensityFit:
     d: Float[Tensor, "*batch m"]
     bound: Float[Tensor, "*batch m"]
     log_likelihood: Float[Tensor, "*batch m"]
-    converged: Float[Tensor, "*batch m"]
+    converged: Bool[Tensor, "*batch m"]
     n_iter: int
 
 
@@ -256,6 +256,18 @@ def domain_rule(
     return torch.maximum(0.5 * (high.amax(-2) - low.amin(-2)), scales * scale)
 
 
+def refuse_narrow_bound(bound: Tensor, scale: Tensor) -> None:
+    """Refuse a domain that the head of the density does not fit in."""
+    narrow = bound < 2.0 * scale
+    if bool(narrow.any()):
+        first = narrow.nonzero()[0]
+        raise ValueError(
+            f"Expected argument `bound` to be at least two robust scales of the residuals, "
+            f"{2.0 * scale[tuple(first)].item():.4g}, but got {bound[tuple(first)].item():.4g}; it is the half-width "
+            "of the domain that errors can lie in, in the unit of the data."
+        )
+
+
 def fit_density(
     error: Float[Tensor, "*batch N m"],
     *,
@@ -273,7 +285,8 @@ def fit_density(
         error: residuals (*, N, m), centred as the fit left them.
         sigma: keeps σ at this value (``inf``: Gaussian) and fits d alone, Remark 7 of the paper.
         d: keeps d at this value and fits σ alone, Remark 6.
-        bound: half-width of the domain, in the unit of ``error``; default by :func:`domain_rule`.
+        bound: half-width of the domain, in the unit of ``error``, at least two robust scales of them; default by
+            :func:`domain_rule`. A residual beyond it counts as one on the flat tail.
         weight: non-negative weights of the residuals.
         d_min: floor under d; default a tenth of the robust scale, since the likelihood grows without limit as d → 0
             on residuals that a fit has interpolated.
@@ -322,6 +335,8 @@ def fit_density(
     scale = torch.where(scale > 0, scale, torch.sqrt(_mean(error.square(), normalised))).clamp(min=tiny)
     floor = parameter("d_min", d_min)
     half_width = parameter("bound", bound)
+    if half_width is not None:
+        refuse_narrow_bound(half_width, scale)
     fixed_sigma = parameter("sigma", sigma, infinite=True)
     state = initial_state(
         error,

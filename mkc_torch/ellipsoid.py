@@ -7,6 +7,8 @@ A triaxial sensor in a constant field that turns through all directions draws an
 
 from __future__ import annotations
 
+import copy
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -14,7 +16,8 @@ from torch import Tensor
 
 from mkc_torch.coverage import Coverage, coverage
 from mkc_torch.linear import MKCRegression, RankDeficientError
-from mkc_torch.linear._estimator import LinearEstimator
+from mkc_torch.linear._estimator import Fitted, LinearEstimator
+from mkc_torch.order_statistic import order_statistic
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -28,11 +31,16 @@ MAX_STANDARD_ERROR = 0.05
 
 
 class NotIdentifiableError(ValueError):
-    """The points do not determine an ellipsoid. ``coverage`` says what is missing, where it could be computed."""
+    """The points do not determine an ellipsoid.
 
-    def __init__(self, message: str, coverage: Coverage | None = None) -> None:
+    ``coverage`` says which directions are missing and ``directions`` (K, 3) holds the vectors it was computed from,
+    about the best centre known; both are None where all points are equal.
+    """
+
+    def __init__(self, message: str, found: Coverage | None = None, directions: Tensor | None = None) -> None:
         super().__init__(message)
-        self.coverage = coverage
+        self.coverage = found
+        self.directions = directions
 
 
 class Ellipsoid(NamedTuple):
@@ -98,7 +106,7 @@ def _axes(shape: Tensor) -> tuple[Tensor, Tensor]:
     return values.flip(-1).rsqrt(), vectors
 
 
-class EllipsoidFit:
+class EllipsoidFit(Fitted):
     """Ellipsoid through points by robust linear regression: the linear head for magnetometers.
 
     Args:
@@ -116,7 +124,7 @@ class EllipsoidFit:
         residual_: (*, N), calibrated norm less ``radius_``.
         weights_: (*, N), the weight in [0, 1] with which each point entered.
         center_se_, semi_axes_se_, calibration_matrix_se_: standard errors of the same shapes, where the estimator
-            has a ``covariance_``.
+            has a ``covariance_``; infinite where nine points leave none to tell errors from.
         coverage_: one :class:`mkc_torch.coverage.Coverage`, or a list of them, of the points in use.
         estimator_: the fitted estimator; its residual is algebraic, about twice the relative error of the norm.
 
@@ -135,9 +143,6 @@ class EllipsoidFit:
     def __init__(self, estimator: LinearEstimator | None = None) -> None:
         self.estimator = MKCRegression() if estimator is None else estimator
 
-    def __repr__(self) -> str:
-        return f"EllipsoidFit(estimator={self.estimator!r})"
-
     def fit(
         self, points: Float[Tensor, "*batch N 3"], sample_weight: Float[Tensor, "*batch N"] | None = None
     ) -> EllipsoidFit:
@@ -153,62 +158,56 @@ class EllipsoidFit:
             NotIdentifiableError: the points lie on a plane or cover too few directions; the message names those that
                 are missing.
         """
-        self._check(points)
-        points = points.contiguous()  # torch.median of an expanded tensor returns uninitialised memory
-        origin = points.median(-2, keepdim=True).values
-        size = torch.linalg.vector_norm(points - origin, dim=-1).median(-1).values[..., None, None]
+        self._forget()
+        points, weight = _prepared(points, sample_weight)
+        try:
+            self._fit(points, weight)
+        except NotIdentifiableError:
+            self._forget()
+            raise
+        return self
+
+    def _forget(self) -> None:
+        """Drop the results of an earlier fit."""
+        for name in [n for n in self.__dict__ if n.endswith("_")]:
+            del self.__dict__[name]
+
+    def _fit(self, points: Tensor, weight: Tensor | None) -> None:
+        used = None if weight is None else (weight > 0).to(points.dtype).unsqueeze(-1)
+        half = 0.5 * points.shape[-2]
+        origin = order_statistic(points, used, half).unsqueeze(-2)
+        radius = torch.linalg.vector_norm(points - origin, dim=-1, keepdim=True)
+        size = order_statistic(radius, used, half).unsqueeze(-2)
         if bool((size <= 0).any()):
-            raise NotIdentifiableError(_stuck(points))
+            raise _refusal(_stuck(points), points - origin)
         X = monomials((points - origin) / size).unsqueeze(-2)
         Y = torch.ones_like(X[..., 0])
-        weight = None if sample_weight is None else sample_weight.unsqueeze(-1)
+        self.estimator_ = copy.copy(self.estimator)
         try:
-            self.estimator_ = self.estimator.fit(X, Y, weight)
+            self.estimator_.fit(X, Y, None if weight is None else weight.unsqueeze(-1))
         except RankDeficientError:
-            raise NotIdentifiableError(_flat(points)) from None
+            raise _refusal(_flat(points), points - _middle(points)) from None
         local = ellipsoid_from_coefficients(self.estimator_.coef_)
         self._refuse_unbounded(local, points)
         scale = size.squeeze(-1)
         self._keep(points, Ellipsoid(origin.squeeze(-2) + scale * local.center, local.shape / size.square()))
         self.weights_ = self.estimator_.weights_.squeeze(-1)
         self._standard_errors(local, scale)
-        self._refuse_uncovered(points, sample_weight)
-        return self
+        self._refuse_uncovered(self.calibrate(points), weight)
 
     def calibrate(self, points: Float[Tensor, "*batch M 3"]) -> Float[Tensor, "*batch M 3"]:
         """``calibration_matrix_ @ (p - center_)`` of each point: the field in the unit of the points."""
         return torch.einsum("...ij,...kj->...ki", self.calibration_matrix_, points - self.center_.unsqueeze(-2))
 
-    @staticmethod
-    def _check(points: Tensor) -> None:
-        if not isinstance(points, Tensor) or not points.is_floating_point():
-            got = points.dtype if isinstance(points, Tensor) else type(points).__name__
-            raise TypeError(f"Expected argument `points` to be a real floating-point tensor but got {got}.")
-        if points.dim() < 2 or points.shape[-1] != 3:
-            raise ValueError(f"Expected argument `points` of shape (*, N, 3) but got {tuple(points.shape)}.")
-        if points.shape[-2] < MIN_POINTS:
-            raise ValueError(
-                f"Expected at least {MIN_POINTS} points, one for each coefficient of an ellipsoid, "
-                f"but got {points.shape[-2]}."
-            )
-        finite = torch.isfinite(points)
-        if not bool(finite.all()):
-            first = tuple((~finite).nonzero()[0].tolist())
-            raise ValueError(
-                f"Expected argument `points` to be finite but got {points[first].item()} at index {first} "
-                f"({int((~finite).sum())} such values); drop those points."
-            )
-
     def _refuse_unbounded(self, local: Ellipsoid, points: Tensor) -> None:
         values = torch.linalg.eigvalsh(local.shape.nan_to_num(0.0, 0.0, 0.0))
         # a surface a hundred times longer than wide is a cylinder to these points
-        bounded = values[..., 0] > 1e-4 * values[..., -1]
+        bounded = (values[..., 0] > 1e-4 * values[..., -1]).reshape(-1)
         if not bool(bounded.all()):
-            found = _coverages(points - _middle(points), None)
-            worst = found[int((~bounded).reshape(-1).nonzero()[0, 0])]
-            raise NotIdentifiableError(
-                "Not identifiable: the quadric that fits the points is no ellipsoid. " + _advice(worst), worst
-            )
+            index = int((~bounded).nonzero()[0, 0])
+            vectors = (points - _middle(points)).reshape(-1, *points.shape[-2:])[index]
+            where = f"Problem {index}: " if points.dim() > 2 else ""
+            raise _refusal(f"{where}Not identifiable: the quadric that fits the points is no ellipsoid.", vectors)
 
     def _keep(self, points: Tensor, ellipsoid: Ellipsoid) -> None:
         self.center_ = ellipsoid.center
@@ -221,8 +220,6 @@ class EllipsoidFit:
     def _standard_errors(self, local: Ellipsoid, scale: Tensor) -> None:
         """First-order propagation from the coefficients; the calibration matrix W solves dW W + W dW = dA₁."""
         covariance = getattr(self.estimator_, "covariance_", None)
-        for name in ("center_se_", "semi_axes_se_", "calibration_matrix_se_"):
-            self.__dict__.pop(name, None)
         if covariance is None:
             return
 
@@ -244,53 +241,96 @@ class EllipsoidFit:
         d_matrix = radius[:, None, None] * (d_root + root.flatten(1).unsqueeze(-1) * d_log_radius.unsqueeze(1))
         rows = torch.cat([jacobian[:, :6], d_matrix], 1)
         variance = torch.einsum("bij,bjk,bik->bi", rows, covariance.reshape(-1, 9, 9), rows)
-        errors = variance.clamp(min=0.0).sqrt().reshape(*scale.shape[:-1], 15)
+        errors = variance.nan_to_num(torch.inf).clamp(min=0.0).sqrt().reshape(*scale.shape[:-1], 15)
         self.center_se_ = errors[..., :3] * scale
         self.semi_axes_se_ = errors[..., 3:6] * scale
         self.calibration_matrix_se_ = errors[..., 6:].unflatten(-1, (3, 3))
 
-    def _refuse_uncovered(self, points: Tensor, sample_weight: Tensor | None) -> None:
-        in_use = self.weights_ if sample_weight is None else self.weights_ * (sample_weight > 0)
-        found = _coverages(self.calibrate(points), in_use)
-        self.coverage_: Coverage | list[Coverage] = found[0] if points.dim() == 2 else found
+    def _refuse_uncovered(self, field: Tensor, weight: Tensor | None) -> None:
+        in_use = self.weights_ >= 0.5 if weight is None else (self.weights_ >= 0.5) & (weight > 0)
+        flat = field.detach().reshape(-1, *field.shape[-2:])
+        directions = [f[use] for f, use in zip(flat, in_use.reshape(flat.shape[0], -1), strict=True)]
+        found = [coverage(d) for d in directions]
+        self.coverage_: Coverage | list[Coverage] = found[0] if field.dim() == 2 else found
+        largest = self._largest_standard_error()
         for index, one in enumerate(found):
+            where = f"Problem {index}: " if field.dim() > 2 else ""
             if one.information < MIN_INFORMATION:
-                raise NotIdentifiableError(
-                    f"Not identifiable: too few directions are covered to tell the offset from the shape "
-                    f"({one.information:.1e} of the information of an even coverage; {MIN_INFORMATION:g} is needed). "
-                    + _advice(one),
-                    one,
+                raise _refusal(
+                    f"{where}Not identifiable: too few directions are covered to tell the offset from the shape "
+                    f"({one.information:.1e} of the information of an even coverage; {MIN_INFORMATION:g} is needed).",
+                    directions[index],
                 )
-            if not hasattr(self, "center_se_"):
-                continue
-            radius = self.radius_.reshape(-1)[index]
-            errors = torch.cat([self.center_se_.reshape(-1, 3)[index], self.semi_axes_se_.reshape(-1, 3)[index]])
-            if not float(errors.max()) <= MAX_STANDARD_ERROR * float(radius):
-                raise NotIdentifiableError(
-                    f"Not identifiable: the centre or a semi-axis has a standard error of {float(errors.max()):.3g}, "
-                    f"more than {MAX_STANDARD_ERROR:.0%} of the radius {float(radius):.3g}. " + _advice(one),
-                    one,
+            if largest is not None and MAX_STANDARD_ERROR < float(largest[index]) < math.inf:
+                radius = float(self.radius_.reshape(-1)[index])
+                raise _refusal(
+                    f"{where}Not identifiable: the centre or a semi-axis has a standard error of "
+                    f"{float(largest[index]) * radius:.3g}, more than {MAX_STANDARD_ERROR:.0%} of the radius "
+                    f"{radius:.3g}.",
+                    directions[index],
                 )
 
+    def _largest_standard_error(self) -> Tensor | None:
+        """Of centre and semi-axes as a share of the radius, for each problem; infinite where it is unknown."""
+        if "center_se_" not in self.__dict__:
+            return None
+        errors = torch.cat([self.center_se_, self.semi_axes_se_], -1).amax(-1) / self.radius_
+        return errors.detach().reshape(-1)
 
-def _coverages(vectors: Tensor, weight: Tensor | None) -> list[Coverage]:
-    """Coverage of each problem by the points of at least half the full weight."""
-    flat = vectors.detach().reshape(-1, *vectors.shape[-2:])
+
+def _prepared(points: Tensor, sample_weight: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Checked points and weights; what a point of weight 0 holds is replaced, so that it can be anything."""
+    if not isinstance(points, Tensor) or not points.is_floating_point():
+        got = points.dtype if isinstance(points, Tensor) else type(points).__name__
+        raise TypeError(f"Expected argument `points` to be a real floating-point tensor but got {got}.")
+    if points.dim() < 2 or points.shape[-1] != 3:
+        raise ValueError(f"Expected argument `points` of shape (*, N, 3) but got {tuple(points.shape)}.")
+    weight = None
+    if sample_weight is not None:
+        if sample_weight.shape != points.shape[:-1] and sample_weight.shape != points.shape[-2:-1]:
+            raise ValueError(
+                f"Expected argument `sample_weight` of shape {tuple(points.shape[:-1])} "
+                f"but got {tuple(sample_weight.shape)}."
+            )
+        weight = sample_weight.to(points).expand(points.shape[:-1])
+    count = points.shape[-2] if weight is None else int((weight > 0).sum(-1).min())
+    if count < MIN_POINTS:
+        raise ValueError(
+            f"Expected at least {MIN_POINTS} points, one for each coefficient of an ellipsoid, but got {count}."
+        )
+    finite = torch.isfinite(points)
+    if weight is not None:
+        finite = finite | (weight == 0).unsqueeze(-1)
+    if not bool(finite.all()):
+        first = tuple((~finite).nonzero()[0].tolist())
+        raise ValueError(
+            f"Expected argument `points` to be finite but got {points[first].item()} at index {first} "
+            f"({int((~finite).sum())} such values); drop those points."
+        )
     if weight is None:
-        return [coverage(v) for v in flat]
-    weight = weight.detach().reshape(flat.shape[0], -1)
-    return [coverage(v[w >= 0.5]) for v, w in zip(flat, weight, strict=True)]
+        return points, None
+    first_used = (weight > 0).to(torch.int64).argmax(-1)[..., None, None].expand(*points.shape[:-2], 1, 3)
+    return torch.where((weight > 0).unsqueeze(-1), points, points.gather(-2, first_used)), weight
 
 
 def _middle(points: Tensor) -> Tensor:
     return 0.5 * (points.amax(-2, keepdim=True) + points.amin(-2, keepdim=True))
 
 
-def _advice(found: Coverage) -> str:
-    if not found.gaps:
-        return "Turn the sensor through all directions."
-    missing = "; ".join(str(g) for g in found.gaps)
-    return f"Directions not covered: {missing}. Turn the sensor so that the field points there too."
+def _refusal(message: str, vectors: Tensor) -> NotIdentifiableError:
+    """The error, with the directions that are covered and advice on those that are not."""
+    flat = vectors.detach().reshape(-1, 3)
+    directions = flat[torch.linalg.vector_norm(flat, dim=-1) > 0]
+    if len(directions) == 0:
+        return NotIdentifiableError(message)
+    found = coverage(directions)
+    if "Turn the sensor" not in message:
+        missing = "; ".join(str(g) for g in found.gaps)
+        turn = "Turn the sensor so that the field points there too."
+        message += (
+            f" Directions not covered: {missing}. {turn}" if missing else " Turn the sensor through all directions."
+        )
+    return NotIdentifiableError(message, found, directions)
 
 
 def _stuck(points: Tensor) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
@@ -155,7 +156,8 @@ class MKCLoss(nn.Module):
                     "Expected a finite `sigma` with `learn_sigma=True` but got inf, where its gradient is 0; "
                     "start large, at 10 say, or pass `learn_sigma=False`."
                 )
-            self.raw_kappa.copy_(torch.logit(kappa.double() / KAPPA_MAX))
+            # a hair inside the range, where the gradient is not 0
+            self.raw_kappa.copy_(torch.logit((kappa.double() / KAPPA_MAX).clamp(max=1.0 - 1e-6)))
         elif self.fixed_kappa is not None:
             self.fixed_kappa.copy_(kappa)
 
@@ -192,6 +194,16 @@ class MKCLoss(nn.Module):
             self.raw_d.copy_(torch.logit((d.double() - low) / (high - low)))
         elif self.fixed_d is not None:
             self.fixed_d.copy_(d)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> MKCLoss:
+        """Parameters and bounds stay in float32 at least: half would round them, or overflow."""
+
+        def keep(t: Tensor) -> Tensor:
+            out = fn(t)
+            return t.to(out.device) if out.dtype in (torch.float16, torch.bfloat16) else out
+
+        super()._apply(keep, recurse)  # type: ignore[no-untyped-call]
+        return self
 
     def log_normalizer(self) -> Float[Tensor, " m"]:
         """``log(d Z)`` of each channel: what the negative log-likelihood adds to the energy."""

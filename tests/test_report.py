@@ -9,8 +9,9 @@ import torch
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
-from mkc_torch.calibration import NotCalibratedError, calibrate
+from mkc_torch.calibration import calibrate
 from mkc_torch.demo import simulated_recording
+from mkc_torch.ellipsoid import NotIdentifiableError
 from mkc_torch.recording import Recording
 from mkc_torch.report import Comparison, calibration_report, refusal_report, wording
 from tests.test_calibration import noisy_ellipsoid, recorded
@@ -147,7 +148,7 @@ def test_recording_without_time_has_samples_on_the_axis():
 def test_refusal_names_the_directions_and_the_motion():
     points = noisy_ellipsoid(600)
     cap = recorded(points[points[:, 2] < -10.0])
-    with pytest.raises(NotCalibratedError) as refused:
+    with pytest.raises(NotIdentifiableError) as refused:
         calibrate(cap)
     shown = refusal_report(cap, refused.value)
     text = text_of(shown)
@@ -160,7 +161,7 @@ def test_refusal_names_the_directions_and_the_motion():
 
 def test_refusal_without_any_direction_has_no_map():
     still = recorded(torch.ones(50, 3, dtype=torch.float64))
-    with pytest.raises(NotCalibratedError) as refused:
+    with pytest.raises(NotIdentifiableError) as refused:
         calibrate(still)
     assert "<svg " not in refusal_report(still, refused.value)
 

@@ -20,8 +20,9 @@ from mkc_torch._commands.console import (
 )
 from mkc_torch._commands.summary import show
 from mkc_torch._files import claim_folder, write_atomically
-from mkc_torch.calibration import Calibration, NotCalibratedError
+from mkc_torch.calibration import Calibration
 from mkc_torch.calibration import calibrate as fit
+from mkc_torch.ellipsoid import NotIdentifiableError
 from mkc_torch.recording import Recording
 from mkc_torch.report import calibration_report, refusal_report
 
@@ -77,11 +78,11 @@ def calibrate_into(
     with folder_removed_on_failure(folder):
         try:
             calibration = fit(recording, field_strength=field_strength)
-        except NotCalibratedError as error:
+        except NotIdentifiableError as error:
             page = refusal_report(recording, error)
-            result.unlink(missing_ok=True)  # an old one beside a new refusal would be taken for its result
             write_atomically(report, page, overwrite=force)
-            raise NotCalibratedError(f"{error} See {report}.", error.coverage, error.directions) from None
+            result.unlink(missing_ok=True)  # an old one beside a new refusal would be taken for its result
+            raise NotIdentifiableError(f"{error} See {report}.", error.coverage, error.directions) from None
         page = calibration_report(calibration, recording)
         write_atomically(result, calibration.to_json(), overwrite=force)
         write_atomically(report, page, overwrite=force)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -43,7 +44,8 @@ def demo(
     console.print()
     console.print(_table(rows))
     console.print(f"\nNext: open {files[-1]}, or", markup=False, soft_wrap=True)
-    console.print(f"  mkc apply {files[1]} {files[0]} --output corrected.csv", markup=False, soft_wrap=True)
+    command = shlex.join(["mkc", "apply", str(files[1]), str(files[0]), "--output", "corrected.csv"])
+    console.print(f"  {command}", markup=False, soft_wrap=True)
 
 
 def _demonstrate(folder: Path, *, force: bool) -> tuple[Calibration, list[Comparison], list[Path]]:

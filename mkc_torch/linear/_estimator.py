@@ -20,7 +20,20 @@ class NotFittedError(AttributeError):
     """A result was asked for before ``fit``."""
 
 
-class LinearEstimator:
+class Fitted:
+    """Results have names that end in an underscore and exist after ``fit``; a repr shows the parameters."""
+
+    def __repr__(self) -> str:
+        names = [p for p in inspect.signature(type(self).__init__).parameters if p != "self"]
+        return f"{type(self).__name__}({', '.join(f'{p}={getattr(self, p)!r}' for p in names)})"
+
+    def __getattr__(self, name: str) -> Any:
+        if name.endswith("_") and not name.startswith("_"):
+            raise NotFittedError(f"{type(self).__name__} has no `{name}` yet; call fit(X, Y) first.")
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+
+class LinearEstimator(Fitted):
     """Base of the linear estimators: ``fit(X, Y, sample_weight=None)`` returns the estimator itself.
 
     Attributes, after ``fit`` (``*`` are batch dimensions):
@@ -55,12 +68,3 @@ class LinearEstimator:
     def _by_channel(self, values: Tensor) -> Tensor:
         """Drop the channel dimension where the user gave none."""
         return values.squeeze(-1) if self._single_channel else values
-
-    def __repr__(self) -> str:
-        names = [p for p in inspect.signature(type(self).__init__).parameters if p != "self"]
-        return f"{type(self).__name__}({', '.join(f'{p}={getattr(self, p)!r}' for p in names)})"
-
-    def __getattr__(self, name: str) -> Any:
-        if name.endswith("_") and not name.startswith("_"):
-            raise NotFittedError(f"{type(self).__name__} has no `{name}` yet; call fit(X, Y) first.")
-        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")

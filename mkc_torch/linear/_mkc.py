@@ -17,6 +17,28 @@ if TYPE_CHECKING:
     from mkc_torch.linear._problem import LinearProblem
 
 
+def channel_parameter(name: str, value: float | Tensor, problem: LinearProblem, *, infinite: bool = False) -> Tensor:
+    """A positive parameter of every channel as a tensor (B, m); accepts a number, (m,) or (*, m).
+
+    Where the user gave no channel dimension, (*,) is accepted too, the shape in which results come back.
+    """
+    t = torch.as_tensor(value, dtype=problem.Y.dtype, device=problem.Y.device)
+    m = problem.num_channels
+    if problem.single_channel and problem.batch and t.shape == problem.batch:
+        t = t.unsqueeze(-1)
+    if t.dim() > 0 and t.shape[-1] not in (1, m):
+        raise ValueError(f"Expected argument `{name}` to be a number or of shape ({m},) but got {tuple(t.shape)}.")
+    if not bool(((t > 0) & (torch.isfinite(t) | infinite)).all()):
+        kind = "positive" if infinite else "positive and finite"
+        raise ValueError(f"Expected argument `{name}` to be {kind} but got {value}.")
+    try:
+        return t.expand(*problem.batch, m).reshape(-1, m)
+    except RuntimeError:
+        raise ValueError(
+            f"Expected argument `{name}` of shape (m,) or (*, m) = {(*problem.batch, m)} but got {tuple(t.shape)}."
+        ) from None
+
+
 def kernel_weight(
     residual: Float[Tensor, "B *S N m"], kappa: Float[Tensor, "B *S m"], d: Float[Tensor, "B *S m"]
 ) -> Float[Tensor, "B *S N m"]:
@@ -61,6 +83,9 @@ def coefficient_covariance(
     used = (
         problem.total_weight().sum(-1) if problem.sample_weight is None else (problem.sample_weight > 0).sum((-2, -1))
     )
-    dof = used / (used - problem.num_coefficients).clamp(min=1)
+    left = used - problem.num_coefficients
+    dof = used / left.clamp(min=1)
     in_basis = sandwich(curvature, score, dof.to(score.dtype), kind, bandwidth)
-    return problem.restore(torch.matmul(torch.matmul(problem.to_coef, in_basis), problem.to_coef.mT))
+    covariance = torch.matmul(torch.matmul(problem.to_coef, in_basis), problem.to_coef.mT)
+    # as many coefficients as values leave nothing to tell errors from
+    return problem.restore(torch.where((left > 0)[:, None, None], covariance, torch.inf))

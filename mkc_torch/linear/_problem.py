@@ -168,6 +168,17 @@ class CanonicalShapes:
     single_channel: bool
 
 
+def _check_magnitude(Y: Tensor) -> None:
+    """Residuals are squared twice, in weights and in covariances, which must neither overflow nor vanish."""
+    largest = float(Y.detach().abs().max())
+    limit = float(torch.finfo(Y.dtype).max) ** 0.25
+    if largest > limit or 0.0 < largest < 1.0 / limit:
+        raise ValueError(
+            f"Expected argument `Y` of a magnitude between {1.0 / limit:.0e} and {limit:.0e} in {Y.dtype} "
+            f"but got {largest:.3g}; choose another unit."
+        )
+
+
 def canonical_shapes(
     X: Float[Tensor, "*batch N m n"],
     Y: Float[Tensor, "*batch N m"],
@@ -202,6 +213,7 @@ def canonical_shapes(
         raise ValueError(f"Expected at least one sample and one column but got `X` {tuple(X.shape)}.")
     _check_finite("X", X)
     _check_finite("Y", Y)
+    _check_magnitude(Y)
     batch = _common_batch("X", X.shape[:-3], "Y", Y.shape[:-2])
     N, m = Y.shape[-2:]
     weight = None

@@ -71,6 +71,11 @@ def robust_start(problem: LinearProblem, method: Start | Tensor = "lts", *, seed
     case: the values on the fit keep weight 1 and the others lose theirs.
     """
     if isinstance(method, Tensor):
+        n = problem.num_coefficients
+        if method.dim() == 0 or method.shape[-1] != n or not bool(torch.isfinite(method).all()):
+            raise ValueError(
+                f"Expected argument `start` to be {n} finite coefficients, (n,) or (*, n), but got {method.tolist()}."
+            )
         beta = problem.in_basis(method.to(problem.Y))
     elif method == "lts":
         beta = _trimmed_start(problem, seed)

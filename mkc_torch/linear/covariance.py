@@ -20,6 +20,13 @@ def checked_kind(kind: CovarianceKind) -> CovarianceKind:
     return kind
 
 
+def checked_bandwidth(bandwidth: float | None) -> float | None:
+    """``bandwidth``, or a clear error."""
+    if bandwidth is not None and not 0 <= bandwidth < float("inf"):
+        raise ValueError(f"Expected argument `bandwidth` to be a number of lags >= 0 but got {bandwidth}.")
+    return bandwidth
+
+
 def andrews_bandwidth(score: Float[Tensor, "*batch N n"]) -> Float[Tensor, " *batch"]:
     """Bandwidth in samples of the Bartlett kernel by Andrews' AR(1) rule, 1.1447 (α N)^(1/3), at most N / 4.
 

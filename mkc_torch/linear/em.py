@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -16,17 +15,13 @@ from mkc_torch.density_fit import (
     initial_state,
     negative_log_likelihood,
     newton_step,
+    refuse_narrow_bound,
 )
 from mkc_torch.linear._estimator import LinearEstimator
-from mkc_torch.linear._mkc import coefficient_covariance, fixed_point_step, kernel_weight
+from mkc_torch.linear._mkc import channel_parameter, coefficient_covariance, fixed_point_step, kernel_weight
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import RobustStart, Start, robust_start
-from mkc_torch.linear.covariance import CovarianceKind, checked_kind
-from mkc_torch.linear.fixed_point import channel_parameter
-
-if TYPE_CHECKING:
-    pass
-
+from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 
 _FLOOR = 0.3
 """Least d in robust scales: a scale is at most doubled by outliers, and a fit that interpolates ends far below."""
@@ -77,7 +72,7 @@ def _alternate(
         if bool(done.any()) or len(history) > max_iter:
             out_beta[index] = beta
             out_state = _write(out_state, index, state)
-            converged[index] = done
+            converged[index] = done & torch.isfinite(now)
             keep = (~done).nonzero().squeeze(-1)
             if keep.numel() == 0:
                 break
@@ -135,14 +130,15 @@ class MKCRegression(LinearEstimator):
     where the Gaussian likelihood at least squares is higher than what it ends at, it goes on from there.
 
     The domain ``a`` of each channel is fixed before, from a rough fit: half the range of its residuals, and no less
-    than ten of its d (:func:`mkc_torch.density_fit.domain_rule` says why), or what ``bound`` says. d stays above a
-    tenth of the robust scale, since the likelihood of residuals that a fit interpolates grows without limit.
+    than ten of its d (:func:`mkc_torch.density_fit.domain_rule` says why), or what ``bound`` says. d stays above 0.3
+    robust scales, since the likelihood of residuals that a fit interpolates grows without limit.
 
     Args:
         sigma: None learns σ; a number, (m,) or (*, m) keeps it: ``inf`` is least squares with learned channel weights
             (Remark 7).
         d: None learns d; a value keeps it (Remark 6).
-        bound: half-width of the domain in the unit of Y, a number, (m,) or (*, m); None takes the rule above.
+        bound: half-width of the domain in the unit of Y, at least two robust scales of the residuals, a number, (m,) or
+            (*, m); None takes the rule above. A residual beyond it counts as one on the flat tail.
         start: "lts", "s", "least_squares", or a tensor of coefficients.
         max_iter: alternations at most.
         tol: converged when two alternations in a row each raise the mean log-likelihood by less (nats per sample).
@@ -195,7 +191,7 @@ class MKCRegression(LinearEstimator):
         self.max_iter = max_iter
         self.tol = tol
         self.covariance = checked_kind(covariance)
-        self.bandwidth = bandwidth
+        self.bandwidth = checked_bandwidth(bandwidth)
         self.seed = seed
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> MKCRegression:
@@ -217,6 +213,7 @@ class MKCRegression(LinearEstimator):
         else:
             beta = begin.beta
             bound = channel_parameter("bound", self.bound, problem)
+            refuse_narrow_bound(bound, begin.scale)
             state = self._initial_state(problem, beta, begin.scale, bound, d_min)
         maximum = _alternate(problem, beta, state, max_iter=self.max_iter, tol=self.tol)
         if state.free_kappa and state.free_d:
@@ -255,7 +252,7 @@ class MKCRegression(LinearEstimator):
             problem.residual(beta),
             _normalised_weight(problem),
             scale,
-            torch.maximum(bound, 2.0 * d_min),
+            bound,
             d_min,
             kappa=None if sigma is None else sigma.pow(-2),
             d=d,

@@ -9,33 +9,22 @@ import torch
 from torch import Tensor
 
 from mkc_torch.linear._estimator import LinearEstimator
-from mkc_torch.linear._mkc import coefficient_covariance, fixed_point_step, kernel_weight, mean_energy
+from mkc_torch.linear._mkc import (
+    channel_parameter,
+    coefficient_covariance,
+    fixed_point_step,
+    kernel_weight,
+    mean_energy,
+)
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import Start, robust_start
-from mkc_torch.linear.covariance import CovarianceKind, checked_kind
+from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 
 _GRADUATION = 10
-
-
-def channel_parameter(name: str, value: float | Tensor, problem: LinearProblem, *, infinite: bool = False) -> Tensor:
-    """A positive parameter of every channel as a tensor (B, m); accepts a number, (m,) or (*, m)."""
-    t = torch.as_tensor(value, dtype=problem.Y.dtype, device=problem.Y.device)
-    m = problem.num_channels
-    if t.dim() > 0 and t.shape[-1] not in (1, m):
-        raise ValueError(f"Expected argument `{name}` to be a number or of shape ({m},) but got {tuple(t.shape)}.")
-    if not bool(((t > 0) & (torch.isfinite(t) | infinite)).all()):
-        kind = "positive" if infinite else "positive and finite"
-        raise ValueError(f"Expected argument `{name}` to be {kind} but got {value}.")
-    try:
-        return t.expand(*problem.batch, m).reshape(-1, m)
-    except RuntimeError:
-        raise ValueError(
-            f"Expected argument `{name}` of shape (m,) or (*, m) = {(*problem.batch, m)} but got {tuple(t.shape)}."
-        ) from None
 
 
 def whitened(X: Tensor, Y: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
@@ -49,7 +38,7 @@ def whitened(X: Tensor, Y: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
     if covariance.shape != (m, m):
         raise ValueError(f"Expected argument `noise_covariance` of shape ({m}, {m}) but got {tuple(covariance.shape)}.")
     factor, info = torch.linalg.cholesky_ex(covariance)
-    if int(info) != 0 or not torch.allclose(covariance, covariance.mT):
+    if int(info) != 0 or not torch.allclose(covariance, covariance.mT, rtol=1e-5, atol=0.0):
         raise ValueError("Expected argument `noise_covariance` to be symmetric and positive definite.")
     return (
         torch.linalg.solve_triangular(factor, X, upper=False),
@@ -142,7 +131,7 @@ class FixedPointLinear(LinearEstimator):
         self.max_iter = max_iter
         self.tol = tol
         self.covariance = checked_kind(covariance)
-        self.bandwidth = bandwidth
+        self.bandwidth = checked_bandwidth(bandwidth)
         self.seed = seed
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> FixedPointLinear:

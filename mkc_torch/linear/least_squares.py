@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -11,10 +10,7 @@ from torch import Tensor
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._mkc import coefficient_covariance
 from mkc_torch.linear._problem import canonical_shapes, linear_problem
-from mkc_torch.linear.covariance import CovarianceKind, checked_kind
-
-if TYPE_CHECKING:
-    pass
+from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 
 
 class LeastSquares(LinearEstimator):
@@ -33,7 +29,7 @@ class LeastSquares(LinearEstimator):
     def __init__(self, *, covariance: CovarianceKind = "sandwich", bandwidth: float | None = None) -> None:
         super().__init__()
         self.covariance = checked_kind(covariance)
-        self.bandwidth = bandwidth
+        self.bandwidth = checked_bandwidth(bandwidth)
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> LeastSquares:
         """Fit ``Y ~ X coef``.

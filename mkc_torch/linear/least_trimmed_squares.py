@@ -112,6 +112,8 @@ class LeastTrimmedSquares(LinearEstimator):
 
     def __init__(self, h: int | None = None, *, starts: int = 500, seed: int = 0) -> None:
         super().__init__()
+        if h is not None and (isinstance(h, bool) or not isinstance(h, int)):
+            raise TypeError(f"Expected argument `h` to be a whole number but got {h!r}.")
         if starts < 1:
             raise ValueError(f"Expected argument `starts` to be at least 1 but got {starts}.")
         self.h = h

@@ -9,8 +9,9 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
-from mkc_torch.calibration import MAX_REJECTED, Calibration, NotCalibratedError, Vector, prepared
+from mkc_torch.calibration import MAX_REJECTED, Calibration, Vector, prepared
 from mkc_torch.coverage import nearest_axis
+from mkc_torch.ellipsoid import NotIdentifiableError
 from mkc_torch.recording import Recording
 from mkc_torch.report import pictures, wording
 
@@ -65,7 +66,7 @@ def calibration_report(
     )
 
 
-def refusal_report(recording: Recording, error: NotCalibratedError) -> str:
+def refusal_report(recording: Recording, error: NotIdentifiableError) -> str:
     """The page for a recording that determines no calibration: which directions are missing, and how to record them.
 
     Args:
@@ -79,7 +80,7 @@ def refusal_report(recording: Recording, error: NotCalibratedError) -> str:
         >>> flat = Recording({"mag_x": angle.cos(), "mag_y": angle.sin(), "mag_z": 0 * angle}, name="flat")
         >>> try:
         ...     calibrate(flat)
-        ... except NotCalibratedError as error:
+        ... except NotIdentifiableError as error:
         ...     page = refusal_report(flat, error)
         >>> "not identifiable" in page
         True
