@@ -147,6 +147,7 @@ def test_other_texts_are_refused(text, told):
     [
         (("center", "value"), [1, 2], "`center.value`.*3 numbers"),
         (("center", "value"), [1, 2, "x"], "`center.value`"),
+        (("center", "value"), [1, 2, 10**400], "`center.value`"),
         (("center", "value"), [1, 2, None], "`center.value`"),
         (("matrix", "value"), [[1, 0, 0], [0, 1, 0]], "`matrix.value`.*3 rows"),
         (("matrix", "value"), [[1, 0, 0], [0, 1, 0], 3], "`matrix.value.2`"),

@@ -155,3 +155,13 @@ def test_a_gap_reads_as_a_sentence():
 
 def test_float32_and_many_vectors():
     assert coverage(sample(0, 10_000, 3).float()).fraction == 1.0
+
+
+@pytest.mark.parametrize("length", [1e-300, 1e-13, 1e300])
+def test_the_length_of_directions_does_not_matter(length):
+    assert coverage(length * fibonacci_sphere(500)).fraction == coverage(fibonacci_sphere(500)).fraction
+
+
+def test_no_directions_are_refused():
+    with pytest.raises(ValueError, match="at least one direction"):
+        coverage(torch.zeros(0, 3))

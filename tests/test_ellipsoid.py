@@ -19,6 +19,7 @@ from mkc_torch.linear import (
     LeastSquares,
     LeastTrimmedSquares,
     MKCRegression,
+    NotFittedError,
     Ridge,
     SRegression,
 )
@@ -492,3 +493,43 @@ def test_a_flight_that_never_turns_over_is_refused_naming_what_is_missing(name):
     error = refused(recorded(name))
     assert "+z" in str(error)
     assert error.coverage is not None
+
+
+def test_what_a_point_of_weight_0_holds_does_not_matter():
+    order = torch.randperm(200, generator=torch.Generator().manual_seed(0))
+    points = fibonacci_sphere(200)[order] * torch.tensor([40.0, 50.0, 60.0], dtype=torch.float64) + 5.0
+    weight = torch.ones(200, dtype=torch.float64)
+    weight[:120] = 0.0
+    expected = EllipsoidFit().fit(points[120:])
+    spoiled = points.clone()
+    spoiled[:60], spoiled[60:120] = math.nan, 1e6
+    fit = EllipsoidFit().fit(spoiled, weight)
+    torch.testing.assert_close(fit.center_, expected.center_, rtol=0, atol=1e-8)
+    torch.testing.assert_close(fit.semi_axes_, expected.semi_axes_, rtol=0, atol=1e-8)
+
+
+def test_a_refused_fit_leaves_no_results_of_its_own_or_of_an_earlier_one():
+    sphere = 50.0 * fibonacci_sphere(400)
+    fit = EllipsoidFit().fit(sphere)
+    with pytest.raises(NotIdentifiableError, match="Not identifiable") as refused:
+        fit.fit(sphere[sphere[:, 2] > 43.0] + 0.1 * torch.randn(sphere[sphere[:, 2] > 43.0].shape).double())
+    assert refused.value.coverage is not None
+    assert refused.value.directions is not None
+    with pytest.raises(NotFittedError, match="center_"):
+        _ = fit.center_
+
+
+def test_two_fits_do_not_share_the_estimator_they_were_given():
+    estimator = MKCRegression()
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(400, 3, generator=generator, dtype=torch.float64)
+    first = EllipsoidFit(estimator).fit(50.0 * fibonacci_sphere(400) + 0.1 * noise)
+    d = float(first.estimator_.d_)
+    EllipsoidFit(estimator).fit(50.0 * fibonacci_sphere(400) + 2.0 * noise)
+    assert float(first.estimator_.d_) == d
+
+
+def test_nine_points_leave_nothing_to_tell_errors_from():
+    generator = torch.Generator().manual_seed(1)
+    points = 50.0 * fibonacci_sphere(9) + torch.randn(9, 3, generator=generator, dtype=torch.float64)
+    assert bool(torch.isinf(EllipsoidFit().fit(points).semi_axes_se_).all())

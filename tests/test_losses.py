@@ -674,3 +674,14 @@ def test_per_sample_gradients_under_vmap_with_masks():
     slopes = vmap(grad(lambda x, y, m: loss(x, y, m)))(x, y, mask)
     leaf = x.clone().requires_grad_()
     torch.testing.assert_close(slopes, gradients(loss(leaf, y, mask), leaf)[0])
+
+
+def test_half_keeps_the_parameters_and_bounds_in_float32():
+    loss = MKCLoss(1, d=1000.0).half()
+    assert {t.dtype for t in loss.state_dict().values()} == {torch.float32}
+    assert math.isfinite(loss(torch.ones(3, 1).half(), torch.zeros(3, 1).half()).item())
+
+
+def test_a_bandwidth_at_the_end_of_its_range_can_still_move():
+    loss = MKCLoss(1, sigma=0.05)
+    assert float(torch.autograd.grad(loss.kappa.sum(), loss.raw_kappa)[0]) > 1e-5

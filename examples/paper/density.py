@@ -19,7 +19,7 @@ from scipy.special import erf, gammaln
 from scipy.stats import norm
 
 from mkc_torch import MKCLoss
-from mkc_torch.functional import log_partition
+from mkc_torch.functional import energy, log_partition
 
 LENGTHS = np.concatenate([np.linspace(1, 12, 12), np.logspace(1.2, 7, 12)])
 KAPPAS = np.concatenate([[0.0], np.logspace(-3, math.log10(400), 40)])
@@ -65,6 +65,15 @@ def slope_errors() -> float:
     return float(np.abs(found / expected - 1).max())
 
 
+def edge_errors() -> float:
+    """d log Z / d length against 2 exp(-energy(length)) / Z, where it exceeds 1e-6."""
+    grid = [(k, a) for k in KAPPAS for a in LENGTHS]
+    kappa, length = torch.tensor(grid, dtype=torch.float64).unbind(-1)
+    found = torch.func.grad(lambda a: log_partition(kappa, a).sum())(length)
+    expected = torch.exp(math.log(2) - energy(length, kappa)) / torch.tensor([series(k, a) for k, a in grid])
+    return float((found / expected - 1).abs()[expected > 1e-6].max())
+
+
 def gaussian_difference() -> tuple[float, float]:
     """Largest difference to weighted least squares and to GaussianNLLLoss at sigma = inf, over value and gradients."""
     generator = torch.Generator().manual_seed(0)
@@ -98,6 +107,7 @@ def main() -> None:
         ("Z, relative, float64", normaliser_errors(torch.float64)),
         ("Z, relative, float32", normaliser_errors(torch.float32)),
         ("d log Z / d kappa, relative, float64", slope_errors()),
+        ("d log Z / d (a/d), relative where it exceeds 1e-6, float64", edge_errors()),
         ("sigma = inf against weighted least squares, value and gradient", wls),
         ("sigma = inf against GaussianNLLLoss, value and gradients", gaussian),
     ):

@@ -6,6 +6,7 @@ unless B exceeds n and also exceeds 16 or A: more channels than that are not mea
 ``X.unsqueeze(-2), Y.unsqueeze(-1)`` says "one channel" whatever the sizes.
 """
 
+from mkc_torch.linear._estimator import NotFittedError
 from mkc_torch.linear._problem import RankDeficientError
 from mkc_torch.linear.em import MKCRegression
 from mkc_torch.linear.fixed_point import FixedPointLinear
@@ -20,6 +21,7 @@ __all__ = [
     "LeastSquares",
     "LeastTrimmedSquares",
     "MKCRegression",
+    "NotFittedError",
     "RankDeficientError",
     "Ridge",
     "SRegression",

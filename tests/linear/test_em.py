@@ -548,3 +548,35 @@ def test_dependent_columns_are_refused():
 def test_fewer_values_than_coefficients_are_refused():
     with pytest.raises(ValueError, match="at least 4 values"):
         MKCRegression().fit(sample(0, 3, 4), sample(1, 3))
+
+
+def test_what_a_batched_fit_returns_can_be_given_to_the_next():
+    generator = torch.Generator().manual_seed(0)
+    X = torch.randn(50, 2, generator=generator, dtype=torch.float64)
+    Y = X.sum(-1) + 0.1 * torch.randn(3, 50, generator=generator, dtype=torch.float64)
+    first = MKCRegression().fit(X, Y)
+    second = MKCRegression(bound=first.bound_, start=first.coef_).fit(X, Y)
+    torch.testing.assert_close(second.bound_, first.bound_)
+    torch.testing.assert_close(second.log_likelihood_, first.log_likelihood_, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("start", [torch.full((2,), math.nan), torch.zeros(3), torch.tensor(1.0)])
+def test_a_start_that_is_no_set_of_coefficients_is_refused(start):
+    X, y = torch.randn(20, 2).double(), torch.randn(20).double()
+    with pytest.raises(ValueError, match="`start` to be 2 finite coefficients"):
+        MKCRegression(start=start).fit(X, y)
+
+
+def test_a_domain_too_narrow_for_the_residuals_is_refused():
+    X, y = torch.ones(50, 1).double(), torch.linspace(-1, 1, 50).double()
+    with pytest.raises(
+        ValueError, match=r"`bound` to be at least two robust scales of the residuals, 1\.\d+, but got 0.1"
+    ):
+        MKCRegression(bound=0.1).fit(X, y)
+
+
+@pytest.mark.parametrize(("dtype", "unit"), [(torch.float64, 1e200), (torch.float64, 1e-200), (torch.float32, 1e19)])
+def test_a_unit_that_overflows_is_refused(dtype, unit):
+    X, y = torch.ones(50, 1, dtype=dtype), unit * torch.linspace(-1, 1, 50, dtype=dtype)
+    with pytest.raises(ValueError, match=r"`Y` of a magnitude between .* choose another unit"):
+        MKCRegression().fit(X, y)
