@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
+from mkc_torch.calibration_file import Calibration, Matrix, Spread, Vector
 from mkc_torch.coverage import Coverage
-from mkc_torch.disturbance import Interval, disturbed_intervals
+from mkc_torch.disturbance import disturbed_intervals
 from mkc_torch.ellipsoid import (
     MIN_POINTS,
     EllipsoidFit,
     ellipsoid_from_coefficients,
-    symmetric_root,
 )
-from mkc_torch.functional import mkc_weight
 from mkc_torch.linear import MKCRegression
 from mkc_torch.linear.covariance import CovarianceKind
 from mkc_torch.recording import Recording, RecordingError
 
-if TYPE_CHECKING:
-    from jaxtyping import Float
-
-__all__ = ["Calibration", "Spread", "calibrate", "prepared"]
+__all__ = ["Calibration", "Matrix", "Spread", "Vector", "calibrate", "prepared"]
 
 REJECTED_BELOW = 0.5
 """A sample of less than this weight counts as rejected."""
@@ -33,135 +27,9 @@ REJECTED_BELOW = 0.5
 MAX_REJECTED = 0.2
 """Above this share of rejected samples one ellipsoid is a doubtful model, and a warning says so."""
 
-Vector = tuple[float, float, float]
-Matrix = tuple[Vector, Vector, Vector]
-
 _LEAST = 1e-60
 FEW_SAMPLES = 50
 _AXES = ("mag_x", "mag_y", "mag_z")
-
-
-class Spread(NamedTuple):
-    """The size of residuals: 1.4826 times their median absolute value, and their root mean square."""
-
-    robust: float
-    rms: float
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """What a recording says about its magnetometer: ``field = matrix @ (measured - center)``.
-
-    Lengths are in ``unit``, the recording's, but for the corrected field, which is in ``field_unit``.
-
-    Attributes:
-        recording: name of the recording.
-        samples: samples in the fit.
-        unit: of what was measured.
-        center, center_se: offset (hard iron) and its standard errors.
-        semi_axes, semi_axes_se: of the ellipsoid, ascending.
-        rotation: columns along the semi-axes, determinant +1.
-        matrix, matrix_se: the calibration matrix, symmetric.
-        radius: geometric mean of the semi-axes.
-        field_strength, field_unit: the length of the corrected field: the radius, unless it was given.
-        sigma, d, bound: MKC density of :meth:`algebraic_residual`, no units; ``sigma`` is inf for Gaussian residuals.
-        before: of the measured norm about its median.
-        after: of :meth:`norm_residual`, rejected samples included.
-        rejected: number of samples of weight below one half.
-        disturbed: where rejected samples stand close together in time.
-        coverage: of directions, by the samples in use.
-        warnings: sentences about the recording and the fit.
-    """
-
-    recording: str
-    samples: int
-    unit: str
-    center: Vector
-    center_se: Vector
-    semi_axes: Vector
-    semi_axes_se: Vector
-    rotation: Matrix
-    matrix: Matrix
-    matrix_se: Matrix
-    radius: float
-    field_strength: float
-    field_unit: str
-    sigma: float
-    d: float
-    bound: float
-    before: Spread
-    after: Spread
-    rejected: int
-    disturbed: tuple[Interval, ...]
-    coverage: Coverage
-    warnings: tuple[str, ...]
-
-    @property
-    def rejected_share(self) -> float:
-        return self.rejected / self.samples
-
-    def corrected(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """The field in ``field_unit`` from measurements in ``unit``."""
-        center, matrix = points.new_tensor(self.center), points.new_tensor(self.matrix)
-        return (points - center) @ matrix.mT
-
-    def norm_residual(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """Length of the corrected field less what it should be, in ``unit``."""
-        relative = torch.linalg.vector_norm(self.corrected(points), dim=-1) / self.field_strength
-        return self.radius * (relative - 1.0)
-
-    def algebraic_residual(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """``(|field| / field_strength)² - 1``, twice the relative error of the length to first order."""
-        return (self.corrected(points) / self.field_strength).square().sum(-1) - 1.0
-
-    def weight(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """The weight in [0, 1] with which measurements enter the fit."""
-        return mkc_weight(self.algebraic_residual(points), self.sigma, self.d)
-
-    def apply(self, recording: Recording) -> dict[str, Float[Tensor, " N"]]:
-        """The corrected field of a recording, row by row: ``time`` where it has one, ``field_x``, ``field_y``,
-        ``field_z`` in ``field_unit``. No row is dropped; where a measurement is missing, so is the field.
-
-        Raises:
-            MissingColumnError: the recording has no ``mag_x``, ``mag_y`` or ``mag_z``.
-
-        Example:
-            >>> from mkc_torch.demo import simulated_recording
-            >>> recording, _ = simulated_recording()
-            >>> calibration = calibrate(recording, field_strength=48.0)
-            >>> field = calibration.apply(recording)
-            >>> list(field), round(float(torch.stack(list(field.values())[1:]).norm(dim=0).median()), 1)
-            (['time', 'field_x', 'field_y', 'field_z'], 48.0)
-        """
-        field = self.corrected(recording.magnetometer())
-        time = {} if recording.time is None else {"time": recording.time}
-        return time | dict(zip(("field_x", "field_y", "field_z"), field.unbind(-1), strict=True))
-
-    def to_json(self) -> str:
-        """The calibration as JSON of the schema "mkc-calibration/1", from which :meth:`from_json` makes it again.
-
-        Numbers round-trip exactly. JSON has no infinity and no NaN: ``sigma`` is the string "inf" where the residuals
-        are Gaussian, and a standard error that is not known is null.
-        """
-        from mkc_torch.calibration_file import calibration_to_json
-
-        return calibration_to_json(self)
-
-    @staticmethod
-    def from_json(text: str) -> Calibration:
-        """The calibration of a JSON text.
-
-        Raises:
-            CalibrationFileError: not JSON, of another schema, or a value that is missing or of the wrong kind.
-
-        Example:
-            >>> Calibration.from_json('{"schema": "mkc-model/1"}')
-            Traceback (most recent call last):
-            mkc_torch.calibration_file.CalibrationFileError: this is no calibration: its schema is "mkc-model/1", ...
-        """
-        from mkc_torch.calibration_file import calibration_from_json
-
-        return calibration_from_json(text)
 
 
 def prepared(recording: Recording) -> Recording:
@@ -233,7 +101,7 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
     radius = float(fit.radius_)
     strength = radius if field_strength is None else field_strength
     scale = strength / radius
-    matrix_se = fit.calibration_matrix_se_ if field_strength is None else strength * _root_se(fit)
+    matrix_se = fit.calibration_matrix_se_ if field_strength is None else strength * fit.root_se_
     density = _density(fit)
     rejected = fit.weights_ < REJECTED_BELOW
     found = fit.coverage_
@@ -275,21 +143,6 @@ def _density(fit: EllipsoidFit) -> tuple[float, float, float]:
     local = ellipsoid_from_coefficients(estimator.coef_)
     factor = float(1.0 - local.center @ local.shape @ local.center)
     return float(estimator.sigma_), factor * float(estimator.d_), factor * float(estimator.bound_)
-
-
-def _root_se(fit: EllipsoidFit) -> Tensor:
-    """Standard errors (3, 3) of the root W of the shape matrix A₁, in the unit of the points: dW W + W dW = dA₁."""
-    estimator = fit.estimator_
-    assert isinstance(estimator, MKCRegression)
-    coef = estimator.coef_
-    jacobian = torch.func.jacrev(lambda c: ellipsoid_from_coefficients(c).shape.flatten())(coef)
-    local = ellipsoid_from_coefficients(coef)
-    root = symmetric_root(local.shape)
-    eye = torch.eye(3, dtype=root.dtype)
-    d_root = torch.linalg.solve(torch.kron(root, eye) + torch.kron(eye, root), jacobian)
-    variance = torch.einsum("ij,jk,ik->i", d_root, estimator.covariance_, d_root)
-    size = local.shape.det().pow(-1 / 6) / fit.radius_
-    return (variance.clamp(min=0.0).sqrt() * size).unflatten(0, (3, 3))
 
 
 def _warnings(fit: EllipsoidFit, found: Coverage, rejected_share: float) -> list[str]:

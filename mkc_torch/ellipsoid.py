@@ -126,6 +126,7 @@ class EllipsoidFit(Fitted):
         center_se_, semi_axes_se_, calibration_matrix_se_: standard errors of the same shapes, where the estimator
             has a ``covariance_``; infinite where nine points leave none to tell errors from.
         coverage_: one :class:`mkc_torch.coverage.Coverage`, or a list of them, of the points in use.
+        root_se_: standard errors of ``calibration_matrix_ / radius_``, which makes the ellipsoid a unit sphere.
         estimator_: the fitted estimator; its residual is algebraic, about twice the relative error of the norm.
 
     References:
@@ -239,12 +240,13 @@ class EllipsoidFit(Fitted):
         d_log_radius = -torch.einsum("bi,bij->bj", inverse, jacobian[:, 6:]) / 6.0
         radius = torch.linalg.det(local.shape.reshape(-1, 3, 3)).pow(-1 / 6)
         d_matrix = radius[:, None, None] * (d_root + root.flatten(1).unsqueeze(-1) * d_log_radius.unsqueeze(1))
-        rows = torch.cat([jacobian[:, :6], d_matrix], 1)
+        rows = torch.cat([jacobian[:, :6], d_matrix, d_root], 1)
         variance = torch.einsum("bij,bjk,bik->bi", rows, covariance.reshape(-1, 9, 9), rows)
-        errors = variance.nan_to_num(torch.inf).clamp(min=0.0).sqrt().reshape(*scale.shape[:-1], 15)
+        errors = variance.nan_to_num(torch.inf).clamp(min=0.0).sqrt().reshape(*scale.shape[:-1], 24)
         self.center_se_ = errors[..., :3] * scale
         self.semi_axes_se_ = errors[..., 3:6] * scale
-        self.calibration_matrix_se_ = errors[..., 6:].unflatten(-1, (3, 3))
+        self.calibration_matrix_se_ = errors[..., 6:15].unflatten(-1, (3, 3))
+        self.root_se_ = errors[..., 15:].unflatten(-1, (3, 3)) / scale.unsqueeze(-1)
 
     def _refuse_uncovered(self, field: Tensor, weight: Tensor | None) -> None:
         in_use = self.weights_ >= 0.5 if weight is None else (self.weights_ >= 0.5) & (weight > 0)
