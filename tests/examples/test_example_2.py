@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from mkc_torch.linear import MKCRegression
+from mkc_torch.density_fit import domain_rule
+from mkc_torch.linear import MKCRegression, em
 
 PATH = Path(__file__).parents[2] / "examples" / "paper" / "example_2.py"
 DRAWS = 150
@@ -34,3 +35,16 @@ def test_the_algorithm_as_printed_finds_the_same_line(example):
     y = example.recordings(1, seed=3)[1, 0]
     fit = MKCRegression().fit(example.design(), y)
     assert abs(example.scipy_em(y.numpy()) - fit.coef_.numpy()).max() < 0.02
+
+
+def test_a_rough_fit_on_a_tight_domain_finds_the_head_under_outliers_on_one_side(example, monkeypatch):
+    X, Y = example.design(), example.recordings(400, seed=2)[5]
+
+    def error():
+        return (MKCRegression().fit(X, Y).coef_ - 1.0).norm(dim=-1)
+
+    tight = error()
+    monkeypatch.setattr(em, "domain_rule", lambda e, scale, used=None, scales=10.0: domain_rule(e, scale, used))  # noqa: ARG005
+    wide = error()
+    assert int((tight < wide - 1e-3).sum()) >= 10
+    assert int((tight > wide + 1e-3).sum()) <= 2

@@ -12,6 +12,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from mkc_torch import fit_density
+from mkc_torch.functional import mkc_nll
 from mkc_torch.linear import FixedPointLinear, LeastAbsoluteDeviations, LeastSquares, MKCRegression, RankDeficientError
 from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear._robust_start import robust_start
@@ -580,3 +581,14 @@ def test_a_unit_that_overflows_is_refused(dtype, unit):
     X, y = torch.ones(50, 1, dtype=dtype), unit * torch.linspace(-1, 1, 50, dtype=dtype)
     with pytest.raises(ValueError, match=r"`Y` of a magnitude between .* choose another unit"):
         MKCRegression().fit(X, y)
+
+
+def test_the_likelihood_is_never_below_that_of_a_gaussian_at_least_squares():
+    generator = torch.Generator().manual_seed(0)
+    X = torch.randn(20, 3, generator=generator, dtype=torch.float64)
+    Y = torch.randn(300, 20, generator=generator, dtype=torch.float64)
+    fit = MKCRegression().fit(X, Y)
+    residual = Y - LeastSquares().fit(X, Y).predict(X)
+    d = residual.square().mean(-1, keepdim=True).sqrt()
+    gaussian = -mkc_nll(residual, math.inf, d, fit.bound_.unsqueeze(-1)).sum(-1)
+    assert float((fit.log_likelihood_ - gaussian).min()) > -1e-9

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from mkc_torch.linear import FixedPointLinear, LeastSquares, RankDeficientError, SRegression
+from mkc_torch.linear._problem import linear_problem
+from mkc_torch.linear._robust_start import robust_start
 from mkc_torch.linear.covariance import andrews_bandwidth, long_run_covariance
 from tests.literature import DATA_SETS, REFERENCE
 
@@ -484,3 +486,18 @@ def test_starts_agree_where_there_is_one_minimum():
     for start in ("s", "least_squares", LeastSquares().fit(X, y).coef_):
         got = FixedPointLinear(sigma=20.0, start=start).fit(X, y).coef_
         torch.testing.assert_close(got, expected, rtol=1e-7, atol=1e-8)
+
+
+def test_being_led_from_a_wide_bandwidth_ends_lower_where_minima_are_many():
+    generator = torch.Generator().manual_seed(0)
+    X = torch.randn(100, 3, generator=generator, dtype=torch.float64)
+    Y = X.sum(-1) + torch.randn(60, 100, generator=generator, dtype=torch.float64)
+    Y[:, :20] += 15.0
+    problem = linear_problem(X, Y)
+    start = problem.coefficients(robust_start(problem).beta)
+    led, alone = FixedPointLinear(sigma=0.2).fit(X, Y), FixedPointLinear(sigma=0.2, start=start).fit(X, Y)
+    lower = int((led.history_[-1] < alone.history_[-1] - 1e-9).sum())
+    higher = int((led.history_[-1] > alone.history_[-1] + 1e-9).sum())
+    assert lower >= 10
+    assert lower > 3 * higher
+    assert float((led.coef_ - 1).norm(dim=-1).mean()) < 0.95 * float((alone.coef_ - 1).norm(dim=-1).mean())
