@@ -38,7 +38,8 @@ class LinearEstimator(Fitted):
 
     Attributes, after ``fit`` (``*`` are batch dimensions):
         coef_: coefficients (*, n).
-        weights_: the weight in [0, 1] with which each value entered the fit, (*, N, m), or (*, N) for one channel.
+        weights_: the weight in [0, 1] with which each value entered the fit, (*, N, m); m is 1 for
+            one channel given as (*, N).
     """
 
     coef_: Float[Tensor, "*batch n"]
@@ -63,8 +64,4 @@ class LinearEstimator(Fitted):
     def _set_common(self, problem: LinearProblem, beta: Tensor, weights: Tensor) -> None:
         self._single_channel = problem.single_channel
         self.coef_ = problem.coefficients(beta)
-        self.weights_ = self._by_channel(problem.restore(weights))
-
-    def _by_channel(self, values: Tensor) -> Tensor:
-        """Drop the channel dimension where the user gave none."""
-        return values.squeeze(-1) if self._single_channel else values
+        self.weights_ = problem.restore(weights)

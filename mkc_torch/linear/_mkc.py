@@ -18,14 +18,9 @@ if TYPE_CHECKING:
 
 
 def channel_parameter(name: str, value: float | Tensor, problem: LinearProblem, *, infinite: bool = False) -> Tensor:
-    """A positive parameter of every channel as a tensor (B, m); accepts a number, (m,) or (*, m).
-
-    Where the user gave no channel dimension, (*,) is accepted too, the shape in which results come back.
-    """
+    """A positive parameter of every channel as a tensor (B, m); accepts a number, (m,) or (*, m)."""
     t = torch.as_tensor(value, dtype=problem.Y.dtype, device=problem.Y.device)
     m = problem.num_channels
-    if problem.single_channel and problem.batch and t.shape == problem.batch:
-        t = t.unsqueeze(-1)
     if t.dim() > 0 and t.shape[-1] not in (1, m):
         raise ValueError(f"Expected argument `{name}` to be a number or of shape ({m},) but got {tuple(t.shape)}.")
     if not bool(((t > 0) & (torch.isfinite(t) | infinite)).all()):

@@ -146,7 +146,7 @@ class MKCRegression(LinearEstimator):
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
         seed: of the robust start.
 
-    Attributes, after ``fit`` (``*`` batch dimensions; without ``m`` for one channel given as (*, N)):
+    Attributes, after ``fit`` (``*`` batch dimensions; m is 1 for one channel given as (*, N)):
         coef_: (*, n).
         sigma_, d_, bound_: (*, m): bandwidth (``inf`` for a Gaussian channel), scale and half-width of the domain.
         log_likelihood_: sum over samples and channels, (*,); compare only at equal ``bound_``.
@@ -264,9 +264,9 @@ class MKCRegression(LinearEstimator):
         residual = problem.residual(maximum.beta)
         self._set_common(problem, maximum.beta, kernel_weight(residual, kappa, d))
         nll = negative_log_likelihood(residual, _normalised_weight(problem), maximum.state)
-        self.sigma_ = self._by_channel(problem.restore(kappa.rsqrt()))
-        self.d_ = self._by_channel(problem.restore(d))
-        self.bound_ = self._by_channel(problem.restore(torch.exp(maximum.state.log_bound)))
+        self.sigma_ = problem.restore(kappa.rsqrt())
+        self.d_ = problem.restore(d)
+        self.bound_ = problem.restore(torch.exp(maximum.state.log_bound))
         self.log_likelihood_ = problem.restore(-(problem.total_weight() * nll).sum(-1))
         self.history_ = torch.stack([problem.restore(h) for h in maximum.history])
         self.exact_fit_ = problem.restore(begin.exact)

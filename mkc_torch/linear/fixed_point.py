@@ -92,7 +92,7 @@ class FixedPointLinear(LinearEstimator):
 
     Attributes, after ``fit`` (``*`` batch dimensions):
         coef_: (*, n).
-        weights_: ``exp(-e² / (2 d² σ²))`` of each value, (*, N, m), or (*, N) for one channel.
+        weights_: ``exp(-e² / (2 d² σ²))`` of each value, (*, N, m); m is 1 for one channel.
         covariance_: of the coefficients, (*, n, n).
         history_: the loss (9) before every step, (steps + 1, *).
         n_iter_: steps made. converged_: (*,).

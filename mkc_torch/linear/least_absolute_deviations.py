@@ -30,7 +30,7 @@ class LeastAbsoluteDeviations(LinearEstimator):
 
     Attributes, after ``fit``:
         coef_: coefficients (*, n). Their gradient in Y is that of the solution through the n values.
-        weights_: ones of the shape of Y; the estimator weighs no value down.
+        weights_: ones, (*, N, m); the estimator weighs no value down.
         objective_: the minimum (*,) of ``sum(sample_weight * |Y - X coef|)`` over samples and channels.
         n_iter_: interior-point iterations (*,) of each problem, 0 where least squares already fits exactly.
         converged_: whether each problem (*,) reached ``tol``, or the rounding error of an objective near 0.

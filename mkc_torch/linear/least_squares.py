@@ -84,5 +84,5 @@ class Ridge(LinearEstimator):
         augmented = linear_problem(rows.unsqueeze(-2), target.unsqueeze(-1))
         self.coef_ = augmented.coefficients(augmented.weighted_fit(torch.ones_like(augmented.Y)))
         self._single_channel = values.single_channel
-        self.weights_ = self._by_channel(torch.ones_like(values.Y))
+        self.weights_ = torch.ones_like(values.Y)
         return self

@@ -93,8 +93,8 @@ class LeastTrimmedSquares(LinearEstimator):
 
     Attributes, after ``fit``:
         coef_: (*, n).
-        scale_: (*, m), or (*,) for one channel: trimmed root mean square, made consistent for Gaussian residuals.
-        objective_: (*, m) or (*,): sum of the h smallest squared residuals.
+        scale_: (*, m), m being 1 for one channel: trimmed root mean square, made consistent for Gaussian residuals.
+        objective_: (*, m): sum of the h smallest squared residuals.
         weights_: 1 for the values that count, else 0.
         n_iter_, converged_: steps made, and whether they had come to rest, (*,).
 
@@ -136,8 +136,8 @@ class LeastTrimmedSquares(LinearEstimator):
         self._set_common(problem, minimum.beta, minimum.weight)
         scale = problem.restore(minimum.scale)
         total = problem.restore(problem.total_weight())
-        self.objective_ = self._by_channel(scale.square() * h / N * total)
-        self.scale_ = self._by_channel(scale * gaussian_consistency(h / N))
+        self.objective_ = scale.square() * h / N * total
+        self.scale_ = scale * gaussian_consistency(h / N)
         self.n_iter_ = minimum.n_iter
         self.converged_ = problem.restore(minimum.converged)
         return self

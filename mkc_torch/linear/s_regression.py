@@ -81,7 +81,7 @@ class SRegression(LinearEstimator):
 
     Attributes, after ``fit``:
         coef_: (*, n).
-        scale_: (*, m), or (*,) for one channel: the M-scale, consistent for Gaussian residuals.
+        scale_: (*, m), m being 1 for one channel: the M-scale, consistent for Gaussian residuals.
         weights_: bisquare weights in [0, 1].
         n_iter_, converged_: steps made, and whether they had come to rest, (*,).
 
@@ -109,7 +109,7 @@ class SRegression(LinearEstimator):
         problem = linear_problem(X, Y, sample_weight)
         minimum = minimise_m_scale(problem, starts=self.starts, seed=self.seed)
         self._set_common(problem, minimum.beta, minimum.weight)
-        self.scale_ = self._by_channel(problem.restore(minimum.scale))
+        self.scale_ = problem.restore(minimum.scale)
         self.n_iter_ = minimum.n_iter
         self.converged_ = problem.restore(minimum.converged)
         return self

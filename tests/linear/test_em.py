@@ -282,7 +282,7 @@ def test_an_infinite_sigma_of_one_channel_is_least_squares_exactly():
     X, y = line(0)
     fit = MKCRegression(sigma=math.inf, bound=1e4).fit(X, y)
     torch.testing.assert_close(fit.coef_, LeastSquares().fit(X, y).coef_, rtol=1e-10, atol=1e-11)
-    torch.testing.assert_close(fit.d_, (y - X @ fit.coef_).square().mean().sqrt(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(fit.d_[0], (y - X @ fit.coef_).square().mean().sqrt(), rtol=1e-6, atol=0)
 
 
 def test_given_sigma_and_d_are_the_fixed_point():
@@ -452,7 +452,7 @@ def test_one_design_serves_many_targets():
     X, y = line(0)
     Y = torch.stack([y, y.flip(0), 10.0 * y])
     fit = MKCRegression().fit(X, Y)
-    assert fit.d_.shape == (3,)
+    assert fit.d_.shape == (3, 1)
     for i in range(3):
         torch.testing.assert_close(fit.coef_[i], MKCRegression().fit(X, Y[i]).coef_, rtol=1e-4, atol=1e-5)
 
@@ -512,10 +512,12 @@ def test_float32_stays_float32():
     torch.testing.assert_close(fit.d_.double(), exact.d_, rtol=2e-2, atol=0)
 
 
-def test_one_channel_without_its_dimension_gives_results_without_it():
+def test_one_channel_is_a_channel_dimension_of_one_in_every_result():
     fit = MKCRegression().fit(*line(0))
-    assert fit.sigma_.shape == fit.d_.shape == fit.bound_.shape == ()
-    assert fit.weights_.shape == (100,)
+    assert fit.sigma_.shape == fit.d_.shape == fit.bound_.shape == (1,)
+    assert fit.weights_.shape == (100, 1)
+    assert fit.coef_.shape == fit.covariance_.shape[:1]
+    assert fit.log_likelihood_.shape == ()
 
 
 # errors
@@ -590,5 +592,5 @@ def test_the_likelihood_is_never_below_that_of_a_gaussian_at_least_squares():
     fit = MKCRegression().fit(X, Y)
     residual = Y - LeastSquares().fit(X, Y).predict(X)
     d = residual.square().mean(-1, keepdim=True).sqrt()
-    gaussian = -mkc_nll(residual, math.inf, d, fit.bound_.unsqueeze(-1)).sum(-1)
+    gaussian = -mkc_nll(residual, math.inf, d, fit.bound_).sum(-1)
     assert float((fit.log_likelihood_ - gaussian).min()) > -1e-9

@@ -63,7 +63,7 @@ def test_an_infinite_sigma_is_least_squares_exactly():
     X, y = contaminated_line(0)
     fit = FixedPointLinear(sigma=math.inf, d=2.0).fit(X, y)
     torch.testing.assert_close(fit.coef_, lstsq(X, y), rtol=1e-12, atol=1e-12)
-    assert torch.equal(fit.weights_, torch.ones(60).double())
+    assert torch.equal(fit.weights_, torch.ones(60, 1).double())
     assert bool(fit.converged_)
     torch.testing.assert_close(fit.history_[-1], 0.5 * ((y - X @ fit.coef_) / 2.0).square().mean())
 
@@ -424,7 +424,7 @@ def test_an_exact_fit_keeps_weight_one_and_the_others_lose_theirs():
     y[:24] += 30.0
     fit = FixedPointLinear(sigma=1.0, d=1.0).fit(X, y)
     torch.testing.assert_close(fit.coef_, truth, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(fit.weights_, (torch.arange(60) >= 24).double())
+    torch.testing.assert_close(fit.weights_[:, 0], (torch.arange(60) >= 24).double())
     assert bool(fit.converged_)
 
 

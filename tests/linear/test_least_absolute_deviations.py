@@ -258,7 +258,7 @@ def test_result_goes_exactly_through_n_values():
 
 def test_weights_are_ones_of_the_shape_of_the_targets():
     fit = LeastAbsoluteDeviations().fit(sample(0, 10, 2), heavy(1, 10), torch.arange(10.0).double())
-    torch.testing.assert_close(fit.weights_, torch.ones(10, dtype=torch.float64))
+    torch.testing.assert_close(fit.weights_, torch.ones(10, 1, dtype=torch.float64))
 
 
 def test_gradient_is_that_of_the_line_through_the_values():
