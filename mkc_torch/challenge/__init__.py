@@ -1,0 +1,11 @@
+"""The blind proof: recordings with physics hidden in them, and the score of a diagnosis that was not told.
+
+The generator shares no code with the catalogue of effects and uses other functional forms of the same physics.
+"""
+
+from mkc_torch.challenge.generator import Case, draw
+from mkc_torch.challenge.key import Key
+from mkc_torch.challenge.run import run_challenge
+from mkc_torch.challenge.score import Score, score
+
+__all__ = ["Case", "Key", "Score", "draw", "run_challenge", "score"]

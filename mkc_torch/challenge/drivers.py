@@ -1,0 +1,93 @@
+"""What drives effects from outside: the temperature and the current, as they are and as they are recorded."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Generator, Tensor
+
+from mkc_torch.challenge.draws import choose, happens, log_uniform, normal, smooth, uniform, whole
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+def draw_temperature(g: Generator, time: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """°C: a warm-up, a trend, slow weather, or a heater switched on and off."""
+    x = time - time[0]
+    step = float(x[1])
+    start, span = uniform(g, 10.0, 35.0), log_uniform(g, 3.0, 20.0)
+    kind = choose(g, ("warm-up", "trend", "weather", "heater"), (0.25, 0.15, 0.3, 0.3))
+    if kind == "warm-up":
+        shape = 1.0 - torch.exp(-x / uniform(g, 10.0, 60.0))
+    elif kind == "trend":
+        shape = x / float(x[-1]) * choose(g, (-1.0, 1.0))
+    elif kind == "weather":
+        shape = 0.5 * smooth(g, len(x), 1, step, uniform(g, 20.0, 60.0))[:, 0]
+    else:
+        period, phase = uniform(g, 20.0, 50.0), uniform(g, 0.0, 1.0)
+        on = ((x / period + phase) % 1.0 < uniform(g, 0.3, 0.7)).double()
+        shape = lagged(on, step, uniform(g, 4.0, 12.0))
+    return start + span * (shape + 0.02 * smooth(g, len(x), 1, step, 8.0)[:, 0])
+
+
+def draw_current(g: Generator, time: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """A, as a throttle makes it: steps, ramps and rests between 0.3 A and a peak of 4-30 A."""
+    count, step = len(time), float(time[1] - time[0])
+    peak = log_uniform(g, 4.0, 30.0)
+    level = 0.0
+    values: list[float] = []
+    while len(values) < count:
+        hold = max(round(uniform(g, 1.0, 9.0) / step), 1)
+        # never a whole recording at rest
+        rests = bool(values) and happens(g, 0.25)
+        target = 0.0 if rests else uniform(g, 0.1, 1.0)
+        rise = max(round(choose(g, (0.05, uniform(g, 0.5, 4.0))) / step), 1)
+        values += [level + (target - level) * (k + 1) / rise for k in range(rise)] + [target] * hold
+        level = target
+    throttle = torch.tensor(values[:count], dtype=torch.float64)
+    ripple = 0.02 * throttle * smooth(g, count, 1, step, 0.5)[:, 0]
+    return 0.3 + peak * (throttle.square() * 0.6 + throttle * 0.4 + ripple)
+
+
+def recorded_temperature(g: Generator, true: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """With 0.02-0.1 K of noise, in steps of a sixteenth of a kelvin or a hundredth."""
+    noisy = true + uniform(g, 0.02, 0.1) * normal(g, len(true))
+    return quantised(noisy, choose(g, (0.0625, 0.01)))
+
+
+def recorded_current(g: Generator, true: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """With noise of 0.3-1 % of the range, in steps of 0.01-0.1 A."""
+    spread = uniform(g, 0.003, 0.01) * float(true.max())
+    return quantised(true + spread * normal(g, len(true)), choose(g, (0.01, 0.05, 0.1)))
+
+
+def recorded_voltage(g: Generator, current: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    """V: a battery that sags under the current and runs down."""
+    cells = whole(g, 2, 6)
+    used = torch.linspace(0.0, uniform(g, 0.0, 0.15), len(current), dtype=torch.float64)
+    sag = uniform(g, 0.004, 0.03) * current
+    return quantised(cells * (4.1 - used) - sag + 0.03 * normal(g, len(current)), 0.01)
+
+
+def lagged(values: Float[Tensor, " N"], step: float, constant: float) -> Float[Tensor, " N"]:
+    """First-order lag with a time constant in s, at rest at the first value.
+
+    Example:
+        >>> lagged(torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64), 1.0, 0.0)
+        tensor([0., 1., 1.], dtype=torch.float64)
+    """
+    if constant <= 0.0:
+        return values.clone()
+    keep, state = math.exp(-step / constant), float(values[0])
+    out = []
+    for value in values.tolist():
+        state = keep * state + (1.0 - keep) * value
+        out.append(state)
+    return torch.tensor(out, dtype=torch.float64)
+
+
+def quantised(values: Float[Tensor, " N"], step: float) -> Float[Tensor, " N"]:
+    return (values / step).round() * step

@@ -1,0 +1,125 @@
+"""The proof's result for a reader: one HTML page with its pictures in it, and a summary in Markdown."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mkc_torch.challenge.binomial import Share
+from mkc_torch.challenge.key import Key
+from mkc_torch.challenge.score import Score
+
+_TEMPLATES = Path(__file__).parent / "templates"
+_SHARED = Path(__file__).parents[1] / "report" / "templates"
+
+
+def challenge_page(
+    score: Score, baselines: Mapping[str, Score], keys: Sequence[Key], settings: Mapping[str, Any]
+) -> str:
+    """The page. Needs the ``cli`` extra.
+
+    Args:
+        score: of the diagnosis.
+        baselines: name to score of what it is compared with.
+        keys: of all cases.
+        settings: of the run.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
+    from markupsafe import Markup
+
+    from mkc_torch.challenge import pictures
+
+    environment = Environment(
+        loader=FileSystemLoader([_TEMPLATES, _SHARED]),
+        autoescape=select_autoescape(["html", "html.j2"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(share=share_text, number=number_text)
+    return environment.get_template("challenge.html.j2").render(
+        score=score,
+        passed=sum(m.holds for m in score.measured),
+        baselines=baselines,
+        settings=settings,
+        effects=hidden_table(keys),
+        rows=comparison(score, baselines),
+        figures={
+            "power": Markup(pictures.power_curves(score, baselines)),
+            "p_values": Markup(pictures.p_values(score)),
+            "confusion": Markup(pictures.confusion(score)),
+        },
+    )
+
+
+def summary(score: Score, baselines: Mapping[str, Score], settings: Mapping[str, Any]) -> str:
+    """The numbers in Markdown."""
+    lines = ["# The blind proof", "", *(f"- {name}: {value}" for name, value in settings.items()), ""]
+    lines += ["| asked | measured | holds |", "|---|---|---|"]
+    lines += [
+        f"| {m.threshold.sentence} | {number_text(m.value)} | {'yes' if m.holds else '**no**'} |"
+        for m in score.measured
+    ]
+    names = ["diagnosis", *baselines]
+    lines += ["", f"| | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
+    lines += [f"| {label} | {' | '.join(cells)} |" for label, cells in comparison(score, baselines)]
+    lines += ["", "| hidden | named first |", "|---|---|"]
+    for hidden, row in score.confusion.items():
+        told = ", ".join(f"{name} {count}" for name, count in sorted(row.items(), key=lambda item: -item[1]))
+        lines.append(f"| {hidden} | {told} |")
+    return "\n".join(lines) + "\n"
+
+
+def comparison(score: Score, baselines: Mapping[str, Score]) -> list[tuple[str, list[str]]]:
+    """Rows of the table that sets the diagnosis beside the baselines."""
+    scores = [score, *baselines.values()]
+    return [
+        ("false alarms on empty recordings", [share_text(s.false_alarms) for s in scores]),
+        ("named right, z and z_sep ≥ 10", [share_text(s.named) for s in scores]),
+        ("driver right", [share_text(s.driver) for s in scores]),
+        ("named right with the driver withheld", [share_text(s.withheld_named) for s in scores]),
+        ("more findings than effects", [share_text(s.extra) for s in scores]),
+        ("both of two named", [f"{s.doubles[2]} of {sum(s.doubles.values())}" for s in scores]),
+        ("failed", [str(len(s.failed)) for s in scores]),
+    ]
+
+
+def hidden_table(keys: Sequence[Key]) -> list[dict[str, Any]]:
+    """For each effect how often it was hidden, and how well it could be seen."""
+    found: dict[str, list[tuple[float, float]]] = {}
+    for key in keys:
+        for effect in key.effects:
+            found.setdefault(effect.effect, []).append((effect.z, effect.z_sep))
+    return [
+        {
+            "effect": name,
+            "count": len(pairs),
+            "z": _median([z for z, _ in pairs]),
+            "z_sep": _median([z_sep for _, z_sep in pairs]),
+            "strong": sum(min(pair) >= 10.0 for pair in pairs),
+        }
+        for name, pairs in sorted(found.items())
+    ]
+
+
+def share_text(share: Share) -> str:
+    """With its 95 % interval.
+
+    Example:
+        >>> share_text(Share(3, 60, 0.01, 0.139))
+        '5.0 % (3 of 60; 1.0-13.9 %)'
+    """
+    if not share.total:
+        return "—"
+    interval = f"{100 * share.low:.1f}-{100 * share.high:.1f} %"
+    return f"{100 * share.value:.1f} % ({share.count} of {share.total}; {interval})"
+
+
+def number_text(value: float) -> str:
+    return "not measured" if math.isnan(value) else f"{value:.4g}"
+
+
+def _median(values: Sequence[float]) -> float:
+    return sorted(values)[len(values) // 2]

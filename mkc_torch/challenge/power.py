@@ -1,0 +1,215 @@
+"""The oracle: how well the best possible test would see a hidden effect, and tell it from its best rival.
+
+``z² = (1 − ε) δᵀ M δ`` with δ the effect's trace in the residual, M the inverse of the noise's true covariance with the
+calibration's tangents projected out in its metric, and ε the share of outliers; for ``z_sep`` the best rival's
+tangents are projected out too. Without attitude the residual is that of the calibrated length. With a gyro it counts
+as such too, which makes its z a lower bound. Effects enter to first order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.challenge.families import Family
+from mkc_torch.challenge.noise import Noise
+from mkc_torch.challenge.process import Process
+from mkc_torch.challenge.scene import Scene
+from mkc_torch.challenge.state_space import whitened
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+_RANK = 1e-9
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another explanation, and how well the hidden effect is told from it."""
+
+    effect: str
+    drivers: tuple[str, ...]
+    z_sep: float
+
+
+@dataclass(frozen=True)
+class Power:
+    """Numbers of standard deviations: ``z`` against nothing, ``z_sep`` against the best of ``rivals``, hardest first.
+
+    ``coefficients`` are those of the effect's own linear family that come nearest to it, and ``missed`` the z of what
+    they leave; without such a family, nothing and infinity.
+    """
+
+    z: float
+    z_sep: float
+    rivals: tuple[Rival, ...]
+    coefficients: tuple[float, ...] = ()
+    missed: float = math.inf
+
+    def scaled(self, size: float) -> Power:
+        """For an effect of another size."""
+        rivals = tuple(Rival(rival.effect, rival.drivers, size * rival.z_sep) for rival in self.rivals)
+        coefficients = tuple(size * value for value in self.coefficients)
+        missed = size * self.missed if self.coefficients else math.inf
+        return Power(size * self.z, size * self.z_sep, rivals, coefficients, missed)
+
+
+@dataclass(frozen=True)
+class Question:
+    """An effect's trace (N, 3) in the measurement's axes, what it is to be told from, and its own linear family."""
+
+    trace: Float[Tensor, "N 3"]
+    rivals: Sequence[Family]
+    own: Family | None = None
+
+
+@dataclass(frozen=True)
+class Metric:
+    """The residual's space: how a trace of the measurement shows in it, and the noise there."""
+
+    scene: Scene
+    noise: Noise
+    vector: bool
+
+    def residual(self, traces: Float[Tensor, "N 3 p"]) -> Float[Tensor, "N c p"]:
+        """Of the calibrated length (c = 1), or of the measured vector (c = 3), µT."""
+        if self.vector:
+            return traces
+        return torch.einsum("ni,nip->np", self.scene.sensitivity, traces)[:, None]
+
+    def nuisance(self) -> Float[Tensor, "N c q"]:
+        """Tangents of the calibration: offset, gains and couplings, and with attitude the field in the world."""
+        field, eye = self.scene.field, torch.eye(3, dtype=torch.float64)
+        count = len(field)
+        offset = eye.expand(count, 3, 3)
+        coupling = torch.einsum("ij,nk->nijk", eye, field).reshape(count, 3, 9)
+        tangents = [offset, coupling]
+        if self.vector:
+            tangents.append(self.scene.sensor.soft @ self.scene.motion.rotation.mT)
+        return self.residual(torch.cat(tangents, -1))
+
+    def white_variance(self) -> Float[Tensor, "N c"]:
+        variance = torch.tensor(self.noise.white, dtype=torch.float64).square()
+        if self.vector:
+            return variance.expand(len(self.scene.time), 3)
+        return (self.scene.sensitivity.square() @ variance)[:, None]
+
+    def coloured(self) -> tuple[Float[Tensor, "N c s"], list[Process]]:
+        """The processes of the noise and how they enter the residual."""
+        count = len(self.scene.time)
+        gains = torch.zeros(count, 3, 0, dtype=torch.float64)
+        processes: list[Process] = []
+        if self.noise.axes is not None:
+            gains = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
+            processes += self.noise.axes
+        if self.noise.ambient is not None:
+            gains = torch.cat([gains, self.scene.along[:, :, None]], -1)
+            processes.append(self.noise.ambient)
+        if self.vector and self.noise.attitude is not None:
+            gains = torch.cat([gains, attitude_gains(self.scene)], -1)
+            processes += [self.noise.attitude] * 3
+        return self.residual(gains), processes
+
+    def whitened(self, traces: Float[Tensor, "N c p"], keep: Float[Tensor, " N"] | None = None) -> Float[Tensor, "M p"]:
+        """Columns whose inner products are those of the inverse covariance."""
+        gains, processes = self.coloured()
+        return whitened(traces, self.white_variance(), gains, processes, keep)
+
+
+def attitude_gains(scene: Scene) -> Float[Tensor, "N 3 3"]:
+    """What a small turn of the recorded attitude about each world axis adds to the residual, µT/rad."""
+    eye = torch.eye(3, dtype=torch.float64)
+    turned = torch.linalg.cross(eye, scene.field_world.expand(3, 3))  # rows: e_k × h
+    return scene.sensor.soft @ scene.motion.rotation.mT @ turned.mT
+
+
+def powers(metric: Metric, questions: Sequence[Question], share: float) -> list[Power]:
+    """Of several effects at once, each with the traces of the others taken as known in form.
+
+    Args:
+        metric: the residual's space.
+        questions: one for each effect; families are compared by identity.
+        share: of outliers.
+    """
+    asked = [family for question in questions for family in (*question.rivals, question.own) if family is not None]
+    union = list({id(family): family for family in asked}.values())
+    place = {id(family): k for k, family in enumerate(union)}
+    projection = Projection(metric, [q.trace[..., None] for q in questions], [family.traces for family in union])
+    kept = math.sqrt(1.0 - share)
+    found = []
+    for k, question in enumerate(questions):
+        others = [j for j in range(len(questions)) if j != k]
+        z = kept * projection.left(k, others, ())
+        told = _best_of_each(
+            [
+                Rival(family.effect, family.drivers, kept * projection.left(k, others, (place[id(family)],)))
+                for family in question.rivals
+            ]
+        )
+        power = Power(z, min([z, *(rival.z_sep for rival in told)]), tuple(told))
+        if question.own is not None:
+            coefficients, missed = projection.coefficients(k, place[id(question.own)])
+            power = replace(power, coefficients=tuple(coefficients.tolist()), missed=kept * missed)
+        found.append(power)
+    return found
+
+
+def _best_of_each(rivals: Sequence[Rival]) -> list[Rival]:
+    """The best member of each family of rivals, hardest first."""
+    best: dict[tuple[str, tuple[str, ...]], Rival] = {}
+    for rival in sorted(rivals, key=lambda rival: rival.z_sep):
+        best.setdefault((rival.effect, rival.drivers), rival)
+    return list(best.values())
+
+
+class Projection:
+    """Whitened effects and families with the calibration projected out, ready to be compared in any combination."""
+
+    def __init__(
+        self, metric: Metric, effects: Sequence[Float[Tensor, "N 3 p"]], families: Sequence[Float[Tensor, "N 3 p"]]
+    ) -> None:
+        blocks = [metric.residual(block) for block in (*effects, *families)]
+        nuisance = metric.nuisance()
+        columns = torch.cat([nuisance, *blocks], -1)
+        # columns of very different size would spoil the rank decision
+        size = torch.linalg.vector_norm(columns, dim=(0, 1)).clamp(min=1e-300)
+        white = metric.whitened(columns.div_(size))
+        q = nuisance.shape[-1]
+        self._size = size[q:]
+        basis = range_of(white[:, :q])
+        rest = white[:, q:]
+        rest -= basis @ (basis.mT @ rest)
+        self._gram = rest.mT @ rest
+        ends = torch.tensor([0, *(block.shape[-1] for block in blocks)]).cumsum(0).tolist()
+        self._parts = [list(range(a, b)) for a, b in pairwise(ends)]
+        self._effects = len(effects)
+
+    def left(self, effect: int, others: Sequence[int], families: Sequence[int]) -> float:
+        """Length of the effect's trace, one column, when others and families are projected out too."""
+        target = self._parts[effect]
+        out = [c for k in others for c in self._parts[k]]
+        out += [c for k in families for c in self._parts[self._effects + k]]
+        own = self._gram[target][:, target]
+        if out:
+            inside, cross = self._gram[out][:, out], self._gram[out][:, target]
+            own = own - cross.mT @ torch.linalg.pinv(inside, hermitian=True, rtol=1e-10) @ cross
+        return math.sqrt(max(float(own), 0.0)) * float(self._size[target])
+
+    def coefficients(self, effect: int, family: int) -> tuple[Float[Tensor, " p"], float]:
+        """The family's coefficients that come nearest to the effect, and the length of what they miss."""
+        target, block = self._parts[effect], self._parts[self._effects + family]
+        inside, cross = self._gram[block][:, block], self._gram[block][:, target]
+        scaled = (torch.linalg.pinv(inside, hermitian=True, rtol=1e-10) @ cross)[:, 0]
+        return scaled * self._size[target] / self._size[block], self.left(effect, (), (family,))
+
+
+def range_of(columns: Float[Tensor, "M q"]) -> Float[Tensor, "M r"]:
+    """An orthonormal basis of the columns' span."""
+    u, s, _ = torch.linalg.svd(columns, full_matrices=False)
+    return u[:, s > _RANK * s[0]]

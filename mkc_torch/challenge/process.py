@@ -1,0 +1,78 @@
+"""Autoregressive processes and random walks: their numbers, samples and state space."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Generator, Tensor
+
+from mkc_torch.challenge.draws import unit_variance
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+_BURN_IN = 1000
+
+
+@dataclass(frozen=True)
+class Process:
+    """``x[k] = Σ coefficients[j] x[k-1-j] + innovation · e[k]``, e of variance 1.
+
+    A random walk has the coefficient 1 and begins at 0; any other process is stationary.
+    """
+
+    coefficients: tuple[float, ...]
+    innovation: float
+    family: str = "gaussian"
+
+    @property
+    def walks(self) -> bool:
+        return self.coefficients == (1.0,)
+
+    def sample(self, g: Generator, count: int) -> Float[Tensor, " N"]:
+        lead = 0 if self.walks else _BURN_IN
+        errors = (self.innovation * unit_variance(g, self.family, count + lead)).tolist()
+        values: list[float] = []
+        past = [0.0] * len(self.coefficients)
+        for error in errors:
+            value = error + sum(c * v for c, v in zip(self.coefficients, past, strict=True))
+            past = [value, *past[:-1]]
+            values.append(value)
+        return torch.tensor(values[lead:], dtype=torch.float64)
+
+    def transition(self) -> np.ndarray:
+        """The companion matrix (p, p); the state's first entry is the process."""
+        order = len(self.coefficients)
+        companion = np.eye(order, k=-1)
+        companion[0] = self.coefficients
+        return companion
+
+    def start(self) -> np.ndarray:
+        """Covariance (p, p) of the state before the first sample."""
+        order = len(self.coefficients)
+        drive = np.zeros((order, order))
+        drive[0, 0] = self.innovation**2
+        if self.walks:
+            return drive
+        f = self.transition()
+        return np.linalg.solve(np.eye(order * order) - np.kron(f, f), drive.ravel()).reshape(order, order)
+
+
+def autoregressive(coefficients: tuple[float, ...], deviation: float, family: str = "gaussian") -> Process:
+    """The stationary process of that standard deviation.
+
+    Example:
+        >>> round(autoregressive((0.6,), 2.0).innovation, 6)
+        1.6
+    """
+    unit = math.sqrt(Process(coefficients, 1.0).start()[0, 0])
+    return Process(coefficients, deviation / unit, family)
+
+
+def resonance(radius: float, frequency: float) -> tuple[float, float]:
+    """Coefficients of the AR(2) with poles at ``radius · exp(±2πi frequency)``, frequency in cycles per sample."""
+    return 2.0 * radius * math.cos(2.0 * math.pi * frequency), -radius * radius

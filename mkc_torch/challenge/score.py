@@ -1,0 +1,253 @@
+"""The score: what the diagnoses say against what the keys know."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Any
+
+import torch
+
+from mkc_torch.challenge.binomial import Share, share, uniformity
+from mkc_torch.challenge.key import Key, KeyEffect
+from mkc_torch.challenge.thresholds import INSEPARABLE_BELOW, STRONG_Z, THRESHOLDS, Threshold
+from mkc_torch.challenge.verdict import FAILED, NOTHING, Answer, answer, covered, driver_right, named_right
+
+BINS = (0.0, 3.0, 5.0, 7.0, 10.0, 15.0, 30.0, math.inf)
+"""Edges of the bins of z and z_sep."""
+
+ONSET_TOLERANCE = 1.0
+"""s."""
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Single effects with ``low <= z < high``: how many raised an alarm, and how many were named right."""
+
+    low: float
+    high: float
+    found: Share
+    named: Share
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One threshold and what was measured."""
+
+    threshold: Threshold
+    value: float
+
+    @property
+    def holds(self) -> bool:
+        return self.threshold.holds(self.value)
+
+
+@dataclass(frozen=True)
+class Score:
+    """The result of a proof. Single effects with z and z_sep of at least ten are called strong.
+
+    ``confusion`` counts what was hidden (an effect, ``nothing``, or an effect with its driver withheld) against what
+    was named first; ``doubles`` how many of two hidden effects were named; ``ratios`` are residuals on second
+    recordings relative to the oracle's.
+    """
+
+    false_alarms: Share
+    p_values: tuple[float, ...]
+    p_distance: float
+    p_uniform: float
+    confusion: Mapping[str, Mapping[str, int]]
+    strong: int
+    named: Share
+    driver: Share
+    withheld_named: Share
+    extra: Share
+    separable: Share
+    candidates: float
+    onset_errors: tuple[float, ...]
+    coverage: Share
+    coverage_by_effect: Mapping[str, Share]
+    parameters_missing: int
+    power_z: tuple[Bin, ...]
+    power_z_sep: tuple[Bin, ...]
+    ratios: tuple[float, ...]
+    doubles: Mapping[int, int]
+    failed: tuple[str, ...]
+    measured: tuple[Measured, ...]
+
+    def numbers(self) -> dict[str, Any]:
+        """As JSON has it; infinite and undefined numbers become null."""
+        return _plain(asdict(self) | {"holds": {m.threshold.measure: m.holds for m in self.measured}})
+
+
+@dataclass(frozen=True)
+class _Single:
+    """A recording with one hidden effect of the catalogue, and what was said about it."""
+
+    truth: KeyEffect
+    said: Answer
+
+    @property
+    def strong(self) -> bool:
+        return min(self.truth.z, self.truth.z_sep) >= STRONG_Z
+
+    @property
+    def named(self) -> bool:
+        return bool(self.said.findings) and named_right(self.said.findings[0].named, self.truth)
+
+    @property
+    def driver(self) -> bool:
+        return bool(self.said.findings) and driver_right(self.said.findings[0].named, self.truth)
+
+
+def score(
+    keys: Sequence[Key],
+    diagnoses: Mapping[str, Mapping[str, Any] | None],
+    ratios: Mapping[str, float] | None = None,
+) -> Score:
+    """Compare diagnoses with keys.
+
+    Args:
+        keys: of all cases.
+        diagnoses: name of a recording to the content of its ``diagnosis.json``; a name that is missing failed.
+        ratios: name to the residual of the corrected second recording relative to the oracle's.
+    """
+    said = {key.name: answer(diagnoses.get(key.name)) for key in keys}
+    singles = [_Single(key.effects[0], said[key.name]) for key in keys if key.kind == "single"]
+    strong = [case for case in singles if case.strong]
+    empty = [said[key.name] for key in keys if key.kind == "empty"]
+    p_values = tuple(a.p_value for a in empty if a.p_value is not None)
+    distance, p_uniform = uniformity(p_values)
+    told = [case for case in singles if case.truth.z_sep >= INSEPARABLE_BELOW and case.said.findings]
+    by_effect, missing = coverage(singles)
+    strong_names = {k.name for k in keys if k.kind == "single" and min(k.effects[0].z, k.effects[0].z_sep) >= STRONG_Z}
+    results: dict[str, Any] = {
+        "false_alarms": _share_of(empty, lambda a: a.alarm),
+        "p_values": p_values,
+        "p_distance": distance,
+        "p_uniform": p_uniform,
+        "confusion": confusion(keys, said),
+        "strong": len(strong),
+        "named": _share_of(strong, lambda case: case.named),
+        "driver": _share_of(strong, lambda case: case.driver),
+        "withheld_named": _share_of([case for case in strong if case.truth.withheld], lambda case: case.named),
+        "extra": _share_of(strong, lambda case: len(case.said.findings) > 1),
+        "separable": _share_of(told, lambda case: not case.said.findings[0].others),
+        "candidates": _mean([1.0 + len(case.said.findings[0].others) for case in told]),
+        "onset_errors": onset_errors(strong),
+        "coverage": share(sum(s.count for s in by_effect.values()), sum(s.total for s in by_effect.values())),
+        "coverage_by_effect": by_effect,
+        "parameters_missing": missing,
+        "power_z": power(singles, lambda truth: truth.z),
+        "power_z_sep": power(singles, lambda truth: truth.z_sep),
+        "ratios": tuple(ratio for name, ratio in (ratios or {}).items() if name in strong_names),
+        "doubles": doubles(keys, said),
+        "failed": tuple(name for name, a in said.items() if a.verdict == FAILED),
+    }
+    return Score(**results, measured=_measured(results))
+
+
+def confusion(keys: Sequence[Key], said: Mapping[str, Answer]) -> dict[str, dict[str, int]]:
+    """What was hidden, to what was named first, to how often; two at once are left out."""
+    counts: dict[str, Counter[str]] = {}
+    for key in keys:
+        if key.kind != "double":
+            counts.setdefault(hidden_name(key), Counter())[said[key.name].name] += 1
+    return {hidden: dict(counter) for hidden, counter in sorted(counts.items())}
+
+
+def hidden_name(key: Key) -> str:
+    """The row of a case in the confusion matrix."""
+    if not key.effects:
+        return NOTHING
+    effect = key.effects[0]
+    return f"{effect.effect}, driver withheld" if effect.withheld else effect.effect
+
+
+def onset_errors(cases: Sequence[_Single]) -> tuple[float, ...]:
+    """s, of steps that were named; infinite where no onset was given."""
+    errors = []
+    for case in cases:
+        truth, findings = case.truth, case.said.findings
+        if truth.effect == "hard_iron_step" and findings and findings[0].named.effect == truth.effect:
+            onset = findings[0].onset
+            errors.append(math.inf if onset is None or truth.onset is None else abs(onset - truth.onset))
+    return tuple(errors)
+
+
+def coverage(cases: Sequence[_Single]) -> tuple[dict[str, Share], int]:
+    """Of the numbers of effects named right, by effect; and how many parameters the diagnoses do not have."""
+    inside: dict[str, list[bool]] = {}
+    missing = 0
+    for case in cases:
+        if not (case.named and case.driver) or case.said.findings[0].named.effect != case.truth.effect:
+            continue
+        for parameter in case.truth.parameters:
+            if not parameter.scored:
+                continue
+            found = covered(case.said.findings[0], parameter)
+            missing += found is None
+            inside.setdefault(case.truth.effect, []).extend(found or [])
+    return {effect: share(sum(hits), len(hits)) for effect, hits in sorted(inside.items())}, missing
+
+
+def power(cases: Sequence[_Single], measure: Callable[[KeyEffect], float]) -> tuple[Bin, ...]:
+    """Shares found and named right, in bins of z or z_sep."""
+    bins = []
+    for low, high in pairwise(BINS):
+        part = [case for case in cases if low <= measure(case.truth) < high]
+        found = _share_of(part, lambda case: case.said.verdict != FAILED and case.said.alarm)
+        bins.append(Bin(low, high, found, _share_of(part, lambda case: case.named)))
+    return tuple(bins)
+
+
+def doubles(keys: Sequence[Key], said: Mapping[str, Answer]) -> dict[int, int]:
+    """How many of two hidden effects were named, to how often."""
+    counts = {0: 0, 1: 0, 2: 0}
+    for key in keys:
+        if key.kind == "double":
+            left = [finding.named for finding in said[key.name].findings]
+            right = 0
+            for truth in key.effects:
+                match = next((k for k, named in enumerate(left) if named_right(named, truth)), None)
+                if match is not None:
+                    left.pop(match)
+                    right += 1
+            counts[right] += 1
+    return counts
+
+
+def _measured(results: Mapping[str, Any]) -> tuple[Measured, ...]:
+    onsets, ratios = results["onset_errors"], results["ratios"]
+    values = {
+        "empty_cases": float(results["false_alarms"].total),
+        "false_alarms": results["false_alarms"].value,
+        "p_uniform": results["p_uniform"],
+        "strong_cases": float(results["strong"]),
+        "named_right": results["named"].value,
+        "driver_right": results["driver"].value,
+        "separable_share": results["separable"].value,
+        "candidates_named": results["candidates"],
+        "step_within": _mean([float(error <= ONSET_TOLERANCE) for error in onsets]),
+        "coverage": results["coverage"].value,
+        "second_ratio": float(torch.tensor(ratios, dtype=torch.float64).median()) if ratios else math.nan,
+    }
+    return tuple(Measured(threshold, values[threshold.measure]) for threshold in THRESHOLDS)
+
+
+def _share_of(cases: Sequence[Any], holds: Callable[[Any], bool]) -> Share:
+    return share(sum(bool(holds(case)) for case in cases), len(cases))
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values) if values else math.nan
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,123 @@
+"""What a diagnosis says, in the terms of the score, and whether it is right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from mkc_torch.challenge.families import POSITION
+from mkc_torch.challenge.key import KeyEffect, KeyParameter
+from mkc_torch.challenge.thresholds import COVERAGE_FACTOR
+
+NOTHING, UNKNOWN, FAILED = "nothing", "unknown", "failed"
+
+_WITHHELD = ("offset_drift", "hard_iron_step", UNKNOWN)
+"""The time course of a driver that was not recorded is all there is to name."""
+
+_NO_DRIVERS = frozenset(("time", "field", "mag_x", "mag_y", "mag_z"))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    effect: str
+    drivers: frozenset[str]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """``others`` are the alternatives that the diagnosis says its data cannot rule out."""
+
+    named: Candidate
+    others: tuple[Candidate, ...]
+    onset: float | None
+    parameters: tuple[Mapping[str, Any], ...]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A diagnosis; ``verdict`` is ``failed`` where there is none."""
+
+    verdict: str
+    p_value: float | None
+    findings: tuple[Finding, ...]
+
+    @property
+    def alarm(self) -> bool:
+        """It claims that something is there. A diagnosis that failed counts as one: it helps nobody."""
+        return self.verdict != "adequate" or bool(self.findings)
+
+    @property
+    def name(self) -> str:
+        """The effect it names first."""
+        if self.findings:
+            return self.findings[0].named.effect
+        return {"adequate": NOTHING, FAILED: FAILED}.get(self.verdict, UNKNOWN)
+
+
+def answer(diagnosis: Mapping[str, Any] | None) -> Answer:
+    """From the content of ``diagnosis.json``; None for a diagnosis that failed."""
+    if diagnosis is None:
+        return Answer(FAILED, None, ())
+    p_value = diagnosis.get("p_value")
+    findings = tuple(_finding(numbers) for numbers in diagnosis.get("findings", ()))
+    return Answer(diagnosis["verdict"], None if p_value is None else float(p_value), findings)
+
+
+def _finding(numbers: Mapping[str, Any]) -> Finding:
+    others = [other for other in numbers.get("alternatives") or () if not other.get("separable", True)]
+    return Finding(
+        _candidate(numbers),
+        tuple(_candidate(other) for other in others),
+        numbers.get("onset"),
+        tuple(numbers.get("parameters") or ()),
+    )
+
+
+def _candidate(numbers: Mapping[str, Any]) -> Candidate:
+    return Candidate(numbers["effect"], frozenset(numbers.get("drivers") or ()) - _NO_DRIVERS)
+
+
+def named_right(named: Candidate, truth: KeyEffect) -> bool:
+    """It is the hidden effect, or a rival that the data cannot tell from it."""
+    if truth.withheld:
+        return named.effect in _WITHHELD or _is_inseparable(named, truth)
+    return named.effect == truth.effect or _is_inseparable(named, truth)
+
+
+def driver_right(named: Candidate, truth: KeyEffect) -> bool:
+    """Its drivers are those of the hidden effect, or of a rival that the data cannot tell from it."""
+    if truth.effect == "field_gradient" and truth.drivers:
+        own = bool(named.drivers) and named.drivers <= frozenset(POSITION)
+    else:
+        own = named.drivers == frozenset(truth.drivers)
+    return own or any(named.drivers == frozenset(rival.drivers) for rival in truth.inseparable)
+
+
+def _is_inseparable(named: Candidate, truth: KeyEffect) -> bool:
+    return any((rival.effect, frozenset(rival.drivers)) == (named.effect, named.drivers) for rival in truth.inseparable)
+
+
+def covered(finding: Finding, truth: KeyParameter) -> list[bool] | None:
+    """For each number of the parameter, whether the 90 % interval covers it; None where the diagnosis has no such one.
+
+    A parameter of the diagnosis answers to the key's if it has its unit and shape.
+    """
+    value = torch.tensor(truth.value, dtype=torch.float64)
+    for parameter in finding.parameters:
+        if parameter.get("unit") != truth.unit or parameter.get("standard_error") is None:
+            continue
+        stated, error = _numbers(parameter["value"]), _numbers(parameter["standard_error"])
+        if stated is None or error is None or stated.shape != value.shape or error.shape != value.shape:
+            continue
+        return ((stated - value).abs() <= COVERAGE_FACTOR * error).ravel().tolist()
+    return None
+
+
+def _numbers(value: float | Sequence[Any]) -> torch.Tensor | None:
+    try:
+        return torch.tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError):
+        return None

@@ -1,0 +1,170 @@
+import dataclasses
+import json
+import math
+
+import pytest
+
+from mkc_torch.challenge.key import KeyEffect, KeyParameter, KeyRival
+from mkc_torch.challenge.score import score
+from mkc_torch.challenge.thresholds import THRESHOLDS, Threshold
+from tests.challenge.test_key import example
+
+
+def key(name, kind="single", *, effect="hard_iron_step", drivers=(), z=20.0, z_sep=15.0, **more):
+    parameters = more.pop("parameters", ())
+    rival = KeyRival("driver_offset", ("aux_1",), z_sep)
+    truth = KeyEffect(effect, "", drivers, more.pop("withheld", ""), more.pop("onset", None), 1.0, parameters, z, z_sep,
+                      rival, (rival,) if z_sep < 6 else ())  # fmt: skip
+    effects = () if kind == "empty" else (truth, *more.pop("others", ()))
+    return dataclasses.replace(example(name), kind=kind, effects=effects)
+
+
+def finding(effect, drivers=(), onset=None, parameters=(), alternatives=()):
+    return {"effect": effect, "drivers": list(drivers), "onset": onset, "parameters": list(parameters),
+            "alternatives": list(alternatives)}  # fmt: skip
+
+
+def says(*findings, verdict="explained", p_value=0.01):
+    return {"verdict": verdict, "p_value": p_value, "findings": list(findings)}
+
+
+NOTHING = says(verdict="adequate", p_value=0.5)
+
+
+def measured(result, name):
+    return next(m for m in result.measured if m.threshold.measure == name)
+
+
+def test_false_alarms_are_verdicts_findings_and_failures():
+    keys = [key(name, "empty") for name in "abcde"]
+    answers = {"a": NOTHING, "b": says(verdict="unexplained"), "c": says(finding("offset_drift")), "d": NOTHING}
+    result = score(keys, answers)
+    assert (result.false_alarms.count, result.false_alarms.total) == (3, 5)
+    assert result.failed == ("e",)
+    assert len(result.p_values) == 4
+    assert result.confusion == {"nothing": {"nothing": 2, "unknown": 1, "offset_drift": 1, "failed": 1}}
+
+
+def test_named_and_driver_right_among_the_strong():
+    keys = [
+        key("right", effect="current_field", drivers=("current",)),
+        key("driver", effect="current_field", drivers=("current",)),
+        key("wrong", effect="current_field", drivers=("current",)),
+        key("weak", effect="current_field", drivers=("current",), z_sep=4.0),
+    ]
+    answers = {
+        "right": says(finding("current_field", ["current"])),
+        "driver": says(finding("current_field", ["aux_1"])),
+        "wrong": says(finding("offset_drift")),
+        "weak": NOTHING,
+    }
+    result = score(keys, answers)
+    assert result.strong == 3
+    assert (result.named.count, result.named.total) == (2, 3)
+    assert (result.driver.count, result.driver.total) == (1, 3)
+
+
+def test_an_inseparable_rival_is_right_and_a_separable_one_wrong():
+    keys = [key("below", z_sep=5.0), key("above", z_sep=9.0)]
+    answers = {name: says(finding("driver_offset", ["aux_1"])) for name in ("below", "above")}
+    bins = {(b.low, b.high): b.named.count for b in score(keys, answers).power_z_sep}
+    assert bins[5.0, 7.0] == 1
+    assert bins[7.0, 10.0] == 0
+
+
+@pytest.mark.parametrize(("named", "right"), [("offset_drift", 1), ("hard_iron_step", 1), ("unknown", 1),
+                                              ("current_field", 0), ("cubic_nonlinearity", 0)])  # fmt: skip
+def test_a_withheld_driver_is_named_by_its_time_course(named, right):
+    result = score([key("a", effect="current_field", withheld="current")], {"a": says(finding(named))})
+    assert result.withheld_named.count == right
+    assert list(result.confusion) == ["current_field, driver withheld"]
+
+
+def test_position_drives_a_gradient_in_any_part():
+    hidden = key("a", effect="field_gradient", drivers=("position_x", "position_y", "position_z"))
+    assert score([hidden], {"a": says(finding("field_gradient", ["position_x"]))}).driver.count == 1
+    assert score([hidden], {"a": says(finding("field_gradient", []))}).driver.count == 0
+
+
+def test_time_and_field_are_no_drivers():
+    assert score([key("a")], {"a": says(finding("hard_iron_step", ["time"]))}).driver.count == 1
+
+
+def test_candidates_and_separable_share():
+    other = {"effect": "offset_drift", "drivers": [], "separable": False}
+    ruled_out = other | {"separable": True}
+    answers = {
+        "a": says(finding("hard_iron_step", alternatives=[ruled_out])),
+        "b": says(finding("hard_iron_step", alternatives=[other, ruled_out])),
+    }
+    result = score([key("a"), key("b")], answers)
+    assert result.separable.value == 0.5
+    assert result.candidates == 1.5
+
+
+def test_onset_errors():
+    keys = [key("a", onset=10.0), key("b", onset=10.0)]
+    result = score(keys, {"a": says(finding("hard_iron_step", onset=10.4)), "b": says(finding("hard_iron_step"))})
+    assert result.onset_errors == pytest.approx((0.4, math.inf))
+    assert measured(result, "step_within").value == 0.5
+
+
+def test_intervals_of_ninety_per_cent():
+    truth = (KeyParameter("offset_change", [1.0, 2.0, 3.0], "µT", True),)
+    stated = {"name": "step", "value": [1.0, 2.16, 3.17], "standard_error": [0.1, 0.1, 0.1], "unit": "µT"}
+    keys = [key("a", parameters=truth), key("b", parameters=truth)]
+    answers = {
+        "a": says(finding("hard_iron_step", parameters=[{**stated, "unit": "s"}, stated])),
+        "b": says(finding("hard_iron_step")),
+    }
+    result = score(keys, answers)
+    assert (result.coverage.count, result.coverage.total) == (2, 3)
+    assert result.parameters_missing == 1
+
+
+def test_parameters_that_are_not_scored_do_not_count():
+    truth = (KeyParameter("offset_change", [1.0, 2.0, 3.0], "µT", False),)
+    stated = {"name": "step", "value": [0.0] * 3, "standard_error": [0.1] * 3, "unit": "µT"}
+    result = score([key("a", parameters=truth)], {"a": says(finding("hard_iron_step", parameters=[stated]))})
+    assert result.coverage.total == 0
+    assert not measured(result, "coverage").holds
+
+
+def test_power_over_bins():
+    keys = [key(str(z), z=z, z_sep=z) for z in (2.0, 4.0, 12.0, 14.0, 100.0)]
+    answers = dict.fromkeys(("2.0", "4.0", "12.0"), NOTHING)
+    answers |= {name: says(finding("hard_iron_step")) for name in ("14.0", "100.0")}
+    bins = [(b.named.count, b.named.total) for b in score(keys, answers).power_z]
+    assert bins == [(0, 1), (0, 1), (0, 0), (0, 0), (1, 2), (0, 0), (1, 1)]
+
+
+def test_two_at_once_are_counted_once_each():
+    second = key("x", effect="offset_drift").effects
+    keys = [key(name, "double", others=second) for name in "abc"]
+    answers = {
+        "a": says(finding("offset_drift"), finding("hard_iron_step")),
+        "b": says(finding("hard_iron_step"), finding("hard_iron_step")),
+        "c": NOTHING,
+    }
+    assert score(keys, answers).doubles == {0: 1, 1: 1, 2: 1}
+
+
+def test_second_ratio_is_the_median_of_the_strong():
+    keys = [key("a"), key("b"), key("c"), key("weak", z=3.0, z_sep=3.0)]
+    result = score(keys, {}, {"a": 1.0, "b": 1.02, "c": math.inf, "weak": 9.0})
+    assert measured(result, "second_ratio").value == pytest.approx(1.02)
+
+
+def test_nothing_measured_holds_no_threshold_and_is_json():
+    result = score([], {})
+    assert not any(m.holds for m in result.measured)
+    json.dumps(result.numbers(), allow_nan=False)
+
+
+def test_thresholds_are_ranges():
+    assert len({threshold.measure for threshold in THRESHOLDS}) == len(THRESHOLDS)
+    inside = Threshold("a", 0.85, 0.95, "")
+    assert inside.holds(0.85)
+    assert inside.holds(0.95)
+    assert not inside.holds(0.96)
+    assert not inside.holds(math.nan)
