@@ -2,14 +2,16 @@
 
 A triaxial sensor in a constant field that turns through all directions draws an ellipsoid. Its centre is the offset
 (hard iron), its shape the gains and cross-couplings (soft iron). The fit is linear regression on the nine monomials of
-(36) of Li et al., "Multi-kernel Correntropy Regression" (2023), appendix A, by any estimator of ``mkc_torch.linear``.
+(36) of Li et al., "Multi-kernel Correntropy Regression" (2023), appendix A, by any estimator of ``mkc_torch.linear``; a
+finish by maximum likelihood in the unit of the points can follow.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +19,8 @@ from torch import Tensor
 from mkc_torch.coverage import Coverage, coverage
 from mkc_torch.linear import MKCRegression, RankDeficientError
 from mkc_torch.linear._estimator import Fitted, LinearEstimator
+from mkc_torch.nonlinear import NonlinearFit
+from mkc_torch.nonlinear import fit as nonlinear_fit
 from mkc_torch.order_statistic import order_statistic
 
 if TYPE_CHECKING:
@@ -95,6 +99,39 @@ def symmetric_root(shape: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 
     return vectors @ torch.diag_embed(values.sqrt()) @ vectors.mT
 
 
+_SYMMETRIC = (0, 1, 2, 1, 3, 4, 2, 4, 5)
+"""Where each element of a symmetric matrix, row by row, is among those of its upper triangle."""
+
+
+def ellipsoid_from_root(theta: Float[Tensor, "*batch 9"]) -> Ellipsoid:
+    """The ellipsoid ``|L (p - center)| = 1`` from its centre and the upper triangle of the symmetric L."""
+    root = theta[..., 3:][..., list(_SYMMETRIC)].unflatten(-1, (3, 3))
+    return Ellipsoid(theta[..., :3], root @ root)
+
+
+def sampson_distance(theta: Float[Tensor, " 9"], points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+    """First-order distance of points to an ellipsoid, in their unit, positive outside.
+
+    With y = L (p - center) it is ``(|y| - 1) / |∇_p |y||``. From the orthogonal distance e it differs by at most about
+    ``e² b / (2 a²)``, a and b the shortest and the longest semi-axis; at the ends of the axes it is exact.
+
+    Args:
+        theta: as :func:`ellipsoid_from_root` takes it, in the unit of the points.
+        points: (N, 3).
+
+    Example:
+        >>> theta = torch.tensor([0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 1.0, 0.0, 1.0])
+        >>> sampson_distance(theta, torch.tensor([[3.0, 0.0, 0.0], [0.0, 0.5, 0.0]]))
+        tensor([ 1.0000, -0.5000])
+    """
+    root = theta[3:][list(_SYMMETRIC)].unflatten(-1, (3, 3))
+    y = (points - theta[:3]) @ root
+    # keeps a point at the very centre finite
+    tiny = torch.finfo(y.dtype).eps ** 2
+    norm = (y.square().sum(-1) + tiny).sqrt()
+    return (norm - 1.0) * norm / ((y @ root).square().sum(-1) + tiny).sqrt()
+
+
 def _axes(shape: Tensor) -> tuple[Tensor, Tensor]:
     """Semi-axes in ascending order and the rotation whose columns they lie along, with determinant +1."""
     values, vectors = torch.linalg.eigh(shape)
@@ -112,6 +149,11 @@ class EllipsoidFit(Fitted):
     Args:
         estimator: any estimator of ``mkc_torch.linear``; default ``MKCRegression()``. Give it ``covariance="hac"``
             when the points are a time series in the order of time.
+        finish: None keeps the algebraic fit; "maximum_likelihood" goes on from it to the maximum of the MKC likelihood
+            of the points' distances to the surface, :func:`sampson_distance`, with σ and d learned again, in the unit
+            of the points. It is what the algebraic fit is an approximation of where the noise of the points is the
+            same in all directions: the algebraic residual weighs a point by its distance to the centre and is biased
+            by the square of the noise over the radius.
 
     Attributes, after ``fit`` (``*`` batch dimensions, lengths in the unit of the points):
         center_: (*, 3), the offset.
@@ -124,10 +166,13 @@ class EllipsoidFit(Fitted):
         residual_: (*, N), calibrated norm less ``radius_``.
         weights_: (*, N), the weight in [0, 1] with which each point entered.
         center_se_, semi_axes_se_, calibration_matrix_se_: standard errors of the same shapes, where the estimator
-            has a ``covariance_``; infinite where nine points leave none to tell errors from.
+            has a ``covariance_``; infinite where nine points leave none to tell errors from. After a finish they are
+            those of the finish, of the estimator's kind ("sandwich" where it has none).
         coverage_: one :class:`mkc_torch.coverage.Coverage`, or a list of them, of the points in use.
         root_se_: standard errors of ``calibration_matrix_ / radius_``, which makes the ellipsoid a unit sphere.
         estimator_: the fitted estimator; its residual is algebraic, about twice the relative error of the norm.
+        finish_: the :class:`mkc_torch.nonlinear.NonlinearFit` of the finish, or None: residual, d and bound are in the
+            unit of the points, ``theta`` is about the median of the points in units of their median distance from it.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), appendix A, (36)-(41).
@@ -141,8 +186,13 @@ class EllipsoidFit(Fitted):
         [1.0, 2.0, 3.0, 40.0, 50.0, 60.0]
     """
 
-    def __init__(self, estimator: LinearEstimator | None = None) -> None:
+    def __init__(
+        self, estimator: LinearEstimator | None = None, *, finish: Literal["maximum_likelihood"] | None = None
+    ) -> None:
+        if finish not in (None, "maximum_likelihood"):
+            raise ValueError(f"Expected argument `finish` to be None or 'maximum_likelihood' but got {finish!r}.")
         self.estimator = MKCRegression() if estimator is None else estimator
+        self.finish = finish
 
     def fit(
         self, points: Float[Tensor, "*batch N 3"], sample_weight: Float[Tensor, "*batch N"] | None = None
@@ -191,10 +241,41 @@ class EllipsoidFit(Fitted):
         local = ellipsoid_from_coefficients(self.estimator_.coef_)
         self._refuse_unbounded(local, points)
         scale = size.squeeze(-1)
-        self._keep(points, Ellipsoid(origin.squeeze(-2) + scale * local.center, local.shape / size.square()))
         self.weights_ = self.estimator_.weights_.squeeze(-1)
-        self._standard_errors(local, scale)
+        self.finish_: NonlinearFit | None = None
+        parameters = self.estimator_.coef_
+        covariance = getattr(self.estimator_, "covariance_", None)
+        ellipsoid_of: Callable[[Tensor], Ellipsoid] = ellipsoid_from_coefficients
+        if self.finish is not None:
+            self.finish_ = self._finished(local, (points - origin) / size, scale, weight)
+            parameters, covariance = self.finish_.theta, self.finish_.covariance
+            ellipsoid_of = ellipsoid_from_root
+            self.weights_ = self.finish_.weights.squeeze(-1)
+            local = ellipsoid_from_root(parameters)
+            self._refuse_unbounded(local, points)
+        self._keep(points, Ellipsoid(origin.squeeze(-2) + scale * local.center, local.shape / size.square()))
+        if covariance is not None:
+            self._standard_errors(local, scale, parameters, covariance, ellipsoid_of)
         self._refuse_uncovered(self.calibrate(points), weight)
+
+    def _finished(self, local: Ellipsoid, points: Tensor, scale: Tensor, weight: Tensor | None) -> NonlinearFit:
+        """The maximum of the likelihood of the distances that is nearest to an ellipsoid, all in local coordinates."""
+        root = symmetric_root(local.shape)
+        row, column = torch.triu_indices(3, 3)
+
+        def distance(theta: Tensor, data: tuple[Tensor, Tensor]) -> Tensor:
+            near, unit = data
+            return (unit * sampson_distance(theta, near)).unsqueeze(-1)
+
+        return nonlinear_fit(
+            distance,
+            torch.cat([local.center, root[..., row, column]], -1),
+            data=(points, scale),
+            weight=None if weight is None else weight.unsqueeze(-1),
+            graduate=False,
+            covariance=getattr(self.estimator, "covariance", "sandwich"),
+            bandwidth=getattr(self.estimator, "bandwidth", None),
+        )
 
     def calibrate(self, points: Float[Tensor, "*batch M 3"]) -> Float[Tensor, "*batch M 3"]:
         """``calibration_matrix_ @ (p - center_)`` of each point: the field in the unit of the points."""
@@ -218,19 +299,22 @@ class EllipsoidFit(Fitted):
         self.coef_ = coefficients_from_ellipsoid(ellipsoid)
         self.residual_ = torch.linalg.vector_norm(self.calibrate(points), dim=-1) - self.radius_.unsqueeze(-1)
 
-    def _standard_errors(self, local: Ellipsoid, scale: Tensor) -> None:
-        """First-order propagation from the coefficients; the calibration matrix W solves dW W + W dW = dA₁."""
-        covariance = getattr(self.estimator_, "covariance_", None)
-        if covariance is None:
-            return
+    def _standard_errors(
+        self,
+        local: Ellipsoid,
+        scale: Tensor,
+        parameters: Tensor,
+        covariance: Tensor,
+        ellipsoid_of: Callable[[Tensor], Ellipsoid],
+    ) -> None:
+        """First-order propagation from the parameters; the calibration matrix W solves dW W + W dW = dA₁."""
 
-        def quantities(coef: Tensor) -> Tensor:
-            center, shape = ellipsoid_from_coefficients(coef)
+        def quantities(theta: Tensor) -> Tensor:
+            center, shape = ellipsoid_of(theta)
             axes = torch.linalg.eigvalsh(shape).flip(-1).rsqrt()
             return torch.cat([center, axes, shape.flatten()])
 
-        flat = self.estimator_.coef_.reshape(-1, 9)
-        jacobian = torch.func.vmap(torch.func.jacrev(quantities))(flat)
+        jacobian = torch.func.vmap(torch.func.jacrev(quantities))(parameters.reshape(-1, 9))
         root = symmetric_root(local.shape).reshape(-1, 3, 3)
         eye = torch.eye(3, dtype=root.dtype, device=root.device)
         lyapunov = torch.stack([torch.kron(w, eye) + torch.kron(eye, w) for w in root])

@@ -8,11 +8,19 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import brentq, least_squares
 from torch import Tensor
 
 from mkc_torch import EllipsoidFit, NotIdentifiableError
 from mkc_torch.coverage import fibonacci_sphere
-from mkc_torch.ellipsoid import Ellipsoid, coefficients_from_ellipsoid, ellipsoid_from_coefficients, monomials
+from mkc_torch.ellipsoid import (
+    Ellipsoid,
+    coefficients_from_ellipsoid,
+    ellipsoid_from_coefficients,
+    ellipsoid_from_root,
+    monomials,
+    sampson_distance,
+)
 from mkc_torch.linear import (
     FixedPointLinear,
     LeastAbsoluteDeviations,
@@ -234,6 +242,162 @@ def test_batch_equals_loop(estimator):
         torch.testing.assert_close(axes[a, b], alone.semi_axes_, rtol=1e-5, atol=0)
         torch.testing.assert_close(errors[a, b], alone.calibration_matrix_se_, rtol=1e-3, atol=1e-7)
         torch.testing.assert_close(calibrated[a, b], alone.calibrate(points[a, b]), rtol=0, atol=1e-3)
+
+
+# the finish by maximum likelihood
+
+
+def finished(estimator: object = None) -> EllipsoidFit:
+    return EllipsoidFit(estimator, finish="maximum_likelihood")
+
+
+def orthogonal_distance(point: np.ndarray, axes: np.ndarray) -> float:
+    """Signed distance to the ellipsoid of these semi-axes about the origin, from the foot of the perpendicular."""
+
+    def excess(multiplier: float) -> float:
+        return float(((axes * point / (axes**2 + multiplier)) ** 2).sum() - 1.0)
+
+    multiplier = brentq(excess, -(axes.min() ** 2) * (1 - 1e-9), 1e8, xtol=1e-13)
+    foot = axes**2 * point / (axes**2 + multiplier)
+    return math.copysign(float(np.linalg.norm(point - foot)), multiplier)
+
+
+UPRIGHT = torch.tensor([0, 0, 0, 1 / 35, 0, 0, 1 / 45, 0, 1 / 60], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("noise", [0.1, 1.0, 5.0])
+def test_the_distance_is_the_orthogonal_one_to_first_order(noise):
+    points = fibonacci_sphere(300) * AXES + noise * sample(0, 300, 3)
+    exact = torch.tensor([orthogonal_distance(p, AXES.numpy()) for p in points.numpy()], dtype=torch.float64)
+    error = (sampson_distance(UPRIGHT, points) - exact).abs()
+    a, b = float(AXES.min()), float(AXES.max())
+    assert bool((error <= exact.square() * b / (2 * a * a) + 1e-9).all())
+    assert float(exact.abs().max()) > 2 * noise
+
+
+def test_the_distance_is_exact_at_the_ends_of_the_axes_and_finite_at_the_centre():
+    ends = torch.diag(AXES) + torch.diag(torch.tensor([2.0, -3.0, 4.0], dtype=torch.float64))
+    distance = sampson_distance(UPRIGHT, torch.cat([ends, torch.zeros(1, 3, dtype=torch.float64)]))
+    torch.testing.assert_close(distance[:3], torch.tensor([2.0, -3.0, 4.0], dtype=torch.float64))
+    assert -1e3 < float(distance[3]) < 0
+    assert bool(torch.isfinite(torch.func.jacrev(sampson_distance)(UPRIGHT, torch.zeros(1, 3).double())).all())
+
+
+def test_the_finish_of_gaussian_points_is_least_squares_of_orthogonal_distances():
+    points = surface(150, turn=torch.eye(3).double()) + 0.5 * sample(0, 150, 3)
+    fit = finished().fit(points)
+
+    def distances(theta: np.ndarray) -> np.ndarray:
+        center, shape = ellipsoid_from_root(torch.from_numpy(theta))
+        values, vectors = np.linalg.eigh(shape.numpy())
+        turned = (points.numpy() - center.numpy()) @ vectors
+        return np.array([orthogonal_distance(p, values**-0.5) for p in turned])
+
+    start = UPRIGHT.numpy().copy()
+    start[:3] = CENTER.numpy()
+    found = torch.from_numpy(least_squares(distances, start, x_scale="jac").x)
+    torch.testing.assert_close(fit.center_, found[:3], rtol=0, atol=0.02)
+    torch.testing.assert_close(
+        fit.semi_axes_, torch.linalg.eigvalsh(ellipsoid_from_root(found).shape).flip(0).rsqrt(), rtol=0, atol=0.02
+    )
+    # the algebraic fit is not
+    assert float((EllipsoidFit().fit(points).semi_axes_ - fit.semi_axes_).abs().max()) > 0.03
+
+
+def test_the_finish_takes_away_the_bias_of_the_algebraic_fit():
+    points = surface(200) + 1.0 * sample(0, 60, 200, 3)
+    algebraic = (EllipsoidFit().fit(points).semi_axes_ - AXES).mean(0)
+    likeliest = (finished().fit(points).semi_axes_ - AXES).mean(0)
+    assert float(algebraic[0]) > 0.08
+    assert float(likeliest[0].abs()) < 0.5 * float(algebraic[0])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_disturbed_points_do_not_move_the_finish(seed):
+    fit = finished().fit(disturbed(10 * seed))
+    torch.testing.assert_close(fit.center_, CENTER, rtol=0, atol=0.3)
+    torch.testing.assert_close(fit.semi_axes_, AXES, rtol=0, atol=0.4)
+    assert float(fit.weights_[:40].median()) < 0.05
+    assert float(fit.weights_[40:].mean()) > 0.6
+    assert bool(fit.finish_.converged)
+
+
+def test_the_finish_is_in_the_unit_of_the_points():
+    points = disturbed(0)
+    fit = finished().fit(points)
+    root = fit.calibration_matrix_ / fit.radius_
+    theta = torch.cat([fit.center_, root[tuple(torch.triu_indices(3, 3))]])
+    torch.testing.assert_close(fit.finish_.residual.squeeze(-1), sampson_distance(theta, points), rtol=1e-7, atol=1e-9)
+    assert float(fit.finish_.d) == pytest.approx(0.2, rel=0.2)
+    milli = finished().fit(1e3 * (points + 70.0))
+    torch.testing.assert_close(milli.semi_axes_, 1e3 * fit.semi_axes_, rtol=1e-5, atol=0)
+    torch.testing.assert_close(milli.finish_.d, 1e3 * fit.finish_.d, rtol=1e-3, atol=0)
+    torch.testing.assert_close(milli.center_se_, 1e3 * fit.center_se_, rtol=1e-3, atol=0)
+
+
+def test_the_finish_recovers_an_exact_ellipsoid():
+    fit = finished().fit(surface(200))
+    torch.testing.assert_close(fit.center_, CENTER, rtol=0, atol=1e-7)
+    torch.testing.assert_close(fit.semi_axes_, AXES, rtol=1e-8, atol=0)
+    assert bool(torch.isfinite(fit.semi_axes_se_).all())
+
+
+def test_a_batch_of_finishes_is_a_loop():
+    points = torch.stack([disturbed(10 * s, share=0.05 * s) for s in range(4)]).reshape(2, 2, 200, 3)
+    weight = torch.ones(2, 2, 200).double()
+    weight[..., 100:110] = 0.0
+    fit = finished().fit(points, weight)
+    assert fit.center_.shape == fit.semi_axes_se_.shape == (2, 2, 3)
+    assert fit.weights_.shape == (2, 2, 200)
+    for i in range(4):
+        a, b = divmod(i, 2)
+        alone = finished().fit(points[a, b], weight[a, b])
+        torch.testing.assert_close(fit.center_[a, b], alone.center_, rtol=0, atol=1e-3)
+        torch.testing.assert_close(fit.semi_axes_[a, b], alone.semi_axes_, rtol=1e-4, atol=0)
+        torch.testing.assert_close(fit.semi_axes_se_[a, b], alone.semi_axes_se_, rtol=0.02, atol=0)
+
+
+def test_standard_errors_of_the_finish_are_the_spread_of_repeated_experiments():
+    fit = finished(LeastSquares()).fit(surface(150) + 0.2 * sample(0, 150, 150, 3))
+    for name in ("center_", "semi_axes_", "calibration_matrix_"):
+        spread = getattr(fit, name).std(0)
+        predicted = getattr(fit, name[:-1] + "_se_").square().mean(0).sqrt()
+        torch.testing.assert_close(predicted, spread, rtol=0.2, atol=0)
+    # they are those of the finish
+    algebraic = EllipsoidFit(LeastSquares()).fit(surface(150) + 0.2 * sample(0, 150, 150, 3))
+    assert not torch.allclose(fit.center_se_, algebraic.center_se_, rtol=0.01)
+
+
+def test_the_finish_has_the_kind_of_errors_of_its_estimator():
+    slow = torch.nn.functional.avg_pool1d(sample(0, 3, 1, 229), 30, 1).squeeze(1).mT
+    points = surface(200) + 2.0 * slow
+    sandwich, hac = finished(MKCRegression()).fit(points), finished(MKCRegression(covariance="hac")).fit(points)
+    torch.testing.assert_close(sandwich.center_, hac.center_)
+    assert bool((hac.center_se_ > 1.3 * sandwich.center_se_).all())
+    none = finished(MKCRegression(covariance="hac", bandwidth=0)).fit(points)
+    torch.testing.assert_close(none.center_se_, sandwich.center_se_)
+    assert hasattr(finished(LeastTrimmedSquares()).fit(points), "center_se_")
+
+
+def test_without_a_finish_there_is_none():
+    assert EllipsoidFit().fit(disturbed(0)).finish_ is None
+    with pytest.raises(ValueError, match="`finish` to be None or 'maximum_likelihood' but got 'ml'"):
+        EllipsoidFit(finish="ml")
+
+
+def test_a_finish_is_refused_where_the_algebraic_fit_is():
+    sphere = fibonacci_sphere(1000)
+    cap = 50.0 * sphere[sphere[:, 2] > math.cos(math.radians(60))]
+    with pytest.raises(NotIdentifiableError, match="Not identifiable"):
+        finished().fit(cap + 0.5 * sample(0, len(cap), 3))
+    points = 50.0 * fibonacci_sphere(9) + sample(1, 9, 3)
+    assert bool(torch.isinf(finished().fit(points).semi_axes_se_).all())
+
+
+def test_the_finish_of_float32_stays_float32():
+    fit = finished().fit((surface(200) + 0.1 * sample(0, 200, 3)).float())
+    assert fit.center_.dtype == fit.semi_axes_se_.dtype == torch.float32
+    torch.testing.assert_close(fit.semi_axes_.double(), AXES, rtol=2e-3, atol=0)
 
 
 # standard errors
@@ -485,6 +649,7 @@ def test_a_passing_magnet_does_not_move_the_fit():
     truth = torch.tensor([44.2, 44.5, 45.6], dtype=torch.float64)
     fit = EllipsoidFit().fit(points)
     assert float((fit.semi_axes_ - truth).abs().max()) < 0.6
+    assert float((finished().fit(points).semi_axes_ - truth).abs().max()) < 0.6
     assert float((EllipsoidFit(LeastSquares()).fit(points).semi_axes_ - truth).abs().max()) > 4.0
 
 
