@@ -4,6 +4,7 @@ from importlib.metadata import version
 
 from mkc_torch import functional, linear
 from mkc_torch.density_fit import DensityFit, fit_density
+from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.distribution import MKCDistribution
 from mkc_torch.ellipsoid import EllipsoidFit, NotIdentifiableError
 from mkc_torch.losses import MKCLoss
@@ -13,11 +14,13 @@ __version__ = version("mkc-torch")
 
 __all__ = [
     "DensityFit",
+    "Diagnosis",
     "EllipsoidFit",
     "MKCDistribution",
     "MKCLoss",
     "NotIdentifiableError",
     "Recording",
+    "diagnose",
     "fit_density",
     "functional",
     "linear",

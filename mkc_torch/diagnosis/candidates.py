@@ -1,0 +1,64 @@
+"""All candidates of a recording: effect × driver × shape."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.diagnosis.drivers import Driver
+from mkc_torch.diagnosis.model import Term
+from mkc_torch.effects.protocol import Effect, Shape
+from mkc_torch.simulation.protocol import PreparedSimulation
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["candidate_terms", "described", "finer"]
+
+_STEPS = 8
+
+
+def candidate_terms(
+    prepared: PreparedSimulation, drivers: Sequence[Driver], effects: Sequence[Effect]
+) -> tuple[Term, ...]:
+    """Each effect that has its port in the simulation, with each driver of its roles and each shape of its grid."""
+    terms = []
+    for effect in effects:
+        if effect.port not in prepared.ports:
+            continue
+        # a role that is known says what the column does; an effect of unknown roles takes what is left over
+        fitting = [None] if not effect.roles else [d for d in drivers if d.role in effect.roles]
+        shapes = effect.shapes(prepared.time)
+        terms += [Term(effect, driver, shape) for driver in fitting for shape in shapes]
+    return tuple(terms)
+
+
+def finer(term: Term, name: str, time: Float[Tensor, " N"], rounds: int) -> tuple[Term, ...]:
+    """The same effect with one number of its shape varied: over an eighth of its range to either side, then ever less.
+
+    Args:
+        term: the effect.
+        name: of the number, one of those that the effect calls continuous.
+        time: of the recording.
+        rounds: how often the range was narrowed before.
+    """
+    low, high = (share * float(time[-1] - time[0]) for share in term.effect.continuous[name])
+    offset = float(time[0]) if name == "onset" else 0.0
+    value = term.shape[name]
+    reach = (high - low) / _STEPS ** (rounds + 1)
+    values = {min(max(value + reach * k / _STEPS, low + offset), high + offset) for k in range(-_STEPS, _STEPS + 1)}
+    return tuple(replace(term, shape={**term.shape, name: v}) for v in sorted(values))
+
+
+def described(shape: Shape) -> str:
+    """A shape as a user reads it.
+
+    Example:
+        >>> described({"onset": 12.345, "lag": 0.5})
+        'onset 12.35 s, lag 0.5 s'
+    """
+    units: Mapping[str, str] = {"onset": " s", "lag": " s", "time_constant": " s"}
+    return ", ".join(f"{name.replace('_', ' ')} {value:.4g}{units.get(name, '')}" for name, value in shape.items())

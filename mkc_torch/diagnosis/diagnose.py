@@ -1,0 +1,296 @@
+"""Diagnose a recording against a simulation: locate the mismatch, name it, model it, show the fit improve."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.candidates import candidate_terms, described
+from mkc_torch.diagnosis.diagnosed_model import model_of
+from mkc_torch.diagnosis.drivers import Drivers, find_drivers
+from mkc_torch.diagnosis.estimate import Estimate, estimate
+from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
+from mkc_torch.diagnosis.findings import finding_of
+from mkc_torch.diagnosis.locate import UNKNOWN, Located, locate
+from mkc_torch.diagnosis.model import JointModel, Term
+from mkc_torch.diagnosis.noise_summary import noise_summary
+from mkc_torch.diagnosis.refit import FittedModel, fitted
+from mkc_torch.diagnosis.result import Candidate, Diagnosis, Finding, HeldOut, Separability, Spread, Traces, Verdict
+from mkc_torch.diagnosis.separability import separability
+from mkc_torch.diagnosis.units import unit_warnings
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.effects.protocol import Effect
+from mkc_torch.recording import Recording
+from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool
+
+__all__ = ["diagnose"]
+
+LEVEL = 0.05
+SURROGATES = 99
+MAX_FINDINGS = 3
+
+FEWEST = 100
+"""With fewer samples nothing can be said about structure."""
+
+_REST = 0.5
+"""A larger share of samples in which nothing moves is a sensor at rest, and is warned of."""
+
+
+def diagnose(
+    simulation: Simulation,
+    recording: Recording,
+    *,
+    effects: Sequence[Effect] = CATALOGUE,
+    level: float = LEVEL,
+    surrogates: int = SURROGATES,
+    max_findings: int = MAX_FINDINGS,
+    seed: int = 0,
+) -> Diagnosis:
+    """What a simulation lacks, by one recording of what it simulates.
+
+    The simulation's own parameters are fitted together with every candidate: effect × driver × shape. The strongest one
+    is judged by the same search on draws of the fitted noise; what passes is kept, refitted jointly, and the search goes
+    on beside it.
+
+    Args:
+        simulation: of the recording, such as :class:`mkc_torch.simulation.Magnetometer`.
+        recording: with named columns; see :class:`mkc_torch.Recording`.
+        effects: the catalogue to search; :data:`mkc_torch.effects.CATALOGUE` and whatever a user adds.
+        level: rate of false alarms, in (0, 1).
+        surrogates: draws of noise for each p-value; at least ``1 / level - 1``.
+        max_findings: findings at most.
+        seed: of the draws.
+
+    Returns:
+        The diagnosis.
+
+    Raises:
+        ValueError: an argument out of range, too few samples, or a recording that the simulation refuses.
+        MissingColumnError: the recording lacks a column that the simulation needs.
+
+    Example:
+        >>> from mkc_torch.demo import simulated_recording
+        >>> from mkc_torch.simulation import Magnetometer
+        >>> result = diagnose(Magnetometer(), simulated_recording()[0])
+        >>> result.verdict in ("adequate", "explained", "unexplained")
+        True
+    """
+    _check(level, surrogates, max_findings)
+    where = f"{recording.name}: " if recording.name else ""
+    if len(recording) < FEWEST:
+        raise ValueError(
+            f"{where}{len(recording)} samples are too few for a diagnosis; it needs {FEWEST} at least. Record for longer."
+        )
+    prepared = simulation.prepare(recording)
+    if len(prepared.time) < FEWEST:
+        raise ValueError(
+            f"{where}{len(prepared.time)} usable samples are too few for a diagnosis; it needs {FEWEST} at least."
+        )
+    drivers = find_drivers(prepared.recording, simulation.columns)
+    terms = candidate_terms(prepared, drivers.drivers, effects)
+    generator = torch.Generator().manual_seed(seed)
+    base = fitted(JointModel(prepared), prepared.start())
+    searches = _searches(base, terms, level, surrogates, max_findings, generator)
+    found = [s for s in searches if s.p_value <= level]
+    final = estimate(found[-1].fit if found else base)
+    return _assembled(prepared, drivers, terms, base, searches, found, final, level, surrogates, seed, generator)
+
+
+def _check(level: float, surrogates: int, max_findings: int) -> None:
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"Expected argument `level` to be in (0, 1) but got {level}.")
+    if surrogates < math.ceil(1.0 / level - 1.0 - 1e-9):
+        raise ValueError(
+            f"Expected argument `surrogates` to be at least {math.ceil(1.0 / level - 1.0 - 1e-9)} at level {level}, "
+            f"for no p-value can be smaller than 1 / (surrogates + 1), but got {surrogates}."
+        )
+    if max_findings < 0:
+        raise ValueError(f"Expected argument `max_findings` to be at least 0 but got {max_findings}.")
+
+
+def _searches(
+    base: FittedModel,
+    terms: tuple[Term, ...],
+    level: float,
+    surrogates: int,
+    max_findings: int,
+    generator: torch.Generator,
+) -> list[Located]:
+    """One search after the other, each beside what the ones before found; the last one may have found nothing."""
+    searches: list[Located] = []
+    fit = base
+    for count in range(max_findings + 1):
+        if not terms:
+            break
+        found = locate(fit, terms, level=level, surrogates=surrogates, generator=generator, parts=count == 0)
+        searches.append(found)
+        if found.p_value > level or count == max_findings - 1:
+            break
+        fit = found.fit
+        terms = tuple(t for t in terms if not _same(t, found.term))
+    return searches
+
+
+def _same(term: Term, found: Term) -> bool:
+    """Whether a candidate is the found effect again, or a curve over its driver; a step elsewhere is another one."""
+    if "onset" in term.shape and "onset" in found.shape:
+        return False
+    return term.key == found.key or (term.effect.id == UNKNOWN and term.columns == found.columns)
+
+
+def _assembled(
+    prepared: PreparedSimulation,
+    drivers: Drivers,
+    terms: tuple[Term, ...],
+    base: FittedModel,
+    searches: list[Located],
+    found: list[Located],
+    final: Estimate,
+    level: float,
+    surrogates: int,
+    seed: int,
+    generator: torch.Generator,
+) -> Diagnosis:
+    blocks = blocks_of(len(base.residual), final.linearised.colour.order + 1)
+    models = [base, *(s.fit for s in found)]
+    evidence = [held_out(model, blocks) for model in models]
+    inliers = (evidence[-1].residual.abs() <= 3.0 * evidence[-1].d) & (final.fit.weights > _REST)
+    findings = [
+        finding_of(s, final, k, *_held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, generator))
+        for k, s in enumerate(found)
+    ]
+    nameless = any(f.effect == UNKNOWN for f in findings)
+    verdict: Verdict = "adequate" if not findings else "unexplained" if nameless else "explained"
+    first = searches[0] if searches else None
+    return Diagnosis(
+        recording=prepared.recording.name,
+        simulation=prepared.name,
+        samples=len(prepared.time),
+        level=level,
+        noise=noise_summary(final),
+        candidates_tried=len(terms),
+        surrogates=surrogates,
+        seed=seed,
+        p_value=first.p_value if first else 1.0,
+        verdict=verdict,
+        findings=tuple(findings),
+        baseline=_spread(evidence[0], inliers),
+        corrected=_spread(evidence[-1], inliers),
+        ceiling=None,
+        advice=_advice(findings),
+        warnings=(
+            *prepared.recording.warnings,
+            *unit_warnings(prepared.recording),
+            *prepared.warnings,
+            *drivers.warnings,
+            *_time_warnings(prepared),
+        ),
+        candidates=_candidates(first),
+        separability=separability(first) if first else _nothing_to_separate(),
+        traces=_traces(prepared, drivers, base, final),
+        model=model_of(final),
+    )
+
+
+def _held(
+    before: Evidence,
+    after: Evidence,
+    blocks: HeldOutBlocks,
+    inliers: Bool[Tensor, "N m"],
+    term: Term,
+    prepared: PreparedSimulation,
+    generator: torch.Generator,
+) -> tuple[HeldOut | None, str]:
+    """The held-out evidence of one effect, or why there is none."""
+    onset, time = term.shape.get("onset"), prepared.time
+    if onset is not None:
+        shorter = min(int((time < onset).sum()), int((time >= onset).sum()))
+        if shorter < 2 * len(time) // (int(blocks.block.max()) + 1):
+            return None, "one side of the step is shorter than two of the held-out blocks"
+    difference = after.log_likelihood - before.log_likelihood
+    gain, interval = gain_interval(difference, blocks.block, generator)
+    return HeldOut(gain, interval, _rms(before, inliers), _rms(after, inliers), prepared.unit), ""
+
+
+def _rms(evidence: Evidence, inliers: Bool[Tensor, "N m"]) -> float:
+    return float(evidence.residual[inliers].square().mean().sqrt())
+
+
+def _spread(evidence: Evidence, inliers: Bool[Tensor, "N m"]) -> Spread:
+    return Spread(
+        float(evidence.log_likelihood.mean()),
+        _rms(evidence, inliers),
+        tuple(evidence.sigma.tolist()),
+        tuple(evidence.d.tolist()),
+    )
+
+
+def _advice(findings: Sequence[Finding]) -> tuple[str, ...]:
+    advice = []
+    for finding in findings:
+        near = [a for a in finding.alternatives if not a.separable]
+        if near:
+            told = ", ".join(f"{a.effect} ({', '.join(a.drivers)})" if a.drivers else a.effect for a in near)
+            advice.append(
+                f"To tell {finding.effect} from {told}, record again while they go different ways: change one and hold "
+                "the other."
+            )
+        if not finding.plausible:
+            advice.append(
+                f"The size of {finding.effect} is not plausible: look for another cause before correcting it."
+            )
+    return tuple(advice)
+
+
+def _candidates(first: Located | None) -> tuple[Candidate, ...]:
+    if first is None:
+        return ()
+    return tuple(
+        Candidate(
+            first.terms[r.number].effect.id,
+            first.terms[r.number].columns,
+            described(first.terms[r.number].shape),
+            r.gain,
+            math.sqrt(2.0 * max(r.gain, 0.0)),
+        )
+        for r in first.ranking
+    )
+
+
+def _nothing_to_separate() -> Separability:
+    return Separability((), torch.zeros(0, 0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
+
+
+def _time_warnings(prepared: PreparedSimulation) -> tuple[str, ...]:
+    if prepared.recording.time is not None:
+        return ()
+    return (
+        "The recording has no column `time`: sample numbers stand in for seconds, and the samples count as evenly spaced.",
+    )
+
+
+def _traces(prepared: PreparedSimulation, drivers: Drivers, base: FittedModel, final: Estimate) -> Traces:
+    shown = {
+        name: driver.values[:, k] + driver.reference[k]
+        for driver in drivers.drivers
+        for k, name in enumerate(driver.columns)
+    }
+    units = {name: unit for driver in drivers.drivers for name, unit in zip(driver.columns, driver.units, strict=True)}
+    return Traces(
+        time=prepared.time,
+        has_time=prepared.recording.time is not None,
+        before=base.residual,
+        after=final.fit.residual,
+        weight=final.fit.weights,
+        channels=prepared.channels,
+        unit=prepared.unit,
+        drivers=shown,
+        driver_units=units,
+    )

@@ -1,0 +1,233 @@
+"""A simulation's model with the findings in it: a module, its file model.json, and the correction of new recordings."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from mkc_torch.diagnosis.drivers import Driver
+from mkc_torch.diagnosis.estimate import Estimate
+from mkc_torch.diagnosis.model import Term
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.effects.protocol import Context, Effect
+from mkc_torch.recording import MissingColumnError, Recording
+from mkc_torch.simulation.protocol import Correction
+from mkc_torch.simulation.registry import correction_of
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["SCHEMA", "DiagnosedModel", "ModelFileError", "model_of"]
+
+SCHEMA = "mkc-model/1"
+
+
+class ModelFileError(ValueError):
+    """A text that is no model; the sentence says why."""
+
+
+class DiagnosedModel(nn.Module):
+    """What a diagnosis found, ready for other recordings of the same sensor or system.
+
+    Args:
+        simulation: its name.
+        state: constants that the simulation needs to correct a recording.
+        parameters: the simulation's own, (p,).
+        terms: the effects, each with its driver's columns, their reference and units, and its shape.
+        gammas: their γ.
+
+    Attributes:
+        theta: the simulation's parameters.
+        gammas: a parameter list, one γ an effect.
+
+    Example:
+        >>> from mkc_torch import diagnose
+        >>> from mkc_torch.demo import simulated_recording
+        >>> from mkc_torch.simulation import Magnetometer
+        >>> recording, _ = simulated_recording()
+        >>> model = diagnose(Magnetometer(), recording).model
+        >>> columns, left_out = DiagnosedModel.from_json(model.to_json()).correct(recording)
+        >>> list(columns)
+        ['time', 'field_x', 'field_y', 'field_z']
+    """
+
+    def __init__(
+        self,
+        simulation: str,
+        state: Mapping[str, Any],
+        parameters: Float[Tensor, " p"],
+        terms: Sequence[Term],
+        gammas: Sequence[Float[Tensor, " q"]],
+    ) -> None:
+        super().__init__()
+        self.simulation = simulation
+        self.state = dict(state)
+        self.theta = nn.Parameter(parameters.detach().clone(), requires_grad=False)
+        self.gammas = nn.ParameterList(nn.Parameter(g.detach().clone(), requires_grad=False) for g in gammas)
+        self.terms = tuple(terms)
+
+    def correct(self, recording: Recording) -> tuple[dict[str, Float[Tensor, " N"]], tuple[str, ...]]:
+        """The corrected signal of a recording, row by row, and sentences about effects that do not carry over.
+
+        Of an effect that is bound to the time of the diagnosed recording what is left at its end is taken off, such as
+        the offset after the last step; one that is bound to its place is left out.
+
+        Raises:
+            MissingColumnError: a column of the simulation, or an effect's driver, is not there.
+        """
+        correction = correction_of(self.simulation, self.state, recording)
+        signals = correction.signals(self.theta)
+        changes: dict[str, Tensor] = {}
+        notes = []
+        for term, gamma in zip(self.terms, self.gammas, strict=True):
+            port = term.effect.port
+            if port not in correction.ports:
+                notes.append(f"{term.effect.id} belongs to the place of the diagnosed recording and is left out.")
+                continue
+            change, note = self._change(term, gamma, _context(term, correction, signals[port], recording))
+            changes[port] = changes[port] + change if port in changes else change
+            notes += note
+        return correction.corrected(self.theta, changes), tuple(notes)
+
+    def forward(self, recording: Recording) -> dict[str, Float[Tensor, " N"]]:
+        """The corrected signal alone, see :meth:`correct`."""
+        return self.correct(recording)[0]
+
+    def _change(self, term: Term, gamma: Tensor, context: Context) -> tuple[Tensor, list[str]]:
+        lasting = getattr(term.effect, "lasting", None)
+        if lasting is None:
+            return term.effect.change(gamma, term.shape, context), []
+        return lasting(gamma, context), [
+            f"{term.effect.id} is bound to the time of the diagnosed recording: its offset at the end is taken off all of "
+            "this one."
+        ]
+
+    def to_json(self) -> str:
+        """The model as JSON of the schema "mkc-model/1"; numbers round-trip exactly."""
+        terms = [
+            {
+                "effect": term.effect.id,
+                "drivers": [
+                    {"column": column, "reference": float(reference), "unit": unit}
+                    for column, reference, unit in zip(*_columns(term), strict=True)
+                ],
+                "shape": dict(term.shape),
+                "parameters": gamma.tolist(),
+                "equation": term.effect.equation,
+            }
+            for term, gamma in zip(self.terms, self.gammas, strict=True)
+        ]
+        content = {
+            "schema": SCHEMA,
+            "simulation": self.simulation,
+            "state": self.state,
+            "parameters": self.theta.tolist(),
+            "effects": terms,
+        }
+        return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+    @staticmethod
+    def from_json(text: str, effects: Sequence[Effect] = CATALOGUE) -> DiagnosedModel:
+        """The model of a JSON text.
+
+        Args:
+            text: of model.json.
+            effects: where the effects are looked up by their id; a user's own go in here too.
+
+        Raises:
+            ModelFileError: not JSON, of another schema, an effect that is not known, or a value of the wrong kind.
+
+        Example:
+            >>> DiagnosedModel.from_json("{}")
+            Traceback (most recent call last):
+            mkc_torch.diagnosis.diagnosed_model.ModelFileError: this is no model: its schema is missing ...
+        """
+        try:
+            content = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ModelFileError(f"this is no model: it is not JSON ({error}).") from None
+        schema = content.get("schema") if isinstance(content, dict) else None
+        if schema != SCHEMA:
+            found = "missing" if schema is None else json.dumps(schema)
+            raise ModelFileError(f'this is no model: its schema is {found} and not "{SCHEMA}".')
+        try:
+            return _read(content, {effect.id: effect for effect in effects})
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, ModelFileError):
+                raise
+            raise ModelFileError(f"this model is damaged: {type(error).__name__} {error}.") from None
+
+
+def model_of(final: Estimate) -> DiagnosedModel:
+    """The model of a final fit."""
+    model = final.fit.model
+    signals = model.prepared.signals(final.fit.parameters[: model.base])
+    terms = []
+    for term in model.terms:
+        anchored = getattr(term.effect, "anchored", None)
+        context = term.context(model.prepared, signals.get(term.effect.port))
+        shape = term.shape if anchored is None else anchored(term.shape, context)
+        terms.append(Term(term.effect, term.driver, shape))
+    parameters = final.fit.parameters
+    return DiagnosedModel(
+        model.prepared.name, model.prepared.state, parameters[: model.base], terms, model.gammas(parameters)
+    )
+
+
+def _columns(term: Term) -> tuple[Sequence[str], Sequence[float], Sequence[str]]:
+    if term.driver is None:
+        return (), (), ()
+    return term.driver.columns, term.driver.reference.tolist(), term.driver.units
+
+
+def _read(content: Mapping[str, Any], known: Mapping[str, Effect]) -> DiagnosedModel:
+    terms, gammas = [], []
+    for entry in content["effects"]:
+        if entry["effect"] not in known:
+            raise ModelFileError(
+                f'its effect "{entry["effect"]}" is not known; register it with `effects=` (known: {", ".join(known)}).'
+            )
+        columns = entry["drivers"]
+        driver = None
+        if columns:
+            reference = torch.tensor([_finite(c["reference"]) for c in columns], dtype=torch.float64)
+            names, units = tuple(c["column"] for c in columns), tuple(c["unit"] for c in columns)
+            driver = Driver(names, "", reference.new_zeros(0, len(columns)), reference, units)
+        shape = {name: _finite(value) for name, value in entry["shape"].items()}
+        terms.append(Term(known[entry["effect"]], driver, shape))
+        gammas.append(_vector(entry["parameters"]))
+    return DiagnosedModel(content["simulation"], content["state"], _vector(content["parameters"]), terms, gammas)
+
+
+def _vector(values: Sequence[float]) -> Tensor:
+    return torch.tensor([_finite(v) for v in values], dtype=torch.float64)
+
+
+def _finite(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ModelFileError(f"this model is damaged: {value!r} is no finite number.")
+    return float(value)
+
+
+def _context(term: Term, correction: Correction, signal: Tensor, recording: Recording) -> Context:
+    port = correction.ports[term.effect.port]
+    drivers, units = signal.new_zeros(len(signal), 0), ()
+    if term.driver is not None:
+        for column in term.driver.columns:
+            if column not in recording:
+                raise missing_driver(column, term.effect.id)
+        drivers, units = recording.stack(*term.driver.columns) - term.driver.reference, term.driver.units
+    return Context(correction.time, drivers, units, signal, port.unit, port.channels)
+
+
+def missing_driver(column: str, effect: str) -> MissingColumnError:
+    """The error for a recording without an effect's driver."""
+    return MissingColumnError(
+        f"The model corrects {effect} by the column `{column}`, which the recording does not have; "
+        f"rename it with `--columns {column}=NAME`, or record it."
+    )

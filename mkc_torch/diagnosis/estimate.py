@@ -1,0 +1,64 @@
+"""The final parameters: one step of generalised least squares from the robust fit, and their covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.linearise import Linearised, Tangents, linearise
+from mkc_torch.diagnosis.model import follows_signal, port_jacobian
+from mkc_torch.diagnosis.refit import FittedModel
+from mkc_torch.diagnosis.search import NoiseFit
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["Estimate", "estimate"]
+
+_MOST_ERRORS = 5.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A fit with its final parameters, their covariance (p, p), and the noise that is left."""
+
+    fit: FittedModel
+    covariance: Float[Tensor, "p p"]
+    noise: NoiseFit
+    linearised: Linearised
+
+    @property
+    def standard_error(self) -> Float[Tensor, " p"]:
+        return self.covariance.diagonal().clamp(min=0.0).sqrt()
+
+
+def estimate(fit: FittedModel) -> Estimate:
+    """One step of generalised least squares on the pseudo-residuals, with the colour and wander of their noise.
+
+    The M-estimate weighs samples as if they were independent; where noise is coloured this step is the more precise one,
+    and its covariance respects the autocorrelation. A step of more than five standard errors is a fit that the noise
+    model does not describe, and is not taken.
+    """
+    model, parameters = fit.model, fit.parameters
+    pointwise = {
+        name: port_jacobian(model, parameters, name) if port.pointwise else None
+        for name, port in model.prepared.ports.items()
+    }
+    jacobian = torch.func.jacfwd(model.residual)(parameters)
+    independent = parameters.new_tensor([float(one) for one in model.prepared.independent])
+    start = model.base
+    for term, size in zip(model.terms, model.sizes, strict=True):
+        if follows_signal(term.effect):
+            jacobian[..., start : start + size] *= independent[:, None]
+        start += size
+    tangents = Tangents(jacobian, (), pointwise)
+    found = linearise(model, parameters, *fit.pseudo, tangents, joint=True)
+    step, covariance = found.search.estimate(0, found.series)
+    error = covariance.diagonal().clamp(min=1e-300).sqrt()
+    if float((step.abs() / error).max()) <= _MOST_ERRORS:
+        parameters = parameters - step
+        fit = replace(fit, parameters=parameters, residual=model.residual(parameters).detach())
+    return Estimate(fit, covariance, found.search.noise_fit(found.series), found)

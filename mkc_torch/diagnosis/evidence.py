@@ -1,0 +1,96 @@
+"""Held-out evidence: with and without the findings, on blocks of the recording that the fit has not seen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.refit import FittedModel, fitted
+from mkc_torch.functional import mkc_nll
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["Evidence", "HeldOutBlocks", "blocks_of", "held_out", "scored"]
+
+FOLDS = 5
+BLOCKS_PER_FOLD = 5
+_GAP = 0.01
+"""Left out beside a held-out block, as a share of the recording; a correlation time at least."""
+
+
+@dataclass(frozen=True)
+class HeldOutBlocks:
+    """Blocks of consecutive samples, one fold each: block and fold of every sample, and what training leaves out."""
+
+    block: Tensor
+    fold: Tensor
+    train: tuple[Bool[Tensor, " N"], ...]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A model on held-out samples: log-likelihood of each (N,), residual (N, m), the density's σ and d (m,)."""
+
+    log_likelihood: Float[Tensor, " N"]
+    residual: Float[Tensor, "N m"]
+    sigma: Float[Tensor, " m"]
+    d: Float[Tensor, " m"]
+
+
+def blocks_of(N: int, correlation: int) -> HeldOutBlocks:
+    """Twenty-five blocks, five folds; between training and held-out samples lies at least a correlation time.
+
+    Args:
+        N: number of samples.
+        correlation: in samples.
+    """
+    count = FOLDS * BLOCKS_PER_FOLD
+    block = (torch.arange(N) * count).div(N, rounding_mode="floor")
+    fold = block % FOLDS
+    gap = max(1, min(math.ceil(_GAP * N) + correlation, N // (4 * count)))
+    train = []
+    for k in range(FOLDS):
+        near = (fold == k).to(torch.float64).reshape(1, 1, -1)
+        widened = torch.nn.functional.max_pool1d(near, 2 * gap + 1, stride=1, padding=gap)
+        train.append(widened.reshape(-1) == 0)
+    return HeldOutBlocks(block, fold, tuple(train))
+
+
+def held_out(fit: FittedModel, blocks: HeldOutBlocks) -> Evidence:
+    """Refit on all folds but one, judge on that one, for each fold; the shapes of effects stay as they are."""
+    N = len(fit.residual)
+    log_likelihood = fit.residual.new_zeros(N)
+    residual = torch.zeros_like(fit.residual)
+    sigma, d = [], []
+    for number, train in enumerate(blocks.train):
+        found = fitted(fit.model, fit.parameters, fit.bound, rows=train.to(fit.residual.dtype), graduate=False)
+        seen = blocks.fold == number
+        out = fit.model.residual(found.parameters).detach()
+        residual[seen] = out[seen]
+        log_likelihood[seen] = scored(out, found.sigma, found.d, found.bound)[seen]
+        sigma.append(found.sigma)
+        d.append(found.d)
+    return Evidence(log_likelihood, residual, torch.stack(sigma).median(0).values, torch.stack(d).median(0).values)
+
+
+def scored(residual: Tensor, sigma: Tensor, d: Tensor, bound: Tensor) -> Float[Tensor, " N"]:
+    """Log-likelihood of each sample, over its channels."""
+    return -mkc_nll(residual, sigma, d, bound).sum(-1)
+
+
+def gain_interval(
+    difference: Float[Tensor, " N"], block: Tensor, generator: torch.Generator, draws: int = 2000
+) -> tuple[float, tuple[float, float]]:
+    """Mean of paired differences, and its 95 % interval by a bootstrap of whole blocks."""
+    count = int(block.max()) + 1
+    total = difference.new_zeros(count).index_add(0, block, difference)
+    size = difference.new_zeros(count).index_add(0, block, torch.ones_like(difference))
+    drawn = torch.randint(count, (draws, count), generator=generator)
+    means = total[drawn].sum(-1) / size[drawn].sum(-1)
+    low, high = torch.quantile(means, torch.tensor([0.025, 0.975], dtype=means.dtype)).tolist()
+    return float(difference.mean()), (low, high)

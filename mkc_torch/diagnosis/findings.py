@@ -1,0 +1,218 @@
+"""A located effect as a finding that a user reads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.estimate import Estimate
+from mkc_torch.diagnosis.evidence import scored
+from mkc_torch.diagnosis.locate import SEPARABLE, Located
+from mkc_torch.diagnosis.model import Term, follows_signal
+from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter
+from mkc_torch.effects.protocol import Context
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["finding_of", "intervals_of", "labels", "parameters_of"]
+
+_MOST_ALTERNATIVES = 5
+_FARTHEST = 30.0
+_BLOCKS, _MOST_GAIN, _CONCENTRATED = 60, 0.9, 0.35
+_POINTS = 80
+_NORMAL_95 = 1.959964
+
+
+def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | None, note: str) -> Finding:
+    """The finding for the effect ``number`` of the final model.
+
+    Args:
+        located: the search that named it.
+        final: the final parameters.
+        number: of the effect among the model's terms.
+        held, note: its held-out evidence, or why there is none.
+    """
+    term = final.fit.model.terms[number]
+    gamma, covariance = _own(final, number)
+    context = _context(final, term)
+    channels = context.channels
+    plausible, told = _plausibility(term, gamma, context)
+    return Finding(
+        effect=term.effect.id,
+        drivers=term.columns,
+        channels=channels,
+        intervals=intervals_of(final, number),
+        onset=term.shape.get("onset"),
+        equation=term.effect.equation,
+        explanation=f"{term.effect.explanation} {term.effect.advice}".strip(),
+        parameters=(*parameters_of(term, gamma, covariance, context), *_shape_parameters(term)),
+        p_value=located.p_value,
+        held_out=held,
+        held_out_note=note,
+        alternatives=_alternatives(located, term),
+        plausible=plausible,
+        plausibility=told,
+        curve=_curve(term, gamma, covariance, context),
+    )
+
+
+def _own(final: Estimate, number: int) -> tuple[Tensor, Tensor]:
+    """γ of one effect and its covariance."""
+    model = final.fit.model
+    start = model.base + sum(model.sizes[:number])
+    mine = slice(start, start + model.sizes[number])
+    return final.fit.parameters[mine], final.covariance[mine, mine]
+
+
+def _context(final: Estimate, term: Term) -> Context:
+    model = final.fit.model
+    signals = model.prepared.signals(final.fit.parameters[: model.base])
+    return term.context(model.prepared, signals.get(term.effect.port))
+
+
+def parameters_of(
+    term: Term, gamma: Float[Tensor, " q"], covariance: Float[Tensor, "q q"], context: Context
+) -> tuple[Parameter, ...]:
+    """γ as named quantities with units and standard errors."""
+    error = covariance.diagonal().clamp(min=0.0).sqrt()
+    readings = getattr(term.effect, "readings", None)
+    parameters, start = [], 0
+    for quantity in term.effect.quantities(term.shape, context):
+        mine = slice(start, start + quantity.size)
+        value, spread = gamma[mine], error[mine]
+        start += quantity.size
+        if readings is not None:
+            value, spread = readings(quantity.name, value, covariance[mine, mine])
+        parameters.append(Parameter(quantity.name, _numbers(value), _numbers(spread), quantity.unit))
+    return tuple(parameters)
+
+
+def _shape_parameters(term: Term) -> tuple[Parameter, ...]:
+    seconds = {"lag", "time_constant"}
+    return tuple(Parameter(name, value, None, "s") for name, value in term.shape.items() if name in seconds)
+
+
+def _numbers(values: Tensor) -> Number:
+    if values.dim() == 0 or values.numel() == 1:
+        return float(values)
+    return tuple(_numbers(v) for v in values)
+
+
+def _plausibility(term: Term, gamma: Tensor, context: Context) -> tuple[bool, str]:
+    limit = term.effect.plausible
+    first = term.effect.quantities(term.shape, context)[0]
+    largest = float(gamma[: first.size].abs().max())
+    if not math.isfinite(limit):
+        return True, "No plausible size is known for this effect; judge it by its equation."
+    if "µT" not in first.unit:
+        return True, f"Its size is in {first.unit or 'no unit'}; plausible sizes are known for µT alone."
+    told = f"Its largest value, {largest:.3g} {first.unit}, is"
+    if largest <= limit:
+        return True, f"{told} within the {limit:g} {first.unit} that is plausible ({term.effect.source})."
+    return False, f"{told} beyond the {limit:g} {first.unit} that is plausible ({term.effect.source}): doubt it."
+
+
+def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
+    """Rivals of the search, nearest first: all that the data do not tell apart, and the next few."""
+    found = []
+    if term.driver is not None:
+        found += [Alternative(term.effect.id, (copy,), 0.0, False) for copy in term.driver.copies]
+    for ranked in located.ranking:
+        rival = located.terms[ranked.number]
+        if rival.key == term.key or ranked.gap > _FARTHEST:
+            continue
+        gap = max(ranked.gap, 0.0)
+        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= SEPARABLE))
+    near = [a for a in found if not a.separable]
+    return tuple(near + [a for a in found if a.separable][: max(0, _MOST_ALTERNATIVES - len(near))])
+
+
+def intervals_of(final: Estimate, number: int) -> tuple[tuple[float, float], ...]:
+    """Where the effect's gain is concentrated: the fewest of sixty blocks that hold nine tenths of it.
+
+    Empty where that is more than a third of the recording.
+    """
+    fit = final.fit
+    model, parameters = fit.model, fit.parameters.clone()
+    start = model.base + sum(model.sizes[:number])
+    with_it = scored(model.residual(parameters), fit.sigma, fit.d, fit.bound)
+    parameters[start : start + model.sizes[number]] = 0.0
+    gain = (with_it - scored(model.residual(parameters), fit.sigma, fit.d, fit.bound)).detach()
+    time = model.prepared.time
+    N = len(time)
+    count = min(_BLOCKS, N // 10)
+    if count < 10:
+        return ()
+    block = (torch.arange(N) * count).div(N, rounding_mode="floor")
+    total = gain.new_zeros(count).index_add(0, block, gain).clamp(min=0.0)
+    order = total.argsort(descending=True)
+    needed = int((total[order].cumsum(0) < _MOST_GAIN * total.sum()).sum()) + 1
+    if float(total.sum()) <= 0 or needed > _CONCENTRATED * count:
+        return ()
+    inside = torch.zeros(count, dtype=torch.bool)
+    inside[order[:needed]] = True
+    intervals: list[tuple[float, float]] = []
+    for k in inside.nonzero().squeeze(-1).tolist():
+        rows = (block == k).nonzero().squeeze(-1)
+        first, last = float(time[rows[0]]), float(time[rows[-1]])
+        if intervals and inside[k - 1] and k > 0:
+            intervals[-1] = (intervals[-1][0], last)
+        else:
+            intervals.append((first, last))
+    return tuple(intervals)
+
+
+def _curve(term: Term, gamma: Tensor, covariance: Tensor, context: Context) -> Curve | None:
+    """The effect's change at its port along its driver, along the signal, or along time, with its 95 % band."""
+    made = _along(term, context)
+    if made is None:
+        return None
+    driver, unit, x, synthetic = made
+    shape = {name: value for name, value in term.shape.items() if name != "lag"}
+
+    def change(gamma: Tensor) -> Tensor:
+        return term.effect.change(gamma, shape, synthetic)
+
+    slope = torch.func.jacfwd(change)(gamma)
+    variance = torch.einsum("ncq,qr,ncr->nc", slope, covariance, slope).clamp(min=0.0)
+    return Curve(driver, unit, x, change(gamma), _NORMAL_95 * variance.sqrt(), context.channels, context.signal_unit)
+
+
+def _along(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | None:
+    flat = context.signal.new_zeros(_POINTS, context.signal.shape[1])
+    if term.driver is not None:
+        values = context.drivers
+        if values.shape[1] == 1:
+            x = torch.linspace(float(values.min()), float(values.max()), _POINTS, dtype=values.dtype)
+            drivers, name, unit = x.unsqueeze(-1), term.columns[0], term.driver.units[0]
+            shown = x + term.driver.reference
+        else:
+            direction = torch.linalg.svd(values - values.mean(0), full_matrices=False).Vh[0]
+            along = values @ direction
+            x = torch.linspace(float(along.min()), float(along.max()), _POINTS, dtype=values.dtype)
+            drivers, unit, shown = x.unsqueeze(-1) * direction, term.driver.units[0], x
+            name = f"{term.columns[0].rpartition('_')[0]} along its main direction"
+        time = torch.arange(_POINTS, dtype=values.dtype)
+        return name, unit, shown, replace(context, time=time, drivers=drivers, signal=flat)
+    if follows_signal(term.effect):
+        reach = float(context.signal.abs().max())
+        x = torch.linspace(-reach, reach, _POINTS, dtype=context.signal.dtype)
+        signal = x.unsqueeze(-1).expand(-1, context.signal.shape[1])
+        time = torch.arange(_POINTS, dtype=x.dtype)
+        none = context.drivers.new_zeros(_POINTS, 0)
+        return "field on the axis", context.signal_unit, x, replace(context, time=time, signal=signal, drivers=none)
+    index = torch.linspace(0, len(context.time) - 1, 4 * _POINTS).long()
+    flat = context.signal.new_zeros(len(index), context.signal.shape[1])
+    time = context.time[index]
+    return "time", "s", time, replace(context, time=time, drivers=context.drivers.new_zeros(len(index), 0), signal=flat)
+
+
+def labels(terms: Sequence[Term]) -> tuple[str, ...]:
+    """``effect (driver)`` of terms."""
+    return tuple(f"{t.effect.id} ({', '.join(t.columns)})" if t.columns else t.effect.id for t in terms)

@@ -1,0 +1,262 @@
+"""From a fitted model to a search: tangents of the parameters, of every candidate and of wandering noise, whitened."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.model import JointModel, Term, directions, follows_signal, port_jacobian, through_port
+from mkc_torch.diagnosis.noise import (
+    Colour,
+    autoregressive,
+    colour_of,
+    cosines,
+    dct,
+    port_colour,
+)
+from mkc_torch.diagnosis.search import LinearSearch
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["Linearised", "Tangents", "linearise", "tangents_of"]
+
+SLOW_COURSES = 100
+"""Cosine courses of each wandering channel: on 90 s they reach 1.1 Hz."""
+
+CORNERS = (8.0, 40.0)
+"""Numbers of the courses beyond which the wander falls off; beside them, a random walk."""
+
+
+_ALTERNATIONS = 2
+_MOST, _MARGIN, _FEWEST = 0.9, 3.0, 1000
+
+
+@dataclass(frozen=True)
+class Tangents:
+    """How the residual moves: with the parameters (N, m, p), with each candidate's γ (N, m, q), through each port."""
+
+    nuisance: Float[Tensor, "N m p"]
+    candidates: tuple[Float[Tensor, "N m q"], ...]
+    pointwise: dict[str, Tensor | None]
+
+
+def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Sequence[Term]) -> Tangents:
+    """The tangents at these parameters, by forward mode."""
+    prepared = model.prepared
+    pointwise = {
+        name: port_jacobian(model, parameters, name) if port.pointwise else None
+        for name, port in prepared.ports.items()
+    }
+    nuisance = torch.func.jacfwd(model.residual)(parameters)
+    signals = prepared.signals(parameters[: model.base])
+    courses = [directions(t, t.context(prepared, signals.get(t.effect.port))) for t in terms]
+    independent = parameters.new_tensor([float(one) for one in prepared.independent])
+    found: list[Tensor | None] = [None] * len(terms)
+    for name in prepared.ports:
+        members = [i for i, term in enumerate(terms) if term.effect.port == name]
+        if not members:
+            continue
+        joined = torch.cat([courses[i] for i in members], -1)
+        moved = through_port(model, parameters, name, joined, pointwise[name])
+        for i, part in zip(members, moved.split([courses[i].shape[-1] for i in members], -1), strict=True):
+            found[i] = independent[:, None] * part if follows_signal(terms[i].effect) else part
+    return Tangents(nuisance, tuple(t for t in found if t is not None), pointwise)
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """A search and the series it is about.
+
+    Attributes:
+        search: over the candidates.
+        series: (M,), the whitened pseudo-residual, and what the prior pulls at.
+        colour: of the stationary part of the noise.
+        entrance: where wandering noise enters, coloured noise may too: the port's pointwise tangents, and the
+            autoregression of noise that gives such residuals; None where there is no such port.
+    """
+
+    search: LinearSearch
+    series: Float[Tensor, " M"]
+    colour: Colour
+    entrance: tuple[Tensor, Tensor] | None
+
+    @property
+    def evidence(self) -> float:
+        """Log-likelihood of the residuals by their own noise, up to a constant that all noise of a recording shares."""
+        return self.search.noise_fit(self.series).log_likelihood - float(self.colour.root.log().sum())
+
+    def entering(self, count: int, generator: torch.Generator) -> Float[Tensor, "M B"] | None:
+        """Draws of coloured noise that enters at the port, of variance one once whitened."""
+        if self.entrance is None:
+            return None
+        pointwise, coefficients = self.entrance
+        N, _, channels = pointwise.shape
+        drawn = autoregressive(coefficients, N, channels * count, generator).reshape(N, channels, count)
+        flat = self.colour.whiten(torch.einsum("nmc,ncb->nmb", pointwise, drawn))
+        rows = len(self.series) - len(flat)
+        prior = torch.randn(rows, count, generator=generator, dtype=flat.dtype)
+        return torch.cat([flat / flat.std(), prior])
+
+
+def linearise(
+    model: JointModel,
+    parameters: Float[Tensor, " p"],
+    pseudo: Float[Tensor, "N m"],
+    counts: Float[Tensor, "N m"],
+    tangents: Tangents,
+    *,
+    noise: Float[Tensor, "N m"] | None = None,
+    wander: bool = True,
+    joint: bool = False,
+) -> Linearised:
+    """A search around a fit.
+
+    Args:
+        model, parameters: the fit.
+        pseudo: its pseudo-residual, without the effect that is sought.
+        counts: 0 where a residual was rejected; there the tangents say nothing either.
+        tangents: at the fit.
+        noise: what the noise's colour is read from; default ``pseudo``.
+        wander: allow for noise that wanders at the ports, and for coloured noise; without, noise counts as white.
+        joint: the one candidate is all of the parameters, to be estimated together.
+    """
+    m = pseudo.shape[1]
+    nuisance = counts.unsqueeze(-1) * tangents.nuisance
+    widths = [t.shape[-1] for t in tangents.candidates]
+    joined = counts.unsqueeze(-1) * torch.cat([tangents.nuisance[..., :0], *tangents.candidates], -1)
+    pull = _Pull.of(model, parameters)
+    kept = _bandwidth(tangents.nuisance)
+    plain = Colour(tuple(pseudo.new_zeros(0) for _ in range(m)), pseudo.new_ones(kept, m) * _level(pseudo))
+    if not wander:
+        return _searching(plain, pull, nuisance, pseudo, joined, widths, None, joint=joint)
+    slow = _slow_courses(model, parameters, tangents)
+    if slow is not None:
+        slow = replace(slow, tangents=counts.unsqueeze(-1) * slow.tangents)
+    colour = _colour(plain, pull, nuisance, pseudo if noise is None else noise, slow)
+    found = _searching(colour, pull, nuisance, pseudo, joined, widths, slow, joint=joint)
+    if slow is None or tangents.pointwise[slow.port] is None:
+        return found
+    block = counts.unsqueeze(-1) * tangents.pointwise[slow.port]
+    return replace(found, entrance=(block, port_colour(pseudo, block)))
+
+
+def _searching(
+    colour: Colour,
+    pull: _Pull,
+    nuisance: Tensor,
+    pseudo: Tensor,
+    joined: Tensor,
+    widths: list[int],
+    slow: _Slow | None,
+    *,
+    joint: bool = False,
+) -> Linearised:
+    flat = colour.whiten(pseudo)
+    parameters = pull.under(colour.whiten(nuisance), flat)
+    candidates = list(pull.below(colour.whiten(joined)).split(widths, -1)) if widths else []
+    search = LinearSearch(
+        parameters[:, :0] if joint else parameters,
+        [parameters] if joint else candidates,
+        pull.below(colour.whiten(pseudo.new_zeros(*pseudo.shape, 0) if slow is None else slow.tangents)),
+        pseudo.new_zeros(0, 0) if slow is None else slow.scales,
+    )
+    return Linearised(search, pull.beside(flat), colour, None)
+
+
+def _colour(plain: Colour, pull: _Pull, nuisance: Tensor, noise: Tensor, slow: _Slow | None) -> Colour:
+    """The likeliest colour of the noise beside a wander at the port, by alternating between the two."""
+    K, m = plain.root.shape
+    nothing = nuisance[..., :0]
+
+    def seen(colour: Colour, slow: _Slow | None) -> Linearised:
+        return _searching(colour, pull, nuisance, noise, nothing, [], slow)
+
+    def read(found: Linearised) -> Colour:
+        power = found.search.stationary(found.series)[: K * m].unflatten(0, (K, m))
+        return colour_of(power * found.colour.root.square())
+
+    best = read(seen(plain, None))
+    if slow is None:
+        return best
+    # from the side of no wander and from that of no colour: either could pass for the other
+    tried = [seen(best, slow)]
+    beside = read(seen(plain, slow))
+    for _ in range(_ALTERNATIONS):
+        tried.append(seen(beside, slow))
+        beside = read(tried[-1])
+    return max(tried, key=lambda found: found.evidence).colour
+
+
+def _level(pseudo: Tensor) -> Tensor:
+    """Root mean square of each channel: noisy channels count for less from the start."""
+    return pseudo.square().mean(0).sqrt().clamp(min=1e-300)
+
+
+def _bandwidth(nuisance: Float[Tensor, "N m p"]) -> int:
+    """How many of the slowest cosine coefficients hold what moves: three times as many as hold nine tenths of it."""
+    N = len(nuisance)
+    power = dct(nuisance).square().sum(1)
+    share = (power / power.sum(0).clamp(min=1e-300)).cumsum(0)
+    typical = (share < _MOST).sum(0).double().median()
+    return int(min(N, max(_FEWEST, _MARGIN * float(typical))))
+
+
+@dataclass(frozen=True)
+class _Pull:
+    """A Gaussian prior as rows below the whitened residuals."""
+
+    root: Tensor  # (r, p)
+    distance: Tensor  # (r,)
+
+    @classmethod
+    def of(cls, model: JointModel, parameters: Tensor) -> _Pull:
+        prior = model.prior
+        if prior is None:
+            return cls(parameters.new_zeros(0, len(parameters)), parameters.new_zeros(0))
+        precision = prior.precision if prior.precision.dim() == 2 else torch.diag(prior.precision)
+        values, vectors = torch.linalg.eigh(precision)
+        known = values > 0
+        root = values[known].sqrt().unsqueeze(-1) * vectors[:, known].mT
+        return cls(root, root @ (parameters - prior.mean))
+
+    def under(self, nuisance: Tensor, flat: Tensor) -> Tensor:
+        """The parameters' tangents, with rows on the scale of the residuals."""
+        return torch.cat([nuisance, flat.std() * self.root])
+
+    def below(self, columns: Tensor) -> Tensor:
+        """Other tangents: the prior does not know of them."""
+        return torch.cat([columns, columns.new_zeros(len(self.distance), columns.shape[-1])])
+
+    def beside(self, flat: Tensor) -> Tensor:
+        return torch.cat([flat, flat.std() * self.distance])
+
+
+@dataclass(frozen=True)
+class _Slow:
+    """Slow courses at a port: tangents (N, m, k) and standard deviations in each family of wander (F, k)."""
+
+    port: str
+    tangents: Tensor
+    scales: Tensor
+
+
+def _slow_courses(model: JointModel, parameters: Tensor, tangents: Tangents) -> _Slow | None:
+    """Slow courses at the port that wanders; None if no port does."""
+    N = len(tangents.nuisance)
+    count = min(SLOW_COURSES, N // 10)
+    wandering = [name for name, port in model.prepared.ports.items() if port.wanders]
+    if not wandering or count == 0:
+        return None
+    name = wandering[0]
+    c = len(model.prepared.ports[name].channels)
+    courses = cosines(count, N)
+    eye = torch.eye(c, dtype=courses.dtype)
+    spread = (courses[:, None, :, None] * eye[:, None, :]).reshape(N, c, count * c)
+    k = torch.arange(1, count + 1, dtype=courses.dtype).repeat_interleave(c)
+    scales = torch.stack([1.0 / k, *((1.0 + (k / corner).square()).rsqrt() for corner in CORNERS)])
+    return _Slow(name, through_port(model, parameters, name, spread, tangents.pointwise[name]), scales)

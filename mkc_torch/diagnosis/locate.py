@@ -1,0 +1,298 @@
+"""Locate and name: the strongest candidate beside a fit, how sure it is after the whole search, and its rivals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.candidates import finer
+from mkc_torch.diagnosis.linearise import Linearised, Tangents, linearise, tangents_of
+from mkc_torch.diagnosis.model import JointModel, Term
+from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted
+from mkc_torch.diagnosis.search import Gains, NoiseFit, log_survival
+from mkc_torch.functional import mkc_energy
+from mkc_torch.order_statistic import robust_scale
+
+if TYPE_CHECKING:
+    pass
+
+__all__ = ["SEPARABLE", "UNKNOWN", "Located", "Ranked", "locate"]
+
+SEPARABLE = 4.5
+"""Nats by which a rival must be less likely to count as told apart: three standard errors of what sets them apart."""
+
+_SHORT_LIST = 5
+_PARTS, _BETTER = 2, 0.8
+_ROUNDS = 3
+_LEADING = 3
+_RAW = 1000.0
+_OVERWHELMING = 150.0
+"""Nats by which an account has to be likelier that no draws of noise are needed to tell."""
+_HANDICAP, _HANDICAP_SHARE = 10.0, 0.1
+
+UNKNOWN = "unknown"
+"""Id of the effect that is a curve, not physics."""
+
+Key = tuple[str, tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Located:
+    """The outcome of a search.
+
+    Attributes:
+        term: the strongest candidate, at its best shape.
+        fit: the joint refit with it.
+        p_value: after the whole search.
+        ranking: for each candidate physics its best shape, gain in nats, and nats behind the first; best first.
+        noise: the wander of the noise without the candidate.
+        linearised: the search that the p-value is from; ``tangents`` and ``terms`` are its candidates.
+    """
+
+    term: Term
+    fit: FittedModel
+    p_value: float
+    ranking: tuple[Ranked, ...]
+    noise: NoiseFit
+    linearised: Linearised
+    tangents: Tangents
+    terms: tuple[Term, ...]
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A candidate at its best shape: number in the list of candidates, gain in nats, and nats behind the first."""
+
+    number: int
+    gain: float
+    gap: float
+
+
+def locate(
+    base: FittedModel,
+    terms: Sequence[Term],
+    *,
+    level: float,
+    surrogates: int,
+    generator: torch.Generator,
+    parts: bool = True,
+) -> Located:
+    """Search the candidates beside a fit.
+
+    Args:
+        base: the simulation with what was found so far.
+        terms: candidates.
+        level: below which p-value the candidate is named with care.
+        surrogates: draws of noise that the strongest candidate is judged against, of each kind of noise.
+        generator: of the draws.
+        parts: also start from fits to parts of the recording, for where one model over all of it runs away.
+    """
+    terms = tuple(terms)
+    best = _strongest(base, terms, parts=parts)
+    parameters = best.parameters[: base.model.size]
+    if best.model.terms[-1] not in terms:
+        terms = (*terms, best.model.terms[-1])
+    tangents = tangents_of(base.model, parameters, terms)
+    number = terms.index(best.model.terms[-1])
+    gamma = best.parameters[base.model.size :]
+    # the residual without the effect, as the fit with it weighs the samples
+    left, counts = best.pseudo
+    pseudo = left - counts * torch.einsum("nmq,q->nm", tangents.candidates[number], gamma)
+    linearised = linearise(base.model, parameters, pseudo, counts, tangents)
+    noise = linearised.search.noise_fit(linearised.series)
+    found = linearised.search.gains(linearised.series.unsqueeze(-1))
+    p_value = _judged(linearised, noise, found, surrogates, generator)
+    if p_value > level and _overwhelming(best, base, linearised, parameters, tangents):
+        p_value = 1.0 / (1 + surrogates)
+    if p_value <= level:
+        # whether there is an effect is asked of the noise that has it in; which one it is, of the noise beside it
+        linearised = linearise(base.model, parameters, pseudo, counts, tangents, noise=left)
+        found = linearised.search.gains(linearised.series.unsqueeze(-1))
+    ranking = _ranking(terms, found)
+    first = terms[ranking[0].number]
+    if p_value <= level and first.key != best.model.terms[-1].key:
+        best = _refined(_refitted(best, base, first, linearised, ranking[0].number), base)
+    return Located(best.model.terms[-1], best, p_value, ranking, noise, linearised, tangents, terms)
+
+
+Start = tuple[Tensor, tuple[Tensor, Tensor]]
+"""Parameters to linearise around, and the pseudo-residual there with what counts of it."""
+
+Listed = tuple[Term, Tensor, Tensor]
+"""A candidate worth a joint refit, with the parameters and the γ to start from."""
+
+
+def _short_list(base: FittedModel, terms: tuple[Term, ...], starts: Sequence[Start], most: int) -> list[Listed]:
+    """Of each start the strongest candidates, noise taken for white."""
+    chosen: dict[Key, Listed] = {}
+    known: dict[int, Tangents] = {}
+    for parameters, (pseudo, counts) in starts:
+        if id(parameters) not in known:
+            known[id(parameters)] = tangents_of(base.model, parameters, terms)
+        plain = linearise(base.model, parameters, pseudo, counts, known[id(parameters)], wander=False)
+        log_p = plain.search.gains(plain.series.unsqueeze(-1)).log_p[:, 0]
+        taken = 0
+        for number in log_p.argsort().tolist():
+            if terms[number].key not in chosen:
+                gamma, _ = plain.search.estimate(number, plain.series)
+                chosen[terms[number].key] = terms[number], parameters, -gamma
+                taken += 1
+            if taken >= most:
+                break
+    return list(chosen.values())
+
+
+def _part_starts(base: FittedModel, d: Float[Tensor, " m"]) -> list[Start]:
+    """Around fits to parts of the recording; those only that fit their part clearly better than d tells of the whole."""
+    prepared = base.model.prepared
+    N = len(prepared.time)
+    starts = []
+    for part in range(_PARTS):
+        rows = torch.zeros(N, dtype=torch.bool)
+        rows[part * N // _PARTS : (part + 1) * N // _PARTS] = True
+        try:
+            theta = prepared.start(rows)
+        except ValueError:
+            continue
+        parameters = torch.cat([theta, base.parameters[base.model.base :]])
+        residual = base.model.residual(parameters)
+        if bool((robust_scale(residual[rows]) < _BETTER * d).any()):
+            starts.append((parameters, clipped_residual(residual)))
+    return starts
+
+
+def _strongest(base: FittedModel, terms: tuple[Term, ...], *, parts: bool) -> FittedModel:
+    """The likeliest of the joint refits, each of the leading ones at its best shape.
+
+    Candidates are ranked by the likelihood's own score and by a clipped one, which still sees a stretch of samples that
+    the fit rejects; and, where one model over all of the recording runs away, around fits to parts of it.
+    """
+    around = base.parameters
+    listed = _short_list(base, terms, [(around, base.pseudo)], _SHORT_LIST)
+    listed += _short_list(base, terms, [(around, clipped_residual(base.residual))], 2)
+    fits: dict[Key, FittedModel] = {}
+    _refit_all(fits, base, listed)
+    if parts:
+        least = torch.stack([fit.d for fit in fits.values()]).amin(0)
+        _refit_all(fits, base, [one for start in _part_starts(base, least) for one in _short_list(base, terms, [start], 2)])
+    leading = sorted(fits.values(), key=lambda fit: _score(fit, base), reverse=True)[:_LEADING]
+    shaped = [_refined(_best_shape(fit, base, terms), base) for fit in leading]
+    return max(shaped, key=lambda fit: _score(fit, base))
+
+
+def _refit_all(fits: dict[Key, FittedModel], base: FittedModel, listed: Sequence[Listed]) -> None:
+    """Put the joint refit of each into ``fits``, where it is the better one of its physics."""
+    done: set[tuple[Key, int]] = set()
+    for term, parameters, gamma in listed:
+        if (term.key, id(parameters)) in done:
+            continue
+        done.add((term.key, id(parameters)))
+        fit = fitted(base.model.with_term(term), torch.cat([parameters, gamma]), base.bound)
+        if term.key not in fits or _score(fit, base) > _score(fits[term.key], base):
+            fits[term.key] = fit
+
+
+def _score(fit: FittedModel, base: FittedModel) -> float:
+    """Gain in nats less Schwarz's penalty, and less what a curve without a name has to exceed a named effect by."""
+    gain = fit.log_likelihood - base.log_likelihood
+    score = gain - 0.5 * fit.model.sizes[-1] * math.log(len(fit.residual))
+    return score - _handicap(gain) if fit.model.terms[-1].effect.id == UNKNOWN else score
+
+
+def _handicap(gain: float) -> float:
+    return _HANDICAP + _HANDICAP_SHARE * max(gain, 0.0)
+
+
+def _best_shape(fit: FittedModel, base: FittedModel, terms: tuple[Term, ...]) -> FittedModel:
+    """The fit, or a better one with another shape of the same effect; onsets are many, and closed in on later."""
+    own = fit.model.terms[-1]
+    others = [t for t in terms if t.key == own.key and t.shape != own.shape]
+    if "onset" in own.shape or not others:
+        return fit
+    refits = [_reshaped(fit, base, other) for other in others]
+    return max([fit, *refits], key=lambda f: _score(f, base))
+
+
+def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
+    model = base.model.with_term(term)
+    kept = fit.parameters[: model.size]
+    more = kept.new_zeros(model.size - len(kept))
+    return fitted(model, torch.cat([kept, more]), base.bound, graduate=False)
+
+
+def _judged(linearised: Linearised, noise: NoiseFit, found: Gains, count: int, generator: torch.Generator) -> float:
+    """The p-value of the strongest candidate after the whole search, from draws of the fitted noise.
+
+    Coloured noise is drawn where it enters, at a port whose axes may turn against the residual. Each candidate's ratios
+    are first divided by how much the draws exceed their chi-square (Bartlett's correction), so that one whose noise is
+    larger than the model's does not set the level for all.
+    """
+    stationary = linearised.entering(count, generator)
+    if stationary is None:
+        stationary = linearised.search.white(count, generator)
+    drawn = linearised.search.gains(stationary + linearised.search.wander(count, noise, generator))
+    dof = found.dof.clamp(min=1.0)
+    excess = (drawn.ratio.mean(-1) / dof).clamp(min=1.0).unsqueeze(-1)
+    own = log_survival(found.ratio / excess, dof.unsqueeze(-1)).amin()
+    others = log_survival(drawn.ratio / excess, dof.unsqueeze(-1)).amin(0)
+    return (1 + int((others <= own).sum())) / (1 + count)
+
+
+def _overwhelming(
+    best: FittedModel, base: FittedModel, without: Linearised, parameters: Tensor, tangents: Tangents
+) -> bool:
+    """Whether an effect is so large that noise which includes it is the unlikelier account by far.
+
+    The search holds the noise's colour as the residuals without the effect show it, and an effect a hundred times the
+    noise hides in that. Here either account has the noise that fits it.
+    """
+    if best.log_likelihood - base.log_likelihood < _RAW:
+        return False
+    left, counts = best.pseudo
+    own = linearise(base.model, parameters, left, counts, replace(tangents, candidates=()))
+    price = 0.5 * best.model.sizes[-1] * math.log(len(left))
+    return own.evidence - without.evidence - price > _OVERWHELMING
+
+
+def _ranking(terms: tuple[Term, ...], found: Gains) -> tuple[Ranked, ...]:
+    """By gain in nats less one for each parameter (Akaike's criterion), each physics at its best shape."""
+    gain = 0.5 * found.ratio[:, 0]
+    # a curve without a name can follow any named effect a little better; it has to do so clearly
+    nameless = torch.tensor([term.effect.id == UNKNOWN for term in terms])
+    score = gain - found.dof - torch.where(nameless, _HANDICAP + _HANDICAP_SHARE * gain, 0.0)
+    score = torch.where(found.dof > 0, score, -torch.inf)
+    best: dict[Key, int] = {}
+    for number in score.argsort(descending=True).tolist():
+        best.setdefault(terms[number].key, number)
+    return tuple(Ranked(number, float(gain[number]), float(score.max() - score[number])) for number in best.values())
+
+
+def _refitted(best: FittedModel, base: FittedModel, term: Term, linearised: Linearised, number: int) -> FittedModel:
+    gamma, _ = linearised.search.estimate(number, linearised.series)
+    start = torch.cat([best.parameters[: base.model.size], -gamma])
+    return fitted(base.model.with_term(term), start, base.bound)
+
+
+def _refined(best: FittedModel, base: FittedModel) -> FittedModel:
+    """The fit with the likeliest values of its shape's continuous numbers, closed in on one by one."""
+    term = best.model.terms[-1]
+    names = [name for name in term.shape if name in getattr(term.effect, "continuous", ())]
+    if not names:
+        return best
+    for count in range(_ROUNDS):
+        for name in names:
+            shapes = finer(term, name, base.model.prepared.time, count)
+            value = [_energy(best, base.model.with_term(shape)) for shape in shapes]
+            term = shapes[min(range(len(shapes)), key=value.__getitem__)]
+    moved = fitted(base.model.with_term(term), best.parameters, base.bound, graduate=False)
+    return moved if moved.log_likelihood > best.log_likelihood else best
+
+
+def _energy(fit: FittedModel, model: JointModel) -> float:
+    """Of another shape, at the same parameters."""
+    return float(mkc_energy(model.residual(fit.parameters), fit.sigma, fit.d).sum())

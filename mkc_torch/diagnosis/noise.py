@@ -1,0 +1,213 @@
+"""The noise that structure is tested against: heavy-tailed, coloured, and wandering at the simulation's ports.
+
+Residuals enter as pseudo-residuals, the bounded values whose least squares are the M-estimate to first order (Huber,
+"Robust Statistics", 1981, 7.6). In the basis of cosines (DCT-II) stationary noise is nearly independent from one
+coefficient to the next, and a random walk exactly so; dividing by the root of the spectrum makes it white.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["Colour", "autoregressive", "colour_of", "cosines", "dct", "inverse_dct", "port_colour", "pseudo_residual"]
+
+MAX_ORDER = 12
+"""Highest order of the autoregression."""
+
+
+REJECTED_BELOW = 0.1
+"""A residual of a smaller weight says nothing, neither of the noise nor of an effect."""
+
+
+def pseudo_residual(
+    error: Float[Tensor, "N m"], sigma: Float[Tensor, " m"], d: Float[Tensor, " m"]
+) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
+    """The score of the MKC density over its mean slope, and 1 where a residual counts: 0 where it is rejected.
+
+    Example:
+        >>> error = torch.tensor([[0.1], [-0.1], [50.0]])
+        >>> values, counts = pseudo_residual(error, torch.tensor([2.0]), torch.tensor([1.0]))
+        >>> values.round(decimals=2).squeeze(-1) + 0.0, counts.squeeze(-1)
+        (tensor([ 0.1000, -0.1000,  0.0000]), tensor([1., 1., 0.]))
+    """
+    x = sigma.pow(-2) * (error / d).square()
+    weight = torch.exp(-0.5 * x)
+    counts = (weight >= REJECTED_BELOW).to(error.dtype)
+    slope = (counts * weight * (1.0 - x)).sum(-2) / counts.sum(-2).clamp(min=1.0)
+    return counts * weight * error / slope.clamp(min=0.2), counts
+
+
+def dct(values: Float[Tensor, N * rest]) -> Float[Tensor, N * rest]:
+    """Orthonormal cosine transform (DCT-II) over the first dimension.
+
+    Makhoul, "A fast cosine transform in one and two dimensions", IEEE Trans. ASSP 28 (1980).
+
+    Example:
+        >>> dct(torch.ones(4))
+        tensor([2., 0., 0., 0.])
+    """
+    N = values.shape[0]
+    if values.numel() == 0:
+        return values
+    folded = torch.cat([values[::2], values[1::2].flip(0)]).movedim(0, -1)
+    spectrum = torch.fft.fft(folded)
+    angle = torch.arange(N, dtype=values.dtype, device=values.device) * (-math.pi / (2 * N))
+    real = spectrum.real * torch.cos(angle) - spectrum.imag * torch.sin(angle)
+    real = real * math.sqrt(2.0 / N)
+    real[..., 0] *= math.sqrt(0.5)
+    return real.movedim(-1, 0)
+
+
+def inverse_dct(values: Float[Tensor, N * rest]) -> Float[Tensor, N * rest]:
+    """The inverse of :func:`dct`.
+
+    Example:
+        >>> inverse_dct(dct(torch.tensor([1.0, 2.0, 4.0], dtype=torch.float64)))
+        tensor([1., 2., 4.], dtype=torch.float64)
+    """
+    N = values.shape[0]
+    scaled = values.movedim(0, -1) * math.sqrt(N / 2)
+    scaled[..., 0] *= math.sqrt(2.0)
+    mirrored = torch.cat([torch.zeros_like(scaled[..., :1]), scaled[..., 1:].flip(-1)], -1)
+    angle = torch.arange(N, dtype=values.dtype, device=values.device) * (math.pi / (2 * N))
+    spectrum = torch.complex(scaled, -mirrored) * torch.polar(torch.ones_like(angle), angle)
+    folded = torch.fft.ifft(spectrum).real
+    out = torch.empty_like(folded)
+    half = (N + 1) // 2
+    out[..., ::2], out[..., 1::2] = folded[..., :half], folded[..., half:].flip(-1)
+    return out.movedim(-1, 0)
+
+
+def cosines(count: int, N: int, dtype: torch.dtype = torch.float64) -> Float[Tensor, "N count"]:
+    """The first ``count`` slow courses of the cosine basis, the constant left out; each of mean square one."""
+    k = torch.arange(1, count + 1, dtype=dtype)
+    n = torch.arange(N, dtype=dtype) + 0.5
+    return math.sqrt(2.0) * torch.cos(math.pi / N * n.unsqueeze(-1) * k)
+
+
+@dataclass(frozen=True)
+class Colour:
+    """The spectrum of each channel's stationary noise as an autoregression; order 0 is white.
+
+    Attributes:
+        coefficients: φ of ``e[t] = Σ φ_j e[t-j] + innovation``, one tensor a channel.
+        root: (K, m), root of the spectrum on the K slowest frequencies of the cosine basis, on any one scale.
+    """
+
+    coefficients: tuple[Tensor, ...]
+    root: Float[Tensor, "K m"]
+
+    @property
+    def order(self) -> int:
+        return max(len(c) for c in self.coefficients)
+
+    def whiten(self, values: Float[Tensor, "N m *rest"]) -> Float[Tensor, Km * rest]:
+        """The slowest cosine coefficients over the root of the spectrum, as many as ``root`` has, channels stacked."""
+        root = self.root.reshape(*self.root.shape, *[1] * (values.dim() - 2)).to(values.dtype)
+        return (dct(values)[: len(root)] / root).flatten(0, 1)
+
+
+def port_colour(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c"]) -> Tensor:
+    """Autoregression of noise that enters at a port, alike and independent in its channels, and gives these residuals.
+
+    Where the port's axes turn against the residual, ``cov_residual(lag) = cov_port(lag) · mean(P[t] P[t + lag]ᵀ)``.
+    """
+    N = values.shape[0]
+    highest = min(MAX_ORDER, N // 10)
+    covariance = _autocovariance(values, highest).sum(-1)
+    overlap = torch.stack([(pointwise[: N - lag] * pointwise[lag:]).sum() / N for lag in range(highest + 1)])
+    ratio = (overlap / overlap[0]).clamp(min=0.2)
+    return _levinson(covariance / ratio, N * values.shape[1])
+
+
+def autoregressive(coefficients: Tensor, N: int, count: int, generator: torch.Generator) -> Float[Tensor, "N count"]:
+    """Stationary draws of an autoregression whose innovations have variance one."""
+    # a circle three times as long, of which a third is used, hides that it closes
+    length = 3 * N
+    frequency = torch.arange(length // 2 + 1, dtype=torch.float64) * (2 * math.pi / length)
+    white = torch.fft.rfft(torch.randn(length, count, generator=generator, dtype=torch.float64), dim=0)
+    return torch.fft.irfft(white * _root(coefficients, frequency).unsqueeze(-1), n=length, dim=0)[:N]
+
+
+def colour_of(power: Float[Tensor, "K m"]) -> Colour:
+    """The spectrum of each channel from the squares of its K slowest cosine coefficients.
+
+    It is the product of three: an autoregression by Levinson's recursion, of an order by BIC; a slow part that rises
+    towards low frequencies, of the likeliest size and corner (Whittle's likelihood); and local averages of what these
+    two miss, over the more coefficients the higher the frequency.
+
+    Whittle, "Estimation and information in stationary time series", Arkiv för Matematik 2 (1953).
+    """
+    K = len(power)
+    # the K slowest coefficients are those of a series that was thinned to K samples
+    frequency = (torch.arange(K, dtype=power.dtype) + 0.5) * (math.pi / K)
+    lag = torch.arange(min(MAX_ORDER, K // 10) + 1, dtype=power.dtype)
+    covariance = torch.cos(lag.unsqueeze(-1) * frequency) @ power / K
+    phis = tuple(_levinson(column, K) for column in covariance.unbind(-1))
+    root = torch.stack([_root(phi, frequency) for phi in phis], -1)
+    root = root * torch.stack([_slow_part(p).sqrt() for p in (power / root.square()).unbind(-1)], -1)
+    left = _local_mean(power / root.square())
+    return Colour(phis, root * left.sqrt())
+
+
+def _slow_part(power: Float[Tensor, " K"]) -> Float[Tensor, " K"]:
+    """``1 + size · shape`` with the likeliest of a grid of sizes and shapes; the level is profiled out."""
+    K = len(power)
+    k = torch.arange(K, dtype=power.dtype) + 1.0
+    shapes = [k.pow(-2), *(1.0 / (1.0 + (k / corner).square()) for corner in (3.0, 10.0, 30.0))]
+    sizes = torch.logspace(-1.0, 7.0, 25, dtype=power.dtype)
+    spectra = 1.0 + (torch.stack(shapes).unsqueeze(1) * sizes.unsqueeze(-1)).flatten(0, 1)
+    spectra = torch.cat([torch.ones_like(spectra[:1]), spectra])
+    value = spectra.log().sum(-1) + K * (power / spectra).mean(-1).clamp(min=1e-300).log()
+    return spectra[int(value.argmin())]
+
+
+def _local_mean(values: Float[Tensor, "K m"]) -> Float[Tensor, "K m"]:
+    """Mean over a neighbourhood of each row, of an eighth of its number to either side, and ten rows at least."""
+    K = len(values)
+    index = torch.arange(K)
+    half = torch.clamp(index // 8, min=10)
+    low, high = (index - half).clamp(min=0), (index + half + 1).clamp(max=K)
+    low = torch.minimum(low, (high - 21).clamp(min=0))
+    high = torch.maximum(high, (low + 21).clamp(max=K))
+    total = torch.cat([values.new_zeros(1, values.shape[1]), values.cumsum(0)])
+    return (total[high] - total[low]) / (high - low).unsqueeze(-1)
+
+
+def _root(phi: Tensor, frequency: Tensor) -> Tensor:
+    """Root of the spectrum of an autoregression with innovations of variance one."""
+    phase = frequency.unsqueeze(-1) * torch.arange(1, len(phi) + 1, dtype=frequency.dtype)
+    return torch.hypot(1.0 - torch.cos(phase) @ phi, torch.sin(phase) @ phi).reciprocal()
+
+
+def _autocovariance(values: Tensor, highest: int) -> Float[Tensor, "lags m"]:
+    N = values.shape[0]
+    spectrum = torch.fft.rfft(values, n=2 * N, dim=0)
+    return torch.fft.irfft(spectrum.abs().square(), n=2 * N, dim=0)[: highest + 1] / N
+
+
+def _levinson(covariance: Float[Tensor, " lags"], N: int) -> Tensor:
+    """Autoregression from autocovariances by Levinson's recursion, its order by BIC on N samples."""
+    phi = covariance.new_zeros(0)
+    if float(covariance[0]) <= 0:
+        return phi
+    variance = float(covariance[0])
+    best, lowest = phi, N * math.log(variance)
+    for order in range(1, len(covariance)):
+        known = float(phi @ covariance[1:order].flip(0)) if order > 1 else 0.0
+        reflection = (float(covariance[order]) - known) / variance
+        reflection = min(max(reflection, -0.999), 0.999)
+        phi = torch.cat([phi - reflection * phi.flip(0), phi.new_tensor([reflection])])
+        variance *= 1.0 - reflection * reflection
+        score = N * math.log(variance) + order * math.log(N)
+        if score < lowest:
+            best, lowest = phi, score
+    return best

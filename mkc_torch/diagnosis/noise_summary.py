@@ -1,0 +1,49 @@
+"""The noise that is left, in words and numbers."""
+
+from __future__ import annotations
+
+import torch
+
+from mkc_torch.diagnosis.estimate import Estimate
+from mkc_torch.diagnosis.linearise import CORNERS
+from mkc_torch.diagnosis.result import Noise, Number
+
+__all__ = ["noise_summary"]
+
+_CLEAR = 3.0
+"""Nats by which a wander has to be likelier than none to be told of."""
+
+_COLOURED = 0.05
+"""Sum of squared autoregression coefficients from which noise is called coloured."""
+
+
+def noise_summary(final: Estimate) -> Noise:
+    """White, autoregressive, or wandering like a random walk, with its numbers."""
+    fit, linearised, wander = final.fit, final.linearised, final.noise
+    orders = linearised.colour.coefficients
+    coloured = any(float(phi.square().sum()) > _COLOURED for phi in orders)
+    parameters: dict[str, Number] = {}
+    clear = wander.size > 0 and wander.gain > _CLEAR
+    if clear:
+        spread = linearised.search.wander_spread(wander)
+        parameters["wander"] = spread
+        if wander.family > 0:
+            length = float(fit.model.prepared.time[-1] - fit.model.prepared.time[0])
+            parameters["wander_period"] = 2.0 * length / CORNERS[wander.family - 1]
+    if coloured:
+        parameters["autoregression"] = tuple(tuple(phi.tolist()) for phi in orders)
+    if clear and wander.family == 0:
+        model, told = "random_walk", f"an offset that wanders like a random walk, by {parameters['wander']:.2g} in all"
+    elif clear or coloured:
+        model, told = "ar", "coloured noise" + (", with a slow part that enters with the offset" if clear else "")
+    else:
+        model, told = "white", "white noise"
+    tail = "Gaussian" if bool(torch.isinf(fit.sigma).all()) else "heavy-tailed"
+    return Noise(
+        model,  # type: ignore[arg-type]
+        parameters,
+        tuple(fit.sigma.tolist()),
+        tuple(fit.d.tolist()),
+        tuple(fit.bound.tolist()),
+        f"{tail} {told}",
+    )

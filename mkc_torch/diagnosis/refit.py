@@ -1,0 +1,104 @@
+"""Joint robust refits of a simulation with candidate effects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch import nonlinear
+from mkc_torch.diagnosis.model import JointModel, Term
+from mkc_torch.diagnosis.noise import pseudo_residual
+from mkc_torch.order_statistic import robust_scale
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["FittedModel", "clipped_residual", "fitted"]
+
+_CLIP = 2.0
+
+
+@dataclass(frozen=True)
+class FittedModel:
+    """A joint model at its most likely parameters.
+
+    Attributes:
+        model, parameters: what was fitted.
+        sigma, d, bound: (m,) of the MKC density.
+        residual, weights: (N, m).
+        log_likelihood: in nats, of all samples and channels.
+    """
+
+    model: JointModel
+    parameters: Float[Tensor, " p"]
+    sigma: Float[Tensor, " m"]
+    d: Float[Tensor, " m"]
+    bound: Float[Tensor, " m"]
+    residual: Float[Tensor, "N m"]
+    weights: Float[Tensor, "N m"]
+    log_likelihood: float
+
+    @property
+    def pseudo(self) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
+        """The pseudo-residual, and 1 where it counts."""
+        return pseudo_residual(self.residual, self.sigma, self.d)
+
+
+def fitted(
+    model: JointModel,
+    start: Float[Tensor, " p"],
+    bound: Float[Tensor, " m"] | None = None,
+    *,
+    rows: Float[Tensor, " N"] | None = None,
+    graduate: bool = True,
+) -> FittedModel:
+    """The most likely parameters of a joint model.
+
+    Args:
+        model: a simulation with effects.
+        start: where to begin.
+        bound: half-width of the density's domain; None for the rule of :func:`mkc_torch.nonlinear.fit`.
+        rows: weights of the samples; 0 leaves one out.
+        graduate: False for a start near the answer.
+    """
+    found = nonlinear.fit(
+        model.residual,
+        start,
+        bound=bound,
+        weight=rows,
+        prior=model.prior,
+        graduate=graduate,
+        covariance=None,
+        max_iter=60,
+        tol=1e-7,
+    )
+    return FittedModel(
+        model,
+        found.theta,
+        found.sigma,
+        found.d,
+        found.bound,
+        model.residual(found.theta).detach(),
+        found.weights,
+        float(found.log_likelihood) * len(model.prepared.time),
+    )
+
+
+def clipped_residual(residual: Float[Tensor, "N m"]) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
+    """Pseudo-residual of Huber's score at two robust scales: what a redescending score takes for outliers still counts.
+
+    Huber, "Robust Statistics" (1981), 7.6.
+    """
+    scale = robust_scale(residual)
+    z = residual / scale.clamp(min=1e-300)
+    slope = (z.abs() < _CLIP).to(z.dtype).mean(0).clamp(min=0.2)
+    return scale * z.clamp(-_CLIP, _CLIP) / slope, torch.ones_like(residual)
+
+
+def started(model: FittedModel, term: Term, gamma: Tensor, base: Tensor | None = None) -> tuple[JointModel, Tensor]:
+    """The joint model with one more effect, and a start for it."""
+    parameters = model.parameters if base is None else base
+    return model.model.with_term(term), torch.cat([parameters, gamma])

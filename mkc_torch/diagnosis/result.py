@@ -1,0 +1,215 @@
+"""What a diagnosis says: verdict, findings, and the figures a report draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from mkc_torch.diagnosis.diagnosed_model import DiagnosedModel
+
+__all__ = [
+    "Alternative",
+    "Candidate",
+    "Curve",
+    "Diagnosis",
+    "Finding",
+    "HeldOut",
+    "Noise",
+    "Parameter",
+    "Separability",
+    "Spread",
+    "Traces",
+]
+
+Verdict = Literal["adequate", "explained", "unexplained"]
+Number = float | tuple["Number", ...]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of an effect; ``standard_error`` has the shape of ``value`` and None where it is not known."""
+
+    name: str
+    value: Number
+    standard_error: Number | None
+    unit: str
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Evidence on blocks that the fit has not seen; the gain in nats per sample, with its 95 % interval."""
+
+    log_likelihood_gain: float
+    confidence_interval: tuple[float, float]
+    rmse_before: float
+    rmse_after: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another candidate for a finding: how much less likely it is, in nats, and whether the data tell them apart."""
+
+    effect: str
+    drivers: tuple[str, ...]
+    log_likelihood_gap: float
+    separable: bool
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The trace of an effect against what drives it, one row a point, one column a channel.
+
+    ``band`` is the half-width of a 95 % interval.
+    """
+
+    driver: str
+    unit: str
+    x: Float[Tensor, " points"]
+    value: Float[Tensor, "points channels"]
+    band: Float[Tensor, "points channels"]
+    channels: tuple[str, ...]
+    value_unit: str
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A piece of physics that the simulation lacks, or the effect "unknown"; see ``diagnosis.json``."""
+
+    effect: str
+    drivers: tuple[str, ...]
+    channels: tuple[str, ...]
+    intervals: tuple[tuple[float, float], ...]
+    onset: float | None
+    equation: str
+    explanation: str
+    parameters: tuple[Parameter, ...]
+    p_value: float
+    held_out: HeldOut | None
+    held_out_note: str
+    alternatives: tuple[Alternative, ...]
+    plausible: bool
+    plausibility: str
+    curve: Curve | None = None
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The noise that structure was tested against.
+
+    ``model`` is one of "white", "ar" and "random_walk"; ``parameters`` names its numbers; ``bound`` is the half-width of
+    the density's domain, one for all models compared.
+    """
+
+    model: Literal["white", "ar", "random_walk"]
+    parameters: Mapping[str, Number]
+    sigma: tuple[float, ...]
+    d: tuple[float, ...]
+    bound: tuple[float, ...]
+    description: str
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A model on held-out blocks: log-likelihood in nats per sample, root mean square over the common inliers."""
+
+    log_likelihood: float
+    rmse: float
+    sigma: tuple[float, ...]
+    d: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One candidate of the search at its best shape, for the first finding.
+
+    ``log_likelihood_gain`` is that of the linearised model in nats; ``z`` its square root doubled, roughly the number of
+    standard errors.
+    """
+
+    effect: str
+    drivers: tuple[str, ...]
+    shape: str
+    log_likelihood_gain: float
+    z: float
+
+
+@dataclass(frozen=True)
+class Separability:
+    """How well candidates could be told apart on this recording, whatever was found.
+
+    ``labels`` are ``effect`` or ``effect (driver)``.
+
+    ``share[i, j]`` is the share of candidate i's trace that candidate j cannot take over, once the simulation's own
+    parameters have been refitted: 0 means inseparable, 1 means at right angles. ``left[i]`` is the share that survives
+    the refit alone.
+    """
+
+    labels: tuple[str, ...]
+    share: Float[Tensor, "k k"]
+    left: Float[Tensor, " k"]
+
+
+@dataclass(frozen=True)
+class Traces:
+    """What the report draws: one row a sample that was used."""
+
+    time: Float[Tensor, " N"]
+    has_time: bool
+    before: Float[Tensor, "N m"]
+    after: Float[Tensor, "N m"]
+    weight: Float[Tensor, "N m"]
+    channels: tuple[str, ...]
+    unit: str
+    drivers: Mapping[str, Float[Tensor, " N"]] = field(default_factory=dict)
+    driver_units: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The diagnosis of one recording, as ``diagnosis.json`` has it and what its report draws beside it.
+
+    Attributes:
+        recording, simulation, samples, level: what was asked: names, number of samples used, false-alarm level.
+        noise: the noise model that structure was tested against.
+        candidates_tried, surrogates, seed: the size of the search.
+        p_value: of the strongest candidate after the whole search.
+        verdict: "adequate", "explained" or "unexplained".
+        findings: strongest first.
+        baseline, corrected: the simulation without and with the findings, on held-out blocks.
+        ceiling: share of the baseline's held-out variance that a flexible model of all columns explains, next to the
+            share that the findings explain; None where it was not asked for.
+        advice: what to record next or to do, in sentences.
+        warnings: what was noticed.
+        candidates: the candidates of the search, best first.
+        separability: of the leading candidates.
+        traces: the residuals.
+        model: the simulation's sensor or system with the findings in it; None where there is none to apply.
+    """
+
+    recording: str
+    simulation: str
+    samples: int
+    level: float
+    noise: Noise
+    candidates_tried: int
+    surrogates: int
+    seed: int
+    p_value: float
+    verdict: Verdict
+    findings: tuple[Finding, ...]
+    baseline: Spread
+    corrected: Spread
+    ceiling: tuple[float, float] | None
+    advice: tuple[str, ...]
+    warnings: tuple[str, ...]
+    candidates: tuple[Candidate, ...]
+    separability: Separability
+    traces: Traces
+    model: DiagnosedModel | None = field(default=None, repr=False, compare=False)

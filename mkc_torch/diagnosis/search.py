@@ -1,0 +1,303 @@
+"""The search: every candidate effect against the linearised simulation, by profiled likelihood ratios in one batch.
+
+At the current fit the pseudo-residual is ``-J δ - T γ + noise``: J the tangents of the simulation's own parameters,
+taken out of everything, T those of a candidate, noise a whitened part plus a wander at the simulation's ports whose
+size is fitted anew with every candidate. The largest ratio of the search is judged by the same search on draws of the
+fitted noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["Gains", "LinearSearch", "log_survival"]
+
+_LEFT = 1e-4
+"""A direction of a candidate of which the simulation's own parameters leave a smaller share than this is dropped."""
+
+_SINGULAR = 1e-10
+"""Smallest eigenvalue, over the largest, of parameters on scales of their own that still tells them apart."""
+
+_SIZES = 12
+"""Sizes of wander tried, from none to a few times the largest that could fit."""
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Of C candidates on B series: likelihood ratio (twice the gain in nats) and the log of its chi-square p-value."""
+
+    ratio: Float[Tensor, "C B"]
+    log_p: Float[Tensor, "C B"]
+    dof: Float[Tensor, " C"]
+
+
+def log_survival(ratio: Tensor, dof: Tensor) -> Tensor:
+    """Log of the chi-square survival function, also where it underflows.
+
+    Example:
+        >>> log_survival(torch.tensor([3.841, 2000.0], dtype=torch.float64), torch.tensor([1.0, 3.0])).exp()
+        tensor([0.0500, 0.0000], dtype=torch.float64)
+    """
+    half, x = 0.5 * dof.to(ratio), 0.5 * ratio.clamp(min=0.0)
+    direct = torch.special.gammaincc(half.expand_as(x), x.clamp(max=600.0)).clamp(min=1e-300).log()
+    safe = x.clamp(min=1.0)
+    far = -safe + (half - 1.0) * safe.log() - torch.lgamma(half) - torch.log1p(-((half - 1.0) / safe).clamp(max=0.5))
+    return torch.where(x > 300.0, far, direct)
+
+
+@dataclass(frozen=True)
+class _Wander:
+    """One family of wander in its own axes: singular values, rotation, and the sizes that are tried."""
+
+    scale: Tensor  # (k,) standard deviations of the courses at size 1
+    axes: Tensor  # (k, k)
+    strength: Tensor  # (k,)
+    sizes: Tensor  # (S,) squared sizes, the first one 0
+
+
+class LinearSearch:
+    """A linearised simulation with candidates, ready to be tried on any number of series.
+
+    Args:
+        nuisance: (M, p) whitened tangents of the simulation's own parameters; M samples times channels.
+        candidates: whitened tangents of each candidate, (M, q).
+        wander: (M, k) whitened tangents of slow courses at the ports; k may be 0.
+        scales: standard deviations of those courses, up to one size, for each family of wander, (F, k).
+    """
+
+    def __init__(
+        self,
+        nuisance: Float[Tensor, "M p"],
+        candidates: Sequence[Float[Tensor, "M q"]],
+        wander: Float[Tensor, "M k"],
+        scales: Float[Tensor, "F k"],
+    ) -> None:
+        self._basis = torch.linalg.qr(nuisance / torch.linalg.vector_norm(nuisance, dim=0).clamp(min=1e-300)).Q
+        self._dof = nuisance.shape[0] - nuisance.shape[1]
+        self._widths = [c.shape[1] for c in candidates]
+        self._flat = torch.cat([nuisance[:, :0], *candidates], -1)
+        self._wander = wander
+        columns = self._flat
+        on_basis = self._basis.mT @ columns
+        wander_basis = self._basis.mT @ wander
+        self._cross = wander.mT @ columns - wander_basis.mT @ on_basis  # (k, cols)
+        gram = wander.mT @ wander - wander_basis.mT @ wander_basis
+        self._families = [_family(gram, scale) for scale in scales] if wander.shape[1] else []
+        self._groups = self._grouped(columns, on_basis)
+
+    def _grouped(self, columns: Tensor, on_basis: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """For each width: numbers of the candidates, their columns, whitening (C, q, q) and degrees of freedom."""
+        starts = torch.tensor([0, *self._widths]).cumsum(0)
+        groups = []
+        for width in sorted(set(self._widths)):
+            member = torch.tensor([i for i, w in enumerate(self._widths) if w == width])
+            index = starts[member].unsqueeze(-1) + torch.arange(width)
+            block, shadow = columns[:, index].movedim(0, -1), on_basis[:, index].movedim(0, -1)
+            full = block @ block.mT
+            gram = full - shadow @ shadow.mT
+            size = torch.diagonal(full, dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
+            values, vectors = torch.linalg.eigh(gram * size.unsqueeze(-1) * size.unsqueeze(-2))
+            kept = values > _LEFT
+            root = torch.where(kept, values.clamp(min=_LEFT).rsqrt(), 0.0)
+            # orthonormal coordinates of each candidate's own space; dropped directions become zero columns
+            groups.append((member, index, size.unsqueeze(-1) * vectors * root.unsqueeze(-2), kept.sum(-1).double()))
+        return groups
+
+    @property
+    def dof(self) -> Float[Tensor, " C"]:
+        """Directions of each candidate that the simulation's own parameters leave."""
+        out = torch.zeros(len(self._widths), dtype=torch.float64)
+        for member, _, _, dof in self._groups:
+            out[member] = dof
+        return out
+
+    def white(self, count: int, generator: torch.Generator) -> Float[Tensor, "M B"]:
+        """Draws of the white part, of variance one."""
+        return torch.randn(self._basis.shape[0], count, generator=generator, dtype=self._flat.dtype)
+
+    def wander(self, count: int, noise: NoiseFit, generator: torch.Generator) -> Float[Tensor, "M B"]:
+        """Draws of the fitted wander, on the scale on which the white part has variance one."""
+        if noise.size == 0:
+            return self._wander.new_zeros(self._basis.shape[0], count)
+        scale = noise.size**0.5 * self._families[noise.family].scale
+        courses = torch.randn(len(scale), count, generator=generator, dtype=self._flat.dtype)
+        return self._wander @ (scale.unsqueeze(-1).to(courses) * courses)
+
+    def wander_spread(self, noise: NoiseFit) -> float:
+        """Standard deviation of the fitted wander, over the recording, in the unit of its port; equal channels."""
+        scale = self._families[noise.family].scale
+        distinct = scale.square().sum() / (scale == scale.max()).sum()
+        return float((noise.size * noise.variance * distinct).sqrt())
+
+    def gains(self, series: Float[Tensor, "M B"]) -> Gains:
+        """The likelihood ratio of each candidate on each series, the noise's sizes profiled out."""
+        series = series.to(self._flat.dtype)
+        on_basis = self._basis.mT @ series
+        power = (series.square().sum(0) - on_basis.square().sum(0)).double()
+        inner = (self._flat.mT @ series - (self._flat.mT @ self._basis) @ on_basis).double()
+        slow = (self._wander.mT @ series - (self._wander.mT @ self._basis) @ on_basis).double()
+        null, best = self._profile(power, inner, slow)
+        ratio = (2.0 * (best - null)).clamp(min=0.0)
+        dof = self.dof
+        log_p = log_survival(ratio, dof.clamp(min=1.0).unsqueeze(-1))
+        return Gains(ratio, torch.where(dof.unsqueeze(-1) > 0, log_p, 0.0), dof)
+
+    def noise_fit(self, series: Float[Tensor, " M"]) -> NoiseFit:
+        """Family and squared size of the wander without any candidate."""
+        series = series.to(self._flat.dtype).unsqueeze(-1)
+        on_basis = self._basis.mT @ series
+        power = (series.square().sum(0) - on_basis.square().sum(0)).double()
+        slow = (self._wander.mT @ series - (self._wander.mT @ self._basis) @ on_basis).double()
+        none = float(-0.5 * self._dof * power.log())
+        best = NoiseFit(0, 0.0, float(power / self._dof), none, 0.0)
+        for number, family in enumerate(self._families):
+            rotated = family.axes.mT @ (family.scale.unsqueeze(-1) * slow)
+            for size in family.sizes[1:]:
+                left, log_det = _without_wander(power, rotated, family, size)
+                value = float(-0.5 * log_det - 0.5 * self._dof * left.log())
+                if value > best.log_likelihood:
+                    best = NoiseFit(number, float(size), float(left / self._dof), value, value - none)
+        return best
+
+    def estimate(self, number: int, series: Float[Tensor, " M"]) -> tuple[Tensor, Tensor]:
+        """γ of a candidate by generalised least squares (q,), and its covariance (q, q), at the likeliest noise.
+
+        The sign is that of the series' own regression; directions that the nuisance takes over are 0.
+        """
+        start = sum(self._widths[:number])
+        index = torch.arange(start, start + self._widths[number])
+        columns = self._flat[:, index]
+        columns = columns - self._basis @ (self._basis.mT @ columns)
+        left = series - self._basis @ (self._basis.mT @ series)
+        best: tuple[float, Tensor, Tensor] | None = None
+        for family, size in [(None, None), *((f, size) for f in self._families for size in f.sizes[1:])]:
+            gram, inner, power = columns.mT @ columns, columns.mT @ left, left.square().sum()
+            log_det = power.new_zeros(())
+            if family is not None and size is not None:
+                cross = family.axes.mT @ (family.scale.unsqueeze(-1) * self._cross[:, index])
+                rotated = family.axes.mT @ (family.scale * (self._wander.mT @ left))
+                share = size / (1.0 + size * family.strength)
+                gram = gram - cross.mT @ (share.unsqueeze(-1) * cross)
+                inner = inner - cross.mT @ (share * rotated)
+                power = power - (share * rotated.square()).sum()
+                log_det = torch.log1p(size * family.strength).sum()
+            size_of = gram.diagonal().clamp(min=1e-300).rsqrt()
+            scaled = gram * size_of.unsqueeze(-1) * size_of
+            inverse = torch.linalg.pinv(scaled, hermitian=True, rtol=_SINGULAR) * size_of.unsqueeze(-1) * size_of
+            gamma = inverse @ inner
+            rest = power - inner @ gamma
+            value = float(-0.5 * log_det - 0.5 * self._dof * rest.log())
+            if best is None or value > best[0]:
+                best = value, gamma, inverse * rest / self._dof
+        assert best is not None
+        return best[1], best[2]
+
+    def trace(self, number: int, series: Float[Tensor, " M"]) -> tuple[Tensor, Tensor, float]:
+        """A candidate at its best γ, less what the nuisance takes over.
+
+        Returns:
+            Its trace (M,), an orthonormal basis of the candidate's space (M, q'), and the share of the trace's square
+            that the nuisance leaves.
+        """
+        start = sum(self._widths[:number])
+        columns = self._flat[:, start : start + self._widths[number]]
+        left = columns - self._basis @ (self._basis.mT @ columns)
+        gamma = self.estimate(number, series)[0]
+        if float(gamma.abs().max()) == 0:
+            gamma = torch.ones_like(gamma)
+        trace, whole = left @ gamma, columns @ gamma
+        basis, size, _ = torch.linalg.svd(left, full_matrices=False)
+        share = float(trace.square().sum() / whole.square().sum().clamp(min=1e-300))
+        return trace, basis[:, size > 1e-6 * size[0].clamp(min=1e-300)], share
+
+    def stationary(self, series: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
+        """Expected square of the stationary noise of each coordinate, under the likeliest wander.
+
+        It is the square of what is left once the simulation's own tangents and the wander are predicted, and the
+        variance of that prediction: what they took of the noise is given back (the E-step for variance components).
+        """
+        fit = self.noise_fit(series)
+        left = series - self._basis @ (self._basis.mT @ series)
+        taken = self._basis.square().sum(-1)
+        if fit.size > 0:
+            family = self._families[fit.family]
+            courses = self._wander @ (family.scale.unsqueeze(-1) * family.axes)
+            courses = courses - self._basis @ (self._basis.mT @ courses)
+            share = fit.size / (1.0 + fit.size * family.strength)
+            left = left - courses @ (share * (courses.mT @ left))
+            taken = taken + courses.square() @ share
+        return left.square() + fit.variance * taken
+
+    def _profile(self, power: Tensor, inner: Tensor, slow: Tensor) -> tuple[Tensor, Tensor]:
+        """Largest log-likelihood over the noise's sizes: of nothing (B,), and of each candidate (C, B)."""
+        B = power.shape[0]
+        null = -0.5 * self._dof * power.log()
+        best = torch.full((len(self._widths), B), -torch.inf, dtype=torch.float64)
+        self._update(best, power, inner, None, None, power.new_zeros(()))
+        for family in self._families:
+            rotated = family.axes.mT @ (family.scale.unsqueeze(-1) * slow)
+            cross = family.axes.mT @ (family.scale.unsqueeze(-1) * self._cross.double())
+            for size in family.sizes[1:]:
+                left, log_det = _without_wander(power, rotated, family, size)
+                null = torch.maximum(null, -0.5 * log_det - 0.5 * self._dof * left.log())
+                share = size / (1.0 + size * family.strength)
+                at_size = inner - cross.mT @ (share.unsqueeze(-1) * rotated)
+                self._update(best, left, at_size, cross, share, log_det)
+        return null, best
+
+    def _update(
+        self, best: Tensor, power: Tensor, inner: Tensor, cross: Tensor | None, share: Tensor | None, log_det: Tensor
+    ) -> None:
+        for member, index, own, dof in self._groups:
+            score = own.mT @ inner[index]  # (C, q, B)
+            if cross is None or share is None:
+                explained = score.square().sum(-2)
+            else:
+                shadow = own.mT @ cross.mT[index]  # (C, q, k)
+                live = (own != 0).any(-2).double()
+                gram = torch.diag_embed(torch.ones_like(live)) - shadow * share @ shadow.mT
+                explained = (score * torch.linalg.solve(gram, score)).sum(-2)
+            left = (power - explained).clamp(min=1e-12 * power)
+            value = -0.5 * log_det - 0.5 * self._dof * left.log()
+            value = torch.where(dof.unsqueeze(-1) > 0, value, -torch.inf)
+            best[member] = torch.maximum(best[member], value)
+
+
+@dataclass(frozen=True)
+class NoiseFit:
+    """The wander of a series.
+
+    Attributes:
+        family: its number.
+        size: squared, in units of the white part's variance.
+        variance: of the white part.
+        log_likelihood, gain: in nats; the gain is over no wander.
+    """
+
+    family: int
+    size: float
+    variance: float
+    log_likelihood: float
+    gain: float
+
+
+def _family(gram: Tensor, scale: Tensor) -> _Wander:
+    strength, axes = torch.linalg.eigh(scale.unsqueeze(-1) * gram.double() * scale)
+    strength = strength.clamp(min=0.0)
+    sizes = torch.cat([strength.new_zeros(1), torch.logspace(-0.5, 5.0, _SIZES, dtype=torch.float64) / strength[-1]])
+    return _Wander(scale, axes, strength, sizes)
+
+
+def _without_wander(power: Tensor, rotated: Tensor, family: _Wander, size: Tensor) -> tuple[Tensor, Tensor]:
+    """Weighted sum of squares (B,) and log-determinant at a size of wander."""
+    share = size / (1.0 + size * family.strength)
+    left = (power - (share.unsqueeze(-1) * rotated.square()).sum(0)).clamp(min=1e-12 * power)
+    return left, torch.log1p(size * family.strength).sum()

@@ -1,0 +1,51 @@
+"""The catalogue of effects: one piece of physics a file, with its drivers, units, size and source.
+
+A user's own effect is a class with the attributes of :class:`Effect`; :class:`GainEffect` makes it a dozen lines.
+Each class says what the physics is, how it changes the simulation, what drives it, its units, the size that is
+plausible, and where that is from.
+"""
+
+from __future__ import annotations
+
+from mkc_torch.effects.cubic_nonlinearity import CubicNonlinearity
+from mkc_torch.effects.current_field import CurrentField
+from mkc_torch.effects.driver_offset import DriverOffset
+from mkc_torch.effects.field_gradient import FieldGradient
+from mkc_torch.effects.hard_iron_step import HardIronStep
+from mkc_torch.effects.offset_drift import OffsetDrift
+from mkc_torch.effects.protocol import (
+    AnchoredEffect,
+    Context,
+    ContinuousEffect,
+    Effect,
+    GainEffect,
+    LastingEffect,
+    Quantity,
+    Shape,
+)
+from mkc_torch.effects.temperature_offset import TemperatureOffset
+from mkc_torch.effects.unknown import Unknown
+
+__all__ = [
+    "CATALOGUE",
+    "AnchoredEffect",
+    "Context",
+    "ContinuousEffect",
+    "Effect",
+    "GainEffect",
+    "LastingEffect",
+    "Quantity",
+    "Shape",
+]
+
+CATALOGUE: tuple[Effect, ...] = (
+    HardIronStep(),
+    OffsetDrift(),
+    TemperatureOffset(),
+    CurrentField(),
+    FieldGradient(),
+    CubicNonlinearity(),
+    DriverOffset(),
+    Unknown(),
+)
+"""The effects that a diagnosis tries."""

@@ -1,0 +1,43 @@
+"""An offset that follows a recorded column: temperature, current, or one whose role is not known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.effects.protocol import Context, GainEffect, Shape, lagged
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class DriverOffset(GainEffect):
+    """The sensor's offset is in proportion to a quantity that nothing else is known about.
+
+    Simulation: adds ``k (x − x̄)`` to the sensor's axes; the part of the mean x̄ is in the offset.
+    Drivers: a column of no known role; effects of a known role build on this one.
+    Units: k in µT for each unit of the column.
+    Plausible: any size.
+    Source: the linear response to any small disturbance.
+
+    Attributes:
+        gain: what a user reads k as.
+        lags: time constants in s that are tried, behind which the sensor follows the column.
+    """
+
+    id = "driver_offset"
+    roles: tuple[str, ...] = ("any",)
+    gain = "offset_per_unit"
+    equation = "δB = k (x − x̄)"
+    explanation = "The sensor's offset follows this column."
+    advice = "Find out what the column stands for; correct with the fitted gain until then."
+    source = "linear response, first order in the driver"
+    lags: tuple[float, ...] = (0.0,)
+
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
+        return tuple({"lag": lag} if lag else {} for lag in self.lags)
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+        return lagged(context.drivers[:, 0], context.time, shape.get("lag", 0.0))

@@ -1,0 +1,79 @@
+"""An ambient field that changes with position, as it does in buildings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.protocol import Context, Quantity, Shape, per
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class FieldGradient:
+    """Iron in a building bends the Earth's field, so that it changes with position.
+
+    Simulation: adds a polynomial of the position, less its mean, of degree one or two to the ambient field. Where the
+    port carries the field's vector (east, north, up), the polynomial is the gradient of a harmonic one, as that of a
+    field without sources in the room is: 5 terms of degree one and 7 of degree two. Where the port carries the strength
+    alone it is any polynomial: 3 terms and 6.
+    Drivers: the position, three columns.
+    Units: gradient in µT/m, curvature in µT/m².
+    Plausible: up to 200 µT/m; some µT/cm occur near steel.
+    Source: Maxwell's equations in a room without sources; BROAD trial 21 (Laidig et al., Data 6(7):72, 2021).
+    """
+
+    id = "field_gradient"
+    port = "field"
+    roles: tuple[str, ...] = ("position",)
+    equation = "B(p) = B₀ + G p + …,  ∇·B = 0, ∇×B = 0"
+    explanation = "The ambient field is not the same everywhere: iron nearby bends it."
+    advice = "Record in the open, or turn the sensor on the spot."
+    plausible = 200.0
+    source = "indoor gradients of up to some µT/cm near steel; BROAD trial 21 (Laidig et al., Data 6(7):72, 2021)"
+
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
+        return ({"degree": 1.0}, {"degree": 2.0})
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
+        first = per(context.signal_unit, context.units[0])
+        second = f"{first}²" if context.units[0] else first
+        sizes = (3, 6) if len(context.channels) == 1 else (5, 7)
+        gradient, curvature = Quantity("gradient", sizes[0], first), Quantity("curvature", sizes[1], second)
+        return (gradient,) if shape["degree"] < 2 else (gradient, curvature)
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
+        terms = _polynomials if len(context.channels) == 1 else _harmonic_gradients
+        basis = terms(context.drivers, int(shape["degree"]))
+        return torch.einsum("nfc,f->nc", basis, gamma)
+
+
+def _polynomials(p: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N f 1"]:
+    """Monomials x, y, z, and of degree two x², y², z², xy, xz, yz."""
+    x, y, z = p.unbind(-1)
+    terms = [x, y, z]
+    if degree > 1:
+        terms += [x * x, y * y, z * z, x * y, x * z, y * z]
+    return torch.stack(terms, -1).unsqueeze(-1)
+
+
+def _harmonic_gradients(p: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N f 3"]:
+    """Gradients of the harmonic polynomials of degree two, and three."""
+    x, y, z = p.unbind(-1)
+    o = torch.zeros_like(x)
+    fields = [(y, x, o), (z, o, x), (o, z, y), (x, -y, o), (-x, -y, 2 * z)]
+    if degree > 1:
+        fields += [
+            (y * z, x * z, x * y),
+            (3 * (x * x - y * y), -6 * x * y, o),
+            (6 * x * y, 3 * (x * x - y * y), o),
+            (2 * x * z, -2 * y * z, x * x - y * y),
+            (4 * z * z - 3 * x * x - y * y, -2 * x * y, 8 * x * z),
+            (-2 * x * y, 4 * z * z - x * x - 3 * y * y, 8 * y * z),
+            (-6 * x * z, -6 * y * z, 6 * z * z - 3 * x * x - 3 * y * y),
+        ]
+    return torch.stack([torch.stack(f, -1) for f in fields], 1)

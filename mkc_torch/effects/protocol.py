@@ -1,0 +1,224 @@
+"""What an effect is: physics with an amplitude γ that changes what passes through a port of a simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = [
+    "AnchoredEffect",
+    "Context",
+    "ContinuousEffect",
+    "Effect",
+    "GainEffect",
+    "LastingEffect",
+    "Quantity",
+    "Shape",
+]
+
+Shape = Mapping[str, float]
+"""Numbers that an effect is not linear in, such as its onset or a time constant in s; they are searched, not fitted."""
+
+
+@dataclass(frozen=True)
+class Context:
+    """What an effect sees of a recording: N samples, k drivers, c channels of the port it acts on.
+
+    Attributes:
+        time: in s.
+        drivers: (N, k), in the recording's units, less their means over the recording that was diagnosed.
+        units: of the drivers.
+        signal: (N, c), what passes through the port.
+        signal_unit: its unit.
+        channels: its components' names.
+    """
+
+    time: Float[Tensor, " N"]
+    drivers: Float[Tensor, "N k"]
+    units: tuple[str, ...]
+    signal: Float[Tensor, "N c"]
+    signal_unit: str
+    channels: tuple[str, ...]
+
+
+class Quantity(NamedTuple):
+    """A parameter as a user reads it: it covers ``size`` numbers of γ, in ``unit``."""
+
+    name: str
+    size: int
+    unit: str
+
+
+class Effect(Protocol):
+    """A piece of physics. At γ = 0 it changes nothing.
+
+    Some effects can do more: :class:`ContinuousEffect`, :class:`LastingEffect`, :class:`AnchoredEffect`.
+
+    Attributes:
+        id: its name in ``diagnosis.json``.
+        port: where it acts; an effect is tried where a simulation has that port.
+        roles: the roles of the columns that drive it, as :mod:`mkc_torch.diagnosis.drivers` gives them; empty for an
+            effect of time or of the signal alone.
+        equation: in symbols.
+        explanation: a sentence a user reads.
+        advice: what to do about it.
+        plausible: largest plausible size of each number of the first quantity of γ, in its unit; infinite where
+            nothing is known.
+        source: where the physics and its size are from.
+    """
+
+    @property
+    def id(self) -> str: ...
+    @property
+    def port(self) -> str: ...
+    @property
+    def roles(self) -> tuple[str, ...]: ...
+    @property
+    def equation(self) -> str: ...
+    @property
+    def explanation(self) -> str: ...
+    @property
+    def advice(self) -> str: ...
+    @property
+    def plausible(self) -> float: ...
+    @property
+    def source(self) -> str: ...
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
+        """The parameters that γ holds, in its order."""
+        ...
+
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
+        """The grid of shapes that is searched."""
+        ...
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
+        """What the effect adds to the signal."""
+        ...
+
+
+@runtime_checkable
+class ContinuousEffect(Effect, Protocol):
+    """An effect with numbers in its shape that can take any value, and are closed in on after the search of the grid.
+
+    Attributes:
+        continuous: their names, each with its least and largest value as shares of the recording's length in s.
+    """
+
+    @property
+    def continuous(self) -> Mapping[str, tuple[float, float]]: ...
+
+
+@runtime_checkable
+class LastingEffect(Effect, Protocol):
+    """An effect that is bound to the time of its recording, of which something lasts."""
+
+    def lasting(self, gamma: Float[Tensor, " q"], context: Context) -> Float[Tensor, "N c"]:
+        """What is left of it in a later recording of the same sensor."""
+        ...
+
+
+@runtime_checkable
+class AnchoredEffect(Effect, Protocol):
+    """An effect whose shape has to be told something of the diagnosed recording before it can act on another one."""
+
+    def anchored(self, shape: Shape, context: Context) -> Shape:
+        """The shape with what it needs of this recording."""
+        ...
+
+
+class GainEffect:
+    """An effect that adds a gain per channel times one course: ``gain ⊗ course``. Give it a ``course``.
+
+    Example:
+        A user's own effect, a bus voltage that shifts the offset:
+
+        >>> class SupplyOffset(GainEffect):
+        ...     id = "supply_offset"
+        ...     roles = ("voltage",)
+        ...     equation = "δB = k (V − V₀)"
+        ...     explanation = "The offset follows the supply voltage."
+        ...     plausible = 1.0
+        ...     source = "our bench, 2024"
+        ...
+        ...     def course(self, shape, context):
+        ...         return context.drivers[:, 0]
+        >>> SupplyOffset().port
+        'sensor'
+    """
+
+    id: str
+    port: str = "sensor"
+    roles: tuple[str, ...] = ()
+    equation: str = ""
+    explanation: str = ""
+    advice: str = ""
+    plausible: float = float("inf")
+    source: str = ""
+    gain: str = "gain"
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+        """How the effect goes along the recording, at a gain of one."""
+        raise NotImplementedError
+
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
+        return ({},)
+
+    def unit(self, context: Context) -> str:
+        """Of the gain: the signal's unit, for each unit of the driver."""
+        return per(context.signal_unit, context.units[0]) if context.units else context.signal_unit
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return (Quantity(self.gain, len(context.channels), self.unit(context)),)
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
+        return self.course(shape, context).unsqueeze(-1) * gamma
+
+
+def per(unit: str, other: str) -> str:
+    """The unit of one for each of the other.
+
+    Example:
+        >>> per("µT", "A"), per("µT", ""), per("µT", "°C")
+        ('µT/A', 'µT', 'µT/K')
+    """
+    return f"{unit}/{'K' if other == '°C' else other}" if other else unit
+
+
+def after(time: Float[Tensor, " N"], onset: float) -> Float[Tensor, " N"]:
+    """0 before the onset, 1 from it on."""
+    return (time >= onset).to(time.dtype)
+
+
+def lagged(values: Float[Tensor, " N"], time: Float[Tensor, " N"], lag: float) -> Float[Tensor, " N"]:
+    """Values behind a first-order lag with this time constant in s, at rest before the first sample.
+
+    Each value counts for the whole interval that ends at its sample: ``y[k] = a y[k-1] + (1 - a) x[k]`` with
+    ``a = exp(-Δt / lag)``, exact for intervals of any length.
+
+    Example:
+        >>> time = torch.arange(0.0, 5.0, 0.01, dtype=torch.float64)
+        >>> float(lagged((time >= 1.0).double(), time, 1.0)[200])
+        0.63...
+    """
+    if lag <= 0:
+        return values
+    first, decay = values[0], torch.exp(-time.diff().clamp(min=0.0) / lag)
+    decay = torch.cat([decay.new_zeros(1), decay])
+    level = (1.0 - decay) * (values - first)
+    # y[k] = decay[k] y[k-1] + level[k], a prefix composition of affine maps by doubling
+    shift = 1
+    while shift < len(values):
+        head_decay, head_level = decay[:shift], level[:shift]
+        tail_level = decay[shift:] * level[:-shift] + level[shift:]
+        tail_decay = decay[shift:] * decay[:-shift]
+        decay, level = torch.cat([head_decay, tail_decay]), torch.cat([head_level, tail_level])
+        shift *= 2
+    return first + level

@@ -1,0 +1,44 @@
+"""An offset that follows the temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.effects.driver_offset import DriverOffset
+from mkc_torch.effects.protocol import Context, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class TemperatureOffset(DriverOffset):
+    """The offset of the sensing element and its amplifier changes with their temperature.
+
+    Simulation: adds ``k (T − T̄)`` to the sensor's axes, T as recorded or behind a first-order lag, for the sensing
+    element may warm later than the thermometer; or ``k (T − T̄)(1 + c (T − T̄))``, a response that bends a little.
+    Drivers: a column with the role temperature.
+    Units: k in µT/K, the lag in s, the curvature c in 1/K.
+    Plausible: up to 5 µT/K.
+    Source: data sheets of MEMS magnetometers, about 0.2 µT/K.
+    """
+
+    id = "temperature_offset"
+    roles = ("temperature",)
+    gain = "offset_per_kelvin"
+    equation = "δB = k (T − T̄)"
+    explanation = "The sensor's offset changes with temperature."
+    advice = "Correct with the fitted coefficient, or calibrate at the temperature of use."
+    plausible = 5.0
+    source = "offset temperature coefficients of MEMS magnetometers, about 0.2 µT/K in data sheets"
+    lags = (0.0, 1.0, 5.0)
+    continuous: Mapping[str, tuple[float, float]] = {"lag": (0.0, 0.2), "curvature": (-0.002, 0.002)}
+
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
+        return (*super().shapes(time), {"curvature": 0.02}, {"curvature": -0.02})
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+        follows = super().course(shape, context)
+        return follows * (1.0 + shape.get("curvature", 0.0) * follows)

@@ -1,0 +1,58 @@
+"""A smooth response to a recorded column that no named effect describes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.protocol import Context, Quantity, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+DEGREE = 3
+"""Of the curve."""
+
+
+class Unknown:
+    """The offset follows a column along a smooth curve, by physics that the catalogue does not have.
+
+    Simulation: adds ``Σ γ_j P_j(x)`` to the sensor's axes, with Legendre polynomials P_1 to P_3 and the column's range
+    in the recording mapped to [-1, 1]; outside of it the curve goes on as a constant.
+    Drivers: one column, whatever its role.
+    Units: γ in µT.
+    Plausible: any size.
+    Source: none; it is a curve and no physics.
+    """
+
+    id = "unknown"
+    port = "sensor"
+    roles: tuple[str, ...] = ("temperature", "current", "any")
+    equation = "δB = f(x), a smooth curve"
+    explanation = "The offset follows this column along a curve that no effect of the catalogue describes."
+    advice = "Look at the curve; find out what the column does to the sensor."
+    plausible = float("inf")
+    source = "none: a curve, not physics"
+
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
+        return ({},)
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return tuple(
+            Quantity(f"legendre_{j}", len(context.channels), context.signal_unit) for j in range(1, DEGREE + 1)
+        )
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
+        x = context.drivers[:, 0]
+        low, high = shape.get("low", x.min()), shape.get("high", x.max())
+        t = ((2.0 * x - low - high) / (high - low)).clamp(-1.0, 1.0)
+        polynomials = torch.stack([t, 1.5 * t**2 - 0.5, 2.5 * t**3 - 1.5 * t], -1)
+        return polynomials @ gamma.reshape(DEGREE, -1)
+
+    def anchored(self, shape: Shape, context: Context) -> Shape:
+        """The shape with the column's range in this recording, for use on another one."""
+        x = context.drivers[:, 0]
+        return {**shape, "low": float(x.min()), "high": float(x.max())}

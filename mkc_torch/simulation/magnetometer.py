@@ -1,0 +1,422 @@
+"""The magnetometer: a constant ambient field, an offset and a matrix; what else it senses is for effects to say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from mkc_torch.calibration import prepared
+from mkc_torch.coverage import coverage
+from mkc_torch.ellipsoid import MIN_INFORMATION, EllipsoidFit, NotIdentifiableError
+from mkc_torch.linear import LeastTrimmedSquares
+from mkc_torch.nonlinear import GaussianPrior
+from mkc_torch.recording import Recording
+from mkc_torch.simulation.protocol import Changes, Port
+from mkc_torch.simulation.rotation import from_quaternion, rotation_since
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["Magnetometer", "MagnetometerCorrection"]
+
+WINDOW = 2.0
+"""Length in s over which a gyroscope's rotation is trusted; each window has its own unknown direction of the field."""
+
+_QUATERNION = ("q_w", "q_x", "q_y", "q_z")
+_GYRO = ("gyro_x", "gyro_y", "gyro_z")
+_ACCEL = ("accel_x", "accel_y", "accel_z")
+_AXES = ("x", "y", "z")
+_CHANNELS = ("along", "across_1", "across_2")
+_INDEPENDENT = (True, False, False)  # the error of a rotation is across the field, in residual and signal alike
+
+SOFT_IRON = 0.1
+"""Standard deviation, before the data speak, of what soft iron, gains and misalignment add to the unit matrix. Weak
+against a sensor that is turned through all directions; it decides for the identity where a vehicle never tilts."""
+
+GYRO_BIAS = 0.02
+"""Standard deviation of a gyroscope's bias in rad/s before the data speak."""
+
+_SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_MIN_ROWS = 50
+_REWEIGHTED, _RIDGE = 10, 1e-4
+
+
+@dataclass(frozen=True)
+class Magnetometer:
+    """``matrix @ (measured - offset)`` is the ambient field in the sensor's axes, of constant strength and direction.
+
+    What is compared depends on the recording. With an attitude, the vector with the world's field. Otherwise, its length
+    with the field's, as a distance in the units of the measurement; and where the turns of the sensor do not determine
+    it from the length, but there is a gyroscope, the vector with the field of the same two seconds turned along.
+
+    Attributes:
+        use: "attitude", "norm" or "gyro"; None takes the first of these that the recording allows. The length goes
+            before the gyroscope because the drift of a gyroscope enters the vector as structure of its own.
+
+    Example:
+        >>> from mkc_torch.demo import simulated_recording
+        >>> prepared_simulation = Magnetometer().prepare(simulated_recording()[0])
+        >>> prepared_simulation.channels, prepared_simulation.unit
+        (('norm',), 'µT')
+    """
+
+    use: str | None = None
+    name: str = "magnetometer"
+
+    @property
+    def columns(self) -> frozenset[str]:
+        return frozenset({"time", *(f"mag_{a}" for a in _AXES), *_GYRO, *_ACCEL, *_QUATERNION})
+
+    def prepare(self, recording: Recording) -> NormView | AttitudeView | GyroView:
+        """The magnetometer of a recording.
+
+        Raises:
+            MissingColumnError: a column of the magnetometer, or of what ``use`` asks for, is not there.
+            RecordingError: too few usable samples.
+            NotIdentifiableError: no view determines the sensor; the message names the directions that are missing.
+            ValueError: ``use`` is none of the three.
+        """
+        if self.use not in (None, "attitude", "gyro", "norm"):
+            raise ValueError(f"Expected argument `use` to be 'attitude', 'gyro', 'norm' or None but got {self.use!r}.")
+        has_attitude = all(name in recording for name in _QUATERNION)
+        has_gyro = all(name in recording for name in _GYRO) and recording.time is not None
+        if self.use == "attitude" or (self.use is None and has_attitude):
+            return AttitudeView(prepared(recording.finite(*_QUATERNION)))
+        if self.use == "gyro":
+            recording["time"]
+            return GyroView(prepared(recording.finite(*_GYRO)))
+        try:
+            return NormView(prepared(recording))
+        except NotIdentifiableError:
+            if self.use == "norm" or not has_gyro:
+                raise
+        return GyroView(prepared(recording.finite(*_GYRO)))
+
+
+class _View:
+    """What the three comparisons share: the measured field and the sensor's model."""
+
+    name = "magnetometer"
+    view: str
+
+    def __init__(self, recording: Recording) -> None:
+        self.recording = recording
+        self.measured = recording.magnetometer()
+        self.unit = recording.units["mag_x"]
+        self.state = {"view": self.view}
+        self.warnings: tuple[str, ...] = ()
+
+    @cached_property
+    def time(self) -> Float[Tensor, " N"]:
+        known = self.recording.time
+        return torch.arange(len(self.recording), dtype=torch.float64) if known is None else known
+
+    def signals(self, theta: Float[Tensor, " p"]) -> Mapping[str, Float[Tensor, "N 3"]]:
+        """At the port "sensor", the simulated field as the sensor's own axes and gains show it."""
+        # not the measured one: its noise is the residual's too, and would pass for a nonlinearity
+        return {"sensor": self.simulated(theta)}
+
+    def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
+        """The measurement as simulated, less its offset."""
+        raise NotImplementedError
+
+    def matrix(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "3 3"]:
+        """Calibration matrix of the parameters."""
+        return _MATRIX_OF_VIEW[self.view](theta)
+
+    def corrected(self, theta: Float[Tensor, " p"], sensor: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """The calibrated field, once ``sensor`` is taken off the measurement."""
+        return (self.measured - sensor - theta[:3]) @ self.matrix(theta).mT
+
+    def _sensor_change(self, changes: Changes) -> Tensor:
+        return changes.get("sensor", self.measured.new_zeros(()))
+
+    def _ellipsoid(self, rows: Tensor | None) -> EllipsoidFit:
+        points = self.measured if rows is None else self.measured[rows]
+        return EllipsoidFit(LeastTrimmedSquares(), finish=None).fit(points)
+
+
+class NormView(_View):
+    """Length of the field: one channel, the distance from the ellipsoid to first order, in the measurement's units."""
+
+    view = "norm"
+    channels = ("norm",)
+    independent: tuple[bool, ...] = (True,)
+    parameter_names = (
+        *(f"offset_{a}" for a in _AXES),
+        *(f"matrix_{_AXES[i]}{_AXES[j]}" for i, j in _SYMMETRIC),
+    )
+    prior: GaussianPrior | None = None
+
+    def __init__(self, recording: Recording) -> None:
+        super().__init__(recording)
+        self.ports = {
+            "sensor": Port(_AXES, self.unit, wanders=True),
+            "field": Port(("strength",), self.unit),
+        }
+        fit = self._ellipsoid(None)
+        self.strength = float(fit.radius_)
+        self._full = self._theta(fit)
+
+    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Tensor:
+        return self._full.clone() if rows is None else self._theta(self._ellipsoid(rows))
+
+    def _theta(self, fit: EllipsoidFit) -> Tensor:
+        matrix = fit.calibration_matrix_ * (self.strength / float(fit.radius_))
+        return torch.cat([fit.center_, torch.stack([matrix[i, j] for i, j in _SYMMETRIC])])
+
+    def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 1"]:
+        field = self.corrected(theta, self._sensor_change(changes))
+        length = torch.linalg.vector_norm(field, dim=-1, keepdim=True)
+        steepness = torch.linalg.vector_norm(field @ self.matrix(theta), dim=-1, keepdim=True) / length
+        return (length - self.strength - changes.get("field", 0.0)) / steepness
+
+    def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
+        away = self.measured - theta[:3]
+        field = away @ self.matrix(theta).mT
+        outward = field @ self.matrix(theta)
+        outward = outward / torch.linalg.vector_norm(outward, dim=-1, keepdim=True)
+        return away - self.residual(theta, {}) * outward
+
+
+class AttitudeView(_View):
+    """The vector, turned into the world by a recorded attitude: along the world's field, and in two axes across it.
+
+    Errors of the attitude turn the field, so they enter across it alone, as noise that knows nothing of the motion.
+    """
+
+    view = "attitude"
+    channels = _CHANNELS
+    independent = _INDEPENDENT
+    parameter_names = (
+        *(f"offset_{a}" for a in _AXES),
+        *(f"response_{a}{b}" for a in _AXES for b in _AXES),
+        "field_tilt_1",
+        "field_tilt_2",
+    )
+
+    def __init__(self, recording: Recording) -> None:
+        super().__init__(recording)
+        self.to_world = from_quaternion(recording.stack(*_QUATERNION))
+        self.ports = {
+            "sensor": Port(_AXES, self.unit, wanders=True),
+            "field": Port(("east", "north", "up"), self.unit),
+        }
+        self.prior = _matrix_prior(len(self.parameter_names))
+        self.strength, self._ahead = 1.0, self.measured.new_zeros(3)
+        offset, ahead = self._offset_and_field(None)
+        self.strength = float(torch.linalg.vector_norm(ahead))
+        self._ahead = ahead / self.strength
+        self._across = torch.linalg.svd(self._ahead.unsqueeze(0)).Vh[1:]
+        self._frame = torch.cat([self._ahead.unsqueeze(0), self._across])
+        turned = torch.einsum("kij,i->kj", self.to_world, ahead)
+        offset, response = _response(self.measured, turned, offset)
+        self._unbent = torch.linalg.inv(response)
+        self._full = torch.cat([offset, response.flatten(), offset.new_zeros(2)])
+        self.warnings = _turned_too_little(self.corrected(self._full, offset.new_zeros(3)))
+
+    def ambient(self, theta: Float[Tensor, " p"]) -> Float[Tensor, " 3"]:
+        """The world's field."""
+        direction = self._ahead + theta[12:14] @ self._across
+        return self.strength * direction / torch.linalg.vector_norm(direction)
+
+    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Tensor:
+        if rows is None:
+            return self._full.clone()
+        offset, field = self._offset_and_field(rows)
+        size = torch.linalg.vector_norm(field)
+        matrix = (size / self.strength) * torch.eye(3, dtype=field.dtype)
+        ahead = field / size
+        tilt = self._across @ ahead / (self._ahead @ ahead)
+        return torch.cat([offset, matrix.flatten(), tilt])
+
+    def _offset_and_field(self, rows: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Offset and world field by least trimmed squares, the matrix taken for the identity."""
+        turn, seen = (self.to_world, self.measured) if rows is None else (self.to_world[rows], self.measured[rows])
+        if len(seen) < _MIN_ROWS:
+            raise ValueError(f"{len(seen)} samples are too few for the offset and the world's field.")
+        eye = torch.eye(3, dtype=turn.dtype).expand(len(turn), 3, 3)
+        coefficients = LeastTrimmedSquares().fit(torch.cat([eye, turn.mT], -1), seen).coef_
+        return coefficients[:3], coefficients[3:]
+
+    def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
+        # the simulated vector, not the measured one, goes through the matrix: the noise of what a matrix is fitted to
+        # would shrink it. A fixed matrix takes the difference back into the world.
+        left = self.measured - self._sensor_change(changes) - theta[:3] - self.simulated(theta)
+        world = torch.einsum("kij,kj->ki", self.to_world, left @ self._unbent.mT)
+        return (world - changes.get("field", 0.0)) @ self._frame.mT
+
+    def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
+        field = torch.einsum("kij,i->kj", self.to_world, self.ambient(theta))
+        return field @ theta[3:12].unflatten(0, (3, 3)).mT
+
+
+class GyroView(_View):
+    """The vector, turned by the gyroscope to the first sample of its window: along the window's field, and across it."""
+
+    view = "gyro"
+    channels = _CHANNELS
+    independent = _INDEPENDENT
+    parameter_names = (*NormView.parameter_names, *(f"gyro_bias_{a}" for a in _AXES))
+
+    def __init__(self, recording: Recording) -> None:
+        super().__init__(recording)
+        self.ports = {
+            "sensor": Port(_AXES, self.unit, wanders=True, pointwise=False),
+            "field": Port(("strength",), self.unit, pointwise=False),
+        }
+        self.prior = _bias_prior()
+        self.window, first = _windows(self.time)
+        self.turned = rotation_since(self.time, recording.stack(*_GYRO), first)
+        self.elapsed = (self.time - self.time[first]).unsqueeze(-1)
+        self.count = int(self.window.max()) + 1
+        fit = self._ellipsoid(None)
+        self.strength = float(fit.radius_)
+        self._full = self._theta(fit)
+
+    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Tensor:
+        return self._full.clone() if rows is None else self._theta(self._ellipsoid(rows))
+
+    def _theta(self, fit: EllipsoidFit) -> Tensor:
+        matrix = fit.calibration_matrix_ * (self.strength / float(fit.radius_))
+        return torch.cat([fit.center_, torch.stack([matrix[i, j] for i, j in _SYMMETRIC]), fit.center_.new_zeros(3)])
+
+    def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
+        field = self.corrected(theta, self._sensor_change(changes))
+        along = self._steadied(theta, field)
+        middle = self._window_mean(along, self._weights(along.detach()))
+        direction = middle / torch.linalg.vector_norm(middle, dim=-1, keepdim=True)
+        ambient = (self.strength + changes.get("field", 0.0)) * direction[self.window]
+        frame = _frame(direction.detach())[self.window]
+        return torch.einsum("kij,kj->ki", frame, along - ambient)
+
+    def _steadied(self, theta: Tensor, field: Tensor) -> Tensor:
+        """The calibrated field in the axes of its window's first sample."""
+        # a small bias turns each sample by bias · elapsed against the window's first
+        steady = field - self.elapsed * torch.linalg.cross(theta[9:12].expand_as(field), field)
+        return torch.einsum("kij,kj->ki", self.turned, steady)
+
+    def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
+        along = self._steadied(theta, (self.measured - theta[:3]) @ self.matrix(theta).mT)
+        middle = self._window_mean(along, self._weights(along.detach()))
+        direction = middle / torch.linalg.vector_norm(middle, dim=-1, keepdim=True)
+        field = torch.einsum("kij,ki->kj", self.turned, self.strength * direction[self.window])
+        return torch.linalg.solve(self.matrix(theta), field.mT).mT
+
+    def _window_mean(self, values: Tensor, weight: Tensor) -> Tensor:
+        total = values.new_zeros(self.count, values.shape[-1]).index_add(0, self.window, weight * values)
+        return total / weight.new_zeros(self.count, 1).index_add(0, self.window, weight)[:, :1]
+
+    def _weights(self, along: Tensor) -> Tensor:
+        """Of each sample in its window's mean: one step of Welsch's estimator from a Huber mean, as constants."""
+        weight = along.new_ones(len(along), 1)
+        for cut in (2.0, 1.0, 1.0):
+            distance = torch.linalg.vector_norm(
+                along - self._window_mean(along, weight)[self.window], dim=-1, keepdim=True
+            )
+            scale = distance.median() + 1e-9 * self.strength
+            weight = 1.0 / torch.clamp(distance / (cut * scale), min=1.0).square()
+        return weight
+
+
+class MagnetometerCorrection:
+    """``matrix @ (measured - change - offset)`` on any recording of the sensor.
+
+    Args:
+        state: of the view that was fitted.
+        recording: with ``mag_x``, ``mag_y``, ``mag_z``.
+    """
+
+    def __init__(self, state: Mapping[str, Any], recording: Recording) -> None:
+        if state.get("view") not in _MATRIX_OF_VIEW:
+            raise ValueError(f"The model's view is {state.get('view')!r} and not one of {', '.join(_MATRIX_OF_VIEW)}.")
+        self._matrix = _MATRIX_OF_VIEW[state["view"]]
+        self.measured = recording.magnetometer()
+        self.recording = recording
+        known = recording.time
+        self.time = torch.arange(len(recording), dtype=torch.float64) if known is None else known
+        self.ports = {"sensor": Port(_AXES, recording.units["mag_x"])}
+
+    def signals(self, theta: Float[Tensor, " p"]) -> Mapping[str, Float[Tensor, "N 3"]]:
+        return {"sensor": self.measured - theta[:3]}
+
+    def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
+        field = (self.measured - changes.get("sensor", 0.0) - theta[:3]) @ self._matrix(theta).mT
+        time = {} if self.recording.time is None else {"time": self.recording.time}
+        return time | dict(zip(("field_x", "field_y", "field_z"), field.unbind(-1), strict=True))
+
+
+def _symmetric(theta: Tensor) -> Tensor:
+    xx, yy, zz, xy, xz, yz = theta[3:9].unbind()
+    return torch.stack([torch.stack([xx, xy, xz]), torch.stack([xy, yy, yz]), torch.stack([xz, yz, zz])])
+
+
+def _inverse(theta: Tensor) -> Tensor:
+    return torch.linalg.inv(theta[3:12].unflatten(0, (3, 3)))
+
+
+_MATRIX_OF_VIEW = {"norm": _symmetric, "gyro": _symmetric, "attitude": _inverse}
+
+
+def _frame(direction: Float[Tensor, "W 3"]) -> Float[Tensor, "W 3 3"]:
+    """Orthonormal axes as rows, the first along each direction."""
+    smallest = torch.nn.functional.one_hot(direction.abs().argmin(-1), 3).to(direction)
+    second = torch.linalg.cross(direction, smallest)
+    second = second / torch.linalg.vector_norm(second, dim=-1, keepdim=True)
+    return torch.stack([direction, second, torch.linalg.cross(direction, second)], -2)
+
+
+def _windows(time: Tensor) -> tuple[Tensor, Tensor]:
+    """The window of each sample, and the first sample of that window; a gap of more than a window starts a new one."""
+    number = torch.floor((time - time[0]) / WINDOW).long()
+    _, window, counts = torch.unique_consecutive(number, return_inverse=True, return_counts=True)
+    start = torch.cat([counts.new_zeros(1), counts.cumsum(0)[:-1]])
+    return window, start[window]
+
+
+def _matrix_prior(count: int) -> GaussianPrior:
+    mean = torch.zeros(count, dtype=torch.float64)
+    precision = torch.zeros(count, dtype=torch.float64)
+    mean[3:12] = torch.eye(3, dtype=torch.float64).flatten()
+    precision[3:12] = SOFT_IRON**-2
+    return GaussianPrior(mean, precision)
+
+
+def _bias_prior() -> GaussianPrior:
+    mean = torch.zeros(12, dtype=torch.float64)
+    precision = torch.zeros(12, dtype=torch.float64)
+    precision[9:] = GYRO_BIAS**-2
+    return GaussianPrior(mean, precision)
+
+
+def _response(measured: Tensor, turned: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Offset and response matrix by reweighted least squares of the measurement on the turned field, near the identity."""
+    response = torch.eye(3, dtype=turned.dtype)
+    ridge = len(turned) * _RIDGE * turned.square().sum(-1).mean()
+    for _ in range(_REWEIGHTED):
+        left = torch.linalg.vector_norm(measured - offset - turned @ response.mT, dim=-1)
+        scale = left.median().clamp(min=1e-9 * turned.abs().max())
+        weight = torch.exp(-0.5 * (left / (2.0 * scale)).square()).unsqueeze(-1)
+        regressors = torch.cat([turned, torch.ones_like(turned[:, :1])], -1)
+        pull = torch.diag(torch.cat([ridge.expand(3), ridge.new_zeros(1)]))
+        gram = regressors.mT @ (weight * regressors) + pull
+        known = torch.cat([torch.eye(3, dtype=turned.dtype), turned.new_zeros(1, 3)])
+        solved = torch.linalg.solve(gram, regressors.mT @ (weight * measured) + pull @ known)
+        response, offset = solved[:3].mT, solved[3]
+    return offset, response
+
+
+def _turned_too_little(field: Tensor) -> tuple[str, ...]:
+    found = coverage(field)
+    if found.information >= MIN_INFORMATION:
+        return ()
+    missing = "; ".join(str(gap) for gap in found.gaps)
+    return (
+        "The ellipsoid alone is not identifiable from this recording; the attitude stands in for the missing turns"
+        + (f". Directions not covered: {missing}." if missing else "."),
+    )

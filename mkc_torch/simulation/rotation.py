@@ -1,0 +1,64 @@
+"""Rotations from quaternions and rates."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["from_quaternion", "rotation_since"]
+
+
+def from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrices from body to world of quaternions (w, x, y, z) of any length but 0.
+
+    Example:
+        >>> from_quaternion(torch.tensor([1.0, 0.0, 0.0, 1.0])) @ torch.tensor([1.0, 0.0, 0.0])
+        tensor([0., 1., 0.])
+    """
+    w, x, y, z = (quaternion / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        [w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    w1, v1, w2, v2 = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    w = w1 * w2 - (v1 * v2).sum(-1, keepdim=True)
+    return torch.cat([w, w1 * v2 + w2 * v1 + torch.linalg.cross(v1, v2)], -1)
+
+
+def rotation_since(time: Float[Tensor, " N"], rate: Float[Tensor, "N 3"], first: Tensor) -> Float[Tensor, "N 3 3"]:
+    """Rotation matrices from the body at each sample to the body at sample ``first`` of its window, from a gyroscope.
+
+    Args:
+        time: in s, ascending.
+        rate: angular rate in the body's axes, in rad/s.
+        first: for each sample the index of the first one of its window; windows are runs of samples.
+
+    Example:
+        >>> time = torch.linspace(0.0, 1.0, 101)
+        >>> rate = torch.tensor([0.0, 0.0, torch.pi / 2]).expand(101, 3)
+        >>> turned = rotation_since(time, rate, torch.zeros(101, dtype=torch.long))
+        >>> (turned[-1] @ torch.tensor([1.0, 0.0, 0.0])).round(decimals=3) + 0.0
+        tensor([0., 1., 0.])
+    """
+    turn = 0.5 * (rate[1:] + rate[:-1]) * time.diff().unsqueeze(-1)
+    angle = torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
+    step = torch.cat([torch.cos(0.5 * angle), 0.5 * torch.sinc(0.5 * angle / torch.pi) * turn], -1)
+    identity = step.new_tensor([[1.0, 0.0, 0.0, 0.0]])
+    total = torch.cat([identity, step])
+    # a prefix product by doubling: q[k] becomes the product of the 2^j steps that end at k
+    shift = 1
+    while shift < len(total):
+        total = torch.cat([total[:shift], _product(total[:-shift], total[shift:])])
+        shift *= 2
+    attitude = from_quaternion(total)
+    return attitude[first].mT @ attitude
