@@ -15,9 +15,10 @@ from mkc_torch.diagnosis.drivers import Drivers, find_drivers
 from mkc_torch.diagnosis.estimate import Estimate, estimate
 from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
 from mkc_torch.diagnosis.findings import finding_of
-from mkc_torch.diagnosis.locate import UNKNOWN, Located, locate
+from mkc_torch.diagnosis.locate import Located, locate
 from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.noise_summary import noise_summary
+from mkc_torch.diagnosis.preference import UNKNOWN
 from mkc_torch.diagnosis.refit import FittedModel, fitted
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Finding, HeldOut, Separability, Spread, Traces, Verdict
 from mkc_torch.diagnosis.separability import separability
@@ -38,6 +39,8 @@ MAX_FINDINGS = 3
 
 FEWEST = 100
 """With fewer samples nothing can be said about structure."""
+
+_WIDER = 3.0
 
 _REST = 0.5
 """A larger share of samples in which nothing moves is a sensor at rest, and is warned of."""
@@ -96,11 +99,18 @@ def diagnose(
     drivers = find_drivers(prepared.recording, simulation.columns)
     terms = candidate_terms(prepared, drivers.drivers, effects)
     generator = torch.Generator().manual_seed(seed)
-    base = fitted(JointModel(prepared), prepared.start())
+    base = _base(prepared)
     searches = _searches(base, terms, level, surrogates, max_findings, generator)
     found = [s for s in searches if s.p_value <= level]
     final = estimate(found[-1].fit if found else base)
     return _assembled(prepared, drivers, terms, base, searches, found, final, level, surrogates, seed, generator)
+
+
+def _base(prepared: PreparedSimulation) -> FittedModel:
+    """The simulation alone, on the domain that all models share: wide enough for whatever effect reshapes residuals."""
+    rough = fitted(JointModel(prepared), prepared.start())
+    bound = _WIDER * torch.maximum(rough.bound, rough.bound.mean())
+    return fitted(rough.model, rough.parameters, bound, graduate=False)
 
 
 def _check(level: float, surrogates: int, max_findings: int) -> None:

@@ -14,13 +14,16 @@ from mkc_torch.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Driver", "Drivers", "find_drivers"]
+__all__ = ["ANY", "Driver", "Drivers", "find_drivers"]
 
 FEWEST_FINITE = 0.5
 """A column with a smaller share of finite values is no driver."""
 
 COPY = 1e-9
 """Two columns whose correlation is nearer to ±1 than this are one driver."""
+
+ANY = "any"
+"""The role of a column whose role is not known."""
 
 _ROLE_OF_NAME: Mapping[str, str] = {"temperature": "temperature", "temp": "temperature", "current": "current"}
 _ROLE_OF_UNIT: Mapping[str, str] = {"°C": "temperature", "K": "temperature", "A": "current"}
@@ -104,7 +107,7 @@ def role_of(name: str, unit: str) -> str:
         >>> role_of("temperature", "°C"), role_of("esc_power", "A"), role_of("current_3", ""), role_of("rpm", "")
         ('temperature', 'current', 'current', 'any')
     """
-    return _ROLE_OF_NAME.get(name.lower().split("_")[0]) or _ROLE_OF_UNIT.get(unit, "any")
+    return _ROLE_OF_NAME.get(name.lower().split("_")[0]) or _ROLE_OF_UNIT.get(unit, ANY)
 
 
 def _usable(name: str, values: Tensor) -> tuple[Tensor | None, list[str]]:
@@ -137,7 +140,7 @@ def _singles(usable: Mapping[str, Tensor], units: Mapping[str, str], warnings: l
     """One driver for each group of columns that are copies of one another; a known role goes before an unknown one."""
     if not usable:
         return []
-    names = sorted(usable, key=lambda name: role_of(name, units[name]) == "any")
+    names = sorted(usable, key=lambda name: role_of(name, units[name]) == ANY)
     table = torch.stack([usable[name] for name in names])
     centred = table - table.mean(-1, keepdim=True)
     centred = centred / torch.linalg.vector_norm(centred, dim=-1, keepdim=True)

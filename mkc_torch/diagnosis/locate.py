@@ -13,6 +13,7 @@ from torch import Tensor
 from mkc_torch.diagnosis.candidates import finer
 from mkc_torch.diagnosis.linearise import Linearised, Tangents, linearise, tangents_of
 from mkc_torch.diagnosis.model import JointModel, Term
+from mkc_torch.diagnosis.preference import Preference
 from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted
 from mkc_torch.diagnosis.search import Gains, NoiseFit, log_survival
 from mkc_torch.functional import mkc_energy
@@ -21,7 +22,7 @@ from mkc_torch.order_statistic import robust_scale
 if TYPE_CHECKING:
     pass
 
-__all__ = ["SEPARABLE", "UNKNOWN", "Located", "Ranked", "locate"]
+__all__ = ["SEPARABLE", "Located", "Ranked", "locate"]
 
 SEPARABLE = 4.5
 """Nats by which a rival must be less likely to count as told apart: three standard errors of what sets them apart."""
@@ -33,10 +34,6 @@ _LEADING = 3
 _RAW = 1000.0
 _OVERWHELMING = 150.0
 """Nats by which an account has to be likelier that no draws of noise are needed to tell."""
-_HANDICAP, _HANDICAP_SHARE = 10.0, 0.1
-
-UNKNOWN = "unknown"
-"""Id of the effect that is a curve, not physics."""
 
 Key = tuple[str, tuple[str, ...]]
 
@@ -93,7 +90,8 @@ def locate(
         parts: also start from fits to parts of the recording, for where one model over all of it runs away.
     """
     terms = tuple(terms)
-    best = _strongest(base, terms, parts=parts)
+    prefer = Preference(terms, base.model.prepared)
+    best = _strongest(base, terms, prefer, parts=parts)
     parameters = best.parameters[: base.model.size]
     if best.model.terms[-1] not in terms:
         terms = (*terms, best.model.terms[-1])
@@ -113,7 +111,7 @@ def locate(
         # whether there is an effect is asked of the noise that has it in; which one it is, of the noise beside it
         linearised = linearise(base.model, parameters, pseudo, counts, tangents, noise=left)
         found = linearised.search.gains(linearised.series.unsqueeze(-1))
-    ranking = _ranking(terms, found)
+    ranking = _ranking(terms, found, prefer)
     first = terms[ranking[0].number]
     if p_value <= level and first.key != best.model.terms[-1].key:
         best = _refined(_refitted(best, base, first, linearised, ranking[0].number), base)
@@ -166,7 +164,7 @@ def _part_starts(base: FittedModel, d: Float[Tensor, " m"]) -> list[Start]:
     return starts
 
 
-def _strongest(base: FittedModel, terms: tuple[Term, ...], *, parts: bool) -> FittedModel:
+def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *, parts: bool) -> FittedModel:
     """The likeliest of the joint refits, each of the leading ones at its best shape.
 
     Candidates are ranked by the likelihood's own score and by a clipped one, which still sees a stretch of samples that
@@ -176,16 +174,18 @@ def _strongest(base: FittedModel, terms: tuple[Term, ...], *, parts: bool) -> Fi
     listed = _short_list(base, terms, [(around, base.pseudo)], _SHORT_LIST)
     listed += _short_list(base, terms, [(around, clipped_residual(base.residual))], 2)
     fits: dict[Key, FittedModel] = {}
-    _refit_all(fits, base, listed)
+    _refit_all(fits, base, listed, prefer)
     if parts:
         least = torch.stack([fit.d for fit in fits.values()]).amin(0)
-        _refit_all(fits, base, [one for start in _part_starts(base, least) for one in _short_list(base, terms, [start], 2)])
-    leading = sorted(fits.values(), key=lambda fit: _score(fit, base), reverse=True)[:_LEADING]
-    shaped = [_refined(_best_shape(fit, base, terms), base) for fit in leading]
-    return max(shaped, key=lambda fit: _score(fit, base))
+        _refit_all(fits, base, [one for start in _part_starts(base, least) for one in _short_list(base, terms, [start], 2)], prefer)
+    leading = sorted(fits.values(), key=lambda fit: _score(fit, base, prefer), reverse=True)[:_LEADING]
+    shaped = [_refined(_best_shape(fit, base, terms, prefer), base) for fit in leading]
+    return max(shaped, key=lambda fit: _score(fit, base, prefer))
 
 
-def _refit_all(fits: dict[Key, FittedModel], base: FittedModel, listed: Sequence[Listed]) -> None:
+def _refit_all(
+    fits: dict[Key, FittedModel], base: FittedModel, listed: Sequence[Listed], prefer: Preference
+) -> None:
     """Put the joint refit of each into ``fits``, where it is the better one of its physics."""
     done: set[tuple[Key, int]] = set()
     for term, parameters, gamma in listed:
@@ -193,29 +193,25 @@ def _refit_all(fits: dict[Key, FittedModel], base: FittedModel, listed: Sequence
             continue
         done.add((term.key, id(parameters)))
         fit = fitted(base.model.with_term(term), torch.cat([parameters, gamma]), base.bound)
-        if term.key not in fits or _score(fit, base) > _score(fits[term.key], base):
+        if term.key not in fits or _score(fit, base, prefer) > _score(fits[term.key], base, prefer):
             fits[term.key] = fit
 
 
-def _score(fit: FittedModel, base: FittedModel) -> float:
+def _score(fit: FittedModel, base: FittedModel, prefer: Preference) -> float:
     """Gain in nats less Schwarz's penalty, and less what a curve without a name has to exceed a named effect by."""
     gain = fit.log_likelihood - base.log_likelihood
     score = gain - 0.5 * fit.model.sizes[-1] * math.log(len(fit.residual))
-    return score - _handicap(gain) if fit.model.terms[-1].effect.id == UNKNOWN else score
+    return score - prefer.handicap(fit.model.terms[-1], gain)
 
 
-def _handicap(gain: float) -> float:
-    return _HANDICAP + _HANDICAP_SHARE * max(gain, 0.0)
-
-
-def _best_shape(fit: FittedModel, base: FittedModel, terms: tuple[Term, ...]) -> FittedModel:
+def _best_shape(fit: FittedModel, base: FittedModel, terms: tuple[Term, ...], prefer: Preference) -> FittedModel:
     """The fit, or a better one with another shape of the same effect; onsets are many, and closed in on later."""
     own = fit.model.terms[-1]
     others = [t for t in terms if t.key == own.key and t.shape != own.shape]
     if "onset" in own.shape or not others:
         return fit
     refits = [_reshaped(fit, base, other) for other in others]
-    return max([fit, *refits], key=lambda f: _score(f, base))
+    return max([fit, *refits], key=lambda f: _score(f, base, prefer))
 
 
 def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
@@ -259,12 +255,11 @@ def _overwhelming(
     return own.evidence - without.evidence - price > _OVERWHELMING
 
 
-def _ranking(terms: tuple[Term, ...], found: Gains) -> tuple[Ranked, ...]:
+def _ranking(terms: tuple[Term, ...], found: Gains, prefer: Preference) -> tuple[Ranked, ...]:
     """By gain in nats less one for each parameter (Akaike's criterion), each physics at its best shape."""
     gain = 0.5 * found.ratio[:, 0]
-    # a curve without a name can follow any named effect a little better; it has to do so clearly
-    nameless = torch.tensor([term.effect.id == UNKNOWN for term in terms])
-    score = gain - found.dof - torch.where(nameless, _HANDICAP + _HANDICAP_SHARE * gain, 0.0)
+    handicap = [prefer.handicap(term, float(one)) for term, one in zip(terms, gain, strict=True)]
+    score = gain - found.dof - gain.new_tensor(handicap)
     score = torch.where(found.dof > 0, score, -torch.inf)
     best: dict[Key, int] = {}
     for number in score.argsort(descending=True).tolist():

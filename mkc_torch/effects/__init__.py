@@ -22,6 +22,7 @@ from mkc_torch.effects.protocol import (
     LastingEffect,
     Quantity,
     Shape,
+    SignalEffect,
 )
 from mkc_torch.effects.temperature_offset import TemperatureOffset
 from mkc_torch.effects.unknown import Unknown
@@ -36,6 +37,7 @@ __all__ = [
     "LastingEffect",
     "Quantity",
     "Shape",
+    "SignalEffect",
 ]
 
 CATALOGUE: tuple[Effect, ...] = (

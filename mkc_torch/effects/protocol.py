@@ -21,6 +21,7 @@ __all__ = [
     "LastingEffect",
     "Quantity",
     "Shape",
+    "SignalEffect",
 ]
 
 Shape = Mapping[str, float]
@@ -59,7 +60,8 @@ class Quantity(NamedTuple):
 class Effect(Protocol):
     """A piece of physics. At γ = 0 it changes nothing.
 
-    Some effects can do more: :class:`ContinuousEffect`, :class:`LastingEffect`, :class:`AnchoredEffect`.
+    Some effects can do more: :class:`SignalEffect`, :class:`ContinuousEffect`, :class:`LastingEffect`,
+    :class:`AnchoredEffect`.
 
     Attributes:
         id: its name in ``diagnosis.json``.
@@ -102,6 +104,18 @@ class Effect(Protocol):
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
         """What the effect adds to the signal."""
         ...
+
+
+@runtime_checkable
+class SignalEffect(Effect, Protocol):
+    """An effect that can depend on the signal at its port; one without this attribute does not.
+
+    Attributes:
+        follows_signal: whether it does.
+    """
+
+    @property
+    def follows_signal(self) -> bool: ...
 
 
 @runtime_checkable

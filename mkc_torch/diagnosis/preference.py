@@ -1,0 +1,67 @@
+"""Which of two accounts goes first where both fit: physics with a known driver, unless another is clearly better."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.drivers import ANY
+from mkc_torch.diagnosis.model import Term
+from mkc_torch.effects.protocol import GainEffect
+from mkc_torch.simulation.protocol import PreparedSimulation
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["UNKNOWN", "Preference"]
+
+UNKNOWN = "unknown"
+"""Id of the effect that is a curve, not physics."""
+
+NAMELESS = (10.0, 0.1)
+"""A curve without a name can follow any named effect a little better: nats, and share of its gain, that it has to give."""
+
+ROLELESS, FOLLOWER, ALIKE_COLUMNS = 0.3, 0.6, 0.9
+"""A column of unknown role may be a consequence of a known driver; the second share holds above this correlation."""
+
+EVENT, ALIKE_EVENT = 0.4, 0.85
+"""An event in time that goes along with a known driver to more than this correlation gives this share."""
+
+_KNOWN = ("temperature", "current")
+
+
+class Preference:
+    """Handicaps of candidates, in nats.
+
+    Args:
+        terms: all candidates; their drivers of known role are what others are compared with.
+        prepared: the simulation of the recording.
+    """
+
+    def __init__(self, terms: Sequence[Term], prepared: PreparedSimulation) -> None:
+        drivers = {id(t.driver): t.driver for t in terms if t.driver is not None and t.driver.role in _KNOWN}
+        courses = [_unit(driver.values[:, 0]) for driver in drivers.values()]
+        self._known = torch.stack(courses) if courses else prepared.time.new_zeros(0, len(prepared.time))
+        self._prepared = prepared
+
+    def handicap(self, term: Term, gain: float) -> float:
+        """What a candidate's gain is lessened by before it is compared with others."""
+        fixed, share = NAMELESS if term.effect.id == UNKNOWN else (0.0, 0.0)
+        if term.driver is not None and term.driver.role == ANY:
+            share += FOLLOWER if self._alike(term.driver.values[:, 0]) > ALIKE_COLUMNS else ROLELESS
+        elif term.driver is None and isinstance(term.effect, GainEffect):
+            course = term.effect.course(term.shape, term.context(self._prepared, None))
+            share += EVENT if self._alike(course) > ALIKE_EVENT else 0.0
+        return fixed + share * max(gain, 0.0)
+
+    def _alike(self, course: Float[Tensor, " N"]) -> float:
+        """Largest correlation with one of the known drivers, either sign."""
+        return float((self._known @ _unit(course)).abs().max()) if len(self._known) else 0.0
+
+
+def _unit(course: Tensor) -> Tensor:
+    centred = course - course.mean()
+    return centred / torch.linalg.vector_norm(centred).clamp(min=1e-300)
