@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import sys
+from importlib.util import find_spec
 
-_EXTRA = ("typer", "rich", "polars", "matplotlib", "jinja2")
+_EXTRA = ("typer", "rich", "polars", "matplotlib", "jinja2", "jsonschema")
 
 
 def main() -> None:
@@ -14,13 +15,12 @@ def main() -> None:
     Raises:
         SystemExit: always; 0 when all was done, 1 when something failed, 2 for a command that makes no sense.
     """
-    try:
-        from mkc_torch._commands import app
-    except ModuleNotFoundError as error:
-        missing = (error.name or "").partition(".")[0]
-        if missing not in _EXTRA:
-            raise
+    # found, not imported: what is missing is said at once and not after the work, and what is not needed costs no time
+    missing = next((name for name in _EXTRA if find_spec(name) is None), None)
+    if missing is not None:
         sys.exit(f'mkc: {missing} is not installed; install the command line with `pip install "mkc-torch[cli]"`.')
+    from mkc_torch._commands import app
+
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a pipe's encoding may lack σ and ±

@@ -16,6 +16,7 @@ from mkc_torch._commands.console import (
     out,
     parsed_columns,
     progress,
+    refuse_same_names,
     with_unit,
 )
 from mkc_torch._commands.summary import show
@@ -24,7 +25,6 @@ from mkc_torch.calibration import Calibration
 from mkc_torch.calibration import calibrate as fit
 from mkc_torch.ellipsoid import NotIdentifiableError
 from mkc_torch.recording import Recording
-from mkc_torch.report import calibration_report, refusal_report
 
 
 def calibrate(
@@ -50,9 +50,9 @@ def calibrate(
         raise typer.BadParameter(f"--field-strength must be a positive number of µT but is {field_strength:g}.")
     if not unit.strip():
         raise typer.BadParameter("--unit is empty; name the unit, such as counts.")
-    _refuse_same_names(recordings)
+    refuse_same_names(recordings)
     console, failed = out(), 0
-    with progress([path.name for path in recordings]) as step:
+    with progress(len(recordings)) as step:
         for path in recordings:
             step(path.name)
             try:
@@ -60,9 +60,11 @@ def calibrate(
                 calibration, files = calibrate_into(output / path.stem, recording, field_strength, force=force)
             except FAILURES as error:
                 failed += 1
-                complain(path, error)
+                with step.aside():
+                    complain(path, error)
             else:
-                show(console, calibration, files)
+                with step.aside():
+                    show(console, calibration, files)
             step(None)
     if len(recordings) > 1 and failed:
         err().print(f"mkc: {failed} of {len(recordings)} recordings were not calibrated.", soft_wrap=True)
@@ -73,6 +75,8 @@ def calibrate_into(
     folder: Path, recording: Recording, field_strength: float | None, *, force: bool
 ) -> tuple[Calibration, list[Path]]:
     """Write calibration.json and report.html of a recording; where it is refused, the report alone says why."""
+    from mkc_torch.report import calibration_report, refusal_report
+
     claim_folder(folder, overwrite=force)
     report, result = folder / "report.html", folder / "calibration.json"
     with folder_removed_on_failure(folder):
@@ -87,14 +91,3 @@ def calibrate_into(
         write_atomically(result, calibration.to_json(), overwrite=force)
         write_atomically(report, page, overwrite=force)
     return calibration, [result, report]
-
-
-def _refuse_same_names(recordings: list[Path]) -> None:
-    taken: dict[str, Path] = {}
-    for path in recordings:
-        other = taken.setdefault(path.stem.casefold(), path)
-        if other is not path:
-            raise typer.BadParameter(
-                f"{other} and {path} would write into the same folder, {path.stem}; "
-                "rename one, or calibrate them in two calls with different --output."
-            )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import typer
@@ -19,9 +21,27 @@ FAILURES = (ValueError, OSError, ImportError, RuntimeError)
 _WIDTH_IN_A_PIPE = 100
 
 
+@dataclass(frozen=True)
+class Look:
+    """How text is set for where it goes; another process can set it too, and this one print it."""
+
+    terminal: bool
+    width: int
+
+    @classmethod
+    def of(cls, console: Console) -> Look:
+        return cls(console.is_terminal, console.width)
+
+    def set(self, show: Callable[[Console], None]) -> str:
+        """What ``show`` prints."""
+        text = io.StringIO()
+        show(_console(self.terminal, width=self.width, file=text))
+        return text.getvalue()
+
+
 def out() -> Console:
     """Standard output: coloured on a terminal, plain text of a fixed width in a pipe."""
-    return _console(sys.stdout.isatty(), stderr=False)
+    return _console(sys.stdout.isatty())
 
 
 def err() -> Console:
@@ -29,10 +49,13 @@ def err() -> Console:
     return _console(sys.stderr.isatty(), stderr=True)
 
 
-def _console(terminal: bool, *, stderr: bool) -> Console:
+def _console(
+    terminal: bool, *, stderr: bool = False, width: int | None = None, file: io.StringIO | None = None
+) -> Console:
     return Console(
-        stderr=stderr, highlight=False, soft_wrap=False,
-        force_terminal=terminal, no_color=None if terminal else True, width=None if terminal else _WIDTH_IN_A_PIPE,
+        file=file, stderr=stderr, highlight=False, soft_wrap=False,
+        force_terminal=terminal, no_color=None if terminal else True,
+        width=width if terminal else width or _WIDTH_IN_A_PIPE,
     )  # fmt: skip
 
 
@@ -92,28 +115,64 @@ def with_unit(recording: Recording, unit: str) -> Recording:
     )
 
 
-@contextmanager
-def progress(names: Sequence[str]) -> Iterator[Callable[[str | None], None]]:
-    """A bar over several files on a terminal; nothing for one file or in a pipe.
+def refuse_same_names(recordings: Sequence[Path]) -> None:
+    """Refuses recordings whose results would go to one place.
 
-    Gives a function to call with the name of each file begun, and with None when one is done.
+    Raises:
+        typer.BadParameter: two have the same name, but for the ending and for capitals.
     """
+    taken: dict[str, Path] = {}
+    for path in recordings:
+        other = taken.setdefault(path.stem.casefold(), path)
+        if other is not path:
+            raise typer.BadParameter(
+                f"{other} and {path} would write into the same folder, {path.stem}; "
+                "rename one, or give them in two calls with different --output."
+            )
+
+
+class Steps:
+    """A bar over several things to do; without one it does nothing."""
+
+    def __init__(self, bar: Progress | None, total: int) -> None:
+        self._bar = bar
+        self._task = None if bar is None else bar.add_task("", total=total)
+
+    def __call__(self, name: str | None) -> None:
+        """To be called with the name of each thing begun, and with None when one is done."""
+        if self._bar is None or self._task is None:
+            return
+        if name is None:
+            self._bar.advance(self._task)
+        else:
+            self._bar.update(self._task, description=name)
+
+    def count(self, name: str, done: int, total: int) -> None:
+        """Name what is being done, and how much of it is."""
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, description=name, completed=done, total=total)
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """The bar is out of the way of what is printed meanwhile."""
+        if self._bar is None:
+            yield
+            return
+        self._bar.stop()
+        yield
+        self._bar.start()
+
+
+@contextmanager
+def progress(total: int) -> Iterator[Steps]:
+    """A bar over several things on a terminal; nothing for one thing or in a pipe."""
     console = err()
-    if len(names) < 2 or not console.is_terminal:
-        yield lambda _: None
+    if total < 2 or not console.is_terminal:
+        yield Steps(None, total)
         return
     parts = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    both = sys.stdout.isatty()  # else what is printed would go where the bar is, not into the user's file
-    with Progress(*parts, console=console, transient=True, redirect_stdout=both) as bar:
-        task = bar.add_task("", total=len(names))
-
-        def step(name: str | None) -> None:
-            if name is None:
-                bar.advance(task)
-            else:
-                bar.update(task, description=name)
-
-        yield step
+    with Progress(*parts, console=console, transient=True, redirect_stdout=False, redirect_stderr=False) as bar:
+        yield Steps(bar, total)
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
@@ -17,8 +17,10 @@ from mkc_torch.demo import Truth, simulated_recording
 from mkc_torch.ellipsoid import EllipsoidFit
 from mkc_torch.linear import LeastSquares
 from mkc_torch.recording import Recording, write_table
-from mkc_torch.report import Comparison, calibration_report
 from mkc_torch.report.wording import number
+
+if TYPE_CHECKING:
+    from mkc_torch.report import Comparison
 
 _NOTE = (
     "SIMULATED: no sensor recorded this. A program turned a sensor with a known offset and known gains through all "
@@ -49,6 +51,8 @@ def demo(
 
 
 def _demonstrate(folder: Path, *, force: bool) -> tuple[Calibration, list[Comparison], list[Path]]:
+    from mkc_torch.report import calibration_report
+
     recording, truth = simulated_recording()
     calibration = calibrate(recording)
     rows = _comparison(recording, truth, calibration)
@@ -61,6 +65,8 @@ def _demonstrate(folder: Path, *, force: bool) -> tuple[Calibration, list[Compar
 
 
 def _comparison(recording: Recording, truth: Truth, calibration: Calibration) -> list[Comparison]:
+    from mkc_torch.report import Comparison
+
     squares = EllipsoidFit(LeastSquares()).fit(recording.magnetometer())
     return [
         Comparison("truth", truth.center, truth.semi_axes),

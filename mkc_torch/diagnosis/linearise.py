@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.noise import (
     colour_of,
     cosines,
     dct,
+    enters_at_port,
     port_colour,
 )
 from mkc_torch.diagnosis.search import LinearSearch
@@ -100,7 +101,8 @@ class Linearised:
         flat = self.colour.whiten(torch.einsum("nmc,ncb->nmb", pointwise, drawn))
         rows = len(self.series) - len(flat)
         prior = torch.randn(rows, count, generator=generator, dtype=flat.dtype)
-        return torch.cat([flat / flat.std(), prior])
+        # the colour knows how much there is at each frequency; the draws know how frequencies hang together
+        return torch.cat([flat / flat.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-300), prior])
 
 
 def linearise(
@@ -142,7 +144,11 @@ def linearise(
     if slow is None or tangents.pointwise[slow.port] is None:
         return found
     block = counts.unsqueeze(-1) * tangents.pointwise[slow.port]
-    return replace(found, entrance=(block, port_colour(pseudo, block)))
+    # the wander is drawn for itself
+    beside = pseudo - slow.tangents @ found.search.courses(found.series)
+    if not enters_at_port(beside, block):
+        return found
+    return replace(found, entrance=(block, port_colour(beside, block)))
 
 
 def _searching(

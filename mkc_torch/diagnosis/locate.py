@@ -27,10 +27,10 @@ __all__ = ["SEPARABLE", "Located", "Ranked", "locate"]
 SEPARABLE = 4.5
 """Nats by which a rival must be less likely to count as told apart: three standard errors of what sets them apart."""
 
-_SHORT_LIST = 5
+_SHORT_LIST = 4
 _PARTS, _BETTER = 2, 0.8
 _ROUNDS = 3
-_LEADING = 3
+_LEADING = 2
 _RAW = 1000.0
 _OVERWHELMING = 150.0
 """Nats by which an account has to be likelier that no draws of noise are needed to tell."""
@@ -114,7 +114,9 @@ def locate(
     ranking = _ranking(terms, found, prefer)
     first = terms[ranking[0].number]
     if p_value <= level and first.key != best.model.terms[-1].key:
-        best = _refined(_refitted(best, base, first, linearised, ranking[0].number), base)
+        best = _refitted(best, base, first, linearised, ranking[0].number)
+    if p_value <= level:
+        best = _refined(best, base, again=True)
     return Located(best.model.terms[-1], best, p_value, ranking, noise, linearised, tangents, terms)
 
 
@@ -177,15 +179,18 @@ def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *
     _refit_all(fits, base, listed, prefer)
     if parts:
         least = torch.stack([fit.d for fit in fits.values()]).amin(0)
-        _refit_all(fits, base, [one for start in _part_starts(base, least) for one in _short_list(base, terms, [start], 2)], prefer)
+        _refit_all(
+            fits,
+            base,
+            [one for start in _part_starts(base, least) for one in _short_list(base, terms, [start], 2)],
+            prefer,
+        )
     leading = sorted(fits.values(), key=lambda fit: _score(fit, base, prefer), reverse=True)[:_LEADING]
     shaped = [_refined(_best_shape(fit, base, terms, prefer), base) for fit in leading]
     return max(shaped, key=lambda fit: _score(fit, base, prefer))
 
 
-def _refit_all(
-    fits: dict[Key, FittedModel], base: FittedModel, listed: Sequence[Listed], prefer: Preference
-) -> None:
+def _refit_all(fits: dict[Key, FittedModel], base: FittedModel, listed: Sequence[Listed], prefer: Preference) -> None:
     """Put the joint refit of each into ``fits``, where it is the better one of its physics."""
     done: set[tuple[Key, int]] = set()
     for term, parameters, gamma in listed:
@@ -273,8 +278,14 @@ def _refitted(best: FittedModel, base: FittedModel, term: Term, linearised: Line
     return fitted(base.model.with_term(term), start, base.bound)
 
 
-def _refined(best: FittedModel, base: FittedModel) -> FittedModel:
-    """The fit with the likeliest values of its shape's continuous numbers, closed in on one by one."""
+def _refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> FittedModel:
+    """The fit with the likeliest values of its shape's continuous numbers, closed in on one by one.
+
+    Args:
+        best: the fit.
+        base: what it is beside.
+        again: once more from there, with the amplitudes that fit the new shape.
+    """
     term = best.model.terms[-1]
     names = [name for name in term.shape if name in getattr(term.effect, "continuous", ())]
     if not names:
@@ -285,7 +296,9 @@ def _refined(best: FittedModel, base: FittedModel) -> FittedModel:
             value = [_energy(best, base.model.with_term(shape)) for shape in shapes]
             term = shapes[min(range(len(shapes)), key=value.__getitem__)]
     moved = fitted(base.model.with_term(term), best.parameters, base.bound, graduate=False)
-    return moved if moved.log_likelihood > best.log_likelihood else best
+    if moved.log_likelihood <= best.log_likelihood:
+        return best
+    return _refined(moved, base) if again else moved
 
 
 def _energy(fit: FittedModel, model: JointModel) -> float:

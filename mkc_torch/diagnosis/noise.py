@@ -17,7 +17,17 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Colour", "autoregressive", "colour_of", "cosines", "dct", "inverse_dct", "port_colour", "pseudo_residual"]
+__all__ = [
+    "Colour",
+    "autoregressive",
+    "colour_of",
+    "cosines",
+    "dct",
+    "enters_at_port",
+    "inverse_dct",
+    "port_colour",
+    "pseudo_residual",
+]
 
 MAX_ORDER = 12
 """Highest order of the autoregression."""
@@ -126,6 +136,29 @@ def port_colour(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c"])
     overlap = torch.stack([(pointwise[: N - lag] * pointwise[lag:]).sum() / N for lag in range(highest + 1)])
     ratio = (overlap / overlap[0]).clamp(min=0.2)
     return _levinson(covariance / ratio, N * values.shape[1])
+
+
+def enters_at_port(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c"]) -> bool:
+    """Whether coloured noise is rather that of a port whose axes turn against the residual than the residual's own.
+
+    Products of residuals some samples apart are regressed on how much of the port's axes they share: noise that enters
+    there is proportional to it, the residual's own does not depend on it. The larger part over all lags decides.
+    """
+    N = len(values)
+    through, own = 0.0, 0.0
+    lag = 2
+    while lag <= N // 20:
+        product = (values[:-lag] * values[lag:]).flatten()
+        overlap = (pointwise[:-lag] * pointwise[lag:]).sum(-1).flatten()
+        used = overlap != 0
+        product, overlap = product[used], overlap[used]
+        if len(product) > 2:
+            centred = overlap - overlap.mean()
+            slope = float(centred @ product) / max(float(centred @ centred), 1e-300)
+            part = slope * float(overlap.mean())
+            through, own = through + part, own + float(product.mean()) - part
+        lag = math.ceil(1.5 * lag)
+    return through > own
 
 
 def autoregressive(coefficients: Tensor, N: int, count: int, generator: torch.Generator) -> Float[Tensor, "N count"]:

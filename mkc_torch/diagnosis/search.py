@@ -218,6 +218,16 @@ class LinearSearch:
         share = float(trace.square().sum() / whole.square().sum().clamp(min=1e-300))
         return trace, basis[:, size > 1e-6 * size[0].clamp(min=1e-300)], share
 
+    def courses(self, series: Float[Tensor, " M"]) -> Float[Tensor, " k"]:
+        """Amplitudes of the slow courses in the likeliest wander, their best linear prediction."""
+        fit = self.noise_fit(series)
+        if fit.size == 0:
+            return self._wander.new_zeros(self._wander.shape[1])
+        family = self._families[fit.family]
+        left = series - self._basis @ (self._basis.mT @ series)
+        rotated = family.axes.mT @ (family.scale * (self._wander.mT @ left))
+        return family.scale * (family.axes @ (fit.size / (1.0 + fit.size * family.strength) * rotated))
+
     def stationary(self, series: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
         """Expected square of the stationary noise of each coordinate, under the likeliest wander.
 

@@ -1,5 +1,27 @@
 """Reports a user reads: one HTML page each, pictures within, nothing loaded from elsewhere. Needs the ``cli`` extra."""
 
-from mkc_torch.report.calibration import Comparison, calibration_report, refusal_report
+from __future__ import annotations
 
-__all__ = ["Comparison", "calibration_report", "refusal_report"]
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mkc_torch.report.calibration import Comparison, calibration_report, refusal_report
+    from mkc_torch.report.diagnosis import diagnosis_report
+
+__all__ = ["Comparison", "calibration_report", "diagnosis_report", "refusal_report"]
+
+_HOMES = {
+    "Comparison": "calibration",
+    "calibration_report": "calibration",
+    "diagnosis_report": "diagnosis",
+    "refusal_report": "calibration",
+}
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        # templates and pictures take half a second to import, and many a command needs the wording alone
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

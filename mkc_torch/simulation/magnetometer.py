@@ -209,7 +209,7 @@ class AttitudeView(_View):
         }
         self.prior = _matrix_prior(len(self.parameter_names))
         self.strength, self._ahead = 1.0, self.measured.new_zeros(3)
-        offset, ahead = self._offset_and_field(None)
+        offset, ahead = self._offset_and_field()
         self.strength = float(torch.linalg.vector_norm(ahead))
         self._ahead = ahead / self.strength
         self._across = torch.linalg.svd(self._ahead.unsqueeze(0)).Vh[1:]
@@ -228,20 +228,17 @@ class AttitudeView(_View):
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Tensor:
         if rows is None:
             return self._full.clone()
-        offset, field = self._offset_and_field(rows)
-        size = torch.linalg.vector_norm(field)
-        matrix = (size / self.strength) * torch.eye(3, dtype=field.dtype)
-        ahead = field / size
-        tilt = self._across @ ahead / (self._ahead @ ahead)
-        return torch.cat([offset, matrix.flatten(), tilt])
+        if int(rows.sum()) < _MIN_ROWS:
+            raise ValueError(f"{int(rows.sum())} samples are too few for the offset and the response.")
+        turned = torch.einsum("kij,i->kj", self.to_world[rows], self.strength * self._ahead)
+        offset = (self.measured[rows] - turned).median(0).values
+        offset, response = _response(self.measured[rows], turned, offset)
+        return torch.cat([offset, response.flatten(), offset.new_zeros(2)])
 
-    def _offset_and_field(self, rows: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _offset_and_field(self) -> tuple[Tensor, Tensor]:
         """Offset and world field by least trimmed squares, the matrix taken for the identity."""
-        turn, seen = (self.to_world, self.measured) if rows is None else (self.to_world[rows], self.measured[rows])
-        if len(seen) < _MIN_ROWS:
-            raise ValueError(f"{len(seen)} samples are too few for the offset and the world's field.")
-        eye = torch.eye(3, dtype=turn.dtype).expand(len(turn), 3, 3)
-        coefficients = LeastTrimmedSquares().fit(torch.cat([eye, turn.mT], -1), seen).coef_
+        eye = torch.eye(3, dtype=self.to_world.dtype).expand(len(self.to_world), 3, 3)
+        coefficients = LeastTrimmedSquares().fit(torch.cat([eye, self.to_world.mT], -1), self.measured).coef_
         return coefficients[:3], coefficients[3:]
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:

@@ -1,0 +1,112 @@
+"""``mkc challenge``: the blind proof of this installation's own diagnosis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import torch
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from mkc_torch._commands.apply import correct, read_correction
+from mkc_torch._commands.console import FAILURES, Look, complain, out, progress
+from mkc_torch._commands.diagnosis_files import Request, diagnose_file
+from mkc_torch._commands.processes import cores
+from mkc_torch.recording import Recording
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from mkc_torch.challenge import Score
+
+_QUIET = Look(terminal=False, width=100)
+
+
+def challenge(
+    output: Annotated[Path, typer.Option(help="Folder for recordings, key, diagnoses and page.")] = Path(
+        "mkc_challenge"
+    ),
+    cases: Annotated[
+        int | None, typer.Option(metavar="N", min=0, help="Recordings with something hidden; default: 240.")
+    ] = None,
+    empty: Annotated[
+        int | None,
+        typer.Option(metavar="M", min=0, help="Recordings with nothing hidden; default: five for three others."),
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="S", min=0, help="Of all that is drawn.")] = 1,
+    duration: Annotated[float, typer.Option(metavar="s", min=10.0, help="Length of a recording in s.")] = 90.0,
+    workers: Annotated[
+        int | None, typer.Option(metavar="W", min=1, help="Processes; default: as many as cores.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
+) -> None:
+    """Hide physics in simulated recordings, have them diagnosed by who was not told, and only then open the key.
+
+    A hash of the key is written before the first diagnosis, so that it can be shown not to have changed.
+    """
+    from mkc_torch.challenge import run
+
+    cases = run.CASES if cases is None else cases
+    empty = round(cases * run.EMPTY / run.CASES) if empty is None else empty
+    if cases + empty == 0:
+        raise typer.BadParameter("--cases and --empty are both 0; ask for one recording at least.")
+    torch.set_num_threads(1)
+    try:
+        with progress(cases + empty) as step:
+            score = run.run_challenge(
+                diagnose_unseen, correct_unseen, cases=cases, empty=empty, seed=seed, output=output, overwrite=force,
+                workers=min(workers or cores(), cases + empty), duration=duration, progress=step.count,
+            )  # fmt: skip
+    except FAILURES as error:
+        complain(output, error)
+        raise typer.Exit(1) from None
+    _show(score, cases, empty, output)
+
+
+def diagnose_unseen(paths: list[Path], folder: Path) -> None:
+    """Diagnose recordings as ``mkc diagnose`` does, but for the reports, which nobody reads in this number."""
+    for path in paths:
+        place = folder / path.stem
+        for old in ("diagnosis.json", "model.json"):  # of an earlier run, which would be scored in place of a failure
+            (place / old).unlink(missing_ok=True)
+        for outcome in diagnose_file(path, place, Request(force=True, report=False), _QUIET):
+            if outcome.failed:
+                (folder / f"{path.stem}.error.txt").write_text(f"{outcome.text}\n", encoding="utf-8")
+
+
+def correct_unseen(model: Path, recording: Path) -> Mapping[str, Tensor]:
+    """A recording corrected as ``mkc apply`` does."""
+    return correct(read_correction(model), Recording.read(recording)).columns
+
+
+def _show(score: Score, cases: int, empty: int, output: Path) -> None:
+    from mkc_torch.challenge.page import number_text, share_text
+
+    console = out()
+    console.print()
+    console.print(Text(f"Blind proof: {cases} recordings with something hidden, {empty} with nothing", style="bold"))
+    table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
+    table.add_column("asked", overflow="fold")
+    table.add_column("measured", justify="right")
+    table.add_column("holds")
+    for m in score.measured:
+        table.add_row(
+            Text(m.threshold.sentence),
+            number_text(m.value),
+            Text("yes") if m.holds else Text("no", style="bold yellow"),
+        )
+    console.print(table)
+    facts = Table.grid(padding=(0, 3, 0, 0))
+    facts.add_column(no_wrap=True)
+    facts.add_column(overflow="fold")
+    facts.add_row("false alarms", share_text(score.false_alarms))
+    facts.add_row("named right", share_text(score.named))
+    facts.add_row("driver right", share_text(score.driver))
+    facts.add_row("failed", ", ".join(score.failed) or "none")
+    console.print(facts)
+    for name in ("challenge.html", "summary.md", "key_hash.txt"):
+        # outside the table, where a long path would be broken and could not be copied
+        console.print(Text.assemble(f"{'written':<15}", (str(output / name), "cyan")), soft_wrap=True)

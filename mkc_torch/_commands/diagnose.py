@@ -1,0 +1,140 @@
+"""``mkc diagnose``: recordings in, and out for each what its simulation lacks, a model with it, and a report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+
+from mkc_torch._commands.console import Look, Steps, err, out, parsed_columns, progress, refuse_same_names
+from mkc_torch._commands.diagnosis_files import SIMULATIONS, Outcome, Request, diagnose_file
+from mkc_torch._commands.processes import in_processes
+
+_SURROGATES = 99
+
+
+def diagnose(
+    recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="CSV or Parquet files with a header.")],
+    simulation: Annotated[
+        str, typer.Option(metavar="NAME", help=f"What the recordings are compared with: {', '.join(SIMULATIONS)}.")
+    ],
+    output: Annotated[Path, typer.Option(help="Folder; each REC gets a folder of its name in it.")],
+    columns: Annotated[
+        str | None,
+        typer.Option(metavar="NAME=COLUMN,...", help="What the columns are called: mag_x=mx,temperature=IMU_T"),
+    ] = None,
+    unit: Annotated[str, typer.Option(help="Unit of the magnetometer's columns, such as counts.")] = "µT",
+    experiments: Annotated[
+        str | None,
+        typer.Option(metavar="COLUMN", help="Column that separates runs in one table; default: experiment, if any."),
+    ] = None,
+    level: Annotated[float, typer.Option(metavar="RATE", help="Rate of false alarms.")] = 0.05,
+    surrogates: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", help=f"Draws of noise for each p-value; default: {_SURROGATES}, more at a low level."
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, metavar="S", help="Of the draws of noise.")] = 0,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
+) -> None:
+    """Say what a simulation lacks: where recordings differ from it, by what physics, how sure, and how much it helps.
+
+    Each REC gets diagnosis.json, model.json (for `mkc apply`) and report.html. Exits with 0 when every recording was
+    diagnosed, whatever was found, and 1 when some were not.
+    """
+    request = Request(
+        simulation=_known(simulation),
+        columns=_columns(columns, experiments),
+        unit=_unit(unit),
+        level=_level(level),
+        surrogates=_surrogates(surrogates, level),
+        seed=seed,
+        force=force,
+    )
+    refuse_same_names(recordings)
+    torch.set_num_threads(1)
+    look = Look.of(out())
+    work = partial(_diagnosed, output, request, look)
+    total = failed = 0
+    with progress(len(recordings)) as step, in_processes(work, recordings) as results:
+        for path, result in zip(recordings, results, strict=True):
+            step(path.name)
+            outcomes = _waited_for(result, path)
+            _tell(outcomes, step)
+            total += len(outcomes)
+            failed += sum(outcome.failed for outcome in outcomes)
+            step(None)
+    if total > 1 and failed:
+        err().print(f"mkc: {failed} of {total} recordings were not diagnosed.", soft_wrap=True)
+    raise typer.Exit(1 if failed else 0)
+
+
+def _diagnosed(output: Path, request: Request, look: Look, path: Path) -> list[Outcome]:
+    return diagnose_file(path, output / path.stem, request, look)
+
+
+def _waited_for(result: Callable[[], list[Outcome]], path: Path) -> list[Outcome]:
+    try:
+        return result()
+    except BrokenProcessPool:
+        return [Outcome(f"{path}: its process ended, perhaps for lack of memory; try it in a call of its own.", True)]
+
+
+def _tell(outcomes: list[Outcome], step: Steps) -> None:
+    with step.aside():
+        for outcome in outcomes:
+            if outcome.failed:
+                err().print(f"mkc: {outcome.text}", markup=False, soft_wrap=True)
+            else:
+                typer.echo(outcome.text, nl=False)
+
+
+def _known(simulation: str) -> str:
+    if simulation not in SIMULATIONS:
+        raise typer.BadParameter(
+            f'--simulation "{simulation}" is not known; known: {", ".join(SIMULATIONS)}. Name one of them.'
+        )
+    return simulation
+
+
+def _columns(columns: str | None, experiments: str | None) -> dict[str, str]:
+    names = parsed_columns(columns)
+    if experiments is None:
+        return names
+    if not experiments.strip():
+        raise typer.BadParameter("--experiments is empty; name the column that separates the runs.")
+    if names.setdefault("experiment", experiments.strip()) != experiments.strip():
+        raise typer.BadParameter("--columns and --experiments name different columns for experiment; leave one out.")
+    return names
+
+
+def _unit(unit: str) -> str:
+    if not unit.strip():
+        raise typer.BadParameter("--unit is empty; name the unit, such as counts.")
+    return unit
+
+
+def _level(level: float) -> float:
+    if not 0.0 < level < 1.0:
+        raise typer.BadParameter(f"--level must be a rate between 0 and 1 but is {level:g}.")
+    return level
+
+
+def _surrogates(count: int | None, level: float) -> int:
+    """Draws for each p-value: no p-value can be smaller than one over their number plus one."""
+    fewest = math.ceil(1.0 / level - 1.0 - 1e-9)
+    if count is None:
+        return max(_SURROGATES, fewest)
+    if count < fewest:
+        raise typer.BadParameter(
+            f"--surrogates must be at least {fewest} at level {level:g}, for no p-value is smaller than "
+            f"1 / (surrogates + 1), but is {count}."
+        )
+    return count

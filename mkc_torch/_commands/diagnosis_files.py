@@ -1,0 +1,160 @@
+"""From a recording's file to the files of its diagnosis: what `mkc diagnose` and `mkc challenge` both run."""
+
+from __future__ import annotations
+
+import re
+import traceback
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mkc_torch._commands.console import FAILURES, Look, folder_removed_on_failure, sentence_of, with_unit
+from mkc_torch._commands.diagnosis_summary import show
+from mkc_torch._files import claim_folder, write_atomically
+from mkc_torch.diagnosis import Diagnosis, diagnose
+from mkc_torch.recording import Recording
+
+if TYPE_CHECKING:
+    from mkc_torch.simulation import Simulation
+
+__all__ = ["MAGNETOMETER", "SIMULATIONS", "Outcome", "Request", "diagnose_file", "folder_names", "write_diagnosis"]
+
+MAGNETOMETER = "magnetometer"
+SIMULATIONS = (MAGNETOMETER,)
+"""Simulations that are known by name."""
+
+_EXPERIMENT = "experiment"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of each recording."""
+
+    simulation: str = MAGNETOMETER
+    columns: Mapping[str, str] = field(default_factory=dict)
+    unit: str = "µT"
+    level: float = 0.05
+    surrogates: int = 99
+    seed: int = 0
+    force: bool = False
+    report: bool = True
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A recording, or one experiment of it: its summary, or the sentence that says why there is none."""
+
+    text: str
+    failed: bool
+
+
+def diagnose_file(path: Path, folder: Path, request: Request, look: Look) -> list[Outcome]:
+    """Diagnose a file into a folder; each experiment of a table that holds several on its own, into a folder in it.
+
+    One that fails does not keep the others from being done.
+    """
+    try:
+        recording = with_unit(Recording.read(path, columns=request.columns), request.unit)
+        claim_folder(folder, overwrite=request.force)
+    except Exception as error:
+        return [_failed(path, "", error)]
+    with folder_removed_on_failure(folder):
+        outcomes = [
+            _outcome(path, label, part, place, request, look) for label, part, place in _parts(recording, folder)
+        ]
+        if all(outcome.failed for outcome in outcomes):
+            _remove_if_empty(folder)
+    return outcomes
+
+
+def write_diagnosis(diagnosis: Diagnosis, folder: Path, *, force: bool, report: bool = True) -> list[Path]:
+    """Write diagnosis.json, model.json and report.html of a diagnosis into a folder."""
+    from mkc_torch.diagnosis.diagnosis_file import diagnosis_to_json
+    from mkc_torch.report import diagnosis_report
+
+    texts = {"diagnosis.json": diagnosis_to_json(diagnosis)}
+    if diagnosis.model is not None:
+        texts["model.json"] = diagnosis.model.to_json()
+    else:
+        (folder / "model.json").unlink(missing_ok=True)  # an old one would be taken for this diagnosis' own
+    if report:
+        texts["report.html"] = diagnosis_report(diagnosis)
+    for name, text in texts.items():
+        write_atomically(folder / name, text, overwrite=force)
+    return [folder / name for name in texts]
+
+
+def folder_names(labels: list[str]) -> list[str]:
+    """A folder's name for each label, no two alike on any file system.
+
+    Example:
+        >>> folder_names(["run 1", "a/b", "A:B", "..", ""])
+        ['run 1', 'a_b', 'A_B_2', '_', '__2']
+    """
+    names: list[str] = []
+    taken: set[str] = set()
+    for label in labels:
+        plain = re.sub(r"[^\w .+-]", "_", label).strip(" .")[:100] or "_"
+        name, count = plain, 1
+        while name.casefold() in taken:
+            count += 1
+            name = f"{plain}_{count}"
+        taken.add(name.casefold())
+        names.append(name)
+    return names
+
+
+def _parts(recording: Recording, folder: Path) -> Iterator[tuple[str, Recording, Path]]:
+    """The experiments of a table, with their labels and folders; of one without, itself."""
+    if _EXPERIMENT not in recording:
+        yield "", recording, folder
+        return
+    parts = recording.experiments()
+    for (label, part), name in zip(parts.items(), folder_names(list(parts)), strict=True):
+        yield label, part, folder / name
+
+
+def _outcome(path: Path, label: str, recording: Recording, folder: Path, request: Request, look: Look) -> Outcome:
+    try:
+        claim_folder(folder, overwrite=request.force or not label)  # the whole folder was claimed before
+        with folder_removed_on_failure(folder):
+            diagnosis = diagnose(
+                _simulation(request.simulation), recording,
+                level=request.level, surrogates=request.surrogates, seed=request.seed,
+            )  # fmt: skip
+            files = write_diagnosis(diagnosis, folder, force=request.force, report=request.report)
+    except Exception as error:
+        return _failed(path, label, error)
+    return Outcome(look.set(lambda console: show(console, diagnosis, files)), failed=False)
+
+
+def _simulation(name: str) -> Simulation:
+    from mkc_torch.simulation import Magnetometer
+
+    if name != MAGNETOMETER:
+        raise ValueError(f'there is no simulation "{name}"; known: {", ".join(SIMULATIONS)}.')
+    return Magnetometer()
+
+
+def _failed(path: Path, label: str, error: Exception) -> Outcome:
+    subject = f"{path}, experiment {label}" if label else str(path)
+    sentence = sentence_of(error) if isinstance(error, FAILURES) else _unexpected(error)
+    return Outcome(sentence if sentence.startswith(subject) else f"{subject}: {sentence}", failed=True)
+
+
+def _unexpected(error: Exception) -> str:
+    """What is no fault of the user's, with the place to look at."""
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f" in {Path(frames[-1].filename).name}, line {frames[-1].lineno}" if frames else ""
+    told = sentence_of(error)
+    return (
+        f"an error of the program's own ({type(error).__name__}{where}{f': {told}' if told else ''}); please report it."
+    )
+
+
+def _remove_if_empty(folder: Path) -> None:
+    try:
+        folder.rmdir()
+    except OSError:
+        return

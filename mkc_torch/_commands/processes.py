@@ -1,0 +1,84 @@
+"""Work on several files at once: one process a core, quiet when interrupted."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import contextmanager, suppress
+from typing import TypeVar
+
+import torch
+
+__all__ = ["cores", "in_processes"]
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def cores() -> int:
+    """Cores that this process may use.
+
+    Example:
+        >>> cores() >= 1
+        True
+    """
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def in_processes(work: Callable[[T], R], items: Sequence[T]) -> Iterator[Iterator[Callable[[], R]]]:
+    """For each item, in order, a function that waits for its result.
+
+    A single item is worked on in this process. A function raises what ``work`` raised, and :class:`BrokenProcessPool`
+    for an item whose process died.
+    """
+    workers = min(len(items), cores())
+    if workers < 2:
+        yield (lambda item=item: work(item) for item in items)  # type: ignore[misc]
+        return
+    before = set(multiprocessing.active_children())
+    # spawned, for torch's threads do not survive a fork
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start) as pool:
+        try:
+            with _not_interrupted():  # processes that start inherit it, and say nothing when they are interrupted
+                futures: list[Future[R]] = [pool.submit(_interruptible, work, item) for item in items]
+            yield (future.result for future in futures)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for child in set(multiprocessing.active_children()) - before:
+                with suppress(ProcessLookupError, TypeError):
+                    os.kill(child.pid, signal.SIGINT)  # type: ignore[arg-type]
+            raise
+
+
+def _start() -> None:
+    torch.set_num_threads(1)  # as many processes as cores leave none for more
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _interruptible(work: Callable[[T], R], item: T) -> R:
+    """Work that an interrupt ends as it would here: what is half-written is cleared away."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return work(item)
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextmanager
+def _not_interrupted() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    known = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, known)
