@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.drivers import Driver
 from mkc_torch.diagnosis.model import Term
-from mkc_torch.effects.protocol import Effect, Shape
+from mkc_torch.effects.protocol import ContinuousEffect, Effect, Shape
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ def finer(term: Term, name: str, time: Float[Tensor, " N"], rounds: int) -> tupl
         time: of the recording.
         rounds: how often the range was narrowed before.
     """
+    assert isinstance(term.effect, ContinuousEffect)
     low, high = (share * float(time[-1] - time[0]) for share in term.effect.continuous[name])
     offset = float(time[0]) if name == "onset" else 0.0
     value = term.shape[name]

@@ -58,9 +58,9 @@ def diagnose(
 ) -> Diagnosis:
     """What a simulation lacks, by one recording of what it simulates.
 
-    The simulation's own parameters are fitted together with every candidate: effect × driver × shape. The strongest one
-    is judged by the same search on draws of the fitted noise; what passes is kept, refitted jointly, and the search goes
-    on beside it.
+    The simulation's own parameters are fitted together with every candidate: effect × driver × shape. The strongest
+    one is judged by the same search on draws of the fitted noise; what passes is kept, refitted jointly, and the search
+    goes on beside it.
 
     Args:
         simulation: of the recording, such as :class:`mkc_torch.simulation.Magnetometer`.
@@ -89,7 +89,7 @@ def diagnose(
     where = f"{recording.name}: " if recording.name else ""
     if len(recording) < FEWEST:
         raise ValueError(
-            f"{where}{len(recording)} samples are too few for a diagnosis; it needs {FEWEST} at least. Record for longer."
+            f"{where}{len(recording)} samples are too few for a diagnosis; it needs {FEWEST} at least. Record longer."
         )
     prepared = simulation.prepare(recording)
     if len(prepared.time) < FEWEST:
@@ -282,7 +282,7 @@ def _time_warnings(prepared: PreparedSimulation) -> tuple[str, ...]:
     if prepared.recording.time is not None:
         return ()
     return (
-        "The recording has no column `time`: sample numbers stand in for seconds, and the samples count as evenly spaced.",
+        "The recording has no column `time`: sample numbers stand in for seconds, and samples count as evenly spaced.",
     )
 
 

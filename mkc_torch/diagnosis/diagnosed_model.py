@@ -14,7 +14,7 @@ from mkc_torch.diagnosis.drivers import Driver
 from mkc_torch.diagnosis.estimate import Estimate
 from mkc_torch.diagnosis.model import Term
 from mkc_torch.effects import CATALOGUE
-from mkc_torch.effects.protocol import Context, Effect
+from mkc_torch.effects.protocol import AnchoredEffect, Context, Effect, LastingEffect
 from mkc_torch.recording import MissingColumnError, Recording
 from mkc_torch.simulation.protocol import Correction
 from mkc_torch.simulation.registry import correction_of
@@ -99,12 +99,11 @@ class DiagnosedModel(nn.Module):
         return self.correct(recording)[0]
 
     def _change(self, term: Term, gamma: Tensor, context: Context) -> tuple[Tensor, list[str]]:
-        lasting = getattr(term.effect, "lasting", None)
-        if lasting is None:
+        if not isinstance(term.effect, LastingEffect):
             return term.effect.change(gamma, term.shape, context), []
-        return lasting(gamma, context), [
-            f"{term.effect.id} is bound to the time of the diagnosed recording: its offset at the end is taken off all of "
-            "this one."
+        return term.effect.lasting(gamma, context), [
+            f"{term.effect.id} is bound to the time of the diagnosed recording: its offset at the end is taken off all "
+            "of this one."
         ]
 
     def to_json(self) -> str:
@@ -169,9 +168,8 @@ def model_of(final: Estimate) -> DiagnosedModel:
     signals = model.prepared.signals(final.fit.parameters[: model.base])
     terms = []
     for term in model.terms:
-        anchored = getattr(term.effect, "anchored", None)
         context = term.context(model.prepared, signals.get(term.effect.port))
-        shape = term.shape if anchored is None else anchored(term.shape, context)
+        shape = term.effect.anchored(term.shape, context) if isinstance(term.effect, AnchoredEffect) else term.shape
         terms.append(Term(term.effect, term.driver, shape))
     parameters = final.fit.parameters
     return DiagnosedModel(
@@ -216,7 +214,8 @@ def _finite(value: Any) -> float:
 
 def _context(term: Term, correction: Correction, signal: Tensor, recording: Recording) -> Context:
     port = correction.ports[term.effect.port]
-    drivers, units = signal.new_zeros(len(signal), 0), ()
+    drivers = signal.new_zeros(len(signal), 0)
+    units: tuple[str, ...] = ()
     if term.driver is not None:
         for column in term.driver.columns:
             if column not in recording:

@@ -38,9 +38,9 @@ class Estimate:
 def estimate(fit: FittedModel) -> Estimate:
     """One step of generalised least squares on the pseudo-residuals, with the colour and wander of their noise.
 
-    The M-estimate weighs samples as if they were independent; where noise is coloured this step is the more precise one,
-    and its covariance respects the autocorrelation. A step of more than five standard errors is a fit that the noise
-    model does not describe, and is not taken.
+    The M-estimate weighs samples as if they were independent; where noise is coloured this step is the more precise
+    one, and its covariance respects the autocorrelation. A step of more than five standard errors is a fit that the
+    noise model does not describe, and is not taken.
     """
     model, parameters = fit.model, fit.parameters
     pointwise = {

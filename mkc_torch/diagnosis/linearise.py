@@ -141,9 +141,10 @@ def linearise(
         slow = replace(slow, tangents=counts.unsqueeze(-1) * slow.tangents)
     colour = _colour(plain, pull, nuisance, pseudo if noise is None else noise, slow)
     found = _searching(colour, pull, nuisance, pseudo, joined, widths, slow, joint=joint)
-    if slow is None or tangents.pointwise[slow.port] is None:
+    pointwise = None if slow is None else tangents.pointwise[slow.port]
+    if slow is None or pointwise is None:
         return found
-    block = counts.unsqueeze(-1) * tangents.pointwise[slow.port]
+    block = counts.unsqueeze(-1) * pointwise
     # the wander is drawn for itself
     beside = pseudo - slow.tangents @ found.search.courses(found.series)
     if not enters_at_port(beside, block):

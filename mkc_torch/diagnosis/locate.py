@@ -16,11 +16,12 @@ from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.preference import Preference
 from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted
 from mkc_torch.diagnosis.search import Gains, NoiseFit, log_survival
+from mkc_torch.effects.protocol import ContinuousEffect
 from mkc_torch.functional import mkc_energy
 from mkc_torch.order_statistic import robust_scale
 
 if TYPE_CHECKING:
-    pass
+    from jaxtyping import Float
 
 __all__ = ["SEPARABLE", "Located", "Ranked", "locate"]
 
@@ -148,7 +149,7 @@ def _short_list(base: FittedModel, terms: tuple[Term, ...], starts: Sequence[Sta
 
 
 def _part_starts(base: FittedModel, d: Float[Tensor, " m"]) -> list[Start]:
-    """Around fits to parts of the recording; those only that fit their part clearly better than d tells of the whole."""
+    """Around fits to parts of the recording; those only that fit their part clearly better than d allows for."""
     prepared = base.model.prepared
     N = len(prepared.time)
     starts = []
@@ -287,7 +288,8 @@ def _refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> Fi
         again: once more from there, with the amplitudes that fit the new shape.
     """
     term = best.model.terms[-1]
-    names = [name for name in term.shape if name in getattr(term.effect, "continuous", ())]
+    free = term.effect.continuous if isinstance(term.effect, ContinuousEffect) else {}
+    names = [name for name in term.shape if name in free]
     if not names:
         return best
     for count in range(_ROUNDS):

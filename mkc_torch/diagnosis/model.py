@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.drivers import Driver
-from mkc_torch.effects.protocol import Context, Effect, GainEffect, Shape
+from mkc_torch.effects.protocol import Context, Effect, GainEffect, Shape, SignalEffect
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -130,7 +130,7 @@ def port_jacobian(model: JointModel, parameters: Float[Tensor, " p"], port: str)
 
 def follows_signal(effect: Effect) -> bool:
     """Whether an effect is a function of the signal at its port."""
-    return bool(getattr(effect, "follows_signal", False))
+    return isinstance(effect, SignalEffect) and effect.follows_signal
 
 
 def directions(term: Term, context: Context) -> Float[Tensor, "N c q"]:

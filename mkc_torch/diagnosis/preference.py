@@ -22,7 +22,7 @@ UNKNOWN = "unknown"
 """Id of the effect that is a curve, not physics."""
 
 NAMELESS = (10.0, 0.1)
-"""A curve without a name can follow any named effect a little better: nats, and share of its gain, that it has to give."""
+"""A curve without a name can follow any named effect a little better: nats, and share of its gain, that it gives."""
 
 ROLELESS, FOLLOWER, ALIKE_COLUMNS = 0.3, 0.6, 0.9
 """A column of unknown role may be a consequence of a known driver; the second share holds above this correlation."""

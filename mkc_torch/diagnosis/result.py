@@ -103,8 +103,8 @@ class Finding:
 class Noise:
     """The noise that structure was tested against.
 
-    ``model`` is one of "white", "ar" and "random_walk"; ``parameters`` names its numbers; ``bound`` is the half-width of
-    the density's domain, one for all models compared.
+    ``model`` is one of "white", "ar" and "random_walk"; ``parameters`` names its numbers; ``bound`` is the half-width
+    of the density's domain, one for all models compared.
     """
 
     model: Literal["white", "ar", "random_walk"]
@@ -129,8 +129,8 @@ class Spread:
 class Candidate:
     """One candidate of the search at its best shape, for the first finding.
 
-    ``log_likelihood_gain`` is that of the linearised model in nats; ``z`` its square root doubled, roughly the number of
-    standard errors.
+    ``log_likelihood_gain`` is that of the linearised model in nats; ``z`` the root of twice that, roughly the number
+    of standard errors.
     """
 
     effect: str

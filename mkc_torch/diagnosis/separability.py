@@ -16,16 +16,16 @@ _MOST = 8
 def separability(located: Located) -> Separability:
     """The matrix of the leading candidates, each at its best shape, in the metric of the noise.
 
-    The trace of a candidate is its tangent along the γ that fits best. Its share is the squared length that is left once
-    the simulation's own parameters, and then the rival, have taken over what they can, over that before the rival.
+    The trace of a candidate is its tangent along the γ that fits best. Its share is the squared length that is left
+    once the simulation's own parameters, and then the rival, have taken over what they can, over that before the rival.
     """
     numbers = [ranked.number for ranked in located.ranking[:_MOST]]
     traces, spaces, left = [], [], []
     for number in numbers:
-        trace, space, share = located.linearised.search.trace(number, located.linearised.series)
+        trace, space, kept = located.linearised.search.trace(number, located.linearised.series)
         traces.append(trace)
         spaces.append(space)
-        left.append(share)
+        left.append(kept)
     share = torch.ones(len(numbers), len(numbers), dtype=torch.float64)
     for i, trace in enumerate(traces):
         length = float(trace.square().sum())

@@ -53,8 +53,8 @@ def _rate(recording: Recording) -> str | None:
     if size is None or recording.units["gyro_x"] != "rad/s" or size <= 12.0:
         return None
     return (
-        f"The gyroscope turns at about {size:.3g} rad/s, faster than a hand or a vehicle; it may be in °/s. Nothing was "
-        "converted."
+        f"The gyroscope turns at about {size:.3g} rad/s, faster than a hand or a vehicle; it may be in °/s. Nothing "
+        "was converted."
     )
 
 

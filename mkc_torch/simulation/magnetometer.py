@@ -50,9 +50,10 @@ _REWEIGHTED, _RIDGE = 10, 1e-4
 class Magnetometer:
     """``matrix @ (measured - offset)`` is the ambient field in the sensor's axes, of constant strength and direction.
 
-    What is compared depends on the recording. With an attitude, the vector with the world's field. Otherwise, its length
-    with the field's, as a distance in the units of the measurement; and where the turns of the sensor do not determine
-    it from the length, but there is a gyroscope, the vector with the field of the same two seconds turned along.
+    What is compared depends on the recording. With an attitude, the vector with the world's field. Otherwise, its
+    length with the field's, as a distance in the units of the measurement; and where the turns of the sensor do not
+    determine it from the length, but there is a gyroscope, the vector with the field of the same two seconds turned
+    along.
 
     Attributes:
         use: "attitude", "norm" or "gyro"; None takes the first of these that the recording allows. The length goes
@@ -254,7 +255,7 @@ class AttitudeView(_View):
 
 
 class GyroView(_View):
-    """The vector, turned by the gyroscope to the first sample of its window: along the window's field, and across it."""
+    """The vector, turned by the gyroscope to the first sample of its window: along that window's field, and across."""
 
     view = "gyro"
     channels = _CHANNELS
@@ -392,7 +393,7 @@ def _bias_prior() -> GaussianPrior:
 
 
 def _response(measured: Tensor, turned: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    """Offset and response matrix by reweighted least squares of the measurement on the turned field, near the identity."""
+    """Offset and response by reweighted least squares of the measurement on the turned field, near the identity."""
     response = torch.eye(3, dtype=turned.dtype)
     ridge = len(turned) * _RIDGE * turned.square().sum(-1).mean()
     for _ in range(_REWEIGHTED):
