@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager, suppress
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import torch
 
@@ -45,20 +45,33 @@ def in_processes(work: Callable[[T], R], items: Sequence[T]) -> Iterator[Iterato
     before = set(multiprocessing.active_children())
     # spawned, for torch's threads do not survive a fork
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start) as pool:
+    stop = context.Event()
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(stop,)) as pool:
         try:
             with _not_interrupted():  # processes that start inherit it, and say nothing when they are interrupted
                 futures: list[Future[R]] = [pool.submit(_interruptible, work, item) for item in items]
             yield (future.result for future in futures)
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            stop.set()  # an item that a process has taken already cannot be cancelled
             for child in set(multiprocessing.active_children()) - before:
                 with suppress(ProcessLookupError, TypeError):
                     os.kill(child.pid, signal.SIGINT)  # type: ignore[arg-type]
+            pool.shutdown(cancel_futures=True)
             raise
 
 
-def _start() -> None:
+class _Stop(Protocol):
+    """Whether to stop, as all processes know it."""
+
+    def is_set(self) -> bool: ...
+
+
+_stop: _Stop | None = None
+
+
+def _start(stop: _Stop) -> None:
+    global _stop
+    _stop = stop
     torch.set_num_threads(1)  # as many processes as cores leave none for more
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -67,6 +80,8 @@ def _interruptible(work: Callable[[T], R], item: T) -> R:
     """Work that an interrupt ends as it would here: what is half-written is cleared away."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
+        if _stop is not None and _stop.is_set():
+            raise KeyboardInterrupt
         return work(item)
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)

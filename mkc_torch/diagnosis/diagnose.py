@@ -96,7 +96,8 @@ def diagnose(
         raise ValueError(
             f"{where}{len(prepared.time)} usable samples are too few for a diagnosis; it needs {FEWEST} at least."
         )
-    drivers = find_drivers(prepared.recording, simulation.columns)
+    roles = frozenset(role for effect in effects for role in effect.roles)
+    drivers = find_drivers(prepared.recording, simulation.columns, roles)
     terms = candidate_terms(prepared, drivers.drivers, effects)
     generator = torch.Generator().manual_seed(seed)
     base = _base(prepared)

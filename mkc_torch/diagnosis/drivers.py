@@ -59,7 +59,7 @@ class Drivers:
     warnings: tuple[str, ...]
 
 
-def find_drivers(recording: Recording, taken: frozenset[str]) -> Drivers:
+def find_drivers(recording: Recording, taken: frozenset[str], roles: frozenset[str] = frozenset()) -> Drivers:
     """The drivers among a recording's columns.
 
     A column's role comes from its name (``temperature``, ``temp_imu``, ``current_2`` …) or its unit. Missing values
@@ -68,6 +68,7 @@ def find_drivers(recording: Recording, taken: frozenset[str]) -> Drivers:
     Args:
         recording: the samples in use.
         taken: columns that the simulation uses itself.
+        roles: further roles, of a user's own effects: a column has one if its name is that or begins with it.
 
     Example:
         >>> ramp = torch.linspace(20.0, 30.0, 50)
@@ -89,7 +90,8 @@ def find_drivers(recording: Recording, taken: frozenset[str]) -> Drivers:
     if all(name in usable for name in _POSITION):
         columns = torch.stack([usable.pop(name) for name in _POSITION], -1)
         drivers.append(_driver(_POSITION, "position", columns, tuple(recording.units[n] for n in _POSITION)))
-    drivers += _singles(usable, recording.units, warnings)
+    known = {name: _own_role(name, roles) or role_of(name, recording.units[name]) for name in usable}
+    drivers += _singles(usable, recording.units, known, warnings)
     return Drivers(tuple(drivers), tuple(warnings))
 
 
@@ -108,6 +110,12 @@ def role_of(name: str, unit: str) -> str:
         ('temperature', 'current', 'current', 'any')
     """
     return _ROLE_OF_NAME.get(name.lower().split("_")[0]) or _ROLE_OF_UNIT.get(unit, ANY)
+
+
+def _own_role(name: str, roles: frozenset[str]) -> str:
+    """The role of a user's effect that a column's name says; the longest, if several."""
+    fitting = [role for role in roles if role != ANY and (name == role or name.startswith(f"{role}_"))]
+    return max(fitting, key=len, default="")
 
 
 def _usable(name: str, values: Tensor) -> tuple[Tensor | None, list[str]]:
@@ -136,11 +144,13 @@ def _filled(values: Tensor, finite: Tensor) -> Tensor:
     return torch.lerp(values[a], values[b], share)
 
 
-def _singles(usable: Mapping[str, Tensor], units: Mapping[str, str], warnings: list[str]) -> list[Driver]:
+def _singles(
+    usable: Mapping[str, Tensor], units: Mapping[str, str], roles: Mapping[str, str], warnings: list[str]
+) -> list[Driver]:
     """One driver for each group of columns that are copies of one another; a known role goes before an unknown one."""
     if not usable:
         return []
-    names = sorted(usable, key=lambda name: role_of(name, units[name]) == ANY)
+    names = sorted(usable, key=lambda name: roles[name] == ANY)
     table = torch.stack([usable[name] for name in names])
     centred = table - table.mean(-1, keepdim=True)
     centred = centred / torch.linalg.vector_norm(centred, dim=-1, keepdim=True)
@@ -155,7 +165,6 @@ def _singles(usable: Mapping[str, Tensor], units: Mapping[str, str], warnings: l
         if copies:
             told = ", ".join(f"`{copy}`" for copy in copies)
             warnings.append(f"Column `{name}` and {told} are copies of one another: this data cannot tell them apart.")
-        role = role_of(name, units[name])
-        drivers.append(_driver((name,), role, usable[name].unsqueeze(-1), (units[name],), copies))
+        drivers.append(_driver((name,), roles[name], usable[name].unsqueeze(-1), (units[name],), copies))
     order = {name: k for k, name in enumerate(usable)}
     return sorted(drivers, key=lambda d: order[d.columns[0]])

@@ -52,7 +52,8 @@ def blocks_of(N: int, correlation: int) -> HeldOutBlocks:
     count = FOLDS * BLOCKS_PER_FOLD
     block = (torch.arange(N) * count).div(N, rounding_mode="floor")
     fold = block % FOLDS
-    gap = max(1, min(math.ceil(_GAP * N) + correlation, N // (4 * count)))
+    # never so much that training blocks of an ordinary recording are left empty
+    gap = max(1, min(max(math.ceil(_GAP * N), correlation), 3 * N // (4 * count)))
     train = []
     for k in range(FOLDS):
         near = (fold == k).to(torch.float64).reshape(1, 1, -1)

@@ -80,7 +80,10 @@ class JointModel:
         if known is None or not self.terms:
             return known
         more = known.mean.new_zeros(self.size - self.base)
-        return GaussianPrior(torch.cat([known.mean, more]), torch.cat([known.precision, more]))
+        precision = known.precision
+        if precision.dim() == 1:
+            return GaussianPrior(torch.cat([known.mean, more]), torch.cat([precision, more]))
+        return GaussianPrior(torch.cat([known.mean, more]), torch.block_diag(precision, torch.diag(more)))
 
     def gammas(self, parameters: Float[Tensor, " p"]) -> tuple[Tensor, ...]:
         """Of the effects, in their order."""

@@ -125,6 +125,9 @@ class Colour:
         return (dct(values)[: len(root)] / root).flatten(0, 1)
 
 
+_SHARED, _CLEAR = 0.5, 2.0
+
+
 def port_colour(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c"]) -> Tensor:
     """Autoregression of noise that enters at a port, alike and independent in its channels, and gives these residuals.
 
@@ -134,8 +137,10 @@ def port_colour(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c"])
     highest = min(MAX_ORDER, N // 10)
     covariance = _autocovariance(values, highest).sum(-1)
     overlap = torch.stack([(pointwise[: N - lag] * pointwise[lag:]).sum() / N for lag in range(highest + 1)])
-    ratio = (overlap / overlap[0]).clamp(min=0.2)
-    return _levinson(covariance / ratio, N * values.shape[1])
+    ratio = overlap / overlap[0]
+    # where the port has turned away, the residuals say too little about it
+    known = int((ratio < _SHARED).long().argmax()) if bool((ratio < _SHARED).any()) else len(ratio)
+    return _levinson(covariance[:known] / ratio[:known], N * values.shape[1])
 
 
 def enters_at_port(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c"]) -> bool:
@@ -154,9 +159,12 @@ def enters_at_port(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c
         product, overlap = product[used], overlap[used]
         if len(product) > 2:
             centred = overlap - overlap.mean()
-            slope = float(centred @ product) / max(float(centred @ centred), 1e-300)
-            part = slope * float(overlap.mean())
-            through, own = through + part, own + float(product.mean()) - part
+            spread = float(centred @ centred) / max(float(overlap.mean()) ** 2, 1e-300)
+            part = float(centred @ product) * float(overlap.mean()) / max(float(centred @ centred), 1e-300)
+            rest = float(product.mean()) - part
+            error = float(product.std()) * math.sqrt(1.0 / max(spread, 1e-300) + 1.0 / len(product))
+            through += part if abs(part) > _CLEAR * error else 0.0
+            own += rest if abs(rest) > _CLEAR * error else 0.0
         lag = math.ceil(1.5 * lag)
     return through > own
 
@@ -173,22 +181,42 @@ def autoregressive(coefficients: Tensor, N: int, count: int, generator: torch.Ge
 def colour_of(power: Float[Tensor, "K m"]) -> Colour:
     """The spectrum of each channel from the squares of its K slowest cosine coefficients.
 
-    It is the product of three: an autoregression by Levinson's recursion, of an order by BIC; a slow part that rises
-    towards low frequencies, of the likeliest size and corner (Whittle's likelihood); and local averages of what these
-    two miss, over the more coefficients the higher the frequency.
+    It is the product of three: a slow part that rises towards low frequencies, of the likeliest size and corner
+    (Whittle's likelihood); an autoregression by Levinson's recursion, of an order by BIC; and local averages of what
+    these two miss, over the more coefficients the higher the frequency.
 
     Whittle, "Estimation and information in stationary time series", Arkiv för Matematik 2 (1953).
     """
-    K = len(power)
-    # the K slowest coefficients are those of a series that was thinned to K samples
-    frequency = (torch.arange(K, dtype=power.dtype) + 0.5) * (math.pi / K)
-    lag = torch.arange(min(MAX_ORDER, K // 10) + 1, dtype=power.dtype)
-    covariance = torch.cos(lag.unsqueeze(-1) * frequency) @ power / K
-    phis = tuple(_levinson(column, K) for column in covariance.unbind(-1))
-    root = torch.stack([_root(phi, frequency) for phi in phis], -1)
-    root = root * torch.stack([_slow_part(p).sqrt() for p in (power / root.square()).unbind(-1)], -1)
+    found = [_shape(one) for one in power.unbind(-1)]
+    root = torch.stack([shape.sqrt() for _, shape in found], -1)
     left = _local_mean(power / root.square())
-    return Colour(phis, root * left.sqrt())
+    return Colour(tuple(phi for phi, _ in found), root * left.sqrt())
+
+
+def _shape(power: Float[Tensor, " K"]) -> tuple[Tensor, Tensor]:
+    """Autoregression, and the spectrum that it and a slow part make, whichever of the two is read first."""
+    K = len(power)
+    alone = _autoregression(power)
+    first = _spectrum(alone, K)
+    slow = _slow_part(power)
+    beside = _autoregression(power / slow)
+    pairs = [(alone, first * _slow_part(power / first)), (beside, slow * _spectrum(beside, K))]
+    return min(pairs, key=lambda pair: float(pair[1].log().mean() + (power / pair[1]).mean().log()))
+
+
+def _autoregression(power: Float[Tensor, " K"]) -> Tensor:
+    K = len(power)
+    lag = torch.arange(min(MAX_ORDER, K // 10) + 1, dtype=power.dtype)
+    return _levinson(torch.cos(lag.unsqueeze(-1) * _frequencies(K, power)) @ power / K, K)
+
+
+def _spectrum(phi: Tensor, K: int) -> Float[Tensor, " K"]:
+    return _root(phi, _frequencies(K, phi)).square()
+
+
+def _frequencies(K: int, like: Tensor) -> Float[Tensor, " K"]:
+    """The K slowest coefficients are those of a series that was thinned to K samples."""
+    return (torch.arange(K, dtype=like.dtype) + 0.5) * (math.pi / K)
 
 
 def _slow_part(power: Float[Tensor, " K"]) -> Float[Tensor, " K"]:

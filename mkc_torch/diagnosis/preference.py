@@ -30,8 +30,6 @@ ROLELESS, FOLLOWER, ALIKE_COLUMNS = 0.3, 0.6, 0.9
 EVENT, ALIKE_EVENT = 0.4, 0.85
 """An event in time that goes along with a known driver to more than this correlation gives this share."""
 
-_KNOWN = ("temperature", "current")
-
 
 class Preference:
     """Handicaps of candidates, in nats.
@@ -42,7 +40,9 @@ class Preference:
     """
 
     def __init__(self, terms: Sequence[Term], prepared: PreparedSimulation) -> None:
-        drivers = {id(t.driver): t.driver for t in terms if t.driver is not None and t.driver.role in _KNOWN}
+        drivers = {
+            id(t.driver): t.driver for t in terms if t.driver is not None and t.driver.role not in (ANY, "position")
+        }
         courses = [_unit(driver.values[:, 0]) for driver in drivers.values()]
         self._known = torch.stack(courses) if courses else prepared.time.new_zeros(0, len(prepared.time))
         self._prepared = prepared

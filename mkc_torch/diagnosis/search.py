@@ -175,6 +175,7 @@ class LinearSearch:
         start = sum(self._widths[:number])
         index = torch.arange(start, start + self._widths[number])
         columns = self._flat[:, index]
+        size_of = columns.square().sum(0).clamp(min=1e-300).rsqrt()
         columns = columns - self._basis @ (self._basis.mT @ columns)
         left = series - self._basis @ (self._basis.mT @ series)
         best: tuple[float, Tensor, Tensor] | None = None
@@ -189,9 +190,10 @@ class LinearSearch:
                 inner = inner - cross.mT @ (share * rotated)
                 power = power - (share * rotated.square()).sum()
                 log_det = torch.log1p(size * family.strength).sum()
-            size_of = gram.diagonal().clamp(min=1e-300).rsqrt()
             scaled = gram * size_of.unsqueeze(-1) * size_of
-            inverse = torch.linalg.pinv(scaled, hermitian=True, rtol=_SINGULAR) * size_of.unsqueeze(-1) * size_of
+            inverse = (
+                torch.linalg.pinv(scaled, hermitian=True, atol=_SINGULAR, rtol=0.0) * size_of.unsqueeze(-1) * size_of
+            )
             gamma = inverse @ inner
             rest = power - inner @ gamma
             value = float(-0.5 * log_det - 0.5 * self._dof * rest.log())

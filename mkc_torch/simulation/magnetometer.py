@@ -14,6 +14,7 @@ from mkc_torch.calibration import prepared
 from mkc_torch.coverage import coverage
 from mkc_torch.ellipsoid import MIN_INFORMATION, EllipsoidFit, NotIdentifiableError
 from mkc_torch.linear import LeastTrimmedSquares
+from mkc_torch.linear._problem import RankDeficientError
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.recording import Recording
 from mkc_torch.simulation.protocol import Changes, Port
@@ -44,6 +45,7 @@ GYRO_BIAS = 0.02
 _SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 _MIN_ROWS = 50
 _REWEIGHTED, _RIDGE = 10, 1e-4
+_TURNED = 1e-3
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class Magnetometer:
         has_attitude = all(name in recording for name in _QUATERNION)
         has_gyro = all(name in recording for name in _GYRO) and recording.time is not None
         if self.use == "attitude" or (self.use is None and has_attitude):
-            return AttitudeView(prepared(recording.finite(*_QUATERNION)))
+            return AttitudeView(prepared(_with_attitude(recording)))
         if self.use == "gyro":
             recording["time"]
             return GyroView(prepared(recording.finite(*_GYRO)))
@@ -239,7 +241,10 @@ class AttitudeView(_View):
     def _offset_and_field(self) -> tuple[Tensor, Tensor]:
         """Offset and world field by least trimmed squares, the matrix taken for the identity."""
         eye = torch.eye(3, dtype=self.to_world.dtype).expand(len(self.to_world), 3, 3)
-        coefficients = LeastTrimmedSquares().fit(torch.cat([eye, self.to_world.mT], -1), self.measured).coef_
+        try:
+            coefficients = LeastTrimmedSquares().fit(torch.cat([eye, self.to_world.mT], -1), self.measured).coef_
+        except RankDeficientError:
+            raise _one_axis(self.to_world) from None
         return coefficients[:3], coefficients[3:]
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
@@ -271,14 +276,45 @@ class GyroView(_View):
         self.prior = _bias_prior()
         self.window, first = _windows(self.time)
         self.turned = rotation_since(self.time, recording.stack(*_GYRO), first)
-        self.elapsed = (self.time - self.time[first]).unsqueeze(-1)
+        self.summed = _summed(self.turned, self.time, first)
         self.count = int(self.window.max()) + 1
-        fit = self._ellipsoid(None)
-        self.strength = float(fit.radius_)
-        self._full = self._theta(fit)
+        try:
+            fit = self._ellipsoid(None)
+        except NotIdentifiableError as error:
+            offset = self._offset_by_turns(error)
+            self.strength = float(torch.linalg.vector_norm(self.measured - offset, dim=-1).median())
+            self._full = torch.cat([offset, offset.new_tensor([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]), offset.new_zeros(3)])
+            self.warnings = (f"The gyroscope stands in for turns that are missing: {error}",)
+        else:
+            self.strength = float(fit.radius_)
+            self._full = self._theta(fit)
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Tensor:
         return self._full.clone() if rows is None else self._theta(self._ellipsoid(rows))
+
+    def _offset_by_turns(self, error: NotIdentifiableError) -> Tensor:
+        """The offset that leaves the field of each window steady, by reweighted least squares; the matrix is 1.
+
+        Raises:
+            NotIdentifiableError: ``error``, where the turns do not determine the offset either.
+        """
+        seen = torch.einsum("kij,kj->ki", self.turned, self.measured)
+        weight = seen.new_ones(len(seen), 1)
+        offset = seen.new_zeros(3)
+        for _ in range(_REWEIGHTED):
+            mean = self._window_mean(seen, weight)[self.window]
+            turned = self._window_mean(self.turned.flatten(1), weight)[self.window].unflatten(-1, (3, 3))
+            regressors, target = (self.turned - turned), seen - mean
+            gram = torch.einsum("kai,k,kaj->ij", regressors, weight[:, 0], regressors)
+            known = torch.linalg.eigvalsh(gram)
+            if not bool(known[0] > _TURNED * known[-1]):
+                raise error
+            offset = torch.linalg.lstsq(
+                gram, torch.einsum("kai,k,ka->i", regressors, weight[:, 0], target).unsqueeze(-1)
+            ).solution.squeeze(-1)
+            left = torch.linalg.vector_norm(target - regressors @ offset, dim=-1, keepdim=True)
+            weight = torch.exp(-0.5 * (left / (2.0 * left.median().clamp(min=1e-9))).square()).clamp(min=1e-12)
+        return offset
 
     def _theta(self, fit: EllipsoidFit) -> Tensor:
         matrix = fit.calibration_matrix_ * (self.strength / float(fit.radius_))
@@ -295,9 +331,9 @@ class GyroView(_View):
 
     def _steadied(self, theta: Tensor, field: Tensor) -> Tensor:
         """The calibrated field in the axes of its window's first sample."""
-        # a small bias turns each sample by bias · elapsed against the window's first
-        steady = field - self.elapsed * torch.linalg.cross(theta[9:12].expand_as(field), field)
-        return torch.einsum("kij,kj->ki", self.turned, steady)
+        along = torch.einsum("kij,kj->ki", self.turned, field)
+        # a bias b, small, turns what has been summed up since the window's first sample by the integral of turned · b
+        return along - torch.linalg.cross(self.summed @ theta[9:12], along)
 
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
         along = self._steadied(theta, (self.measured - theta[:3]) @ self.matrix(theta).mT)
@@ -390,6 +426,37 @@ def _bias_prior() -> GaussianPrior:
     precision = torch.zeros(12, dtype=torch.float64)
     precision[9:] = GYRO_BIAS**-2
     return GaussianPrior(mean, precision)
+
+
+def _with_attitude(recording: Recording) -> Recording:
+    """The samples that have an attitude; a quaternion of length zero is none."""
+    length = torch.linalg.vector_norm(recording.stack(*_QUATERNION), dim=-1)
+    columns = {
+        name: torch.where(length > 0.0, values, torch.nan) if name in _QUATERNION else values
+        for name, values in recording.columns.items()
+    }
+    marked = Recording(
+        columns, name=recording.name, units=recording.units, warnings=recording.warnings, labels=recording.labels
+    )
+    return marked.finite(*_QUATERNION)
+
+
+def _one_axis(to_world: Tensor) -> NotIdentifiableError:
+    """The refusal of a recording that turns about one axis of the sensor alone, or not at all."""
+    turned = (to_world - to_world.mean(0)).square().sum((0, 1))
+    axis = _AXES[int(turned.argmin())]
+    return NotIdentifiableError(
+        f"Not identifiable: the sensor turns about its {axis} axis alone, or not at all, so the offset along +{axis} "
+        "cannot be told from the field. Turn it about another axis too."
+    )
+
+
+def _summed(turned: Tensor, time: Tensor, first: Tensor) -> Tensor:
+    """Integral of the rotation over time since the first sample of each window, (N, 3, 3), by trapezoids."""
+    step = 0.5 * (turned[1:] + turned[:-1]) * time.diff()[:, None, None]
+    total = torch.cat([torch.zeros_like(turned[:1]), step.cumsum(0)])
+    # between windows the frames differ, but what was summed before a window's first sample is taken off
+    return total - total[first]
 
 
 def _response(measured: Tensor, turned: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:

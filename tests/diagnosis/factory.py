@@ -1,0 +1,194 @@
+"""Diagnoses made by hand, with residuals that show what the findings say."""
+
+import math
+
+import torch
+
+from mkc_torch.diagnosis.result import (
+    Alternative,
+    Candidate,
+    Curve,
+    Diagnosis,
+    Finding,
+    HeldOut,
+    Noise,
+    Parameter,
+    Separability,
+    Spread,
+    Traces,
+)
+
+CHANNELS = ("norm", "turn_x", "turn_y", "turn_z")
+CATALOGUE = (
+    "hard_iron_step", "current_field", "temperature_offset", "offset_drift", "field_gradient", "cubic_nonlinearity",
+    "driver_offset", "driver_gain", "mains_interference", "time_lag", "hysteresis", "eddy_current",
+)  # fmt: skip
+
+
+def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candidates=12, **changes):
+    """A diagnosis of a simulated magnetometer; any field can be replaced by name."""
+    found = (_step, _current, _unknown)[:findings]
+    names = CHANNELS[:channels]
+    traces = make_traces(findings, names, samples, has_time)
+    used = traces.weight > 0.5
+    before, after = (float(e[used].square().mean().sqrt()) for e in (traces.before, traces.after))
+    content = {
+        "recording": "flight_07",
+        "simulation": "magnetometer",
+        "samples": samples,
+        "level": 0.05,
+        "noise": Noise(
+            "ar",
+            {"coefficients": (0.42, -0.08)},
+            (2.1,) * channels,
+            (0.31,) * channels,
+            (12.0,) * channels,
+            "noise with a memory of 2 samples and 11 % outliers",
+        ),
+        "candidates_tried": 64,
+        "surrogates": 199,
+        "seed": 0,
+        "p_value": 0.005 if findings else 0.37,
+        "verdict": "explained" if findings else "adequate",
+        "findings": tuple(f(names, has_time) for f in found),
+        "baseline": Spread(-1.2345, before, (1.1,) * channels, (0.52,) * channels),
+        "corrected": Spread(-0.9012, after, (math.inf,) * channels, (0.31,) * channels),
+        "ceiling": (0.62, 0.59),
+        "advice": ("Record at two more temperatures, at least 10 °C apart.",) if findings else (),
+        "warnings": ("3 samples without a finite value were left out.",),
+        "candidates": make_candidates(candidates),
+        "separability": make_separability(min(candidates, 8)),
+        "traces": traces,
+    }
+    return Diagnosis(**content | changes)
+
+
+def make_traces(findings, channels, samples, has_time):
+    generator = torch.Generator().manual_seed(1)
+    n, m = samples, len(channels)
+    time = torch.arange(n, dtype=torch.float64) / (50.0 if has_time else 1.0)
+    share = torch.arange(n) / max(n, 1)
+    noise = 0.4 * torch.randn(n, m, generator=generator, dtype=torch.float64)
+    outlier = torch.rand(n, m, generator=generator) < 0.12
+    noise[outlier] += 8.0 * torch.randn(int(outlier.sum()), generator=generator, dtype=torch.float64)
+    current = 15.0 + 9.0 * torch.sin(share * 40.0) + torch.randn(n, generator=generator)
+    temperature = 24.0 + 11.0 * (1.0 - torch.exp(-3.0 * share)) + 0.05 * torch.randn(n, generator=generator)
+    effect = torch.zeros(n, m, dtype=torch.float64)
+    turning = torch.cos(share.unsqueeze(-1) * 120.0 + torch.arange(m))
+    if findings > 0:
+        effect += 1.2 * turning * (share > 0.45).unsqueeze(-1)
+    if findings > 1:
+        effect += 0.06 * (current - 15.0).unsqueeze(-1)
+    if findings > 2:
+        effect += 0.02 * (temperature - 30.0).square().unsqueeze(-1)
+    drivers = {"current": current.double(), "temperature": temperature.double()}
+    return Traces(
+        time=time,
+        has_time=has_time,
+        before=noise + effect,
+        after=noise,
+        weight=torch.where(outlier, 0.05, 0.95).double(),
+        channels=channels,
+        unit="µT",
+        drivers=drivers,
+        driver_units={"current": "A", "temperature": "°C"},
+    )
+
+
+def make_candidates(count):
+    gains = [900.0 * 0.6**i for i in range(count)]
+    return tuple(
+        Candidate(
+            CATALOGUE[i % len(CATALOGUE)] if i < len(CATALOGUE) else "driver_offset",
+            () if i == 0 else ("current",) if i < len(CATALOGUE) else (f"column_{i}",),
+            "step at 41.3 s" if i == 0 else "",
+            gain,
+            math.sqrt(2.0 * gain),
+        )
+        for i, gain in enumerate(gains)
+    )
+
+
+def make_separability(count):
+    generator = torch.Generator().manual_seed(2)
+    share = torch.rand(count, count, generator=generator, dtype=torch.float64)
+    share = 0.5 * (share + share.mT)
+    share.fill_diagonal_(0.0)
+    labels = tuple(CATALOGUE[i % len(CATALOGUE)] for i in range(count))
+    return Separability(labels, share, torch.linspace(0.99, 0.23, count, dtype=torch.float64))
+
+
+def _step(channels, has_time):
+    return Finding(
+        effect="hard_iron_step",
+        drivers=(),
+        channels=("mag_x", "mag_y", "mag_z"),
+        intervals=(),
+        onset=41.32 if has_time else 2025.0,
+        equation="B = A (m − b − Δb·1[t > t₀])",
+        explanation="The sensor's offset changes at one moment, as when a magnetised part comes near and stays.",
+        parameters=(
+            Parameter("offset change", (3.2137, -1.1042, 0.3251), (0.0812, 0.0774, 0.0921), "µT"),
+            Parameter("onset", 41.32, 0.14, "s"),
+        ),
+        p_value=0.005,
+        held_out=HeldOut(0.3124, (0.2811, 0.3502), 0.912, 0.521, "µT"),
+        held_out_note="",
+        alternatives=(
+            Alternative("offset_drift", (), 41.2, True),
+            Alternative("current_field", ("current",), 1.3, False),
+        ),
+        plausible=True,
+        plausibility="3.4 µT; steps of 1 to 50 µT occur.",
+        curve=_curve("time", "s" if has_time else "", channels, lambda x: (x > 0.45).double()),
+    )
+
+
+def _current(channels, has_time):
+    return Finding(
+        effect="current_field",
+        drivers=("current",),
+        channels=("mag_x", "mag_y", "mag_z"),
+        intervals=((12.1, 18.4), (60.0, 71.5)) if has_time else ((600.0, 900.0),),
+        onset=None,
+        equation="δB = k I",
+        explanation="A current near the sensor adds a field in proportion to it.",
+        parameters=(
+            Parameter("k", (-0.1702, 0.3311, 0.0298), (0.0123, 0.0119, 0.0131), "µT/A"),
+            Parameter("α", 4.02e-6, 1.1e-7, "1/µT²"),
+        ),
+        p_value=0.01,
+        held_out=None,
+        held_out_note="The event has no second occurrence to be held out.",
+        alternatives=(),
+        plausible=True,
+        plausibility="0.37 µT/A; up to 1 µT/A occurs.",
+        curve=_curve("current", "A", channels, lambda x: x - 0.5),
+    )
+
+
+def _unknown(channels, _has_time):
+    return Finding(
+        effect="unknown",
+        drivers=("temperature",),
+        channels=channels,
+        intervals=(),
+        onset=None,
+        equation="residual = f(temperature)",
+        explanation="The residual depends on this column in a way that no effect in the catalogue has.",
+        parameters=(Parameter("knots", tuple(0.1 * i for i in range(20)), None, "µT"),),
+        p_value=0.045,
+        held_out=HeldOut(0.0021, (-0.0004, 0.0046), 0.5214, 0.5198, "µT"),
+        held_out_note="Blocks of 4 s with gaps of 1 s.",
+        alternatives=(Alternative("temperature_offset", ("temperature",), 7.9, True),),
+        plausible=False,
+        plausibility="A curve has no size to compare.",
+        curve=_curve("temperature", "°C", channels, lambda x: (2.0 * x - 1.0).square()),
+    )
+
+
+def _curve(driver, unit, channels, shape):
+    x = torch.linspace(0.0, 1.0, 60, dtype=torch.float64)
+    value = shape(x).unsqueeze(-1) * (0.6 + 0.4 * torch.arange(len(channels)))
+    low, high = {"time": (0.0, 90.0), "current": (5.0, 25.0), "temperature": (24.0, 35.0)}[driver]
+    return Curve(driver, unit, low + (high - low) * x, value, torch.full_like(value, 0.12), channels, "µT")

@@ -1,0 +1,140 @@
+"""The physics of each effect, against formulas written anew."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from numpy.polynomial import legendre
+
+from mkc_torch.effects import CATALOGUE, Context
+from mkc_torch.effects.protocol import after
+from tests.effects.contexts import make_context
+
+EFFECTS = {effect.id: effect for effect in CATALOGUE}
+STEP, DRIFT = EFFECTS["hard_iron_step"], EFFECTS["offset_drift"]
+TEMPERATURE, CURRENT = EFFECTS["temperature_offset"], EFFECTS["current_field"]
+CUBIC, UNKNOWN, COLUMN = EFFECTS["cubic_nonlinearity"], EFFECTS["unknown"], EFFECTS["driver_offset"]
+TIME = torch.linspace(7.0, 97.0, 901, dtype=torch.float64)
+
+
+def timed(time=TIME):
+    return Context(time, time.new_zeros(len(time), 0), (), time.new_zeros(len(time), 3), "µT", ("x", "y", "z"))
+
+
+def driven(values, unit):
+    values = torch.as_tensor(values, dtype=torch.float64)
+    time = 0.1 * torch.arange(len(values), dtype=torch.float64)
+    return Context(time, values.unsqueeze(-1), (unit,), values.new_zeros(len(values), 3), "µT", ("x", "y", "z"))
+
+
+def test_a_step_is_there_from_its_onset_on():
+    gamma = torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64)
+    change = STEP.change(gamma, {"onset": 40.0}, timed())
+    before = TIME < 40.0
+    assert torch.equal(change[before], torch.zeros(int(before.sum()), 3, dtype=torch.float64))
+    assert torch.equal(change[~before], gamma.expand(int((~before).sum()), 3))
+    assert after(torch.tensor([1.0, 2.0, 3.0]), 2.0).tolist() == [0.0, 1.0, 1.0]
+
+
+def test_onsets_are_searched_all_along_but_the_ends():
+    onsets = np.array([shape["onset"] for shape in STEP.shapes(TIME)])
+    np.testing.assert_allclose(np.diff(onsets), 0.9, rtol=1e-9)
+    assert 7.0 + 0.01 * 90.0 < onsets[0] < 7.0 + 0.1 * 90.0
+    assert onsets[0] - 7.0 == pytest.approx(97.0 - onsets[-1])
+
+
+DRIFTS = DRIFT.shapes(TIME)
+
+
+@pytest.mark.parametrize("shape", DRIFTS, ids=str)
+def test_a_drift_runs_once_from_nothing_to_all(shape):
+    course = DRIFT.course(shape, timed())
+    assert float(course[0]) == pytest.approx(0.0, abs=1e-12)
+    assert float(course[-1]) == pytest.approx(1.0, abs=1e-12)
+    assert bool((course.diff() >= 0).all())
+    assert bool((course.diff() > 0).float().mean() > 0.5)
+
+
+def test_drifts_are_those_of_their_formulas():
+    t = TIME.numpy() - 7.0
+    expected = {
+        (): t / 90.0,
+        ("power",): np.sqrt(t / 90.0),
+        ("time_constant",): (1.0 - np.exp(-t / 9.0)) / (1.0 - np.exp(-10.0)),
+    }
+    shapes = [{}, {"power": 0.5}, {"time_constant": 9.0}]
+    for shape in shapes:
+        assert shape in [{k: pytest.approx(v) for k, v in s.items()} for s in DRIFTS]
+        np.testing.assert_allclose(DRIFT.course(shape, timed()), expected[tuple(shape)], atol=1e-12)
+    middle = DRIFT.course({"middle": 45.0, "width": 4.5}, timed())
+    assert float(middle[450]) == pytest.approx(0.5, abs=1e-9)
+    logistic = 1.0 / (1.0 + np.exp(-(t - 45.0) / 4.5))
+    np.testing.assert_allclose(np.corrcoef(middle, logistic)[0, 1], 1.0, rtol=1e-12)
+
+
+def test_drifts_of_every_kind_are_searched():
+    kinds = [tuple(sorted(shape)) for shape in DRIFTS]
+    assert {k: kinds.count(k) for k in set(kinds)} == {
+        (): 1, ("power",): 1, ("time_constant",): 4, ("middle", "width"): 6,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("effect", [STEP, DRIFT], ids=lambda e: e.id)
+def test_what_lasts_is_the_offset_at_the_end(effect):
+    gamma = torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64)
+    shape = effect.shapes(TIME)[-1]
+    end = effect.change(gamma, shape, timed())[-1]
+    later = timed(torch.arange(5, dtype=torch.float64))
+    torch.testing.assert_close(effect.lasting(gamma, later), end.expand(5, 3))
+
+
+@pytest.mark.parametrize(("effect", "unit"), [(CURRENT, "A"), (COLUMN, "V"), (TEMPERATURE, "°C")])
+def test_offsets_are_in_proportion_to_their_column(effect, unit):
+    context = driven([-2.0, 0.0, 3.0], unit)
+    change = effect.change(torch.tensor([1.0, 0.0, -0.5], dtype=torch.float64), {}, context)
+    assert change.tolist() == [[-2.0, 0.0, 1.0], [0.0, 0.0, 0.0], [3.0, 0.0, -1.5]]
+
+
+def test_a_temperature_can_be_lagged_and_bent():
+    context = driven([0.0, 10.0, 10.0, -5.0], "°C")
+    shapes = TEMPERATURE.shapes(context.time)
+    assert [dict(s) for s in shapes] == [{}, {"lag": 1.0}, {"lag": 5.0}, {"curvature": 0.02}, {"curvature": -0.02}]
+    bent = TEMPERATURE.course({"curvature": 0.02}, context)
+    np.testing.assert_allclose(bent, [0.0, 12.0, 12.0, -4.5])
+    a = np.exp(-0.1)
+    first = 10.0 * (1.0 - a)
+    second = a * first + 10.0 * (1.0 - a)
+    np.testing.assert_allclose(
+        TEMPERATURE.course({"lag": 1.0}, context), [0.0, first, second, a * second - 5.0 * (1.0 - a)]
+    )
+
+
+def test_the_cubic_bends_each_axis_by_its_own_field():
+    context = make_context(CUBIC)
+    gamma = torch.tensor([1e-5, 0.0, -2e-5], dtype=torch.float64)
+    B = context.signal.numpy()
+    expected = np.stack([1e-5 * B[:, 0] ** 3, 0.0 * B[:, 1], -2e-5 * B[:, 2] ** 3], -1)
+    np.testing.assert_allclose(CUBIC.change(gamma, {}, context), expected, rtol=1e-12)
+
+
+def test_the_cubic_follows_the_unit_of_the_signal():
+    assert CUBIC.quantities({}, replace(make_context(CUBIC), signal_unit="counts"))[0].unit == "1/counts²"
+
+
+def test_a_curve_is_a_legendre_series_in_its_own_range():
+    context = driven(np.linspace(-3.0, 5.0, 41), "V")
+    gamma = torch.arange(9, dtype=torch.float64) - 4.0
+    t = np.linspace(-1.0, 1.0, 41)
+    expected = np.stack([legendre.legval(t, [0.0, *gamma.reshape(3, 3)[:, c].tolist()]) for c in range(3)], -1)
+    np.testing.assert_allclose(UNKNOWN.change(gamma, {}, context), expected, atol=1e-12)
+
+
+def test_a_curve_keeps_its_range_on_another_recording():
+    context = driven(np.linspace(-3.0, 5.0, 41), "V")
+    gamma = torch.arange(9, dtype=torch.float64) - 4.0
+    shape = UNKNOWN.anchored({}, context)
+    assert shape == {"low": -3.0, "high": 5.0}
+    original = UNKNOWN.change(gamma, {}, context)
+    other = UNKNOWN.change(gamma, shape, driven([-9.0, -3.0, 1.0, 5.0, 9.0], "V"))
+    torch.testing.assert_close(other, original[[0, 0, 20, 40, 40]])

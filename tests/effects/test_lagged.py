@@ -1,0 +1,52 @@
+"""The first-order lag, against SciPy's filter and the differential equation."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+from scipy.signal import lfilter, lfiltic
+
+from mkc_torch.effects.protocol import lagged
+
+RANDOM = np.random.default_rng(4)
+
+
+@pytest.mark.parametrize("N", [2, 3, 64, 65, 1000])
+@pytest.mark.parametrize("lag", [1e-3, 0.3, 5.0, 1e4])
+def test_even_samples_are_filtered_as_scipy_does(N, lag):
+    x = RANDOM.standard_normal(N).cumsum() + 20.0
+    a = np.exp(-0.02 / lag)
+    state = lfiltic([1.0 - a], [1.0, -a], y=[x[0]])
+    expected = np.concatenate([x[:1], lfilter([1.0 - a], [1.0, -a], x[1:], zi=state)[0]])
+    found = lagged(torch.from_numpy(x), 0.02 * torch.arange(N, dtype=torch.float64), lag)
+    np.testing.assert_allclose(found, expected, rtol=1e-11)
+
+
+def test_uneven_samples_solve_the_differential_equation():
+    time = np.cumsum(0.3 * RANDOM.random(40) + 0.01)
+    x = RANDOM.standard_normal(40)
+    y = [x[0]]
+    for k in range(1, 40):
+        solution = solve_ivp(
+            lambda _, y, k=k: (x[k] - y) / 0.7, (time[k - 1], time[k]), [y[-1]], rtol=1e-10, atol=1e-12
+        )
+        y.append(solution.y[0, -1])
+    found = lagged(torch.from_numpy(x), torch.from_numpy(time), 0.7)
+    np.testing.assert_allclose(found, y, atol=1e-8)
+
+
+def test_a_long_gap_forgets_what_was_before():
+    time = torch.tensor([0.0, 1.0, 1001.0, 1002.0], dtype=torch.float64)
+    found = lagged(torch.tensor([5.0, 5.0, 2.0, 2.0], dtype=torch.float64), time, 1.0)
+    assert found.tolist() == pytest.approx([5.0, 5.0, 2.0, 2.0], abs=1e-12)
+
+
+def test_without_a_lag_nothing_changes():
+    x = torch.from_numpy(RANDOM.standard_normal(5))
+    assert torch.equal(lagged(x, torch.arange(5.0, dtype=torch.float64), 0.0), x)
+
+
+def test_derivatives_go_through_the_lag():
+    time = torch.linspace(0.0, 3.0, 50, dtype=torch.float64)
+    values = torch.sin(time).requires_grad_()
+    assert torch.autograd.gradcheck(lambda v: lagged(v, time, 0.5), (values,))

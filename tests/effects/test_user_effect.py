@@ -1,0 +1,70 @@
+"""An effect of a user's own, found and named among those of the catalogue."""
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch import diagnose
+from mkc_torch.diagnosis import DiagnosedModel
+from mkc_torch.effects import CATALOGUE, GainEffect
+from mkc_torch.simulation import Magnetometer
+from tests.simulation.tumbling import tumbling
+
+GAIN = (1.0, -0.6, 0.4)
+
+
+class SupplyOffset(GainEffect):
+    """The sensor's offset follows the supply voltage."""
+
+    id = "supply_offset"
+    roles = ("voltage",)
+    gain = "offset_per_volt"
+    equation = "δB = k (V − V̄)"
+    explanation = "The offset follows the supply voltage."
+    plausible = 2.0
+    source = "our bench"
+
+    def course(self, shape, context):  # noqa: ARG002
+        return context.drivers[:, 0]
+
+
+@pytest.fixture(scope="module")
+def diagnosis():
+    time = np.arange(600) / 50.0
+    voltage = 12.0 + np.sin(2.0 * time) + 0.5 * np.sin(5.3 * time)
+    sensor = np.outer(voltage - voltage.mean(), GAIN)
+    recording = tumbling(600, noise=0.3, sensor=sensor, voltage=voltage)
+    return diagnose(Magnetometer(), recording, effects=(*CATALOGUE, SupplyOffset()), surrogates=19, max_findings=1)
+
+
+def test_it_is_named_by_the_role_its_column_is_called(diagnosis):
+    assert [(f.effect, f.drivers) for f in diagnosis.findings] == [("supply_offset", ("voltage",))]
+
+
+def test_the_finding_speaks_with_its_words(diagnosis):
+    (finding,) = diagnosis.findings
+    assert finding.equation == SupplyOffset.equation
+    assert finding.explanation.startswith(SupplyOffset.explanation)
+    assert finding.plausible
+    assert "our bench" in finding.plausibility
+    gain = finding.parameters[0]
+    assert (gain.name, gain.unit) == ("offset_per_volt", "µT")
+    value, error = np.array(gain.value), np.array(gain.standard_error)
+    assert (np.abs(value - GAIN) < 4.0 * error).all()
+    assert (error < 0.05).all()
+
+
+def test_the_model_takes_it_off_again(diagnosis):
+    time = np.arange(300) / 50.0
+    voltage = 12.0 + np.cos(3.0 * time)
+    clean, spoilt = (
+        tumbling(300, voltage=voltage),
+        tumbling(300, sensor=np.outer(voltage - 12.0, GAIN), voltage=voltage),
+    )
+    model = DiagnosedModel.from_json(diagnosis.model.to_json(), effects=(*CATALOGUE, SupplyOffset()))
+    strengths = []
+    for recording in (clean, spoilt):
+        columns, _ = model.correct(recording)
+        strengths.append(torch.stack([columns[f"field_{axis}"] for axis in "xyz"], -1).norm(dim=-1))
+    assert float(strengths[1].std()) < 0.1
+    assert float(strengths[0].std()) > 0.3

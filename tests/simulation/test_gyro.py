@@ -1,0 +1,162 @@
+"""The vector, turned along by the gyroscope."""
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch import NotIdentifiableError
+from mkc_torch.simulation import Magnetometer
+from tests.simulation.tumbling import (
+    FIELD,
+    OFFSET,
+    body_rate,
+    changed,
+    symmetric_truth,
+    true_matrix,
+    tumbling,
+    turns,
+)
+
+
+def prepared(N=500, **further):
+    return Magnetometer(use="gyro").prepare(tumbling(N, gyro=True, **further))
+
+
+@pytest.fixture(scope="module")
+def view():
+    return prepared()
+
+
+def truth(view):
+    return symmetric_truth(view.strength, further=3)
+
+
+def test_next_to_nothing_is_left_at_the_truth(view):
+    residual = view.residual(truth(view), {})
+    assert view.channels == ("along", "across_1", "across_2")
+    assert residual.shape == (500, 3)
+    # of the length nothing is lost; across it the trapezoid rule of the turns at 50 Hz
+    assert float(residual[:, 0].abs().max()) < 1e-4
+    assert 1e-4 < float(residual[:, 1:].abs().max()) < 0.03
+
+
+def test_the_error_of_the_turns_falls_with_the_square_of_the_rate():
+    sizes = []
+    for rate in (50.0, 200.0):
+        view = prepared(round(20 * rate), rate=rate)
+        sizes.append(float(view.residual(truth(view), {}).square().mean().sqrt()))
+    assert sizes[1] < sizes[0] / 12.0
+
+
+def test_the_start_is_the_truth_without_noise(view):
+    torch.testing.assert_close(view.start(), truth(view), rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(view.start(torch.arange(500) > 20), truth(view), rtol=1e-8, atol=1e-8)
+    assert len(view.parameter_names) == len(view.start())
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_channels_are_orthonormal_and_the_first_is_along_the_field(view, axis):
+    """One sample that is off by a vector moves its own residual by as much, turned; its window hardly notices."""
+    theta, k = truth(view), 230
+    ambient = turns(view.time.numpy()[k]).inv().apply(FIELD)
+    axes = np.linalg.qr(np.stack([ambient, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], -1))[0].T
+    axes[0] *= np.sign(axes[0] @ ambient)
+    change = torch.zeros(500, 3, dtype=torch.float64)
+    change[k] = -torch.from_numpy(np.linalg.solve(true_matrix(view.strength), 5.0 * axes[axis]))
+    moved = (view.residual(theta, {"sensor": change}) - view.residual(theta, {}))[k]
+    assert float(moved.norm()) == pytest.approx(5.0, rel=0.01)
+    if axis == 0:
+        assert float(moved[0]) == pytest.approx(5.0, rel=0.01)
+    else:
+        assert abs(float(moved[0])) < 0.05
+
+
+def test_axes_across_are_orthogonal(view):
+    generator = torch.Generator().manual_seed(0)
+    change = torch.zeros(500, 3, dtype=torch.float64)
+    picked = torch.arange(10, 500, 50)
+    change[picked] = torch.randn(len(picked), 3, generator=generator, dtype=torch.float64)
+    moved = (view.residual(truth(view), {"sensor": change}) - view.residual(truth(view), {}))[picked]
+    expected = (change[picked] @ torch.from_numpy(true_matrix(view.strength))).norm(dim=-1)
+    torch.testing.assert_close(moved.norm(dim=-1), expected, rtol=0.02, atol=0.02)
+
+
+def test_a_change_at_the_sensor_is_one_of_the_measurement():
+    change = torch.randn(500, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    view = prepared(sensor=change)
+    assert float(view.residual(truth(view), {}).abs().max()) > 1.0
+    assert float(view.residual(truth(view), {"sensor": change}).abs().max()) < 0.03
+
+
+def test_a_change_of_the_field_is_one_of_its_strength(view):
+    stronger = torch.linspace(-1.0, 1.0, 500, dtype=torch.float64).unsqueeze(-1)
+    moved = view.residual(truth(view), {"field": stronger}) - view.residual(truth(view), {})
+    torch.testing.assert_close(moved[:, :1], -stronger)
+    assert float(moved[:, 1:].abs().max()) < 1e-12
+
+
+def test_windows_last_two_seconds_and_end_at_gaps():
+    time = np.concatenate([np.arange(300), 1000 + np.arange(200)]) / 50.0
+    rate = body_rate(time)
+    measured = turns(time).inv().apply(FIELD)
+    table = tumbling(500, gyro=True)
+    new = {"time": time} | {f"gyro_{a}": rate[:, k] for k, a in enumerate("xyz")}
+    new |= {f"mag_{a}": measured[:, k] for k, a in enumerate("xyz")}
+    view = Magnetometer(use="gyro").prepare(changed(table, **new))
+    counts = torch.bincount(view.window)
+    assert counts.tolist() == [100, 100, 100, 100, 100]
+    identity = torch.tensor([0, 0, 0, 1, 1, 1, 0, 0, 0, 0, 0, 0], dtype=torch.float64)
+    identity[3:6] *= view.strength / np.linalg.norm(FIELD)
+    assert float(view.residual(identity, {}).abs().max()) < 0.03
+
+
+def test_outliers_do_not_move_their_window():
+    sensor = np.zeros((500, 3))
+    sensor[5::7] += (60.0, -40.0, 50.0)
+    view = prepared(noise=0.1, sensor=sensor)
+    residual = view.residual(truth(view), {})
+    clean = torch.ones(500, dtype=torch.bool)
+    clean[5::7] = False
+    assert float(residual[clean].abs().max()) < 1.0
+    assert float(residual[~clean].norm(dim=-1).min()) > 50.0
+
+
+def test_signals_are_the_simulated_measurement(view):
+    found = view.signals(truth(view))["sensor"]
+    torch.testing.assert_close(found, view.measured - torch.from_numpy(OFFSET), atol=0.03, rtol=0.0)
+
+
+def test_a_bias_of_the_gyroscope_is_a_parameter():
+    bias = np.array([0.02, -0.01, 0.015])
+    recording = tumbling(500, gyro=True)
+    spoilt = changed(recording, **{f"gyro_{a}": recording[f"gyro_{a}"] + bias[k] for k, a in enumerate("xyz")})
+    view = Magnetometer(use="gyro").prepare(spoilt)
+    theta = truth(view)
+    without = float(view.residual(theta, {}).square().mean().sqrt())
+    theta[9:12] = torch.from_numpy(bias)
+    assert float(view.residual(theta, {}).square().mean().sqrt()) < 0.1 * without
+
+
+def test_what_is_known_of_the_bias_beforehand(view):
+    assert bool((view.prior.precision[9:] > 0).all())
+    assert view.prior.mean.tolist() == [0.0] * 12 or view.prior.mean[9:].tolist() == [0.0] * 3
+
+
+def test_ports(view):
+    assert view.ports["field"].channels == ("strength",)
+    assert not any(port.pointwise for port in view.ports.values())
+    assert view.state == {"view": "gyro"}
+
+
+def test_a_hand_that_turns_too_little_for_the_length_is_followed_by_the_gyroscope():
+    recording = tumbling(500, noise=0.2, size=(1.0, 0.3, 0.3), gyro=True)
+    with pytest.raises(NotIdentifiableError, match="Directions not covered"):
+        Magnetometer(use="norm").prepare(recording)
+    view = Magnetometer().prepare(recording)
+    assert view.view == "gyro"
+    np.testing.assert_allclose(view.start()[:3], OFFSET, atol=5.0)
+
+
+def test_a_turn_about_one_axis_determines_no_offset_along_it():
+    with pytest.raises(NotIdentifiableError, match="Directions not covered"):
+        Magnetometer().prepare(tumbling(500, noise=0.2, size=(1.0, 0.0, 0.0), gyro=True))
