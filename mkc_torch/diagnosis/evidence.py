@@ -53,7 +53,7 @@ def blocks_of(N: int, correlation: int) -> HeldOutBlocks:
     block = (torch.arange(N) * count).div(N, rounding_mode="floor")
     fold = block % FOLDS
     # never so much that training blocks of an ordinary recording are left empty
-    gap = max(1, min(max(math.ceil(_GAP * N), correlation), 3 * N // (4 * count)))
+    gap = max(1, min(max(math.ceil(_GAP * N), correlation), N // (2 * count)))
     train = []
     for k in range(FOLDS):
         near = (fold == k).to(torch.float64).reshape(1, 1, -1)
