@@ -140,6 +140,7 @@ def _simulation(name: str) -> Simulation:
 def _failed(path: Path, label: str, error: Exception) -> Outcome:
     subject = f"{path}, experiment {label}" if label else str(path)
     sentence = sentence_of(error) if isinstance(error, FAILURES) else _unexpected(error)
+    sentence = sentence.removeprefix(f"{path.stem}/{label}: " if label else f"{path.stem}: ")  # the path says it
     return Outcome(sentence if sentence.startswith(subject) else f"{subject}: {sentence}", failed=True)
 
 

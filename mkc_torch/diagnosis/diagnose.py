@@ -257,7 +257,7 @@ def _advice(findings: Sequence[Finding]) -> tuple[str, ...]:
             advice.append(
                 f"The size of {finding.effect} is not plausible: look for another cause before correcting it."
             )
-    return tuple(advice)
+    return tuple(dict.fromkeys(advice))
 
 
 def _candidates(first: Located | None) -> tuple[Candidate, ...]:

@@ -6,6 +6,8 @@ import torch
 
 from mkc_torch import diagnose
 from mkc_torch.diagnosis import DiagnosedModel
+from mkc_torch.diagnosis.candidates import candidate_terms
+from mkc_torch.diagnosis.drivers import find_drivers
 from mkc_torch.effects import CATALOGUE, GainEffect
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling
@@ -39,6 +41,18 @@ def diagnosis():
 
 def test_it_is_named_by_the_role_its_column_is_called(diagnosis):
     assert [(f.effect, f.drivers) for f in diagnosis.findings] == [("supply_offset", ("voltage",))]
+
+
+@pytest.mark.xfail(strict=True, reason="the curve is for columns of known roles and of none")
+def test_a_curve_without_a_name_is_tried_on_its_column_too():
+    """Where the user's formula is not the right one, the mismatch must not pass for adequate."""
+    prepared = Magnetometer().prepare(tumbling(600, noise=0.3, voltage=np.sin(np.arange(600) / 25.0)))
+    effects = (*CATALOGUE, SupplyOffset())
+    drivers = find_drivers(prepared.recording, Magnetometer().columns, frozenset({"voltage", "any"}))
+    tried = {term.key for term in candidate_terms(prepared, drivers.drivers, effects)}
+    assert ("supply_offset", ("voltage",)) in tried
+    assert ("driver_offset", ("voltage",)) not in tried
+    assert ("unknown", ("voltage",)) in tried
 
 
 def test_the_finding_speaks_with_its_words(diagnosis):

@@ -1,0 +1,183 @@
+"""The whole way: an effect is put into a recording whose truth is known, and has to be named, sized and taken off."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch import diagnose
+from mkc_torch.diagnosis import DiagnosedModel
+from mkc_torch.diagnosis.diagnosed_model import ModelFileError
+from mkc_torch.diagnosis.diagnosis_file import diagnosis_to_json
+from mkc_torch.recording import MissingColumnError, Recording
+from mkc_torch.simulation import Magnetometer
+from tests.shared_data import shared_data
+from tests.simulation.tumbling import FIELD, changed, tumbling
+
+N = 2000
+TIME = np.arange(N) / 50.0
+CURRENT = 2.0 + 1.5 * np.sign(np.sin(2 * np.pi * TIME / 13.0)) + 0.3 * np.sin(2 * np.pi * TIME / 3.1)
+TEMPERATURE = 22.0 + 6.0 * (1.0 - np.exp(-TIME / 15.0)) + 0.8 * np.sin(2 * np.pi * TIME / 17.0)
+DECOYS = {
+    "aux_1": np.cumsum(np.random.default_rng(1).standard_normal(N)),
+    "aux_2": np.sin(2 * np.pi * TIME / 9.0) + 0.05 * TIME,
+}
+COLUMNS = {"current": CURRENT, "temperature": TEMPERATURE, **DECOYS}
+GAIN = np.array([0.4, -0.3, 0.5])
+
+
+def outliers(seed=3, share=0.1, size=15.0):
+    """Sparse, large, on every axis."""
+    random = np.random.default_rng(seed)
+    return size * random.standard_normal((N, 3)) * (random.random((N, 1)) < share)
+
+
+def recording_of(effect, **options):
+    return tumbling(N, noise=0.4, sensor=effect + outliers(), **{**COLUMNS, **options})
+
+
+HIDDEN = {
+    "hard_iron_step": (4.0 * GAIN * (TIME[:, None] >= 23.4), (), "offset_change", 4.0 * GAIN),
+    "current_field": (GAIN * (CURRENT[:, None] - 2.0), ("current",), "field_per_ampere", GAIN),
+    "temperature_offset": (GAIN * (TEMPERATURE[:, None] - 22.0), ("temperature",), "offset_per_kelvin", GAIN),
+}
+
+
+@pytest.fixture(scope="module", params=sorted(HIDDEN))
+def named(request):
+    effect, drivers, parameter, value = HIDDEN[request.param]
+    return request.param, drivers, parameter, value, diagnose(Magnetometer(), recording_of(effect))
+
+
+def test_it_is_named_with_its_driver(named):
+    effect, drivers, _, _, diagnosis = named
+    assert diagnosis.verdict == "explained"
+    assert (diagnosis.findings[0].effect, diagnosis.findings[0].drivers) == (effect, drivers)
+    assert diagnosis.findings[0].p_value <= 0.05
+
+
+def test_its_size_is_within_its_errors(named):
+    _, _, name, value, diagnosis = named
+    (parameter,) = [p for p in diagnosis.findings[0].parameters if p.name == name]
+    off = (np.array(parameter.value) - value) / np.array(parameter.standard_error)
+    assert np.abs(off).max() < 4.0
+    assert np.abs(np.array(parameter.value) - value).max() < 0.25 * np.abs(value).max()
+
+
+def test_the_fit_improves_on_blocks_that_it_has_not_seen(named):
+    held = named[-1].findings[0].held_out
+    assert held.confidence_interval[0] > 0.0
+    assert held.rmse_after < held.rmse_before
+
+
+def test_the_file_is_valid_and_says_the_same(named):
+    effect, *_, diagnosis = named
+    content = json.loads(diagnosis_to_json(diagnosis))
+    assert content["schema"] == "mkc-diagnosis/1"
+    assert content["findings"][0]["effect"] == effect
+
+
+def test_the_model_takes_it_off_another_recording(named):
+    effect, *_, diagnosis = named
+    model = DiagnosedModel.from_json(diagnosis.model.to_json())
+    lasting = {"hard_iron_step": 4.0 * GAIN * np.ones((N, 1))}.get(effect, HIDDEN[effect][0])
+    later = tumbling(N, noise=0.0, sensor=lasting, size=(0.9, 1.1, 1.2), **COLUMNS)
+    columns, notes = model.correct(later)
+    length = torch.stack([columns[f"field_{axis}"] for axis in "xyz"], -1).norm(dim=-1)
+    assert float((length / length.mean() - 1.0).abs().max()) * np.linalg.norm(FIELD) < 0.5
+    assert bool(notes) == (effect == "hard_iron_step")
+
+
+def test_a_step_is_found_to_the_sample_or_nearly():
+    effect = 4.0 * GAIN * (TIME[:, None] >= 23.4)
+    assert diagnose(Magnetometer(), recording_of(effect)).findings[0].onset == pytest.approx(23.4, abs=0.3)
+
+
+def test_nothing_is_found_where_nothing_is():
+    found = [diagnose(Magnetometer(), tumbling(N, noise=0.4, sensor=outliers(s), seed=s, **COLUMNS)) for s in range(4)]
+    assert sum(d.verdict != "adequate" for d in found) <= 1
+    assert all(d.model is not None for d in found)
+
+
+def test_the_same_seed_gives_the_same_diagnosis():
+    recording = recording_of(np.zeros((N, 3)))
+    first, second = (diagnosis_to_json(diagnose(Magnetometer(), recording, seed=5)) for _ in range(2))
+    assert first == second
+
+
+def test_a_time_offset_and_a_name_change_nothing():
+    recording = recording_of(HIDDEN["current_field"][0])
+    moved = Recording({**recording.columns, "time": recording["time"] + 1000.0}, name="other", units=recording.units)
+    a, b = diagnose(Magnetometer(), recording), diagnose(Magnetometer(), moved)
+    assert [f.effect for f in a.findings] == [f.effect for f in b.findings]
+    assert np.allclose(a.findings[0].parameters[0].value, b.findings[0].parameters[0].value, rtol=1e-3)
+
+
+def test_the_driver_s_copy_is_a_rival_that_cannot_be_told_apart():
+    recording = recording_of(HIDDEN["current_field"][0], spare=3.0 * CURRENT + 1.0)
+    (finding, *_) = diagnose(Magnetometer(), recording).findings
+    assert finding.drivers == ("current",)
+    assert ("spare",) in [a.drivers for a in finding.alternatives if not a.separable]
+
+
+def test_the_level_holds_with_three_hundred_columns():
+    random = np.random.default_rng(4)
+    many = {f"column_{k}": np.cumsum(random.standard_normal(N)) for k in range(300)}
+    assert diagnose(Magnetometer(), tumbling(N, noise=0.4, sensor=outliers(), **many)).verdict == "adequate"
+
+
+def test_without_its_driver_a_model_refuses():
+    model = diagnose(Magnetometer(), recording_of(HIDDEN["current_field"][0])).model
+    with pytest.raises(MissingColumnError, match=r"current_field by the column `current`.*--columns current=NAME"):
+        model.correct(changed(recording_of(np.zeros((N, 3))), current=None))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{", "not JSON"),
+        ('{"schema": "mkc-calibration/1"}', 'its schema is "mkc-calibration/1"'),
+        ('{"schema": "mkc-model/1"}', "damaged"),
+        (
+            '{"schema": "mkc-model/1", "simulation": "magnetometer", "state": {}, "parameters": [], '
+            '"effects": [{"effect": "magic", "drivers": [], "shape": {}, "parameters": []}]}',
+            '"magic" is not known',
+        ),
+    ],
+)
+def test_a_text_that_is_no_model_is_refused(text, said):
+    with pytest.raises(ModelFileError, match=said):
+        DiagnosedModel.from_json(text)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"level": 0.0}, "`level`"),
+        ({"surrogates": 5}, "`surrogates` to be at least 19"),
+        ({"max_findings": -1}, "`max_"),
+    ],
+)
+def test_arguments_out_of_range_are_refused(options, said):
+    with pytest.raises(ValueError, match=said):
+        diagnose(Magnetometer(), recording_of(np.zeros((N, 3))), **options)
+
+
+def test_two_rows_are_too_few():
+    with pytest.raises(ValueError, match="2 samples are too few for a diagnosis"):
+        diagnose(Magnetometer(), tumbling(2))
+
+
+@pytest.mark.parametrize(("name", "onset", "step"), [
+    ("broad_34_attached_magnet_3cm", 51.5, (1.3, -0.5, -13.4)),
+    ("broad_36_attached_magnet_5cm", 54.8, (-0.7, -0.1, 5.7)),
+])  # fmt: skip
+def test_a_magnet_that_is_taken_off_a_real_sensor_is_seen(name, onset, step):
+    whole = Recording.read(shared_data(f"magnetometer/{name}.csv"))
+    # every fourth sample, and the length alone: the step has to be seen without optical truth, in seconds
+    columns = {key: whole[key][::4] for key in ("time", "mag_x", "mag_y", "mag_z")}
+    finding = diagnose(Magnetometer(use="norm"), Recording(columns, name=name)).findings[0]
+    assert finding.effect == "hard_iron_step"
+    assert finding.onset == pytest.approx(onset, abs=1.0)
+    assert np.abs(np.array(finding.parameters[0].value) - step).max() < 1.0
