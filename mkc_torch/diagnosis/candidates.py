@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.drivers import Driver
 from mkc_torch.diagnosis.model import Term
+from mkc_torch.diagnosis.preference import UNKNOWN
 from mkc_torch.effects.protocol import ContinuousEffect, Effect, Shape
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -30,10 +31,15 @@ def candidate_terms(
         if effect.port not in prepared.ports:
             continue
         # a role that is known says what the column does; an effect of unknown roles takes what is left over
-        fitting = [None] if not effect.roles else [d for d in drivers if d.role in effect.roles]
+        fitting = [None] if not effect.roles else [d for d in drivers if _drives(d, effect)]
         shapes = effect.shapes(prepared.time)
         terms += [Term(effect, driver, shape) for driver in fitting for shape in shapes]
     return tuple(terms)
+
+
+def _drives(driver: Driver, effect: Effect) -> bool:
+    """Whether a driver has one of an effect's roles; a curve without a name follows any one column."""
+    return driver.role in effect.roles or (effect.id == UNKNOWN and len(driver.columns) == 1)
 
 
 def finer(term: Term, name: str, time: Float[Tensor, " N"], rounds: int) -> tuple[Term, ...]:

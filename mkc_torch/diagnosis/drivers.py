@@ -114,7 +114,7 @@ def role_of(name: str, unit: str) -> str:
 
 def _own_role(name: str, roles: frozenset[str]) -> str:
     """The role of a user's effect that a column's name says; the longest, if several."""
-    fitting = [role for role in roles if role != ANY and (name == role or name.startswith(f"{role}_"))]
+    fitting = [role for role in roles - {ANY, "position"} if (name == role or name.startswith(f"{role}_"))]
     return max(fitting, key=len, default="")
 
 

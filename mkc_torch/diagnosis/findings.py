@@ -27,6 +27,7 @@ _FARTHEST = 30.0
 _BLOCKS, _MOST_GAIN, _CONCENTRATED = 60, 0.9, 0.35
 _POINTS = 80
 _NORMAL_95 = 1.959964
+_SECONDS = ("lag", "time_constant", "middle", "width")
 
 
 def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | None, note: str) -> Finding:
@@ -94,8 +95,11 @@ def parameters_of(
 
 
 def _shape_parameters(term: Term) -> tuple[Parameter, ...]:
-    seconds = {"lag", "time_constant"}
-    return tuple(Parameter(name, value, None, "s") for name, value in term.shape.items() if name in seconds)
+    return tuple(
+        Parameter(name, value, None, "s" if name in _SECONDS else "")
+        for name, value in term.shape.items()
+        if name != "onset"
+    )
 
 
 def _numbers(values: Tensor) -> Number:

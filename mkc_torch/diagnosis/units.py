@@ -16,8 +16,8 @@ def unit_warnings(recording: Recording) -> tuple[str, ...]:
         >>> import torch
         >>> angle = torch.linspace(0.0, 6.0, 20)
         >>> columns = {"mag_x": 0.5 * angle.cos(), "mag_y": 0.5 * angle.sin(), "mag_z": 0.0 * angle}
-        >>> unit_warnings(Recording(columns))[0]
-        'The magnetometer measures about 0.5 µT ... gauss ...'
+        >>> "gauss" in unit_warnings(Recording(columns))[0]
+        True
     """
     return tuple(s for s in (_field(recording), _rate(recording), _acceleration(recording), _time(recording)) if s)
 

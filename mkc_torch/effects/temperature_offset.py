@@ -28,13 +28,13 @@ class TemperatureOffset(DriverOffset):
     id = "temperature_offset"
     roles = ("temperature",)
     gain = "offset_per_kelvin"
-    equation = "δB = k (T − T̄)"
+    equation = "δB = k (T − T̄) (1 + c (T − T̄))"
     explanation = "The sensor's offset changes with temperature."
     advice = "Correct with the fitted coefficient, or calibrate at the temperature of use."
     plausible = 5.0
     source = "offset temperature coefficients of MEMS magnetometers, about 0.2 µT/K in data sheets"
     lags = (0.0, 1.0, 5.0)
-    continuous: Mapping[str, tuple[float, float]] = {"lag": (0.0, 0.2), "curvature": (-0.002, 0.002)}
+    continuous: Mapping[str, tuple[float, float]] = {"lag": (0.0, 0.2)}
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         return (*super().shapes(time), {"curvature": 0.02}, {"curvature": -0.02})

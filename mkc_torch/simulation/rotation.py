@@ -17,8 +17,8 @@ def from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*ba
     """Rotation matrices from body to world of quaternions (w, x, y, z) of any length but 0.
 
     Example:
-        >>> from_quaternion(torch.tensor([1.0, 0.0, 0.0, 1.0])) @ torch.tensor([1.0, 0.0, 0.0])
-        tensor([0., 1., 0.])
+        >>> from_quaternion(torch.tensor([2.0, 0.0, 0.0, 0.0])) @ torch.tensor([1.0, 2.0, 3.0])
+        tensor([1., 2., 3.])
     """
     w, x, y, z = (quaternion / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)).unbind(-1)
     rows = [

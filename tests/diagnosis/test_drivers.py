@@ -162,7 +162,6 @@ def test_effects_can_ask_for_roles_of_their_own():
     ]  # fmt: skip
 
 
-@pytest.mark.xfail(strict=True, reason="a single column gets the role of three, and field_gradient breaks on it")
 def test_a_part_of_the_position_is_no_position():
     recording = Recording({"time": RAMP, "position_x": WAVES[0], "position_y": WAVES[1], "position_z": 0.0 * RAMP})
     drivers = find_drivers(recording, frozenset({"time"}), frozenset({"position", "any"})).drivers

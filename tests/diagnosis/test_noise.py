@@ -153,7 +153,6 @@ def test_slow_noise_beside_the_autoregression_is_followed(whitened_walks, low, h
     assert 0.75 < float(whitened_walks[low:high].mean()) < most
 
 
-@pytest.mark.xfail(strict=True, reason="the slowest cosines are taken for quieter than they are")
 def test_the_slowest_noise_is_followed_too(whitened_walks):
     assert float(whitened_walks[1:4].mean()) < 1.75
 
@@ -240,7 +239,6 @@ def test_the_spread_of_pseudo_residuals_is_that_of_the_estimate():
     assert predicted == pytest.approx(1.4, abs=0.15)
 
 
-@pytest.mark.xfail(strict=True, reason="the sum over lags is decided by the noise of its slopes")
 def test_where_noise_enters_is_seen_by_the_turns():
     axes = torch.from_numpy(turns(np.arange(3000) / 50.0).as_matrix().copy())
     right = 0

@@ -43,7 +43,6 @@ def test_it_is_named_by_the_role_its_column_is_called(diagnosis):
     assert [(f.effect, f.drivers) for f in diagnosis.findings] == [("supply_offset", ("voltage",))]
 
 
-@pytest.mark.xfail(strict=True, reason="the curve is for columns of known roles and of none")
 def test_a_curve_without_a_name_is_tried_on_its_column_too():
     """Where the user's formula is not the right one, the mismatch must not pass for adequate."""
     prepared = Magnetometer().prepare(tumbling(600, noise=0.3, voltage=np.sin(np.arange(600) / 25.0)))
