@@ -102,9 +102,27 @@ def diagnose(
     generator = torch.Generator().manual_seed(seed)
     base = _base(prepared)
     searches = _searches(base, terms, level, surrogates, max_findings, generator)
-    found = [s for s in searches if s.p_value <= level]
+    found = [s for s in searches if s.p_value <= level][:max_findings]
+    blocks = blocks_of(len(base.residual), _memory(searches))
+    evidence = [held_out(model, blocks) for model in (base, *(s.fit for s in found))]
+    while len(found) > 1 and not _confirmed(evidence[-2], evidence[-1], blocks, seed):
+        # what comes after a finding also has what the finding's own form left over; unseen blocks have to confirm it
+        found, evidence = found[:-1], evidence[:-1]
     final = estimate(found[-1].fit if found else base)
-    return _assembled(prepared, drivers, terms, base, searches, found, final, level, surrogates, seed, generator)
+    return _assembled(
+        prepared, drivers, terms, base, searches, found, final, blocks, evidence, level, surrogates, seed, generator
+    )
+
+
+def _memory(searches: Sequence[Located]) -> int:
+    """Samples over which the noise remembers: the order of its colour, one at least."""
+    return 1 + max((s.linearised.colour.order for s in searches), default=0)
+
+
+def _confirmed(before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int) -> bool:
+    difference = after.log_likelihood - before.log_likelihood
+    _, (low, _) = gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))
+    return low > 0.0
 
 
 def _base(prepared: PreparedSimulation) -> FittedModel:
@@ -164,14 +182,13 @@ def _assembled(
     searches: list[Located],
     found: list[Located],
     final: Estimate,
+    blocks: HeldOutBlocks,
+    evidence: list[Evidence],
     level: float,
     surrogates: int,
     seed: int,
     generator: torch.Generator,
 ) -> Diagnosis:
-    blocks = blocks_of(len(base.residual), final.linearised.colour.order + 1)
-    models = [base, *(s.fit for s in found)]
-    evidence = [held_out(model, blocks) for model in models]
     inliers = (evidence[-1].residual.abs() <= 3.0 * evidence[-1].d) & (final.fit.weights > _REST)
     findings = [
         finding_of(s, final, k, *_held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, generator))
