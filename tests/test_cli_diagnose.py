@@ -207,28 +207,23 @@ def test_other_units_are_named_not_guessed(tmp_path, factor, unit):
 
 
 @pytest.mark.parametrize(
-    ("columns", "words"),
+    ("changes", "rows", "words"),
     [
-        ({name: values[:2] for name, values in sensor(QUIET).items()}, ["2 samples are too few", "Record"]),
-        (
-            {name: values for name, values in sensor(QUIET).items() if name != "mag_y"},
-            ["no column `mag_y`", "--columns"],
-        ),
-        (sensor(QUIET) | {"mag_y": torch.full((500,), math.nan)}, ["no sample has finite values"]),
-        (
-            sensor(QUIET) | {name: torch.full((500,), 20.0) for name in AXES},
-            ["all points are equal", "Turn the sensor"],
-        ),
-        (sensor(QUIET) | {"time": torch.full((500,), math.nan)}, ["no sample has a finite time"]),
+        ({}, 2, ["2 samples are too few", "Record"]),
+        ({"mag_y": None}, 500, ["no column `mag_y`", "--columns"]),
+        ({"mag_y": torch.full((500,), math.nan)}, 500, ["no sample has finite values"]),
+        (dict.fromkeys(AXES, torch.full((500,), 20.0)), 500, ["all points are equal", "Turn the sensor"]),
+        ({"time": torch.full((500,), math.nan)}, 500, ["no sample has a finite time"]),
     ],
 )
-def test_bad_recordings_are_refused_in_one_sentence(tmp_path, columns, words):
-    path = table(tmp_path / "bad.csv", columns)
+def test_bad_recordings_are_refused_in_one_sentence(tmp_path, changes, rows, words):
+    columns = {name: values for name, values in (sensor(QUIET) | changes).items() if values is not None}
+    path = table(tmp_path / "bad.csv", {name: values[:rows] for name, values in columns.items()})
     refused(diagnosed(path, "--output", tmp_path / "out"), f"mkc: {path}: ", *words)
     assert not (tmp_path / "out" / "bad").exists()
 
 
-@pytest.mark.xfail(reason="a ball of noise passes for a small ellipsoid")
+@pytest.mark.xfail(reason="a ball of noise passes for a small ellipsoid, and takes a minute", run=False)
 def test_a_sensor_at_rest(tmp_path):
     generator = torch.Generator().manual_seed(0)
     still = {name: 20.0 + 0.3 * torch.randn(150, generator=generator, dtype=torch.float64) for name in AXES}
@@ -355,15 +350,15 @@ def test_an_interrupt_ends_all_processes_and_leaves_nothing(tmp_path):
 
 def test_challenge(tmp_path):
     folder = tmp_path / "proof"
-    command = ("challenge", "--cases", 1, "--empty", 1, "--seed", 3, "--duration", 20, "--workers", 1)
+    command = ("challenge", "--cases", 1, "--empty", 1, "--seed", 4, "--duration", 15, "--workers", 1)
     result = mkc(*command, "--output", folder)
     assert result.exit_code == 0, result.output
-    for words in ("Blind proof: 1 recordings with something hidden, 1 with nothing", "false alarms", "asked", "holds"):
+    for words in ("Blind proof: 2 recordings, something hidden in 1", "false alarms", "asked", "holds"):
         assert words in result.stdout
     assert str(folder / "challenge.html") in result.stdout
     assert "failed none" in " ".join(result.stdout.split())
     record = json.loads((folder / "score.json").read_text(encoding="utf-8"))
-    assert (record["settings"]["hidden"], record["settings"]["empty"], record["settings"]["seed"]) == (1, 1, 3)
+    assert (record["settings"]["hidden"], record["settings"]["empty"], record["settings"]["seed"]) == (1, 1, 4)
     made = sorted(path.name for path in (folder / "diagnoses").iterdir())
     assert made == ["case_00000", "case_00001"]
     assert sorted(p.name for p in (folder / "diagnoses" / "case_00000").iterdir()) == ["diagnosis.json", "model.json"]

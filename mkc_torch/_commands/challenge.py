@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -87,7 +88,7 @@ def _show(score: Score, cases: int, empty: int, output: Path) -> None:
 
     console = out()
     console.print()
-    console.print(Text(f"Blind proof: {cases} recordings with something hidden, {empty} with nothing", style="bold"))
+    console.print(Text(f"Blind proof: {cases + empty:,} recordings, something hidden in {cases:,}", style="bold"))
     table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
     table.add_column("asked", overflow="fold")
     table.add_column("measured", justify="right")
@@ -96,7 +97,7 @@ def _show(score: Score, cases: int, empty: int, output: Path) -> None:
         table.add_row(
             Text(m.threshold.sentence),
             number_text(m.value),
-            Text("yes") if m.holds else Text("no", style="bold yellow"),
+            Text("—") if math.isnan(m.value) else Text("yes") if m.holds else Text("no", style="bold yellow"),
         )
     console.print(table)
     facts = Table.grid(padding=(0, 3, 0, 0))

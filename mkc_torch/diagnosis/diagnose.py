@@ -40,7 +40,7 @@ MAX_FINDINGS = 3
 FEWEST = 100
 """With fewer samples nothing can be said about structure."""
 
-_WIDER = 3.0
+_WIDER, _NEAR = 3.0, 0.05
 
 _REST = 0.5
 """A larger share of samples in which nothing moves is a sensor at rest, and is warned of."""
@@ -108,7 +108,7 @@ def diagnose(
     while len(found) > 1 and not _confirmed(evidence[-2], evidence[-1], blocks, seed):
         # what comes after a finding also has what the finding's own form left over; unseen blocks have to confirm it
         found, evidence = found[:-1], evidence[:-1]
-    final = estimate(found[-1].fit if found else base)
+    final = estimate(found[-1].fit if found else base).at_least(evidence[-1].jackknife)
     return _assembled(
         prepared, drivers, terms, base, searches, found, final, blocks, evidence, level, surrogates, seed, generator
     )
@@ -163,14 +163,18 @@ def _searches(
         if found.p_value > level or count == max_findings - 1:
             break
         fit = found.fit
-        terms = tuple(t for t in terms if not _same(t, found.term))
+        near = _NEAR * float(base.model.prepared.time[-1] - base.model.prepared.time[0])
+        terms = tuple(t for t in terms if not _same(t, found.term, near))
     return searches
 
 
-def _same(term: Term, found: Term) -> bool:
-    """Whether a candidate is the found effect again, or a curve over its driver; a step elsewhere is another one."""
+def _same(term: Term, found: Term, near: float) -> bool:
+    """Whether a candidate is the found effect again, or a curve over its driver.
+
+    A step further away than ``near``, in s, is another one; closer by, it would only mend how the first one rises.
+    """
     if "onset" in term.shape and "onset" in found.shape:
-        return False
+        return abs(term.shape["onset"] - found.shape["onset"]) < near
     return term.key == found.key or (term.effect.id == UNKNOWN and term.columns == found.columns)
 
 

@@ -34,6 +34,12 @@ class Estimate:
     def standard_error(self) -> Float[Tensor, " p"]:
         return self.covariance.diagonal().clamp(min=0.0).sqrt()
 
+    def at_least(self, error: Float[Tensor, " p"]) -> Estimate:
+        """The same with standard errors that are nowhere smaller than these; correlations stay."""
+        own = self.standard_error
+        larger = torch.where(own > 0, torch.maximum(error / own.clamp(min=1e-300), torch.ones_like(own)), 1.0)
+        return replace(self, covariance=larger.unsqueeze(-1) * self.covariance * larger)
+
 
 def estimate(fit: FittedModel) -> Estimate:
     """One step of generalised least squares on the pseudo-residuals, with the colour and wander of their noise.

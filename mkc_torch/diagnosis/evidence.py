@@ -34,12 +34,26 @@ class HeldOutBlocks:
 
 @dataclass(frozen=True)
 class Evidence:
-    """A model on held-out samples: log-likelihood of each (N,), residual (N, m), the density's σ and d (m,)."""
+    """A model on held-out samples: log-likelihood of each (N,), residual (N, m), the density's σ and d (m,).
+
+    ``parameters`` are those of the fits without each fold, (folds, p).
+    """
 
     log_likelihood: Float[Tensor, " N"]
     residual: Float[Tensor, "N m"]
     sigma: Float[Tensor, " m"]
     d: Float[Tensor, " m"]
+    parameters: Float[Tensor, "folds p"]
+
+    @property
+    def jackknife(self) -> Float[Tensor, " p"]:
+        """Standard errors of the parameters by leaving one fold out at a time.
+
+        Each fold is made of blocks all over the recording, so they see what a model of the noise, or of the effect's
+        form, does not. Efron & Tibshirani, "An Introduction to the Bootstrap" (1993), (11.5).
+        """
+        folds = len(self.parameters)
+        return ((folds - 1) * self.parameters.var(0, correction=0)).sqrt()
 
 
 def blocks_of(N: int, correlation: int) -> HeldOutBlocks:
@@ -67,7 +81,7 @@ def held_out(fit: FittedModel, blocks: HeldOutBlocks) -> Evidence:
     N = len(fit.residual)
     log_likelihood = fit.residual.new_zeros(N)
     residual = torch.zeros_like(fit.residual)
-    sigma, d = [], []
+    sigma, d, parameters = [], [], []
     for number, train in enumerate(blocks.train):
         found = fitted(fit.model, fit.parameters, fit.bound, rows=train.to(fit.residual.dtype), graduate=False)
         seen = blocks.fold == number
@@ -76,7 +90,9 @@ def held_out(fit: FittedModel, blocks: HeldOutBlocks) -> Evidence:
         log_likelihood[seen] = scored(out, found.sigma, found.d, found.bound)[seen]
         sigma.append(found.sigma)
         d.append(found.d)
-    return Evidence(log_likelihood, residual, torch.stack(sigma).median(0).values, torch.stack(d).median(0).values)
+        parameters.append(found.parameters)
+    middle = torch.stack(sigma).median(0).values, torch.stack(d).median(0).values
+    return Evidence(log_likelihood, residual, *middle, torch.stack(parameters))
 
 
 def scored(residual: Tensor, sigma: Tensor, d: Tensor, bound: Tensor) -> Float[Tensor, " N"]:
