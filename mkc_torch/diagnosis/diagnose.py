@@ -18,7 +18,7 @@ from mkc_torch.diagnosis.findings import finding_of
 from mkc_torch.diagnosis.locate import Located, locate
 from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.noise_summary import noise_summary
-from mkc_torch.diagnosis.preference import UNKNOWN
+from mkc_torch.diagnosis.preference import ALIKE_COLUMNS, UNKNOWN, alike
 from mkc_torch.diagnosis.refit import FittedModel, fitted
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Finding, HeldOut, Separability, Spread, Traces, Verdict
 from mkc_torch.diagnosis.separability import separability
@@ -175,7 +175,10 @@ def _same(term: Term, found: Term, near: float) -> bool:
     """
     if "onset" in term.shape and "onset" in found.shape:
         return abs(term.shape["onset"] - found.shape["onset"]) < near
-    return term.key == found.key or (term.effect.id == UNKNOWN and term.columns == found.columns)
+    if term.key == found.key or (term.effect.id == UNKNOWN and term.columns == found.columns):
+        return True
+    # beside a driver that was found, a column that goes the same way would only share its amplitude
+    return term.driver is not None and found.driver is not None and alike(term.driver, found.driver) > ALIKE_COLUMNS
 
 
 def _assembled(

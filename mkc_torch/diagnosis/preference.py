@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.drivers import ANY
+from mkc_torch.diagnosis.drivers import ANY, Driver
 from mkc_torch.diagnosis.model import Term
 from mkc_torch.effects.protocol import GainEffect
 from mkc_torch.simulation.protocol import PreparedSimulation
@@ -16,15 +16,15 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["UNKNOWN", "Preference"]
+__all__ = ["ALIKE_COLUMNS", "UNKNOWN", "Preference", "alike"]
 
 UNKNOWN = "unknown"
 """Id of the effect that is a curve, not physics."""
 
-NAMELESS = (10.0, 0.1)
+NAMELESS = (10.0, 0.25)
 """A curve without a name can follow any named effect a little better: nats, and share of its gain, that it gives."""
 
-ROLELESS, FOLLOWER, ALIKE_COLUMNS = 0.3, 0.6, 0.9
+ROLELESS, FOLLOWER, ALIKE_COLUMNS = 0.3, 0.95, 0.9
 """A column of unknown role may be a consequence of a known driver; the second share holds above this correlation."""
 
 EVENT, ALIKE_EVENT = 0.4, 0.85
@@ -60,6 +60,13 @@ class Preference:
     def _alike(self, course: Float[Tensor, " N"]) -> float:
         """Largest correlation with one of the known drivers, either sign."""
         return float((self._known @ _unit(course)).abs().max()) if len(self._known) else 0.0
+
+
+def alike(one: Driver, other: Driver) -> float:
+    """Correlation of two drivers of one column each, either sign; 0 for others."""
+    if one.values.shape[1] != 1 or other.values.shape[1] != 1:
+        return 0.0
+    return abs(float(_unit(one.values[:, 0]) @ _unit(other.values[:, 0])))
 
 
 def _unit(course: Tensor) -> Tensor:
