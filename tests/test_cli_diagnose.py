@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures.process import BrokenProcessPool
 
 import pytest
 import torch
@@ -18,6 +19,7 @@ from typer.testing import CliRunner
 from mkc_torch import _files
 from mkc_torch._commands import app, diagnosis_files
 from mkc_torch._commands.console import Look
+from mkc_torch._commands.diagnose import _waited_for
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.diagnosis_file import validate
 from mkc_torch.recording import Recording, write_table
@@ -223,7 +225,6 @@ def test_bad_recordings_are_refused_in_one_sentence(tmp_path, changes, rows, wor
     assert not (tmp_path / "out" / "bad").exists()
 
 
-@pytest.mark.xfail(reason="a ball of noise passes for a small ellipsoid, and takes a minute", run=False)
 def test_a_sensor_at_rest(tmp_path):
     generator = torch.Generator().manual_seed(0)
     still = {name: 20.0 + 0.3 * torch.randn(150, generator=generator, dtype=torch.float64) for name in AXES}
@@ -337,7 +338,7 @@ def started(*arguments):
 def test_an_interrupt_ends_all_processes_and_leaves_nothing(tmp_path):
     recordings = [quiet(tmp_path / f"{name}.csv") for name in "abcdef"]
     out = tmp_path / "out"
-    process = started("diagnose", *recordings, "--output", out, "--simulation", "magnetometer", "--surrogates", "99999")
+    process = started("diagnose", *recordings, "--output", out, *QUICK)
     waited = time.monotonic() + 60.0
     while not out.is_dir() and process.poll() is None and time.monotonic() < waited:
         time.sleep(0.05)
@@ -346,6 +347,15 @@ def test_an_interrupt_ends_all_processes_and_leaves_nothing(tmp_path):
     assert process.returncode == 130
     assert "Traceback" not in told
     assert [path.name for path in out.rglob("*") if path.is_file() and path.name not in WRITTEN] == []
+
+
+def test_a_process_that_dies_is_told(tmp_path):
+    def died():
+        raise BrokenProcessPool
+
+    (outcome,) = _waited_for(died, tmp_path / "a.csv")
+    assert outcome.failed
+    assert "its process ended" in outcome.text
 
 
 def test_challenge(tmp_path):

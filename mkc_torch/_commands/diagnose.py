@@ -15,8 +15,7 @@ import typer
 from mkc_torch._commands.console import Look, Steps, err, out, parsed_columns, progress, refuse_same_names
 from mkc_torch._commands.diagnosis_files import SIMULATIONS, Outcome, Request, diagnose_file
 from mkc_torch._commands.processes import in_processes
-
-_SURROGATES = 99
+from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
 
 
 def diagnose(
@@ -34,14 +33,12 @@ def diagnose(
         str | None,
         typer.Option(metavar="COLUMN", help="Column that separates runs in one table; default: experiment, if any."),
     ] = None,
-    level: Annotated[float, typer.Option(metavar="RATE", help="Rate of false alarms.")] = 0.05,
+    level: Annotated[float, typer.Option(metavar="RATE", help="Rate of false alarms.")] = LEVEL,
     surrogates: Annotated[
         int | None,
-        typer.Option(
-            metavar="N", help=f"Draws of noise for each p-value; default: {_SURROGATES}, more at a low level."
-        ),
+        typer.Option(metavar="N", help=f"Draws of noise for each p-value; default: {SURROGATES}, more at a low level."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, metavar="S", help="Of the draws of noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Of the draws of noise.")] = 0,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
     """Say what a simulation lacks: where recordings differ from it, by what physics, how sure, and how much it helps.
@@ -59,6 +56,7 @@ def diagnose(
         force=force,
     )
     refuse_same_names(recordings)
+    # a number does not depend on how many recordings a call has; and threads of processes that share the cores stall
     torch.set_num_threads(1)
     look = Look.of(out())
     work = partial(_diagnosed, output, request, look)
@@ -131,7 +129,7 @@ def _surrogates(count: int | None, level: float) -> int:
     """Draws for each p-value: no p-value can be smaller than one over their number plus one."""
     fewest = math.ceil(1.0 / level - 1.0 - 1e-9)
     if count is None:
-        return max(_SURROGATES, fewest)
+        return max(SURROGATES, fewest)
     if count < fewest:
         raise typer.BadParameter(
             f"--surrogates must be at least {fewest} at level {level:g}, for no p-value is smaller than "

@@ -13,6 +13,7 @@ from mkc_torch._commands.console import FAILURES, Look, folder_removed_on_failur
 from mkc_torch._commands.diagnosis_summary import show
 from mkc_torch._files import claim_folder, write_atomically
 from mkc_torch.diagnosis import Diagnosis, diagnose
+from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
 from mkc_torch.recording import Recording
 
 if TYPE_CHECKING:
@@ -34,8 +35,8 @@ class Request:
     simulation: str = MAGNETOMETER
     columns: Mapping[str, str] = field(default_factory=dict)
     unit: str = "µT"
-    level: float = 0.05
-    surrogates: int = 99
+    level: float = LEVEL
+    surrogates: int = SURROGATES
     seed: int = 0
     force: bool = False
     report: bool = True

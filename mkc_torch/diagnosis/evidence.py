@@ -36,7 +36,7 @@ class HeldOutBlocks:
 class Evidence:
     """A model on held-out samples: log-likelihood of each (N,), residual (N, m), the density's σ and d (m,).
 
-    ``parameters`` are those of the fits without each fold, (folds, p).
+    ``parameters`` are those of the fits without each fold, (folds, p), which leave out this share of the samples.
     """
 
     log_likelihood: Float[Tensor, " N"]
@@ -44,6 +44,7 @@ class Evidence:
     sigma: Float[Tensor, " m"]
     d: Float[Tensor, " m"]
     parameters: Float[Tensor, "folds p"]
+    left_out: float
 
     @property
     def jackknife(self) -> Float[Tensor, " p"]:
@@ -52,8 +53,7 @@ class Evidence:
         Each fold is made of blocks all over the recording, so they see what a model of the noise, or of the effect's
         form, does not. Efron & Tibshirani, "An Introduction to the Bootstrap" (1993), (11.5).
         """
-        folds = len(self.parameters)
-        return ((folds - 1) * self.parameters.var(0, correction=0)).sqrt()
+        return ((1.0 - self.left_out) / self.left_out * self.parameters.var(0, correction=0)).sqrt()
 
 
 def blocks_of(N: int, correlation: int) -> HeldOutBlocks:
@@ -92,7 +92,8 @@ def held_out(fit: FittedModel, blocks: HeldOutBlocks) -> Evidence:
         d.append(found.d)
         parameters.append(found.parameters)
     middle = torch.stack(sigma).median(0).values, torch.stack(d).median(0).values
-    return Evidence(log_likelihood, residual, *middle, torch.stack(parameters))
+    left_out = 1.0 - float(torch.stack(blocks.train).double().mean())
+    return Evidence(log_likelihood, residual, *middle, torch.stack(parameters), left_out)
 
 
 def scored(residual: Tensor, sigma: Tensor, d: Tensor, bound: Tensor) -> Float[Tensor, " N"]:

@@ -46,6 +46,7 @@ _SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 _MIN_ROWS = 50
 _REWEIGHTED, _RIDGE = 10, 1e-4
 _TURNED = 1e-3
+_AT_REST = 0.1
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,7 @@ class _View:
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
         self.measured = recording.magnetometer()
+        _refuse_at_rest(self.measured)
         self.unit = recording.units["mag_x"]
         self.state = {"view": self.view}
         self.warnings: tuple[str, ...] = ()
@@ -426,6 +428,22 @@ def _bias_prior() -> GaussianPrior:
     precision = torch.zeros(12, dtype=torch.float64)
     precision[9:] = GYRO_BIAS**-2
     return GaussianPrior(mean, precision)
+
+
+def _refuse_at_rest(measured: Tensor) -> None:
+    """Refuse a sensor that does not turn: a ball of noise would pass for a small ellipsoid.
+
+    Raises:
+        NotIdentifiableError: the measurements lie close together, and those that follow one another no closer.
+    """
+    middle = measured.median(0).values
+    spread = (measured - middle).square().sum(-1).median()
+    apart = measured.diff(dim=0).square().sum(-1).median()
+    if bool(spread < (_AT_REST * torch.linalg.vector_norm(middle)).square()) and bool(apart > 0.5 * spread):
+        raise NotIdentifiableError(
+            f"Not identifiable: the sensor is at rest, its measurements stay within {float(spread.sqrt()):.3g} of one "
+            "another. Turn the sensor through all directions while recording."
+        )
 
 
 def _with_attitude(recording: Recording) -> Recording:
