@@ -14,7 +14,7 @@ import typer
 
 from mkc_torch._commands.console import Look, Steps, err, out, parsed_columns, progress, refuse_same_names
 from mkc_torch._commands.diagnosis_files import SIMULATIONS, Outcome, Request, diagnose_file
-from mkc_torch._commands.processes import in_processes
+from mkc_torch._commands.processes import cores, in_processes
 from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
 
 
@@ -56,8 +56,8 @@ def diagnose(
         force=force,
     )
     refuse_same_names(recordings)
-    # a number does not depend on how many recordings a call has; and threads of processes that share the cores stall
-    torch.set_num_threads(1)
+    # threads of processes that share the cores stall; one recording has them to itself
+    torch.set_num_threads(cores() if len(recordings) == 1 else 1)
     look = Look.of(out())
     work = partial(_diagnosed, output, request, look)
     total = failed = 0

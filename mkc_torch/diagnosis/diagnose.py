@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -42,6 +43,9 @@ FEWEST = 100
 
 _WIDER, _NEAR = 3.0, 0.05
 
+_BEYOND_DOUBT = 10.0
+"""Nats beyond all draws of noise from which unseen blocks need only to lean the way of a finding, not to confirm it."""
+
 _REST = 0.5
 """A larger share of samples in which nothing moves is a sensor at rest, and is warned of."""
 
@@ -59,8 +63,8 @@ def diagnose(
     """What a simulation lacks, by one recording of what it simulates.
 
     The simulation's own parameters are fitted together with every candidate: effect × driver × shape. The strongest
-    one is judged by the same search on draws of the fitted noise; what passes is kept, refitted jointly, and the search
-    goes on beside it.
+    one is judged by the same search on draws of the fitted noise, and by whether it predicts blocks that the fit has
+    not seen; what passes is kept, refitted jointly, and the search goes on beside it.
 
     Args:
         simulation: of the recording, such as :class:`mkc_torch.simulation.Magnetometer`.
@@ -101,22 +105,9 @@ def diagnose(
     terms = candidate_terms(prepared, drivers.drivers, effects)
     generator = torch.Generator().manual_seed(seed)
     base = _base(prepared)
-    searches = _searches(base, terms, level, surrogates, max_findings, generator)
-    found = [s for s in searches if s.p_value <= level][:max_findings]
-    blocks = blocks_of(len(base.residual), _memory(searches))
-    evidence = [held_out(model, blocks) for model in (base, *(s.fit for s in found))]
-    while len(found) > 1 and not _confirmed(evidence[-2], evidence[-1], blocks, seed):
-        # what comes after a finding also has what the finding's own form left over; unseen blocks have to confirm it
-        found, evidence = found[:-1], evidence[:-1]
-    final = estimate(found[-1].fit if found else base).at_least(evidence[-1].jackknife)
-    return _assembled(
-        prepared, drivers, terms, base, searches, found, final, blocks, evidence, level, surrogates, seed, generator
-    )
-
-
-def _memory(searches: Sequence[Located]) -> int:
-    """Samples over which the noise remembers: the order of its colour, one at least."""
-    return 1 + max((s.linearised.colour.order for s in searches), default=0)
+    search = _searched(base, terms, level, surrogates, max_findings, seed, generator)
+    final = estimate(search.found[-1].fit if search.found else base).at_least(search.evidence[-1].jackknife)
+    return _assembled(prepared, drivers, terms, base, search, final, level, surrogates, seed, generator)
 
 
 def _confirmed(before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int) -> bool:
@@ -144,28 +135,51 @@ def _check(level: float, surrogates: int, max_findings: int) -> None:
         raise ValueError(f"Expected argument `max_findings` to be at least 0 but got {max_findings}.")
 
 
-def _searches(
+@dataclass(frozen=True)
+class _Search:
+    """One search after the other: the first one, what was found, and what unseen blocks did not confirm.
+
+    ``evidence`` is that of the simulation alone and with one finding more each.
+    """
+
+    first: Located | None
+    found: tuple[Located, ...]
+    unconfirmed: Located | None
+    blocks: HeldOutBlocks
+    evidence: tuple[Evidence, ...]
+
+
+def _searched(
     base: FittedModel,
     terms: tuple[Term, ...],
     level: float,
     surrogates: int,
     max_findings: int,
+    seed: int,
     generator: torch.Generator,
-) -> list[Located]:
-    """One search after the other, each beside what the ones before found; the last one may have found nothing."""
-    searches: list[Located] = []
-    fit = base
-    for count in range(max_findings + 1):
-        if not terms:
-            break
-        found = locate(fit, terms, level=level, surrogates=surrogates, generator=generator, parts=count == 0)
-        searches.append(found)
-        if found.p_value > level or count == max_findings - 1:
-            break
-        fit = found.fit
+) -> _Search:
+    """Search beside what was found, as long as something is found that unseen blocks confirm."""
+    N, fit = len(base.residual), base
+    first: Located | None = None
+    found: list[Located] = []
+    if terms:
+        first = locate(fit, terms, level=level, surrogates=surrogates, generator=generator)
+    blocks = blocks_of(N, 1 if first is None else 1 + first.linearised.colour.order)
+    evidence = [held_out(base, blocks)]
+    last = first
+    while last is not None and last.p_value <= level and len(found) < max_findings:
+        evidence.append(held_out(last.fit, blocks))
+        better = bool(evidence[-1].log_likelihood.mean() > evidence[-2].log_likelihood.mean())
+        beyond_doubt = not found and last.beyond > _BEYOND_DOUBT and better
+        if not beyond_doubt and not _confirmed(evidence[-2], evidence[-1], blocks, seed):
+            return _Search(first, tuple(found), last, blocks, tuple(evidence[:-1]))
+        found.append(last)
         near = _NEAR * float(base.model.prepared.time[-1] - base.model.prepared.time[0])
-        terms = tuple(t for t in terms if not _same(t, found.term, near))
-    return searches
+        terms = tuple(t for t in terms if not _same(t, last.term, near))
+        if len(found) == max_findings or not terms:
+            break
+        last = locate(last.fit, terms, level=level, surrogates=surrogates, generator=generator, parts=False)
+    return _Search(first, tuple(found), None, blocks, tuple(evidence))
 
 
 def _same(term: Term, found: Term, near: float) -> bool:
@@ -186,16 +200,14 @@ def _assembled(
     drivers: Drivers,
     terms: tuple[Term, ...],
     base: FittedModel,
-    searches: list[Located],
-    found: list[Located],
+    search: _Search,
     final: Estimate,
-    blocks: HeldOutBlocks,
-    evidence: list[Evidence],
     level: float,
     surrogates: int,
     seed: int,
     generator: torch.Generator,
 ) -> Diagnosis:
+    found, blocks, evidence, first = search.found, search.blocks, search.evidence, search.first
     inliers = (evidence[-1].residual.abs() <= 3.0 * evidence[-1].d) & (final.fit.weights > _REST)
     findings = [
         finding_of(s, final, k, *_held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, generator))
@@ -203,7 +215,6 @@ def _assembled(
     ]
     nameless = any(f.effect == UNKNOWN for f in findings)
     verdict: Verdict = "adequate" if not findings else "unexplained" if nameless else "explained"
-    first = searches[0] if searches else None
     return Diagnosis(
         recording=prepared.recording.name,
         simulation=prepared.name,
@@ -225,6 +236,7 @@ def _assembled(
             *unit_warnings(prepared.recording),
             *prepared.warnings,
             *drivers.warnings,
+            *([_not_confirmed(search.unconfirmed)] if search.unconfirmed else []),
             *_time_warnings(prepared),
         ),
         candidates=_candidates(first),
@@ -301,6 +313,14 @@ def _candidates(first: Located | None) -> tuple[Candidate, ...]:
 
 def _nothing_to_separate() -> Separability:
     return Separability((), torch.zeros(0, 0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
+
+
+def _not_confirmed(located: Located) -> str:
+    name = " of ".join([located.term.effect.id, *([", ".join(located.term.columns)] if located.term.columns else [])])
+    return (
+        f"{name} ({described(located.term.shape) or 'no onset'}): p = {located.p_value:.2g} after the whole search, "
+        "but it does not predict blocks better that the fit has not seen, so it does not count as a finding."
+    )
 
 
 def _time_warnings(prepared: PreparedSimulation) -> tuple[str, ...]:

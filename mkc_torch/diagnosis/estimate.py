@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.linearise import Linearised, Tangents, linearise
-from mkc_torch.diagnosis.model import follows_signal, port_jacobian
+from mkc_torch.diagnosis.linearise import Linearised, linearise, tangents_of
+from mkc_torch.diagnosis.local import beside_wander
 from mkc_torch.diagnosis.refit import FittedModel
 from mkc_torch.diagnosis.search import NoiseFit
 
@@ -49,19 +49,17 @@ def estimate(fit: FittedModel) -> Estimate:
     noise model does not describe, and is not taken.
     """
     model, parameters = fit.model, fit.parameters
-    pointwise = {
-        name: port_jacobian(model, parameters, name) if port.pointwise else None
-        for name, port in model.prepared.ports.items()
-    }
-    jacobian = torch.func.jacfwd(model.residual)(parameters)
-    independent = parameters.new_tensor([float(one) for one in model.prepared.independent])
-    start = model.base
-    for term, size in zip(model.terms, model.sizes, strict=True):
-        if follows_signal(term.effect):
-            jacobian[..., start : start + size] *= independent[:, None]
-        start += size
-    tangents = Tangents(jacobian, (), pointwise)
-    found = linearise(model, parameters, *fit.pseudo, tangents, joint=True)
+    tangents = tangents_of(model, parameters)
+    local = beside_wander(fit, model, parameters, tangents)
+    found = linearise(
+        model,
+        parameters,
+        local.values,
+        local.counts,
+        replace(tangents, slow=local.slow),
+        colour=local.noise.colour,
+        joint=True,
+    )
     step, covariance = found.search.estimate(0, found.series)
     error = covariance.diagonal().clamp(min=1e-300).sqrt()
     if float((step.abs() / error).max()) <= _MOST_ERRORS:

@@ -24,39 +24,74 @@ from mkc_torch.diagnosis.search import LinearSearch
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Linearised", "Tangents", "linearise", "tangents_of"]
+__all__ = ["Linearised", "Slow", "Tangents", "linearise", "tangents_of"]
 
-SLOW_COURSES = 100
-"""Cosine courses of each wandering channel: on 90 s they reach 1.1 Hz."""
+SLOW_COURSES = 150
+"""Cosine courses of each wandering channel: on 90 s they reach 0.8 Hz."""
 
-CORNERS = (8.0, 40.0)
+CORNERS = (25.0,)
 """Numbers of the courses beyond which the wander falls off; beside them, a random walk."""
 
 
-_ALTERNATIONS = 2
 _MOST, _MARGIN, _FEWEST = 0.9, 3.0, 1000
 
 
 @dataclass(frozen=True)
 class Tangents:
-    """How the residual moves: with the parameters (N, m, p), with each candidate's γ (N, m, q), through each port."""
+    """How the residual moves.
+
+    Attributes:
+        nuisance: with the parameters, (N, m, p).
+        candidates: with each candidate's γ, (N, m, q).
+        pointwise: through each port whose samples are apart, (N, m, channels); of the others None.
+        slow: with slow courses at the port that wanders; None where none does.
+    """
 
     nuisance: Float[Tensor, "N m p"]
     candidates: tuple[Float[Tensor, "N m q"], ...]
     pointwise: dict[str, Tensor | None]
+    slow: Slow | None
+
+    @property
+    def bare(self) -> Tangents:
+        """The same without candidates."""
+        return replace(self, candidates=())
 
 
-def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Sequence[Term]) -> Tangents:
+@dataclass(frozen=True)
+class Slow:
+    """Slow courses of a port's channels: tangents (N, m, k), standard deviations in each family of wander (F, k)."""
+
+    port: str
+    channels: int
+    tangents: Tensor
+    scales: Tensor
+
+    def with_shares(self, shares: Float[Tensor, " c"]) -> Slow:
+        """The same with so many times the variance in each channel."""
+        return replace(self, scales=self.scales * shares.sqrt().repeat(self.scales.shape[1] // len(shares)))
+
+    def of_family(self, number: int) -> Slow:
+        """The same with one family of wander only."""
+        return replace(self, scales=self.scales[number : number + 1])
+
+
+def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Sequence[Term] = ()) -> Tangents:
     """The tangents at these parameters, by forward mode."""
     prepared = model.prepared
     pointwise = {
         name: port_jacobian(model, parameters, name) if port.pointwise else None
         for name, port in prepared.ports.items()
     }
+    independent = parameters.new_tensor([float(one) for one in prepared.independent])
     nuisance = torch.func.jacfwd(model.residual)(parameters)
+    start = model.base
+    for term, size in zip(model.terms, model.sizes, strict=True):
+        if follows_signal(term.effect):
+            nuisance[..., start : start + size] *= independent[:, None]
+        start += size
     signals = prepared.signals(parameters[: model.base])
     courses = [directions(t, t.context(prepared, signals.get(t.effect.port))) for t in terms]
-    independent = parameters.new_tensor([float(one) for one in prepared.independent])
     found: list[Tensor | None] = [None] * len(terms)
     for name in prepared.ports:
         members = [i for i, term in enumerate(terms) if term.effect.port == name]
@@ -66,7 +101,24 @@ def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Seque
         moved = through_port(model, parameters, name, joined, pointwise[name])
         for i, part in zip(members, moved.split([courses[i].shape[-1] for i in members], -1), strict=True):
             found[i] = independent[:, None] * part if follows_signal(terms[i].effect) else part
-    return Tangents(nuisance, tuple(t for t in found if t is not None), pointwise)
+    slow = _slow_courses(model, parameters, pointwise)
+    return Tangents(nuisance, tuple(t for t in found if t is not None), pointwise, slow)
+
+
+def _slow_courses(model: JointModel, parameters: Tensor, pointwise: dict[str, Tensor | None]) -> Slow | None:
+    N = len(model.prepared.time)
+    count = min(SLOW_COURSES, N // 10)
+    wandering = [name for name, port in model.prepared.ports.items() if port.wanders]
+    if not wandering or count == 0:
+        return None
+    name = wandering[0]
+    c = len(model.prepared.ports[name].channels)
+    courses = cosines(count, N)
+    eye = torch.eye(c, dtype=courses.dtype)
+    spread = (courses[:, None, :, None] * eye[:, None, :]).reshape(N, c, count * c)
+    k = torch.arange(1, count + 1, dtype=courses.dtype).repeat_interleave(c)
+    scales = torch.stack([1.0 / k, *((1.0 + (k / corner).square()).rsqrt() for corner in CORNERS)])
+    return Slow(name, c, through_port(model, parameters, name, spread, pointwise[name]), scales)
 
 
 @dataclass(frozen=True)
@@ -85,6 +137,12 @@ class Linearised:
     series: Float[Tensor, " M"]
     colour: Colour
     entrance: tuple[Tensor, Tensor] | None
+
+    def colour_beside(self) -> Colour:
+        """The colour of what is left beside the wander."""
+        K, m = self.colour.root.shape
+        power = self.search.stationary(self.series)[: K * m].unflatten(0, (K, m))
+        return colour_of(power * self.colour.root.square())
 
     @property
     def evidence(self) -> float:
@@ -112,7 +170,9 @@ def linearise(
     counts: Float[Tensor, "N m"],
     tangents: Tangents,
     *,
-    noise: Float[Tensor, "N m"] | None = None,
+    colour: Colour | None = None,
+    near: Colour | None = None,
+    white: bool = False,
     wander: bool = True,
     joint: bool = False,
 ) -> Linearised:
@@ -123,80 +183,79 @@ def linearise(
         pseudo: its pseudo-residual, without the effect that is sought.
         counts: 0 where a residual was rejected; there the tangents say nothing either.
         tangents: at the fit.
-        noise: what the noise's colour is read from; default ``pseudo``.
-        wander: allow for noise that wanders at the ports, and for coloured noise; without, noise counts as white.
+        colour: of the noise; default the likeliest one of ``pseudo``.
+        near: a colour that is close to it.
+        white: beside the wander, noise counts as white.
+        wander: allow for noise that wanders at the ports.
         joint: the one candidate is all of the parameters, to be estimated together.
     """
     m = pseudo.shape[1]
-    nuisance = counts.unsqueeze(-1) * tangents.nuisance
-    widths = [t.shape[-1] for t in tangents.candidates]
-    joined = counts.unsqueeze(-1) * torch.cat([tangents.nuisance[..., :0], *tangents.candidates], -1)
     pull = _Pull.of(model, parameters)
     kept = _bandwidth(tangents.nuisance)
+    slow = tangents.slow if wander else None
+    seen = _Seen.of(pseudo, counts, tangents, slow, kept)
     plain = Colour(tuple(pseudo.new_zeros(0) for _ in range(m)), pseudo.new_ones(kept, m) * _level(pseudo))
-    if not wander:
-        return _searching(plain, pull, nuisance, pseudo, joined, widths, None, joint=joint)
-    slow = _slow_courses(model, parameters, tangents)
-    if slow is not None:
-        slow = replace(slow, tangents=counts.unsqueeze(-1) * slow.tangents)
-    colour = _colour(plain, pull, nuisance, pseudo if noise is None else noise, slow)
-    found = _searching(colour, pull, nuisance, pseudo, joined, widths, slow, joint=joint)
+    if white:
+        return _searching(plain, pull, seen, slow)
+    if joint and colour is not None:
+        return _searching(colour, pull, seen, slow, joint=True)
+    bare = replace(seen, candidates=())
+    found = _coloured(plain, near, pull, bare, slow) if colour is None else _searching(colour, pull, bare, slow)
+    candidates = [pull.below(found.colour.scaled(one)) for one in seen.candidates]
+    found = replace(found, search=found.search.with_candidates(candidates))
     pointwise = None if slow is None else tangents.pointwise[slow.port]
-    if slow is None or pointwise is None:
+    if slow is None or pointwise is None or not tangents.candidates:
         return found
     block = counts.unsqueeze(-1) * pointwise
     # the wander is drawn for itself
-    beside = pseudo - slow.tangents @ found.search.courses(found.series)
+    beside = pseudo - counts * (slow.tangents @ found.search.courses(found.series))
     if not enters_at_port(beside, block):
         return found
     return replace(found, entrance=(block, port_colour(beside, block)))
 
 
-def _searching(
-    colour: Colour,
-    pull: _Pull,
-    nuisance: Tensor,
-    pseudo: Tensor,
-    joined: Tensor,
-    widths: list[int],
-    slow: _Slow | None,
-    *,
-    joint: bool = False,
-) -> Linearised:
-    flat = colour.whiten(pseudo)
-    parameters = pull.under(colour.whiten(nuisance), flat)
-    candidates = list(pull.below(colour.whiten(joined)).split(widths, -1)) if widths else []
+@dataclass(frozen=True)
+class _Seen:
+    """What a search is about, in the K slowest coefficients of the cosine basis, where a colour is a division."""
+
+    pseudo: Tensor  # (K, m)
+    nuisance: Tensor  # (K, m, p)
+    candidates: tuple[Tensor, ...]  # (K, m, q)
+    slow: Tensor  # (K, m, k)
+
+    @classmethod
+    def of(cls, pseudo: Tensor, counts: Tensor, tangents: Tangents, slow: Slow | None, kept: int) -> _Seen:
+        courses = tangents.nuisance[..., :0] if slow is None else slow.tangents
+        parts = [pseudo.unsqueeze(-1), tangents.nuisance, *tangents.candidates, courses]
+        joined = torch.cat(parts, -1)
+        joined[..., 1:] *= counts.unsqueeze(-1)
+        values, nuisance, *candidates, moved = dct(joined, kept).split([t.shape[-1] for t in parts], -1)
+        return cls(values.squeeze(-1), nuisance, tuple(candidates), moved)
+
+
+def _searching(colour: Colour, pull: _Pull, seen: _Seen, slow: Slow | None, *, joint: bool = False) -> Linearised:
+    flat = colour.scaled(seen.pseudo)
+    parameters = pull.under(colour.scaled(seen.nuisance), flat)
+    candidates = [pull.below(colour.scaled(one)) for one in seen.candidates]
     search = LinearSearch(
         parameters[:, :0] if joint else parameters,
         [parameters] if joint else candidates,
-        pull.below(colour.whiten(pseudo.new_zeros(*pseudo.shape, 0) if slow is None else slow.tangents)),
-        pseudo.new_zeros(0, 0) if slow is None else slow.scales,
+        pull.below(colour.scaled(seen.slow)),
+        flat.new_zeros(0, 0) if slow is None else slow.scales,
     )
     return Linearised(search, pull.beside(flat), colour, None)
 
 
-def _colour(plain: Colour, pull: _Pull, nuisance: Tensor, noise: Tensor, slow: _Slow | None) -> Colour:
-    """The likeliest colour of the noise beside a wander at the port, by alternating between the two."""
-    K, m = plain.root.shape
-    nothing = nuisance[..., :0]
-
-    def seen(colour: Colour, slow: _Slow | None) -> Linearised:
-        return _searching(colour, pull, nuisance, noise, nothing, [], slow)
-
-    def read(found: Linearised) -> Colour:
-        power = found.search.stationary(found.series)[: K * m].unflatten(0, (K, m))
-        return colour_of(power * found.colour.root.square())
-
-    best = read(seen(plain, None))
+def _coloured(plain: Colour, near: Colour | None, pull: _Pull, seen: _Seen, slow: Slow | None) -> Linearised:
+    """With the likeliest colour of the noise beside a wander at the port, by alternating between the two."""
+    best = _searching(plain, pull, replace(seen, slow=seen.slow[..., :0]), None).colour_beside()
+    tried = [_searching(best, pull, seen, slow)]
     if slow is None:
-        return best
+        return tried[0]
     # from the side of no wander and from that of no colour: either could pass for the other
-    tried = [seen(best, slow)]
-    beside = read(seen(plain, slow))
-    for _ in range(_ALTERNATIONS):
-        tried.append(seen(beside, slow))
-        beside = read(tried[-1])
-    return max(tried, key=lambda found: found.evidence).colour
+    beside = _searching(plain, pull, seen, slow).colour_beside() if near is None else near
+    tried.append(_searching(beside, pull, seen, slow))
+    return max(tried, key=lambda found: found.evidence)
 
 
 def _level(pseudo: Tensor) -> Tensor:
@@ -241,29 +300,3 @@ class _Pull:
 
     def beside(self, flat: Tensor) -> Tensor:
         return torch.cat([flat, flat.std() * self.distance])
-
-
-@dataclass(frozen=True)
-class _Slow:
-    """Slow courses at a port: tangents (N, m, k) and standard deviations in each family of wander (F, k)."""
-
-    port: str
-    tangents: Tensor
-    scales: Tensor
-
-
-def _slow_courses(model: JointModel, parameters: Tensor, tangents: Tangents) -> _Slow | None:
-    """Slow courses at the port that wanders; None if no port does."""
-    N = len(tangents.nuisance)
-    count = min(SLOW_COURSES, N // 10)
-    wandering = [name for name, port in model.prepared.ports.items() if port.wanders]
-    if not wandering or count == 0:
-        return None
-    name = wandering[0]
-    c = len(model.prepared.ports[name].channels)
-    courses = cosines(count, N)
-    eye = torch.eye(c, dtype=courses.dtype)
-    spread = (courses[:, None, :, None] * eye[:, None, :]).reshape(N, c, count * c)
-    k = torch.arange(1, count + 1, dtype=courses.dtype).repeat_interleave(c)
-    scales = torch.stack([1.0 / k, *((1.0 + (k / corner).square()).rsqrt() for corner in CORNERS)])
-    return _Slow(name, through_port(model, parameters, name, spread, tangents.pointwise[name]), scales)

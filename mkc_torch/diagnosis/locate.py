@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.candidates import finer
 from mkc_torch.diagnosis.linearise import Linearised, Tangents, linearise, tangents_of
+from mkc_torch.diagnosis.local import beside_wander
 from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.preference import Preference
 from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted
@@ -47,6 +48,7 @@ class Located:
         term: the strongest candidate, at its best shape.
         fit: the joint refit with it.
         p_value: after the whole search.
+        beyond: nats by which it is rarer, by itself, than the strongest of the draws.
         ranking: for each candidate physics its best shape, gain in nats, and nats behind the first; best first.
         noise: the wander of the noise without the candidate.
         linearised: the search that the p-value is from; ``tangents`` and ``terms`` are its candidates.
@@ -55,6 +57,7 @@ class Located:
     term: Term
     fit: FittedModel
     p_value: float
+    beyond: float
     ranking: tuple[Ranked, ...]
     noise: NoiseFit
     linearised: Linearised
@@ -92,6 +95,7 @@ def locate(
     """
     terms = tuple(terms)
     prefer = Preference(terms, base.model.prepared)
+    tried = len(terms)
     best = _strongest(base, terms, prefer, parts=parts)
     parameters = best.parameters[: base.model.size]
     if best.model.terms[-1] not in terms:
@@ -99,18 +103,19 @@ def locate(
     tangents = tangents_of(base.model, parameters, terms)
     number = terms.index(best.model.terms[-1])
     gamma = best.parameters[base.model.size :]
-    # the residual without the effect, as the fit with it weighs the samples
-    left, counts = best.pseudo
-    pseudo = left - counts * torch.einsum("nmq,q->nm", tangents.candidates[number], gamma)
+    # without the effect, as what is left beside it weighs the samples
+    left = beside_wander(best, base.model, parameters, tangents)
+    counts, tangents = left.counts, replace(tangents, slow=left.slow)
+    pseudo = left.values - counts * torch.einsum("nmq,q->nm", tangents.candidates[number], gamma)
     linearised = linearise(base.model, parameters, pseudo, counts, tangents)
     noise = linearised.search.noise_fit(linearised.series)
     found = linearised.search.gains(linearised.series.unsqueeze(-1))
-    p_value = _judged(linearised, noise, found, surrogates, generator)
-    if p_value > level and _overwhelming(best, base, linearised, parameters, tangents):
-        p_value = 1.0 / (1 + surrogates)
+    p_value, beyond = _judged(linearised, noise, found, tried, surrogates, generator)
+    if p_value > level and _overwhelming(best, base, linearised, left.noise):
+        p_value, beyond = 1.0 / (1 + surrogates), math.inf
     if p_value <= level:
         # whether there is an effect is asked of the noise that has it in; which one it is, of the noise beside it
-        linearised = linearise(base.model, parameters, pseudo, counts, tangents, noise=left)
+        linearised = linearise(base.model, parameters, pseudo, counts, tangents, colour=left.noise.colour)
         found = linearised.search.gains(linearised.series.unsqueeze(-1))
     ranking = _ranking(terms, found, prefer)
     first = terms[ranking[0].number]
@@ -118,7 +123,7 @@ def locate(
         best = _refitted(best, base, first, linearised, ranking[0].number)
     if p_value <= level:
         best = _refined(best, base, again=True)
-    return Located(best.model.terms[-1], best, p_value, ranking, noise, linearised, tangents, terms)
+    return Located(best.model.terms[-1], best, p_value, beyond, ranking, noise, linearised, tangents, terms)
 
 
 Start = tuple[Tensor, tuple[Tensor, Tensor]]
@@ -135,7 +140,7 @@ def _short_list(base: FittedModel, terms: tuple[Term, ...], starts: Sequence[Sta
     for parameters, (pseudo, counts) in starts:
         if id(parameters) not in known:
             known[id(parameters)] = tangents_of(base.model, parameters, terms)
-        plain = linearise(base.model, parameters, pseudo, counts, known[id(parameters)], wander=False)
+        plain = linearise(base.model, parameters, pseudo, counts, known[id(parameters)], white=True, wander=False)
         log_p = plain.search.gains(plain.series.unsqueeze(-1)).log_p[:, 0]
         taken = 0
         for number in log_p.argsort().tolist():
@@ -227,12 +232,15 @@ def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
     return fitted(model, torch.cat([kept, more]), base.bound, graduate=False)
 
 
-def _judged(linearised: Linearised, noise: NoiseFit, found: Gains, count: int, generator: torch.Generator) -> float:
-    """The p-value of the strongest candidate after the whole search, from draws of the fitted noise.
+def _judged(
+    linearised: Linearised, noise: NoiseFit, found: Gains, tried: int, count: int, generator: torch.Generator
+) -> tuple[float, float]:
+    """The p-value of the strongest candidate after the whole search, and how far it is beyond draws of fitted noise.
 
     Coloured noise is drawn where it enters, at a port whose axes may turn against the residual. Each candidate's ratios
     are first divided by how much the draws exceed their chi-square (Bartlett's correction), so that one whose noise is
-    larger than the model's does not set the level for all.
+    larger than the model's does not set the level for all. A shape that was closed in on, beyond the first ``tried``
+    candidates, is left out: the draws had no such choice.
     """
     stationary = linearised.entering(count, generator)
     if stationary is None:
@@ -240,14 +248,12 @@ def _judged(linearised: Linearised, noise: NoiseFit, found: Gains, count: int, g
     drawn = linearised.search.gains(stationary + linearised.search.wander(count, noise, generator))
     dof = found.dof.clamp(min=1.0)
     excess = (drawn.ratio.mean(-1) / dof).clamp(min=1.0).unsqueeze(-1)
-    own = log_survival(found.ratio / excess, dof.unsqueeze(-1)).amin()
-    others = log_survival(drawn.ratio / excess, dof.unsqueeze(-1)).amin(0)
-    return (1 + int((others <= own).sum())) / (1 + count)
+    own = log_survival(found.ratio / excess, dof.unsqueeze(-1))[:tried].amin()
+    others = log_survival(drawn.ratio / excess, dof.unsqueeze(-1))[:tried].amin(0)
+    return (1 + int((others <= own).sum())) / (1 + count), float(others.min() - own)
 
 
-def _overwhelming(
-    best: FittedModel, base: FittedModel, without: Linearised, parameters: Tensor, tangents: Tangents
-) -> bool:
+def _overwhelming(best: FittedModel, base: FittedModel, without: Linearised, beside: Linearised) -> bool:
     """Whether an effect is so large that noise which includes it is the unlikelier account by far.
 
     The search holds the noise's colour as the residuals without the effect show it, and an effect a hundred times the
@@ -255,10 +261,8 @@ def _overwhelming(
     """
     if best.log_likelihood - base.log_likelihood < _RAW:
         return False
-    left, counts = best.pseudo
-    own = linearise(base.model, parameters, left, counts, replace(tangents, candidates=()))
-    price = 0.5 * best.model.sizes[-1] * math.log(len(left))
-    return own.evidence - without.evidence - price > _OVERWHELMING
+    price = 0.5 * best.model.sizes[-1] * math.log(len(best.residual))
+    return beside.evidence - without.evidence - price > _OVERWHELMING
 
 
 def _ranking(terms: tuple[Term, ...], found: Gains, prefer: Preference) -> tuple[Ranked, ...]:

@@ -55,8 +55,8 @@ def pseudo_residual(
     return counts * weight * error / slope.clamp(min=0.2), counts
 
 
-def dct(values: Float[Tensor, N * rest]) -> Float[Tensor, N * rest]:
-    """Orthonormal cosine transform (DCT-II) over the first dimension.
+def dct(values: Float[Tensor, N * rest], count: int | None = None) -> Float[Tensor, count * rest]:
+    """Orthonormal cosine transform (DCT-II) over the first dimension, or the first ``count`` of its coefficients.
 
     Makhoul, "A fast cosine transform in one and two dimensions", IEEE Trans. ASSP 28 (1980).
 
@@ -65,12 +65,16 @@ def dct(values: Float[Tensor, N * rest]) -> Float[Tensor, N * rest]:
         tensor([2., 0., 0., 0.])
     """
     N = values.shape[0]
+    count = N if count is None else min(count, N)
     if values.numel() == 0:
-        return values
+        return values[:count]
     folded = torch.cat([values[::2], values[1::2].flip(0)]).movedim(0, -1)
-    spectrum = torch.fft.fft(folded)
-    angle = torch.arange(N, dtype=values.dtype, device=values.device) * (-math.pi / (2 * N))
-    real = spectrum.real * torch.cos(angle) - spectrum.imag * torch.sin(angle)
+    spectrum = torch.fft.rfft(folded)
+    if count > spectrum.shape[-1]:
+        # the spectrum of what is real mirrors
+        spectrum = torch.cat([spectrum, spectrum[..., 1 : (N + 1) // 2].conj().flip(-1)], -1)
+    angle = torch.arange(count, dtype=values.dtype, device=values.device) * (-math.pi / (2 * N))
+    real = spectrum.real[..., :count] * torch.cos(angle) - spectrum.imag[..., :count] * torch.sin(angle)
     real = real * math.sqrt(2.0 / N)
     real[..., 0] *= math.sqrt(0.5)
     return real.movedim(-1, 0)
@@ -121,8 +125,12 @@ class Colour:
 
     def whiten(self, values: Float[Tensor, "N m *rest"]) -> Float[Tensor, Km * rest]:
         """The slowest cosine coefficients over the root of the spectrum, as many as ``root`` has, channels stacked."""
-        root = self.root.reshape(*self.root.shape, *[1] * (values.dim() - 2)).to(values.dtype)
-        return (dct(values)[: len(root)] / root).flatten(0, 1)
+        return self.scaled(dct(values, len(self.root)))
+
+    def scaled(self, coefficients: Float[Tensor, "K m *rest"]) -> Float[Tensor, Km * rest]:
+        """The same of what is in the cosine basis already."""
+        root = self.root.reshape(*self.root.shape, *[1] * (coefficients.dim() - 2)).to(coefficients.dtype)
+        return (coefficients / root).flatten(0, 1)
 
 
 _SHARED, _CLEARLY = 0.5, 1.01

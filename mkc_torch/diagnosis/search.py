@@ -9,6 +9,7 @@ fitted noise.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -26,8 +27,11 @@ _LEFT = 1e-4
 _SINGULAR = 1e-10
 """Smallest eigenvalue, over the largest, of parameters on scales of their own that still tells them apart."""
 
-_SIZES = 12
+_SIZES = 36
 """Sizes of wander tried, from none to a few times the largest that could fit."""
+
+
+_EQUAL = 3.0
 
 
 @dataclass(frozen=True)
@@ -82,16 +86,25 @@ class LinearSearch:
     ) -> None:
         self._basis = torch.linalg.qr(nuisance / torch.linalg.vector_norm(nuisance, dim=0).clamp(min=1e-300)).Q
         self._dof = nuisance.shape[0] - nuisance.shape[1]
-        self._widths = [c.shape[1] for c in candidates]
-        self._flat = torch.cat([nuisance[:, :0], *candidates], -1)
         self._wander = wander
-        columns = self._flat
-        on_basis = self._basis.mT @ columns
-        wander_basis = self._basis.mT @ wander
-        self._cross = wander.mT @ columns - wander_basis.mT @ on_basis  # (k, cols)
-        gram = wander.mT @ wander - wander_basis.mT @ wander_basis
+        self._wander_basis = self._basis.mT @ wander
+        gram = wander.mT @ wander - self._wander_basis.mT @ self._wander_basis
         self._families = [_family(gram, scale) for scale in scales] if wander.shape[1] else []
+        self._try(candidates)
+
+    def _try(self, candidates: Sequence[Float[Tensor, "M q"]]) -> None:
+        self._widths = [c.shape[1] for c in candidates]
+        columns = torch.cat([self._basis[:, :0], *candidates], -1)
+        on_basis = self._basis.mT @ columns
+        self._flat = columns
+        self._cross = self._wander.mT @ columns - self._wander_basis.mT @ on_basis  # (k, cols)
         self._groups = self._grouped(columns, on_basis)
+
+    def with_candidates(self, candidates: Sequence[Float[Tensor, "M q"]]) -> LinearSearch:
+        """The same simulation and noise, another set of candidates."""
+        other = copy(self)
+        other._try(candidates)
+        return other
 
     def _grouped(self, columns: Tensor, on_basis: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
         """For each width: numbers of the candidates, their columns, whitening (C, q, q) and degrees of freedom."""
@@ -178,29 +191,30 @@ class LinearSearch:
         size_of = columns.square().sum(0).clamp(min=1e-300).rsqrt()
         columns = columns - self._basis @ (self._basis.mT @ columns)
         left = series - self._basis @ (self._basis.mT @ series)
-        best: tuple[float, Tensor, Tensor] | None = None
-        for family, size in [(None, None), *((f, size) for f in self._families for size in f.sizes[1:])]:
-            gram, inner, power = columns.mT @ columns, columns.mT @ left, left.square().sum()
-            log_det = power.new_zeros(())
-            if family is not None and size is not None:
-                cross = family.axes.mT @ (family.scale.unsqueeze(-1) * self._cross[:, index])
-                rotated = family.axes.mT @ (family.scale * (self._wander.mT @ left))
-                share = size / (1.0 + size * family.strength)
-                gram = gram - cross.mT @ (share.unsqueeze(-1) * cross)
-                inner = inner - cross.mT @ (share * rotated)
-                power = power - (share * rotated.square()).sum()
-                log_det = torch.log1p(size * family.strength).sum()
-            scaled = gram * size_of.unsqueeze(-1) * size_of
-            inverse = (
-                torch.linalg.pinv(scaled, hermitian=True, atol=_SINGULAR, rtol=0.0) * size_of.unsqueeze(-1) * size_of
-            )
-            gamma = inverse @ inner
-            rest = power - inner @ gamma
-            value = float(-0.5 * log_det - 0.5 * self._dof * rest.log())
-            if best is None or value > best[0]:
-                best = value, gamma, inverse * rest / self._dof
-        assert best is not None
-        return best[1], best[2]
+        gram, inner, power = columns.mT @ columns, columns.mT @ left, left.square().sum()
+        q = len(index)
+        # one row for each size of wander, none first
+        grams, inners = [gram.flatten().unsqueeze(0)], [inner.unsqueeze(0)]
+        powers, log_dets = [power.reshape(1)], [power.new_zeros(1)]
+        slow = self._wander.mT @ left
+        for family in self._families:
+            cross = family.axes.mT @ (family.scale.unsqueeze(-1) * self._cross[:, index])
+            rotated = family.axes.mT @ (family.scale * slow)
+            sizes = family.sizes[1:].unsqueeze(-1)
+            share = sizes / (1.0 + sizes * family.strength)
+            grams.append(gram.flatten() - share @ (cross.unsqueeze(-1) * cross.unsqueeze(-2)).flatten(1))
+            inners.append(inner - share @ (cross * rotated.unsqueeze(-1)))
+            powers.append(power - share @ rotated.square())
+            log_dets.append(torch.log1p(sizes * family.strength).sum(-1))
+        scale = size_of.unsqueeze(-1) * size_of
+        scaled = torch.cat(grams).unflatten(-1, (q, q)) * scale
+        inverse = torch.linalg.pinv(scaled, hermitian=True, atol=_SINGULAR, rtol=0.0) * scale
+        inner = torch.cat(inners)
+        gamma = (inverse @ inner.unsqueeze(-1)).squeeze(-1)
+        rest = torch.cat(powers) - (inner * gamma).sum(-1)
+        value = -0.5 * torch.cat(log_dets) - 0.5 * self._dof * rest.clamp(min=1e-300).log()
+        best = int(value.argmax())
+        return gamma[best], inverse[best] * rest[best] / self._dof
 
     def trace(self, number: int, series: Float[Tensor, " M"]) -> tuple[Tensor, Tensor, float]:
         """A candidate at its best γ, less what the nuisance takes over.
@@ -229,6 +243,26 @@ class LinearSearch:
         left = series - self._basis @ (self._basis.mT @ series)
         rotated = family.axes.mT @ (family.scale * (self._wander.mT @ left))
         return family.scale * (family.axes @ (fit.size / (1.0 + fit.size * family.strength) * rotated))
+
+    def shares(self, series: Float[Tensor, " M"], channels: int) -> Float[Tensor, " c"]:
+        """Variance of the wander of each channel over that of the scales given, where the series says so; mean one.
+
+        MacKay's fixed point for variance components, "Bayesian interpolation", Neural Computation 4 (1992), with a few
+        courses' worth of equal channels.
+        """
+        fit = self.noise_fit(series)
+        if fit.size == 0:
+            return self._wander.new_ones(channels)
+        family = self._families[fit.family]
+        left = series - self._basis @ (self._basis.mT @ series)
+        rotated = family.axes.mT @ (family.scale * (self._wander.mT @ left))
+        share = fit.size / (1.0 + fit.size * family.strength)
+        square = (family.axes @ (share * rotated)).square() / (fit.size * fit.variance)
+        known = family.axes.square() @ (1.0 - share / fit.size)
+        found = (square.unflatten(0, (-1, channels)).sum(0) + _EQUAL) / (
+            known.unflatten(0, (-1, channels)).sum(0) + _EQUAL
+        )
+        return found / found.mean()
 
     def stationary(self, series: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
         """Expected square of the stationary noise of each coordinate, under the likeliest wander.

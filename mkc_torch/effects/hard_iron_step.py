@@ -33,7 +33,7 @@ class HardIronStep(GainEffect):
 
     id = "hard_iron_step"
     gain = "offset_change"
-    continuous: Mapping[str, tuple[float, float]] = {"onset": (0.06, 0.94)}
+    continuous: Mapping[str, tuple[float, float]] = {"onset": (0.08, 0.92)}
     equation = "δB = Δb · 1[t ≥ t₀]"
     explanation = "The sensor's offset jumped: something magnetic that moves with the sensor was attached or taken off."
     advice = "Look for what changed at that time; use the calibration from after the step."
@@ -46,8 +46,8 @@ class HardIronStep(GainEffect):
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         first, length = float(time[0]), float(time[-1] - time[0])
         count = round(1.0 / self.SPACING)
-        # near the ends a step cannot be told from a burst of outliers
-        return tuple({"onset": first + length * k / count} for k in range(6, count - 5))
+        # a shorter side could not be held out in blocks, nor told from a burst of outliers
+        return tuple({"onset": first + length * k / count} for k in range(8, count - 7))
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return after(context.time, shape["onset"])

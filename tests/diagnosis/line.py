@@ -13,6 +13,7 @@ class Line:
     name = "line"
     channels = ("left", "right")
     unit = "V"
+    independent = (True, True)
     parameter_names = ("level", "slope")
     warnings = ()
     state = {}  # noqa: RUF012

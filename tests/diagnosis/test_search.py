@@ -265,3 +265,33 @@ def test_the_stationary_power_has_what_nuisance_and_wander_took_given_back(searc
     assert float(mean.mean()) == pytest.approx(1.0, abs=0.03)
     taken = torch.linalg.qr(torch.cat([NUISANCE, WANDER[:, :3]], -1)).Q.square().sum(-1)
     assert float(mean[taken > taken.quantile(0.9)].mean()) == pytest.approx(1.0, abs=0.08)
+
+
+def test_a_search_takes_other_candidates(search):
+    y = wandering(3.0, 0, seed=20).unsqueeze(-1)
+    other = LinearSearch(NUISANCE, CANDIDATES[2:], WANDER, SCALES)
+    torch.testing.assert_close(search.with_candidates(CANDIDATES[2:]).gains(y).ratio, other.gains(y).ratio)
+    torch.testing.assert_close(search.gains(y).ratio[2:], other.gains(y).ratio)
+
+
+def test_the_share_of_a_channel_is_its_variance():
+    """Courses of two channels take turns; those of the first are three times the size of the others."""
+    courses = torch.cat([smooth(30) * randn(M, 1, seed=6), smooth(30) * randn(M, 1, seed=7)], -1)
+    courses = courses.unflatten(-1, (2, 30)).mT.flatten(-2)
+    scales = torch.ones(1, 60).double()
+    search = LinearSearch(NUISANCE, [], courses, scales)
+    size = torch.tensor([3.0, 1.0]).double().repeat(30)
+    found = torch.stack(
+        [search.shares(randn(M, seed=s) + courses @ (size * randn(60, seed=100 + s)), 2) for s in range(40)]
+    )
+    assert float(found.sum(-1).sub(2.0).abs().max()) < 1e-9
+    # 1.8 and 0.2 are the shares; a few courses' worth of equal channels are in the estimate
+    assert found.mean(0)[0] == pytest.approx(1.73, abs=0.08)
+
+
+def test_without_a_wander_channels_are_alike(search):
+    quiet = LinearSearch(NUISANCE, [], WANDER, SCALES)
+    y = randn(M, seed=5)
+    y = y - WANDER @ torch.linalg.lstsq(WANDER, y).solution
+    assert quiet.noise_fit(y).size == 0
+    assert quiet.shares(y, 2).tolist() == [1.0, 1.0]

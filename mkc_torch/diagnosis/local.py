@@ -1,0 +1,86 @@
+"""Pseudo-residuals around a wander: an outlier is what is far from the noise's own slow course, not from zero."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.density_fit import fit_density
+from mkc_torch.diagnosis.linearise import SLOW_COURSES, Linearised, Slow, Tangents, linearise
+from mkc_torch.diagnosis.model import JointModel
+from mkc_torch.diagnosis.noise import pseudo_residual
+from mkc_torch.diagnosis.refit import FittedModel
+from mkc_torch.order_statistic import robust_scale
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["Local", "beside_wander"]
+
+_ROUNDS = 4
+_NEAR = 3.0
+_SETTLED = 5e-3
+"""Share of the residuals that may still come to count or cease to."""
+
+
+@dataclass(frozen=True)
+class Local:
+    """Residuals that are judged by their distance from the wander, and the noise they make.
+
+    Attributes:
+        values: the pseudo-residuals.
+        counts: 0 where a residual is rejected.
+        noise: their colour and wander; a search without candidates.
+        slow: the courses of the wander, with the share of each channel.
+    """
+
+    values: Float[Tensor, "N m"]
+    counts: Float[Tensor, "N m"]
+    noise: Linearised
+    slow: Slow | None
+
+
+def beside_wander(fit: FittedModel, model: JointModel, parameters: Float[Tensor, " p"], tangents: Tangents) -> Local:
+    """The pseudo-residual of a fit, around the likeliest wander of its noise.
+
+    The fit alone takes a wander that is larger than the white noise for a heavy tail, and turns down its excursions.
+
+    Args:
+        fit: its residuals are judged.
+        model, parameters: where the tangents are from; ``fit`` may have a term more.
+        tangents: of the parameters and of the ports.
+    """
+    slow = tangents.slow
+    if slow is None:
+        values, counts = fit.pseudo
+        return Local(values, counts, linearise(model, parameters, values, counts, tangents.bare), None)
+    # a burst must not pull the first course its way
+    counts = _near_median(fit.residual, 2 * len(fit.residual) // SLOW_COURSES)
+    values = counts * fit.residual
+    noise = linearise(model, parameters, values, counts, tangents.bare, white=True)
+    family = noise.search.noise_fit(noise.series).family
+    for _ in range(_ROUNDS):
+        course = slow.tangents @ noise.search.courses(noise.series)
+        quick = fit.residual - course
+        density = fit_density(quick, bound=fit.bound)
+        before = counts
+        values, counts = pseudo_residual(quick, density.sigma, density.d)
+        values = values + counts * course
+        if float((counts != before).double().mean()) < _SETTLED:
+            break
+        slow = slow.with_shares(noise.search.shares(noise.series, slow.channels))
+        one = replace(tangents.bare, slow=slow.of_family(family))
+        noise = linearise(model, parameters, values, counts, one, colour=noise.colour_beside())
+    noise = linearise(model, parameters, values, counts, replace(tangents.bare, slow=slow), near=noise.colour_beside())
+    return Local(values, counts, noise, slow)
+
+
+def _near_median(residual: Float[Tensor, "N m"], width: int) -> Float[Tensor, "N m"]:
+    """1 where a residual is within three robust scales of its running median over about ``width`` samples."""
+    half = max(width // 2, 1)
+    padded = torch.nn.functional.pad(residual.mT, (half, half), mode="reflect")
+    away = residual - padded.unfold(-1, 2 * half + 1, 1).median(-1).values.mT
+    return (away.abs() <= _NEAR * robust_scale(away)).to(residual.dtype)
