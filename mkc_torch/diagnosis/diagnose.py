@@ -43,8 +43,8 @@ FEWEST = 100
 
 _WIDER, _NEAR = 3.0, 0.05
 
-_BEYOND_DOUBT = 10.0
-"""Nats beyond all draws of noise from which unseen blocks need only to lean the way of a finding, not to confirm it."""
+_LEANING, _BEYOND_DOUBT = 10.0, 40.0
+"""Nats beyond all draws of noise from which unseen blocks need only to lean a finding's way, or not to be asked."""
 
 _REST = 0.5
 """A larger share of samples in which nothing moves is a sensor at rest, and is warned of."""
@@ -110,6 +110,20 @@ def diagnose(
     return _assembled(prepared, drivers, terms, base, search, final, level, surrogates, seed, generator)
 
 
+def _holds(
+    located: Located, before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int, *, first: bool
+) -> bool:
+    """Whether what was found counts.
+
+    Blocks weigh samples as if their noise was white, and miss what is plain in coloured noise: the further a finding is
+    beyond all draws, the less they have to say. What comes after a finding also has what that one's form left over.
+    """
+    if first and located.beyond > _BEYOND_DOUBT:
+        return True
+    better = bool(after.log_likelihood.mean() > before.log_likelihood.mean())
+    return (first and located.beyond > _LEANING and better) or _confirmed(before, after, blocks, seed)
+
+
 def _confirmed(before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int) -> bool:
     difference = after.log_likelihood - before.log_likelihood
     _, (low, _) = gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))
@@ -169,9 +183,7 @@ def _searched(
     last = first
     while last is not None and last.p_value <= level and len(found) < max_findings:
         evidence.append(held_out(last.fit, blocks))
-        better = bool(evidence[-1].log_likelihood.mean() > evidence[-2].log_likelihood.mean())
-        beyond_doubt = not found and last.beyond > _BEYOND_DOUBT and better
-        if not beyond_doubt and not _confirmed(evidence[-2], evidence[-1], blocks, seed):
+        if not _holds(last, evidence[-2], evidence[-1], blocks, seed, first=not found):
             return _Search(first, tuple(found), last, blocks, tuple(evidence[:-1]))
         found.append(last)
         near = _NEAR * float(base.model.prepared.time[-1] - base.model.prepared.time[0])
