@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from mkc_torch.functional import KAPPA_MAX, as_computed, energy, inverse_square, log_partition
+from mkc_torch.fused import energy_sums
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -254,15 +255,15 @@ class MKCLoss(nn.Module):
             error = torch.where(counts, error, 0.0)
         shape = [1] * error.dim()
         shape[axis] = self.num_channels
-        kappa, d = (p.to(torch.promote_types(p.dtype, error.dtype)).view(shape) for p in (self.kappa, self.d))
-        loss = energy(error / d, kappa)
-        norm = self.log_normalizer().to(loss.dtype) if self.normalize else None
+        kappa, d = (p.to(torch.promote_types(p.dtype, error.dtype)) for p in (self.kappa, self.d))
+        norm = self.log_normalizer().to(error.dtype) if self.normalize else None
         if self.reduction == "none":
+            loss = energy(error / d.view(shape), kappa.view(shape))
             if norm is not None:
                 loss = loss + norm.view(shape)
             return loss if weight is None else weight * loss
-        total = loss.sum() if weight is None else (weight * loss).sum()
-        elements = float(loss.numel()) if weight is None else weight.sum()
+        total = energy_sums(error.to(kappa.dtype), kappa, d, weight, axis).sum()
+        elements = float(error.numel()) if weight is None else weight.sum()
         if norm is not None:
             if weight is None:
                 total = total + norm.sum() * (elements / self.num_channels)
