@@ -77,7 +77,7 @@ def _plain(error: Tensor, kappa: Tensor, d: Tensor, weight: Tensor | None, axis:
 
 
 class _EnergySums(torch.autograd.Function):
-    """Sums, and what their gradients are made of: error exp(-x), and the sums by kappa and by d."""
+    """Sums, and what their gradients are made of: z exp(-x), and the sums by kappa and by d."""
 
     generate_vmap_rule = True
 
@@ -126,7 +126,7 @@ class _EnergySums(torch.autograd.Function):
                 *none[4:],
             )
         return (
-            pull * _shaped(grad / d.square(), error.dim(), ctx.axis) if wants[0] else None,
+            pull * _shaped(grad / d, error.dim(), ctx.axis) if wants[0] else None,
             curve * grad if wants[1] else None,
             stretch * grad if wants[2] else None,
             *none[3:],
@@ -157,26 +157,24 @@ def _part(
     # a power of two that small scales exactly, and at kappa = 0 leaves z^2 / 2
     least = _LEAST[error.dtype]
     positive = kappa.clamp(min=least)
-    narrow = d.square().reciprocal()
-    minus_x = error * error * _shaped(-0.5 * positive * narrow, error.dim(), axis)
+    z = error / _shaped(d, error.dim(), axis)
+    minus_x = z * z * _shaped(-0.5 * positive, error.dim(), axis)
     inlier = torch.exp(minus_x)
-    pull = error * inlier
+    pull = z * inlier
     value = torch.expm1(minus_x)
     if weight is not None:
         pull, value = pull * weight, value * weight
     sums = -_summed(value, axis) / positive
-    curve = _by_kappa(error, minus_x, inlier, kappa, narrow, weight, axis) if by_kappa else torch.zeros_like(sums)
-    stretch = -_summed(error * pull, axis) * narrow / d if by_d else torch.zeros_like(sums)
+    curve = _by_kappa(z, minus_x, inlier, kappa, weight, axis) if by_kappa else torch.zeros_like(sums)
+    stretch = -_summed(z * pull, axis) / d if by_d else torch.zeros_like(sums)
     return sums, pull, curve, stretch
 
 
-def _by_kappa(
-    error: Tensor, minus_x: Tensor, inlier: Tensor, kappa: Tensor, narrow: Tensor, weight: Tensor | None, axis: int
-) -> Tensor:
+def _by_kappa(z: Tensor, minus_x: Tensor, inlier: Tensor, kappa: Tensor, weight: Tensor | None, axis: int) -> Tensor:
     """``-sum (1 - exp(-x) (1 + x)) / kappa^2``, at ``kappa = 0`` the sum of ``-z^4 / 8``."""
     x = -minus_x.clamp(min=-1e4)  # exp(-1e4) is 0 already, and 0 times it stays 0
-    q = error * error * _shaped(0.5 * narrow, error.dim(), axis)
+    q = 0.5 * z * z
     near = q * q * (0.5 - x * (1.0 / 3.0 - 0.125 * x))
-    far = (1.0 - inlier * (1.0 + x)) * _shaped(kappa.pow(-2), error.dim(), axis)
+    far = (1.0 - inlier * (1.0 + x)) * _shaped(kappa.pow(-2), z.dim(), axis)
     values = torch.where(x < _SERIES_BELOW[x.dtype], near, far)
     return -_summed(values if weight is None else values * weight, axis)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -21,6 +23,13 @@ DEFAULT_BOUND_IN_D = 100.0
 
 DEFAULT_D_MIN_IN_D = 1e-3
 """Floor under d, in units of the initial d, where none is given."""
+
+
+WATCH_EVERY = 64
+"""Forward passes in training after which a scale near its floor is looked for; a look waits for an accelerator."""
+
+NEAR_FLOOR = 2.0
+"""Times the floor below which a scale counts as collapsed."""
 
 
 class MKCLoss(nn.Module):
@@ -52,6 +61,9 @@ class MKCLoss(nn.Module):
 
     Raises:
         ValueError: an argument out of range, or learning asked for with ``normalize=False``.
+
+    Warns:
+        UserWarning: once, when a learned d has come near its floor in training: the network may fit every point.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (9) and (17).
@@ -97,6 +109,7 @@ class MKCLoss(nn.Module):
                 "Expected `learn_sigma=False, learn_d=False` with `normalize=False`: without the normaliser the loss "
                 "is smallest at sigma -> 0 or d -> inf, whatever the data. Drop `normalize=False` to learn them."
             )
+        self._forwards, self._told_of_floor = 0, False
         self.num_channels = num_channels
         self.normalize = normalize
         self.channel_dim = channel_dim
@@ -246,13 +259,18 @@ class MKCLoss(nn.Module):
 
         Raises:
             TypeError: integer or complex input or target.
-            ValueError: shapes differ, are empty, or have another number of channels.
+            ValueError: shapes differ, are empty, or have another number of channels; a target that counts is NaN or
+                infinite. On an accelerator the loss does not wait for the last: there it comes out as NaN.
         """
         axis = self._checked_axis(input, target)
+        if not torch.compiler.is_compiling():
+            self._watch_scale()
         error = input.to(_at_least_float32(input)) - target.to(_at_least_float32(target))
         if weight is not None:
             weight, counts = self._checked_weight(weight, error, axis)
             error = torch.where(counts, error, 0.0)
+        if not torch.compiler.is_compiling():
+            _refuse_not_finite(target, None if weight is None else counts)
         shape = [1] * error.dim()
         shape[axis] = self.num_channels
         kappa, d = (p.to(torch.promote_types(p.dtype, error.dtype)) for p in (self.kappa, self.d))
@@ -275,6 +293,29 @@ class MKCLoss(nn.Module):
         if isinstance(elements, Tensor):
             return total / torch.where(elements > 0, elements, 1.0)
         return total / elements
+
+    def _watch_scale(self) -> None:
+        if self.raw_d is None or not self.training or self._told_of_floor or not torch.is_grad_enabled():
+            return
+        self._forwards += 1
+        if self._forwards % WATCH_EVERY:
+            return
+        with torch.no_grad():
+            near = self.d < NEAR_FLOOR * self.d_min
+        try:
+            channels = near.nonzero().flatten().tolist()
+        except RuntimeError:  # under vmap there is no one value
+            return
+        if channels:
+            self._told_of_floor = True
+            scales, floors = self.d.detach()[channels].tolist(), self.d_min[channels].tolist()
+            warnings.warn(
+                f"The scale d of channel {', '.join(map(str, channels))} fell to {scales}, next to its floor {floors}. "
+                "The network may fit every point, noise included, and the likelihood grows without limit as d -> 0: "
+                "watch a validation set, regularise, or raise `d_min` to the precision of the targets. If the targets "
+                "are that precise, start with a smaller `d`.",
+                stacklevel=3,
+            )
 
     def _checked_axis(self, input: Tensor, target: Tensor) -> int:
         for name, value in (("input", input), ("target", target)):
@@ -314,6 +355,28 @@ class MKCLoss(nn.Module):
         return (
             f"{self.num_channels}, learns={learned}, normalize={self.normalize}, channel_dim={self.channel_dim}, "
             f"reduction={self.reduction!r}"
+        )
+
+
+def _refuse_not_finite(target: Tensor, counts: Tensor | None) -> None:
+    """Refuse a target that counts and is NaN or infinite, where looking does not have to wait for an accelerator."""
+    if target.device.type != "cpu":
+        return
+    with torch.no_grad():
+        total = target.sum()
+    try:
+        fine = math.isfinite(total.item())
+    except RuntimeError:  # under vmap there is no one value
+        return
+    if fine:
+        return
+    bad = ~torch.isfinite(target.detach())
+    if counts is not None:
+        bad = bad & counts
+    if bool(bad.any()):
+        raise ValueError(
+            f"Expected argument `target` to be finite but got {int(bad.sum())} values that are not, the first at index "
+            f"{tuple(bad.nonzero()[0].tolist())}. Leave them out: loss(input, target, weight=torch.isfinite(target))."
         )
 
 

@@ -685,3 +685,71 @@ def test_half_keeps_the_parameters_and_bounds_in_float32():
 def test_a_bandwidth_at_the_end_of_its_range_can_still_move():
     loss = MKCLoss(1, sigma=0.05)
     assert float(torch.autograd.grad(loss.kappa.sum(), loss.raw_kappa)[0]) > 1e-5
+
+
+@pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+def test_a_target_that_is_not_finite_is_refused_with_the_remedy(reduction, value):
+    loss = MKCLoss(2, reduction=reduction)
+    target = torch.zeros(3, 2)
+    target[1, 0] = value
+    with pytest.raises(ValueError, match=r"`target` to be finite but got 1 values.*\(1, 0\).*isfinite\(target\)"):
+        loss(torch.zeros(3, 2), target)
+    masked = loss(torch.zeros(3, 2), target, weight=torch.isfinite(target))
+    assert bool(torch.isfinite(masked).all())
+
+
+def test_targets_whose_sum_overflows_are_no_reason_to_refuse():
+    loss = MKCLoss(1, bound=3e38, d=1e37)
+    assert math.isfinite(loss(torch.zeros(4, 1), torch.full((4, 1), 2e38)).item())
+
+
+def test_per_sample_gradients_are_not_stopped_by_the_look_at_targets():
+    loss, target = MKCLoss(1), torch.arange(4.0).unsqueeze(-1)
+    parameters = dict(loss.named_parameters())
+
+    def one(p, x, y):
+        return torch.func.functional_call(loss, p, (x, y))
+
+    slopes = torch.func.vmap(torch.func.grad(one), in_dims=(None, 0, 0))(parameters, torch.zeros(4, 1), target)
+    assert slopes["raw_d"].shape == (4, 1)
+
+
+def interpolating(loss, steps=300):
+    """Every target is a parameter: nothing is left but to shrink d."""
+    target = torch.linspace(-1.0, 1.0, 16).unsqueeze(-1)
+    points = target.clone().requires_grad_()
+    optimiser = torch.optim.Adam([points, *loss.parameters()], lr=0.3)
+    for _ in range(steps):
+        optimiser.zero_grad()
+        loss(points, target).backward()
+        optimiser.step()
+    return loss
+
+
+def test_a_network_that_fits_every_point_is_warned_of_once():
+    loss = MKCLoss(1)
+    with pytest.warns(UserWarning, match=r"scale d of channel 0 fell to .* next to its floor .*`d_min`") as told:
+        interpolating(loss)
+    assert len(told) == 1
+    assert float(loss.d.detach()) < 2.0 * float(loss.d_min)
+
+
+def test_the_warning_is_given_in_training_alone():
+    loss = MKCLoss(1)
+    with torch.no_grad():
+        loss.raw_d.fill_(-30.0)
+    loss.eval()
+    for _ in range(200):
+        loss(torch.zeros(2, 1), torch.ones(2, 1))
+
+
+def test_ordinary_noise_is_no_collapse():
+    loss = MKCLoss(1)
+    target = torch.randn(256, 1, generator=torch.Generator().manual_seed(0))
+    optimiser = torch.optim.Adam(loss.parameters(), lr=0.1)
+    for _ in range(200):
+        optimiser.zero_grad()
+        loss(torch.zeros(256, 1), target).backward()
+        optimiser.step()
+    assert 0.7 < float(loss.d.detach()) < 1.3
