@@ -53,7 +53,7 @@ def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candi
         "findings": tuple(f(names, has_time) for f in found),
         "baseline": Spread(-1.2345, before, (1.1,) * channels, (0.52,) * channels),
         "corrected": Spread(-0.9012, after, (math.inf,) * channels, (0.31,) * channels),
-        "ceiling": (0.62, 0.59),
+        "ceiling": Spread(-0.8951, 0.97 * after, (1.4,) * channels, (0.3,) * channels),
         "advice": ("Record at two more temperatures, at least 10 °C apart.",) if findings else (),
         "warnings": ("3 samples without a finite value were left out.",),
         "candidates": make_candidates(candidates),

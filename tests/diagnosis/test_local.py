@@ -76,9 +76,7 @@ def test_the_noise_is_that_of_what_is_left():
     fit, tangents, local = local_of(walk([0.05, 0.05, 0.05]), "norm")
     noise = local.noise.search.noise_fit(local.noise.series)
     assert noise.size > 0
-    again = linearise(
-        fit.model, fit.parameters, local.values, local.counts, tangents.bare, colour=local.noise.colour
-    )
+    again = linearise(fit.model, fit.parameters, local.values, local.counts, tangents.bare, colour=local.noise.colour)
     torch.testing.assert_close(again.series, local.noise.series)
 
 

@@ -289,7 +289,7 @@ def test_the_share_of_a_channel_is_its_variance():
     assert found.mean(0)[0] == pytest.approx(1.73, abs=0.08)
 
 
-def test_without_a_wander_channels_are_alike(search):
+def test_without_a_wander_channels_are_alike():
     quiet = LinearSearch(NUISANCE, [], WANDER, SCALES)
     y = randn(M, seed=5)
     y = y - WANDER @ torch.linalg.lstsq(WANDER, y).solution
