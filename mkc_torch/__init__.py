@@ -7,8 +7,10 @@ from mkc_torch.density_fit import DensityFit, fit_density
 from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.distribution import MKCDistribution
 from mkc_torch.ellipsoid import EllipsoidFit, NotIdentifiableError
+from mkc_torch.heteroscedastic import HeteroscedasticMKCLoss, MKCHead
 from mkc_torch.losses import MKCLoss
 from mkc_torch.recording import Recording
+from mkc_torch.uncertainty import beyond_bound, inlier_weight, outliers, predictive_interval
 
 __version__ = version("mkc-torch")
 
@@ -16,12 +18,18 @@ __all__ = [
     "DensityFit",
     "Diagnosis",
     "EllipsoidFit",
+    "HeteroscedasticMKCLoss",
     "MKCDistribution",
+    "MKCHead",
     "MKCLoss",
     "NotIdentifiableError",
     "Recording",
+    "beyond_bound",
     "diagnose",
     "fit_density",
     "functional",
+    "inlier_weight",
     "linear",
+    "outliers",
+    "predictive_interval",
 ]

@@ -39,6 +39,9 @@ KAPPA_MAX = 400.0
 
 _HEAD_TOLERANCE = 1e-13
 
+_FEW = 4096
+"""Elements up to which the number of calls counts more than the memory of six of each."""
+
 
 def _head_quadrature(count: int) -> tuple[Tensor, Tensor]:
     """Nodes on [0, 1] and weights of an even integrand on [-1, 1]: Gauss-Legendre under sinh(2t), denser near 0."""
@@ -132,8 +135,16 @@ def energy_dkappa(z: Tensor, kappa: Tensor) -> Tensor:
     x = kappa * q
     small = x < 0.5
     near_x = torch.where(small, x, 0.0)
-    near = torch.zeros_like(x)
-    # the integral of t exp(-x t) over [0, 1], which is (1 - exp(-x) (1 + x)) / x^2, by Gauss and Legendre's six points;
+    near = _near(near_x)
+    # capped, so that 0 times it stays 0 where kappa = 0 and the square overflows
+    near_q = torch.where(small, q, 0.0).clamp(max=math.sqrt(torch.finfo(q.dtype).max))
+    direct_x = torch.where(small, 1.0, x).clamp(max=1e4)  # exp(-1e4) is 0 already
+    direct = (1.0 - torch.exp(-direct_x) * (1.0 + direct_x)) / torch.where(small, 1.0, kappa).square()
+    return -torch.where(small, near_q * near_q * near, direct)
+
+
+def _near(x: Tensor) -> Tensor:
+    """``(1 - exp(-x) (1 + x)) / x^2``, the integral of t exp(-x t) over [0, 1], by Gauss and Legendre's six points."""
     # written out, since the compiler makes variables of a module's numbers
     rule = (
         (0.03376524289842403, 0.0028924065498159403),
@@ -143,13 +154,13 @@ def energy_dkappa(z: Tensor, kappa: Tensor) -> Tensor:
         (0.8306046932331322, 0.14982512785597574),
         (0.9662347571015759, 0.0827698396397692),
     )
+    if x.numel() <= _FEW and not torch.compiler.is_compiling():
+        nodes, weights = x.new_tensor(rule).unbind(-1)
+        return (weights * torch.exp(-x.unsqueeze(-1) * nodes)).sum(-1)
+    near = torch.zeros_like(x)
     for node, weight in rule:
-        near = near + weight * torch.exp(-node * near_x)
-    # capped, so that 0 times it stays 0 where kappa = 0 and the square overflows
-    near_q = torch.where(small, q, 0.0).clamp(max=math.sqrt(torch.finfo(q.dtype).max))
-    direct_x = torch.where(small, 1.0, x).clamp(max=1e4)  # exp(-1e4) is 0 already
-    direct = (1.0 - torch.exp(-direct_x) * (1.0 + direct_x)) / torch.where(small, 1.0, kappa).square()
-    return -torch.where(small, near_q * near_q * near, direct)
+        near = near + weight * torch.exp(-node * x)
+    return near
 
 
 def energy(z: Float[Tensor, "*batch"], kappa: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
@@ -282,7 +293,7 @@ class _LogPartition(torch.autograd.Function):
             return None, None
         kappa, length, by_kappa, by_length = ctx.saved_tensors
         if torch.is_grad_enabled():
-            _, by_kappa, by_length = _log_partition_and_slopes(kappa, length, energy)
+            by_kappa, by_length = _log_partition_and_slopes(kappa, length, energy)[1:]
         wants = ctx.needs_input_grad
         return grad * by_kappa if wants[0] else None, grad * by_length if wants[1] else None
 

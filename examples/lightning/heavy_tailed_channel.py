@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
@@ -21,15 +23,66 @@ from torch.utils.data import DataLoader, TensorDataset
 from mkc_torch import MKCLoss
 from mkc_torch.lightning import MKCExpectationMaximization
 
-try:
-    from peers import AdaptiveLoss, LearnedGaussianNLL, StudentTNLL
-except ModuleNotFoundError:  # as a module of the examples
-    from examples.lightning.peers import AdaptiveLoss, LearnedGaussianNLL, StudentTNLL
-
 SAMPLES, NOISE = 2000, 0.1
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4)
 
 MKC_EM, MKC_JOINT = "MKC, EM", "MKC, joint"
+
+
+class LearnedGaussianNLL(nn.Module):
+    """torch.nn.GaussianNLLLoss with one learned variance for each channel."""
+
+    def __init__(self, num_channels: int) -> None:
+        super().__init__()
+        self.log_variance = nn.Parameter(torch.zeros(num_channels))
+        self._nll = nn.GaussianNLLLoss()
+
+    def forward(self, input: Tensor, target: Tensor) -> Tensor:
+        variance: Tensor = self.log_variance.exp().expand_as(input)
+        loss: Tensor = self._nll(input, target, variance)
+        return loss
+
+
+class StudentTNLL(nn.Module):
+    """Negative log-likelihood of Student's t with learned degrees of freedom and scale for each channel."""
+
+    def __init__(self, num_channels: int) -> None:
+        super().__init__()
+        self.log_freedom = nn.Parameter(torch.full((num_channels,), math.log(5.0)))
+        self.log_scale = nn.Parameter(torch.zeros(num_channels))
+
+    def forward(self, input: Tensor, target: Tensor) -> Tensor:
+        freedom = 1.0 + self.log_freedom.exp()
+        density = torch.distributions.StudentT(freedom, input, self.log_scale.exp())
+        return -density.log_prob(target).mean()
+
+
+class AdaptiveLoss(nn.Module):
+    """The general adaptive robust loss with learned shape α in (0, 2) and scale c for each channel.
+
+    Barron, "A General and Adaptive Robust Loss Function", CVPR 2019, (13)-(16); the normaliser by the trapezoidal rule.
+    """
+
+    def __init__(self, num_channels: int) -> None:
+        super().__init__()
+        self.raw_shape = nn.Parameter(torch.zeros(num_channels))
+        self.log_scale = nn.Parameter(torch.zeros(num_channels))
+        reach = torch.linspace(0.0, math.asinh(1e4), 2001, dtype=torch.float64).sinh()
+        self.register_buffer("nodes", torch.cat([-reach.flip(0)[:-1], reach]).float(), persistent=False)
+
+    @staticmethod
+    def rho(z: Tensor, shape: Tensor) -> Tensor:
+        far = (2.0 - shape).clamp(min=1e-3)
+        return far / shape * ((z.square() / far + 1.0).pow(0.5 * shape) - 1.0)
+
+    def forward(self, input: Tensor, target: Tensor) -> Tensor:
+        shape = 0.01 + 1.98 * torch.sigmoid(self.raw_shape)
+        scale = self.log_scale.exp()
+        nodes: Tensor = self.nodes  # type: ignore[assignment]
+        density = torch.exp(-self.rho(nodes.unsqueeze(-1), shape))
+        log_z = torch.trapezoid(density, nodes, dim=0).log()
+        return (self.rho((input - target) / scale, shape) + scale.log() + log_z).mean()
+
 
 LOSSES: dict[str, Callable[[], nn.Module]] = {
     "MSE": nn.MSELoss,
@@ -72,8 +125,10 @@ class Regression(LightningModule):
         return loss
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        own = [{"params": self.criterion.parameters(), "lr": 3e-2}] if list(self.criterion.parameters()) else []
-        return torch.optim.Adam([{"params": self.net.parameters()}, *own], lr=5e-3)
+        groups: list[dict[str, Any]] = [{"params": self.net.parameters()}]
+        if list(self.criterion.parameters()):
+            groups.append({"params": self.criterion.parameters(), "lr": 3e-2})
+        return torch.optim.Adam(groups, lr=5e-3)
 
 
 def trained(name: str, share: float, seed: int, epochs: int) -> Regression:

@@ -1,0 +1,126 @@
+"""The negative log-likelihood of a loss as a metric of torchmetrics, which adds up over batches and processes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+try:
+    from torchmetrics import Metric
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        "mkc_torch.metrics needs torchmetrics, which comes with Lightning: pip install 'mkc-torch[lightning]'"
+    ) from error
+
+from mkc_torch.functional import log_partition
+from mkc_torch.fused import energy_sums
+from mkc_torch.losses import MKCLoss, _refuse_not_finite
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["MKCNegativeLogLikelihood"]
+
+
+class MKCNegativeLogLikelihood(Metric):
+    """Mean negative log-density of errors under an :class:`MKCLoss`, in nats per element.
+
+    Sums and weights are kept in float64 and added over processes, so that the mean over a set of data does not depend
+    on how it was cut into batches. σ, d and the bound are those of the loss when a batch comes in: the metric refers to
+    the loss and does not own it. It has no parameters, and a clone of it refers to the same loss; copied together with
+    the loss, in one module after it, it refers to the copy.
+
+    Values compare only at equal bounds. Beyond the bound the formula of :func:`mkc_torch.functional.mkc_nll` goes on.
+
+    Args:
+        loss: the loss; its own ``normalize`` and ``reduction`` do not matter.
+        per_channel: whether ``compute`` returns the mean of each channel, (m,), or one over all elements.
+        kwargs: options of :class:`torchmetrics.Metric`.
+
+    Raises:
+        TypeError: ``loss`` is no MKCLoss.
+
+    Example:
+        >>> loss = MKCLoss(2, sigma=3.0, d=1.0, bound=50.0)
+        >>> metric = MKCNegativeLogLikelihood(loss)
+        >>> metric.update(torch.zeros(4, 2), torch.ones(4, 2))
+        >>> metric.update(torch.zeros(1, 2), torch.zeros(1, 2))
+        >>> metric.compute()
+        tensor(1.3616, dtype=torch.float64)
+    """
+
+    is_differentiable = False
+    higher_is_better = False
+    full_state_update = False
+
+    total: Tensor
+    weight: Tensor
+
+    def __init__(self, loss: MKCLoss, *, per_channel: bool = False, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        if not isinstance(loss, MKCLoss):
+            raise TypeError(
+                f"Expected argument `loss` to be an MKCLoss but got {type(loss).__name__}; "
+                "pass the loss that is trained with."
+            )
+        self._loss = _Reference(loss)
+        self.per_channel = per_channel
+        for name in ("total", "weight"):
+            self.add_state(name, torch.zeros(loss.num_channels, dtype=torch.float64), dist_reduce_fx="sum")
+
+    @property
+    def loss(self) -> MKCLoss:
+        """The loss whose σ, d and bound are used."""
+        return self._loss.loss
+
+    def update(
+        self,
+        input: Float[Tensor, "*shape"],
+        target: Float[Tensor, "*shape"],
+        weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
+    ) -> None:
+        """Adds a batch.
+
+        Args:
+            input: predictions, as for the loss.
+            target: targets of the same shape.
+            weight: as for the loss: non-negative weights or a mask, of the shape of ``input`` or without its channels.
+
+        Raises:
+            TypeError, ValueError: as the loss does.
+        """
+        loss = self.loss
+        axis = loss._checked_axis(input, target)
+        with torch.no_grad():
+            error = input.double() - target.double()
+            if weight is None:
+                weights, counts = torch.ones_like(error), None
+            else:
+                weights, counts = loss._checked_weight(weight, error, axis)
+                error = torch.where(counts, error, 0.0)
+            _refuse_not_finite(target, counts)
+            kappa, d, bound = (t.double() for t in (loss.kappa, loss.d, loss.bound))
+            others = [i for i in range(error.dim()) if i != axis]
+            elements = weights.sum(others) if others else weights
+            norm = torch.log(d) + log_partition(kappa, bound / d)
+            total = energy_sums(error, kappa, d, weights, axis) + norm * elements
+        self.total += total.to(self.total)
+        self.weight += elements.to(self.weight)
+
+    def compute(self) -> Float[Tensor, ""] | Float[Tensor, " m"]:
+        """Nats per element in float64: the weighted mean, NaN where nothing counted."""
+        if self.per_channel:
+            return self.total / self.weight
+        return self.total.sum() / self.weight.sum()
+
+
+class _Reference:
+    """Keeps a module out of its holder's parameters and state, and shared by the holder's copies."""
+
+    def __init__(self, loss: MKCLoss) -> None:
+        self.loss = loss
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _Reference:
+        return _Reference(memo.get(id(self.loss), self.loss))
