@@ -8,7 +8,7 @@ import torch
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
-from mkc_torch.diagnosis.result import Candidate, Separability
+from mkc_torch.diagnosis.result import Candidate, Extrapolation, Separability
 from mkc_torch.report import diagnosis_wording as say
 from mkc_torch.report.diagnosis import bars, diagnosis_report, heat_map
 from tests.diagnosis.factory import CHANNELS, make_candidates, make_diagnosis, make_separability
@@ -185,7 +185,32 @@ def test_pages_without_candidates_curves_and_separability():
     text = text_of(page)
     assert "The candidates" not in text
     assert "What this recording can tell apart" not in text
-    assert "flexible model" not in text
+    assert "ceiling" not in text
+
+
+def test_the_ceiling_stands_beside_the_models_compared():
+    for findings in (0, 2):
+        diagnosis = make_diagnosis(findings, samples=300, channels=2)
+        rows = dict(say.held_out_rows(diagnosis))
+        assert list(rows)[-1] == "with any smooth correction (the ceiling)"
+        assert rows["with any smooth correction (the ceiling)"] == [
+            f"{diagnosis.ceiling.rmse:.3f}", "−0.895", "1.40, 1.40", "0.300, 0.300",
+        ]  # fmt: skip
+        text = text_of(diagnosis_report(diagnosis))
+        assert f"with any smooth correction (the ceiling) {diagnosis.ceiling.rmse:.3f} −0.895" in text
+        assert "The ceiling is how far curves of all columns and of time come" in text
+
+
+def test_whether_a_finding_extrapolates_is_said():
+    diagnosis = make_diagnosis(2, samples=300)
+    assert "beyond its range" not in text_of(diagnosis_report(diagnosis))
+    for gain, interval, told in (
+        (0.31, (0.28, 0.35), "it predicts where that is high: +0.310 nats a sample (95 %: 0.280 to 0.350)"),
+        (-0.02, (-0.12, 0.09), "it says nothing where that is high: −0.020"),
+        (-0.3, (-0.4, -0.2), "it misleads where that is high: −0.300"),
+    ):
+        text = text_of(diagnosis_report(first_changed(diagnosis, extrapolation=Extrapolation(gain, interval))))
+        assert f"beyond its range fitted where its driver is low, {told}" in text
 
 
 def test_drivers_that_switch_are_constant_or_missing():

@@ -68,6 +68,8 @@ def _of_all(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     if not d.findings:
         searched = f"{d.candidates_tried:,} candidates tried, level {d.level:g}"
         yield "how sure", f"{say.evidence(d.p_value, d.surrogates)}; {searched}"
+    if d.ceiling is not None:
+        yield "ceiling", say.ceiling_reached(d)
     yield "noise", say.noise_model(d.noise)
     for sentence in say.to_do(d):
         yield "to do", sentence

@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.candidates import candidate_terms, described
+from mkc_torch.diagnosis.ceiling import ceiling
+from mkc_torch.diagnosis.density_check import density_warnings
 from mkc_torch.diagnosis.diagnosed_model import model_of
 from mkc_torch.diagnosis.drivers import Drivers, find_drivers
 from mkc_torch.diagnosis.estimate import Estimate, estimate
 from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
+from mkc_torch.diagnosis.extrapolation import extrapolated, extrapolation_warning
 from mkc_torch.diagnosis.findings import finding_of
 from mkc_torch.diagnosis.locate import Located, locate
 from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.noise_summary import noise_summary
 from mkc_torch.diagnosis.preference import ALIKE_COLUMNS, UNKNOWN, alike
 from mkc_torch.diagnosis.refit import FittedModel, fitted
+from mkc_torch.diagnosis.remaining import remaining, remaining_warning
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Finding, HeldOut, Separability, Spread, Traces, Verdict
 from mkc_torch.diagnosis.separability import separability
 from mkc_torch.diagnosis.units import unit_warnings
@@ -43,8 +47,8 @@ FEWEST = 100
 
 _WIDER, _NEAR = 3.0, 0.05
 
-_LEANING, _BEYOND_DOUBT = 10.0, 40.0
-"""Nats beyond all draws of noise from which unseen blocks need only to lean a finding's way, or not to be asked."""
+_BEYOND_DOUBT = 40.0
+"""Nats beyond all draws of noise from which unseen blocks are not asked."""
 
 _REST = 0.5
 """A larger share of samples in which nothing moves is a sensor at rest, and is warned of."""
@@ -115,13 +119,14 @@ def _holds(
 ) -> bool:
     """Whether what was found counts.
 
-    Blocks weigh samples as if their noise was white, and miss what is plain in coloured noise: the further a finding is
-    beyond all draws, the less they have to say. What comes after a finding also has what that one's form left over.
+    Blocks weigh samples as if their noise was white, and miss what is plain in coloured noise: of the first finding,
+    which the draws of noise have judged, they need only to lean its way. What comes after a finding also has what that
+    one's form left over, and they have to confirm it.
     """
-    if first and located.beyond > _BEYOND_DOUBT:
-        return True
-    better = bool(after.log_likelihood.mean() > before.log_likelihood.mean())
-    return (first and located.beyond > _LEANING and better) or _confirmed(before, after, blocks, seed)
+    if first:
+        better = bool(after.log_likelihood.mean() > before.log_likelihood.mean())
+        return better or located.beyond > _BEYOND_DOUBT
+    return _confirmed(before, after, blocks, seed)
 
 
 def _confirmed(before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int) -> bool:
@@ -221,12 +226,18 @@ def _assembled(
 ) -> Diagnosis:
     found, blocks, evidence, first = search.found, search.blocks, search.evidence, search.first
     inliers = (evidence[-1].residual.abs() <= 3.0 * evidence[-1].d) & (final.fit.weights > _REST)
+    fits = [base, *(s.fit for s in found)]
     findings = [
-        finding_of(s, final, k, *_held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, generator))
+        replace(
+            finding_of(s, final, k, *_held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, generator)),
+            extrapolation=extrapolated(fits[k], s.fit, seed),
+        )
         for k, s in enumerate(found)
     ]
     nameless = any(f.effect == UNKNOWN for f in findings)
     verdict: Verdict = "adequate" if not findings else "unexplained" if nameless else "explained"
+    any_fit = ceiling(base.model, final.fit, drivers.drivers, blocks)
+    left = () if nameless else remaining(any_fit, evidence[-1], final.fit, drivers.drivers, blocks, seed)
     return Diagnosis(
         recording=prepared.recording.name,
         simulation=prepared.name,
@@ -241,7 +252,7 @@ def _assembled(
         findings=tuple(findings),
         baseline=_spread(evidence[0], inliers),
         corrected=_spread(evidence[-1], inliers),
-        ceiling=None,
+        ceiling=_spread(any_fit.evidence, inliers),
         advice=_advice(findings),
         warnings=(
             *prepared.recording.warnings,
@@ -250,6 +261,9 @@ def _assembled(
             *drivers.warnings,
             *([_not_confirmed(search.unconfirmed)] if search.unconfirmed else []),
             *_time_warnings(prepared),
+            *remaining_warning(left),
+            *(sentence for finding in findings for sentence in extrapolation_warning(finding)),
+            *density_warnings(final.fit.residual, final.fit.sigma, final.fit.d, final.fit.bound, prepared.channels),
         ),
         candidates=_candidates(first),
         separability=separability(first) if first else _nothing_to_separate(),

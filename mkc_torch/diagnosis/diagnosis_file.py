@@ -47,7 +47,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "findings": [_finding(f) for f in d.findings],
         "baseline": _spread(d.baseline),
         "corrected": _spread(d.corrected),
-        "ceiling": None if d.ceiling is None else {"flexible_model": d.ceiling[0], "findings": d.ceiling[1]},
+        "ceiling": None if d.ceiling is None else _spread(d.ceiling),
         "advice": d.advice,
         "warnings": d.warnings,
     }

@@ -102,13 +102,19 @@ def scored(residual: Tensor, sigma: Tensor, d: Tensor, bound: Tensor) -> Float[T
 
 
 def gain_interval(
-    difference: Float[Tensor, " N"], block: Tensor, generator: torch.Generator, draws: int = 2000
+    difference: Float[Tensor, " N"],
+    block: Tensor,
+    generator: torch.Generator,
+    draws: int = 2000,
+    *,
+    coverage: float = 0.95,
 ) -> tuple[float, tuple[float, float]]:
-    """Mean of paired differences, and its 95 % interval by a bootstrap of whole blocks."""
+    """Mean of paired differences, and its interval, of 95 % by default, by a bootstrap of whole blocks."""
     count = int(block.max()) + 1
     total = difference.new_zeros(count).index_add(0, block, difference)
     size = difference.new_zeros(count).index_add(0, block, torch.ones_like(difference))
     drawn = torch.randint(count, (draws, count), generator=generator)
     means = total[drawn].sum(-1) / size[drawn].sum(-1)
-    low, high = torch.quantile(means, torch.tensor([0.025, 0.975], dtype=means.dtype)).tolist()
+    tail = 0.5 * (1.0 - coverage)
+    low, high = torch.quantile(means, torch.tensor([tail, 1.0 - tail], dtype=means.dtype)).tolist()
     return float(difference.mean()), (low, high)

@@ -18,6 +18,7 @@ __all__ = [
     "Candidate",
     "Curve",
     "Diagnosis",
+    "Extrapolation",
     "Finding",
     "HeldOut",
     "Noise",
@@ -53,6 +54,14 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
+class Extrapolation:
+    """A fit to the low values of a driver, judged on the high ones: gain in nats per sample, its 95 % interval."""
+
+    log_likelihood_gain: float
+    confidence_interval: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class Alternative:
     """Another candidate for a finding: how much less likely it is, in nats, and whether the data tell them apart."""
 
@@ -80,7 +89,10 @@ class Curve:
 
 @dataclass(frozen=True)
 class Finding:
-    """A piece of physics that the simulation lacks, or the effect "unknown"; see ``diagnosis.json``."""
+    """A piece of physics that the simulation lacks, or the effect "unknown"; see ``diagnosis.json``.
+
+    ``extrapolation`` is for the report; None where it was not asked for or cannot be told.
+    """
 
     effect: str
     drivers: tuple[str, ...]
@@ -97,6 +109,7 @@ class Finding:
     plausible: bool
     plausibility: str
     curve: Curve | None = None
+    extrapolation: Extrapolation | None = None
 
 
 @dataclass(frozen=True)
@@ -183,8 +196,8 @@ class Diagnosis:
         verdict: "adequate", "explained" or "unexplained".
         findings: strongest first.
         baseline, corrected: the simulation without and with the findings, on held-out blocks.
-        ceiling: share of the baseline's held-out variance that a flexible model of all columns explains, next to the
-            share that the findings explain; None where it was not asked for.
+        ceiling: the simulation with a smooth correction by all columns and by time instead of the findings, on the
+            same held-out blocks: how far any fit could come. None where it was not asked for.
         advice: what to record next or to do, in sentences.
         warnings: what was noticed.
         candidates: the candidates of the search, best first.
@@ -206,7 +219,7 @@ class Diagnosis:
     findings: tuple[Finding, ...]
     baseline: Spread
     corrected: Spread
-    ceiling: tuple[float, float] | None
+    ceiling: Spread | None
     advice: tuple[str, ...]
     warnings: tuple[str, ...]
     candidates: tuple[Candidate, ...]

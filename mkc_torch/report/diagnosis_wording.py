@@ -6,16 +6,27 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from mkc_torch.diagnosis.result import Alternative, Candidate, Diagnosis, Finding, HeldOut, Noise, Number, Traces
+from mkc_torch.diagnosis.result import (
+    Alternative,
+    Candidate,
+    Diagnosis,
+    Extrapolation,
+    Finding,
+    HeldOut,
+    Noise,
+    Number,
+    Traces,
+)
 from mkc_torch.report.wording import bandwidth, decimals, number, share, size
 
 __all__ = [
     "Clock",
+    "ceiling_reached",
     "chance",
     "clock_of",
     "effect_name",
     "evidence",
-    "explained_share",
+    "extrapolation",
     "gain",
     "headline",
     "held_out_rows",
@@ -239,17 +250,21 @@ def gain(held_out: HeldOut, *, short: bool = False) -> str:
         >>> gain(held_out), gain(held_out, short=True)
         ('+0.312 nats a sample (95 %: 0.281 to 0.350)', '+0.312 [0.281, 0.350]')
     """
-    low, high = held_out.confidence_interval
+    return gain_told(held_out.log_likelihood_gain, held_out.confidence_interval, short=short)
+
+
+def gain_told(value: float, interval: tuple[float, float], *, short: bool = False) -> str:
+    """A gain with its interval, to the digits that the interval leaves."""
+    low, high = interval
     known = math.isfinite(low) and math.isfinite(high)
     places = decimals(0.25 * (high - low)) if known and high > low else 3
-    value = number(held_out.log_likelihood_gain, places)
-    signed = value if value.startswith("−") else f"+{value}"
+    told = number(value, places)
+    signed = told if told.startswith("−") else f"+{told}"
     if short:
         return f"{signed} [{number(low, places)}, {number(high, places)}]" if known else signed
-    told = f"{signed} nats a sample"
     if not known:
-        return f"{told} (interval not known)"
-    return f"{told} (95 %: {number(low, places)} to {number(high, places)})"
+        return f"{signed} nats a sample (interval not known)"
+    return f"{signed} nats a sample (95 %: {number(low, places)} to {number(high, places)})"
 
 
 def improvement(before: float, after: float, unit: str) -> str:
@@ -273,6 +288,8 @@ def held_out_rows(diagnosis: Diagnosis) -> list[tuple[str, list[str]]]:
     rows = [("the simulation as it is", diagnosis.baseline)]
     if diagnosis.findings:
         rows.append(("with the findings", diagnosis.corrected))
+    if diagnosis.ceiling is not None:
+        rows.append(("with any smooth correction (the ceiling)", diagnosis.ceiling))
     return [
         (
             name,
@@ -398,13 +415,27 @@ def noise_parameters(noise: Noise, channels: Sequence[str]) -> list[tuple[str, s
     return rows
 
 
-def explained_share(diagnosis: Diagnosis) -> str:
-    """How much of what any model of the columns could explain the findings do; empty where it was not asked for."""
+def ceiling_reached(diagnosis: Diagnosis) -> str:
+    """How far a smooth correction by all columns comes; empty where it was not asked for."""
     if diagnosis.ceiling is None:
         return ""
-    flexible, found = (share(max(value, 0.0)) for value in diagnosis.ceiling)
-    told = f"A flexible model of all columns explains {flexible} of the residual's variance on held-out blocks"
-    return f"{told}; the findings explain {found}." if diagnosis.findings else f"{told}."
+    unit = plain(diagnosis.traces.unit)
+    return f"a smooth correction by all columns and by time reaches {size(diagnosis.ceiling.rmse)} {unit}".rstrip()
+
+
+def extrapolation(found: Extrapolation) -> str:
+    """What a fit to low values of a driver says of high ones.
+
+    Example:
+        >>> extrapolation(Extrapolation(0.3124, (0.2811, 0.3502)))
+        'fitted where its driver is low, it predicts where that is high: +0.312 nats a sample (95 %: 0.281 to 0.350)'
+        >>> extrapolation(Extrapolation(-0.02, (-0.12, 0.09))).partition(":")[0]
+        'fitted where its driver is low, it says nothing where that is high'
+    """
+    low, high = found.confidence_interval
+    told = "predicts" if low > 0.0 else "misleads" if high < 0.0 else "says nothing"
+    told_gain = gain_told(found.log_likelihood_gain, found.confidence_interval)
+    return f"fitted where its driver is low, it {told} where that is high: {told_gain}"
 
 
 def _capital(text: str) -> str:

@@ -1,18 +1,21 @@
 """How far a smooth correction by all columns comes on blocks that it has not seen."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from scipy import stats
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.ceiling import ceiling
+from mkc_torch.diagnosis.ceiling import Ceiling, ceiling
 from mkc_torch.diagnosis.drivers import Driver, find_drivers
-from mkc_torch.diagnosis.evidence import blocks_of, gain_interval, held_out
-from mkc_torch.diagnosis.model import JointModel
+from mkc_torch.diagnosis.evidence import Evidence, blocks_of, gain_interval, held_out
+from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.refit import fitted
 from mkc_torch.diagnosis.remaining import remaining
 from mkc_torch.diagnosis.smooth import curves_of, legendre, smooth_tangents
+from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.line import Line
 from tests.simulation.tumbling import tumbling
@@ -111,9 +114,6 @@ def test_of_columns_by_the_dozen_the_right_one_is_taken():
 
 def test_beside_a_model_it_is_about_what_is_left():
     """The parameters of the model are refitted with the curves: nothing is left to gain by what it has already."""
-    from mkc_torch.diagnosis.model import Term
-    from mkc_torch.effects import CATALOGUE
-
     fit, drivers, blocks = made(along(LOAD), load=LOAD, **walks(2))
     effect = next(e for e in CATALOGUE if e.id == "driver_offset")
     model = fit.model.with_term(Term(effect, next(d for d in drivers if d.columns == ("load",)), {}))
@@ -149,13 +149,18 @@ def test_a_port_that_is_not_pointwise(count):
     np.testing.assert_allclose(found.evidence.d, 0.1, atol=0.015)
 
 
-def test_every_sample_is_scored_by_the_fits_to_other_folds():
-    line = Line(300)
-    fit, blocks = fitted(JointModel(line), line.start()), blocks_of(300, 1)
-    found, alone = ceiling(fit.model, fit, (), blocks).evidence, held_out(fit, blocks)
-    torch.testing.assert_close(found.residual, alone.residual, rtol=0.0, atol=0.005)
-    torch.testing.assert_close(found.log_likelihood, alone.log_likelihood, rtol=0.0, atol=0.05)
-    assert found.left_out == pytest.approx(alone.left_out)
+def test_a_fold_knows_nothing_of_its_own_samples():
+    line, spoilt, blocks = Line(300), Line(300), blocks_of(300, 1)
+    hidden = ~blocks.train[2]
+    spoilt.measured[hidden] += 0.7
+    first = fitted(JointModel(line), line.start())
+    second = fitted(JointModel(spoilt), first.parameters, first.bound, graduate=False)
+    before, after = (ceiling(fit.model, fit, (), blocks).evidence for fit in (first, second))
+    seen = blocks.fold == 2
+    torch.testing.assert_close(
+        after.residual[seen] - before.residual[seen], torch.full_like(before.residual[seen], 0.7), rtol=0.0, atol=0.1
+    )
+    assert after.left_out == pytest.approx(held_out(first, blocks).left_out)
 
 
 def test_curves_are_legendre_polynomials():
@@ -187,7 +192,7 @@ def wandering(request):
 def test_noise_that_wanders_is_not_told_as_what_remains(wandering):
     fit, drivers, blocks, alone = wandering
     corrected = held_out(fit, blocks)
-    assert gained(alone.evidence, corrected, blocks) > -0.05
+    assert gained(alone.evidence, corrected, blocks) > 0.0
     assert remaining(alone, corrected, fit, drivers, blocks, 0) == ()
 
 
@@ -199,6 +204,23 @@ def test_a_wandering_column_that_matters_is_told_from_wandering_noise():
     assert "load" in remaining(alone, held_out(fit, blocks), fit, drivers, blocks, 0)
 
 
-def test_what_is_too_small_to_matter_is_not_told():
-    fit, drivers, blocks = made(0.1 * along(LOAD), load=LOAD)
-    assert remaining(ceiling(fit.model, fit, drivers, blocks), held_out(fit, blocks), fit, drivers, blocks, 0) == ()
+def scores(gain, columns=("load",)):
+    noise = 0.1 * torch.randn(N, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    nothing = torch.zeros(5, 0)
+    return Ceiling(Evidence(gain + noise, nothing, nothing, nothing, nothing, 0.2), columns)
+
+
+@pytest.mark.parametrize(
+    ("gain", "by_time", "columns", "told"),
+    [
+        (0.05, 0.0, ("load",), ("load",)),
+        (0.005, 0.0, ("load",), ()),  # too small to matter
+        (0.05, 0.05, ("load",), ()),
+        (0.05, 0.0, (), ()),
+        (-0.05, 0.0, ("load",), ()),
+    ],
+)
+def test_what_remains_gains_enough_and_more_than_time(monkeypatch, gain, by_time, columns, told):
+    monkeypatch.setattr("mkc_torch.diagnosis.remaining.ceiling", lambda *_: scores(by_time, ()))
+    fit = SimpleNamespace(model=SimpleNamespace(terms=()))
+    assert remaining(scores(gain, columns), scores(0.0).evidence, fit, (), blocks_of(N, 3), 0) == told

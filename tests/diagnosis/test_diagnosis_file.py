@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("jsonschema")
 
 from mkc_torch.diagnosis.diagnosis_file import DiagnosisFileError, diagnosis_to_json, json_schema, validate
-from mkc_torch.diagnosis.result import HeldOut, Parameter
+from mkc_torch.diagnosis.result import Extrapolation, HeldOut, Parameter
 from tests.diagnosis.factory import make_diagnosis
 
 
@@ -46,6 +46,19 @@ def test_keys_are_those_of_the_format(content):
         "held_out", "held_out_note", "alternatives", "plausible", "plausibility",
     }  # fmt: skip
     assert set(content["baseline"]) == {"log_likelihood", "rmse", "sigma", "d"}
+
+
+def test_the_ceiling_is_written_as_the_other_models_are():
+    diagnosis = make_diagnosis(1, channels=4)
+    told = written(diagnosis)["ceiling"]
+    assert told["rmse"] == diagnosis.ceiling.rmse
+    assert told["log_likelihood"] == diagnosis.ceiling.log_likelihood
+    assert len(told["sigma"]) == len(told["d"]) == 4
+
+
+def test_what_is_for_the_report_alone_is_not_written():
+    diagnosis = with_finding(make_diagnosis(1), extrapolation=Extrapolation(0.2, (0.1, 0.3)))
+    assert written(diagnosis) == written(make_diagnosis(1))
 
 
 def test_numbers_round_trip_exactly():
@@ -122,6 +135,7 @@ BAD = [
     (("search", "seed"), "0"),
     (("baseline", "rmse"), -1.0),
     (("ceiling",), [0.1, 0.2]),
+    (("ceiling", "rmse"), -1.0),
     (("warnings",), "one sentence"),
     (("findings", 0, "effect"), "Hard iron"),
     (("findings", 0, "drivers"), "current"),
