@@ -88,7 +88,9 @@ class _EnergySums(torch.autograd.Function):
         positive = kappa.clamp(min=_LEAST[error.dtype])
         z = error / _shaped(d, error.dim(), axis)
         square = z * z
-        minus_x = (square * _shaped(-0.5 * positive, error.dim(), axis)).clamp(min=-1e4)  # exp(-1e4) is 0 already
+        minus_x = square * _shaped(-0.5 * positive, error.dim(), axis)
+        if by_kappa:
+            minus_x = minus_x.clamp(min=-1e4)  # exp(-1e4) is 0 already, and no product with it is NaN
         inlier = torch.exp(minus_x)
         pull, value = z * inlier, torch.expm1(minus_x)
         if weight is not None:
