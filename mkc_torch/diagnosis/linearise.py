@@ -197,9 +197,10 @@ def linearise(
     plain = Colour(tuple(pseudo.new_zeros(0) for _ in range(m)), pseudo.new_ones(kept, m) * _level(pseudo))
     if white:
         return _searching(plain, pull, seen, slow)
-    if joint and colour is not None:
-        return _searching(colour, pull, seen, slow, joint=True)
     bare = replace(seen, candidates=())
+    if joint:
+        own = _coloured(plain, near, pull, bare, slow).colour if colour is None else colour
+        return _searching(own, pull, seen, slow, joint=True)
     found = _coloured(plain, near, pull, bare, slow) if colour is None else _searching(colour, pull, bare, slow)
     candidates = [pull.below(found.colour.scaled(one)) for one in seen.candidates]
     found = replace(found, search=found.search.with_candidates(candidates))

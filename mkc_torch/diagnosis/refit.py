@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch import nonlinear
-from mkc_torch.diagnosis.model import JointModel, Term
+from mkc_torch.diagnosis.model import JointModel
 from mkc_torch.diagnosis.noise import pseudo_residual
 from mkc_torch.order_statistic import robust_scale
 
@@ -96,9 +96,3 @@ def clipped_residual(residual: Float[Tensor, "N m"]) -> tuple[Float[Tensor, "N m
     z = residual / scale.clamp(min=1e-300)
     slope = (z.abs() < _CLIP).to(z.dtype).mean(0).clamp(min=0.2)
     return scale * z.clamp(-_CLIP, _CLIP) / slope, torch.ones_like(residual)
-
-
-def started(model: FittedModel, term: Term, gamma: Tensor, base: Tensor | None = None) -> tuple[JointModel, Tensor]:
-    """The joint model with one more effect, and a start for it."""
-    parameters = model.parameters if base is None else base
-    return model.model.with_term(term), torch.cat([parameters, gamma])

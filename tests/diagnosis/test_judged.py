@@ -1,0 +1,46 @@
+"""The p-value of a search: a shape that was closed in on has no advantage over the draws that it is judged against."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis.locate import _judged
+from mkc_torch.diagnosis.search import Gains, log_survival
+
+DRAWS = 99
+DOF = torch.tensor([3.0, 3.0]).double()
+
+
+def gains(ratio):
+    ratio = torch.as_tensor(ratio, dtype=torch.float64)
+    return Gains(ratio, log_survival(ratio, DOF.unsqueeze(-1)), DOF)
+
+
+def judged(own, tried):
+    drawn = torch.distributions.Chi2(torch.tensor(3.0).double())
+    torch.manual_seed(0)
+    noise = drawn.sample((2, DRAWS))
+    search = SimpleNamespace(
+        white=lambda count, _: torch.zeros(1, count),
+        wander=lambda count, _noise, _generator: torch.zeros(1, count),
+        gains=lambda _series: gains(noise),
+    )
+    linearised = SimpleNamespace(entering=lambda _count, _generator: None, search=search)
+    return _judged(linearised, None, gains([[own[0]], [own[1]]]), tried, DRAWS, None)
+
+
+def test_what_exceeds_all_draws_has_the_smallest_p_value_and_says_by_how_much():
+    p_value, beyond = judged((100.0, 1.0), tried=2)
+    assert p_value == pytest.approx(1.0 / (1 + DRAWS))
+    assert beyond > 10.0
+
+
+def test_a_shape_closed_in_on_is_left_out():
+    with_it, _ = judged((1.0, 100.0), tried=2)
+    without, beyond = judged((1.0, 100.0), tried=1)
+    assert with_it == pytest.approx(1.0 / (1 + DRAWS))
+    assert without > 0.3
+    assert beyond < 0.0
+    assert math.isfinite(beyond)
