@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
     from mkc_torch.linear._problem import LinearProblem
+    from mkc_torch.linear.implicit import Layer
 
 Self = TypeVar("Self", bound="LinearEstimator")
 
@@ -65,3 +66,11 @@ class LinearEstimator(Fitted):
         self._single_channel = problem.single_channel
         self.coef_ = problem.coefficients(beta)
         self.weights_ = problem.restore(weights)
+
+    def _set_layer(self, layer: Layer) -> None:
+        self._single_channel = layer.single_channel
+        self.coef_ = layer.coef
+        self.weights_ = layer.weights
+        self.covariance_ = layer.covariance
+        self.converged_ = layer.converged
+        self.differentiable_ = layer.differentiable

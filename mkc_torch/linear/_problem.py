@@ -179,16 +179,16 @@ def _check_magnitude(Y: Tensor) -> None:
         )
 
 
-def canonical_shapes(
+def laid_out(
     X: Float[Tensor, "*batch N m n"],
     Y: Float[Tensor, "*batch N m"],
     sample_weight: Float[Tensor, "*batch N"] | None = None,
 ) -> CanonicalShapes:
-    """Check types, shapes and values, and give one-channel input its channel dimension.
+    """Check types and shapes, and give one-channel input its channel dimension, without a look at the values.
 
     Raises:
         TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
-        ValueError: shapes do not fit, or values are not finite.
+        ValueError: shapes do not fit.
     """
     for name, value in (("X", X), ("Y", Y)):
         if not isinstance(value, Tensor) or not value.is_floating_point():
@@ -211,9 +211,6 @@ def canonical_shapes(
         X, Y = X.unsqueeze(-2), Y.unsqueeze(-1)
     if X.shape[-1] == 0 or Y.numel() == 0:
         raise ValueError(f"Expected at least one sample and one column but got `X` {tuple(X.shape)}.")
-    _check_finite("X", X)
-    _check_finite("Y", Y)
-    _check_magnitude(Y)
     batch = _common_batch("X", X.shape[:-3], "Y", Y.shape[:-2])
     N, m = Y.shape[-2:]
     weight = None
@@ -222,6 +219,26 @@ def canonical_shapes(
         batch = _common_batch("sample_weight", weight.shape[:-2], "Y", batch)
         weight = weight.expand(*batch, N, m)
     return CanonicalShapes(X, Y.expand(*batch, N, m), weight, batch, single)
+
+
+def canonical_shapes(
+    X: Float[Tensor, "*batch N m n"],
+    Y: Float[Tensor, "*batch N m"],
+    sample_weight: Float[Tensor, "*batch N"] | None = None,
+) -> CanonicalShapes:
+    """Check types, shapes and values, and give one-channel input its channel dimension.
+
+    Raises:
+        TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
+        ValueError: shapes do not fit, or values are not finite.
+    """
+    values = laid_out(X, Y, sample_weight)
+    _check_finite("X", X)
+    _check_finite("Y", Y)
+    _check_magnitude(Y)
+    if sample_weight is not None:
+        _check_weight(sample_weight, values)
+    return values
 
 
 def linear_problem(
@@ -282,6 +299,12 @@ def _as_weight(sample_weight: Tensor, N: int, m: int, single_channel: bool, Y: T
         raise ValueError(
             f"Expected argument `sample_weight` of shape (*, {N}) or (*, {N}, {m}) but got {tuple(weight.shape)}."
         )
+    return weight
+
+
+def _check_weight(sample_weight: Tensor, values: CanonicalShapes) -> None:
+    N, m = values.Y.shape[-2:]
+    weight = _as_weight(sample_weight, N, m, values.single_channel, values.Y)
     _check_finite("sample_weight", weight)
     if (weight < 0).any():
         raise ValueError(f"Expected argument `sample_weight` to be >= 0 but got {weight.min().item()}.")
@@ -289,7 +312,6 @@ def _as_weight(sample_weight: Tensor, N: int, m: int, single_channel: bool, Y: T
         raise ValueError(
             "Expected argument `sample_weight` to be positive somewhere in every channel but got all zeros."
         )
-    return weight
 
 
 def _orthonormalise(X: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor]:

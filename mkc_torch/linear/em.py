@@ -22,6 +22,7 @@ from mkc_torch.linear._mkc import channel_parameter, coefficient_covariance, fix
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import RobustStart, Start, robust_start
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
+from mkc_torch.linear.implicit import Given, Rest, fit_layer, wanted
 
 _FLOOR = 0.3
 """Least d in robust scales: a scale is at most doubled by outliers, and a fit that interpolates ends far below."""
@@ -122,6 +123,41 @@ def _gaussian_candidate(problem: LinearProblem, maximum: _Maximum, *, max_iter: 
     )
 
 
+@dataclass(frozen=True)
+class _Known:
+    """What a fit is given beside the data, as it was given."""
+
+    sigma: float | Tensor | None
+    d: float | Tensor | None
+    bound: float | Tensor | None
+    start: Start | Tensor
+
+    def initial_state(
+        self,
+        problem: LinearProblem,
+        beta: Tensor,
+        scale: Tensor,
+        bound: Tensor,
+        d_min: Tensor,
+        tails: Sequence[float | Tensor] = (0.1, 0.4, 1.5),
+    ) -> DensityState:
+        """The likeliest of a few densities to start from at coefficients ``beta``."""
+        d = None if self.d is None else channel_parameter("d", self.d, problem)
+        sigma = None if self.sigma is None else channel_parameter("sigma", self.sigma, problem, infinite=True)
+        if d is not None:
+            d_min = torch.minimum(d, d_min)
+        return initial_state(
+            problem.residual(beta),
+            _normalised_weight(problem),
+            scale,
+            bound,
+            d_min,
+            kappa=None if sigma is None else sigma.pow(-2),
+            d=d,
+            tails=tails,
+        )
+
+
 class MKCRegression(LinearEstimator):
     """Linear regression with learned bandwidths and scales, MKC-EM: Algorithm 3 of the paper.
 
@@ -132,6 +168,14 @@ class MKCRegression(LinearEstimator):
     The domain ``a`` of each channel is fixed before, from a rough fit: half the range of its residuals, and no less
     than ten of its d (:func:`mkc_torch.density_fit.domain_rule` says why), or what ``bound`` says. d stays above 0.3
     robust scales, since the likelihood of residuals that a fit interpolates grows without limit.
+
+    The fit is a differentiable layer: where X, Y, ``sample_weight`` or a given σ, d or bound require a gradient, or
+    under a transform of ``torch.func``, ``coef_``, ``sigma_``, ``d_``, ``weights_`` and ``log_likelihood_`` carry the
+    derivatives of the maximum by implicit differentiation, jointly in all its unknowns: first and second ones, in
+    reverse and forward mode and under ``vmap``. The solution is then polished by Newton steps to where the gradient of
+    the likelihood is rounding. A domain that follows from the data counts as a constant, and so does what ends at a
+    limit: σ at ``inf`` or 0.05, d at its least. There is no derivative where a fit did not come to rest or ended at no
+    strict maximum: asking for one raises. The start, ``covariance_`` and ``history_`` are constants.
 
     Args:
         sigma: None learns σ; a number, (m,) or (*, m) keeps it: ``inf`` is least squares with learned channel weights
@@ -155,6 +199,7 @@ class MKCRegression(LinearEstimator):
         history_: mean negative log-likelihood per sample, summed over channels, at every alternation.
         exact_fit_: more than half of the values lie on the fit to rounding, (*,).
         n_iter_, converged_: alternations made, and whether each problem came to rest.
+        differentiable_: after a fit as a layer, whether each problem's solution has a derivative, (*,).
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (17), (29)-(31), Algorithms 2 and 3, Remarks 6 and 7.
@@ -166,6 +211,21 @@ class MKCRegression(LinearEstimator):
         >>> y[:20] += 20.0
         >>> MKCRegression().fit(X, y).coef_
         tensor([0.9992, 1.0072], dtype=torch.float64)
+
+        The last layer of a network: fitted to samples with outliers, it is judged on others, and the features learn.
+
+        >>> class Features(torch.nn.Module):
+        ...     def __init__(self):
+        ...         super().__init__()
+        ...         self.hidden = torch.nn.Linear(1, 3, dtype=torch.float64)
+        ...         self.solve = MKCRegression(bound=30.0)
+        ...
+        ...     def forward(self, x, y, x_new):
+        ...         return self.solve.fit(self.hidden(x).tanh(), y).predict(self.hidden(x_new).tanh())
+        >>> model, x = Features(), X[:, 1:]
+        >>> (model(x[::2], y[::2], x[1::2]) - y[1::2]).abs().mean().backward()
+        >>> bool((model.hidden.weight.grad != 0).all())
+        True
     """
 
     def __init__(
@@ -204,24 +264,34 @@ class MKCRegression(LinearEstimator):
 
         Raises:
             ValueError: a parameter out of range or of the wrong shape, or bad input as in :meth:`LeastSquares.fit`.
+            NotDifferentiableError: when a derivative is taken of a fit that has none, in the backward pass.
         """
-        problem = linear_problem(X, Y, sample_weight)
-        begin = robust_start(problem, self.start, seed=self.seed)
+        if wanted(X, Y, sample_weight, self.sigma, self.d, self.bound):
+            return self._fit_as_layer(X, Y, sample_weight)
+        self.__dict__.pop("differentiable_", None)
+        with torch.no_grad():
+            problem = linear_problem(X, Y, sample_weight)
+            self._keep(problem, *self._maximise(problem, _Known(self.sigma, self.d, self.bound, self.start)))
+        return self
+
+    def _maximise(self, problem: LinearProblem, known: _Known) -> tuple[RobustStart, _Maximum]:
+        begin = robust_start(problem, known.start, seed=self.seed)
         d_min = _FLOOR * begin.scale
-        if self.bound is None:
-            beta, state = self._on_its_domain(problem, begin, d_min)
+        if known.bound is None:
+            beta, state = self._on_its_domain(problem, known, begin, d_min)
         else:
             beta = begin.beta
-            bound = channel_parameter("bound", self.bound, problem)
+            bound = channel_parameter("bound", known.bound, problem)
             refuse_narrow_bound(bound, begin.scale)
-            state = self._initial_state(problem, beta, begin.scale, bound, d_min)
+            state = known.initial_state(problem, beta, begin.scale, bound, d_min)
         maximum = _alternate(problem, beta, state, max_iter=self.max_iter, tol=self.tol)
         if state.free_kappa and state.free_d:
             maximum = _gaussian_candidate(problem, maximum, max_iter=self.max_iter, tol=self.tol)
-        self._keep(problem, begin, maximum)
-        return self
+        return begin, maximum
 
-    def _on_its_domain(self, problem: LinearProblem, begin: RobustStart, d_min: Tensor) -> tuple[Tensor, DensityState]:
+    def _on_its_domain(
+        self, problem: LinearProblem, known: _Known, begin: RobustStart, d_min: Tensor
+    ) -> tuple[Tensor, DensityState]:
         """Coefficients and state to start from on the domain of the rule, which a rough fit gives.
 
         A robust start's scale is up to twice that of the head when outliers are many and on one side, so the rough fit
@@ -229,35 +299,51 @@ class MKCRegression(LinearEstimator):
         """
         used = None if problem.sample_weight is None else problem.sample_weight > 0
         tight = domain_rule(problem.residual(begin.beta), begin.scale, used, scales=5.0)
-        state = self._initial_state(problem, begin.beta, begin.scale, tight, d_min)
+        state = known.initial_state(problem, begin.beta, begin.scale, tight, d_min)
         rough = _alternate(problem, begin.beta, state, max_iter=self.max_iter, tol=1e-4, patience=1)
         kappa, d = rough.state.kappa, torch.exp(rough.state.log_d)
         bound = domain_rule(problem.residual(rough.beta), d, used)
-        return rough.beta, self._initial_state(problem, rough.beta, d, bound, d_min, tails=(kappa,))
+        return rough.beta, known.initial_state(problem, rough.beta, d, bound, d_min, tails=(kappa,))
 
-    def _initial_state(
-        self,
-        problem: LinearProblem,
-        beta: Tensor,
-        scale: Tensor,
-        bound: Tensor,
-        d_min: Tensor,
-        tails: Sequence[float | Tensor] = (0.1, 0.4, 1.5),
-    ) -> DensityState:
-        d = None if self.d is None else channel_parameter("d", self.d, problem)
-        sigma = None if self.sigma is None else channel_parameter("sigma", self.sigma, problem, infinite=True)
-        if d is not None:
-            d_min = torch.minimum(d, d_min)
-        return initial_state(
-            problem.residual(beta),
-            _normalised_weight(problem),
-            scale,
-            bound,
-            d_min,
-            kappa=None if sigma is None else sigma.pow(-2),
-            d=d,
-            tails=tails,
+    def _fit_as_layer(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None) -> MKCRegression:
+        def solve(problem: LinearProblem, given: Given) -> Rest:
+            start = self.start if given.start is None else given.start
+            begin, maximum = self._maximise(problem, _Known(given.sigma, given.d, given.bound, start))
+            self.n_iter_ = len(maximum.history) - 1
+            state = maximum.state
+            return Rest(
+                beta=maximum.beta,
+                kappa=state.kappa,
+                log_d=state.log_d,
+                converged=maximum.converged,
+                log_bound=state.log_bound,
+                log_d_min=state.log_d_min,
+                free_kappa=state.free_kappa,
+                free_d=state.free_d,
+                extras=(begin.exact, torch.stack(maximum.history, -1)),
+            )
+
+        layer = fit_layer(
+            X,
+            Y,
+            sample_weight,
+            solve,
+            sigma=self.sigma,
+            d=self.d,
+            bound=self.bound,
+            start=self.start if isinstance(self.start, Tensor) else None,
+            covariance=(self.covariance, self.bandwidth),
         )
+        assert layer.log_likelihood is not None
+        self._set_layer(layer)
+        # at a finite stand-in, since the slope of 0 ** -0.5 times a gradient of 0 is NaN
+        gaussian = layer.kappa <= 0
+        self.sigma_ = torch.where(gaussian, torch.inf, torch.where(gaussian, 1.0, layer.kappa).rsqrt())
+        self.d_, self.bound_ = layer.d, layer.bound
+        self.log_likelihood_ = layer.log_likelihood
+        self.exact_fit_, history = layer.extras
+        self.history_ = history.movedim(-1, 0)
+        return self
 
     def _keep(self, problem: LinearProblem, begin: RobustStart, maximum: _Maximum) -> None:
         kappa, d = maximum.state.kappa, torch.exp(maximum.state.log_d)
