@@ -381,6 +381,20 @@ REFERENCE = {
     ),
 }
 
+COLEMAN_LTS = TrimmedReference(
+    13,
+    0.6662200314017414,  # of all 77520 choices; the second best has 0.9721, where a search may end
+    (
+        21.796835213754076,
+        -0.01129068858889826,
+        0.05351927524799519,
+        0.6268099459328487,
+        0.8681703501029238,
+        -2.011137505,
+    ),
+    (),
+)
+
 DATA_SETS = {
     "stackloss": stackloss,
     "stars_cyg": stars_cyg,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.linear._scale_search import minimise_scale
+from mkc_torch.linear._scale_search import minimise_scale, relative_precision
 from mkc_torch.order_statistic import order_statistic
 
 if TYPE_CHECKING:
@@ -80,27 +81,37 @@ def gaussian_consistency(fraction: float) -> float:
 
 
 class LeastTrimmedSquares(LinearEstimator):
-    """Least sum of the h smallest squared residuals, by concentration steps from many elemental starts.
+    """Least sum of the h smallest squared residuals, (24) of Indiveri (2009).
 
-    With m channels every channel keeps its h smallest residuals and the product of the channels' trimmed scales is
-    minimised, so that no channel's unit matters.
+    One channel of few samples is solved to its optimum: where h of N can be chosen in at most 20 000 ways (N = 16),
+    every choice is tried. Otherwise concentration steps run from many elemental starts; up to 400 samples of one
+    channel without weights, the best fit is then improved by exchanging a value that counts for one that does not, as
+    long as that lowers the sum. With m channels every channel keeps its h smallest residuals and the product of the
+    channels' trimmed scales is minimised, so that no channel's unit matters.
+
+    Starts go through n values each, and one through clean values is enough: at a share ε of outliers ``starts`` of them
+    miss with probability ``(1 - (1 - ε)^n)^starts``, which is 1e-6 at ε = 0.45 and 4e-4 at 0.5 for the default and
+    n = 6. Take more for more coefficients.
 
     Args:
-        h: values of each channel that count, n < h <= N; default ``(N + p + 1) // 2`` with p = ceil(n / m), the
+        h: values of each channel that count, p < h <= N; default ``(N + p + 1) // 2`` with p = ceil(n / m), the
             coverage of highest breakdown point.
-        starts: number of elemental starts.
+        starts: number of elemental starts, each through n values.
         seed: of the elemental starts.
 
     Attributes, after ``fit``:
-        coef_: (*, n).
+        coef_: (*, n); its gradient is that of least squares on the values that count.
         scale_: (*, m), m being 1 for one channel: trimmed root mean square, made consistent for Gaussian residuals.
         objective_: (*, m): sum of the h smallest squared residuals.
-        weights_: 1 for the values that count, else 0.
+        weights_: 1 for the values that count, else 0, (*, N, m).
+        exact_: whether the optimum is certain: every choice was tried, or h = N in one channel.
         n_iter_, converged_: steps made, and whether they had come to rest, (*,).
 
     References:
         Rousseeuw, "Least median of squares regression", JASA 79 (1984) 871-880.
         Rousseeuw & Van Driessen, "Computing LTS regression for large data sets", DMKD 12 (2006) 29-45.
+        Hawkins, "The feasible solution algorithm for least trimmed squares regression", Computational Statistics & Data
+        Analysis 17 (1994) 185-196: the exchange.
 
     Example:
         >>> X = torch.stack([torch.ones(10), torch.arange(10.0)], -1).double()
@@ -110,12 +121,18 @@ class LeastTrimmedSquares(LinearEstimator):
         tensor([1.0000, 2.0000], dtype=torch.float64)
     """
 
+    scale_: Float[Tensor, "*batch m"]
+    objective_: Float[Tensor, "*batch m"]
+    exact_: bool
+    n_iter_: int
+    converged_: Tensor
+
     def __init__(self, h: int | None = None, *, starts: int = 500, seed: int = 0) -> None:
         super().__init__()
         if h is not None and (isinstance(h, bool) or not isinstance(h, int)):
             raise TypeError(f"Expected argument `h` to be a whole number but got {h!r}.")
-        if starts < 1:
-            raise ValueError(f"Expected argument `starts` to be at least 1 but got {starts}.")
+        if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
+            raise ValueError(f"Expected argument `starts` to be a whole number of at least 1 but got {starts!r}.")
         self.h = h
         self.starts = starts
         self.seed = seed
@@ -132,12 +149,105 @@ class LeastTrimmedSquares(LinearEstimator):
         if not min(p + 1, N) <= h <= N:
             raise ValueError(f"Expected argument `h` between {p + 1} and the {N} samples but got {h}.")
         rule = TrimmedScale(h / N)
-        minimum = minimise_scale(problem, rule, rule, starts=self.starts, seed=self.seed)
-        self._set_common(problem, minimum.beta, minimum.weight)
-        scale = problem.restore(minimum.scale)
+        with torch.no_grad():
+            beta, n_iter, converged = self._minimise(problem, rule, h)
+            residual = problem.residual(beta).unsqueeze(1)
+            trimmed = rule.scale(problem, residual)
+            weight = rule.weight(problem, residual, trimmed).squeeze(1)
+        if problem.basis.requires_grad or problem.Y.requires_grad:
+            # which values count is a constant
+            beta = problem.weighted_fit(weight * relative_precision(trimmed.squeeze(1)).unsqueeze(-2))
+        self._set_common(problem, beta, weight)
+        scale = problem.restore(trimmed.squeeze(1))
         total = problem.restore(problem.total_weight())
         self.objective_ = scale.square() * h / N * total
         self.scale_ = scale * gaussian_consistency(h / N)
-        self.n_iter_ = minimum.n_iter
-        self.converged_ = problem.restore(minimum.converged)
+        self.exact_ = problem.num_channels == 1 and (h == N or _few_choices(problem, h))
+        self.n_iter_ = n_iter
+        self.converged_ = problem.restore(converged)
         return self
+
+    def _minimise(self, problem: LinearProblem, rule: TrimmedScale, h: int) -> tuple[Tensor, int, Tensor]:
+        if _few_choices(problem, h):
+            beta = _best_choice(problem, rule, h)
+            return beta, 0, torch.ones(beta.shape[0], dtype=torch.bool, device=beta.device)
+        N = problem.num_samples
+        # a small sample has more local minima than a rank after two steps tells apart
+        candidates = 200 if N <= _EXCHANGE_SAMPLES else 10
+        found = minimise_scale(problem, rule, rule, starts=self.starts, candidates=candidates, seed=self.seed)
+        beta = found.beta
+        if _plain(problem) and h < N <= _EXCHANGE_SAMPLES:
+            beta = _exchange(problem, beta, h)
+        return beta, found.n_iter, found.converged
+
+
+EXHAUSTIVE_CHOICES = 20_000
+"""All choices of h samples are tried where there are no more of them."""
+
+_EXCHANGE_SAMPLES = 400
+
+_CHUNK = 1 << 22
+"""Values held at once."""
+
+
+def _plain(problem: LinearProblem) -> bool:
+    return problem.num_channels == 1 and problem.sample_weight is None
+
+
+def _few_choices(problem: LinearProblem, h: int) -> bool:
+    return _plain(problem) and math.comb(problem.num_samples, h) <= EXHAUSTIVE_CHOICES
+
+
+def _best_choice(problem: LinearProblem, rule: TrimmedScale, h: int) -> Float[Tensor, "B n"]:
+    """Least squares on every choice of h samples of one channel: the one with the smallest sum of squares."""
+    N, n = problem.num_samples, problem.num_coefficients
+    choice = torch.tensor(list(itertools.combinations(range(N), h)), device=problem.Y.device)
+    mask = torch.zeros(choice.shape[0], N, dtype=problem.Y.dtype, device=problem.Y.device).scatter_(1, choice, 1.0)
+    per_problem = mask.shape[0] * max(N, n * n)
+    best = []
+    for part in torch.arange(problem.Y.shape[0], device=choice.device).split(max(1, _CHUNK // per_problem)):
+        some = problem.select(part)
+        beta = some.weighted_fit(mask.unsqueeze(-1).expand(part.shape[0], -1, -1, -1))
+        first = rule.scale(some, some.residual(beta)).squeeze(-1).argmin(1)
+        best.append(beta[torch.arange(part.shape[0], device=part.device), first])
+    return torch.cat(best)
+
+
+def _exchange(problem: LinearProblem, beta: Float[Tensor, "B n"], h: int) -> Float[Tensor, "B n"]:
+    """Exchange a sample that counts for one that does not while the sum of squares after the refit falls."""
+    N = problem.num_samples
+    parts = torch.arange(beta.shape[0], device=beta.device).split(max(1, _CHUNK // (N * N)))
+    return torch.cat([_exchange_part(problem.select(part), beta[part], h) for part in parts])
+
+
+def _exchange_part(problem: LinearProblem, beta: Float[Tensor, "B n"], h: int) -> Float[Tensor, "B n"]:
+    N = problem.num_samples
+    rows = problem.basis[:, :, 0]
+    eps = torch.finfo(beta.dtype).eps
+    first = problem.residual(beta)[..., 0].abs().topk(h, dim=-1, largest=False).indices
+    keep = torch.zeros_like(problem.Y[..., 0], dtype=torch.bool).scatter(1, first, True)
+    magnitude = problem.Y.square().sum((-2, -1))
+    active = torch.arange(beta.shape[0], device=beta.device)
+    while active.numel() > 0:
+        some = problem.select(active)
+        counts = keep[active].to(beta.dtype).unsqueeze(-1)
+        gram, _ = some.normal_equations(counts)
+        beta[active] = some.weighted_fit(counts)
+        error = some.residual(beta[active])[..., 0]
+        inverse = torch.linalg.pinv(gram, hermitian=True)
+        mine = rows if rows.shape[0] == 1 else rows[active]
+        leverage = torch.matmul(torch.matmul(mine, inverse), mine.mT)
+        own = leverage.diagonal(dim1=-2, dim2=-1)
+        out, into = (1.0 - own).clamp(min=0.0).unsqueeze(-1), (1.0 + own).unsqueeze(-2)
+        change = error.square().unsqueeze(-2) * out - error.square().unsqueeze(-1) * into
+        change = change + 2.0 * error.unsqueeze(-1) * error.unsqueeze(-2) * leverage
+        # a sample of leverage 1 cannot be spared
+        change = change / (out * into + leverage.square()).clamp(min=eps)
+        allowed = keep[active].unsqueeze(-1) & ~keep[active].unsqueeze(-2)
+        gain, pair = torch.where(allowed, change, torch.inf).flatten(-2).min(-1)
+        total = (counts[..., 0] * error.square()).sum(-1)
+        falls = gain < -(1e3 * eps * total + eps * eps * magnitude[active])
+        active, pair = active[falls], pair[falls]
+        keep[active, pair // N] = False
+        keep[active, pair % N] = True
+    return beta

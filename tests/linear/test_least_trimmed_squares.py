@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from scipy.stats import norm
 from torch import Tensor
 
-from mkc_torch.linear import LeastSquares, LeastTrimmedSquares, RankDeficientError
+from mkc_torch.linear import LeastSquares, LeastTrimmedSquares, least_trimmed_squares
 from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear.least_trimmed_squares import TrimmedScale, gaussian_consistency, order_statistic
-from tests.literature import DATA_SETS, REFERENCE
+from tests.linear.test_mm_regression import clustered
+from tests.literature import COLEMAN_LTS, DATA_SETS, REFERENCE
 
 
 def sample(seed: int, *shape: int) -> Tensor:
@@ -30,16 +31,6 @@ def contaminated_line(seed: int, N: int = 40, n: int = 3, share: float = 0.3) ->
     y = X.sum(-1) + 0.1 * sample(seed + 1, N)
     y[: int(share * N)] += 10.0 + sample(seed + 2, int(share * N))
     return X, y
-
-
-def clustered(seed: int) -> tuple[Tensor, Tensor, Tensor]:
-    """300 samples of 6 regressors, 45 % of them in one cluster 8 deviations away in every regressor, y near 40."""
-    X, truth = sample(seed, 300, 6), sample(seed + 1, 6)
-    y = X @ truth + 0.1 * sample(seed + 2, 300)
-    bad = 135
-    X[:bad] = 8.0 + 0.3 * sample(seed + 3, bad, 6)
-    y[:bad] = 40.0 + 0.3 * sample(seed + 4, bad)
-    return X, y, truth
 
 
 def exhaustive(X: Tensor, y: Tensor, h: int) -> tuple[float, Tensor]:
@@ -72,14 +63,57 @@ def test_rows_rejected_at_two_and_a_half_scales_include_the_published_ones(name)
     assert {r - 1 for r in REFERENCE[name].lts.rejected} <= set(far.nonzero().flatten().tolist())
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("choices", [0, 20_000], ids=["searched", "all choices"])
+@pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize(("N", "n", "h"), [(9, 2, 6), (10, 3, 7), (8, 1, 5), (11, 2, 8), (12, 3, 12)])
-def test_the_optimum_is_that_of_all_subsets(seed, N, n, h):
+def test_the_optimum_is_that_of_all_subsets(seed, N, n, h, choices, monkeypatch):
+    monkeypatch.setattr(least_trimmed_squares, "EXHAUSTIVE_CHOICES", choices)
     X, y = sample(seed, N, n), sample(seed + 100, N) * torch.exp(sample(seed + 200, N))
     objective, coef = exhaustive(X, y, h)
     fit = LeastTrimmedSquares(h=h).fit(X, y)
+    assert fit.exact_ == (choices > 0 or h == N)
     assert float(fit.objective_) == pytest.approx(objective, rel=1e-9)
     torch.testing.assert_close(fit.coef_, coef, rtol=1e-6, atol=1e-8)
+
+
+def test_the_optimum_of_coleman_is_that_of_all_subsets():
+    X, y = DATA_SETS["coleman"]()
+    reference = COLEMAN_LTS
+    fit = LeastTrimmedSquares().fit(X, y)
+    assert int(fit.weights_.sum()) == reference.h
+    assert float(fit.objective_) == pytest.approx(reference.objective, rel=1e-8)
+    torch.testing.assert_close(fit.coef_, torch.tensor(reference.coef, dtype=torch.float64), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("name", DATA_SETS)
+def test_every_seed_finds_one_optimum(name):
+    X, y = DATA_SETS[name]()
+    found = [float(LeastTrimmedSquares(seed=s).fit(X, y).objective_) for s in range(1, 9)]
+    assert max(found) == pytest.approx(min(found), rel=1e-9)
+
+
+def test_no_exchange_of_two_samples_lowers_the_sum():
+    X, y = contaminated_line(4)
+    fit = LeastTrimmedSquares(starts=3).fit(X, y)
+    keep = fit.weights_[:, 0] > 0
+    pairs = [(i, j) for i in keep.nonzero().flatten().tolist() for j in (~keep).nonzero().flatten().tolist()]
+    others = torch.stack([keep] * len(pairs))
+    for row, (i, j) in enumerate(pairs):
+        others[row, i], others[row, j] = False, True
+    index = others.nonzero()[:, 1].reshape(len(pairs), -1)
+    coef = lstsq(X[index], y[index])
+    sums = (y[index] - (X[index] @ coef.unsqueeze(-1)).squeeze(-1)).square().sum(-1)
+    assert float(sums.min()) >= float(fit.objective_) * (1 - 1e-9)
+
+
+def test_the_gradient_is_that_of_least_squares_on_what_counts():
+    X, y = contaminated_line(0)
+    keep = LeastTrimmedSquares().fit(X, y).weights_[:, 0]
+    for leaf in (X, y):
+        leaf.requires_grad_()
+        (got,) = torch.autograd.grad(LeastTrimmedSquares().fit(X, y).coef_.sum(), leaf)
+        (expected,) = torch.autograd.grad(LeastSquares().fit(X, y, keep).coef_.sum(), leaf)
+        torch.testing.assert_close(got, expected)
 
 
 def test_coverage_of_all_samples_is_least_squares():
@@ -168,44 +202,11 @@ def test_weight_zero_is_removal():
 # equivariance
 
 
-def test_regression_scale_and_affine_equivariance():
-    X, y = contaminated_line(0)
-    coef = LeastTrimmedSquares().fit(X, y).coef_
-    shift = sample(5, 3)
-    torch.testing.assert_close(LeastTrimmedSquares().fit(X, y + X @ shift).coef_, coef + shift, rtol=1e-8, atol=1e-9)
-    for factor in (-2.5, 1e-7, 1e7):
-        fit = LeastTrimmedSquares().fit(X, factor * y)
-        torch.testing.assert_close(fit.coef_, factor * coef, rtol=1e-8, atol=0)
-    A = sample(6, 3, 3)
-    got = LeastTrimmedSquares().fit(X @ A, y).coef_
-    torch.testing.assert_close(A @ got, coef, rtol=1e-7, atol=1e-9)
-
-
 def test_columns_of_very_different_size_do_no_harm():
     X, y = contaminated_line(0)
     factor = torch.tensor([1e-8, 1.0, 1e8], dtype=torch.float64)
     coef = LeastTrimmedSquares().fit(X, y).coef_
     torch.testing.assert_close(LeastTrimmedSquares().fit(X * factor, y).coef_ * factor, coef, rtol=1e-8, atol=1e-9)
-
-
-def test_the_order_of_the_samples_does_not_matter():
-    X, y = contaminated_line(0)
-    order = torch.randperm(40, generator=torch.Generator().manual_seed(3))
-    fit, moved = LeastTrimmedSquares().fit(X, y), LeastTrimmedSquares().fit(X[order], y[order])
-    torch.testing.assert_close(moved.coef_, fit.coef_, rtol=1e-8, atol=1e-9)
-    torch.testing.assert_close(moved.weights_, fit.weights_[order])
-
-
-def test_batch_equals_loop():
-    problems = [contaminated_line(10 * s, share=0.1 * s) for s in range(5)]
-    X, y = torch.stack([p[0] for p in problems]).unsqueeze(-2), torch.stack([p[1] for p in problems]).unsqueeze(-1)
-    fit = LeastTrimmedSquares().fit(X, y)
-    assert fit.coef_.shape == (5, 3)
-    assert fit.scale_.shape == (5, 1)
-    for i, (X_i, y_i) in enumerate(problems):
-        alone = LeastTrimmedSquares().fit(X_i, y_i)
-        torch.testing.assert_close(fit.coef_[i], alone.coef_, rtol=1e-9, atol=1e-10)
-        torch.testing.assert_close(fit.objective_[i], alone.objective_, rtol=1e-9, atol=0)
 
 
 def test_one_design_serves_many_targets():
@@ -217,15 +218,6 @@ def test_one_design_serves_many_targets():
 
 
 # breakdown and exact fits
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_forty_five_per_cent_clustered_outliers_do_not_move_it(seed):
-    X, y, truth = clustered(100 * seed)
-    fit = LeastTrimmedSquares().fit(X, y)
-    assert float((LeastSquares().fit(X, y).coef_ - truth).abs().max()) > 0.3  # the cluster is no help
-    assert float((fit.coef_ - truth).abs().max()) < 0.15
-    assert float(fit.weights_[:135].sum()) == 0.0
 
 
 def test_many_samples_are_screened_on_a_part_and_finished_on_all():
@@ -249,12 +241,6 @@ def test_an_exact_fit_is_found_beside_forty_per_cent_outliers():
     assert float(fit.scale_) < 1e-13
     assert bool(torch.isfinite(fit.weights_).all())
     assert float(fit.weights_[:20].sum()) == 0.0
-
-
-def test_targets_of_zero_give_coefficients_of_zero():
-    fit = LeastTrimmedSquares().fit(sample(0, 20, 2), torch.zeros(20).double())
-    assert fit.coef_.tolist() == [0.0, 0.0]
-    assert float(fit.scale_) == 0.0
 
 
 # channels
@@ -309,12 +295,6 @@ def test_no_starts_are_refused():
         LeastTrimmedSquares(starts=0)
 
 
-def test_dependent_columns_are_refused():
-    X, y = contaminated_line(0)
-    with pytest.raises(RankDeficientError, match="linearly dependent"):
-        LeastTrimmedSquares().fit(torch.cat([X, X[:, :1]], 1), y)
-
-
 def test_one_seed_gives_one_result():
     X, y = sample(0, 30, 4), sample(1, 30)
     state = torch.random.get_rng_state()
@@ -324,13 +304,7 @@ def test_one_seed_gives_one_result():
 
 
 def test_the_seed_chooses_the_starts():
-    X, y, _ = clustered(0)
-    found = {float(LeastTrimmedSquares(starts=4, seed=s).fit(X, y).objective_) for s in range(8)}
+    X, y, _ = clustered(0, 1)
+    # weights, so that no exchange finishes what the starts began
+    found = {float(LeastTrimmedSquares(starts=4, seed=s).fit(X[0], y[0], torch.ones(300)).objective_) for s in range(8)}
     assert len(found) > 1
-
-
-def test_float32_stays_float32():
-    X, y = contaminated_line(0)
-    fit = LeastTrimmedSquares().fit(X.float(), y.float())
-    assert fit.coef_.dtype == fit.scale_.dtype == torch.float32
-    torch.testing.assert_close(fit.coef_.double(), LeastTrimmedSquares().fit(X, y).coef_, rtol=1e-3, atol=1e-3)

@@ -1,0 +1,145 @@
+"""Chebyshev (minimax) regression: the smallest largest absolute residual, by an exchange of n + 1 extreme rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+_STALLED = 10
+
+
+@dataclass(frozen=True)
+class Minimax:
+    """Coefficients, the largest absolute residual of the rows in use, the exchanges made, and whether it is optimal."""
+
+    beta: Float[Tensor, "P n"]
+    height: Float[Tensor, " P"]
+    n_iter: Tensor
+    converged: Tensor
+
+
+def equal_heights(rows: Float[Tensor, "*batch k n"], target: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch n"]:
+    """The Chebyshev fit of k = n + 1 rows, whose residuals have one size; not finite where the rows are dependent."""
+    q, upper = torch.linalg.qr(rows, mode="complete")
+    n = rows.shape[-1]
+    normal = q[..., n]
+    height = (normal * target).sum(-1, keepdim=True) / normal.abs().sum(-1, keepdim=True)
+    fitted = target - height * torch.where(normal < 0, -1.0, 1.0)
+    moment = torch.matmul(q[..., :n].mT, fitted.unsqueeze(-1))
+    solution: Tensor = torch.linalg.solve_triangular(upper[..., :n, :], moment, upper=True).squeeze(-1)
+    return solution
+
+
+def minimax(
+    rows: Float[Tensor, "#P R n"],
+    target: Float[Tensor, "P R"],
+    used: Bool[Tensor, "P R"],
+    guess: Float[Tensor, "P n"],
+    *,
+    max_iter: int = 1000,
+) -> Minimax:
+    """Minimise the largest ``|target - rows beta|`` over the rows in use, in float64.
+
+    The simplex method on the dual, a vertex of which is n + 1 rows with the signs of their residuals: the row of the
+    largest residual enters, and the ratio test chooses the one that leaves. Where the height has not grown for some
+    exchanges the rows are taken in their order (Bland's rule), which cannot cycle.
+
+    Args:
+        rows: of full column rank among those in use, of which there are more than n.
+        target: targets.
+        used: which rows count.
+        guess: coefficients whose largest residuals are a good first choice of rows.
+        max_iter: exchanges at most.
+
+    References:
+        Stiefel, "Note on Jordan elimination, linear programming and Tchebycheff approximation", Numerische Mathematik 2
+        (1960) 1-17.
+    """
+    P, R = target.shape
+    n = rows.shape[-1]
+    rows, target, guess = rows.double(), target.double(), guess.double()
+    # around the guess, so that a large offset costs no digits
+    centred = target - torch.matmul(rows, guess.unsqueeze(-1)).squeeze(-1)
+    everywhere = rows.expand(P, -1, -1)
+    basis = _first_rows(everywhere, centred, used)
+    eps = torch.finfo(torch.float64).eps
+    floor = 64 * eps * (target.abs() * used).amax(-1)
+    sign = torch.where(_null_vector(_take(everywhere, basis)) < 0, -1.0, 1.0).to(target)
+    turned = (_null_vector(_take(everywhere, basis)) * centred.gather(1, basis)).sum(-1, keepdim=True) < 0
+    sign = torch.where(turned, -sign, sign)
+
+    beta = torch.zeros_like(guess)
+    height = target.new_zeros(P)
+    best = target.new_full((P,), -1.0)
+    stalled = torch.zeros(P, dtype=torch.long, device=target.device)
+    n_iter = torch.zeros_like(stalled)
+    moving = torch.ones(P, dtype=torch.bool, device=target.device)
+    last = torch.zeros(n + 1, dtype=target.dtype, device=target.device)
+    last[-1] = 1.0
+    for step in range(max_iter + 1):
+        at = moving.nonzero().squeeze(-1)
+        matrix = torch.cat([_take(everywhere[at], basis[at]), sign[at].unsqueeze(-1)], -1)
+        solution = torch.linalg.solve(matrix, centred[at].gather(1, basis[at]))
+        beta[at], height[at] = solution[:, :n], solution[:, n]
+        residual = centred[at] - torch.matmul(everywhere[at], beta[at].unsqueeze(-1)).squeeze(-1)
+        over = torch.where(used[at], residual.abs(), 0.0) - height[at].unsqueeze(-1)
+        beyond = over > torch.maximum(1e-12 * height[at], floor[at]).unsqueeze(-1)
+        left = beyond.any(-1)
+        moving[at[~left]] = False
+        if step == max_iter or not bool(left.any()):
+            break
+        at, matrix, residual, over, beyond = at[left], matrix[left], residual[left], over[left], beyond[left]
+        n_iter[at] += 1
+        grown = height[at] > best[at] + floor[at]
+        stalled[at] = torch.where(grown, 0, stalled[at] + 1)
+        best[at] = torch.maximum(best[at], height[at])
+        patient = stalled[at] <= _STALLED
+        enter = torch.where(patient, over.argmax(-1), beyond.to(torch.uint8).argmax(-1)).unsqueeze(-1)
+        enter_sign = torch.where(residual.gather(1, enter) < 0, -1.0, 1.0).to(target)
+        column = torch.cat([_take(everywhere[at], enter).squeeze(1), enter_sign], -1)
+        both = torch.stack([column, last.expand_as(column)], -1)
+        share, dual = torch.linalg.solve(matrix.mT, both).unbind(-1)
+        falls = share * enter_sign * sign[at]
+        ratio = torch.where(falls > 1e-12, (dual * sign[at]).clamp(min=0.0) / falls, torch.inf)
+        ties = ratio <= ratio.amin(-1, keepdim=True) * (1 + 1e-12)
+        leave = torch.where(ties, basis[at], R).argmin(-1, keepdim=True)
+        basis[at] = basis[at].scatter(1, leave, enter)
+        sign[at] = sign[at].scatter(1, leave, enter_sign)
+    return Minimax(beta + guess, height, n_iter, ~moving)
+
+
+def _take(rows: Float[Tensor, "P R n"], index: Int[Tensor, "P k"]) -> Float[Tensor, "P k n"]:
+    return rows.gather(1, index.unsqueeze(-1).expand(-1, -1, rows.shape[-1]))
+
+
+def _null_vector(rows: Float[Tensor, "P k n"]) -> Float[Tensor, "P k"]:
+    """The vector that is orthogonal to the columns of n + 1 rows of rank n."""
+    q = torch.linalg.qr(rows, mode="complete").Q
+    return q[..., -1]
+
+
+def _first_rows(
+    rows: Float[Tensor, "P R n"], residual: Float[Tensor, "P R"], used: Bool[Tensor, "P R"]
+) -> Int[Tensor, "P n+1"]:
+    """n linearly independent rows, of large residuals where there is a choice, and the largest one of the others."""
+    size = residual.abs() + 1e-3 * (residual.abs() * used).amax(-1, keepdim=True)
+    size = torch.where(used, size.clamp(min=torch.finfo(size.dtype).tiny ** 0.5), 0.0)
+    free = rows * used.unsqueeze(-1)
+    dependent = 1e-8 * torch.linalg.vector_norm(free, dim=-1)
+    chosen: list[Tensor] = []
+    for _ in range(rows.shape[-1]):
+        length = torch.linalg.vector_norm(free, dim=-1)
+        pivot = torch.where(length > dependent, length * size, 0.0).argmax(-1)
+        chosen.append(pivot)
+        row = free.gather(1, pivot[:, None, None].expand(-1, 1, rows.shape[-1]))
+        direction = row / torch.linalg.vector_norm(row, dim=-1, keepdim=True)
+        free = free - torch.matmul(free, direction.mT) * direction
+    taken = torch.stack(chosen, -1)
+    rest = size.scatter(1, taken, -1.0)
+    return torch.cat([taken, rest.argmax(-1, keepdim=True)], -1)

@@ -1,0 +1,254 @@
+"""M-estimation by iteratively reweighted least squares."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, get_args
+
+import torch
+from torch import Tensor
+
+from mkc_torch.linear._estimator import LinearEstimator
+from mkc_torch.linear._problem import LinearProblem, linear_problem
+from mkc_torch.linear._psi import TUNING_95, PsiName, Tuning, checked_tuning, psi_weight
+from mkc_torch.linear._robust_start import robust_start
+from mkc_torch.linear._scale_search import relative_precision
+from mkc_torch.linear.least_absolute_deviations import LeastAbsoluteDeviations
+from mkc_torch.order_statistic import order_statistic
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+MScaleName = Literal["mad", "proposal2"]
+MStart = Literal["lad", "lts", "s", "least_squares"]
+
+MEDIAN_TO_SIGMA = 1.482602218505602
+"""1 / Φ⁻¹(3/4): the standard deviation of a Gaussian over the median of its absolute values."""
+
+_DAMPED_FROM = 30
+
+
+def median_scale(problem: LinearProblem, residual: Float[Tensor, "B N m"]) -> Float[Tensor, "B m"]:
+    """Median absolute residual over that of a standard Gaussian; the mean of the two middle ones where N is even."""
+    size, half = residual.abs(), 0.5 * problem.num_samples
+    low = order_statistic(size, problem.sample_weight, half)
+    # just past the middle, so that an even number has its upper one
+    high = order_statistic(size, problem.sample_weight, min(half * (1.0 + 1e-6), problem.num_samples))
+    return MEDIAN_TO_SIGMA * 0.5 * (low + high)
+
+
+def proposal_2(
+    problem: LinearProblem, residual: Float[Tensor, "B N m"], scale: Float[Tensor, "B m"], k: float
+) -> Float[Tensor, "B m"]:
+    """One step towards the scale s with ``Σ min(r / s, k)² = (N - p) E min(Z, k)²``, Huber's proposal 2."""
+    square = torch.minimum(residual.square(), (k * scale).square().unsqueeze(-2))
+    if problem.sample_weight is not None:
+        square = square * problem.sample_weight
+    inside = math.erf(k / math.sqrt(2.0))
+    density = math.exp(-0.5 * k * k) / math.sqrt(2.0 * math.pi)
+    expected = inside - 2.0 * k * density + k * k * (1.0 - inside)
+    left = (problem.total_weight() - problem.coefficients_per_channel).clamp(min=1.0)
+    return torch.sqrt(square.sum(-2) / (left * expected))
+
+
+def rounding_scale(problem: LinearProblem) -> Float[Tensor, "B m"]:
+    """A scale that stands for 0: where a fit is exact, its rounding errors keep weight 1 and the others lose theirs."""
+    magnitude = problem.Y.abs().amax(-2)
+    return 1e3 * torch.finfo(problem.Y.dtype).eps * torch.where(magnitude > 0, magnitude, 1.0)
+
+
+@dataclass(frozen=True)
+class Reweighted:
+    """Coefficients in the basis at the last step, the scale and weights that belong to them, and the steps (B,)."""
+
+    beta: Float[Tensor, "B n"]
+    scale: Float[Tensor, "B m"]
+    weight: Float[Tensor, "B N m"]
+    n_iter: Tensor
+    converged: Tensor
+
+
+def reweight(
+    problem: LinearProblem,
+    beta: Float[Tensor, "B n"],
+    scale: Float[Tensor, "B m"],
+    weight_of: Callable[[Tensor], Tensor],
+    next_scale: Callable[[Tensor, Tensor], Tensor] | None = None,
+    *,
+    max_iter: int,
+    tol: float,
+) -> Reweighted:
+    """Least squares with the weights of the last residuals, until the fitted values come to rest.
+
+    Args:
+        problem: the regression.
+        beta: start.
+        scale: of the start's residuals; a scale of 0 is replaced by the rounding error of Y.
+        weight_of: weights of standardised residuals.
+        next_scale: scale from residuals and the last scale; None leaves the scale as it is.
+        max_iter: steps at most.
+        tol: a step is at rest when it moves no fitted value by more than this share of the scale, in root mean square.
+    """
+    floor = rounding_scale(problem)
+    scale = torch.maximum(scale, floor)
+    eps = torch.finfo(beta.dtype).eps
+    moving = torch.ones(beta.shape[0], dtype=torch.bool, device=beta.device)
+    n_iter = torch.zeros(beta.shape[0], dtype=torch.long, device=beta.device)
+    residual = problem.residual(beta)
+    root = math.sqrt(problem.num_samples)
+    for step in range(max_iter):
+        if next_scale is not None:
+            proposal = torch.maximum(next_scale(residual, scale), floor)
+            # a median may alternate between two values; their geometric mean leads between them
+            proposal = proposal if step < _DAMPED_FROM else (proposal * scale).sqrt()
+            scale = torch.where(moving.unsqueeze(-1), proposal, scale)
+        weight = weight_of(residual / scale.unsqueeze(-2))
+        updated = problem.weighted_fit(weight * relative_precision(scale).unsqueeze(-2))
+        updated = torch.where(moving.unsqueeze(-1), updated, beta)
+        change = torch.linalg.vector_norm(updated - beta, dim=-1)
+        # the basis is orthonormal, so that coefficients are as long as their fitted values
+        rounding = 16 * eps * torch.linalg.vector_norm(updated, dim=-1)
+        n_iter += moving
+        beta = updated
+        residual = problem.residual(beta)
+        moving = moving & (change > torch.maximum(tol * root * scale.amin(-1), rounding))
+        if not bool(moving.any()):
+            break
+    return Reweighted(beta, scale, weight_of(residual / scale.unsqueeze(-2)), n_iter, ~moving)
+
+
+def check_iterations(max_iter: int, tol: float) -> None:
+    if max_iter < 1:
+        raise ValueError(f"Expected argument `max_iter` to be >= 1 but got {max_iter}; 500 is ample.")
+    if not 0 < tol < 1:
+        raise ValueError(f"Expected argument `tol` to be in (0, 1) but got {tol}; 1e-10 suits float64.")
+
+
+class MEstimator(LinearEstimator):
+    """M-estimator of regression: the coefficients with ``Σ ψ(r / scale) x = 0``, (18) of Indiveri (2009).
+
+    Iteratively reweighted least squares, the scale taken anew from the residuals before every step. With m channels
+    each has its own scale. ψ of "huber" is monotone: outliers in Y have a bounded influence, those in X (leverage
+    points) do not. The other four redescend to 0 and have several solutions, of which the one near the start is found;
+    since the scale moves with the fit, leverage points can still draw it away from a robust start.
+    :class:`MMRegression` holds its scale, and its breakdown point with it.
+
+    Args:
+        psi: "huber", "hampel", "tukey", "andrews" or "welsch", (13)-(16) of Indiveri (2009).
+        tuning: constants of ψ in units of the scale: k; (a, b, c) of "hampel"; 1 / ω of "andrews". Default for
+            95 % efficiency at Gaussian residuals: 1.345; (1.352, 3.156, 7.213); 4.685; 1.339; 2.985.
+        scale: "mad", 1.4826 times the median absolute residual (about 0), which needs N >= 2 p, p = ceil(n / m); or
+            "proposal2", Huber's, which is smoother and breaks down earlier.
+        start: "lad", "lts", "s", "least_squares" or coefficients (*, n); default "lad" for "huber", else "lts".
+        max_iter: steps at most.
+        tol: converged when a step moves the fitted values by less than this share of the scale, in root mean square.
+        seed: of the starts "lts" and "s".
+
+    Attributes, after ``fit``:
+        coef_: (*, n).
+        scale_: (*, m), m being 1 for one channel; of an exact fit the rounding error of Y.
+        weights_: ψ(z) / z, 1 at z = 0, (*, N, m).
+        n_iter_, converged_: steps made, and whether they had come to rest, (*,).
+
+    References:
+        Indiveri, "An entropy-like estimator for robust parameter identification", Entropy 11 (2009), (11)-(21).
+        Huber, "Robust estimation of a location parameter", Annals of Mathematical Statistics 35 (1964), proposal 2.
+        Holland & Welsch, "Robust regression using iteratively reweighted least-squares" (1977), the constants.
+
+    Example:
+        >>> X = torch.stack([torch.ones(10), torch.arange(10.0)], -1).double()
+        >>> y = 1 + 2 * X[:, 1]
+        >>> y[:4] = 100.0
+        >>> MEstimator("tukey").fit(X, y).coef_
+        tensor([1.0000, 2.0000], dtype=torch.float64)
+    """
+
+    scale_: Float[Tensor, "*batch m"]
+    n_iter_: Tensor
+    converged_: Tensor
+
+    def __init__(
+        self,
+        psi: PsiName = "huber",
+        tuning: float | Tuning | None = None,
+        *,
+        scale: MScaleName = "mad",
+        start: MStart | Tensor | None = None,
+        max_iter: int = 500,
+        tol: float = 1e-10,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        checked_tuning(psi, tuning)
+        if scale not in get_args(MScaleName):
+            raise ValueError(f"Expected argument `scale` to be 'mad' or 'proposal2' but got {scale!r}.")
+        if not (start is None or isinstance(start, Tensor) or start in get_args(MStart)):
+            raise ValueError(
+                "Expected argument `start` to be 'lad', 'lts', 's', 'least_squares', coefficients or None "
+                f"but got {start!r}."
+            )
+        check_iterations(max_iter, tol)
+        self.psi = psi
+        self.tuning = tuning
+        self.scale = scale
+        self.start = start
+        self.max_iter = max_iter
+        self.tol = tol
+        self.seed = seed
+
+    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> MEstimator:
+        """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. A weight of 2 is a sample that occurs twice.
+
+        Raises:
+            ValueError: fewer than 2 p samples for "mad", a start of the wrong shape, or bad input as in
+                :meth:`LeastSquares.fit`.
+        """
+        name, tuning = checked_tuning(self.psi, self.tuning)
+        problem = linear_problem(X, Y, sample_weight)
+        p, N = problem.coefficients_per_channel, _fewest_samples(problem)
+        if self.scale == "mad" and 2 * p > N:
+            raise ValueError(
+                f"Expected at least {2 * p} samples for `scale='mad'` with {p} coefficients a channel but got {N}: "
+                "fewer may have a median residual of 0; use scale='proposal2'."
+            )
+        beta = self._start(problem, X, Y, sample_weight)
+        clip = tuning[0] if name == "huber" else TUNING_95["huber"][0]
+
+        first = median_scale(problem, problem.residual(beta))
+        exact = first <= rounding_scale(problem)
+
+        def next_scale(residual: Tensor, scale: Tensor) -> Tensor:
+            if self.scale == "proposal2":
+                return proposal_2(problem, residual, scale, clip)
+            # an exact fit of most values stays one, which rounding errors taken for a scale would undo
+            return torch.where(exact, 0.0, median_scale(problem, residual))
+
+        found = reweight(
+            problem,
+            beta,
+            first,
+            psi_weight(name, tuning),
+            next_scale,
+            max_iter=self.max_iter,
+            tol=self.tol,
+        )
+        self._set_common(problem, found.beta, found.weight)
+        self.scale_ = problem.restore(found.scale)
+        self.n_iter_ = problem.restore(found.n_iter)
+        self.converged_ = problem.restore(found.converged)
+        return self
+
+    def _start(self, problem: LinearProblem, X: Tensor, Y: Tensor, sample_weight: Tensor | None) -> Tensor:
+        start = self.start if self.start is not None else ("lad" if self.psi == "huber" else "lts")
+        if isinstance(start, str) and start == "lad":
+            return problem.in_basis(LeastAbsoluteDeviations().fit(X, Y, sample_weight).coef_)
+        return robust_start(problem, start, seed=self.seed).beta
+
+
+def _fewest_samples(problem: LinearProblem) -> int:
+    """Samples of positive weight in the channel that has fewest."""
+    if problem.sample_weight is None:
+        return problem.num_samples
+    return int((problem.sample_weight > 0).sum(-2).min())

@@ -1,0 +1,164 @@
+"""Newton's method within a trust region for a batch of smooth, not necessarily convex functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+__all__ = ["Minima", "Quadratic", "minimise"]
+
+_NEGATIVE = 1e-6
+"""Least curvature, relative to the largest, at which a stationary point counts as a minimum, with the sign reversed."""
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """Functions about one point each: values (K,), gradients (K, n), symmetric Hessians (K, n, n)."""
+
+    value: Float[Tensor, " K"]
+    gradient: Float[Tensor, "K n"]
+    hessian: Float[Tensor, "K n n"]
+
+    def select(self, keep: Tensor) -> Quadratic:
+        return Quadratic(self.value[keep], self.gradient[keep], self.hessian[keep])
+
+    def moved(self, accept: Tensor, to: Quadratic) -> Quadratic:
+        return Quadratic(
+            torch.where(accept, to.value, self.value),
+            torch.where(accept[:, None], to.gradient, self.gradient),
+            torch.where(accept[:, None, None], to.hessian, self.hessian),
+        )
+
+
+@dataclass(frozen=True)
+class Minima:
+    """Where the descents came to rest: points (K, n), values (K,), steps tried (K,), and whether each is a minimum."""
+
+    point: Float[Tensor, "K n"]
+    value: Float[Tensor, " K"]
+    n_iter: Int[Tensor, " K"]
+    converged: Bool[Tensor, " K"]
+
+
+@dataclass(frozen=True)
+class _Step:
+    """Steps (K, n), their lengths, the gains foreseen of them and of Newton's whole step, and whether all bends up."""
+
+    step: Float[Tensor, "K n"]
+    length: Float[Tensor, " K"]
+    gain: Float[Tensor, " K"]
+    whole_gain: Float[Tensor, " K"]
+    convex: Bool[Tensor, " K"]
+
+
+def _step(at: Quadratic, radius: Float[Tensor, " K"]) -> _Step:
+    """Newton's step with the absolute values of the curvatures, cut to the radius.
+
+    Where going along the most negative curvature gains more, at a saddle say, that is the step.
+    """
+    curvature, vectors = torch.linalg.eigh(at.hessian)
+    slope = torch.matmul(at.gradient.unsqueeze(-2), vectors).squeeze(-2)
+    size = curvature.abs()
+    largest = size.amax(-1)
+    floor = (torch.finfo(size.dtype).eps * largest).clamp(min=torch.finfo(size.dtype).tiny)
+    whole = slope / torch.maximum(size, floor.unsqueeze(-1))
+    whole_gain = 0.5 * (slope * whole).sum(-1)
+    length = torch.linalg.vector_norm(whole, dim=-1)
+    step = whole * (-radius / torch.maximum(length, radius)).unsqueeze(-1)
+    length = torch.minimum(length, radius)
+    gain = -(step * (slope + 0.5 * curvature * step)).sum(-1)
+    # eigenvalues ascend: the first is the most negative
+    convex = curvature[:, 0] >= -_NEGATIVE * largest
+    if not bool(convex.all()):
+        away = radius * slope[:, 0].abs() - 0.5 * curvature[:, 0] * radius.square()
+        leave = ~convex & (away > gain)
+        downhill = torch.zeros_like(step)
+        downhill[:, 0] = torch.where(slope[:, 0] > 0, -radius, radius)
+        step = torch.where(leave.unsqueeze(-1), downhill, step)
+        gain, length = torch.where(leave, away, gain), torch.where(leave, radius, length)
+    return _Step(torch.matmul(vectors, step.unsqueeze(-1)).squeeze(-1), length, gain, whole_gain, convex)
+
+
+def minimise(
+    function: Callable[[Tensor, Tensor], Quadratic],
+    start: Float[Tensor, "K n"],
+    radius: Float[Tensor, " K"],
+    *,
+    tol: float | None = None,
+    max_iter: int = 200,
+    retract: Callable[[Tensor], Tensor] | None = None,
+) -> Minima:
+    """Descend from every start to a local minimum of its function.
+
+    Args:
+        function: called with points (k, n) and the indices (k,) of the descents still under way; gives the functions,
+            their gradients and Hessians there.
+        start: (K, n).
+        radius: length (K,) of the first steps at most.
+        tol: gain of Newton's step, as the second-order model foresees it, below which a descent ends with that step,
+            relative to a value of 1 or the function's own if larger; default 64 times the rounding error of the dtype.
+        max_iter: steps tried at most.
+        retract: takes points to equivalent ones, where a function is constant along some curves.
+
+    Example:
+        >>> def wells(x, index):  # x⁴ - 2 x², with minima at -1 and 1
+        ...     return Quadratic((x**4 - 2 * x**2)[:, 0], 4 * x**3 - 4 * x, (12 * x**2 - 4).unsqueeze(-1))
+        >>> minimise(wells, torch.tensor([[0.5], [-3.0]]), torch.ones(2)).point
+        tensor([[ 1.],
+                [-1.]])
+    """
+    eps = torch.finfo(start.dtype).eps
+    tol = 64.0 * eps if tol is None else tol
+    retract = retract if retract is not None else _same
+    active = torch.arange(start.shape[0], device=start.device)
+    point, at = start, function(start, active)
+    found, value = start.clone(), at.value.clone()
+    n_iter, converged = torch.zeros_like(active), torch.zeros_like(active, dtype=torch.bool)
+    for iteration in range(1, max_iter + 1):
+        newton = _step(at, radius)
+        scale = at.value.abs().clamp(min=1.0)
+        last = newton.convex & (newton.whole_gain <= tol * scale)
+        size = torch.linalg.vector_norm(point, dim=-1)
+        # a region that has shrunk to rounding error holds no lower point
+        stuck = newton.length <= eps * size
+        done = last | stuck
+        if bool(done.any()):
+            # what gains nothing is worth a step only if that is short, not along a flat direction
+            short = last & (newton.length <= 1e-3 * size)
+            ends = torch.where(short.unsqueeze(-1), retract(point + newton.step), point)
+            near = newton.convex & (newton.whole_gain <= max(tol, 1e4 * eps) * scale)
+            where = active[done]
+            found[where], value[where], n_iter[where], converged[where] = (
+                ends[done],
+                at.value[done],
+                iteration,
+                near[done],
+            )
+            left = (~done).nonzero().squeeze(-1)
+            if left.numel() == 0:
+                return Minima(found, value, n_iter, converged)
+            active, point, radius, at = active[left], point[left], radius[left], at.select(left)
+            newton = _Step(*(getattr(newton, f)[left] for f in ("step", "length", "gain", "whole_gain", "convex")))
+        trial = retract(point + newton.step)
+        there = function(trial, active)
+        ratio = (at.value - there.value) / newton.gain
+        accept = (ratio > 1e-4) & torch.isfinite(there.gradient).all(-1)
+        if bool(accept.all()):
+            point, at = trial, there
+        else:
+            point, at = torch.where(accept.unsqueeze(-1), trial, point), at.moved(accept, there)
+        kept = torch.where((ratio > 0.75) & (newton.length > 0.99 * radius), 2.0 * radius, radius)
+        radius = torch.where(accept & (ratio > 0.25), kept, 0.25 * newton.length)
+    found[active], value[active], n_iter[active] = point, at.value, max_iter
+    return Minima(found, value, n_iter, converged)
+
+
+def _same(point: Tensor) -> Tensor:
+    return point

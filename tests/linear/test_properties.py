@@ -1,0 +1,227 @@
+"""What every linear estimator promises, one test a property: equivariance, weights, order, batches, exact fits.
+
+A new estimator is one line of ``CASES``; a property it does not have is named there with the reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+from torch import Tensor
+
+from mkc_torch.linear import (
+    FixedPointLinear,
+    LeastAbsoluteDeviations,
+    LeastMedianOfSquares,
+    LeastSquares,
+    LeastTrimmedSquares,
+    MEstimator,
+    MKCRegression,
+    MMRegression,
+    RankDeficientError,
+    ReweightedLeastSquares,
+    Ridge,
+    SRegression,
+)
+from mkc_torch.linear._estimator import LinearEstimator
+
+N, n = 20, 3
+
+
+@dataclass(frozen=True)
+class Case:
+    """An estimator for a given number of samples, and the properties it has not, each with the reason."""
+
+    name: str
+    make: Callable[[int], LinearEstimator]
+    without: dict[str, str] = field(default_factory=dict)
+    robust: bool = True  # the exact fit of 70 % of the samples is found
+
+
+PENALTY = {
+    "regression": "the penalty draws towards 0",
+    "affine": "the penalty is in the units of the columns",
+    "exact": "the penalty draws towards 0",
+}
+GIVEN_SCALE = {"scale": "d is in the unit of Y"}
+
+CASES = [
+    Case("least squares", lambda _: LeastSquares(), robust=False),
+    Case("ridge", lambda _: Ridge(alpha=2.0), without=PENALTY, robust=False),
+    Case("least absolute deviations", lambda _: LeastAbsoluteDeviations()),
+    Case("fixed point", lambda _: FixedPointLinear(sigma=2.0, d=0.2), without=GIVEN_SCALE),
+    Case("MKC-EM", lambda _: MKCRegression()),
+    Case("M huber", lambda _: MEstimator("huber")),
+    Case("M hampel", lambda _: MEstimator("hampel")),
+    Case("M tukey", lambda _: MEstimator("tukey")),
+    Case("M andrews", lambda _: MEstimator("andrews")),
+    Case("M welsch", lambda _: MEstimator("welsch")),
+    Case("M huber, proposal 2", lambda _: MEstimator("huber", scale="proposal2"), robust=False),
+    Case("M tukey, proposal 2", lambda _: MEstimator("tukey", scale="proposal2"), robust=False),
+    Case("least median of squares", lambda N: LeastMedianOfSquares(3 * N // 5)),
+    Case("largest residual", lambda N: LeastMedianOfSquares(N), robust=False),
+    Case("least trimmed squares", lambda N: LeastTrimmedSquares(3 * N // 5)),
+    Case("reweighted, from lms", lambda N: ReweightedLeastSquares(LeastMedianOfSquares(3 * N // 5))),
+    Case("reweighted, from lts", lambda N: ReweightedLeastSquares(LeastTrimmedSquares(3 * N // 5))),
+    Case("S", lambda _: SRegression()),
+    Case("S, breakdown 0.4", lambda _: SRegression(breakdown=0.4)),
+    Case("MM", lambda _: MMRegression()),
+]
+
+
+def cases(prop: str, *, robust: bool = False) -> list[object]:
+    return [pytest.param(c, id=c.name) for c in CASES if prop not in c.without and (c.robust or not robust)]
+
+
+@pytest.fixture(params=[torch.float64, torch.float32], ids=["float64", "float32"])
+def dtype(request) -> torch.dtype:
+    return request.param
+
+
+def sample(seed: int, *shape: int) -> Tensor:
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def data(seed: int = 0, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+    """X with an intercept column, y = X 1 + noise, and every fifth target far off."""
+    X = torch.cat([torch.ones(N, 1).double(), sample(seed, N, n - 1)], 1)
+    y = X.sum(-1) + 0.1 * sample(seed + 1, N)
+    y[::5] += 5.0 + sample(seed + 2, N // 5)
+    return X.to(dtype), y.to(dtype)
+
+
+def close(got: Tensor, expected: Tensor) -> None:
+    tolerance = 2e-6 if got.dtype == torch.float64 else 5e-3
+    torch.testing.assert_close(got, expected, rtol=tolerance, atol=tolerance * float(expected.abs().max()))
+
+
+def fitted(case: Case, X: Tensor, y: Tensor, weight: Tensor | None = None) -> LinearEstimator:
+    return case.make(y.shape[-1]).fit(X, y, weight)
+
+
+def scale_of(fit: LinearEstimator) -> Tensor | None:
+    return fit.scale_ if hasattr(fit, "scale_") else None
+
+
+@pytest.mark.parametrize("case", cases("regression"))
+def test_regression_equivariance(case, dtype):
+    X, y = data(dtype=dtype)
+    shift = sample(5, n).to(dtype)
+    close(fitted(case, X, y + X @ shift).coef_, fitted(case, X, y).coef_ + shift)
+
+
+@pytest.mark.parametrize("factor", [-2.5, 1e3])
+@pytest.mark.parametrize("case", cases("scale"))
+def test_scale_equivariance(case, factor, dtype):
+    X, y = data(dtype=dtype)
+    fit, scaled = fitted(case, X, y), fitted(case, X, factor * y)
+    close(scaled.coef_, factor * fit.coef_)
+    close(scaled.weights_, fit.weights_)
+    if scale_of(fit) is not None:
+        close(scaled.scale_, abs(factor) * fit.scale_)
+
+
+@pytest.mark.parametrize("case", cases("affine"))
+def test_affine_equivariance(case, dtype):
+    X, y = data(dtype=dtype)
+    A = (sample(6, n, n) * torch.tensor([1e-2, 1.0, 1e2])).to(dtype)
+    close(A @ fitted(case, X @ A, y).coef_, fitted(case, X, y).coef_)
+
+
+@pytest.mark.parametrize("case", cases("repetition"))
+def test_weight_is_repetition(case, dtype):
+    X, y = data(dtype=dtype)
+    count = 1 + torch.arange(N) % 2
+    weighted = fitted(case, X, y, count.to(dtype))
+    repeated = fitted(case, X.repeat_interleave(count, 0), y.repeat_interleave(count))
+    close(weighted.coef_, repeated.coef_)
+    if scale_of(weighted) is not None:
+        close(weighted.scale_, repeated.scale_)
+
+
+@pytest.mark.parametrize("case", cases("order"))
+def test_the_order_of_the_samples_does_not_matter(case, dtype):
+    X, y = data(dtype=dtype)
+    order = torch.randperm(N, generator=torch.Generator().manual_seed(3))
+    fit, moved = fitted(case, X, y), fitted(case, X[order], y[order])
+    close(moved.coef_, fit.coef_)
+    close(moved.weights_, fit.weights_[order])
+
+
+@pytest.mark.parametrize("case", cases("batch"))
+def test_batch_equals_loop(case, dtype):
+    problems = [data(10 * s, dtype) for s in range(4)]
+    X = torch.stack([p[0] for p in problems]).reshape(2, 2, N, 1, n)
+    y = torch.stack([p[1] for p in problems]).reshape(2, 2, N, 1)
+    together = case.make(N).fit(X, y)
+    assert together.coef_.shape == (2, 2, n)
+    assert together.weights_.shape == (2, 2, N, 1)
+    for i, (X_i, y_i) in enumerate(problems):
+        close(together.coef_[i // 2, i % 2], fitted(case, X_i, y_i).coef_)
+
+
+@pytest.mark.parametrize("case", cases("exact"))
+def test_an_exact_fit_is_found(case, dtype):
+    X, _ = data(dtype=dtype)
+    coef = torch.tensor([1.0, -2.0, 3.0], dtype=dtype)
+    fit = fitted(case, X, X @ coef)
+    torch.testing.assert_close(fit.coef_, coef, rtol=0, atol=1e4 * torch.finfo(dtype).eps)
+    assert bool(torch.isfinite(fit.weights_).all())
+    if scale_of(fit) is not None:
+        assert float(fit.scale_) < 1e5 * torch.finfo(dtype).eps
+
+
+@pytest.mark.parametrize("case", cases("exact", robust=True))
+def test_the_exact_fit_of_seventy_per_cent_is_found(case, dtype):
+    X, _ = data(dtype=dtype)
+    coef = torch.tensor([1.0, -2.0, 3.0], dtype=dtype)
+    y = X @ coef
+    y[:6] += 5.0 + sample(9, 6).to(dtype)
+    fit = fitted(case, X, y)
+    torch.testing.assert_close(fit.coef_, coef, rtol=0, atol=1e5 * torch.finfo(dtype).eps)
+    assert bool(torch.isfinite(fit.weights_).all())
+
+
+@pytest.mark.parametrize("case", cases("zero"))
+def test_targets_of_zero_give_coefficients_of_zero(case, dtype):
+    fit = fitted(case, data(dtype=dtype)[0], torch.zeros(N, dtype=dtype))
+    assert fit.coef_.tolist() == [0.0] * n
+    assert bool(torch.isfinite(fit.weights_).all())
+
+
+@pytest.mark.parametrize("case", cases("channels"))
+def test_channels_share_the_coefficients(case):
+    X = torch.stack([data(0)[0], 2.0 * data(20)[0]], -2)
+    Y = X.sum(-1) + 0.1 * sample(30, N, 2)
+    Y[::5, 0] += 5.0
+    fit = case.make(N).fit(X, Y)
+    assert fit.coef_.shape == (n,)
+    assert fit.weights_.shape == (N, 2)
+    limit = 0.15 if case.robust else 1.5
+    assert float((fit.coef_ - 1.0).abs().max()) < limit
+
+
+@pytest.mark.parametrize("case", cases("dtype"))
+def test_float32_stays_float32_and_agrees_with_float64(case):
+    X, y = data()
+    fit = fitted(case, X.float(), y.float())
+    assert fit.coef_.dtype == fit.weights_.dtype == torch.float32
+    torch.testing.assert_close(fit.coef_.double(), fitted(case, X, y).coef_, rtol=5e-3, atol=5e-3)
+
+
+@pytest.mark.parametrize("case", cases("rank"))
+def test_what_cannot_be_fitted_is_refused(case):
+    X, y = data()
+    estimator = case.make(N)
+    bad = y.clone()
+    bad[3] = float("nan")
+    with pytest.raises(ValueError, match=r"`Y` to be finite but got nan"):
+        estimator.fit(X, bad)
+    if case.name != "ridge":  # its penalty determines dependent columns
+        with pytest.raises(RankDeficientError, match="linearly dependent"):
+            estimator.fit(torch.cat([X, X[:, :1]], 1), y)
+        with pytest.raises(ValueError, match="at least 3 values for 3 coefficients"):
+            estimator.fit(X[:2], y[:2])
