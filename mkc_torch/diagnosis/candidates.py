@@ -11,8 +11,8 @@ from torch import Tensor
 from mkc_torch.diagnosis.drivers import Driver
 from mkc_torch.diagnosis.model import Term
 from mkc_torch.diagnosis.preference import UNKNOWN
-from mkc_torch.effects.protocol import ContinuousEffect, Effect, Shape
-from mkc_torch.simulation.protocol import PreparedSimulation
+from mkc_torch.effects.protocol import ChoosyEffect, ContinuousEffect, Effect, RelativeEffect, Shape
+from mkc_torch.simulation.protocol import Port, PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -28,13 +28,31 @@ def candidate_terms(
     """Each effect that has its port in the simulation, with each driver of its roles and each shape of its grid."""
     terms = []
     for effect in effects:
-        if effect.port not in prepared.ports:
-            continue
+        places = [name for name, port in prepared.ports.items() if _fits(effect, name, port)]
         # a role that is known says what the column does; an effect of unknown roles takes what is left over
         fitting = [None] if not effect.roles else [d for d in drivers if _drives(d, effect)]
         shapes = effect.shapes(prepared.time)
-        terms += [Term(effect, driver, shape) for driver in fitting for shape in shapes]
+        terms += [
+            Term(effect, driver, shape, "" if at == effect.port else at)
+            for at in places
+            for driver in fitting
+            for shape in (absolute(effect, shape, prepared.ports[at]) for shape in shapes)
+        ]
     return tuple(terms)
+
+
+def _fits(effect: Effect, name: str, port: Port) -> bool:
+    """Whether an effect acts at a port."""
+    needs = effect.needs if isinstance(effect, ChoosyEffect) else ()
+    return effect.port in (name, port.kind) and set(needs) <= set(port.parts)
+
+
+def absolute(effect: Effect, shape: Shape, port: Port) -> Shape:
+    """A shape in units, of one in shares of what passes through the port."""
+    if not isinstance(effect, RelativeEffect):
+        return shape
+    sizes = {name: dict(zip(("typical", "largest"), values, strict=True)) for name, values in port.sizes.items()}
+    return {**shape} | {name: shape[name] * sizes[part][which] for name, (part, which) in effect.relative.items()}
 
 
 def _drives(driver: Driver, effect: Effect) -> bool:

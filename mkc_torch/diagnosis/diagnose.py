@@ -111,7 +111,7 @@ def diagnose(
     base = _base(prepared)
     search = _searched(base, terms, level, surrogates, max_findings, seed, generator)
     final = estimate(search.found[-1].fit if search.found else base).at_least(search.evidence[-1].jackknife)
-    return _assembled(prepared, drivers, terms, base, search, final, level, surrogates, seed, generator)
+    return _assembled(simulation, prepared, drivers, terms, base, search, final, level, surrogates, seed, generator)
 
 
 def _holds(
@@ -213,6 +213,7 @@ def _same(term: Term, found: Term, near: float) -> bool:
 
 
 def _assembled(
+    simulation: Simulation,
     prepared: PreparedSimulation,
     drivers: Drivers,
     terms: tuple[Term, ...],
@@ -268,7 +269,7 @@ def _assembled(
         candidates=_candidates(first),
         separability=separability(first) if first else _nothing_to_separate(),
         traces=_traces(prepared, drivers, base, final),
-        model=model_of(final),
+        model=model_of(final, simulation),
     )
 
 

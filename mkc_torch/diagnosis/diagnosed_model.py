@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,11 +13,11 @@ from torch import Tensor, nn
 
 from mkc_torch.diagnosis.drivers import Driver
 from mkc_torch.diagnosis.estimate import Estimate
-from mkc_torch.diagnosis.model import Term
+from mkc_torch.diagnosis.model import Term, context_at, summed
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.protocol import AnchoredEffect, Context, Effect, LastingEffect
 from mkc_torch.recording import MissingColumnError, Recording
-from mkc_torch.simulation.protocol import Correction
+from mkc_torch.simulation.protocol import Change, Correction, Simulation
 from mkc_torch.simulation.registry import correction_of
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ class DiagnosedModel(nn.Module):
         parameters: the simulation's own, (p,).
         terms: the effects, each with its driver's columns, their reference and units, and its shape.
         gammas: their γ.
+        source: a simulation of the user's own, which files do not hold.
 
     Attributes:
         theta: the simulation's parameters.
@@ -63,6 +65,7 @@ class DiagnosedModel(nn.Module):
         parameters: Float[Tensor, " p"],
         terms: Sequence[Term],
         gammas: Sequence[Float[Tensor, " q"]],
+        source: Simulation | None = None,
     ) -> None:
         super().__init__()
         self.simulation = simulation
@@ -70,6 +73,7 @@ class DiagnosedModel(nn.Module):
         self.theta = nn.Parameter(parameters.detach().clone(), requires_grad=False)
         self.gammas = nn.ParameterList(nn.Parameter(g.detach().clone(), requires_grad=False) for g in gammas)
         self.terms = tuple(terms)
+        self.source = source
 
     def correct(self, recording: Recording) -> tuple[dict[str, Float[Tensor, " N"]], tuple[str, ...]]:
         """The corrected signal of a recording, row by row, and sentences about effects that do not carry over.
@@ -80,31 +84,39 @@ class DiagnosedModel(nn.Module):
         Raises:
             MissingColumnError: a column of the simulation, or an effect's driver, is not there.
         """
-        correction = correction_of(self.simulation, self.state, recording)
-        signals = correction.signals(self.theta)
-        changes: dict[str, Tensor] = {}
+        correction = correction_of(self.simulation, self.state, recording, self.source)
+        changes: dict[str, Change] = {}
         notes = []
         for term, gamma in zip(self.terms, self.gammas, strict=True):
-            port = term.effect.port
+            port = term.port
             if port not in correction.ports:
                 notes.append(f"{term.effect.id} belongs to the place of the diagnosed recording and is left out.")
                 continue
-            change, note = self._change(term, gamma, _context(term, correction, signals[port], recording))
-            changes[port] = changes[port] + change if port in changes else change
-            notes += note
+            changes[port] = summed(changes.get(port), self._change(term, gamma, correction, recording))
+            if isinstance(term.effect, LastingEffect):
+                notes.append(
+                    f"{term.effect.id} is bound to the time of the diagnosed recording: its offset at the end is taken "
+                    "off all of this one."
+                )
         return correction.corrected(self.theta, changes), tuple(notes)
 
     def forward(self, recording: Recording) -> dict[str, Float[Tensor, " N"]]:
         """The corrected signal alone, see :meth:`correct`."""
         return self.correct(recording)[0]
 
-    def _change(self, term: Term, gamma: Tensor, context: Context) -> tuple[Tensor, list[str]]:
-        if not isinstance(term.effect, LastingEffect):
-            return term.effect.change(gamma, term.shape, context), []
-        return term.effect.lasting(gamma, context), [
-            f"{term.effect.id} is bound to the time of the diagnosed recording: its offset at the end is taken off all "
-            "of this one."
-        ]
+    def _change(self, term: Term, gamma: Tensor, correction: Correction, recording: Recording) -> Change:
+        effect, shape = term.effect, term.shape
+        bare = _context(term, correction, recording)
+
+        def change(signal: Tensor) -> Tensor:
+            context = replace(bare, signal=signal)
+            return (
+                effect.lasting(gamma, context)
+                if isinstance(effect, LastingEffect)
+                else effect.change(gamma, shape, context)
+            )
+
+        return change
 
     def to_json(self) -> str:
         """The model as JSON of the schema "mkc-model/1"; numbers round-trip exactly."""
@@ -116,6 +128,7 @@ class DiagnosedModel(nn.Module):
                     for column, reference, unit in zip(*_columns(term), strict=True)
                 ],
                 "shape": dict(term.shape),
+                **({"port": term.at} if term.at else {}),
                 "parameters": gamma.tolist(),
                 "equation": term.effect.equation,
             }
@@ -131,12 +144,15 @@ class DiagnosedModel(nn.Module):
         return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
     @staticmethod
-    def from_json(text: str, effects: Sequence[Effect] = CATALOGUE) -> DiagnosedModel:
+    def from_json(
+        text: str, effects: Sequence[Effect] = CATALOGUE, simulation: Simulation | None = None
+    ) -> DiagnosedModel:
         """The model of a JSON text.
 
         Args:
             text: of model.json.
             effects: where the effects are looked up by their id; a user's own go in here too.
+            simulation: the user's own that was diagnosed; None for one of the package's.
 
         Raises:
             ModelFileError: not JSON, of another schema, an effect that is not known, or a value of the wrong kind.
@@ -155,25 +171,30 @@ class DiagnosedModel(nn.Module):
             found = "missing" if schema is None else json.dumps(schema)
             raise ModelFileError(f'this is no model: its schema is {found} and not "{SCHEMA}".')
         try:
-            return _read(content, {effect.id: effect for effect in effects})
+            return _read(content, {effect.id: effect for effect in effects}, simulation)
         except (KeyError, TypeError, ValueError) as error:
             if isinstance(error, ModelFileError):
                 raise
             raise ModelFileError(f"this model is damaged: {type(error).__name__} {error}.") from None
 
 
-def model_of(final: Estimate) -> DiagnosedModel:
+def model_of(final: Estimate, simulation: Simulation) -> DiagnosedModel:
     """The model of a final fit."""
     model = final.fit.model
-    signals = model.prepared.signals(final.fit.parameters[: model.base])
+    signals = model.signals(final.fit.parameters)
     terms = []
     for term in model.terms:
-        context = term.context(model.prepared, signals.get(term.effect.port))
+        context = term.context(model.prepared, signals.get(term.port))
         shape = term.effect.anchored(term.shape, context) if isinstance(term.effect, AnchoredEffect) else term.shape
-        terms.append(Term(term.effect, term.driver, shape))
+        terms.append(Term(term.effect, term.driver, shape, term.at))
     parameters = final.fit.parameters
     return DiagnosedModel(
-        model.prepared.name, model.prepared.state, parameters[: model.base], terms, model.gammas(parameters)
+        model.prepared.name,
+        model.prepared.state,
+        parameters[: model.base],
+        terms,
+        model.gammas(parameters),
+        simulation,
     )
 
 
@@ -183,7 +204,7 @@ def _columns(term: Term) -> tuple[Sequence[str], Sequence[float], Sequence[str]]
     return term.driver.columns, term.driver.reference.tolist(), term.driver.units
 
 
-def _read(content: Mapping[str, Any], known: Mapping[str, Effect]) -> DiagnosedModel:
+def _read(content: Mapping[str, Any], known: Mapping[str, Effect], simulation: Simulation | None) -> DiagnosedModel:
     terms, gammas = [], []
     for entry in content["effects"]:
         if entry["effect"] not in known:
@@ -197,9 +218,11 @@ def _read(content: Mapping[str, Any], known: Mapping[str, Effect]) -> DiagnosedM
             names, units = tuple(c["column"] for c in columns), tuple(c["unit"] for c in columns)
             driver = Driver(names, "", reference.new_zeros(0, len(columns)), reference, units)
         shape = {name: _finite(value) for name, value in entry["shape"].items()}
-        terms.append(Term(known[entry["effect"]], driver, shape))
+        terms.append(Term(known[entry["effect"]], driver, shape, entry.get("port", "")))
         gammas.append(_vector(entry["parameters"]))
-    return DiagnosedModel(content["simulation"], content["state"], _vector(content["parameters"]), terms, gammas)
+    return DiagnosedModel(
+        content["simulation"], content["state"], _vector(content["parameters"]), terms, gammas, simulation
+    )
 
 
 def _vector(values: Sequence[float]) -> Tensor:
@@ -212,16 +235,19 @@ def _finite(value: Any) -> float:
     return float(value)
 
 
-def _context(term: Term, correction: Correction, signal: Tensor, recording: Recording) -> Context:
-    port = correction.ports[term.effect.port]
-    drivers = signal.new_zeros(len(signal), 0)
+def _context(term: Term, correction: Correction, recording: Recording) -> Context:
+    port, time = correction.ports[term.port], correction.time
+    drivers = time.new_zeros(len(time), 0)
     units: tuple[str, ...] = ()
     if term.driver is not None:
         for column in term.driver.columns:
             if column not in recording:
                 raise missing_driver(column, term.effect.id)
         drivers, units = recording.stack(*term.driver.columns) - term.driver.reference, term.driver.units
-    return Context(correction.time, drivers, units, signal, port.unit, port.channels)
+    drivers = port.at(drivers)
+    time = time if port.clock is None else port.clock.time
+    nothing = time.new_zeros(len(time), len(port.channels))
+    return context_at(port, time, drivers, units, nothing)
 
 
 def missing_driver(column: str, effect: str) -> MissingColumnError:

@@ -64,5 +64,7 @@ def estimate(fit: FittedModel) -> Estimate:
     error = covariance.diagonal().clamp(min=1e-300).sqrt()
     if float((step.abs() / error).max()) <= _MOST_ERRORS:
         parameters = parameters - step
+        if model.bounds is not None:
+            parameters = parameters.clamp(*model.bounds)
         fit = replace(fit, parameters=parameters, residual=model.residual(parameters).detach())
     return Estimate(fit, covariance, found.search.noise_fit(found.series), found)

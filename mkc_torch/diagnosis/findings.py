@@ -15,7 +15,7 @@ from mkc_torch.diagnosis.evidence import scored
 from mkc_torch.diagnosis.locate import SEPARABLE, Located
 from mkc_torch.diagnosis.model import Term, follows_signal
 from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter
-from mkc_torch.effects.protocol import Context
+from mkc_torch.effects.protocol import Context, PartEffect, RelativeEffect
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -27,7 +27,7 @@ _FARTHEST = 30.0
 _BLOCKS, _MOST_GAIN, _CONCENTRATED = 60, 0.9, 0.35
 _POINTS = 80
 _NORMAL_95 = 1.959964
-_SECONDS = ("lag", "time_constant", "middle", "width")
+_SECONDS = ("lag", "time_constant", "middle", "width", "delay")
 
 
 def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | None, note: str) -> Finding:
@@ -52,7 +52,7 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
         onset=term.shape.get("onset"),
         equation=term.effect.equation,
         explanation=f"{term.effect.explanation} {term.effect.advice}".strip(),
-        parameters=(*parameters_of(term, gamma, covariance, context), *_shape_parameters(term)),
+        parameters=(*parameters_of(term, gamma, covariance, context), *_shape_parameters(term, context)),
         p_value=located.p_value,
         held_out=held,
         held_out_note=note,
@@ -73,8 +73,7 @@ def _own(final: Estimate, number: int) -> tuple[Tensor, Tensor]:
 
 def _context(final: Estimate, term: Term) -> Context:
     model = final.fit.model
-    signals = model.prepared.signals(final.fit.parameters[: model.base])
-    return term.context(model.prepared, signals.get(term.effect.port))
+    return term.context(model.prepared, model.signals(final.fit.parameters).get(term.port))
 
 
 def parameters_of(
@@ -94,12 +93,18 @@ def parameters_of(
     return tuple(parameters)
 
 
-def _shape_parameters(term: Term) -> tuple[Parameter, ...]:
+def _shape_parameters(term: Term, context: Context) -> tuple[Parameter, ...]:
     return tuple(
-        Parameter(name, value, None, "s" if name in _SECONDS else "")
+        Parameter(name, value, None, _unit_of_shape(term, name, context))
         for name, value in term.shape.items()
         if name != "onset"
     )
+
+
+def _unit_of_shape(term: Term, name: str, context: Context) -> str:
+    if isinstance(term.effect, RelativeEffect) and name in term.effect.relative:
+        return context.unit_of(term.effect.relative[name][0])
+    return "s" if name in _SECONDS else ""
 
 
 def _numbers(values: Tensor) -> Number:
@@ -189,6 +194,8 @@ def _curve(term: Term, gamma: Tensor, covariance: Tensor, context: Context) -> C
 
 
 def _along(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | None:
+    if context.parts:
+        return _along_part(term, context)
     flat = context.signal.new_zeros(_POINTS, context.signal.shape[1])
     if term.driver is not None:
         values = context.drivers
@@ -215,6 +222,21 @@ def _along(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | N
     flat = context.signal.new_zeros(len(index), context.signal.shape[1])
     time = context.time[index]
     return "time", "s", time, replace(context, time=time, drivers=context.drivers.new_zeros(len(index), 0), signal=flat)
+
+
+def _along_part(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | None:
+    """Over the range of the part of the signal that the effect mainly follows, the others at their medians."""
+    part = term.effect.along if isinstance(term.effect, PartEffect) else ""
+    if part not in context.parts:
+        return None
+    name = context.parts[part]
+    values = context.component(name)
+    x = torch.linspace(float(values.min()), float(values.max()), _POINTS, dtype=values.dtype)
+    signal = context.signal.median(0).values.expand(_POINTS, -1).clone()
+    signal[:, (context.carries or context.channels).index(name)] = x
+    time = torch.arange(_POINTS, dtype=x.dtype)
+    synthetic = replace(context, time=time, signal=signal, drivers=context.drivers.new_zeros(_POINTS, 0))
+    return name, context.unit_of(part), x, synthetic
 
 
 def labels(terms: Sequence[Term]) -> tuple[str, ...]:

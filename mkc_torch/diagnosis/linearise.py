@@ -90,11 +90,11 @@ def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Seque
         if follows_signal(term.effect):
             nuisance[..., start : start + size] *= independent[:, None]
         start += size
-    signals = prepared.signals(parameters[: model.base])
-    courses = [directions(t, t.context(prepared, signals.get(t.effect.port))) for t in terms]
+    signals = model.signals(parameters)
+    courses = [directions(t, t.context(prepared, signals.get(t.port))) for t in terms]
     found: list[Tensor | None] = [None] * len(terms)
     for name in prepared.ports:
-        members = [i for i, term in enumerate(terms) if term.effect.port == name]
+        members = [i for i, term in enumerate(terms) if term.port == name]
         if not members:
             continue
         joined = torch.cat([courses[i] for i in members], -1)

@@ -13,16 +13,16 @@ from torch import Tensor
 from mkc_torch.diagnosis.candidates import finer
 from mkc_torch.diagnosis.linearise import Linearised, Tangents, linearise, tangents_of
 from mkc_torch.diagnosis.local import beside_wander
-from mkc_torch.diagnosis.model import JointModel, Term
+from mkc_torch.diagnosis.model import JointModel, Key, Term, one_sided
 from mkc_torch.diagnosis.preference import Preference
-from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted
+from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted_beside
 from mkc_torch.diagnosis.search import Gains, NoiseFit, log_survival
 from mkc_torch.effects.protocol import ContinuousEffect
 from mkc_torch.functional import mkc_energy
 from mkc_torch.order_statistic import robust_scale
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 __all__ = ["SEPARABLE", "Located", "Ranked", "locate"]
 
@@ -36,8 +36,6 @@ _LEADING = 2
 _RAW = 1000.0
 _OVERWHELMING = 150.0
 """Nats by which an account has to be likelier that no draws of noise are needed to tell."""
-
-Key = tuple[str, tuple[str, ...]]
 
 
 @dataclass(frozen=True)
@@ -110,14 +108,16 @@ def locate(
     linearised = linearise(base.model, parameters, pseudo, counts, tangents)
     noise = linearised.search.noise_fit(linearised.series)
     found = linearised.search.gains(linearised.series.unsqueeze(-1))
-    p_value, beyond = _judged(linearised, noise, found, tried, surrogates, generator)
+    possible = _possible(terms, linearised)
+    p_value, beyond = _judged(linearised, noise, found, possible[:tried], surrogates, generator)
     if p_value > level and _overwhelming(best, base, linearised, left.noise):
         p_value, beyond = 1.0 / (1 + surrogates), math.inf
     if p_value <= level:
         # whether there is an effect is asked of the noise that has it in; which one it is, of the noise beside it
         linearised = linearise(base.model, parameters, pseudo, counts, tangents, colour=left.noise.colour)
         found = linearised.search.gains(linearised.series.unsqueeze(-1))
-    ranking = _ranking(terms, found, prefer)
+        possible = _possible(terms, linearised)
+    ranking = _ranking(terms, found, prefer, possible)
     first = terms[ranking[0].number]
     if p_value <= level and first.key != best.model.terms[-1].key:
         best = _refitted(best, base, first, linearised, ranking[0].number)
@@ -144,9 +144,14 @@ def _short_list(base: FittedModel, terms: tuple[Term, ...], starts: Sequence[Sta
         log_p = plain.search.gains(plain.series.unsqueeze(-1)).log_p[:, 0]
         taken = 0
         for number in log_p.argsort().tolist():
-            if terms[number].key not in chosen:
+            term = terms[number]
+            if term.key not in chosen:
                 gamma, _ = plain.search.estimate(number, plain.series)
-                chosen[terms[number].key] = terms[number], parameters, -gamma
+                if one_sided(term.effect):
+                    gamma = gamma.clamp(max=0.0)
+                    if not bool(gamma.any()):
+                        continue
+                chosen[term.key] = term, parameters, -gamma
                 taken += 1
             if taken >= most:
                 break
@@ -203,7 +208,7 @@ def _refit_all(fits: dict[Key, FittedModel], base: FittedModel, listed: Sequence
         if (term.key, id(parameters)) in done:
             continue
         done.add((term.key, id(parameters)))
-        fit = fitted(base.model.with_term(term), torch.cat([parameters, gamma]), base.bound)
+        fit = fitted_beside(base, base.model.with_term(term), torch.cat([parameters, gamma]))
         if term.key not in fits or _score(fit, base, prefer) > _score(fits[term.key], base, prefer):
             fits[term.key] = fit
 
@@ -229,18 +234,23 @@ def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
     model = base.model.with_term(term)
     kept = fit.parameters[: model.size]
     more = kept.new_zeros(model.size - len(kept))
-    return fitted(model, torch.cat([kept, more]), base.bound, graduate=False)
+    return fitted_beside(base, model, torch.cat([kept, more]), graduate=False)
 
 
 def _judged(
-    linearised: Linearised, noise: NoiseFit, found: Gains, tried: int, count: int, generator: torch.Generator
+    linearised: Linearised,
+    noise: NoiseFit,
+    found: Gains,
+    possible: Bool[Tensor, " tried"],
+    count: int,
+    generator: torch.Generator,
 ) -> tuple[float, float]:
     """The p-value of the strongest candidate after the whole search, and how far it is beyond draws of fitted noise.
 
     Coloured noise is drawn where it enters, at a port whose axes may turn against the residual. Each candidate's ratios
     are first divided by how much the draws exceed their chi-square (Bartlett's correction), so that one whose noise is
-    larger than the model's does not set the level for all. A shape that was closed in on, beyond the first ``tried``
-    candidates, is left out: the draws had no such choice.
+    larger than the model's does not set the level for all. A shape that was closed in on, beyond those that were
+    tried, is left out: the draws had no such choice. So is an amplitude of a sign that the physics does not allow.
     """
     stationary = linearised.entering(count, generator)
     if stationary is None:
@@ -248,7 +258,9 @@ def _judged(
     drawn = linearised.search.gains(stationary + linearised.search.wander(count, noise, generator))
     dof = found.dof.clamp(min=1.0)
     excess = (drawn.ratio.mean(-1) / dof).clamp(min=1.0).unsqueeze(-1)
-    own = log_survival(found.ratio / excess, dof.unsqueeze(-1))[:tried].amin()
+    tried = len(possible)
+    own = log_survival(found.ratio / excess, dof.unsqueeze(-1))[:tried, 0]
+    own = torch.where(possible, own, 0.0).amin()
     others = log_survival(drawn.ratio / excess, dof.unsqueeze(-1))[:tried].amin(0)
     return (1 + int((others <= own).sum())) / (1 + count), float(others.min() - own)
 
@@ -265,12 +277,23 @@ def _overwhelming(best: FittedModel, base: FittedModel, without: Linearised, bes
     return beside.evidence - without.evidence - price > _OVERWHELMING
 
 
-def _ranking(terms: tuple[Term, ...], found: Gains, prefer: Preference) -> tuple[Ranked, ...]:
-    """By gain in nats less one for each parameter (Akaike's criterion), each physics at its best shape."""
+def _possible(terms: tuple[Term, ...], linearised: Linearised) -> Bool[Tensor, " C"]:
+    """Whether the amplitudes that fit have a sign that the physics allows."""
+    possible = torch.ones(len(terms), dtype=torch.bool)
+    for number, term in enumerate(terms):
+        if one_sided(term.effect):
+            possible[number] = bool((linearised.search.estimate(number, linearised.series)[0] < 0).any())
+    return possible
+
+
+def _ranking(
+    terms: tuple[Term, ...], found: Gains, prefer: Preference, possible: Bool[Tensor, " C"]
+) -> tuple[Ranked, ...]:
+    """By gain in nats less one for each parameter (Akaike's criterion), each physics at its best possible shape."""
     gain = 0.5 * found.ratio[:, 0]
     handicap = [prefer.handicap(term, float(one)) for term, one in zip(terms, gain, strict=True)]
     score = gain - found.dof - gain.new_tensor(handicap)
-    score = torch.where(found.dof > 0, score, -torch.inf)
+    score = torch.where((found.dof > 0) & possible, score, -torch.inf)
     best: dict[Key, int] = {}
     for number in score.argsort(descending=True).tolist():
         best.setdefault(terms[number].key, number)
@@ -279,8 +302,9 @@ def _ranking(terms: tuple[Term, ...], found: Gains, prefer: Preference) -> tuple
 
 def _refitted(best: FittedModel, base: FittedModel, term: Term, linearised: Linearised, number: int) -> FittedModel:
     gamma, _ = linearised.search.estimate(number, linearised.series)
+    gamma = gamma.clamp(max=0.0) if one_sided(term.effect) else gamma
     start = torch.cat([best.parameters[: base.model.size], -gamma])
-    return fitted(base.model.with_term(term), start, base.bound)
+    return fitted_beside(base, base.model.with_term(term), start)
 
 
 def _refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> FittedModel:
@@ -301,7 +325,7 @@ def _refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> Fi
             shapes = finer(term, name, base.model.prepared.time, count)
             value = [_energy(best, base.model.with_term(shape)) for shape in shapes]
             term = shapes[min(range(len(shapes)), key=value.__getitem__)]
-    moved = fitted(base.model.with_term(term), best.parameters, base.bound, graduate=False)
+    moved = fitted_beside(base, base.model.with_term(term), best.parameters, graduate=False)
     if moved.log_likelihood <= best.log_likelihood:
         return best
     return _refined(moved, base) if again else moved

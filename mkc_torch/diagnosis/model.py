@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -10,47 +10,86 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.drivers import Driver
-from mkc_torch.effects.protocol import Context, Effect, GainEffect, Shape, SignalEffect
+from mkc_torch.effects.protocol import BoundedEffect, Context, Effect, GainEffect, Shape, SignalEffect
 from mkc_torch.nonlinear import GaussianPrior
-from mkc_torch.simulation.protocol import PreparedSimulation
+from mkc_torch.simulation.protocol import Change, Changes, Port, PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["JointModel", "Term", "directions", "follows_signal", "port_jacobian", "through_port"]
+__all__ = [
+    "JointModel",
+    "Key",
+    "Term",
+    "context_at",
+    "directions",
+    "follows_signal",
+    "one_sided",
+    "port_jacobian",
+    "summed",
+    "through_port",
+    "with_constant",
+]
 
 _CHUNK = 64
+
+Key = tuple[str, tuple[str, ...], str]
+"""Of a candidate, whatever its shape: the effect's id, its columns and its port."""
 
 
 @dataclass(frozen=True)
 class Term:
-    """An effect with its driver (None for time or the signal alone) and its shape."""
+    """An effect with its driver (None for time or the signal alone), its shape, and its port where it has a choice."""
 
     effect: Effect
     driver: Driver | None
     shape: Shape
+    at: str = ""
 
     @property
     def columns(self) -> tuple[str, ...]:
         return () if self.driver is None else self.driver.columns
 
     @property
-    def key(self) -> tuple[str, tuple[str, ...]]:
+    def port(self) -> str:
+        """The port where it acts."""
+        return self.at or self.effect.port
+
+    @property
+    def key(self) -> Key:
         """What it is, whatever its shape."""
-        return self.effect.id, self.columns
+        return self.effect.id, self.columns, self.port
 
     def context(self, prepared: PreparedSimulation, signal: Tensor | None) -> Context:
         """What the effect sees."""
-        port = prepared.ports[self.effect.port]
-        time = prepared.time
-        values = time.new_zeros(len(time), 0) if self.driver is None else self.driver.values
-        units = () if self.driver is None else self.driver.units
+        port = prepared.ports[self.port]
+        time = prepared.time if port.clock is None else port.clock.time
+        values = time.new_zeros(len(time), 0)
+        units: tuple[str, ...] = ()
+        if self.driver is not None:
+            values, units = self.driver.values, self.driver.units
+            values = port.at(values)
         if signal is None:
             signal = time.new_zeros(len(time), len(port.channels))
-        return Context(time, values, units, signal, port.unit, port.channels)
+        return context_at(port, time, values, units, signal)
 
     def size(self, context: Context) -> int:
         return sum(quantity.size for quantity in self.effect.quantities(self.shape, context))
+
+
+def context_at(port: Port, time: Tensor, drivers: Tensor, units: tuple[str, ...], signal: Tensor) -> Context:
+    """What an effect sees at a port."""
+    return Context(
+        time,
+        drivers,
+        units,
+        signal,
+        port.unit,
+        port.channels,
+        port.carries,
+        port.parts,
+        port.part_units,
+    )
 
 
 class JointModel:
@@ -65,8 +104,7 @@ class JointModel:
         self.prepared = prepared
         self.terms = tuple(terms)
         self.base = len(prepared.parameter_names)
-        signals = prepared.signals(prepared.start())
-        self.sizes = tuple(t.size(t.context(prepared, signals.get(t.effect.port))) for t in self.terms)
+        self.sizes = tuple(t.size(t.context(prepared, None)) for t in self.terms)
 
     @property
     def size(self) -> int:
@@ -89,16 +127,37 @@ class JointModel:
         """Of the effects, in their order."""
         return torch.split(parameters[self.base :], list(self.sizes)) if self.terms else ()
 
-    def changes(self, parameters: Float[Tensor, " p"]) -> dict[str, Tensor]:
+    @property
+    def bounds(self) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"]] | None:
+        """Of the simulation's own parameters; the effects' are free."""
+        known = self.prepared.bounds
+        if known is None or not self.terms:
+            return known
+        free = known[0]
+        least = [
+            free.new_full((size,), limits(term.effect)[0]) for term, size in zip(self.terms, self.sizes, strict=True)
+        ]
+        most = [
+            free.new_full((size,), limits(term.effect)[1]) for term, size in zip(self.terms, self.sizes, strict=True)
+        ]
+        return torch.cat([known[0], *least]), torch.cat([known[1], *most])
+
+    def changes(self, parameters: Float[Tensor, " p"]) -> dict[str, Change]:
         """What the effects add at each port."""
-        signals = self.prepared.signals(parameters[: self.base]) if self.terms else {}
-        total: dict[str, Tensor] = {}
+        total: dict[str, Change] = {}
         for term, gamma in zip(self.terms, self.gammas(parameters), strict=True):
-            port = term.effect.port
-            context = term.context(self.prepared, signals.get(port))
-            change = term.effect.change(gamma, term.shape, context)
-            total[port] = total[port] + change if port in total else change
+            total[term.port] = summed(total.get(term.port), self._change(term, gamma))
         return total
+
+    def _change(self, term: Term, gamma: Tensor) -> Change:
+        def change(signal: Tensor) -> Tensor:
+            return term.effect.change(gamma, term.shape, term.context(self.prepared, signal))
+
+        return change
+
+    def signals(self, parameters: Float[Tensor, " p"]) -> Mapping[str, Tensor]:
+        """What passes through each port, with the effects in it."""
+        return self.prepared.signals(parameters[: self.base], self.changes(parameters))
 
     def residual(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, "N m"]:
         """Recording less prediction."""
@@ -118,17 +177,39 @@ def port_jacobian(model: JointModel, parameters: Float[Tensor, " p"], port: str)
     known = model.prepared.ports[port]
     N = len(model.prepared.time)
     zero = parameters.new_zeros(N, len(known.channels))
-    held = changes.get(port, zero)
 
     def residual(change: Tensor) -> Tensor:
-        return model.prepared.residual(parameters[: model.base], {**changes, port: change})
+        return model.prepared.residual(parameters[: model.base], with_constant(changes, port, change))
 
     columns = []
     for k in range(len(known.channels)):
         direction = torch.zeros_like(zero)
         direction[:, k] = 1.0
-        columns.append(torch.func.jvp(residual, (held + zero,), (direction,))[1])
+        columns.append(torch.func.jvp(residual, (zero,), (direction,))[1])
     return torch.stack(columns, -1)
+
+
+def summed(one: Change | None, other: Change) -> Change:
+    """Two changes at one port."""
+    if one is None:
+        return other
+    first = one
+    return lambda signal: first(signal) + other(signal)
+
+
+def with_constant(changes: Changes, port: str, change: Float[Tensor, "N c"]) -> Changes:
+    """The same with a change at a port that does not depend on its signal."""
+    return {**changes, port: summed(changes.get(port), lambda _: change)}
+
+
+def limits(effect: Effect) -> tuple[float, float]:
+    """Least and greatest value of an effect's γ."""
+    return (effect.least, effect.most) if isinstance(effect, BoundedEffect) else (-torch.inf, torch.inf)
+
+
+def one_sided(effect: Effect) -> bool:
+    """Whether an effect's γ cannot be negative."""
+    return limits(effect)[0] >= 0.0
 
 
 def follows_signal(effect: Effect) -> bool:
@@ -138,7 +219,7 @@ def follows_signal(effect: Effect) -> bool:
 
 def directions(term: Term, context: Context) -> Float[Tensor, "N c q"]:
     """How an effect's change at its port grows with γ at γ = 0, by forward mode."""
-    if isinstance(term.effect, GainEffect):
+    if isinstance(term.effect, GainEffect) and type(term.effect).change is GainEffect.change:
         # a gain on a course: the derivative is the course, channel by channel
         eye = torch.eye(len(context.channels), dtype=context.signal.dtype)
         return term.effect.course(term.shape, context)[:, None, None] * eye
@@ -157,12 +238,12 @@ def through_port(
     if pointwise is not None:
         return torch.einsum("nmc,ncq->nmq", pointwise, courses)
     changes = model.changes(parameters)
-    held = changes.get(port, torch.zeros_like(courses[..., 0]))
+    zero = torch.zeros_like(courses[..., 0])
 
     def residual(change: Tensor) -> Tensor:
-        return model.prepared.residual(parameters[: model.base], {**changes, port: change})
+        return model.prepared.residual(parameters[: model.base], with_constant(changes, port, change))
 
     def push(direction: Tensor) -> Tensor:
-        return torch.func.jvp(residual, (held,), (direction,))[1]
+        return torch.func.jvp(residual, (zero,), (direction,))[1]
 
     return torch.vmap(push, in_dims=-1, out_dims=-1, chunk_size=_CHUNK)(courses)

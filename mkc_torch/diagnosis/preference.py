@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.drivers import ANY, Driver
-from mkc_torch.diagnosis.model import Term
+from mkc_torch.diagnosis.model import Term, follows_signal
 from mkc_torch.effects.protocol import GainEffect
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -52,7 +52,7 @@ class Preference:
         fixed, share = NAMELESS if term.effect.id == UNKNOWN else (0.0, 0.0)
         if term.driver is not None and term.driver.role == ANY:
             share += FOLLOWER if self._alike(term.driver.values[:, 0]) > ALIKE_COLUMNS else ROLELESS
-        elif term.driver is None and isinstance(term.effect, GainEffect):
+        elif term.driver is None and isinstance(term.effect, GainEffect) and not follows_signal(term.effect):
             course = term.effect.course(term.shape, term.context(self._prepared, None))
             share += EVENT if self._alike(course) > ALIKE_EVENT else 0.0
         return fixed + share * max(gain, 0.0)

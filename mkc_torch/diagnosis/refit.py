@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -16,9 +16,10 @@ from mkc_torch.order_statistic import robust_scale
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FittedModel", "clipped_residual", "fitted"]
+__all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_beside"]
 
 _CLIP = 2.0
+_SHARES = (1.0, 0.3, 0.1, 0.01, 0.0)
 
 
 @dataclass(frozen=True)
@@ -66,10 +67,12 @@ def fitted(
     """
     found = nonlinear.fit(
         model.residual,
-        start,
+        _usable(model, start),
         bound=bound,
         weight=rows,
         prior=model.prior,
+        lower=None if model.bounds is None else model.bounds[0],
+        upper=None if model.bounds is None else model.bounds[1],
         graduate=graduate,
         covariance=None,
         max_iter=60,
@@ -85,6 +88,28 @@ def fitted(
         found.weights,
         float(found.log_likelihood) * len(model.prepared.time),
     )
+
+
+def fitted_beside(
+    base: FittedModel, model: JointModel, start: Float[Tensor, " p"], *, graduate: bool = True
+) -> FittedModel:
+    """A model with one more effect on the domain of a fit without it; that fit, where the effect has no answer."""
+    try:
+        return fitted(model, start, base.bound, graduate=graduate)
+    except ValueError:
+        none = base.parameters.new_zeros(model.size - base.model.size)
+        return replace(base, model=model, parameters=torch.cat([base.parameters, none]))
+
+
+def _usable(model: JointModel, start: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
+    """The start, its effects made smaller where the simulation with them has no finite answer."""
+    if not model.terms:
+        return start
+    for share in _SHARES:
+        smaller = torch.cat([start[: model.base], share * start[model.base :]])
+        if bool(model.residual(smaller).isfinite().all()):
+            return smaller
+    return start
 
 
 def clipped_residual(residual: Float[Tensor, "N m"]) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.drivers import Driver
 from mkc_torch.diagnosis.evidence import HeldOutBlocks
-from mkc_torch.diagnosis.model import JointModel, port_jacobian, through_port
+from mkc_torch.diagnosis.model import JointModel, port_jacobian, through_port, with_constant
 from mkc_torch.diagnosis.noise import cosines
+from mkc_torch.simulation.protocol import Port
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -103,6 +104,14 @@ class _Around:
         }
         return cls(model, parameters, torch.func.jacfwd(model.residual)(parameters), pointwise)
 
+    @property
+    def ports(self) -> dict[str, Port]:
+        """Those where curves can enter, each place once."""
+        places: dict[tuple[tuple[str, ...], str], str] = {}
+        for name, port in self.model.prepared.ports.items():
+            places.setdefault((port.channels, port.unit), name)
+        return {name: self.model.prepared.ports[name] for name in places.values()}
+
     def backward(self, port: str, left: Float[Tensor, "N m"]) -> Float[Tensor, "N c"]:
         """What residuals say of a change at a port, by reverse mode where it is not pointwise."""
         known = self.pointwise[port]
@@ -112,7 +121,7 @@ class _Around:
         zero = left.new_zeros(len(left), len(prepared.ports[port].channels))
 
         def residual(change: Tensor) -> Tensor:
-            held = {**changes, port: changes.get(port, 0.0) + change}
+            held = with_constant(changes, port, prepared.ports[port].at(change))
             return prepared.residual(self.parameters[: self.model.base], held)
 
         pulled: Tensor = torch.func.vjp(residual, zero)[1](left)[0]
@@ -134,7 +143,8 @@ def smooth_tangents(
         weights: of the residuals, over the squares of their scales.
         blocks: without each fold of which the columns are chosen anew, where they are too many.
     """
-    around, ports = _Around.of(model, parameters), model.prepared.ports
+    around = _Around.of(model, parameters)
+    ports = around.ports
     own, width = around.own.shape[-1], sum(len(port.channels) for port in ports.values())
     room = (MOST_COLUMNS - own - COURSES * width) // (DEGREE * width)
     allowed = _promising(around, curves, weights, blocks, max(room, 1))
@@ -145,7 +155,8 @@ def smooth_tangents(
     for port in ports:
         c = len(ports[port].channels)
         courses = joined[:, None, :, None] * torch.eye(c, dtype=joined.dtype)[:, None, :]
-        tangents.append(through_port(model, parameters, port, courses.flatten(2), around.pointwise[port]))
+        entering = ports[port].at(courses.flatten(2))
+        tangents.append(through_port(model, parameters, port, entering, around.pointwise[port]))
         for name in names:
             degree = torch.arange(curves[name].shape[-1], dtype=joined.dtype)
             groups.append(torch.arange(start, start + c * len(degree)))
@@ -188,7 +199,7 @@ def _scores(
     """The square of what is left beside the parameters, along the curves of each column, over all ports."""
     left = [_left(around, one) for one in weights]
     total = basis.new_zeros(len(weights), len(basis))
-    for port in around.pointwise:
+    for port in around.ports:
         back = torch.stack([around.backward(port, one) for one in left])
         # ports have units of their own
         back = back / back.square().mean((1, 2), keepdim=True).sqrt().clamp(min=_TINY)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from mkc_torch.effects.cubic_nonlinearity import CubicNonlinearity
 from mkc_torch.effects.current_field import CurrentField
 from mkc_torch.effects.driver_offset import DriverOffset
+from mkc_torch.effects.dynamics import DYNAMICS
 from mkc_torch.effects.field_gradient import FieldGradient
 from mkc_torch.effects.hard_iron_step import HardIronStep
 from mkc_torch.effects.offset_drift import OffsetDrift
@@ -29,6 +30,8 @@ from mkc_torch.effects.unknown import Unknown
 
 __all__ = [
     "CATALOGUE",
+    "DYNAMICS",
+    "SENSOR",
     "AnchoredEffect",
     "Context",
     "ContinuousEffect",
@@ -40,7 +43,7 @@ __all__ = [
     "SignalEffect",
 ]
 
-CATALOGUE: tuple[Effect, ...] = (
+SENSOR: tuple[Effect, ...] = (
     HardIronStep(),
     OffsetDrift(),
     TemperatureOffset(),
@@ -50,4 +53,7 @@ CATALOGUE: tuple[Effect, ...] = (
     DriverOffset(),
     Unknown(),
 )
-"""The effects that a diagnosis tries."""
+"""The effects that a diagnosis of a sensor tries."""
+
+CATALOGUE: tuple[Effect, ...] = (*SENSOR, *DYNAMICS)
+"""All effects; each is tried where a simulation has its port."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -14,12 +14,16 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AnchoredEffect",
+    "BoundedEffect",
+    "ChoosyEffect",
     "Context",
     "ContinuousEffect",
     "Effect",
     "GainEffect",
     "LastingEffect",
+    "PartEffect",
     "Quantity",
+    "RelativeEffect",
     "Shape",
     "SignalEffect",
 ]
@@ -37,8 +41,11 @@ class Context:
         drivers: (N, k), in the recording's units, less their means over the recording that was diagnosed.
         units: of the drivers.
         signal: (N, c), what passes through the port.
-        signal_unit: its unit.
-        channels: its components' names.
+        signal_unit: the unit of what is added to it.
+        channels: names of the components that are added to; of the signal's too, where ``carries`` is empty.
+        carries: names of the signal's components, where they are more than what is added to.
+        parts: what components of the signal are to each other, such as ``{"own": "speed", "position": "angle"}``.
+        part_units: of the parts.
     """
 
     time: Float[Tensor, " N"]
@@ -47,6 +54,21 @@ class Context:
     signal: Float[Tensor, "N c"]
     signal_unit: str
     channels: tuple[str, ...]
+    carries: tuple[str, ...] = ()
+    parts: Mapping[str, str] = field(default_factory=dict)
+    part_units: Mapping[str, str] = field(default_factory=dict)
+
+    def part(self, name: str) -> Float[Tensor, " N"]:
+        """The component of the signal that is this part."""
+        return self.component(self.parts[name])
+
+    def component(self, name: str) -> Float[Tensor, " N"]:
+        """The component of the signal that is called this."""
+        return self.signal[:, (self.carries or self.channels).index(name)]
+
+    def unit_of(self, part: str) -> str:
+        """The unit of a part; empty where it is not known."""
+        return self.part_units.get(part, "")
 
 
 class Quantity(NamedTuple):
@@ -116,6 +138,56 @@ class SignalEffect(Effect, Protocol):
 
     @property
     def follows_signal(self) -> bool: ...
+
+
+@runtime_checkable
+class BoundedEffect(Effect, Protocol):
+    """An effect whose γ is bounded, as that of a drag, which cannot be negative; one without these attributes is free.
+
+    Attributes:
+        least, most: of each number of γ.
+    """
+
+    @property
+    def least(self) -> float: ...
+    @property
+    def most(self) -> float: ...
+
+
+@runtime_checkable
+class ChoosyEffect(Effect, Protocol):
+    """An effect that is not tried at every port of its kind.
+
+    Attributes:
+        needs: parts that the port must have.
+    """
+
+    @property
+    def needs(self) -> tuple[str, ...]: ...
+
+
+@runtime_checkable
+class RelativeEffect(Effect, Protocol):
+    """An effect whose grid of shapes is in shares of how large a part of the signal is.
+
+    Attributes:
+        relative: name of a number in its shapes to the part, and "typical" or "largest".
+    """
+
+    @property
+    def relative(self) -> Mapping[str, tuple[str, str]]: ...
+
+
+@runtime_checkable
+class PartEffect(Effect, Protocol):
+    """An effect that mainly follows one part of the signal, along which its curve is drawn.
+
+    Attributes:
+        along: the part.
+    """
+
+    @property
+    def along(self) -> str: ...
 
 
 @runtime_checkable
@@ -224,7 +296,9 @@ def lagged(values: Float[Tensor, " N"], time: Float[Tensor, " N"], lag: float) -
     """
     if lag <= 0:
         return values
-    first, decay = values[0], torch.exp(-time.diff().clamp(min=0.0) / lag)
+    step = time.diff()
+    # where time goes back, another run begins, at rest
+    first, decay = values[0], torch.where(step < 0, 0.0, torch.exp(-step.clamp(min=0.0) / lag))
     decay = torch.cat([decay.new_zeros(1), decay])
     level = (1.0 - decay) * (values - first)
     # y[k] = decay[k] y[k-1] + level[k], a prefix composition of affine maps by doubling

@@ -1,6 +1,19 @@
 """Simulations: what predicts a recording, with ports through which an effect can act on it."""
 
+from mkc_torch.simulation.dynamics import Dynamics, Parameter, SimulationError
+from mkc_torch.simulation.load import SimulationFileError, load_simulation
 from mkc_torch.simulation.magnetometer import Magnetometer
 from mkc_torch.simulation.protocol import Correction, Port, PreparedSimulation, Simulation
 
-__all__ = ["Correction", "Magnetometer", "Port", "PreparedSimulation", "Simulation"]
+__all__ = [
+    "Correction",
+    "Dynamics",
+    "Magnetometer",
+    "Parameter",
+    "Port",
+    "PreparedSimulation",
+    "Simulation",
+    "SimulationError",
+    "SimulationFileError",
+    "load_simulation",
+]

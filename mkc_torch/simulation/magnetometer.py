@@ -107,6 +107,7 @@ class _View:
 
     name = "magnetometer"
     view: str
+    bounds: tuple[Tensor, Tensor] | None = None
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
@@ -121,7 +122,7 @@ class _View:
         known = self.recording.time
         return torch.arange(len(self.recording), dtype=torch.float64) if known is None else known
 
-    def signals(self, theta: Float[Tensor, " p"]) -> Mapping[str, Float[Tensor, "N 3"]]:
+    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Float[Tensor, "N 3"]]:  # noqa: ARG002
         """At the port "sensor", the simulated field as the sensor's own axes and gains show it."""
         # not the measured one: its noise is the residual's too, and would pass for a nonlinearity
         return {"sensor": self.simulated(theta)}
@@ -138,8 +139,13 @@ class _View:
         """The calibrated field, once ``sensor`` is taken off the measurement."""
         return (self.measured - sensor - theta[:3]) @ self.matrix(theta).mT
 
-    def _sensor_change(self, changes: Changes) -> Tensor:
-        return changes.get("sensor", self.measured.new_zeros(()))
+    def _sensor_change(self, theta: Tensor, changes: Changes) -> Tensor:
+        nothing = self.measured.new_zeros(())
+        return changes["sensor"](self.simulated(theta)) if "sensor" in changes else nothing
+
+    def _field_change(self, changes: Changes) -> Tensor:
+        nothing = self.measured.new_zeros(())
+        return changes["field"](self.measured.new_zeros(len(self.measured), 0)) if "field" in changes else nothing
 
     def _ellipsoid(self, rows: Tensor | None) -> EllipsoidFit:
         points = self.measured if rows is None else self.measured[rows]
@@ -176,10 +182,10 @@ class NormView(_View):
         return torch.cat([fit.center_, torch.stack([matrix[i, j] for i, j in _SYMMETRIC])])
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 1"]:
-        field = self.corrected(theta, self._sensor_change(changes))
+        field = self.corrected(theta, self._sensor_change(theta, changes))
         length = torch.linalg.vector_norm(field, dim=-1, keepdim=True)
         steepness = torch.linalg.vector_norm(field @ self.matrix(theta), dim=-1, keepdim=True) / length
-        return (length - self.strength - changes.get("field", 0.0)) / steepness
+        return (length - self.strength - self._field_change(changes)) / steepness
 
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
         away = self.measured - theta[:3]
@@ -252,9 +258,9 @@ class AttitudeView(_View):
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
         # the simulated vector, not the measured one, goes through the matrix: the noise of what a matrix is fitted to
         # would shrink it. A fixed matrix takes the difference back into the world.
-        left = self.measured - self._sensor_change(changes) - theta[:3] - self.simulated(theta)
+        left = self.measured - self._sensor_change(theta, changes) - theta[:3] - self.simulated(theta)
         world = torch.einsum("kij,kj->ki", self.to_world, left @ self._unbent.mT)
-        return (world - changes.get("field", 0.0)) @ self._frame.mT
+        return (world - self._field_change(changes)) @ self._frame.mT
 
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
         field = torch.einsum("kij,i->kj", self.to_world, self.ambient(theta))
@@ -323,11 +329,11 @@ class GyroView(_View):
         return torch.cat([fit.center_, torch.stack([matrix[i, j] for i, j in _SYMMETRIC]), fit.center_.new_zeros(3)])
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
-        field = self.corrected(theta, self._sensor_change(changes))
+        field = self.corrected(theta, self._sensor_change(theta, changes))
         along = self._steadied(theta, field)
         middle = self._window_mean(along, self._weights(along.detach()))
         direction = middle / torch.linalg.vector_norm(middle, dim=-1, keepdim=True)
-        ambient = (self.strength + changes.get("field", 0.0)) * direction[self.window]
+        ambient = (self.strength + self._field_change(changes)) * direction[self.window]
         frame = _frame(direction.detach())[self.window]
         return torch.einsum("kij,kj->ki", frame, along - ambient)
 
@@ -378,11 +384,11 @@ class MagnetometerCorrection:
         self.time = torch.arange(len(recording), dtype=torch.float64) if known is None else known
         self.ports = {"sensor": Port(_AXES, recording.units["mag_x"])}
 
-    def signals(self, theta: Float[Tensor, " p"]) -> Mapping[str, Float[Tensor, "N 3"]]:
-        return {"sensor": self.measured - theta[:3]}
-
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
-        field = (self.measured - changes.get("sensor", 0.0) - theta[:3]) @ self._matrix(theta).mT
+        away = self.measured - theta[:3]
+        if "sensor" in changes:
+            away = away - changes["sensor"](away)
+        field = away @ self._matrix(theta).mT
         time = {} if self.recording.time is None else {"time": self.recording.time}
         return time | dict(zip(("field_x", "field_y", "field_z"), field.unbind(-1), strict=True))
 

@@ -2,21 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
+import torch
 from torch import Tensor
 
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.recording import Recording
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
-__all__ = ["Correction", "Port", "PreparedSimulation", "Simulation"]
+__all__ = ["Change", "Changes", "Clock", "Correction", "Port", "PreparedSimulation", "Simulation"]
 
-Changes = Mapping[str, Tensor]
+Change = Callable[[Tensor], Tensor]
+"""What effects add at a port, (N, c), as a function of the signal that passes through it."""
+
+Changes = Mapping[str, Change]
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The moments at which a port's signal is simulated, G of them, where they are not the recording's samples.
+
+    Attributes:
+        time: (G,) in s.
+        before, after: (G,), the samples that a moment lies between.
+        share: (G,), how far it is from the one to the other, 0 to 1.
+    """
+
+    time: Float[Tensor, " G"]
+    before: Int[Tensor, " G"]
+    after: Int[Tensor, " G"]
+    share: Float[Tensor, " G"]
+
+    def at(self, values: Float[Tensor, N * rest]) -> Float[Tensor, G * rest]:
+        """Values of the samples, at these moments."""
+        share = self.share.reshape(-1, *[1] * (values.dim() - 1))
+        return torch.lerp(values[self.before], values[self.after], share)
 
 
 @dataclass(frozen=True)
@@ -24,16 +49,31 @@ class Port:
     """A place in a simulation where an effect adds to a signal.
 
     Attributes:
-        channels: what the signal's components are called.
-        unit: of the signal.
+        channels: what the components are called that are added to.
+        unit: of what is added.
         wanders: whether noise that wanders in time may enter here too; the noise model allows for it then.
         pointwise: whether a change of one sample changes the residual of that sample alone.
+        kind: an effect is tried at every port of its kind; default the port's own name.
+        carries: the components of the signal that passes; default the channels.
+        parts: what components of the signal are to each other, such as ``{"own": "speed", "position": "angle"}``.
+        part_units, sizes: of the parts; a size is a typical and the largest absolute value.
+        clock: when; None for the recording's samples.
     """
 
     channels: tuple[str, ...]
     unit: str
     wanders: bool = False
     pointwise: bool = True
+    kind: str = ""
+    carries: tuple[str, ...] = ()
+    parts: Mapping[str, str] = field(default_factory=dict)
+    part_units: Mapping[str, str] = field(default_factory=dict)
+    sizes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    clock: Clock | None = None
+
+    def at(self, values: Float[Tensor, N * rest]) -> Float[Tensor, G * rest]:
+        """Values of the samples, at the moments of this port's signal."""
+        return values if self.clock is None else self.clock.at(values)
 
 
 class PreparedSimulation(Protocol):
@@ -44,6 +84,7 @@ class PreparedSimulation(Protocol):
         channels, unit: of the residual.
         parameter_names: of the p parameters.
         prior: what is known of the parameters beforehand; None if nothing.
+        bounds: least and greatest values of the parameters, (p,) each; None if all are free.
         recording: the samples in use, in the order of time.
         time: in s; the sample's number where the recording has no time.
         ports: where effects can act.
@@ -63,6 +104,8 @@ class PreparedSimulation(Protocol):
     def parameter_names(self) -> tuple[str, ...]: ...
     @property
     def prior(self) -> GaussianPrior | None: ...
+    @property
+    def bounds(self) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"]] | None: ...
     @property
     def recording(self) -> Recording: ...
     @property
@@ -85,10 +128,10 @@ class PreparedSimulation(Protocol):
         ...
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
-        """Recording less prediction, with ``changes[port]`` (N, channels of the port) added at the ports."""
+        """Recording less prediction, with ``changes[port](signal)`` added to what passes through the ports."""
         ...
 
-    def signals(self, theta: Float[Tensor, " p"]) -> Mapping[str, Float[Tensor, "N c"]]:
+    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Float[Tensor, "G k"]]:
         """What passes through each port: what an effect that depends on the signal is a function of."""
         ...
 
@@ -105,10 +148,6 @@ class Correction(Protocol):
     def time(self) -> Float[Tensor, " N"]: ...
     @property
     def ports(self) -> Mapping[str, Port]: ...
-
-    def signals(self, theta: Float[Tensor, " p"]) -> Mapping[str, Float[Tensor, "N c"]]:
-        """What passes through each port."""
-        ...
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
         """The corrected columns, with ``changes`` taken off."""

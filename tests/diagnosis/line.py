@@ -16,6 +16,7 @@ class Line:
     independent = (True, True)
     parameter_names = ("level", "slope")
     warnings = ()
+    bounds = None
     state = {}  # noqa: RUF012
     ports = {  # noqa: RUF012
         "mixed": Port(("a", "b", "c"), "mV", wanders=True),
@@ -37,12 +38,12 @@ class Line:
     def residual(self, theta, changes):
         left = self.measured - (theta[0] + theta[1] * self.time).unsqueeze(-1)
         if "mixed" in changes:
-            left = left - torch.einsum("nmc,nc->nm", self.mixing, changes["mixed"])
+            left = left - torch.einsum("nmc,nc->nm", self.mixing, changes["mixed"](self.signals(theta)["mixed"]))
         if "summed" in changes:
-            left = left - changes["summed"].cumsum(0) / len(self.time)
+            left = left - changes["summed"](self.time.new_zeros(len(self.time), 1)).cumsum(0) / len(self.time)
         return left
 
-    def signals(self, theta):
+    def signals(self, theta, changes=None):  # noqa: ARG002
         level = theta[0] + theta[1] * self.time
         return {"mixed": torch.stack([level, 2.0 * level, level.square()], -1)}
 

@@ -18,7 +18,7 @@ def gains(ratio):
     return Gains(ratio, log_survival(ratio, DOF.unsqueeze(-1)), DOF)
 
 
-def judged(own, tried):
+def judged(own, tried, possible=None):
     drawn = torch.distributions.Chi2(torch.tensor(3.0).double())
     torch.manual_seed(0)
     noise = drawn.sample((2, DRAWS))
@@ -28,13 +28,19 @@ def judged(own, tried):
         gains=lambda _series: gains(noise),
     )
     linearised = SimpleNamespace(entering=lambda _count, _generator: None, search=search)
-    return _judged(linearised, None, gains([[own[0]], [own[1]]]), tried, DRAWS, None)
+    possible = torch.ones(tried, dtype=torch.bool) if possible is None else torch.tensor(possible)
+    return _judged(linearised, None, gains([[own[0]], [own[1]]]), possible, DRAWS, None)
 
 
 def test_what_exceeds_all_draws_has_the_smallest_p_value_and_says_by_how_much():
     p_value, beyond = judged((100.0, 1.0), tried=2)
     assert p_value == pytest.approx(1.0 / (1 + DRAWS))
     assert beyond > 10.0
+
+
+def test_an_amplitude_of_an_impossible_sign_does_not_count():
+    assert judged((100.0, 1.0), 2, possible=(False, True))[0] > 0.3
+    assert judged((100.0, 1.0), 2, possible=(False, False))[0] == 1.0
 
 
 def test_a_shape_closed_in_on_is_left_out():

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.drivers import Driver
-from mkc_torch.diagnosis.model import JointModel, Term, directions, port_jacobian, through_port
+from mkc_torch.diagnosis.model import JointModel, Term, directions, port_jacobian, through_port, with_constant
 from mkc_torch.effects import CATALOGUE, GainEffect
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.line import Line, diagonal_prior, full_prior
@@ -59,12 +59,12 @@ PARAMETERS = torch.tensor([0.9, 0.6, 0.1, -0.2, 0.3, 0.01, 0.02, -0.03, 0.5], dt
 def test_terms_say_what_they_are(driver):
     term = Term(Mixed(), driver, {"more": 1.0})
     assert term.columns == ("load",)
-    assert term.key == ("mixed_offset", ("load",)) == Term(Mixed(), driver, {"more": 2.0}).key
+    assert term.key == ("mixed_offset", ("load",), "mixed") == Term(Mixed(), driver, {"more": 2.0}).key
     assert Term(Cubic(), None, {}).columns == ()
 
 
 def test_effects_see_their_port(line, driver):
-    signal = line.signals(line.start())["mixed"]
+    signal = line.signals(line.start(), {})["mixed"]
     context = Term(Mixed(), driver, {}).context(line, signal)
     assert torch.equal(context.time, line.time)
     assert torch.equal(context.drivers, driver.values)
@@ -88,8 +88,8 @@ def test_changes_at_one_port_add_up(model, line, driver):
     signal = torch.stack([level, 2.0 * level, level.square()], -1)
     first = driver.values * torch.tensor([0.1, -0.2, 0.3]).double()
     second = signal.pow(3) * torch.tensor([0.01, 0.02, -0.03]).double()
-    torch.testing.assert_close(changes["mixed"], first + second)
-    torch.testing.assert_close(changes["summed"], 0.5 * line.time.unsqueeze(-1))
+    torch.testing.assert_close(changes["mixed"](signal), first + second)
+    torch.testing.assert_close(changes["summed"](line.time.new_zeros(100, 1)), 0.5 * line.time.unsqueeze(-1))
     assert JointModel(line).changes(PARAMETERS[:2]) == {}
 
 
@@ -138,11 +138,10 @@ def test_directions_are_how_the_change_grows(line, driver):
 def by_differences(model, parameters, port, courses, step=1e-5):
     """Residual tangents of changes at a port, by central differences around what the effects add there."""
     prepared, changes = model.prepared, model.changes(parameters)
-    held = changes.get(port, torch.zeros_like(courses[..., 0]))
     columns = []
     for k in range(courses.shape[-1]):
         ends = [
-            prepared.residual(parameters[: model.base], {**changes, port: held + sign * step * courses[..., k]})
+            prepared.residual(parameters[: model.base], with_constant(changes, port, sign * step * courses[..., k]))
             for sign in (1.0, -1.0)
         ]
         columns.append((ends[0] - ends[1]) / (2.0 * step))

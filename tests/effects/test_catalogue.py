@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mkc_torch.effects import (
-    CATALOGUE,
+    SENSOR,
     AnchoredEffect,
     ContinuousEffect,
     GainEffect,
@@ -43,7 +43,7 @@ def some_shapes(effect, context):
 
 
 def cases():
-    for effect in CATALOGUE:
+    for effect in SENSOR:
         for channels in (("x", "y", "z"), ("strength",)):
             context = make_context(effect, channels=channels)
             for k, shape in enumerate(some_shapes(effect, context)):
@@ -54,7 +54,7 @@ CASES = list(cases())
 
 
 def test_ids_are_the_contract():
-    assert tuple(effect.id for effect in CATALOGUE) == IDS
+    assert tuple(effect.id for effect in SENSOR) == IDS
 
 
 @pytest.mark.parametrize(("effect", "shape", "context"), CASES)
@@ -89,7 +89,7 @@ def test_forward_tangents_are_finite_differences(effect, shape, context):
     assert bool((tangent.flatten(0, 1).abs().sum(0) > 0).all())
 
 
-@pytest.mark.parametrize("effect", [e for e in CATALOGUE if e.id in QUANTITIES], ids=lambda e: e.id)
+@pytest.mark.parametrize("effect", [e for e in SENSOR if e.id in QUANTITIES], ids=lambda e: e.id)
 def test_quantities_have_their_names_and_units(effect):
     context = make_context(effect)
     for shape in effect.shapes(context.time):
@@ -100,7 +100,7 @@ def test_units_of_drivers_without_a_unit():
     assert (per("µT", ""), per("µT", "°C"), per("counts", "A")) == ("µT", "µT/K", "counts/A")
 
 
-@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.id)
+@pytest.mark.parametrize("effect", SENSOR, ids=lambda e: e.id)
 def test_users_are_told_what_it_is(effect):
     assert effect.equation.startswith(("δB", "B(p)"))
     for sentence in (effect.explanation, effect.advice):
@@ -113,7 +113,7 @@ def test_users_are_told_what_it_is(effect):
         assert heading in words
 
 
-@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.id)
+@pytest.mark.parametrize("effect", SENSOR, ids=lambda e: e.id)
 def test_plausible_sizes_are_those_of_the_first_edition(effect):
     known = {
         "hard_iron_step": 200.0, "offset_drift": 50.0, "temperature_offset": 5.0, "current_field": 20.0,
@@ -122,7 +122,7 @@ def test_plausible_sizes_are_those_of_the_first_edition(effect):
     assert effect.plausible == known[effect.id]
 
 
-@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.id)
+@pytest.mark.parametrize("effect", SENSOR, ids=lambda e: e.id)
 def test_continuous_numbers_stand_in_the_shapes(effect):
     numbers = {name for shape in effect.shapes(torch.linspace(0.0, 90.0, 100).double()) for name in shape}
     assert isinstance(effect, ContinuousEffect) == hasattr(effect, "continuous")
@@ -132,9 +132,9 @@ def test_continuous_numbers_stand_in_the_shapes(effect):
 
 
 def test_what_effects_can_do_beside():
-    lasting = {e.id for e in CATALOGUE if isinstance(e, LastingEffect)}
-    anchored = {e.id for e in CATALOGUE if isinstance(e, AnchoredEffect)}
-    continuous = {e.id for e in CATALOGUE if isinstance(e, ContinuousEffect)}
+    lasting = {e.id for e in SENSOR if isinstance(e, LastingEffect)}
+    anchored = {e.id for e in SENSOR if isinstance(e, AnchoredEffect)}
+    continuous = {e.id for e in SENSOR if isinstance(e, ContinuousEffect)}
     assert lasting == {"hard_iron_step", "offset_drift"}
     assert anchored == {"unknown"}
     assert continuous == {"hard_iron_step", "offset_drift", "temperature_offset"}

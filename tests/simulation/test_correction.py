@@ -37,8 +37,14 @@ def test_changes_are_taken_off_the_measurement():
     theta = symmetric_truth(STRENGTH)
     clean = MagnetometerCorrection({"view": "norm"}, tumbling(50)).corrected(theta, {})
     spoilt = MagnetometerCorrection({"view": "norm"}, tumbling(50, sensor=change))
-    torch.testing.assert_close(stacked(spoilt.corrected(theta, {"sensor": change})), stacked(clean))
-    torch.testing.assert_close(spoilt.signals(theta)["sensor"], spoilt.measured - torch.from_numpy(OFFSET))
+    torch.testing.assert_close(stacked(spoilt.corrected(theta, {"sensor": lambda _: change})), stacked(clean))
+
+
+def test_what_follows_the_signal_sees_the_measurement_less_its_offset():
+    theta, seen = symmetric_truth(STRENGTH), []
+    correction = MagnetometerCorrection({"view": "norm"}, tumbling(50))
+    correction.corrected(theta, {"sensor": lambda signal: seen.append(signal) or torch.zeros_like(signal)})
+    torch.testing.assert_close(seen[0], correction.measured - torch.from_numpy(OFFSET))
 
 
 def test_only_the_sensor_is_corrected():

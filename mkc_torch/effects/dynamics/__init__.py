@@ -1,0 +1,41 @@
+"""Effects on the rates, inputs and outputs of differential equations: one piece of physics a file."""
+
+from __future__ import annotations
+
+from mkc_torch.effects.dynamics.constant_force import ConstantForce
+from mkc_torch.effects.dynamics.coulomb_friction import CoulombFriction
+from mkc_torch.effects.dynamics.coupling import Coupling
+from mkc_torch.effects.dynamics.cubic_stiffness import CubicStiffness
+from mkc_torch.effects.dynamics.dead_zone import DeadZone
+from mkc_torch.effects.dynamics.hard_stop import HardStop
+from mkc_torch.effects.dynamics.input_delay import InputDelay
+from mkc_torch.effects.dynamics.input_saturation import InputSaturation
+from mkc_torch.effects.dynamics.linear_drag import LinearDrag
+from mkc_torch.effects.dynamics.overflow import Overflow
+from mkc_torch.effects.dynamics.position_periodic_force import PositionPeriodicForce
+from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
+from mkc_torch.effects.dynamics.sensor_lag import SensorLag
+from mkc_torch.effects.dynamics.stribeck_friction import StribeckFriction
+from mkc_torch.effects.dynamics.thermal_loss import ThermalLoss
+from mkc_torch.effects.protocol import Effect
+
+__all__ = ["DYNAMICS"]
+
+DYNAMICS: tuple[Effect, ...] = (
+    ConstantForce(),
+    LinearDrag(),
+    QuadraticDrag(),
+    CoulombFriction(),
+    StribeckFriction(),
+    CubicStiffness(),
+    PositionPeriodicForce(),
+    Coupling(),
+    HardStop(),
+    Overflow(),
+    ThermalLoss(),
+    InputDelay(),
+    InputSaturation(),
+    DeadZone(),
+    SensorLag(),
+)
+"""The effects that a diagnosis of differential equations tries."""

@@ -1,0 +1,38 @@
+"""A force that is always there."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.protocol import Context, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class ConstantForce(RateEffect):
+    """A constant push that the simulation lacks: a bias, a slope of the ground, weight that is not balanced.
+
+    Simulation: adds γ to the rate of a state.
+    Drivers: none.
+    Units: γ in the state's unit per s.
+    Plausible: any size, either sign.
+    Source: Newton's second law.
+    """
+
+    id = "constant_force"
+    least = -math.inf
+    gain = "push"
+    of = ""
+    equation = "δẋ = γ"
+    explanation = "Something pushes all the time."
+    advice = "Look for a bias of the actuator, a tilted base or an unbalanced weight."
+    source = "Newton's second law"
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+        return torch.ones_like(context.time)

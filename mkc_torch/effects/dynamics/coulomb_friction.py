@@ -1,0 +1,46 @@
+"""Dry friction."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.protocol import Context, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+WIDTHS = (0.3, 0.1, 0.03, 0.01)
+"""Of the smoothed sign, as shares of the typical speed."""
+
+
+class CoulombFriction(RateEffect):
+    """Dry friction: a force of one size against the motion, whatever the speed.
+
+    Simulation: adds ``−γ tanh(v / w)`` to the rate of a speed v; the width w, in the speed's unit, smooths the jump at
+    standstill, and is reported.
+    Drivers: none but the state.
+    Units: γ in the speed's unit per s; the shape ``width`` in the unit of what it is of.
+    Plausible: γ ≥ 0.
+    Source: Amontons and Coulomb; smoothing as in Andersson, Söderberg & Björklund, Tribology International 40 (2007).
+    """
+
+    id = "coulomb_friction"
+    relative: Mapping[str, tuple[str, str]] = {"width": ("own", "typical")}
+    needs = ("reversing",)  # at speeds of one sign it is a constant force
+    gain = "friction"
+    equation = "δv̇ = −γ tanh(v / w)"
+    explanation = "Dry friction holds against the motion with a force that does not depend on its speed."
+    advice = "Add dry friction of this size."
+    source = "Coulomb's law of friction; Andersson et al., Tribology International 40 (2007), for the smoothing"
+
+    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+        return tuple({"width": width} for width in WIDTHS)
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+        return -torch.tanh(context.part("own") / shape["width"])

@@ -1,0 +1,44 @@
+"""An exchange between two states."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.protocol import Context, Quantity, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class Coupling(RateEffect):
+    """Two states exchange: heat between bodies, fluid between tanks, force between masses.
+
+    Simulation: adds ``γ₁ (y − x)`` to the rate of a state x, and ``γ₂ (x − y)`` to that of y, a state in the same unit.
+    Drivers: none but the states.
+    Units: γ in 1/s.
+    Plausible: γ ≥ 0: exchange evens out.
+    Source: Fourier's and Fick's laws; Hooke's law between masses.
+    """
+
+    id = "coupling"
+    port = "exchange"
+    needs = ("own", "other")
+    gain = "exchange"
+    of = "other"
+    power = 1.0
+    equation = "δẋ = γ₁ (y − x),  δẏ = γ₂ (x − y)"
+    explanation = "The state exchanges with another one: the larger their difference, the faster they even out."
+    advice = "Couple the two with this coefficient."
+    source = "Fourier's law of conduction, Fick's law of diffusion"
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return (Quantity(self.gain, 2, "1/s"),)
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 2"]:  # noqa: ARG002
+        away = context.part("other") - context.part("own")
+        return torch.stack([gamma[0] * away, -gamma[1] * away], -1)

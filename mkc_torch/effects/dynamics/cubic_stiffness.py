@@ -1,0 +1,39 @@
+"""A spring that hardens or softens."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.protocol import Context, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class CubicStiffness(RateEffect):
+    """A spring that is not linear: harder or softer the farther it is stretched.
+
+    Simulation: adds ``−γ x³`` to the rate of the speed whose position is x.
+    Drivers: none but the position.
+    Units: γ in the speed's unit per s and position's unit cubed.
+    Plausible: either sign; negative for a spring that softens.
+    Source: Duffing, "Erzwungene Schwingungen bei veränderlicher Eigenfrequenz" (1918).
+    """
+
+    id = "cubic_stiffness"
+    needs = ("deflection",)
+    least = -math.inf
+    gain = "stiffness"
+    power = 3.0
+    of = "deflection"
+    equation = "δv̇ = −γ x³"
+    explanation = "The restoring force bends: the spring is harder, or softer, at large deflections."
+    advice = "Add a cubic spring with this coefficient."
+    source = "Duffing's oscillator"
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+        return -context.part("deflection").pow(3)

@@ -1,0 +1,51 @@
+"""An actuator that does not answer to small commands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.effects.protocol import Context, GainEffect, Quantity, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+WIDTHS = (0.03, 0.06, 0.1, 0.2, 0.3)
+"""As shares of the largest input."""
+
+
+class DeadZone(GainEffect):
+    """Small commands do nothing, and large ones lose as much: valves with overlap, play, sticking amplifiers.
+
+    Simulation: adds ``−γ clip(u, ±c)`` to an input; a γ of one is a full dead zone.
+    Drivers: none but the input.
+    Units: γ is a share; the shape ``width`` in the unit of what it is of.
+    Plausible: γ from 0 to 1.
+    Source: Khalil, "Nonlinear Systems" (2002), 1.2.7.
+    """
+
+    id = "dead_zone"
+    relative: Mapping[str, tuple[str, str]] = {"width": ("own", "largest")}
+    port = "input"
+    follows_signal = True
+    least, most = 0.0, 1.0
+    needs: tuple[str, ...] = ("own",)
+    plausible = 1.5
+    gain = "share"
+    along = "own"
+    equation = "δu = −γ clip(u, ±c)"
+    explanation = "Small commands have no effect: the actuator has a dead zone."
+    advice = "Take this much off every command."
+    source = "Khalil, Nonlinear Systems (2002), 1.2.7"
+
+    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+        return tuple({"width": width} for width in WIDTHS)
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return (Quantity(self.gain, 1, ""),)
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+        width = shape["width"]
+        return -context.part("own").clamp(-width, width)

@@ -1,0 +1,45 @@
+"""A vessel that runs over."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.protocol import Context, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+RIMS = (0.5, 0.65, 0.8, 0.9)
+"""As shares of the highest level."""
+
+
+class Overflow(RateEffect):
+    """Above the rim a vessel loses what comes in.
+
+    Simulation: adds ``−γ max(x − c, 0)`` to the rate of a level x.
+    Drivers: none but the state.
+    Units: γ in 1/s; the shape ``rim`` in the unit of what it is of.
+    Plausible: γ ≥ 0.
+    Source: flow over a weir, linearised; Henderson, "Open Channel Flow" (1966).
+    """
+
+    id = "overflow"
+    relative: Mapping[str, tuple[str, str]] = {"rim": ("own", "largest")}
+    needs = ("level",)
+    gain = "loss"
+    power = 1.0
+    equation = "δẋ = −γ max(x − c, 0)"
+    explanation = "Above a level something is lost, as when a vessel runs over its rim."
+    advice = "Add a loss above this level."
+    source = "flow over a weir, linearised"
+
+    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+        return tuple({"rim": rim} for rim in RIMS)
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+        return -(context.part("own") - shape["rim"]).clamp(min=0.0)

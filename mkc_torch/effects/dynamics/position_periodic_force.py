@@ -1,0 +1,51 @@
+"""A force that repeats with the position."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.protocol import Context, Quantity, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+ORDERS = (1, 2, 3, 4, 6, 8, 12, 24)
+"""Periods in a turn."""
+
+
+class PositionPeriodicForce(RateEffect):
+    """Cogging and eccentricity: a force that repeats with every turn, or a whole fraction of it.
+
+    Simulation: adds ``γ₁ sin(k x) + γ₂ cos(k x)`` to the rate of the speed whose angle is x.
+    Drivers: none but the position.
+    Units: γ in the speed's unit per s; x in rad.
+    Plausible: either sign.
+    Source: Hanselman, "Brushless Permanent Magnet Motor Design" (2003), ch. 9.
+    """
+
+    id = "position_periodic_force"
+    needs = ("angle",)
+    least = -math.inf
+    gain = "amplitude"
+    of = "angle"
+    equation = "δv̇ = γ₁ sin(k x) + γ₂ cos(k x)"
+    explanation = "A force repeats with the position, as the cogging of a motor or an eccentric weight does."
+    advice = "Add a force with this period."
+    source = "Hanselman, Brushless Permanent Magnet Motor Design (2003)"
+
+    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+        return tuple({"order": float(order)} for order in ORDERS)
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return (Quantity(self.gain, 2, self.unit(context)),)
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:
+        phase = shape["order"] * context.part("angle")
+        return (torch.stack([phase.sin(), phase.cos()], -1) @ gamma).unsqueeze(-1)

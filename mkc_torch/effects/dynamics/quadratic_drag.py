@@ -1,0 +1,36 @@
+"""Drag in proportion to the square of the speed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.protocol import Context, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class QuadraticDrag(RateEffect):
+    """Drag of a blunt body in air or water: proportional to the square of the speed, against it.
+
+    Simulation: adds ``−γ v |v|`` to the rate of a speed v.
+    Drivers: none but the state.
+    Units: γ in 1/m for a speed in m/s: ½ ρ c_d A / m.
+    Plausible: γ ≥ 0.
+    Source: Rayleigh's drag equation, Reynolds numbers from 10³ on.
+    """
+
+    id = "quadratic_drag"
+    gain = "drag"
+    power = 2.0
+    equation = "δv̇ = −γ v |v|"
+    explanation = "The motion is slowed by the square of its speed, as by air."
+    advice = "Add air drag with this coefficient, ½ ρ c_d A / m."
+    source = "Rayleigh's drag equation"
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+        own = context.part("own")
+        return -own * own.abs()

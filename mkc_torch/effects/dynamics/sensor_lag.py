@@ -1,0 +1,52 @@
+"""A sensor that shows what was."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.protocol import Context, GainEffect, Quantity, Shape, lagged
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+SHARES = (0.002, 0.005, 0.01, 0.02, 0.05)
+"""Time constants that are searched, as shares of the longest run."""
+
+
+class SensorLag(GainEffect):
+    """The sensor follows what it measures with a lag, as a thermometer in its housing does.
+
+    Simulation: adds ``γ_i (y_τ − y)`` to each output, y_τ the output behind a lag of first order; a γ of one is a
+    plain lag.
+    Drivers: none but the output.
+    Units: γ is a share; the time constant in s.
+    Plausible: γ from 0 to 1.
+    Source: Doebelin, "Measurement Systems" (2003), 3.3.
+    """
+
+    id = "sensor_lag"
+    port = "output"
+    follows_signal = True
+    least, most = 0.0, 1.0
+    plausible = 1.5
+    gain = "share"
+    continuous: Mapping[str, tuple[float, float]] = {"lag": (0.0005, 0.2)}
+    equation = "δy = γ (y_τ − y),  τ ẏ_τ = y − y_τ"
+    explanation = "The sensor follows what it measures with a lag."
+    advice = "Put a lag of this time constant behind the output."
+    source = "Doebelin, Measurement Systems (2003), 3.3"
+
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
+        length = float(time.max() - time.min())
+        return tuple({"lag": share * length} for share in SHARES)
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return (Quantity(self.gain, len(context.channels), ""),)
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
+        behind = [lagged(one, context.time, shape["lag"]) for one in context.signal.unbind(-1)]
+        return gamma * (torch.stack(behind, -1) - context.signal)

@@ -1,0 +1,54 @@
+"""Inputs between the samples of a recording."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.simulation.protocol import Clock
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["smooth_between"]
+
+_POINTS = 6
+
+
+def smooth_between(
+    values: Float[Tensor, "N u"], time: Float[Tensor, " N"], begins: Bool[Tensor, " N"], clock: Clock
+) -> Float[Tensor, "S u"]:
+    """Values at the moments of a clock, by the polynomial through the six nearest samples of the same run.
+
+    A run of fewer samples is interpolated by straight lines.
+
+    Args:
+        values: at the samples.
+        time: of the samples in s.
+        begins: where a run begins.
+        clock: the moments.
+
+    Example:
+        >>> time = torch.arange(0.0, 10.0, dtype=torch.float64)
+        >>> clock = Clock(time[:-1] + 0.5, torch.arange(9), torch.arange(1, 10), torch.full((9,), 0.5).double())
+        >>> found = smooth_between(torch.sin(time).unsqueeze(-1), time, time == 0.0, clock)
+        >>> bool((found[3:6, 0] - torch.sin(time[3:6] + 0.5)).abs().max() < 5e-3)
+        True
+    """
+    first = begins.nonzero().squeeze(-1)
+    last = torch.cat([first[1:], first.new_tensor([len(time)])]) - 1
+    run = begins.long().cumsum(0)[clock.before] - 1
+    start = torch.minimum(clock.before - _POINTS // 2 + 1, last[run] - _POINTS + 1)
+    enough = last[run] - first[run] + 1 >= _POINTS
+    start = torch.where(enough, torch.maximum(start, first[run]), 0)
+    index = (start.unsqueeze(-1) + torch.arange(_POINTS)).clamp(max=len(time) - 1)
+    at = time[index]
+    away = clock.time.unsqueeze(-1) - at
+    others = ~torch.eye(_POINTS, dtype=torch.bool)
+    above = torch.where(others, away.unsqueeze(-2), 1.0).prod(-1)
+    below = torch.where(others, at.unsqueeze(-1) - at.unsqueeze(-2), 1.0).prod(-1)
+    weight = above / torch.where(enough.unsqueeze(-1), below, 1.0)
+    smooth = torch.einsum("sk,sku->su", weight, values[index])
+    return torch.where(enough.unsqueeze(-1), smooth, clock.at(values))

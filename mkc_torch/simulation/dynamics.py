@@ -1,0 +1,554 @@
+"""Simulations by differential equations: a user's states, inputs, outputs and ``derivative``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from mkc_torch.nonlinear import GaussianPrior, fit
+from mkc_torch.recording import Recording
+from mkc_torch.simulation.between_samples import smooth_between
+from mkc_torch.simulation.first_guess import first_guess
+from mkc_torch.simulation.protocol import Changes, Clock, Port
+from mkc_torch.simulation.trajectory import Grid, Trajectory, solve
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["Dynamics", "DynamicsCorrection", "Parameter", "SimulationError"]
+
+_FEWEST = 3
+_FINEST = 8
+_ROUGH = 0.02
+_REVERSED = 0.05
+
+
+class SimulationError(ValueError):
+    """A simulation that cannot be computed; the sentence says where and why."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a simulation.
+
+    Attributes:
+        value: to start from.
+        lower, upper: least and greatest value.
+        unit: for reports.
+    """
+
+    value: float
+    lower: float = -torch.inf
+    upper: float = torch.inf
+    unit: str = ""
+
+
+class Dynamics:
+    """A system of ordinary differential equations: give it names, parameters and a ``derivative``.
+
+    The parameters and the first state of each experiment are fitted to the recording; the trajectory between is that
+    of the differential equation alone.
+
+    Attributes:
+        states: names.
+        inputs: names of the columns that drive the system.
+        outputs: names of the columns that it answers to; by default those states that are columns of the recording.
+        parameters: name to value to start from, or :class:`Parameter`.
+        initial: of states that are not measured, a guess of their first value; default 0.
+        units: of states and inputs.
+        between: what an input does between two samples: "held" at the earlier one, "linear", or "smooth", a polynomial
+            of fifth degree through six neighbours, for signals that were sampled a few times a period.
+        segment: in s, after which a trajectory may begin anew, for systems so unstable or chaotic that their start does
+            not determine them; None for never.
+        step: greatest step of the computation in s; None for what the recording's samples ask for.
+
+    Example:
+        >>> class Pendulum(Dynamics):
+        ...     states = ("angle", "speed")
+        ...     inputs = ("torque",)
+        ...     parameters = {"stiffness": 9.0, "damping": Parameter(0.1, lower=0.0, unit="1/s")}
+        ...
+        ...     def derivative(self, time, x, u, p):
+        ...         return {
+        ...             "angle": x.speed,
+        ...             "speed": u.torque - p.stiffness * torch.sin(x.angle) - p.damping * x.speed,
+        ...         }
+        >>> time = torch.arange(0.0, 5.0, 0.02)
+        >>> recording = Recording({"time": time, "torque": 0 * time, "angle": torch.cos(3 * time)})
+        >>> Pendulum().prepare(recording).parameter_names
+        ('stiffness', 'damping', 'angle at the start', 'speed at the start')
+    """
+
+    states: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    parameters: Mapping[str, float | Parameter] = {}
+    initial: Mapping[str, float] = {}
+    units: Mapping[str, str] = {}
+    between: str = "linear"
+    segment: float | None = None
+    step: float | None = None
+
+    def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor] | Sequence[Tensor]:
+        """Rate of change of each state, by its name or in the order of ``states``.
+
+        Args:
+            time: (S,) in s.
+            x: the states, each (S,), as attributes.
+            u: the inputs, each (S,), as attributes.
+            p: the parameters as attributes.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} has no `derivative(self, time, x, u, p)`; write one that returns the rate of "
+            "change of each state."
+        )
+
+    def output(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]:  # noqa: ARG002
+        """What is measured, by the columns' names; by default the states themselves."""
+        return vars(x)
+
+    @property
+    def name(self) -> str:
+        return type(self).__name__
+
+    @property
+    def columns(self) -> frozenset[str]:
+        return frozenset({"time", "experiment", *self.inputs, *self.outputs, *self.states})
+
+    def prepare(self, recording: Recording) -> PreparedDynamics:
+        """The simulation of a recording; its column ``experiment`` separates runs.
+
+        Raises:
+            MissingColumnError: the recording lacks ``time``, an input or an output.
+            SimulationError: names that do not fit together, a ``derivative`` or ``output`` of a wrong shape or that is
+                not finite, or too few samples.
+        """
+        _check_names(self)
+        outputs = self.outputs or tuple(s for s in self.states if s in recording)
+        if not outputs:
+            raise SimulationError(
+                f"{self.name}: none of its states ({', '.join(self.states)}) is a column of the recording, which has "
+                f"{', '.join(recording.names)}. Name what is measured in `outputs`."
+            )
+        return PreparedDynamics(self, recording.finite("time", *self.inputs, *outputs).sorted_by_time(), outputs)
+
+
+class PreparedDynamics:
+    """A system of differential equations with the recording that answers it."""
+
+    prior: GaussianPrior | None = None
+
+    def __init__(self, system: Dynamics, recording: Recording, outputs: tuple[str, ...]) -> None:
+        self.system, self.recording, self.channels = system, recording, outputs
+        self.name = system.name
+        self.time = recording["time"]
+        self.measured = recording.stack(*outputs)
+        self.unit = _common(system.units.get(name, recording.units[name]) for name in outputs)
+        self.independent = (True,) * len(outputs)
+        self.state: Mapping[str, object] = {"class": system.name}
+        self.warnings: tuple[str, ...] = ()
+        self.known = {
+            name: one if isinstance(one, Parameter) else Parameter(float(one))
+            for name, one in system.parameters.items()
+        }
+        self.begins, self.labels = _beginnings(recording, system)
+        _refuse_few(self.begins, system.name)
+        self._kinematic = _kinematic(system, self.known)
+        self._lay_out(1)
+        starts = [f"{state} at the start{label}" for label in self.labels for state in system.states]
+        self.parameter_names = (*self.known, *starts)
+        p, n = len(self.known), len(starts)
+        low = [one.lower for one in self.known.values()]
+        high = [one.upper for one in self.known.values()]
+        self.bounds = self.time.new_tensor(low + [-torch.inf] * n), self.time.new_tensor(high + [torch.inf] * n)
+        self._p = p
+        self._check_functions()
+        self._refine()
+
+    def _lay_out(self, parts: int) -> None:
+        """Nodes and stations, each interval between samples in so many parts."""
+        N = len(self.time)
+        inside = ~self.begins[1:]
+        count = torch.where(inside, parts, 1)
+        before = torch.arange(N - 1).repeat_interleave(count)
+        part = torch.arange(len(before)) - (count.cumsum(0) - count).repeat_interleave(count)
+        step = 1.0 / count.repeat_interleave(count).double()
+        share = (part.unsqueeze(-1) + torch.tensor([0.0, 0.5, 1.0], dtype=step.dtype)) * step.unsqueeze(-1)
+        node_before = torch.cat([before, before[-1:]])
+        node_share = torch.cat([share[:, 0], share[-1:, 2]])
+        time = torch.lerp(self.time[:-1][node_before], self.time[1:][node_before], node_share)
+        self.rows = torch.cat([(count.cumsum(0) - count), torch.tensor([len(before)])])
+        begins = torch.zeros(len(time), dtype=torch.bool)
+        begins[self.rows[self.begins]] = True
+        self.grid = Grid(time, begins)
+        early = before.repeat_interleave(3)
+        at = torch.lerp(self.time[early], self.time[early + 1], share.flatten())
+        self.clock = Clock(at, early, early + 1, share.flatten())
+        inputs = self.recording.stack(*self.system.inputs) if self.system.inputs else self.time.new_zeros(N, 0)
+        self.inputs = self._between(inputs)
+        self.inputs_at_rows = inputs
+        self._guess = first_guess(self, time, node_before, node_share)
+        self._last: Trajectory | None = None
+        self.__dict__.pop("ports", None)  # their clock is that of the stations
+
+    def _between(self, inputs: Float[Tensor, "N u"]) -> Float[Tensor, "S u"]:
+        """Inputs at the stations."""
+        if self.system.between == "held":
+            return inputs[self.clock.before]
+        if self.system.between == "linear":
+            return self.clock.at(inputs)
+        return smooth_between(inputs, self.time, self.begins, self.clock)
+
+    @cached_property
+    def ports(self) -> dict[str, Port]:
+        """The rate of each state, exchange between two of the same unit, each input, and the outputs."""
+        system = self.system
+        places = {}
+        for state in system.states:
+            if state in self._kinematic:
+                continue
+            places[f"rate of {state}"] = self._rate_port(state, "rate", self._parts(state))
+        pairs = [
+            (one, other)
+            for one, other in combinations((s for s in system.states if s not in self._kinematic), 2)
+            if self._unit_of(one) == self._unit_of(other)
+        ]
+        for one, other in pairs:
+            port = self._rate_port(one, "exchange", {"own": one, "other": other})
+            places[f"exchange of {one} and {other}"] = replace(port, channels=(one, other))
+        for name in system.inputs:
+            places[f"input {name}"] = Port(
+                (name,),
+                self._unit_of(name),
+                pointwise=False,
+                kind="input",
+                parts={"own": name},
+                part_units={"own": self._unit_of(name)},
+                sizes={"own": _sizes(self.recording[name])},
+                clock=self.clock,
+            )
+        return places | {"output": Port(self.channels, self.unit, pointwise=False, parts={"own": self.channels[0]})}
+
+    def _parts(self, state: str) -> dict[str, str]:
+        """What an effect on the rate of a state can refer to."""
+        positions = [i for i, j in self._kinematic.items() if j == state]
+        parts = {"own": state, **({"position": positions[0]} if positions else {})}
+        if positions and self._unit_of(positions[0]) == "rad":
+            parts["angle"] = positions[0]
+        if positions and self._reverses(positions[0]):
+            parts["deflection"] = positions[0]
+        if self._reverses(state):
+            parts["reversing"] = state
+        if self._unit_of(state) in ("°C", "K"):
+            parts["temperature"] = state
+        elif not positions:
+            parts["level"] = state
+        return parts
+
+    def _reverses(self, state: str) -> bool:
+        """Whether a state has either sign for a good part of the recording, as far as it is known beforehand."""
+        values = self._guess[:, self.system.states.index(state)]
+        return min(float((values > 0).double().mean()), float((values < 0).double().mean())) > _REVERSED
+
+    def _rate_port(self, state: str, kind: str, parts: Mapping[str, str]) -> Port:
+        unit = self._unit_of(state)
+        return Port(
+            (state,),
+            f"{unit}/s" if unit else "1/s",
+            pointwise=False,
+            kind=kind,
+            carries=(*self.system.states, *self.system.inputs),
+            parts=parts,
+            part_units={part: self._unit_of(name) for part, name in parts.items()},
+            sizes={part: _sizes(self._guess[:, self.system.states.index(name)]) for part, name in parts.items()},
+            clock=self.clock,
+        )
+
+    def _unit_of(self, name: str) -> str:
+        return self.system.units.get(name, self.recording.units[name] if name in self.recording else "")
+
+    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
+        values = self.time.new_tensor([one.value for one in self.known.values()])
+        return torch.cat([values, self._guess[self.grid.begins].flatten()])
+
+    def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
+        return self.measured - self.simulated(theta, changes)
+
+    def simulated(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
+        """The outputs at the samples, (N, m); NaN where no trajectory is found."""
+        found = self.trajectory(theta, changes)
+        outputs = self._outputs(theta, found)
+        if "output" in changes:
+            outputs = outputs + changes["output"](outputs)
+        return outputs if found.converged else outputs * torch.nan
+
+    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Tensor]:
+        found = self.trajectory(theta, changes)
+        inputs = self._inputs(changes)
+        outputs = self._outputs(theta, found)
+        rate = torch.cat([found.stations, inputs], -1)
+        at = {name: rate for name, port in self.ports.items() if port.kind in ("rate", "exchange")}
+        at |= {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
+        return at | {"output": outputs}
+
+    def trajectory(self, theta: Float[Tensor, " p"], changes: Changes) -> Trajectory:
+        """The states at all moments, with what effects change."""
+        begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
+        rate = self._rate(theta, changes)
+        last = self._last
+        if last is None:
+            found = solve(rate, self.grid, begin, self._guess)
+        else:
+            found = solve(rate, self.grid, begin, last.states, last.recurrence)
+        if not found.converged and last is not None:
+            found = solve(rate, self.grid, begin, self._guess)
+        # a tensor of a transform must not outlive it
+        if found.converged and not torch._C._functorch.is_functorch_wrapped_tensor(found.states):
+            self._last = Trajectory(found.states.detach(), found.stations.detach(), True, found.recurrence)
+        return found
+
+    def since_begin(self) -> Float[Tensor, " N"]:
+        """Time since the beginning of each sample's run, in s."""
+        first = torch.where(self.begins, torch.arange(len(self.time)), 0).cummax(0).values
+        return self.time - self.time[first]
+
+    def _rate(self, theta: Tensor, changes: Changes) -> Callable[[Tensor], Tensor]:
+        inputs = self._inputs(changes)
+        p = self._parameters(theta)
+        u = _namespace(self.system.inputs, inputs)
+        acting = [
+            ([self.system.states.index(state) for state in port.channels], changes[name])
+            for name, port in self.ports.items()
+            if port.kind in ("rate", "exchange") and name in changes
+        ]
+
+        def rate(states: Tensor) -> Tensor:
+            rates = self._derivative(self.clock.time, states, u, p)
+            for rows, change in acting:
+                for k, added in zip(rows, change(torch.cat([states, inputs], -1)).unbind(-1), strict=True):
+                    rates[k] = rates[k] + added
+            return torch.stack(rates, -1)
+
+        return rate
+
+    def _derivative(self, time: Tensor, states: Tensor, u: Any, p: Any) -> list[Tensor]:
+        found = self.system.derivative(time, _namespace(self.system.states, states), u, p)
+        values = [found[s] for s in self.system.states] if isinstance(found, Mapping) else list(found)
+        return [v + torch.zeros_like(states[:, 0]) for v in values]
+
+    def _inputs(self, changes: Changes) -> Tensor:
+        if not self.system.inputs:
+            return self.inputs
+        columns = [
+            self.inputs[:, [k]] + changes[f"input {name}"](self.inputs[:, [k]])
+            if f"input {name}" in changes
+            else self.inputs[:, [k]]
+            for k, name in enumerate(self.system.inputs)
+        ]
+        return torch.cat(columns, -1)
+
+    def _outputs(self, theta: Tensor, found: Trajectory) -> Float[Tensor, "N m"]:
+        x = _namespace(self.system.states, found.states[self.rows])
+        u = _namespace(self.system.inputs, self.inputs_at_rows)
+        values = self.system.output(self.time, x, u, self._parameters(theta))
+        return torch.stack([values[name] for name in self.channels], -1)
+
+    def _parameters(self, theta: Tensor) -> SimpleNamespace:
+        return SimpleNamespace(**dict(zip(self.known, theta[: self._p].unbind(), strict=True)))
+
+    def _check_functions(self) -> None:
+        """The user's functions at the first guess.
+
+        Raises:
+            SimulationError: a wrong shape, or values that are not finite.
+        """
+        system, theta = self.system, self.start()
+        states = self.grid.spread(self._guess)
+        x, p = _namespace(system.states, states), self._parameters(theta)
+        u = _namespace(system.inputs, self.inputs)
+        found = system.derivative(self.clock.time, x, u, p)
+        if isinstance(found, Mapping):
+            if set(found) != set(system.states):
+                raise SimulationError(
+                    f"{self.name}.derivative returns rates of {', '.join(map(str, found))} but the states are "
+                    f"{', '.join(system.states)}; return one rate for each state."
+                )
+        elif len(found) != len(system.states):
+            raise SimulationError(
+                f"{self.name}.derivative returns {len(found)} rates for {len(system.states)} states "
+                f"({', '.join(system.states)}); return one rate for each state."
+            )
+        values = [found[s] for s in system.states] if isinstance(found, Mapping) else list(found)
+        for state, value in zip(system.states, values, strict=True):
+            _check_value(f"{self.name}.derivative: the rate of `{state}`", value, self.clock.time, x, p)
+        at = _namespace(system.states, states[::3][:1].expand(len(self.time), -1))
+        at_rows = _namespace(system.inputs, self.inputs_at_rows)
+        outputs = system.output(self.time, at, at_rows, p)
+        for name in self.channels:
+            if name not in outputs:
+                raise SimulationError(
+                    f"{self.name}.output does not return `{name}`, which is in its outputs; it returns "
+                    f"{', '.join(map(str, outputs))}."
+                )
+            _check_value(f"{self.name}.output: `{name}`", outputs[name], self.time, at, p)
+
+    def _refine(self) -> None:
+        """Parts of an interval between samples: by the greatest step, or until twice as many change nothing."""
+        if self.system.step is not None:
+            inside = self.time.diff()[~self.begins[1:]]
+            self._lay_out(max(1, int(torch.ceil(inside.max() / self.system.step - 1e-9))))
+            return
+        parts, theta = 1, self.start()
+        before = self.simulated(theta, {})
+        spread = (self.measured - self.measured.median(0).values).abs().median(0).values.clamp(min=1e-300)
+        while parts < _FINEST:
+            self._lay_out(2 * parts)
+            after = self.simulated(theta, {})
+            if not bool(((after - before).abs().amax(0) > _ROUGH * spread).any()):
+                break
+            parts, before = 2 * parts, after
+        self._lay_out(parts)
+
+
+class DynamicsCorrection:
+    """A simulation with its parameters and effects on a new recording: only the first states are estimated anew.
+
+    Args:
+        system: the differential equations.
+        recording: with the inputs, and with outputs from which the first states are estimated.
+        first: in s, how much of each run they are estimated from; None for all.
+    """
+
+    def __init__(self, system: Dynamics, recording: Recording, first: float | None = None) -> None:
+        self.prepared = system.prepare(recording)
+        self.first = first
+        self.time = self.prepared.time
+        self.ports = self.prepared.ports
+
+    def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
+        """The outputs as simulated."""
+        prepared = self.prepared
+        p = len(prepared.known)
+        seen = prepared.since_begin() <= (torch.inf if self.first is None else self.first)
+
+        def residual(begin: Tensor) -> Tensor:
+            return prepared.residual(torch.cat([theta[:p], begin]), changes)
+
+        begin = fit(
+            residual, prepared.start()[p:], weight=seen.to(theta.dtype), covariance=None, graduate=True, max_iter=60
+        ).theta
+        outputs = prepared.simulated(torch.cat([theta[:p], begin]), changes)
+        return {"time": self.time} | dict(zip(prepared.channels, outputs.unbind(-1), strict=True))
+
+
+def _namespace(names: Sequence[str], values: Float[Tensor, "S n"]) -> SimpleNamespace:
+    return SimpleNamespace(**dict(zip(names, values.unbind(-1), strict=True)))
+
+
+def _sizes(values: Float[Tensor, " N"]) -> tuple[float, float]:
+    """Typical and largest absolute value."""
+    return float(values.abs().median()), float(values.abs().amax())
+
+
+def _common(units: Any) -> str:
+    """The unit that all of them are; empty where they differ."""
+    found = set(units)
+    return found.pop() if len(found) == 1 else ""
+
+
+def _check_names(system: Dynamics) -> None:
+    names = [*system.states, *system.inputs, *system.parameters]
+    if system.between not in ("held", "linear", "smooth"):
+        raise SimulationError(
+            f'{system.name}: `between` should be "held", "linear" or "smooth" but is {system.between!r}.'
+        )
+    if not system.states:
+        raise SimulationError(f"{system.name} has no `states`; name them.")
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise SimulationError(f"{system.name} uses the name `{twice[0]}` twice among states, inputs and parameters.")
+    for name in names:
+        if not name.isidentifier():
+            raise SimulationError(f"{system.name}: `{name}` cannot be an attribute; use letters, digits and _.")
+
+
+def _beginnings(recording: Recording, system: Dynamics) -> tuple[Tensor, list[str]]:
+    """Where trajectories begin, and what each is called."""
+    time = recording["time"]
+    begins = torch.zeros(len(time), dtype=torch.bool)
+    begins[0] = True
+    many = "experiment" in recording
+    if many:
+        group = recording["experiment"]
+        begins[1:] |= group[1:] != group[:-1]
+    if system.segment is not None:
+        first = torch.where(begins, torch.arange(len(time)), 0).cummax(0).values
+        number = ((time - time[first]) / system.segment).floor()
+        begins[1:] |= number[1:] != number[:-1]
+    labels = []
+    for row in begins.nonzero().squeeze(-1).tolist():
+        label = ""
+        if many:
+            names = recording.labels.get("experiment")
+            value = int(recording["experiment"][row])
+            label = f" of {names[value] if names else value}"
+        if system.segment is not None:
+            label += f", {float(time[row]):.4g} s"
+        labels.append(label)
+    return begins, labels
+
+
+def _refuse_few(begins: Tensor, name: str) -> None:
+    first = begins.nonzero().squeeze(-1)
+    shortest = int(torch.cat([first, first.new_tensor([len(begins)])]).diff().min())
+    if shortest < _FEWEST:
+        raise SimulationError(
+            f"{name}: a run of {shortest} samples is too short for a trajectory; it needs {_FEWEST} at least. Leave "
+            "it out, or use longer segments."
+        )
+
+
+def _kinematic(system: Dynamics, known: Mapping[str, Parameter]) -> dict[str, str]:
+    """States whose rate is another state, as that of a position is the speed: no physics can be missing there."""
+    generator = torch.Generator().manual_seed(0)
+
+    def drawn(count: int) -> Tensor:
+        return torch.rand(20, count, generator=generator, dtype=torch.float64) + 0.1
+
+    states = drawn(len(system.states))
+    x, u = _namespace(system.states, states), _namespace(system.inputs, drawn(len(system.inputs)))
+    p = SimpleNamespace(**{name: torch.tensor(one.value).double() for name, one in known.items()})
+    found = system.derivative(drawn(1)[:, 0], x, u, p)
+    rates = [found[s] for s in system.states] if isinstance(found, Mapping) and set(found) >= set(system.states) else []
+    if not isinstance(found, Mapping) and len(found) == len(system.states):
+        rates = list(found)
+    pairs = {}
+    for state, rate in zip(system.states, rates, strict=False):
+        for other, value in zip(system.states, states.unbind(-1), strict=True):
+            if state != other and isinstance(rate, Tensor) and rate.shape == value.shape and torch.equal(rate, value):
+                pairs[state] = other
+    return pairs
+
+
+def _check_value(what: str, value: object, time: Tensor, x: SimpleNamespace, p: SimpleNamespace) -> None:
+    if not isinstance(value, Tensor) or value.dim() > 1 or (value.dim() == 1 and len(value) not in (1, len(time))):
+        found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        raise SimulationError(
+            f"{what} should be a tensor of shape ({len(time)},), like the states it is given, but is {found}."
+        )
+    bad = (~value.isfinite()).expand(len(time)).nonzero()
+    if len(bad):
+        row = int(bad[0])
+        told = ", ".join(f"{name} = {float(v.expand(len(time))[row]):.4g}" for name, v in vars(x).items())
+        fixed = ", ".join(f"{name} = {float(v):.4g}" for name, v in vars(p).items())
+        raise SimulationError(
+            f"{what} is {float(value.expand(len(time))[row])} at time {float(time[row]):.4g} s with {told}; "
+            f"parameters {fixed or 'none'}. Keep it finite there, or start from other parameters."
+        )
