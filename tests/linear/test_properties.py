@@ -14,11 +14,14 @@ from torch import Tensor
 
 from mkc_torch.linear import (
     FixedPointLinear,
+    GeneralizedMaximumEntropy,
     LeastAbsoluteDeviations,
+    LeastEntropyLike,
     LeastMedianOfSquares,
     LeastSquares,
     LeastTrimmedSquares,
     MEstimator,
+    MinimumEntropy,
     MKCRegression,
     MMRegression,
     RankDeficientError,
@@ -47,6 +50,22 @@ PENALTY = {
     "exact": "the penalty draws towards 0",
 }
 GIVEN_SCALE = {"scale": "d is in the unit of Y"}
+GIVEN_BANDWIDTH = {"scale": "the bandwidth is in the unit of Y"}
+SEARCHED_BANDWIDTH = {
+    "repetition": "the bandwidth follows from the scale of a start, the best of some elemental sets",
+    "order": "the bandwidth follows from the scale of a start, the best of some elemental sets",
+}
+OWN_STARTS = {
+    "regression": "its minima are equivariant, the starts (50) and (51) from which they are sought are not",
+    "affine": "its minima are equivariant, the starts (50) and (51) from which they are sought are not",
+}
+PRIOR = {
+    "regression": "coefficients are drawn to the middle of their support",
+    "scale": "the support of the coefficients is in the unit of Y",
+    "affine": "the support of the coefficients is in their units",
+    "exact": "coefficients are drawn to the middle of their support",
+}
+DETERMINED_BY_PRIOR = ("ridge", "maximum entropy")  # dependent columns are allowed
 
 CASES = [
     Case("least squares", lambda _: LeastSquares(), robust=False),
@@ -69,6 +88,13 @@ CASES = [
     Case("S", lambda _: SRegression()),
     Case("S, breakdown 0.4", lambda _: SRegression(breakdown=0.4)),
     Case("MM", lambda _: MMRegression()),
+    Case("minimum entropy", lambda _: MinimumEntropy(), without=SEARCHED_BANDWIDTH),
+    Case("minimum entropy, renyi", lambda _: MinimumEntropy("renyi"), without=SEARCHED_BANDWIDTH),
+    Case("minimum entropy, symmetric", lambda _: MinimumEntropy(location="symmetric"), without=SEARCHED_BANDWIDTH),
+    Case("minimum entropy, h = 0.2", lambda _: MinimumEntropy(bandwidth=0.2), without=GIVEN_BANDWIDTH),
+    Case("minimum entropy, renyi, h = 0.2", lambda _: MinimumEntropy("renyi", bandwidth=0.2), without=GIVEN_BANDWIDTH),
+    Case("least entropy-like", lambda _: LeastEntropyLike(), without=OWN_STARTS, robust=False),
+    Case("maximum entropy", lambda _: GeneralizedMaximumEntropy(20.0), without=PRIOR, robust=False),
 ]
 
 
@@ -220,7 +246,7 @@ def test_what_cannot_be_fitted_is_refused(case):
     bad[3] = float("nan")
     with pytest.raises(ValueError, match=r"`Y` to be finite but got nan"):
         estimator.fit(X, bad)
-    if case.name != "ridge":  # its penalty determines dependent columns
+    if case.name not in DETERMINED_BY_PRIOR:
         with pytest.raises(RankDeficientError, match="linearly dependent"):
             estimator.fit(torch.cat([X, X[:, :1]], 1), y)
         with pytest.raises(ValueError, match="at least 3 values for 3 coefficients"):
