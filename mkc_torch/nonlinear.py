@@ -242,7 +242,7 @@ class _Point:
 
 
 @functools.cache
-def _load_forward_mode() -> None:
+def load_forward_mode() -> None:
     """Torch compiles its rules for forward mode at the first use, by a function that it deprecates itself."""
     one = torch.ones(1)
     with warnings.catch_warnings():
@@ -251,7 +251,7 @@ def _load_forward_mode() -> None:
 
 
 def _forward_tangents(function: Residual) -> Residual:
-    _load_forward_mode()
+    load_forward_mode()
 
     def tangents(theta: Tensor, *data: Any) -> Tensor:
         def along(direction: Tensor) -> Tensor:

@@ -12,12 +12,17 @@ import typer
 
 from mkc_torch import calibration_file
 from mkc_torch._commands.console import FAILURES, complain, out, parsed_columns
+from mkc_torch._commands.diagnosis_files import SIMULATIONS, named_simulation, paired_simulation
 from mkc_torch.calibration import Calibration
 from mkc_torch.diagnosis import DiagnosedModel, diagnosed_model, diagnosis_file
 from mkc_torch.recording import Recording, write_table
+from mkc_torch.simulation.load import raised_in
+from mkc_torch.simulation.registry import refuse_unknown
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from mkc_torch.simulation import Simulation
 
 
 def apply(
@@ -27,56 +32,92 @@ def apply(
     ],
     recording: Annotated[Path, typer.Argument(metavar="NEW.csv", help="A recording of the same sensor.")],
     output: Annotated[Path, typer.Option(help="File to write, .csv or .parquet.")],
+    simulation: Annotated[
+        str | None,
+        typer.Option(metavar="FILE.py:CLASS", help="The simulation of your own that was diagnosed; its code is run."),
+    ] = None,
+    simulated: Annotated[
+        Path | None,
+        typer.Option(metavar="SIM.csv", help="What the simulator that was diagnosed wrote for the new recording."),
+    ] = None,
     columns: Annotated[
         str | None,
         typer.Option(metavar="NAME=COLUMN,...", help="What the columns are called: mag_x=mx,mag_y=my,mag_z=mz"),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
-    """Write time, field_x, field_y, field_z: the corrected field of a recording, row by row.
+    """Write what a calibration or a model makes of a recording.
 
-    Of a model's effects those are left out that belong to the time or the place of the diagnosed recording.
+    Of a magnetometer: time, field_x, field_y, field_z, the corrected field row by row. Of a simulation of your own, or
+    of a simulator's output: time and the outputs, simulated with what was found. Of a model's effects those are left
+    out that belong to the time or the place of the diagnosed recording.
     """
     names = parsed_columns(columns)
-    subject = model
+    if simulation is not None and simulated is not None:
+        raise typer.BadParameter("--simulation and --simulated exclude each other; give the one that was diagnosed.")
+    subject: str | Path = model
     try:
-        known = read_correction(model)
+        own = None
+        if simulation is not None or simulated is not None:
+            subject = str(simulation or simulated)
+            own = named_simulation(simulation) if simulation else paired_simulation(Path(subject), names)
+        subject = model
+        known = read_correction(model, own)
         subject = recording
         table = Recording.read(recording, columns=names)
         corrected = correct(known, table)
         subject = output
         write_table(output, corrected.columns, overwrite=force)
-    except FAILURES as error:
-        complain(subject, error)
+    except Exception as error:
+        told = raised_in(simulation, error) if simulation and simulation not in SIMULATIONS else None
+        if told is None and not isinstance(error, FAILURES):
+            raise
+        complain(subject, told or error)
         raise typer.Exit(1) from None
-    field = torch.stack([corrected.columns[f"field_{axis}"] for axis in "xyz"], -1)
-    missing = int((~field.isfinite().all(-1)).sum())
-    norm = torch.linalg.vector_norm(field, dim=-1)
+    _show(table, corrected, output)
+
+
+def _show(table: Recording, corrected: Corrected, output: Path) -> None:
     console = out()
+    columns = {name: values for name, values in corrected.columns.items() if name != "time"}
+    values = torch.stack(list(columns.values()), -1)
+    missing = int((~values.isfinite().all(-1)).sum())
+    is_field = set(columns) == {f"field_{axis}" for axis in "xyz"}
     for warning in table.warnings:
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
     for note in corrected.notes:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
     if missing:
-        console.print(f"warning: {missing} of {len(table)} rows have no finite field.", soft_wrap=True)
-    middle = f", median length {float(norm.nanmedian()):.2f} {corrected.unit}" if missing < len(table) else ""
-    console.print(f"{len(table):,} rows corrected{middle.rstrip()}: {output}", markup=False, soft_wrap=True)
+        what = "field" if is_field else f"value of {', '.join(columns)}"
+        console.print(f"warning: {missing} of {len(values)} rows have no finite {what}.", markup=False, soft_wrap=True)
+    if not is_field:
+        told = f"{len(values):,} rows of {', '.join(columns)} simulated with what was found"
+    elif missing < len(values):
+        norm = torch.linalg.vector_norm(values, dim=-1)
+        told = f"{len(values):,} rows corrected, median length {float(norm.nanmedian()):.2f} {corrected.unit}".rstrip()
+    else:
+        told = f"{len(values):,} rows corrected"
+    console.print(f"{told}: {output}", markup=False, soft_wrap=True)
 
 
 @dataclass(frozen=True)
 class Corrected:
-    """The corrected field of a recording, its unit if it is known, and sentences about what was left out."""
+    """The corrected columns of a recording, their unit if it is known, and sentences about what was left out."""
 
     columns: dict[str, Tensor]
     unit: str
     notes: tuple[str, ...]
 
 
-def read_correction(path: Path) -> Calibration | DiagnosedModel:
+def read_correction(path: Path, simulation: Simulation | None = None) -> Calibration | DiagnosedModel:
     """What a file holds, a calibration or a model, by its schema.
 
+    Args:
+        path: of the file.
+        simulation: the user's own that was diagnosed. A file never says what code is run.
+
     Raises:
-        ValueError: neither of the two.
+        ValueError: neither of the two, or a model of a simulation that is not given.
         OSError: the file cannot be read.
     """
     text = _text(path)
@@ -88,7 +129,9 @@ def read_correction(path: Path) -> Calibration | DiagnosedModel:
     if schema == calibration_file.SCHEMA:
         return Calibration.from_json(text)
     if schema == diagnosed_model.SCHEMA:
-        return DiagnosedModel.from_json(text)
+        known = DiagnosedModel.from_json(text, simulation=simulation)
+        refuse_unknown(known.simulation, simulation)
+        return known
     if schema == diagnosis_file.SCHEMA:
         raise ValueError("this is what a diagnosis says; give the model.json beside it.")
     found = "missing" if schema is None else json.dumps(schema)

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from mkc_torch.recording import Recording
+from mkc_torch.simulation.load import SimulationFileError
 
 FAILURES = (ValueError, OSError, ImportError, RuntimeError)
 """What bad input, a full disk or a numerical breakdown raises."""
@@ -68,7 +69,9 @@ def complain(subject: str | Path, error: BaseException) -> None:
 
 
 def sentence_of(error: BaseException) -> str:
-    """What an error says, on one line; the system's own errors name the file.
+    """What an error says, on one line but for the code that a user's own file raised it in.
+
+    The system's own errors name the file.
 
     Example:
         >>> sentence_of(PermissionError(13, "Permission denied", "report.html"))
@@ -77,6 +80,8 @@ def sentence_of(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename} " if error.filename else ""
         return f"{where}cannot be written or read: {error.strerror.lower()}; choose another place."
+    if isinstance(error, SimulationFileError):
+        return str(error)
     return " ".join(str(error).split())
 
 

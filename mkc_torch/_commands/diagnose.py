@@ -12,23 +12,40 @@ from typing import Annotated
 import torch
 import typer
 
-from mkc_torch._commands.console import Look, Steps, err, out, parsed_columns, progress, refuse_same_names
-from mkc_torch._commands.diagnosis_files import SIMULATIONS, Outcome, Request, diagnose_file
+from mkc_torch._commands.console import Look, Steps, complain, err, out, parsed_columns, progress, refuse_same_names
+from mkc_torch._commands.diagnosis_files import (
+    MAGNETOMETER,
+    SIMULATIONS,
+    Outcome,
+    Request,
+    diagnose_file,
+    simulation_of,
+)
 from mkc_torch._commands.processes import cores, in_processes
 from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
 
 
 def diagnose(
     recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="CSV or Parquet files with a header.")],
-    simulation: Annotated[
-        str, typer.Option(metavar="NAME", help=f"What the recordings are compared with: {', '.join(SIMULATIONS)}.")
-    ],
     output: Annotated[Path, typer.Option(help="Folder; each REC gets a folder of its name in it.")],
+    simulation: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help=f"What they are compared with: {', '.join(SIMULATIONS)}, or FILE.py:CLASS, whose code is run.",
+        ),
+    ] = None,
+    simulated: Annotated[
+        Path | None,
+        typer.Option(metavar="SIM.csv", help="Instead of --simulation: what a simulator wrote, in the same columns."),
+    ] = None,
     columns: Annotated[
         str | None,
         typer.Option(metavar="NAME=COLUMN,...", help="What the columns are called: mag_x=mx,temperature=IMU_T"),
     ] = None,
-    unit: Annotated[str, typer.Option(help="Unit of the magnetometer's columns, such as counts.")] = "µT",
+    unit: Annotated[
+        str | None, typer.Option(help="Unit of the magnetometer's columns, such as counts; default: µT.")
+    ] = None,
     experiments: Annotated[
         str | None,
         typer.Option(metavar="COLUMN", help="Column that separates runs in one table; default: experiment, if any."),
@@ -47,15 +64,17 @@ def diagnose(
     diagnosed, whatever was found, and 1 when some were not.
     """
     request = Request(
-        simulation=_known(simulation),
+        simulation=_known(simulation, simulated),
+        simulated=simulated,
         columns=_columns(columns, experiments),
-        unit=_unit(unit),
+        unit=_unit(unit, simulation),
         level=_level(level),
         surrogates=_surrogates(surrogates, level),
         seed=seed,
         force=force,
     )
     refuse_same_names(recordings)
+    _refuse_unusable(request)
     # threads of processes that share the cores stall; one recording has them to itself
     torch.set_num_threads(cores() if len(recordings) == 1 else 1)
     look = Look.of(out())
@@ -94,12 +113,26 @@ def _tell(outcomes: list[Outcome], step: Steps) -> None:
                 typer.echo(outcome.text, nl=False)
 
 
-def _known(simulation: str) -> str:
-    if simulation not in SIMULATIONS:
+def _known(simulation: str | None, simulated: Path | None) -> str:
+    if (simulation is None) == (simulated is None):
         raise typer.BadParameter(
-            f'--simulation "{simulation}" is not known; known: {", ".join(SIMULATIONS)}. Name one of them.'
+            "give one of --simulation and --simulated: a simulation's name, or the table that one wrote."
         )
-    return simulation
+    if simulation is not None and simulation not in SIMULATIONS and ".py:" not in simulation:
+        raise typer.BadParameter(
+            f'--simulation "{simulation}" is not known; known: {", ".join(SIMULATIONS)}. Name one of them, or one of '
+            "your own as FILE.py:CLASS."
+        )
+    return simulation or ""
+
+
+def _refuse_unusable(request: Request) -> None:
+    """Said once, before anything is written, and not again for each recording."""
+    try:
+        simulation_of(request)
+    except Exception as error:
+        complain(request.simulated or request.simulation, error)
+        raise typer.Exit(1) from None
 
 
 def _columns(columns: str | None, experiments: str | None) -> dict[str, str]:
@@ -113,9 +146,15 @@ def _columns(columns: str | None, experiments: str | None) -> dict[str, str]:
     return names
 
 
-def _unit(unit: str) -> str:
+def _unit(unit: str | None, simulation: str | None) -> str:
+    if unit is None:
+        return "µT"
     if not unit.strip():
         raise typer.BadParameter("--unit is empty; name the unit, such as counts.")
+    if simulation != MAGNETOMETER:
+        raise typer.BadParameter(
+            "--unit is that of a magnetometer's columns; a simulation of your own says its units in its `units`."
+        )
     return unit
 
 

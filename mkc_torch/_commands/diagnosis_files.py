@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import traceback
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,12 +15,25 @@ from mkc_torch._commands.diagnosis_summary import show
 from mkc_torch._files import claim_folder, write_atomically
 from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
+from mkc_torch.diagnosis.python_source import SourceError
 from mkc_torch.recording import Recording
+from mkc_torch.simulation.load import load_simulation, raised_in
 
 if TYPE_CHECKING:
     from mkc_torch.simulation import Simulation
 
-__all__ = ["MAGNETOMETER", "SIMULATIONS", "Outcome", "Request", "diagnose_file", "folder_names", "write_diagnosis"]
+__all__ = [
+    "MAGNETOMETER",
+    "SIMULATIONS",
+    "Outcome",
+    "Request",
+    "diagnose_file",
+    "folder_names",
+    "named_simulation",
+    "paired_simulation",
+    "simulation_of",
+    "write_diagnosis",
+]
 
 MAGNETOMETER = "magnetometer"
 SIMULATIONS = (MAGNETOMETER,)
@@ -30,9 +44,10 @@ _EXPERIMENT = "experiment"
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of each recording."""
+    """What is asked of each recording: to be compared with a simulation, or with what ``simulated`` holds of one."""
 
     simulation: str = MAGNETOMETER
+    simulated: Path | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
     unit: str = "µT"
     level: float = LEVEL
@@ -51,18 +66,23 @@ class Outcome:
 
 
 def diagnose_file(path: Path, folder: Path, request: Request, look: Look) -> list[Outcome]:
-    """Diagnose a file into a folder; each experiment of a table that holds several on its own, into a folder in it.
+    """Diagnose a file into a folder.
 
-    One that fails does not keep the others from being done.
+    Each experiment of a table that holds several is diagnosed on its own, into a folder in it, but for a simulation
+    that takes several at once. One that fails does not keep the others from being done.
     """
     try:
-        recording = with_unit(Recording.read(path, columns=request.columns), request.unit)
+        recording = Recording.read(path, columns=request.columns)
+        simulation = simulation_of(request)
+        if request.simulated is None and request.simulation == MAGNETOMETER:
+            recording = with_unit(recording, request.unit)
         claim_folder(folder, overwrite=request.force)
     except Exception as error:
         return [_failed(path, "", error)]
     with folder_removed_on_failure(folder):
         outcomes = [
-            _outcome(path, label, part, place, request, look) for label, part, place in _parts(recording, folder)
+            _outcome(path, label, simulation, part, place, request, look)
+            for label, part, place in _parts(recording, simulation, folder)
         ]
         if all(outcome.failed for outcome in outcomes):
             _remove_if_empty(folder)
@@ -70,15 +90,20 @@ def diagnose_file(path: Path, folder: Path, request: Request, look: Look) -> lis
 
 
 def write_diagnosis(diagnosis: Diagnosis, folder: Path, *, force: bool, report: bool = True) -> list[Path]:
-    """Write diagnosis.json, model.json and report.html of a diagnosis into a folder."""
+    """Write diagnosis.json, model.json and report.html of a diagnosis into a folder.
+
+    Of differential equations also corrected.py, the simulation with what was found.
+    """
     from mkc_torch.diagnosis.diagnosis_file import diagnosis_to_json
     from mkc_torch.report import diagnosis_report
 
     texts = {"diagnosis.json": diagnosis_to_json(diagnosis)}
     if diagnosis.model is not None:
         texts["model.json"] = diagnosis.model.to_json()
-    else:
-        (folder / "model.json").unlink(missing_ok=True)  # an old one would be taken for this diagnosis' own
+        with suppress(SourceError):
+            texts["corrected.py"] = diagnosis.model.to_python()
+    for name in {"model.json", "corrected.py"} - set(texts):
+        (folder / name).unlink(missing_ok=True)  # an old one would be taken for this diagnosis' own
     if report:
         texts["report.html"] = diagnosis_report(diagnosis)
     for name, text in texts.items():
@@ -106,9 +131,9 @@ def folder_names(labels: list[str]) -> list[str]:
     return names
 
 
-def _parts(recording: Recording, folder: Path) -> Iterator[tuple[str, Recording, Path]]:
-    """The experiments of a table, with their labels and folders; of one without, itself."""
-    if _EXPERIMENT not in recording:
+def _parts(recording: Recording, simulation: Simulation, folder: Path) -> Iterator[tuple[str, Recording, Path]]:
+    """The experiments of a table, with their labels and folders; itself, if it has none or they are taken together."""
+    if _EXPERIMENT not in recording or getattr(simulation, "joins_experiments", False):
         yield "", recording, folder
         return
     parts = recording.experiments()
@@ -116,26 +141,54 @@ def _parts(recording: Recording, folder: Path) -> Iterator[tuple[str, Recording,
         yield label, part, folder / name
 
 
-def _outcome(path: Path, label: str, recording: Recording, folder: Path, request: Request, look: Look) -> Outcome:
+def _outcome(
+    path: Path, label: str, simulation: Simulation, recording: Recording, folder: Path, request: Request, look: Look
+) -> Outcome:
     try:
         claim_folder(folder, overwrite=request.force or not label)  # the whole folder was claimed before
         with folder_removed_on_failure(folder):
             diagnosis = diagnose(
-                _simulation(request.simulation), recording,
-                level=request.level, surrogates=request.surrogates, seed=request.seed,
-            )  # fmt: skip
+                simulation, recording, level=request.level, surrogates=request.surrogates, seed=request.seed
+            )
             files = write_diagnosis(diagnosis, folder, force=request.force, report=request.report)
     except Exception as error:
-        return _failed(path, label, error)
+        own = raised_in(request.simulation, error) if ".py:" in request.simulation else None
+        return _failed(path, label, own or error)
     return Outcome(look.set(lambda console: show(console, diagnosis, files)), failed=False)
 
 
-def _simulation(name: str) -> Simulation:
+def named_simulation(name: str) -> Simulation:
+    """The magnetometer, or a user's own of ``FILE.py:NAME``.
+
+    Raises:
+        SimulationFileError: the file cannot be used.
+    """
     from mkc_torch.simulation import Magnetometer
 
-    if name != MAGNETOMETER:
-        raise ValueError(f'there is no simulation "{name}"; known: {", ".join(SIMULATIONS)}.')
-    return Magnetometer()
+    return Magnetometer() if name == MAGNETOMETER else load_simulation(name)
+
+
+def paired_simulation(path: Path, columns: Mapping[str, str]) -> Simulation:
+    """What a simulator wrote; columns are renamed like those of the recording, where it has them under those names.
+
+    Raises:
+        ValueError, OSError: the file cannot be used.
+    """
+    from mkc_torch.simulation import Paired
+
+    table = Recording.read(path)
+    return Paired(Recording.read(path, columns={name: column for name, column in columns.items() if column in table}))
+
+
+def simulation_of(request: Request) -> Simulation:
+    """What the recordings are compared with.
+
+    Raises:
+        ValueError, OSError: a file of it cannot be used.
+    """
+    if request.simulated is not None:
+        return paired_simulation(request.simulated, request.columns)
+    return named_simulation(request.simulation)
 
 
 def _failed(path: Path, label: str, error: Exception) -> Outcome:

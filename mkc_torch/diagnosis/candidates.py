@@ -85,5 +85,5 @@ def described(shape: Shape) -> str:
         >>> described({"onset": 12.345, "lag": 0.5})
         'onset 12.35 s, lag 0.5 s'
     """
-    units: Mapping[str, str] = {"onset": " s", "lag": " s", "time_constant": " s"}
+    units: Mapping[str, str] = {"onset": " s", "lag": " s", "time_constant": " s", "delay": " s"}
     return ", ".join(f"{name.replace('_', ' ')} {value:.4g}{units.get(name, '')}" for name, value in shape.items())

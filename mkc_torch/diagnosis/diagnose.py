@@ -42,13 +42,13 @@ LEVEL = 0.05
 SURROGATES = 99
 MAX_FINDINGS = 3
 
-FEWEST = 100
+FEWEST = 40
 """With fewer samples nothing can be said about structure."""
 
 _WIDER, _NEAR = 3.0, 0.05
 
 _BEYOND_DOUBT = 40.0
-"""Nats beyond all draws of noise from which unseen blocks are not asked."""
+"""Nats beyond all draws of noise from which unseen blocks are not asked to confirm it."""
 
 _REST = 0.5
 """A larger share of samples in which nothing moves is a sensor at rest, and is warned of."""
@@ -121,12 +121,13 @@ def _holds(
 
     Blocks weigh samples as if their noise was white, and miss what is plain in coloured noise: of the first finding,
     which the draws of noise have judged, they need only to lean its way. What comes after a finding also has what that
-    one's form left over, and they have to confirm it.
+    one's form left over, and they have to confirm it, or to lean its way where it is plain beyond all draws.
     """
+    better = bool(after.log_likelihood.mean() > before.log_likelihood.mean())
+    plain = located.beyond > _BEYOND_DOUBT
     if first:
-        better = bool(after.log_likelihood.mean() > before.log_likelihood.mean())
-        return better or located.beyond > _BEYOND_DOUBT
-    return _confirmed(before, after, blocks, seed)
+        return better or plain
+    return (better and plain) or _confirmed(before, after, blocks, seed)
 
 
 def _confirmed(before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int) -> bool:
@@ -311,11 +312,14 @@ def _advice(findings: Sequence[Finding]) -> tuple[str, ...]:
     for finding in findings:
         near = [a for a in finding.alternatives if not a.separable]
         if near:
-            told = ", ".join(f"{a.effect} ({', '.join(a.drivers)})" if a.drivers else a.effect for a in near)
-            advice.append(
-                f"To tell {finding.effect} from {told}, record again while they go different ways: change one and hold "
-                "the other."
+            told = ", ".join(
+                dict.fromkeys(f"{a.effect} ({', '.join(a.drivers)})" if a.drivers else a.effect for a in near)
             )
+            driven = finding.drivers or any(a.drivers for a in near)
+            how = (
+                "change one and hold the other" if driven or not near[0].at else "at other speeds, loads and amplitudes"
+            )
+            advice.append(f"To tell {finding.effect} from {told}, record again while they go different ways: {how}.")
         if not finding.plausible:
             advice.append(
                 f"The size of {finding.effect} is not plausible: look for another cause before correcting it."
@@ -333,6 +337,7 @@ def _candidates(first: Located | None) -> tuple[Candidate, ...]:
             described(first.terms[r.number].shape),
             r.gain,
             math.sqrt(2.0 * max(r.gain, 0.0)),
+            first.terms[r.number].at,
         )
         for r in first.ranking
     )

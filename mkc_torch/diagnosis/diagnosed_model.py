@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from mkc_torch.diagnosis.drivers import Driver
 from mkc_torch.diagnosis.estimate import Estimate
 from mkc_torch.diagnosis.model import Term, context_at, summed
+from mkc_torch.diagnosis.python_source import python_source
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.protocol import AnchoredEffect, Context, Effect, LastingEffect
 from mkc_torch.recording import MissingColumnError, Recording
@@ -142,6 +143,21 @@ class DiagnosedModel(nn.Module):
             "effects": terms,
         }
         return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+    def to_python(self, module: str | None = None) -> str:
+        """The simulation with what was found as Python: a class derived from the diagnosed one.
+
+        Its parameters have the fitted values, and each effect is a line of torch, so that a person can read, keep and
+        change it. It is a :class:`mkc_torch.simulation.Dynamics` like the one it comes from, without the first states
+        of the recording. Numbers are written to nine digits.
+
+        Args:
+            module: to import the diagnosed class from; default the one it was defined in.
+
+        Raises:
+            SourceError: no differential equations, or an effect that has no line of its own.
+        """
+        return python_source(self, module)
 
     @staticmethod
     def from_json(

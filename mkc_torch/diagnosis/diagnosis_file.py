@@ -141,6 +141,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
                 "drivers": a.drivers,
                 "log_likelihood_gap": _known(a.log_likelihood_gap),
                 "separable": a.separable,
+                **({"at": a.at} if a.at else {}),
             }
             for a in f.alternatives
         ],

@@ -16,11 +16,12 @@ from mkc_torch.diagnosis.locate import SEPARABLE, Located
 from mkc_torch.diagnosis.model import Term, follows_signal
 from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter
 from mkc_torch.effects.protocol import Context, PartEffect, RelativeEffect
+from mkc_torch.effects.units import tidy
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["finding_of", "intervals_of", "labels", "parameters_of"]
+__all__ = ["finding_of", "intervals_of", "labels", "parameters_of", "places_of"]
 
 _MOST_ALTERNATIVES = 5
 _FARTHEST = 30.0
@@ -42,7 +43,7 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
     term = final.fit.model.terms[number]
     gamma, covariance = _own(final, number)
     context = _context(final, term)
-    channels = context.channels
+    channels = places_of(term, context.channels)
     plausible, told = _plausibility(term, gamma, context)
     return Finding(
         effect=term.effect.id,
@@ -61,6 +62,13 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
         plausibility=told,
         curve=_curve(term, gamma, covariance, context),
     )
+
+
+def places_of(term: Term, channels: Sequence[str]) -> tuple[str, ...]:
+    """Where a term acts, as a user reads it: channels of a residual, or the rates and inputs of a simulation."""
+    if "rate of " in term.at or term.at.startswith("exchange of "):
+        return tuple(f"rate of {name}" for name in channels)
+    return tuple(f"input {name}" for name in channels) if term.at.startswith("input ") else tuple(channels)
 
 
 def _own(final: Estimate, number: int) -> tuple[Tensor, Tensor]:
@@ -89,7 +97,7 @@ def parameters_of(
         start += quantity.size
         if readings is not None:
             value, spread = readings(quantity.name, value, covariance[mine, mine])
-        parameters.append(Parameter(quantity.name, _numbers(value), _numbers(spread), quantity.unit))
+        parameters.append(Parameter(quantity.name, _numbers(value), _numbers(spread), tidy(quantity.unit)))
     return tuple(parameters)
 
 
@@ -119,25 +127,26 @@ def _plausibility(term: Term, gamma: Tensor, context: Context) -> tuple[bool, st
     largest = float(gamma[: first.size].abs().max())
     if not math.isfinite(limit):
         return True, "No plausible size is known for this effect; judge it by its equation."
-    if "µT" not in first.unit:
-        return True, f"Its size is in {first.unit or 'no unit'}; plausible sizes are known for µT alone."
-    told = f"Its largest value, {largest:.3g} {first.unit}, is"
+    if first.unit and "µT" not in first.unit:
+        return True, f"Its size is in {first.unit}; plausible sizes are known for µT alone."
+    unit = f" {first.unit}" if first.unit else ""
+    told = f"Its largest value, {largest:.3g}{unit}, is"
     if largest <= limit:
-        return True, f"{told} within the {limit:g} {first.unit} that is plausible ({term.effect.source})."
-    return False, f"{told} beyond the {limit:g} {first.unit} that is plausible ({term.effect.source}): doubt it."
+        return True, f"{told} within the {limit:g}{unit} that is plausible ({term.effect.source})."
+    return False, f"{told} beyond the {limit:g}{unit} that is plausible ({term.effect.source}): doubt it."
 
 
 def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
     """Rivals of the search, nearest first: all that the data do not tell apart, and the next few."""
     found = []
     if term.driver is not None:
-        found += [Alternative(term.effect.id, (copy,), 0.0, False) for copy in term.driver.copies]
+        found += [Alternative(term.effect.id, (copy,), 0.0, False, term.at) for copy in term.driver.copies]
     for ranked in located.ranking:
         rival = located.terms[ranked.number]
         if rival.key == term.key or ranked.gap > _FARTHEST:
             continue
         gap = max(ranked.gap, 0.0)
-        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= SEPARABLE))
+        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= SEPARABLE, rival.at))
     near = [a for a in found if not a.separable]
     return tuple(near + [a for a in found if a.separable][: max(0, _MOST_ALTERNATIVES - len(near))])
 
@@ -145,7 +154,7 @@ def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
 def intervals_of(final: Estimate, number: int) -> tuple[tuple[float, float], ...]:
     """Where the effect's gain is concentrated: the fewest of sixty blocks that hold nine tenths of it.
 
-    Empty where that is more than a third of the recording.
+    Empty where that is more than a third of the recording, and where runs share their times.
     """
     fit = final.fit
     model, parameters = fit.model, fit.parameters.clone()
@@ -156,7 +165,7 @@ def intervals_of(final: Estimate, number: int) -> tuple[tuple[float, float], ...
     time = model.prepared.time
     N = len(time)
     count = min(_BLOCKS, N // 10)
-    if count < 10:
+    if count < 10 or bool((time.diff() < 0).any()):
         return ()
     block = (torch.arange(N) * count).div(N, rounding_mode="floor")
     total = gain.new_zeros(count).index_add(0, block, gain).clamp(min=0.0)
@@ -190,13 +199,14 @@ def _curve(term: Term, gamma: Tensor, covariance: Tensor, context: Context) -> C
 
     slope = torch.func.jacfwd(change)(gamma)
     variance = torch.einsum("ncq,qr,ncr->nc", slope, covariance, slope).clamp(min=0.0)
-    return Curve(driver, unit, x, change(gamma), _NORMAL_95 * variance.sqrt(), context.channels, context.signal_unit)
+    channels, value_unit = places_of(term, context.channels), tidy(context.signal_unit)
+    return Curve(driver, unit, x, change(gamma), _NORMAL_95 * variance.sqrt(), channels, value_unit)
 
 
 def _along(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | None:
-    if context.parts:
+    if context.parts and term.driver is None:
         return _along_part(term, context)
-    flat = context.signal.new_zeros(_POINTS, context.signal.shape[1])
+    flat = context.signal.median(0).values.expand(_POINTS, -1)
     if term.driver is not None:
         values = context.drivers
         if values.shape[1] == 1:
@@ -240,5 +250,14 @@ def _along_part(term: Term, context: Context) -> tuple[str, str, Tensor, Context
 
 
 def labels(terms: Sequence[Term]) -> tuple[str, ...]:
-    """``effect (driver)`` of terms."""
-    return tuple(f"{t.effect.id} ({', '.join(t.columns)})" if t.columns else t.effect.id for t in terms)
+    """``effect (driver)`` of terms, and at which place of a simulation where several could be meant."""
+    places: dict[tuple[str, tuple[str, ...]], set[str]] = {}
+    for term in terms:
+        places.setdefault((term.effect.id, term.columns), set()).add(term.port)
+    several = {key for key, found in places.items() if len(found) > 1}
+    return tuple(
+        t.effect.id
+        + (f" ({', '.join(t.columns)})" if t.columns else "")
+        + (f" at {t.port}" if (t.effect.id, t.columns) in several else "")
+        for t in terms
+    )

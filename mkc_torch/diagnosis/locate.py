@@ -29,8 +29,9 @@ __all__ = ["SEPARABLE", "Located", "Ranked", "locate"]
 SEPARABLE = 4.5
 """Nats by which a rival must be less likely to count as told apart: three standard errors of what sets them apart."""
 
-_SHORT_LIST = 4
+_SHORT_LIST = 6
 _PARTS, _BETTER = 2, 0.8
+_KEPT = 0.8
 _ROUNDS = 3
 _LEADING = 2
 _RAW = 1000.0
@@ -98,7 +99,8 @@ def locate(
     parameters = best.parameters[: base.model.size]
     if best.model.terms[-1] not in terms:
         terms = (*terms, best.model.terms[-1])
-    tangents = tangents_of(base.model, parameters, terms)
+    tangents = tangents_of(best.model, best.parameters, terms)
+    tangents = replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
     number = terms.index(best.model.terms[-1])
     gamma = best.parameters[base.model.size :]
     # without the effect, as what is left beside it weighs the samples
@@ -120,7 +122,10 @@ def locate(
     ranking = _ranking(terms, found, prefer, possible)
     first = terms[ranking[0].number]
     if p_value <= level and first.key != best.model.terms[-1].key:
-        best = _refitted(best, base, first, linearised, ranking[0].number)
+        other = _refitted(best, base, first, linearised, ranking[0].number)
+        # the search knows the noise's colour and is linear: where the joint fit loses much of the gain, it went too far
+        if _score(other, base, prefer) > max(_KEPT * _score(best, base, prefer), 0.0):
+            best = other
     if p_value <= level:
         best = _refined(best, base, again=True)
     return Located(best.model.terms[-1], best, p_value, beyond, ranking, noise, linearised, tangents, terms)

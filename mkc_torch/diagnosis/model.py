@@ -129,18 +129,17 @@ class JointModel:
 
     @property
     def bounds(self) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"]] | None:
-        """Of the simulation's own parameters; the effects' are free."""
+        """Least and greatest values; None if all are free."""
         known = self.prepared.bounds
-        if known is None or not self.terms:
-            return known
-        free = known[0]
-        least = [
-            free.new_full((size,), limits(term.effect)[0]) for term, size in zip(self.terms, self.sizes, strict=True)
-        ]
-        most = [
-            free.new_full((size,), limits(term.effect)[1]) for term, size in zip(self.terms, self.sizes, strict=True)
-        ]
-        return torch.cat([known[0], *least]), torch.cat([known[1], *most])
+        reach = [limits(term.effect) for term in self.terms]
+        if known is None and all(one == (-torch.inf, torch.inf) for one in reach):
+            return None
+        free = self.prepared.time.new_full((self.base,), torch.inf)
+        low, high = (-free, free) if known is None else known
+        least, most = (
+            [free.new_full((size,), one[side]) for one, size in zip(reach, self.sizes, strict=True)] for side in (0, 1)
+        )
+        return torch.cat([low, *least]), torch.cat([high, *most])
 
     def changes(self, parameters: Float[Tensor, " p"]) -> dict[str, Change]:
         """What the effects add at each port."""

@@ -27,7 +27,7 @@ NAMELESS = (10.0, 0.25)
 ROLELESS, FOLLOWER, ALIKE_COLUMNS = 0.3, 0.95, 0.9
 """A column of unknown role may be a consequence of a known driver; the second share holds above this correlation."""
 
-EVENT, ALIKE_EVENT = 0.4, 0.85
+EVENT, ALIKE_EVENT = 0.05, 0.85
 """An event in time that goes along with a known driver to more than this correlation gives this share."""
 
 

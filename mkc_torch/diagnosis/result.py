@@ -63,12 +63,16 @@ class Extrapolation:
 
 @dataclass(frozen=True)
 class Alternative:
-    """Another candidate for a finding: how much less likely it is, in nats, and whether the data tell them apart."""
+    """Another candidate for a finding: how much less likely it is, in nats, and whether the data tell them apart.
+
+    ``at`` is where it acts, of several places that a simulation has for it.
+    """
 
     effect: str
     drivers: tuple[str, ...]
     log_likelihood_gap: float
     separable: bool
+    at: str = ""
 
 
 @dataclass(frozen=True)
@@ -143,7 +147,7 @@ class Candidate:
     """One candidate of the search at its best shape, for the first finding.
 
     ``log_likelihood_gain`` is that of the linearised model in nats; ``z`` the root of twice that, roughly the number
-    of standard errors.
+    of standard errors. ``at`` is where it acts, of several places that a simulation has for it.
     """
 
     effect: str
@@ -151,6 +155,7 @@ class Candidate:
     shape: str
     log_likelihood_gain: float
     z: float
+    at: str = ""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from mkc_torch.effects.dynamics import DYNAMICS
 from mkc_torch.effects.field_gradient import FieldGradient
 from mkc_torch.effects.hard_iron_step import HardIronStep
 from mkc_torch.effects.offset_drift import OffsetDrift
+from mkc_torch.effects.paired import PAIRED
 from mkc_torch.effects.protocol import (
     AnchoredEffect,
     Context,
@@ -31,6 +32,7 @@ from mkc_torch.effects.unknown import Unknown
 __all__ = [
     "CATALOGUE",
     "DYNAMICS",
+    "PAIRED",
     "SENSOR",
     "AnchoredEffect",
     "Context",
@@ -55,5 +57,5 @@ SENSOR: tuple[Effect, ...] = (
 )
 """The effects that a diagnosis of a sensor tries."""
 
-CATALOGUE: tuple[Effect, ...] = (*SENSOR, *DYNAMICS)
+CATALOGUE: tuple[Effect, ...] = (*SENSOR, *DYNAMICS, *PAIRED)
 """All effects; each is tried where a simulation has its port."""

@@ -16,6 +16,7 @@ __all__ = [
     "AnchoredEffect",
     "BoundedEffect",
     "ChoosyEffect",
+    "CodedEffect",
     "Context",
     "ContinuousEffect",
     "Effect",
@@ -217,6 +218,22 @@ class AnchoredEffect(Effect, Protocol):
 
     def anchored(self, shape: Shape, context: Context) -> Shape:
         """The shape with what it needs of this recording."""
+        ...
+
+
+@runtime_checkable
+class CodedEffect(Effect, Protocol):
+    """An effect that can be written out as a line of Python with torch, for a simulation that a person keeps."""
+
+    def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:
+        """An expression for each channel of the port: what is added to it.
+
+        Args:
+            gamma: the effect's numbers.
+            shape: its shape.
+            names: expression of each part of the port's signal, such as ``{"own": "x.speed"}``; "zero" is what makes a
+                temperature "own" absolute.
+        """
         ...
 
 

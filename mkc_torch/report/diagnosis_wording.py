@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 from mkc_torch.diagnosis.result import (
@@ -50,6 +51,7 @@ __all__ = [
 
 _FEWEST_LARGE, _MOST_SMALL = 1e6, 1e-3  # beyond these a number is written with a power of ten
 _MOST_NUMBERS = 12
+_NAMES = {"coulomb": "Coulomb", "stribeck": "Stribeck", "bouc": "Bouc", "wen": "Wen", "magnus": "Magnus"}
 _POWER = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -102,22 +104,26 @@ def effect_name(effect: str) -> str:
     """The name of an effect in words.
 
     Example:
-        >>> effect_name("hard_iron_step"), effect_name("unknown")
-        ('hard-iron step', 'an effect outside the catalogue')
+        >>> effect_name("hard_iron_step"), effect_name("coulomb_friction"), effect_name("unknown")
+        ('hard-iron step', 'Coulomb friction', 'an effect outside the catalogue')
     """
     if effect == "unknown":
         return "an effect outside the catalogue"
-    return effect.replace("_", " ").replace("hard iron", "hard-iron").replace("soft iron", "soft-iron")
+    words = effect.replace("_", " ").replace("hard iron", "hard-iron").replace("soft iron", "soft-iron")
+    return " ".join(_NAMES.get(word, word) for word in words.split(" "))
 
 
-def with_drivers(effect: str, drivers: Sequence[str]) -> str:
-    """An effect with what drives it.
+def with_drivers(effect: str, drivers: Sequence[str], at: str = "") -> str:
+    """An effect with what drives it, and where it acts.
 
     Example:
         >>> with_drivers("current_field", ["battery_A"]), with_drivers("offset_drift", [])
         ('current field (battery_A)', 'offset drift')
+        >>> with_drivers("linear_drag", [], "rate of speed")
+        'linear drag on the rate of speed'
     """
-    return effect_name(effect) + (f" ({several(drivers, 3)})" if drivers else "")
+    place = f" on the {plain(at.removeprefix('loaded '))}" if at else ""
+    return effect_name(effect) + (f" ({several(drivers, 3)})" if drivers else "") + place
 
 
 def label_name(label: str) -> str:
@@ -316,20 +322,32 @@ def inseparable(finding: Finding) -> tuple[Alternative, ...]:
 
 def rivals(finding: Finding, most: int = 3) -> str:
     """The names of those, one after the other; empty where there are none."""
-    each = [with_drivers(a.effect, a.drivers) for a in inseparable(finding)]
+    each = list(dict.fromkeys(with_drivers(a.effect, a.drivers, _elsewhere(a, finding)) for a in inseparable(finding)))
     told = ", ".join(each[:most])
     return f"{told} and {len(each) - most} more" if len(each) > most else told
+
+
+def _elsewhere(alternative: Alternative, finding: Finding) -> str:
+    """Where an alternative acts, if that is not where the finding does."""
+    return "" if _at(alternative.at, finding) else alternative.at
+
+
+def _at(place: str, finding: Finding) -> bool:
+    """Whether a place of a simulation is where a finding acts."""
+    own = place.removeprefix("loaded ").removeprefix("output ")
+    both = tuple(f"rate of {name}" for name in own.removeprefix("exchange of ").split(" and "))
+    return not place or own in finding.channels or both == finding.channels
 
 
 def role(candidate: Candidate, findings: Sequence[Finding]) -> str:
     """What became of a candidate: the number of its finding, or whether it can be told from one."""
     own = candidate.effect, candidate.drivers
     for i, finding in enumerate(findings, 1):
-        if own == (finding.effect, finding.drivers):
+        if own == (finding.effect, finding.drivers) and _at(candidate.at, finding):
             return f"finding {i}"
     for i, finding in enumerate(findings, 1):
         for a in finding.alternatives:
-            if own == (a.effect, a.drivers):
+            if (*own, candidate.at) == (a.effect, a.drivers, a.at):
                 return f"told from finding {i}" if a.separable else f"not to be told from finding {i}"
     return ""
 
@@ -356,7 +374,7 @@ def _or_a_rival(finding: Finding, *, alone: bool) -> str:
     if not alone:
         return f"{name}, or a rival"
     if len(others) == 1:
-        return f"{name} or {with_drivers(others[0].effect, others[0].drivers)}, which this recording cannot tell apart"
+        return f"{name} or {rivals(finding)}, which this recording cannot tell apart"
     return f"{name} or one of {len(others)} others that this recording cannot tell from it"
 
 
@@ -391,12 +409,19 @@ def chance(p_value: float, diagnosis: Diagnosis) -> str:
 def to_do(diagnosis: Diagnosis) -> list[str]:
     """What to do next: what the diagnosis advises, or else what its verdict asks for."""
     if diagnosis.advice:
-        return [plain(sentence) for sentence in diagnosis.advice]
+        ids = {f.effect for f in diagnosis.findings} | {a.effect for f in diagnosis.findings for a in f.alternatives}
+        ids = {one for one in ids if "_" in one}
+        return [_with_names(plain(sentence), ids) for sentence in diagnosis.advice]
     return {
         "adequate": ["Use the simulation as it is, within what this recording covers."],
-        "explained": ["Correct recordings with the model found here, and confirm it on a second recording."],
+        "explained": ["Use the model found here in place of the simulation, and confirm it on a second recording."],
         "unexplained": ["Record more columns that could drive what remains, such as temperature, current and motion."],
     }[diagnosis.verdict].copy()
+
+
+def _with_names(sentence: str, ids: Collection[str]) -> str:
+    """A sentence with effects by their names."""
+    return re.sub(r"[a-z]\w*", lambda word: effect_name(word[0]) if word[0] in ids else word[0], sentence)
 
 
 def noise_model(noise: Noise) -> str:

@@ -3,17 +3,21 @@
 from mkc_torch.simulation.dynamics import Dynamics, Parameter, SimulationError
 from mkc_torch.simulation.load import SimulationFileError, load_simulation
 from mkc_torch.simulation.magnetometer import Magnetometer
+from mkc_torch.simulation.paired import Paired
 from mkc_torch.simulation.protocol import Correction, Port, PreparedSimulation, Simulation
+from mkc_torch.simulation.static import Static
 
 __all__ = [
     "Correction",
     "Dynamics",
     "Magnetometer",
+    "Paired",
     "Parameter",
     "Port",
     "PreparedSimulation",
     "Simulation",
     "SimulationError",
     "SimulationFileError",
+    "Static",
     "load_simulation",
 ]

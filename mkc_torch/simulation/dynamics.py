@@ -13,14 +13,15 @@ import torch
 from torch import Tensor
 
 from mkc_torch.nonlinear import GaussianPrior, fit
+from mkc_torch.order_statistic import robust_scale
 from mkc_torch.recording import Recording
 from mkc_torch.simulation.between_samples import smooth_between
 from mkc_torch.simulation.first_guess import first_guess
 from mkc_torch.simulation.protocol import Changes, Clock, Port
-from mkc_torch.simulation.trajectory import Grid, Trajectory, solve
+from mkc_torch.simulation.trajectory import Grid, Trajectory, defect, marched, solve, stations
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
 __all__ = ["Dynamics", "DynamicsCorrection", "Parameter", "SimulationError"]
 
@@ -28,6 +29,8 @@ _FEWEST = 3
 _FINEST = 8
 _ROUGH = 0.02
 _REVERSED = 0.05
+_WINDOW = 4
+_RATES = ("rate", "loaded rate", "exchange")
 
 
 class SimulationError(ValueError):
@@ -68,6 +71,8 @@ class Dynamics:
         segment: in s, after which a trajectory may begin anew, for systems so unstable or chaotic that their start does
             not determine them; None for never.
         step: greatest step of the computation in s; None for what the recording's samples ask for.
+        starts_from: in s, how much of each run of a new recording its first states are estimated from, so that what
+            follows is a prediction; None for all of it.
 
     Example:
         >>> class Pendulum(Dynamics):
@@ -95,6 +100,8 @@ class Dynamics:
     between: str = "linear"
     segment: float | None = None
     step: float | None = None
+    starts_from: float | None = None
+    joins_experiments: bool = True
 
     def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor] | Sequence[Tensor]:
         """Rate of change of each state, by its name or in the order of ``states``.
@@ -181,6 +188,8 @@ class PreparedDynamics:
         part = torch.arange(len(before)) - (count.cumsum(0) - count).repeat_interleave(count)
         step = 1.0 / count.repeat_interleave(count).double()
         share = (part.unsqueeze(-1) + torch.tensor([0.0, 0.5, 1.0], dtype=step.dtype)) * step.unsqueeze(-1)
+        # between two runs there is nothing: time and inputs stay at the end of the first
+        share = torch.where(inside.repeat_interleave(count).unsqueeze(-1), share, 0.0)
         node_before = torch.cat([before, before[-1:]])
         node_share = torch.cat([share[:, 0], share[-1:, 2]])
         time = torch.lerp(self.time[:-1][node_before], self.time[1:][node_before], node_share)
@@ -214,7 +223,10 @@ class PreparedDynamics:
         for state in system.states:
             if state in self._kinematic:
                 continue
-            places[f"rate of {state}"] = self._rate_port(state, "rate", self._parts(state))
+            parts = self._parts(state)
+            places[f"rate of {state}"] = self._rate_port(state, "rate", parts)
+            if "position" in parts and system.inputs:
+                places[f"loaded rate of {state}"] = self._rate_port(state, "loaded rate", {**parts, "load": "load"})
         pairs = [
             (one, other)
             for one, other in combinations((s for s in system.states if s not in self._kinematic), 2)
@@ -254,7 +266,7 @@ class PreparedDynamics:
 
     def _reverses(self, state: str) -> bool:
         """Whether a state has either sign for a good part of the recording, as far as it is known beforehand."""
-        values = self._guess[:, self.system.states.index(state)]
+        values = self._guess[self.rows, self.system.states.index(state)]
         return min(float((values > 0).double().mean()), float((values < 0).double().mean())) > _REVERSED
 
     def _rate_port(self, state: str, kind: str, parts: Mapping[str, str]) -> Port:
@@ -264,10 +276,14 @@ class PreparedDynamics:
             f"{unit}/s" if unit else "1/s",
             pointwise=False,
             kind=kind,
-            carries=(*self.system.states, *self.system.inputs),
+            carries=(*self.system.states, *self.system.inputs, *(("load",) if "load" in parts else ())),
             parts=parts,
             part_units={part: self._unit_of(name) for part, name in parts.items()},
-            sizes={part: _sizes(self._guess[:, self.system.states.index(name)]) for part, name in parts.items()},
+            sizes={
+                part: _sizes(self._guess[self.rows, self.system.states.index(name)])
+                for part, name in parts.items()
+                if name in self.system.states
+            },
             clock=self.clock,
         )
 
@@ -275,8 +291,31 @@ class PreparedDynamics:
         return self.system.units.get(name, self.recording.units[name] if name in self.recording else "")
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
+        return self._start.clone()
+
+    @cached_property
+    def _start(self) -> Float[Tensor, " p"]:
+        """The user's values, or those with which the measured states obey the equations, whichever simulates better."""
         values = self.time.new_tensor([one.value for one in self.known.values()])
-        return torch.cat([values, self._guess[self.grid.begins].flatten()])
+        begin = self._guess[self.grid.begins].flatten()
+        starts = [torch.cat([values, begin])]
+        if self._p:
+            step = self.grid.step.unsqueeze(-1)
+            typical = self._guess.abs().median(0).values.clamp(min=1e-12)
+
+            def lacking(values: Tensor) -> Tensor:
+                left = defect(self._rate(torch.cat([values, begin]), {}), self._guess, step) / typical
+                total = torch.cat([torch.zeros_like(left[:1]), left.cumsum(0)])
+                return total[_WINDOW:] - total[:-_WINDOW]
+
+            low, high = (bound[: self._p] for bound in self.bounds)
+            try:
+                found = fit(lacking, values, lower=low, upper=high, covariance=None, max_iter=60).theta
+            except ValueError:
+                found = values  # the equations cannot be looked at there
+            starts.append(torch.cat([found, begin]))
+        spread = [robust_scale(self.residual(one, {}).nan_to_num(torch.inf, torch.inf, torch.inf)) for one in starts]
+        return starts[0] if bool((spread[0] <= spread[-1]).all()) else starts[-1]
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
         return self.measured - self.simulated(theta, changes)
@@ -292,9 +331,13 @@ class PreparedDynamics:
     def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Tensor]:
         found = self.trajectory(theta, changes)
         inputs = self._inputs(changes)
+        at_stations = stations(self._rate(theta, changes), found.states, self.grid.step.unsqueeze(-1))
         outputs = self._outputs(theta, found)
-        rate = torch.cat([found.stations, inputs], -1)
-        at = {name: rate for name, port in self.ports.items() if port.kind in ("rate", "exchange")}
+        at = {
+            name: self._signal(port, theta, at_stations, inputs)
+            for name, port in self.ports.items()
+            if port.kind in _RATES
+        }
         at |= {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
         return at | {"output": outputs}
 
@@ -306,12 +349,15 @@ class PreparedDynamics:
         if last is None:
             found = solve(rate, self.grid, begin, self._guess)
         else:
-            found = solve(rate, self.grid, begin, last.states, last.recurrence)
+            found = solve(rate, self.grid, begin, self._guess, last)
         if not found.converged and last is not None:
             found = solve(rate, self.grid, begin, self._guess)
+        if not found.converged and last is None:
+            nearer = marched(rate, self.grid, begin, self._guess)
+            found = found if nearer is None else solve(rate, self.grid, begin, nearer)
         # a tensor of a transform must not outlive it
         if found.converged and not torch._C._functorch.is_functorch_wrapped_tensor(found.states):
-            self._last = Trajectory(found.states.detach(), found.stations.detach(), True, found.recurrence)
+            self._last = replace(found, states=found.states.detach())
         return found
 
     def since_begin(self) -> Float[Tensor, " N"]:
@@ -324,19 +370,34 @@ class PreparedDynamics:
         p = self._parameters(theta)
         u = _namespace(self.system.inputs, inputs)
         acting = [
-            ([self.system.states.index(state) for state in port.channels], changes[name])
+            (port, [self.system.states.index(state) for state in port.channels], changes[name])
             for name, port in self.ports.items()
-            if port.kind in ("rate", "exchange") and name in changes
+            if port.kind in _RATES and name in changes
         ]
 
         def rate(states: Tensor) -> Tensor:
             rates = self._derivative(self.clock.time, states, u, p)
-            for rows, change in acting:
-                for k, added in zip(rows, change(torch.cat([states, inputs], -1)).unbind(-1), strict=True):
+            for port, rows, change in acting:
+                signal = self._signal(port, theta, states, inputs)
+                for k, added in zip(rows, change(signal).unbind(-1), strict=True):
                     rates[k] = rates[k] + added
             return torch.stack(rates, -1)
 
         return rate
+
+    def _signal(self, port: Port, theta: Tensor, states: Tensor, inputs: Tensor) -> Float[Tensor, "S k"]:
+        """What passes through a port of rates: states and inputs, and the load where the port has one."""
+        if "load" not in port.parts:
+            return torch.cat([states, inputs], -1)
+        own = self.system.states.index(port.parts["own"])
+        p = self._parameters(theta)
+        at_rest = torch.cat([states[:, :own], torch.zeros_like(states[:, [own]]), states[:, own + 1 :]], -1)
+        driven, held = (
+            self._derivative(self.clock.time, at_rest, _namespace(self.system.inputs, u), p)[own]
+            for u in (inputs, torch.zeros_like(inputs))
+        )
+        load = (driven - 2.0 * held).abs().unsqueeze(-1)  # of the drive against what holds it
+        return torch.cat([states, inputs, load], -1)
 
     def _derivative(self, time: Tensor, states: Tensor, u: Any, p: Any) -> list[Tensor]:
         found = self.system.derivative(time, _namespace(self.system.states, states), u, p)
@@ -369,7 +430,8 @@ class PreparedDynamics:
         Raises:
             SimulationError: a wrong shape, or values that are not finite.
         """
-        system, theta = self.system, self.start()
+        system = self.system
+        theta = self.time.new_tensor([one.value for one in self.known.values()])
         states = self.grid.spread(self._guess)
         x, p = _namespace(system.states, states), self._parameters(theta)
         u = _namespace(system.inputs, self.inputs)
@@ -405,16 +467,18 @@ class PreparedDynamics:
             inside = self.time.diff()[~self.begins[1:]]
             self._lay_out(max(1, int(torch.ceil(inside.max() / self.system.step - 1e-9))))
             return
-        parts, theta = 1, self.start()
+        parts = 1
+        theta = self.start()
         before = self.simulated(theta, {})
         spread = (self.measured - self.measured.median(0).values).abs().median(0).values.clamp(min=1e-300)
         while parts < _FINEST:
             self._lay_out(2 * parts)
             after = self.simulated(theta, {})
-            if not bool(((after - before).abs().amax(0) > _ROUGH * spread).any()):
+            # no trajectory, NaN, may be one of too long steps
+            if bool(((after - before).abs().amax(0) <= _ROUGH * spread).all()):
                 break
             parts, before = 2 * parts, after
-        self._lay_out(parts)
+        self._lay_out(parts if bool(before.isfinite().all()) else 1)
 
 
 class DynamicsCorrection:
@@ -423,12 +487,12 @@ class DynamicsCorrection:
     Args:
         system: the differential equations.
         recording: with the inputs, and with outputs from which the first states are estimated.
-        first: in s, how much of each run they are estimated from; None for all.
+        first: in s, how much of each run they are estimated from; None for what the system says.
     """
 
     def __init__(self, system: Dynamics, recording: Recording, first: float | None = None) -> None:
         self.prepared = system.prepare(recording)
-        self.first = first
+        self.first = system.starts_from if first is None else first
         self.time = self.prepared.time
         self.ports = self.prepared.ports
 
@@ -492,6 +556,7 @@ def _beginnings(recording: Recording, system: Dynamics) -> tuple[Tensor, list[st
         first = torch.where(begins, torch.arange(len(time)), 0).cummax(0).values
         number = ((time - time[first]) / system.segment).floor()
         begins[1:] |= number[1:] != number[:-1]
+        begins &= ~_short_ends(begins, first)
     labels = []
     for row in begins.nonzero().squeeze(-1).tolist():
         label = ""
@@ -503,6 +568,16 @@ def _beginnings(recording: Recording, system: Dynamics) -> tuple[Tensor, list[st
             label += f", {float(time[row]):.4g} s"
         labels.append(label)
     return begins, labels
+
+
+def _short_ends(begins: Bool[Tensor, " N"], first: Int[Tensor, " N"]) -> Bool[Tensor, " N"]:
+    """Where the last segment of a run begins, if it is too short for a trajectory of its own."""
+    short = torch.zeros_like(begins)
+    rows = begins.nonzero().squeeze(-1)
+    ends = torch.cat([rows[1:], rows.new_tensor([len(begins)])])
+    last = torch.cat([first[1:] != first[:-1], first.new_ones(1).bool()])
+    short[rows] = last[ends - 1] & (ends - rows < _FEWEST) & (rows != first[rows])
+    return short
 
 
 def _refuse_few(begins: Tensor, name: str) -> None:
@@ -526,6 +601,11 @@ def _kinematic(system: Dynamics, known: Mapping[str, Parameter]) -> dict[str, st
     x, u = _namespace(system.states, states), _namespace(system.inputs, drawn(len(system.inputs)))
     p = SimpleNamespace(**{name: torch.tensor(one.value).double() for name, one in known.items()})
     found = system.derivative(drawn(1)[:, 0], x, u, p)
+    if not isinstance(found, Mapping | Sequence | Tensor):
+        raise SimulationError(
+            f"{system.name}.derivative returns {type(found).__name__}; return the rate of each state, by its name or "
+            "in their order."
+        )
     rates = [found[s] for s in system.states] if isinstance(found, Mapping) and set(found) >= set(system.states) else []
     if not isinstance(found, Mapping) and len(found) == len(system.states):
         rates = list(found)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,17 +15,17 @@ if TYPE_CHECKING:
 
     from mkc_torch.simulation.protocol import Simulation
 
-__all__ = ["SimulationFileError", "load_simulation"]
+__all__ = ["SimulationFileError", "load_simulation", "raised_in"]
 
 
 class SimulationFileError(ValueError):
-    """A file of a simulation that cannot be used; the text says why."""
+    """A file of a simulation that cannot be used; the text says why, with the lines in which its code raised."""
 
 
 def load_simulation(source: str) -> Simulation:
     """The simulation that ``FILE.py:NAME`` names: a class, which is called without arguments, or an instance.
 
-    The file is run, as ``import`` would.
+    The file is run, as a script would be: it can import modules beside it.
 
     Raises:
         SimulationFileError: no such file or name, a file or class that raises, or something that is no simulation.
@@ -33,27 +35,45 @@ def load_simulation(source: str) -> Simulation:
         Traceback (most recent call last):
         mkc_torch.simulation.load.SimulationFileError: nowhere.py: there is no such file ...
     """
-    file, _, name = source.rpartition(":")
-    path = Path(file)
-    if not file.endswith(".py") or not name:
-        raise SimulationFileError(f"{source}: this names no simulation; write FILE.py:NAME, as in my.py:Pendulum.")
+    path, name = _parts(source)
     if not path.is_file():
-        raise SimulationFileError(f"{file}: there is no such file for --simulation {source}.")
+        raise SimulationFileError(f"{path}: there is no such file for --simulation {source}.")
     module = _module(path)
     if not hasattr(module, name):
-        known = [key for key, value in vars(module).items() if _is_simulation(value) and not key.startswith("_")]
-        raise SimulationFileError(f"{file}: it defines no `{name}`; simulations in it: {', '.join(known) or 'none'}.")
+        known = [key for key, value in vars(module).items() if _own(value, module)]
+        raise SimulationFileError(f"{path}: it defines no `{name}`; simulations in it: {', '.join(known) or 'none'}.")
     found = getattr(module, name)
     if isinstance(found, type):
         try:
             found = found()
         except Exception as error:
-            raise SimulationFileError(f"{file}: {name}() raised an error of its own.\n{_told(error, path)}") from None
+            raise SimulationFileError(f"{path}: {name}() raised an error of its own.\n{_told(error, path)}") from None
     if not _is_simulation(found):
         raise SimulationFileError(
-            f"{file}: `{name}` is no simulation, for it has no `prepare`; derive it from mkc_torch.simulation.Dynamics."
+            f"{path}: `{name}` is no simulation, for it has no `prepare`; derive it from mkc_torch.simulation.Dynamics "
+            "or Static."
         )
     return found
+
+
+def raised_in(source: str, error: BaseException) -> SimulationFileError | None:
+    """What to tell of an error that the code of ``FILE.py:NAME`` raised while it simulated; None for another's error.
+
+    Example:
+        >>> raised_in("my.py:Pendulum", ValueError("of somebody else's"))
+    """
+    path, name = _parts(source)
+    frames = traceback.extract_tb(error.__traceback__)
+    if not any(_same(frame.filename, path) for frame in frames):
+        return None
+    return SimulationFileError(f"{path}: {name} raised an error of its own.\n{_told(error, path)}")
+
+
+def _parts(source: str) -> tuple[Path, str]:
+    file, _, name = source.rpartition(":")
+    if not file.endswith(".py") or not name:
+        raise SimulationFileError(f"{source}: this names no simulation; write FILE.py:NAME, as in my.py:Pendulum.")
+    return Path(file), name
 
 
 def _module(path: Path) -> ModuleType:
@@ -63,19 +83,41 @@ def _module(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[module.__name__] = module
     try:
-        spec.loader.exec_module(module)
-    except Exception as error:
+        with _beside(path):
+            spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
         del sys.modules[module.__name__]
         raise SimulationFileError(f"{path}: the file raised an error of its own.\n{_told(error, path)}") from None
     return module
 
 
-def _told(error: Exception, path: Path) -> str:
+@contextmanager
+def _beside(path: Path) -> Iterator[None]:
+    """The file's folder is searched for modules first."""
+    folder = str(path.resolve().parent)
+    sys.path.insert(0, folder)
+    try:
+        yield
+    finally:
+        sys.path.remove(folder)
+
+
+def _told(error: BaseException, path: Path) -> str:
     """The user's own part of a traceback."""
     frames = traceback.extract_tb(error.__traceback__)
-    own = [k for k, frame in enumerate(frames) if Path(frame.filename) == path]
-    lines = traceback.format_list(frames[own[0] :] if own else frames)
+    own = [k for k, frame in enumerate(frames) if _same(frame.filename, path)]
+    lines = traceback.format_list(frames[own[0] :] if own else [])
     return "".join([*lines, *traceback.format_exception_only(error)]).rstrip()
+
+
+def _same(filename: str, path: Path) -> bool:
+    return Path(filename).resolve() == path.resolve()
+
+
+def _own(value: object, module: ModuleType) -> bool:
+    """Whether a value of a module is a simulation that was defined there."""
+    kind = value if isinstance(value, type) else type(value)
+    return _is_simulation(value) and kind.__module__ == module.__name__
 
 
 def _is_simulation(value: object) -> bool:

@@ -73,6 +73,10 @@ class Magnetometer:
     name: str = "magnetometer"
 
     @property
+    def joins_experiments(self) -> bool:
+        return False
+
+    @property
     def columns(self) -> frozenset[str]:
         return frozenset({"time", *(f"mag_{a}" for a in _AXES), *_GYRO, *_ACCEL, *_QUATERNION})
 

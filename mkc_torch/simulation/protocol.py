@@ -160,12 +160,16 @@ class Simulation(Protocol):
     Attributes:
         name: as ``diagnosis.json`` gives it.
         columns: names of the columns that the simulation uses itself, which are no drivers of effects.
+        joins_experiments: whether one fit takes all runs of a recording together, told apart by its column
+            ``experiment``; where it does not, each run is diagnosed by itself.
     """
 
     @property
     def name(self) -> str: ...
     @property
     def columns(self) -> frozenset[str]: ...
+    @property
+    def joins_experiments(self) -> bool: ...
 
     def prepare(self, recording: Recording) -> PreparedSimulation:
         """The simulation of a recording.

@@ -16,10 +16,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.nonlinear import load_forward_mode
+
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Grid", "Rate", "Recurrence", "Trajectory", "solve"]
+__all__ = ["Grid", "Rate", "Recurrence", "Trajectory", "defect", "marched", "solve", "stations"]
 
 Rate = Callable[[Tensor], Tensor]
 """Of change of the states, (S, n) → (S, n), at the stations of a grid."""
@@ -28,7 +30,9 @@ _MOST_STEPS = 30
 _SETTLED = 1e-9
 _HALVINGS = 6
 _QUICK = 0.01
-_NEAR = 1e-6
+_ROUNDING = 1e-6
+_HORIZON, _ROUGHLY = 32, 1e-4
+_DIGITS = 100.0
 
 
 @dataclass(frozen=True)
@@ -74,15 +78,15 @@ class Trajectory:
 
     Attributes:
         states: (G, n).
-        stations: (3G-3, n), the states there.
         converged: whether they solve the equations.
-        recurrence: the equations, linearised there.
+        recurrence: the equations, linearised nearby.
+        renewed: gives the equations linearised at the states themselves.
     """
 
     states: Float[Tensor, "G n"]
-    stations: Float[Tensor, "3G-3 n"]
     converged: bool
     recurrence: Recurrence
+    renewed: Callable[[], Recurrence]
 
 
 def solve(
@@ -90,7 +94,7 @@ def solve(
     grid: Grid,
     begin: Float[Tensor, "K n"],
     guess: Float[Tensor, "G n"],
-    known: Recurrence | None = None,
+    known: Trajectory | None = None,
 ) -> Trajectory:
     """The trajectories that begin in given states.
 
@@ -102,7 +106,8 @@ def solve(
         grid: its K trajectories.
         begin: their first states.
         guess: of all states.
-        known: the linearisation of a trajectory nearby; it serves as long as it brings the equations to rest quickly.
+        known: a trajectory nearby, instead of the guess; how its equations were linearised serves as long as it brings
+            these to rest quickly.
 
     Example:
         A decay at a rate of 2/s:
@@ -117,39 +122,84 @@ def solve(
     step = grid.step.unsqueeze(-1)
     origin = grid.begins.unsqueeze(-1)
     places = grid.begins.long().cumsum(0) - 1
-    states = torch.where(origin, begin.detach()[places], guess.detach())
+    states = torch.where(origin, begin.detach()[places], (guess if known is None else known.states).detach())
     at = _Point.of(rate, states, step)
-    fresh = known is None
-    recurrence = _recurrence(rate, states, step, grid) if known is None else known
-    converged, far = False, not fresh
+    fresh, moved_on = known is None, False
+    recurrence = _recurrence(rate, states, step, grid) if known is None else known.recurrence
+    converged = False
+    settled = max(_SETTLED, _DIGITS * torch.finfo(states.dtype).eps)
     for _ in range(_MOST_STEPS):
-        change = recurrence.solved(torch.zeros_like(states), at.defect)
+        change = recurrence.solved(torch.zeros_like(states), at.left.detach())
         size = float((change / at.scale).abs().max())
-        if size < _SETTLED:
+        if size < settled:
             converged = True
             break
-        moved = at
-        part = 1.0
+        after, part = at, 1.0
         if size < torch.inf:
             for _ in range(_HALVINGS if fresh else 1):
-                moved = _Point.of(rate, at.states + part * change, step)
-                if moved.norm <= at.norm:
+                after = _Point.of(rate, at.states + part * change, step)
+                if after.norm <= at.norm:
                     break
                 part *= 0.5
-        if not fresh and not moved.norm <= _QUICK * at.norm:
-            recurrence, fresh, far = _recurrence(rate, at.states, step, grid), True, False
+        if not fresh and not after.norm <= _QUICK * at.norm:
+            recurrence, fresh = _recurrence(rate, at.states, step, grid), True
             continue
-        if not moved.norm < torch.inf or moved is at:
+        if after is at or (not after.norm < at.norm and size * part > _ROUNDING):
             break
-        at, fresh, far = moved, False, far or size * part > _NEAR
-    states = at.states
+        at, fresh, moved_on = after, False, True
+    states, left = at.states, at.left
+
+    def renewed() -> Recurrence:
+        return _recurrence(rate, states, step, grid)
+
+    if any(torch._C._functorch.is_functorch_wrapped_tensor(one) or one.requires_grad for one in (left, begin)):
+        # outside of the transform it is the same, and cheaper
+        recurrence = renewed() if known is None or moved_on else known.renewed()
     # one more step, whose value is that of rounding and whose derivative is that of the solution
-    defect = _defect(rate, states, step)
-    if far and (torch._C._functorch.is_functorch_wrapped_tensor(defect) or defect.requires_grad):
-        recurrence = _recurrence(rate, states, step, grid)
     start = torch.where(origin, begin[places] - states, 0.0)
-    states = states + recurrence.solved(start, defect)
-    return Trajectory(states, _stations(rate, states, step), converged, recurrence)
+    return Trajectory(states + recurrence.solved(start, left), converged, recurrence, renewed)
+
+
+def marched(
+    rate: Rate, grid: Grid, begin: Float[Tensor, "K n"], guess: Float[Tensor, "G n"]
+) -> Float[Tensor, "G n"] | None:
+    """A guess that is near the trajectories, from one that is not: they are solved over a horizon that grows.
+
+    Args:
+        rate, grid, begin: as of :func:`solve`.
+        guess: of all states.
+
+    Returns:
+        The states, to a rough tolerance; None where even a short horizon has no solution.
+    """
+    step = grid.step.unsqueeze(-1)
+    index = torch.arange(len(guess), device=guess.device)
+    first = torch.where(grid.begins, index, 0).cummax(0).values
+    place = index - first
+    states = torch.where(grid.begins.unsqueeze(-1), begin.detach()[grid.begins.long().cumsum(0) - 1], guess.detach())
+    for horizon in range(_HORIZON, grid.longest + _HORIZON, _HORIZON):
+        # beyond what is solved the last state stays
+        states = states[torch.minimum(index, first + horizon - _HORIZON)]
+        inside = (place <= horizon).unsqueeze(-1)
+        for _ in range(_MOST_STEPS):
+            at = _Point.of(rate, states, step)
+            left = torch.where(inside[1:], at.left.detach(), 0.0)
+            change = torch.where(
+                inside, _recurrence(rate, states, step, grid).solved(torch.zeros_like(states), left), 0.0
+            )
+            size = float((change / at.scale).abs().max())
+            if not size < torch.inf:
+                return None
+            part, norm = 1.0, float((left / at.scale).square().mean())
+            for _ in range(_HALVINGS):
+                after = defect(rate, states + part * change, step).detach()
+                if float((torch.where(inside[1:], after, 0.0) / at.scale).square().mean()) <= norm:
+                    break
+                part *= 0.5
+            states = states + part * change
+            if size * part < _ROUGHLY:
+                break
+    return states
 
 
 @dataclass(frozen=True)
@@ -157,7 +207,7 @@ class _Point:
     """States on the way to a solution: what they lack of the equations, in size, and the scale of each state."""
 
     states: Tensor  # (G, n)
-    defect: Tensor  # (G-1, n)
+    left: Tensor  # (G-1, n), with derivatives
     scale: Tensor  # (n,)
     norm: float
 
@@ -165,8 +215,8 @@ class _Point:
     def of(cls, rate: Rate, states: Tensor, step: Tensor) -> _Point:
         scale = states.abs().amax(0)
         scale = scale + 1e-6 * scale.max() + 1e-12
-        defect = _defect(rate, states, step).detach()
-        return cls(states, defect, scale, float((defect / scale).square().mean()))
+        left = defect(rate, states, step)
+        return cls(states, left, scale, float((left.detach() / scale).square().mean()))
 
 
 def _ends(f: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -178,7 +228,7 @@ def _joined(left: Tensor, middle: Tensor, right: Tensor) -> Tensor:
     return torch.stack([left, middle, right], 1).flatten(0, 1)
 
 
-def _stations(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"]) -> Float[Tensor, "3G-3 n"]:
+def stations(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"]) -> Float[Tensor, "3G-3 n"]:
     """States at the stations: in the middle of an interval those of the cubic through its ends."""
     left, right = states[:-1], states[1:]
     middle = 0.5 * (left + right)
@@ -186,9 +236,9 @@ def _stations(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1
     return _joined(left, middle + 0.125 * step * (at_left - at_right), right)
 
 
-def _defect(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"]) -> Float[Tensor, "G-1 n"]:
+def defect(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"]) -> Float[Tensor, "G-1 n"]:
     """What the ends of each interval lack of Simpson's rule; 0 before the beginning of a trajectory."""
-    left, middle, right = _ends(rate(_stations(rate, states, step)))
+    left, middle, right = _ends(rate(stations(rate, states, step)))
     jump = torch.where(step > 0, states[1:] - states[:-1], 0.0)
     return jump - step / 6.0 * (left + 4.0 * middle + right)
 
@@ -214,11 +264,12 @@ class Recurrence:
 def _recurrence(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], grid: Grid) -> Recurrence:
     n = states.shape[1]
     eye = torch.eye(n, dtype=states.dtype, device=states.device)
-    at = _stations(rate, states, step).detach()
+    at = stations(rate, states, step).detach()
 
     def along(direction: Tensor) -> Tensor:
         return torch.func.jvp(rate, (at,), (direction.expand_as(at),))[1]
 
+    load_forward_mode()
     slope = torch.stack([along(direction).detach() for direction in eye], -1)
     left, middle, right = _ends(slope)
     h = step.unsqueeze(-1)

@@ -27,7 +27,8 @@ NOTHING = SimpleNamespace(log_likelihood=torch.zeros(N, dtype=torch.float64))
         (True, 0.01, 1.0, 0.0, True),  # leans its way
         (True, -0.01, 1.0, 0.0, False),
         (True, -0.01, 1.0, 100.0, True),  # plain beyond all draws
-        (False, 0.01, 1.0, 100.0, False),  # leans, and is not confirmed
+        (False, 0.01, 1.0, 10.0, False),  # leans, and is not confirmed
+        (False, 0.01, 1.0, 100.0, True),  # leans, and is plain
         (False, 0.5, 1.0, 0.0, True),
         (False, -0.5, 1.0, 100.0, False),
     ],

@@ -78,7 +78,7 @@ def test_unknown_views_are_refused(state):
 
 
 def test_corrections_are_looked_up_by_name():
-    with pytest.raises(ValueError, match='No simulation "pendulum" is known'):
+    with pytest.raises(ValueError, match='the model is of the simulation "pendulum"'):
         correction_of("pendulum", {}, tumbling(50))
     with pytest.raises(MissingColumnError, match="mag_z"):
         correction_of("magnetometer", {"view": "norm"}, changed(tumbling(50), mag_z=None))

@@ -11,6 +11,7 @@ from mkc_torch.effects.dynamics.hard_stop import HardStop
 from mkc_torch.effects.dynamics.input_delay import InputDelay
 from mkc_torch.effects.dynamics.input_saturation import InputSaturation
 from mkc_torch.effects.dynamics.linear_drag import LinearDrag
+from mkc_torch.effects.dynamics.load_dependent_friction import LoadDependentFriction
 from mkc_torch.effects.dynamics.overflow import Overflow
 from mkc_torch.effects.dynamics.position_periodic_force import PositionPeriodicForce
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
@@ -27,6 +28,7 @@ DYNAMICS: tuple[Effect, ...] = (
     QuadraticDrag(),
     CoulombFriction(),
     StribeckFriction(),
+    LoadDependentFriction(),
     CubicStiffness(),
     PositionPeriodicForce(),
     Coupling(),

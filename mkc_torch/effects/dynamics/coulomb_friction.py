@@ -44,3 +44,6 @@ class CoulombFriction(RateEffect):
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return -torch.tanh(context.part("own") / shape["width"])
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        return (f"-{gamma[0]!r} * torch.tanh({names['own']} / {shape['width']!r})",)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -42,3 +42,7 @@ class Coupling(RateEffect):
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 2"]:  # noqa: ARG002
         away = context.part("other") - context.part("own")
         return torch.stack([gamma[0] * away, -gamma[1] * away], -1)
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
+        away = f"({names['other']} - {names['own']})"
+        return f"{gamma[0]!r} * {away}", f"-{gamma[1]!r} * {away}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from torch import Tensor
@@ -25,15 +26,18 @@ class CubicStiffness(RateEffect):
     """
 
     id = "cubic_stiffness"
-    needs = ("deflection",)
+    needs = ("position", "deflection")
     least = -math.inf
     gain = "stiffness"
     power = 3.0
-    of = "deflection"
+    of = "position"
     equation = "δv̇ = −γ x³"
     explanation = "The restoring force bends: the spring is harder, or softer, at large deflections."
     advice = "Add a cubic spring with this coefficient."
     source = "Duffing's oscillator"
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
-        return -context.part("deflection").pow(3)
+        return -context.part("position").pow(3)
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
+        return (f"-({gamma[0]!r}) * {names['position']} ** 3",)

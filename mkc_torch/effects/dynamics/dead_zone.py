@@ -49,3 +49,7 @@ class DeadZone(GainEffect):
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         width = shape["width"]
         return -context.part("own").clamp(-width, width)
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        own, width = names["own"], shape["width"]
+        return (f"-{gamma[0]!r} * {own}.clamp({-width!r}, {width!r})",)

@@ -50,3 +50,8 @@ class HardStop(RateEffect):
         x, place = context.part("position"), shape["place"]
         push = torch.stack([-(x - place).clamp(min=0.0), (-place - x).clamp(min=0.0)], -1)
         return (push @ gamma).unsqueeze(-1)
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        x, place = names["position"], shape["place"]
+        below = f"{gamma[1]!r} * (-{place!r} - {x}).clamp(min=0.0)"
+        return (f"-{gamma[0]!r} * ({x} - {place!r}).clamp(min=0.0) + {below}",)

@@ -53,6 +53,14 @@ class InputDelay(GainEffect):
         run = torch.cat([time.new_zeros(1), (time.diff() < 0).double()]).cumsum(0)
         longest = float(time.max() - time.min()) + shape["delay"] + 1.0
         axis = run * 2.0 * longest + time
-        at = torch.searchsorted(axis, axis - shape["delay"], right=True) - 1
-        at = torch.where((at >= 0) & (run[at.clamp(min=0)] == run), at, torch.searchsorted(run, run))
-        return own[at] - own
+        then = axis - shape["delay"]
+        at = torch.searchsorted(axis, then, right=True) - 1
+        seen = (at >= 0) & (run[at.clamp(min=0)] == run)
+        at = torch.where(seen, at, torch.searchsorted(run, run))
+        after = torch.where(seen, at + 1, at).clamp(max=len(axis) - 1)
+        share = ((then - axis[at]) / (axis[after] - axis[at]).clamp(min=1e-300)).clamp(0.0, 1.0)
+        return torch.lerp(own[at], own[after], share) - own
+
+    def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:
+        own = names["own"]
+        return (f"{gamma[0]!r} * (shifted({own}, time, {-shape['delay']!r}) - {own})",)

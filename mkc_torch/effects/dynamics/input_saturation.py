@@ -50,3 +50,7 @@ class InputSaturation(GainEffect):
         own = context.part("own")
         limit = shape["limit"]
         return own.clamp(-limit, limit) - own
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        own, limit = names["own"], shape["limit"]
+        return (f"{gamma[0]!r} * ({own}.clamp({-limit!r}, {limit!r}) - {own})",)

@@ -43,3 +43,6 @@ class Overflow(RateEffect):
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return -(context.part("own") - shape["rim"]).clamp(min=0.0)
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        return (f"-{gamma[0]!r} * ({names['own']} - {shape['rim']!r}).clamp(min=0.0)",)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -49,3 +49,7 @@ class PositionPeriodicForce(RateEffect):
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:
         phase = shape["order"] * context.part("angle")
         return (torch.stack([phase.sin(), phase.cos()], -1) @ gamma).unsqueeze(-1)
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        phase = f"{shape['order']!r} * {names['angle']}"
+        return (f"{gamma[0]!r} * torch.sin({phase}) + {gamma[1]!r} * torch.cos({phase})",)

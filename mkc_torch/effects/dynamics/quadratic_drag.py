@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from torch import Tensor
@@ -34,3 +35,6 @@ class QuadraticDrag(RateEffect):
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
         own = context.part("own")
         return -own * own.abs()
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
+        return (f"-{gamma[0]!r} * {names['own']} * {names['own']}.abs()",)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from mkc_torch.effects.protocol import Context, GainEffect, Quantity, Shape, per
+from mkc_torch.effects.protocol import Context, GainEffect, Quantity, Shape
+from mkc_torch.effects.units import quotient
 
 __all__ = ["RateEffect"]
 
@@ -36,14 +37,10 @@ class RateEffect(GainEffect):
     def unit(self, context: Context) -> str:
         if not self.power:
             return context.signal_unit
-        unit = context.unit_of(self.of)
-        return per(context.signal_unit, f"{unit}{_POWERS.get(self.power, f'^{self.power:g}')}") if unit else "1/s"
+        return quotient(context.signal_unit, context.unit_of(self.of), int(self.power)) or "1/s"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return ({},)
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity(self.gain, 1, self.unit(context)),)
-
-
-_POWERS = {1.0: "", 2.0: "²", 3.0: "³"}

@@ -50,3 +50,8 @@ class SensorLag(GainEffect):
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
         behind = [lagged(one, context.time, shape["lag"]) for one in context.signal.unbind(-1)]
         return gamma * (torch.stack(behind, -1) - context.signal)
+
+    def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:
+        lag = shape["lag"]
+        each = zip(gamma, names.values(), strict=True)
+        return tuple(f"{share!r} * (lagged({own}, time, {lag!r}) - {own})" for share, own in each)

@@ -49,3 +49,8 @@ class StribeckFriction(RateEffect):
         rise = torch.exp(-(own / shape["stribeck_speed"]).square())
         against = -torch.tanh(own / shape["width"])
         return (against * (gamma[0] + gamma[1] * rise)).unsqueeze(-1)
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        own = names["own"]
+        rise = f"{gamma[1]!r} * torch.exp(-(({own} / {shape['stribeck_speed']!r}) ** 2))"
+        return (f"-({gamma[0]!r} + {rise}) * torch.tanh({own} / {shape['width']!r})",)

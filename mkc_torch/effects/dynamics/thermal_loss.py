@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from torch import Tensor
@@ -41,3 +42,6 @@ class ThermalLoss(RateEffect):
         offset = ZERO if context.unit_of("own") == "°C" else 0.0
         room = 293.15
         return -((context.part("own") + offset).pow(4) - room**4) / (4.0 * room**3)
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
+        return (f"-{gamma[0]!r} * (({names['own']} + {names['zero']}) ** 4 - 293.15**4) / (4.0 * 293.15**3)",)

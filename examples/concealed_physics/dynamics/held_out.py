@@ -1,0 +1,91 @@
+"""What these examples share: diagnose on some runs, simulate others with and without what was found."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import torch
+
+from mkc_torch import Diagnosis, Recording, diagnose
+from mkc_torch.simulation import Dynamics
+
+DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data" / "dynamics"
+"""Where the recordings lie by default: beside the project's folder."""
+
+
+@dataclass(frozen=True)
+class Proof:
+    """A diagnosis, and the outputs (N, m) of runs that it has not seen: measured, simulated without and with it."""
+
+    diagnosis: Diagnosis
+    time: torch.Tensor
+    measured: torch.Tensor
+    before: torch.Tensor
+    after: torch.Tensor
+
+    def root_mean_square(self, scored: torch.Tensor | slice = slice(None)) -> tuple[float, float]:
+        """Error before and after."""
+        before, after = (self.measured - self.before)[scored], (self.measured - self.after)[scored]
+        return float(before.square().mean().sqrt()), float(after.square().mean().sqrt())
+
+    def mean_absolute(self, scored: torch.Tensor | slice = slice(None)) -> tuple[float, float]:
+        """Error before and after."""
+        before, after = (self.measured - self.before)[scored], (self.measured - self.after)[scored]
+        return float(before.abs().mean()), float(after.abs().mean())
+
+
+def prove(system: Dynamics, train: Recording, tests: Sequence[Recording], *, max_findings: int = 3) -> list[Proof]:
+    """Diagnose the simulation on some runs, and simulate others by what was found."""
+    found = diagnose(system, train, max_findings=max_findings)
+    naive = diagnose(system, train, effects=(), max_findings=0)
+    assert found.model is not None
+    assert naive.model is not None
+    proofs = []
+    for test in tests:
+        columns, plain = found.model(test), naive.model(test)
+        names = [name for name in columns if name != "time"]
+        before, after = (torch.stack([one[name] for name in names], -1) for one in (plain, columns))
+        proofs.append(Proof(found, columns["time"], test.stack(*names), before, after))
+    return proofs
+
+
+def told(diagnosis: Diagnosis) -> str:
+    """The findings in a line."""
+    if not diagnosis.findings:
+        return f"nothing found (p = {diagnosis.p_value:.2f})"
+    parts = []
+    for finding in diagnosis.findings:
+        rivals = [a.effect for a in finding.alternatives if not a.separable]
+        beside = f", not told apart from {', '.join(rivals)}" if rivals else ""
+        parts.append(f"{finding.effect} (p = {finding.p_value:.2f}{beside})")
+    return "; then ".join(parts)
+
+
+def picture(proof: Proof, path: Path, title: str, unit: str, rows: slice = slice(None)) -> None:
+    """Unseen runs as measured and as simulated, and the errors of both simulations."""
+    figure, (above, below) = plt.subplots(2, 1, figsize=(9, 6), sharex=True, layout="constrained")
+    x = torch.arange(len(proof.time))[rows]
+    above.plot(x, proof.measured[rows, 0], color="black", linewidth=2.0, label="measured, not seen by the fit")
+    above.plot(x, proof.before[rows, 0], color="tab:red", label="the simulation")
+    above.plot(x, proof.after[rows, 0], color="tab:blue", label="with what was found")
+    above.set_ylabel(unit)
+    above.set_title(title)
+    above.legend(loc="best")
+    below.plot(x, (proof.measured - proof.before)[rows, 0], color="tab:red")
+    below.plot(x, (proof.measured - proof.after)[rows, 0], color="tab:blue")
+    below.set_ylabel(f"error, {unit}")
+    below.set_xlabel("sample")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def arguments(description: str) -> argparse.Namespace:
+    """Command line of an example."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--data", type=Path, default=DATA, help="folder with the recordings of the four systems")
+    parser.add_argument("--output", type=Path, help="PNG file to write")
+    return parser.parse_args()

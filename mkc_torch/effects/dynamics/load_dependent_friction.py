@@ -1,0 +1,56 @@
+"""Dry friction that grows with the load."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.protocol import Context, Quantity, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+WIDTHS = (0.3, 0.1, 0.03, 0.01)
+"""Of the smoothed sign, as shares of the typical speed."""
+
+
+class LoadDependentFriction(RateEffect):
+    """Dry friction of a gear: a part that is always there, and a part in proportion to what presses the teeth together.
+
+    Simulation: adds ``−(γ₁ + γ₂ |a − h|) tanh(v / w)`` to the rate of a speed v, with a what the inputs drive it by and
+    h what acts on it without them, both at standstill.
+    Drivers: none but the states and inputs.
+    Units: γ₁ in the speed's unit per s; γ₂ is a share; ``width`` in the unit of the speed.
+    Plausible: γ ≥ 0.
+    Source: Duclusaud et al., "Extended Friction Models for the Physics Simulation of Servo Actuators", ICRA 2025.
+    """
+
+    id = "load_dependent_friction"
+    port = "loaded rate"
+    needs = ("reversing", "load")  # at speeds of one sign it is a constant force
+    relative: Mapping[str, tuple[str, str]] = {"width": ("own", "typical")}
+    gain = "friction"
+    most: float = math.inf
+    equation = "δv̇ = −(γ₁ + γ₂ |a − h|) tanh(v / w)"
+    explanation = "Dry friction holds against the motion, the more the harder the drive works against its load."
+    advice = "Add dry friction with a part in proportion to the load."
+    source = "Duclusaud et al., Extended Friction Models for the Physics Simulation of Servo Actuators, ICRA 2025"
+
+    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+        return tuple({"width": width} for width in WIDTHS)
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return (Quantity("friction", 1, context.signal_unit), Quantity("share_of_load", 1, ""))
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:
+        against = -torch.tanh(context.part("own") / shape["width"])
+        return (against * (gamma[0] + gamma[1] * context.part("load"))).unsqueeze(-1)
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        size = f"({gamma[0]!r} + {gamma[1]!r} * {names['load']})"
+        return (f"-{size} * torch.tanh({names['own']} / {shape['width']!r})",)

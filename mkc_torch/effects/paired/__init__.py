@@ -1,0 +1,30 @@
+"""Effects between what was simulated and what was measured: one piece of physics a file.
+
+They act on outputs of simulations without a state of their own, :class:`mkc_torch.simulation.Static` and
+:class:`mkc_torch.simulation.Paired`, whose ports have the part "compared". At the output of differential equations most
+of them would only say again, less well, what an effect on a rate or an input says.
+"""
+
+from __future__ import annotations
+
+from mkc_torch.effects.paired.clock_drift import ClockDrift
+from mkc_torch.effects.paired.delay import Delay
+from mkc_torch.effects.paired.driver_linear import DriverLinear
+from mkc_torch.effects.paired.driver_quadratic import DriverQuadratic
+from mkc_torch.effects.paired.gain import Gain
+from mkc_torch.effects.paired.offset import Offset
+from mkc_torch.effects.paired.output_saturation import OutputSaturation
+from mkc_torch.effects.protocol import Effect
+
+__all__ = ["PAIRED"]
+
+PAIRED: tuple[Effect, ...] = (
+    Gain(),
+    Offset(),
+    Delay(),
+    ClockDrift(),
+    OutputSaturation(),
+    DriverLinear(),
+    DriverQuadratic(),
+)
+"""The effects that a diagnosis of outputs tries."""

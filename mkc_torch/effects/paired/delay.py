@@ -1,0 +1,46 @@
+"""A recording that is late, or early."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.effects.paired.between import shifted
+from mkc_torch.effects.protocol import Context, Quantity, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class Delay:
+    """What is measured comes after what is simulated by a constant time, or before it.
+
+    Simulation: adds ``y(t − γ) − y(t)`` to an output y.
+    Drivers: none but the output.
+    Units: γ in s, negative where the recording is early.
+    Plausible: any size; one that is longer than a quarter of the signal's shortest period is not found from nothing.
+    Source: transport delays; Åström & Murray, "Feedback Systems" (2008), 3.4.
+    """
+
+    id = "delay"
+    port = "output"
+    roles: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ("own", "compared")
+    follows_signal = True
+    plausible = float("inf")
+    equation = "δy = y(t − γ) − y(t)"
+    explanation = "What is measured comes later than what is simulated, or earlier."
+    advice = "Look for filters and transport on the way to the recording, and for how its clock was set."
+    source = "transport delays; Åström & Murray, Feedback Systems (2008), 3.4"
+
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
+        return ({},)
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return (Quantity("delay", 1, "s"),)
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:  # noqa: ARG002
+        own = context.part("own")
+        return (shifted(own, context.time, -gamma[0].expand(len(own))) - own).unsqueeze(-1)

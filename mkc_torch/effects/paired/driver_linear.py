@@ -1,0 +1,54 @@
+"""An output that follows a column."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.protocol import Context, GainEffect, Quantity, Shape
+from mkc_torch.effects.units import quotient
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class DriverLinear(GainEffect):
+    """What is measured follows a recorded column that the simulation does not know of.
+
+    Simulation: adds ``b + k (x − x̄)`` to an output; without b where a parameter of the simulation moves the zero.
+    Drivers: any one column.
+    Units: k in the output's unit for each unit of the column, b in the output's.
+    Plausible: any size.
+    Source: the linear response to any small disturbance.
+
+    Attributes:
+        degree: of the polynomial in x.
+    """
+
+    id = "driver_linear"
+    port = "output"
+    needs: tuple[str, ...] = ("own", "compared")
+    roles: tuple[str, ...] = ("any", "temperature", "current")
+    equation = "δy = b + k (x − x̄)"
+    explanation = "What is measured follows this column in a straight line."
+    advice = "Find out how the column acts on the sensor or the system; correct with the fitted gain until then."
+    source = "linear response, first order in the driver"
+    degree = 1
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        slopes = (
+            Quantity("per_unit", 1, self.unit(context)),
+            Quantity("per_square", 1, quotient(context.signal_unit, context.units[0], 2)),
+        )
+        zero = (Quantity("at_mean", 1, context.signal_unit),) if "fixed zero" in context.parts else ()
+        return slopes[: self.degree] + zero
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:  # noqa: ARG002
+        x = context.drivers[:, 0]
+        columns = [x.pow(k) for k in range(1, self.degree + 1)]
+        if "fixed zero" in context.parts:
+            columns.append(torch.ones_like(x))
+        return (torch.stack(columns, -1) @ gamma).unsqueeze(-1)

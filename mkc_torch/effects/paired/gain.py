@@ -1,0 +1,42 @@
+"""A sensor whose scale is off."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.effects.protocol import Context, GainEffect, Quantity, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class Gain(GainEffect):
+    """What is measured is larger or smaller than what is simulated by a constant share.
+
+    Simulation: adds ``γ y`` to an output y.
+    Drivers: none but the output.
+    Units: γ is a share.
+    Plausible: |γ| up to 0.5.
+    Source: scale errors of sensors; Doebelin, "Measurement Systems" (2003), 3.2.
+    """
+
+    id = "gain"
+    port = "output"
+    needs: tuple[str, ...] = ("own", "compared")
+    follows_signal = True
+    along = "own"
+    gain = "gain_error"
+    plausible = 0.5
+    equation = "δy = γ y"
+    explanation = "What is measured is a constant share larger, or smaller, than what is simulated."
+    advice = "Check the sensor's scale and units, and what the simulator takes for its own."
+    source = "Doebelin, Measurement Systems (2003), 3.2"
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return (Quantity(self.gain, 1, ""),)
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+        return context.part("own")

@@ -1,0 +1,36 @@
+"""A sensor whose zero is off."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.protocol import Context, GainEffect, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class Offset(GainEffect):
+    """What is measured lies beside what is simulated by a constant.
+
+    Simulation: adds γ to an output.
+    Drivers: none.
+    Units: γ in the output's unit.
+    Plausible: any size.
+    Source: zero errors of sensors; Doebelin, "Measurement Systems" (2003), 3.2.
+    """
+
+    id = "offset"
+    port = "output"
+    needs: tuple[str, ...] = ("own", "compared")
+    gain = "offset"
+    equation = "δy = γ"
+    explanation = "What is measured lies beside what is simulated by a constant."
+    advice = "Check the sensor's zero, and where the simulator has its own."
+    source = "Doebelin, Measurement Systems (2003), 3.2"
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+        return torch.ones_like(context.time)

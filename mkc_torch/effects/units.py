@@ -1,0 +1,64 @@
+"""Units as texts: tidied, and divided by one another."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+__all__ = ["quotient", "tidy"]
+
+_RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+_POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+_FACTOR = re.compile(r"(?P<name>[^\d⁻⁰¹²³⁴⁵⁶⁷⁸⁹^]+)\^?(?P<power>[-⁻]?[\d⁰¹²³⁴⁵⁶⁷⁸⁹]+)?$")
+
+
+def tidy(unit: str) -> str:
+    """A unit with each factor once; as it is, where it is no product of powers.
+
+    Example:
+        >>> tidy("rad/s/s"), tidy("m/(s·kg)"), tidy("1/s"), tidy("°C"), tidy("")
+        ('rad/s²', 'm/(s·kg)', '1/s', '°C', '')
+    """
+    factors = _factors(unit)
+    return unit if factors is None else _written(factors)
+
+
+def quotient(unit: str, other: str, power: int = 1) -> str:
+    """The unit of one for each power of the other; empty where one is not known.
+
+    Example:
+        >>> quotient("rad/s²", "rad/s", 2), quotient("rad/s²", "rad/s"), quotient("m/s²", "m/s", 2)
+        ('1/rad', '1/s', '1/m')
+    """
+    above, below = _factors(unit), _factors(other)
+    if not unit or not other or above is None or below is None:
+        return ""
+    return _written({name: above.get(name, 0) - power * below.get(name, 0) for name in {**above, **below}})
+
+
+def _factors(unit: str) -> dict[str, int] | None:
+    """Name to power; None where the text is no product of powers."""
+    factors: dict[str, int] = {}
+    for place, part in enumerate(re.split(r"/", unit.strip())):
+        for piece in re.split(r"[·*]", part.strip().removeprefix("(").removesuffix(")")):
+            if piece.strip() in ("", "1"):
+                continue
+            found = _FACTOR.match(piece.strip())
+            if found is None or " " in piece.strip() or (("(" in part) != (")" in part)):
+                return None
+            power = int((found["power"] or "1").translate(_RAISED))
+            factors[found["name"]] = factors.get(found["name"], 0) + (power if place == 0 else -power)
+    return factors
+
+
+def _written(factors: Mapping[str, int]) -> str:
+    above = [_raised(name, power) for name, power in factors.items() if power > 0]
+    below = [_raised(name, -power) for name, power in factors.items() if power < 0]
+    if not below:
+        return "·".join(above)
+    divisor = below[0] if len(below) == 1 else f"({'·'.join(below)})"
+    return f"{'·'.join(above) or '1'}/{divisor}"
+
+
+def _raised(name: str, power: int) -> str:
+    return name if power == 1 else f"{name}{str(power).translate(_POWERS)}"

@@ -1,0 +1,77 @@
+"""Ports at what a simulation without states puts out: one for each column, and one for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.simulation.protocol import Changes, Port
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["ALL", "changed_outputs", "output_ports", "output_signals"]
+
+ALL = "all outputs"
+"""The port of all columns together, whose kind is "outputs"; that of one is called ``output NAME``."""
+
+
+def output_ports(
+    channels: Sequence[str],
+    units: Mapping[str, str],
+    unit: str,
+    measured: Float[Tensor, "N m"],
+    fixed: Collection[str] = (),
+) -> dict[str, Port]:
+    """The ports of columns.
+
+    Args:
+        channels: their names.
+        units: of each.
+        unit: of all of them; empty where they differ.
+        measured: for the sizes of what passes.
+        fixed: those whose zero no parameter of the simulation moves; they have the part "fixed zero".
+
+    Example:
+        >>> ports = output_ports(("angle",), {"angle": "rad"}, "rad", torch.ones(5, 1))
+        >>> [(name, port.kind, port.unit) for name, port in ports.items()]
+        [('all outputs', 'outputs', 'rad'), ('output angle', 'output', 'rad')]
+    """
+    ports = {ALL: Port(tuple(channels), unit, wanders=True, kind="outputs")}
+    for k, name in enumerate(channels):
+        values = measured[:, k].abs()
+        parts = {"own": name, "compared": name} | ({"fixed zero": name} if name in fixed else {})
+        ports[f"output {name}"] = Port(
+            (name,),
+            units[name],
+            kind="output",
+            parts=parts,
+            part_units=dict.fromkeys(parts, units[name]),
+            sizes={"own": (float(values.median()), float(values.amax()))},
+        )
+    return ports
+
+
+def changed_outputs(outputs: Float[Tensor, "N m"], channels: Sequence[str], changes: Changes) -> Float[Tensor, "N m"]:
+    """The outputs with what effects add: first to each column, then to all."""
+    outputs = _each_changed(outputs, channels, changes)
+    return outputs + changes[ALL](outputs) if ALL in changes else outputs
+
+
+def output_signals(
+    outputs: Float[Tensor, "N m"], channels: Sequence[str], changes: Changes
+) -> dict[str, Float[Tensor, "N k"]]:
+    """What passes through the ports."""
+    own = {f"output {name}": outputs[:, [k]] for k, name in enumerate(channels)}
+    return {ALL: _each_changed(outputs, channels, changes)} | own
+
+
+def _each_changed(outputs: Tensor, channels: Sequence[str], changes: Changes) -> Tensor:
+    columns = [
+        outputs[:, [k]] + changes[f"output {name}"](outputs[:, [k]]) if f"output {name}" in changes else outputs[:, [k]]
+        for k, name in enumerate(channels)
+    ]
+    return torch.cat(columns, -1)

@@ -1,0 +1,350 @@
+"""A simulator as a black box: the columns that it wrote beside those that were recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.nonlinear import GaussianPrior
+from mkc_torch.recording import Recording
+from mkc_torch.simulation.dynamics import SimulationError
+from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
+from mkc_torch.simulation.protocol import Changes
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+__all__ = ["Paired", "PairedCorrection", "PreparedPaired"]
+
+RATE = 5e-5
+"""Standard deviation of the rate between two clocks: 50 ppm, of quartz that nothing steadies."""
+
+_NOT_KEYS = frozenset({"time", "experiment"})
+_FREE = 2.0
+_SAME = 1e-9
+_FEWEST = 2
+
+
+class Paired:
+    """What a simulator wrote, compared with a recording in all columns that both have, at the recording's times.
+
+    Between the simulator's moments its columns go along cubic polynomials. The two clocks may differ: by an offset, of
+    each run, with a standard deviation of half a sampling interval, and by a rate of 50 ppm. Both are fitted, to twice
+    that at most; what is more is no matter of clocks and is found as ``delay`` or ``clock_drift``. A column that is the
+    same in both is an input of the simulator and not compared, but can drive effects.
+
+    Args:
+        simulated: with ``time``; a column ``experiment`` tells runs apart by the same labels as the recording's.
+        outputs: the columns to compare; None for all that both have.
+        offset: standard deviation of the clocks' offset in s; None for half an interval of the recording.
+        rate: standard deviation of their rate.
+
+    Attributes:
+        joins_experiments: True: one fit takes all runs.
+
+    Raises:
+        MissingColumnError: there is no ``time``.
+        ValueError: a standard deviation that is not positive.
+
+    Example:
+        >>> time = torch.arange(0.0, 10.0, 0.1, dtype=torch.float64)
+        >>> simulator = Recording({"time": time, "angle": torch.sin(time)})
+        >>> recording = Recording({"time": time[5:-5] + 0.02, "angle": 1.1 * torch.sin(time[5:-5])})
+        >>> prepared = Paired(simulator).prepare(recording)
+        >>> prepared.channels, prepared.parameter_names
+        (('angle',), ('clock offset', 'clock rate'))
+    """
+
+    name = "simulated"
+    joins_experiments = True
+
+    def __init__(
+        self,
+        simulated: Recording,
+        *,
+        outputs: Sequence[str] | None = None,
+        offset: float | None = None,
+        rate: float = RATE,
+    ) -> None:
+        for what, value in (("offset", offset), ("rate", rate)):
+            if value is not None and not 0.0 < value < float("inf"):
+                raise ValueError(f"Expected argument `{what}` to be positive and finite but got {value}.")
+        self.simulated = simulated.finite("time").sorted_by_time()
+        self.outputs = None if outputs is None else tuple(outputs)
+        self.offset, self.rate = offset, rate
+
+    @property
+    def columns(self) -> frozenset[str]:
+        # what turns out to be an input may drive effects: the columns of a recording are known in `prepare` alone
+        return _NOT_KEYS
+
+    def prepare(self, recording: Recording) -> PreparedPaired:
+        """The simulator's columns beside a recording's.
+
+        Raises:
+            MissingColumnError: the recording has no ``time``, or lacks a column of ``outputs``.
+            SimulationError: no column, no run or no time in common.
+        """
+        shared = self._shared(recording)
+        table = recording.finite("time", *shared).sorted_by_time()
+        table, curve = _met(self.simulated.finite(*shared), table, shared)
+        return PreparedPaired(self, table, shared, curve)
+
+    def _shared(self, recording: Recording) -> tuple[str, ...]:
+        recording["time"]
+        if self.outputs is not None:
+            for name in self.outputs:
+                recording[name], self.simulated[name]
+            return self.outputs
+        shared = tuple(name for name in recording.names if name in self.simulated and name not in _NOT_KEYS)
+        if not shared:
+            raise SimulationError(
+                f"{_called(recording, 'the recording')} and {_called(self.simulated, 'the simulated table')} have no "
+                f"column in common to compare: {_listed(recording)} there, {_listed(self.simulated)} here. Rename with "
+                "`--columns`."
+            )
+        return shared
+
+
+class PreparedPaired:
+    """The columns of a simulator with the recording that answers them."""
+
+    def __init__(self, system: Paired, recording: Recording, shared: tuple[str, ...], curve: _Curve) -> None:
+        self.system, self.name = system, system.name
+        self.time = recording["time"]
+        self.curve = curve
+        measured, same = recording.stack(*shared), []
+        simulated = curve.at(self.time)
+        for k, name in enumerate(shared):
+            reach = float(measured[:, k].amax() - measured[:, k].amin())
+            if float((measured[:, k] - simulated[:, k]).abs().max()) <= _SAME * reach:
+                same.append(name)
+        if len(same) == len(shared):
+            raise SimulationError(
+                f"All columns in common ({', '.join(shared)}) are the same in the recording and in what was simulated; "
+                "there is nothing to diagnose. Give the simulator's own output."
+            )
+        kept = [k for k, name in enumerate(shared) if name not in same]
+        self.channels = tuple(shared[k] for k in kept)
+        self.measured, self.curve = measured[:, kept], curve.columns(kept)
+        # the compared columns go, so that they do not drive effects on themselves
+        left = {name: values for name, values in recording.columns.items() if name not in self.channels}
+        self.recording = _copied(recording, left)
+        self._units = {name: recording.units[name] for name in self.channels}
+        units = set(self._units.values())
+        self.unit = units.pop() if len(units) == 1 else ""
+        self.independent = (True,) * len(self.channels)
+        self.state: Mapping[str, object] = {"channels": list(self.channels)}
+        interval = _interval(self.time, curve.run)
+        width = interval / 2.0 if system.offset is None else system.offset
+        spread = [width] * len(curve.runs) + [system.rate]
+        first = self.time.new_full((len(curve.runs),), torch.inf).scatter_reduce(0, curve.run, self.time, "amin")
+        self._since = self.time - first[curve.run]
+        offsets = [f"clock offset of {one}" if one else "clock offset" for one in curve.runs]
+        self.parameter_names = (*offsets, "clock rate")
+        sizes = self.time.new_tensor(spread)
+        self.prior: GaussianPrior | None = GaussianPrior(torch.zeros_like(sizes), sizes.square().reciprocal())
+        self._most = _FREE * sizes
+        self.bounds = torch.full_like(sizes, -torch.inf), torch.full_like(sizes, torch.inf)
+        self.ports = output_ports(self.channels, self._units, self.unit, self.measured, self.channels)
+        self.warnings: tuple[str, ...] = tuple(
+            f"Column `{name}` is the same in both tables: it counts as an input of the simulator and is not compared."
+            for name in same
+        )
+
+    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
+        return self.time.new_zeros(len(self.parameter_names))
+
+    def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
+        return self.measured - changed_outputs(self._outputs(theta), self.channels, changes)
+
+    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Float[Tensor, "N k"]]:
+        return output_signals(self._outputs(theta), self.channels, changes)
+
+    def _outputs(self, theta: Tensor) -> Float[Tensor, "N m"]:
+        # by a curve that levels off: at a hard bound the fit of what goes the same way would get stuck
+        clock = self._most * torch.tanh(theta / self._most)
+        return self.curve.at(self.time + clock[:-1][self.curve.run] + clock[-1] * self._since)
+
+
+class PairedCorrection:
+    """A simulator's columns for a new recording, with the effects in them; the clocks count as one.
+
+    Args:
+        system: what the simulator wrote for the new recording.
+        channels: the columns that were compared.
+        recording: with its times and drivers; the compared columns need not be there.
+
+    Raises:
+        MissingColumnError: no ``time``, or a column that was not simulated.
+        SimulationError: no run in common, or times that were not simulated.
+    """
+
+    def __init__(self, system: Paired, channels: Sequence[str], recording: Recording) -> None:
+        self.channels = tuple(channels)
+        self.time = recording["time"]
+        inside, self._curve = _found(system.simulated.finite(*self.channels), recording, self.channels)
+        if not bool(inside.all()):
+            raise SimulationError(
+                f"{int((~inside).sum())} of {len(inside)} samples lie outside the times that were simulated; simulate "
+                "all of the recording, or cut it."
+            )
+        units = {name: system.simulated.units[name] for name in self.channels}
+        self.ports = output_ports(self.channels, units, "", self._curve.at(self.time), self.channels)
+
+    def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:  # noqa: ARG002
+        """The simulated columns with the effects."""
+        outputs = changed_outputs(self._curve.at(self.time), self.channels, changes)
+        return {"time": self.time} | dict(zip(self.channels, outputs.unbind(-1), strict=True))
+
+
+@dataclass(frozen=True)
+class _Curve:
+    """What was simulated, as cubic polynomials between its moments, for the samples of a recording.
+
+    Attributes:
+        time, values, slopes: of the S moments, run after run.
+        number: (S,) of each moment's run.
+        run: (N,), of each sample's run; ``runs`` are their labels.
+        low, high: (N,), first and last moment of that run.
+    """
+
+    time: Float[Tensor, " S"]
+    values: Float[Tensor, "S m"]
+    slopes: Float[Tensor, "S m"]
+    number: Int[Tensor, " S"]
+    run: Int[Tensor, " N"]
+    low: Int[Tensor, " N"]
+    high: Int[Tensor, " N"]
+    runs: tuple[str, ...]
+
+    def at(self, time: Float[Tensor, " N"]) -> Float[Tensor, "N m"]:
+        """Values at one moment for each sample."""
+        # on an axis where runs follow one another
+        least = self.time.min()
+        span = self.time.max() - least + 1.0
+        within = (time.detach() - least).clamp(0.0, float(span) - 0.5)
+        after = torch.searchsorted(self.number * span + self.time - least, self.run * span + within, right=True)
+        left = torch.minimum(torch.maximum(after - 1, self.low), self.high - 1)
+        step = (self.time[left + 1] - self.time[left]).unsqueeze(-1)
+        x = (time - self.time[left]).unsqueeze(-1) / step
+        # Hermite's cubic: https://en.wikipedia.org/wiki/Cubic_Hermite_spline
+        rise = self.values[left + 1] - self.values[left]
+        begin, end = step * self.slopes[left], step * self.slopes[left + 1]
+        return self.values[left] + x * (begin + x * (3.0 * rise - 2.0 * begin - end + x * (begin + end - 2.0 * rise)))
+
+    def kept(self, rows: Bool[Tensor, " N"]) -> _Curve:
+        """For some of the samples."""
+        return replace(self, run=self.run[rows], low=self.low[rows], high=self.high[rows])
+
+    def columns(self, kept: Sequence[int]) -> _Curve:
+        """Some of the columns."""
+        return replace(self, values=self.values[:, kept], slopes=self.slopes[:, kept])
+
+
+def _met(simulated: Recording, recording: Recording, names: tuple[str, ...]) -> tuple[Recording, _Curve]:
+    """The samples whose times were simulated, with the curve."""
+    inside, curve = _found(simulated, recording, names)
+    if bool(inside.all()):
+        return recording, curve
+    told = (
+        f"{int((~inside).sum())} of {len(recording)} samples lie outside the times that were simulated, "
+        f"{_range(simulated)}, and are left out."
+    )
+    columns = {name: values[inside] for name, values in recording.columns.items()}
+    return _copied(recording, columns, told), curve.kept(inside)
+
+
+def _found(simulated: Recording, recording: Recording, names: tuple[str, ...]) -> tuple[Bool[Tensor, " N"], _Curve]:
+    """Which samples lie within the simulated times of their run, and the curve.
+
+    Raises:
+        SimulationError: a run was not simulated, or none of its samples.
+    """
+    time = recording["time"]
+    number, labels = _runs(simulated)
+    own, own_labels = _runs(recording)
+    missing = [label for label in own_labels if label not in labels]
+    if missing and (labels != [""] or own_labels != [""]):
+        raise SimulationError(
+            f"{_called(simulated, 'The simulated table')} has no run {_experiments(missing)}; its column `experiment` "
+            f"has {_experiments(labels)}. Runs of both tables are matched by that column."
+        )
+    count = torch.bincount(number, minlength=len(labels))
+    if int(count.min()) < _FEWEST:
+        raise SimulationError(f"{_called(simulated, 'The simulated table')} has a run of one moment; it needs two.")
+    last = count.cumsum(0) - 1
+    run = torch.tensor([labels.index(label) for label in own_labels])[own]
+    low, high = (last - count + 1)[run], last[run]
+    inside = (time >= simulated["time"][low]) & (time <= simulated["time"][high])
+    for k, label in enumerate(own_labels):
+        if not bool(inside[own == k].any()):
+            where = f" of run {label}" if label else ""
+            raise SimulationError(
+                f"{_called(recording, 'The recording')} and {_called(simulated, 'the simulated table')} do not meet in "
+                f"time{where}: {_range(recording, own == k)} was recorded, "
+                f"{_range(simulated, number == labels.index(label))} simulated. Give both the same zero of time."
+            )
+    values = simulated.stack(*names)
+    slopes = _slopes(simulated["time"], values, number)
+    curve = _Curve(simulated["time"], values, slopes, number, run, low, high, tuple(labels))
+    return inside, curve
+
+
+def _slopes(time: Float[Tensor, " S"], values: Float[Tensor, "S m"], number: Int[Tensor, " S"]) -> Float[Tensor, "S m"]:
+    """Of the parabola through each moment and its neighbours; at the ends of a run, of the straight line."""
+    step = time.diff().unsqueeze(-1)
+    same = (number.diff() == 0).unsqueeze(-1)
+    slope = torch.where(same, values.diff(dim=0) / torch.where(same, step, 1.0), 0.0)
+    weight = torch.where(same, 1.0 / torch.where(same, step, 1.0), 0.0)
+    nothing = torch.zeros_like(slope[:1])
+    before, after = torch.cat([nothing, slope]), torch.cat([slope, nothing])
+    left, right = torch.cat([nothing[:, :1], weight]), torch.cat([weight, nothing[:, :1]])
+    return (left * before + right * after) / (left + right)
+
+
+def _runs(recording: Recording) -> tuple[Int[Tensor, " N"], list[str]]:
+    """Number of each sample's run, in the order of their appearance, and the runs' labels."""
+    if "experiment" not in recording:
+        return torch.zeros(len(recording), dtype=torch.long), [""]
+    names = recording.labels.get("experiment", ())
+    values = recording["experiment"].tolist()
+    order = {value: number for number, value in enumerate(dict.fromkeys(values))}
+    labels = [names[int(value)] if names else f"{value:g}" for value in order]
+    return torch.tensor([order[value] for value in values]), labels
+
+
+def _interval(time: Float[Tensor, " N"], run: Int[Tensor, " N"]) -> float:
+    inside = time.diff()[run.diff() == 0]
+    return float(inside.median()) if len(inside) else 1.0
+
+
+def _copied(recording: Recording, columns: Mapping[str, Tensor], *warnings: str) -> Recording:
+    return Recording(
+        columns,
+        name=recording.name,
+        units={name: recording.units[name] for name in columns},
+        warnings=(*recording.warnings, *warnings),
+        labels={name: values for name, values in recording.labels.items() if name in columns},
+    )
+
+
+def _called(recording: Recording, otherwise: str) -> str:
+    return recording.name or otherwise
+
+
+def _listed(recording: Recording) -> str:
+    return ", ".join(name for name in recording.names if name not in _NOT_KEYS) or "none"
+
+
+def _experiments(labels: Sequence[str]) -> str:
+    return ", ".join(label or "(no such column)" for label in labels)
+
+
+def _range(recording: Recording, rows: Bool[Tensor, " N"] | None = None) -> str:
+    time = recording["time"] if rows is None else recording["time"][rows]
+    return f"{float(time.min()):g} to {float(time.max()):g} s"

@@ -1,0 +1,320 @@
+"""Simulations without states: outputs as a function of inputs and parameters, sample by sample."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
+from mkc_torch.recording import Recording
+from mkc_torch.simulation.dynamics import Parameter, SimulationError
+from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
+from mkc_torch.simulation.protocol import Changes, Port
+from mkc_torch.simulation.undetermined import undetermined
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["PreparedStatic", "Static", "StaticCorrection"]
+
+MOST_PARAMETERS = 200
+"""A module with more numbers than this is a fit of anything; what a simulation lacks cannot be asked of it."""
+
+
+class Static:
+    """Outputs that are a function of inputs and parameters at the same moment: derive from it, or wrap a module.
+
+    A subclass gives names, parameters and an ``output``. A module takes the inputs side by side, (N, k), and returns
+    the outputs, (N, m), or (N,) for one; all numbers of its parameters are fitted, from where they are. The module is
+    copied, and computes in float64 and in evaluation mode.
+
+    Args:
+        module: of the user's own; None for a subclass with ``output``.
+        inputs, outputs: names of columns, instead of the class's.
+        name: of the simulation; default the class's, or the module's.
+
+    Attributes:
+        inputs: names of the columns it is a function of.
+        outputs: names of the columns that it predicts.
+        parameters: name to value to start from, or :class:`mkc_torch.simulation.Parameter`.
+        units: of inputs and outputs.
+        joins_experiments: False: each run of a recording is diagnosed by itself.
+
+    Raises:
+        SimulationError: a module without parameters that are real numbers, or with more than 200 of them.
+
+    Example:
+        >>> class Thermistor(Static):
+        ...     inputs = ("temperature",)
+        ...     outputs = ("voltage",)
+        ...     parameters = {"bottom": 0.3, "slope": Parameter(0.01, lower=0.0, unit="V/K")}
+        ...
+        ...     def output(self, time, u, p):
+        ...         return {"voltage": p.bottom + p.slope * u.temperature}
+        >>> time = torch.arange(0.0, 10.0, 0.1)
+        >>> recording = Recording({"time": time, "temperature": 20.0 + time, "voltage": 0.5 + 0.01 * time})
+        >>> Thermistor().prepare(recording).parameter_names
+        ('bottom', 'slope')
+        >>> line = Static(torch.nn.Linear(1, 1), inputs=("temperature",), outputs=("voltage",))
+        >>> line.name, line.prepare(recording).parameter_names
+        ('Linear', ('weight[0,0]', 'bias[0]'))
+    """
+
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    parameters: Mapping[str, float | Parameter] = {}
+    units: Mapping[str, str] = {}
+    joins_experiments: bool = False
+
+    def __init__(
+        self,
+        module: nn.Module | None = None,
+        *,
+        inputs: Sequence[str] | None = None,
+        outputs: Sequence[str] | None = None,
+        name: str | None = None,
+    ) -> None:
+        self.inputs = self.inputs if inputs is None else tuple(inputs)
+        self.outputs = self.outputs if outputs is None else tuple(outputs)
+        self.module = None if module is None else copy.deepcopy(module).double().eval()
+        self._name = name or (type(self).__name__ if module is None else type(module).__name__)
+        if self.module is not None:
+            self.parameters = _numbers_of(self.module, self._name)
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    @property
+    def columns(self) -> frozenset[str]:
+        return frozenset({"time", "experiment", *self.inputs, *self.outputs})
+
+    def output(self, time: Tensor, u: Any, p: Any) -> Mapping[str, Tensor]:
+        """What is measured, by the columns' names.
+
+        Args:
+            time: (N,) in s.
+            u: the inputs, each (N,), as attributes.
+            p: the parameters as attributes.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} has no `output(self, time, u, p)`; write one that returns each of its outputs, or "
+            "wrap a module: Static(module, inputs=(...), outputs=(...))."
+        )
+
+    def computed(
+        self, time: Float[Tensor, " N"], inputs: Float[Tensor, "N k"], theta: Float[Tensor, " p"]
+    ) -> Float[Tensor, "N m"]:
+        """The outputs side by side.
+
+        Raises:
+            SimulationError: an output of a wrong shape, or one that is missing.
+        """
+        if self.module is not None:
+            known = dict(self.module.named_parameters())
+            parts = theta.split([one.numel() for one in known.values()])
+            values = {name: part.reshape(one.shape) for (name, one), part in zip(known.items(), parts, strict=True)}
+            found = torch.func.functional_call(self.module, values, (inputs,))
+            return self._checked_module(found, len(time))
+        u = SimpleNamespace(**dict(zip(self.inputs, inputs.unbind(-1), strict=True)))
+        p = SimpleNamespace(**dict(zip(self.parameters, theta.unbind(), strict=True)))
+        outputs = self.output(time, u, p)
+        return torch.stack([self._checked(outputs, name, len(time)) for name in self.outputs], -1)
+
+    def _checked_module(self, found: object, count: int) -> Tensor:
+        m = len(self.outputs)
+        if isinstance(found, Tensor) and found.shape == (count,) and m == 1:
+            return found.unsqueeze(-1)
+        if not isinstance(found, Tensor) or found.shape != (count, m):
+            told = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
+            raise SimulationError(
+                f"{self.name}: the module should return a tensor of shape ({count}, {m}), a column for each of "
+                f"{', '.join(self.outputs)}, but it returns {told}."
+            )
+        return found
+
+    def _checked(self, outputs: Mapping[str, Tensor], name: str, count: int) -> Tensor:
+        if not isinstance(outputs, Mapping) or name not in outputs:
+            told = ", ".join(map(str, outputs)) if isinstance(outputs, Mapping) else type(outputs).__name__
+            raise SimulationError(
+                f"{self.name}.output does not return `{name}`, which is in its outputs; it returns {told}."
+            )
+        value = outputs[name]
+        if not isinstance(value, Tensor) or value.shape not in ((), (1,), (count,)):
+            told = str(tuple(value.shape)) if isinstance(value, Tensor) else type(value).__name__
+            raise SimulationError(
+                f"{self.name}.output: `{name}` should be a tensor of shape ({count},), like the inputs it is given, "
+                f"but is {told}."
+            )
+        return value.expand(count)
+
+    def prepare(self, recording: Recording) -> PreparedStatic:
+        """The simulation of a recording, which needs no ``time``.
+
+        Raises:
+            MissingColumnError: the recording lacks an input or an output.
+            SimulationError: no outputs are named, or ``output`` returns a wrong shape or what is not finite.
+        """
+        if not self.outputs:
+            raise SimulationError(f"{self.name} has no `outputs`; name the columns that it predicts.")
+        table = recording.finite(*self.inputs, *self.outputs)
+        return PreparedStatic(self, table if table.time is None else table.sorted_by_time())
+
+
+class PreparedStatic:
+    """A function of inputs with the recording that answers it."""
+
+    prior: GaussianPrior | None = None
+
+    def __init__(self, system: Static, recording: Recording) -> None:
+        self.system, self.recording = system, recording
+        self.name, self.channels = system.name, system.outputs
+        self.time = torch.arange(len(recording)).double() if recording.time is None else recording.time
+        self.inputs = _inputs(system, recording)
+        self.measured = recording.stack(*system.outputs)
+        units = {name: system.units.get(name, recording.units[name]) for name in (*system.inputs, *system.outputs)}
+        own = {units[name] for name in system.outputs}
+        self.unit = own.pop() if len(own) == 1 else ""
+        self.known = {
+            name: one if isinstance(one, Parameter) else Parameter(float(one))
+            for name, one in system.parameters.items()
+        }
+        self.parameter_names = tuple(self.known)
+        low = [one.lower for one in self.known.values()]
+        high = [one.upper for one in self.known.values()]
+        self.bounds = self.time.new_tensor(low), self.time.new_tensor(high)
+        self.independent = (True,) * len(self.channels)
+        self._refuse_not_finite()
+        load_forward_mode()
+        tangents = torch.func.jacfwd(lambda theta: self.residual(theta, {}))(self.start())
+        self.warnings = undetermined(tangents.flatten(0, 1), self.start(), self.parameter_names)
+        fixed = tuple(name for k, name in enumerate(self.channels) if not _moves(tangents, k))
+        self.state: Mapping[str, object] = {"class": system.name, "fixed": list(fixed)}
+        self.ports = _ports(system, units, self.unit, self.inputs, self.measured, fixed)
+
+    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
+        return self.time.new_tensor([one.value for one in self.known.values()])
+
+    def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
+        return self.measured - changed_outputs(self._outputs(theta, changes), self.channels, changes)
+
+    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Float[Tensor, "N k"]]:
+        inputs = {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
+        return inputs | output_signals(self._outputs(theta, changes), self.channels, changes)
+
+    def _outputs(self, theta: Tensor, changes: Changes) -> Tensor:
+        return self.system.computed(self.time, _changed_inputs(self.system, self.inputs, changes), theta)
+
+    def _refuse_not_finite(self) -> None:
+        outputs = self._outputs(self.start(), {})
+        bad = (~outputs.isfinite()).nonzero()
+        if not len(bad):
+            return
+        row, column = bad[0].tolist()
+        told = [f"{name} = {float(self.inputs[row, k]):.4g}" for k, name in enumerate(self.system.inputs)]
+        fixed = [f"{name} = {one.value:.4g}" for name, one in list(self.known.items())[:12]]
+        raise SimulationError(
+            f"{self.name}.output: `{self.channels[column]}` is {float(outputs[row, column])} at time "
+            f"{float(self.time[row]):.4g} s with {', '.join(told) or 'no inputs'}; parameters "
+            f"{', '.join(fixed) or 'none'}. Keep it finite there, or start from other parameters."
+        )
+
+
+class StaticCorrection:
+    """A function of inputs with its parameters and effects on a new recording, which needs no outputs.
+
+    Args:
+        system: the function.
+        fixed: the outputs whose zero none of its parameters moves.
+        recording: with the inputs.
+
+    Raises:
+        MissingColumnError: an input is not there.
+    """
+
+    def __init__(self, system: Static, fixed: Sequence[str], recording: Recording) -> None:
+        self.system = system
+        self.time = torch.arange(len(recording)).double() if recording.time is None else recording.time
+        self.inputs = _inputs(system, recording)
+        units = {name: system.units.get(name, "") for name in (*system.inputs, *system.outputs)}
+        nothing = self.time.new_zeros(len(self.time), len(system.outputs))
+        self.ports = _ports(system, units, "", self.inputs, nothing, fixed)
+
+    def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
+        """The outputs as simulated."""
+        inputs = _changed_inputs(self.system, self.inputs, changes)
+        outputs = changed_outputs(self.system.computed(self.time, inputs, theta), self.system.outputs, changes)
+        return {"time": self.time} | dict(zip(self.system.outputs, outputs.unbind(-1), strict=True))
+
+
+def _inputs(system: Static, recording: Recording) -> Float[Tensor, "N k"]:
+    if not system.inputs:
+        return torch.zeros(len(recording), 0, dtype=torch.float64)
+    return recording.stack(*system.inputs)
+
+
+def _changed_inputs(system: Static, inputs: Float[Tensor, "N k"], changes: Changes) -> Float[Tensor, "N k"]:
+    columns = [
+        inputs[:, [k]] + changes[f"input {name}"](inputs[:, [k]]) if f"input {name}" in changes else inputs[:, [k]]
+        for k, name in enumerate(system.inputs)
+    ]
+    return torch.cat(columns, -1) if columns else inputs
+
+
+def _ports(
+    system: Static,
+    units: Mapping[str, str],
+    unit: str,
+    inputs: Float[Tensor, "N k"],
+    measured: Float[Tensor, "N m"],
+    fixed: Sequence[str],
+) -> dict[str, Port]:
+    ports = {}
+    for k, name in enumerate(system.inputs):
+        values = inputs[:, k].abs()
+        ports[f"input {name}"] = Port(
+            (name,),
+            units[name],
+            kind="input",
+            parts={"own": name},
+            part_units={"own": units[name]},
+            sizes={"own": (float(values.median()), float(values.amax()))},
+        )
+    return ports | output_ports(system.outputs, units, unit, measured, fixed)
+
+
+def _moves(tangents: Float[Tensor, "N m p"], channel: int) -> bool:
+    """Whether the parameters together can move one output by a constant, and nothing else."""
+    constant = torch.zeros_like(tangents[..., :1])
+    constant[:, channel] = 1.0
+    columns, target = tangents.flatten(0, 1), constant.flatten(0, 1)
+    columns = columns / torch.linalg.vector_norm(columns, dim=0).clamp(min=1e-300)
+    solution = torch.linalg.lstsq(columns, target, driver="gelsd").solution
+    left = torch.linalg.vector_norm(target - columns @ solution)
+    return bool(left < 1e-6 * torch.linalg.vector_norm(target))
+
+
+def _numbers_of(module: nn.Module, name: str) -> dict[str, float]:
+    """Every number of a module's parameters by its name and place."""
+    numbers: dict[str, float] = {}
+    for key, values in module.named_parameters():
+        if not values.is_floating_point():
+            raise SimulationError(f"{name}: its parameter `{key}` holds no real numbers but {values.dtype}.")
+        flat = values.detach().flatten().tolist()
+        for place, value in enumerate(flat):
+            index = torch.unravel_index(torch.tensor(place), values.shape) if values.dim() else ()
+            told = ",".join(str(int(i)) for i in index)
+            numbers[f"{key}[{told}]" if told else key] = value
+    if not numbers:
+        raise SimulationError(f"{name}: the module has no parameters; there is nothing to fit with what is found.")
+    if len(numbers) > MOST_PARAMETERS:
+        raise SimulationError(
+            f"{name}: the module has {len(numbers):,} numbers, more than {MOST_PARAMETERS}; a network that can follow "
+            "anything lacks nothing. Freeze it into a function of few parameters, and write that as `output`."
+        )
+    return numbers

@@ -1,0 +1,51 @@
+"""The examples of concealed dynamics on real recordings, at a small size."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+from mkc_torch import Recording
+from tests.shared_data import shared_data
+
+FOLDER = Path(__file__).resolve().parents[2] / "examples" / "concealed_physics" / "dynamics"
+
+
+@pytest.fixture
+def loaded(monkeypatch):
+    def load(name):
+        monkeypatch.syspath_prepend(FOLDER)
+        spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+        module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, name, module)
+        spec.loader.exec_module(module)
+        return module
+
+    return load
+
+
+def drops(ball):
+    table = Recording.read(shared_data("dynamics/falling_balls/ball_drops.csv")).experiments()
+    return [
+        Recording({"time": drop["time"], "height": drop["height"]}) for drop in (table[f"{ball}/1"], table[f"{ball}/2"])
+    ]
+
+
+def test_a_light_ball_is_slowed_by_air_and_its_other_drop_says_so(loaded, tmp_path):
+    one, other = drops("Whiffle_Ball_1")
+    (proof,) = loaded("held_out").prove(loaded("falling_balls").Ball(), one, [other], max_findings=1)
+    assert [finding.effect for finding in proof.diagnosis.findings] == ["linear_drag"]
+    before, after = proof.mean_absolute(proof.time - proof.time[0] > 1.0)
+    assert before > 5.0
+    assert after < 1.0
+    loaded("held_out").picture(proof, tmp_path / "drop.png", "drop", "m")
+    assert (tmp_path / "drop.png").stat().st_size > 10_000
+
+
+def test_nothing_is_found_on_a_heavy_ball(loaded):
+    one, other = drops("Bowling_Ball")
+    (proof,) = loaded("held_out").prove(loaded("falling_balls").Ball(), one, [other], max_findings=1)
+    assert proof.diagnosis.verdict == "adequate"
+    before, after = proof.mean_absolute(proof.time - proof.time[0] > 1.0)
+    assert before == pytest.approx(after)

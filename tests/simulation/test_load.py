@@ -1,0 +1,131 @@
+import sys
+
+import pytest
+import torch
+
+from mkc_torch import Recording
+from mkc_torch.simulation import Dynamics, SimulationError, SimulationFileError, load_simulation
+from mkc_torch.simulation.load import raised_in
+
+GOOD = """
+from mkc_torch.simulation import Dynamics
+from beside import RATE
+
+class Decay(Dynamics):
+    states = ("level",)
+    parameters = {"rate": RATE}
+
+    def derivative(self, time, x, u, p):
+        return {"level": -p.rate * x.level}
+
+ready = Decay()
+NUMBER = 3
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    (tmp_path / "beside.py").write_text("RATE = 0.5\n")
+    path = tmp_path / "my.py"
+    path.write_text(GOOD)
+    yield path
+    sys.modules.pop("beside", None)
+
+
+def test_a_class_and_an_instance(file):
+    for name in ("Decay", "ready"):
+        assert load_simulation(f"{file}:{name}").name == "Decay"
+    assert str(file.parent) not in sys.path
+
+
+def test_a_relative_path(file, monkeypatch):
+    monkeypatch.chdir(file.parent)
+    assert load_simulation("my.py:Decay").name == "Decay"
+    file.write_text("1 / 0")
+    with pytest.raises(SimulationFileError, match=r'raised an error of its own.\n  File ".*my.py", line 1'):
+        load_simulation("my.py:Decay")
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ("my.py", "names no simulation; write FILE.py:NAME"),
+        ("my.txt:Decay", "names no simulation"),
+        ("other.py:Decay", "there is no such file"),
+        ("my.py:Missing", "defines no `Missing`; simulations in it: Decay, ready."),
+        ("my.py:NUMBER", "is no simulation, for it has no `prepare`"),
+    ],
+)
+def test_what_cannot_be_loaded(file, monkeypatch, source, words):
+    monkeypatch.chdir(file.parent)
+    with pytest.raises(SimulationFileError, match=words):
+        load_simulation(source)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x = 1\nraise KeyError('gone')\n", ["line 2", "raise KeyError('gone')", "KeyError: 'gone'"]),
+        ("def f(:\n", ["SyntaxError"]),
+        ("import sys\nsys.exit(3)\n", ["SystemExit: 3"]),
+        ("import no_such_module_here\n", ["ModuleNotFoundError"]),
+        (
+            "class Decay:\n    def __init__(self):\n        self.x = undefined\n",
+            ["Decay() raised", "NameError", "line 3"],
+        ),
+    ],
+)
+def test_a_file_that_raises_shows_its_own_lines(tmp_path, text, words):
+    path = tmp_path / "my.py"
+    path.write_text(text)
+    with pytest.raises(SimulationFileError) as caught:
+        load_simulation(f"{path}:Decay")
+    told = str(caught.value)
+    assert told.startswith(f"{path}: ")
+    for word in words:
+        assert word in told
+    assert "importlib" not in told
+    assert "_simulation_my" not in sys.modules or "Decay()" in told
+
+
+def test_code_that_raises_while_it_simulates(tmp_path):
+    path = tmp_path / "my.py"
+    path.write_text(
+        GOOD.replace("from beside import RATE", "RATE = 1.0").replace("p.rate * x.level", "p.speed * x.level")
+    )
+    simulation = load_simulation(f"{path}:Decay")
+    time = torch.arange(0.0, 5.0, 0.1)
+    with pytest.raises(AttributeError) as caught:
+        simulation.prepare(Recording({"time": time, "level": torch.exp(-time)}))
+    told = str(raised_in(f"{path}:Decay", caught.value))
+    assert "Decay raised an error of its own" in told
+    assert "p.speed" in told
+    assert "dynamics.py" not in told
+    assert raised_in(f"{path}:Decay", ValueError("elsewhere")) is None
+
+
+class Wrong(Dynamics):
+    states = ("level",)
+    parameters = {"rate": 0.5}  # noqa: RUF012
+
+    def __init__(self, value):
+        self.value = value
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return self.value(x)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (lambda x: {"level": x.level[:3]}, r"rate of `level` should be a tensor of shape \(\d+,\)"),
+        (lambda _: {"level": 1.0}, "is float"),
+        (lambda x: (x.level, x.level), "returns 2 rates for 1 states"),
+        (lambda x: {"speed": x.level}, "returns rates of speed but the states are level"),
+        (lambda x: {"level": (x.level - 10.0).sqrt()}, "is nan at time 0 s with level = 1; parameters rate = 0.5"),
+    ],
+)
+def test_a_derivative_that_cannot_be_used(value, words):
+    time = torch.arange(0.0, 5.0, 0.1)
+    with pytest.raises(SimulationError, match=words):
+        Wrong(value).prepare(Recording({"time": time, "level": torch.exp(-time)}))

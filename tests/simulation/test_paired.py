@@ -1,0 +1,148 @@
+import pytest
+import torch
+
+from mkc_torch import Recording, diagnose
+from mkc_torch.diagnosis import DiagnosedModel
+from mkc_torch.nonlinear import load_forward_mode
+from mkc_torch.recording import MissingColumnError
+from mkc_torch.simulation import Paired, SimulationError
+
+COUNT = 400
+
+
+def signal(time):
+    return torch.sin(1.1 * time) + 0.6 * torch.sin(2.7 * time + 1.0) + 0.3 * torch.sin(0.31 * time)
+
+
+def simulator(step=0.05, *, first=-2.0, last=22.0, **more):
+    time = torch.arange(first, last, step, dtype=torch.float64)
+    return Recording({"time": time, "y": signal(time)} | more, name="SIM")
+
+
+def times():
+    return torch.arange(COUNT, dtype=torch.float64) * 0.05
+
+
+def recorded(values, **more):
+    g = torch.Generator().manual_seed(2)
+    noise = 0.03 * torch.randn(len(values), generator=g, dtype=torch.float64)
+    noise[torch.rand(len(values), generator=g) < 0.05] += 0.8
+    return Recording({"time": times(), "y": values + noise} | more, name="REC")
+
+
+def temperature():
+    return 20.0 + 4.0 * torch.sin(0.23 * times()) + 2.0 * torch.sin(0.71 * times())
+
+
+@pytest.mark.parametrize(
+    ("values", "effect", "size"),
+    [
+        (lambda t: 1.06 * signal(t), "gain", 0.06),
+        (lambda t: signal(t) + 0.05, "offset", 0.05),
+        (lambda t: signal(t + 0.3), "delay", -0.3),
+        (lambda t: signal(t).clamp(-1.0, 1.0), "output_saturation", 1.0),
+    ],
+    ids=["gain", "offset", "delay", "output_saturation"],
+)
+def test_what_lies_between_the_two_is_named(values, effect, size):
+    found = diagnose(Paired(simulator()), recorded(values(times())), surrogates=19, max_findings=1)
+    assert found.verdict == "explained"
+    assert found.findings[0].effect == effect
+    assert found.findings[0].channels == ("y",)
+    assert found.findings[0].parameters[0].value == pytest.approx(size, rel=0.2)
+
+
+def test_a_driver_is_named_and_corrects_another_recording():
+    drive = temperature()
+    table = recorded(signal(times()) + 0.03 * (drive - 20.0), temperature=drive)
+    found = diagnose(Paired(simulator()), table, surrogates=19, max_findings=1)
+    first = found.findings[0]
+    assert (first.effect, first.drivers) == ("driver_linear", ("temperature",))
+    assert [p.name for p in first.parameters] == ["per_unit", "at_mean"]
+    assert first.parameters[0].value == pytest.approx(0.03, abs=0.003)
+    other = simulator(0.03)
+    model = DiagnosedModel.from_json(found.model.to_json(), simulation=Paired(other))
+    columns = model(Recording({"time": times(), "temperature": drive}))
+    assert float((columns["y"] - table["y"]).abs().median()) < 0.035
+
+
+def test_clocks_that_differ_by_less_than_a_sample_are_no_finding():
+    found = diagnose(Paired(simulator()), recorded(signal(times() + 0.02)), surrogates=19)
+    assert found.verdict == "adequate"
+    assert float(found.model.theta[0]) == pytest.approx(0.02, abs=0.006)
+
+
+def test_interpolation_meets_a_smooth_signal_and_its_slope():
+    load_forward_mode()
+    prepared = Paired(simulator(0.2)).prepare(recorded(signal(times())))
+    at = times() + 0.013
+    torch.testing.assert_close(prepared.curve.at(at)[:, 0], signal(at), rtol=0.0, atol=3e-3)
+    slope = torch.func.jvp(lambda t: prepared.curve.at(t), (at,), (torch.ones_like(at),))[1][:, 0]
+    expected = (signal(at + 1e-5) - signal(at - 1e-5)) / 2e-5
+    torch.testing.assert_close(slope, expected, rtol=0.0, atol=0.06)
+
+
+def test_derivatives_of_the_residual():
+    load_forward_mode()
+    prepared = Paired(simulator()).prepare(recorded(signal(times())))
+    theta = torch.tensor([0.004, 2e-5], dtype=torch.float64)
+    forward = torch.func.jacfwd(lambda one: prepared.residual(one, {}))(theta)
+    step = torch.tensor([1e-6, 1e-8], dtype=torch.float64)
+    for k in range(2):
+        change = step * torch.eye(2, dtype=torch.float64)[k]
+        near = (prepared.residual(theta + change, {}) - prepared.residual(theta - change, {})) / (2.0 * step[k])
+        torch.testing.assert_close(forward[..., k], near, rtol=1e-4, atol=1e-4 * float(near.abs().max()))
+
+
+def test_columns_that_are_the_same_are_inputs():
+    table = recorded(signal(times()))
+    exact = Recording({"time": times(), "y": table["y"], "torque": torch.cos(times())})
+    same = Recording({"time": times(), "y": signal(times()), "torque": torch.cos(times())})
+    prepared = Paired(same).prepare(exact)
+    assert prepared.channels == ("y",)
+    assert "torque" in prepared.recording
+    assert "`torque` is the same in both tables" in prepared.warnings[0]
+    with pytest.raises(SimulationError, match="are the same in the recording and in what was simulated"):
+        Paired(same).prepare(same)
+
+
+def test_runs_are_matched_by_their_labels():
+    def joined(one, other, name, labels):
+        run = torch.cat([torch.zeros(len(one)), torch.ones(len(other))])
+        columns = {key: torch.cat([one[key], other[key]]) for key in ("time", "y")}
+        return Recording(columns | {"experiment": run}, name=name, labels={"experiment": labels})
+
+    second = Recording({"time": times(), "y": 2.0 * signal(times())})
+    sim = simulator()
+    doubled = Recording({"time": sim["time"], "y": 2.0 * sim["y"]})
+    table = joined(recorded(signal(times())), second, "REC", ("b", "a"))
+    prepared = Paired(joined(doubled, sim, "SIM", ("a", "b"))).prepare(table)
+    assert prepared.parameter_names == ("clock offset of a", "clock offset of b", "clock rate")
+    residual = prepared.residual(prepared.start(), {})
+    assert float(residual[:COUNT].abs().median()) < 0.05
+    assert float(residual[COUNT:].abs().max()) < 1e-3
+    with pytest.raises(SimulationError, match="SIM has no run b; its column `experiment` has a, c"):
+        Paired(joined(doubled, sim, "SIM", ("a", "c"))).prepare(table)
+
+
+def test_samples_outside_the_simulated_times_are_left_out():
+    prepared = Paired(simulator(first=0.0, last=15.0)).prepare(recorded(signal(times())))
+    assert len(prepared.time) == 300
+    assert (
+        "100 of 400 samples lie outside the times that were simulated, 0 to 14.95 s" in prepared.recording.warnings[0]
+    )
+
+
+def test_tables_that_do_not_meet():
+    with pytest.raises(SimulationError, match=r"REC and SIM do not meet in time: 0 to 19.95 s was recorded, 100 to "):
+        Paired(simulator(first=100.0, last=120.0)).prepare(recorded(signal(times())))
+    with pytest.raises(SimulationError, match=r"no column in common to compare: z there, y here. Rename"):
+        Paired(simulator()).prepare(Recording({"time": times(), "z": times()}, name="REC"))
+    with pytest.raises(MissingColumnError, match="time"):
+        Paired(simulator()).prepare(Recording({"y": times()}))
+    with pytest.raises(MissingColumnError, match="time"):
+        Paired(Recording({"y": times()}))
+    with pytest.raises(ValueError, match="`rate` to be positive and finite but got 0"):
+        Paired(simulator(), rate=0.0)
+    with pytest.raises(SimulationError, match="run of one moment"):
+        Paired(Recording({"time": torch.zeros(1), "y": torch.zeros(1)})).prepare(recorded(signal(times())))

@@ -1,0 +1,132 @@
+import math
+
+import pytest
+import torch
+
+from mkc_torch import Recording, diagnose
+from mkc_torch.diagnosis import DiagnosedModel
+from mkc_torch.recording import MissingColumnError
+from mkc_torch.simulation import Parameter, SimulationError, Static
+
+
+class Thermistor(Static):
+    inputs = ("temperature",)
+    outputs = ("voltage",)
+    parameters = {"bottom": 0.3, "slope": Parameter(0.01, lower=0.0, unit="V/K")}  # noqa: RUF012
+    units = {"voltage": "V"}  # noqa: RUF012
+
+    def output(self, time, u, p):  # noqa: ARG002
+        return {"voltage": p.bottom + p.slope * u.temperature}
+
+
+def recording(*, load=0.0, count=300, **more):
+    g = torch.Generator().manual_seed(1)
+    time = torch.arange(count, dtype=torch.float64) / 10.0
+    temperature = 20.0 + 8.0 * torch.sin(0.4 * time) + 3.0 * torch.sin(1.7 * time)
+    current = torch.sin(0.9 * time + 1.0) + 0.3 * torch.randn(count, generator=g, dtype=torch.float64)
+    voltage = 0.5 + 0.02 * temperature + load * current + 0.01 * torch.randn(count, generator=g, dtype=torch.float64)
+    voltage[torch.rand(count, generator=g) < 0.05] += 0.5
+    columns = {"time": time, "temperature": temperature, "current": current, "voltage": voltage}
+    return Recording(columns | more, name="bench")
+
+
+@pytest.mark.parametrize(
+    "simulation",
+    [Thermistor(), Static(torch.nn.Linear(1, 1), inputs=("temperature",), outputs=("voltage",))],
+    ids=["class", "module"],
+)
+def test_what_drives_an_output_is_found(simulation):
+    found = diagnose(simulation, recording(load=0.05), surrogates=19, max_findings=1)
+    first = found.findings[0]
+    assert (first.effect, first.drivers, first.channels) == ("driver_linear", ("current",), ("voltage",))
+    assert first.parameters[0].value == pytest.approx(0.05, abs=0.005)
+    assert first.curve.driver == "current"
+    model = DiagnosedModel.from_json(found.model.to_json(), simulation=simulation)
+    table = recording(load=0.05, count=100)
+    columns = model(Recording({name: table[name] for name in ("temperature", "current")}))
+    assert set(columns) == {"time", "voltage"}
+    assert float((columns["voltage"] - table["voltage"]).abs().median()) < 0.012
+
+
+def test_nothing_is_missing_from_a_right_one():
+    assert diagnose(Thermistor(), recording(), surrogates=19).verdict == "adequate"
+
+
+def test_a_module_computes_as_it_does_by_itself():
+    torch.manual_seed(0)
+    module = torch.nn.Sequential(torch.nn.Linear(2, 3), torch.nn.Tanh(), torch.nn.BatchNorm1d(3), torch.nn.Linear(3, 1))
+    before = {name: values.clone() for name, values in module.state_dict().items()}
+    table = recording()
+    prepared = Static(module, inputs=("temperature", "current"), outputs=("voltage",)).prepare(table)
+    predicted = table.stack("voltage") - prepared.residual(prepared.start(), {})
+    expected = module.double().eval()(table.stack("temperature", "current"))
+    torch.testing.assert_close(predicted, expected, rtol=1e-6, atol=1e-9)
+    assert len(prepared.parameter_names) == 9 + 6 + 4
+    assert prepared.parameter_names[:2] == ("0.weight[0,0]", "0.weight[0,1]")
+    for name, values in before.items():
+        assert torch.equal(values.double(), module.state_dict()[name].double())
+
+
+def test_without_time_and_with_units():
+    table = recording()
+    prepared = Thermistor().prepare(Recording({name: table[name] for name in ("temperature", "voltage")}))
+    assert prepared.unit == "V"
+    assert prepared.time[:3].tolist() == [0.0, 1.0, 2.0]
+    assert prepared.bounds[0].tolist() == [-math.inf, 0.0]
+
+
+def test_parameters_that_the_data_cannot_determine_are_named():
+    class Divider(Static):
+        inputs = ("current",)
+        outputs = ("voltage",)
+        parameters = {"upper": 2.0, "lower": 4.0, "unused": 1.0}  # noqa: RUF012
+
+        def output(self, time, u, p):  # noqa: ARG002
+            return {"voltage": p.upper / p.lower * u.current}
+
+    told = " ".join(Divider().prepare(recording()).warnings)
+    assert "does not determine `upper` and `lower`, but only what they are together" in told
+    assert "direction 0.71 upper + 0.71 lower" in told
+    assert "does not determine `unused`" in told
+    assert Thermistor().prepare(recording()).warnings == ()
+
+
+class Odd(Thermistor):
+    def __init__(self, value):
+        super().__init__()
+        self.value = value
+
+    def output(self, time, u, p):  # noqa: ARG002
+        return self.value(u)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (lambda u: {"voltage": u.temperature[:5]}, r"`voltage` should be a tensor of shape \(300,\)"),
+        (lambda _: {"voltage": 3.0}, "but is float"),
+        (lambda u: {"tension": u.temperature}, "does not return `voltage`.* it returns tension"),
+        (lambda u: {"voltage": (u.temperature - 20.5).log()}, "is nan at time .* parameters bottom = 0.3"),
+    ],
+)
+def test_outputs_that_cannot_be_used(value, words):
+    with pytest.raises(SimulationError, match=words):
+        Odd(value).prepare(recording())
+
+
+def test_modules_that_cannot_be_used():
+    line = torch.nn.Linear(1, 2)
+    with pytest.raises(
+        SimulationError, match=r"shape \(300, 1\), a column for each of voltage, but it returns \(300, 2\)"
+    ):
+        Static(line, inputs=("temperature",), outputs=("voltage",)).prepare(recording())
+    with pytest.raises(SimulationError, match="no parameters"):
+        Static(torch.nn.Tanh(), inputs=("temperature",), outputs=("voltage",))
+    with pytest.raises(SimulationError, match="10,100 numbers, more than 200"):
+        Static(torch.nn.Linear(100, 100), inputs=("temperature",), outputs=("voltage",))
+    with pytest.raises(SimulationError, match="has no `outputs`"):
+        Static(torch.nn.Linear(1, 1)).prepare(recording())
+    with pytest.raises(NotImplementedError, match="wrap a module"):
+        Static(outputs=("voltage",)).prepare(recording())
+    with pytest.raises(MissingColumnError, match="temperature"):
+        Thermistor().prepare(Recording({"voltage": torch.ones(5)}))
