@@ -238,7 +238,7 @@ def _assembled(
     ]
     nameless = any(f.effect == UNKNOWN for f in findings)
     verdict: Verdict = "adequate" if not findings else "unexplained" if nameless else "explained"
-    any_fit = ceiling(base.model, final.fit, drivers.drivers, blocks)
+    any_fit = ceiling(base.model, _answerable(base, final.fit), drivers.drivers, blocks)
     left = () if nameless else remaining(any_fit, evidence[-1], final.fit, drivers.drivers, blocks, seed)
     return Diagnosis(
         recording=prepared.recording.name,
@@ -272,6 +272,12 @@ def _assembled(
         traces=_traces(prepared, drivers, base, final),
         model=model_of(final, simulation),
     )
+
+
+def _answerable(base: FittedModel, final: FittedModel) -> FittedModel:
+    """The final fit; that of the simulation alone, if it has no answer at the other's parameters."""
+    alone = base.model.residual(final.parameters[: base.model.size])
+    return final if bool(alone.isfinite().all()) else base
 
 
 def _held(
