@@ -1,10 +1,12 @@
-"""Table II of Li et al. (2023) on a public recording: an ellipsoid fit while a magnet disturbs the sensor.
+"""Table II of Li et al. (2023), an ellipsoid fit while a magnet disturbs the sensor: simulated, and a real recording.
 
+    python examples/paper/table_2.py
     python examples/paper/table_2.py broad_28_stationary_magnet.csv broad_02_undisturbed.csv
 
-The first recording is disturbed, the second, of the same sensor, is not and serves as the truth by least squares. Both
-are trials of the BROAD data set (Laidig et al., "BROAD", Data 6(7):72, 2021, CC BY 4.0) as tables with the columns
-mag_x, mag_y, mag_z in µT.
+The simulated sensor is that of ``mkc demo``; its truth is least squares on the samples that the magnet leaves alone. Of
+the recordings the first one is disturbed; the second, of the same sensor, is not, and serves as the truth by least
+squares. Both are trials of the BROAD data set (Laidig et al., "BROAD", Data 6(7):72, 2021, CC BY 4.0) as tables with
+the columns mag_x, mag_y, mag_z in µT.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from sklearn.linear_model import Lasso as SklearnLasso
 from torch import Tensor
 
 from mkc_torch import EllipsoidFit, Recording
+from mkc_torch.demo import simulated_recording
 from mkc_torch.linear import FixedPointLinear, LeastAbsoluteDeviations, LeastSquares, MKCRegression, Ridge
 from mkc_torch.linear._estimator import LinearEstimator
 
@@ -52,13 +55,16 @@ def points(path: str) -> Tensor:
     return Recording.read(path).finite("mag_x", "mag_y", "mag_z").magnetometer()
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("disturbed")
-    parser.add_argument("undisturbed")
-    arguments = parser.parse_args()
-    truth = EllipsoidFit(LeastSquares()).fit(points(arguments.undisturbed))
-    disturbed = points(arguments.disturbed)
+def simulated() -> tuple[Tensor, Tensor]:
+    """Readings of a simulated sensor, all of them and those without disturbance."""
+    recording, truth = simulated_recording()
+    time, readings = recording["time"], recording.magnetometer()
+    return readings, readings[(time < truth.disturbed[0]) | (time > truth.disturbed[1])]
+
+
+def compared(title: str, disturbed: Tensor, undisturbed: Tensor) -> Table:
+    """Errors of the estimators against least squares without disturbance."""
+    truth = EllipsoidFit(LeastSquares()).fit(undisturbed)
     # a residual of the algebraic fit is about twice the relative error of the norm
     estimators: dict[str, LinearEstimator] = {
         "LS": LeastSquares(),
@@ -68,7 +74,7 @@ def main() -> None:
         "MKC": FixedPointLinear(sigma=2.0, d=0.05),
         "MKC-EM": MKCRegression(),
     }
-    table = Table(title="errors against the undisturbed recording (the paper's own sensor and recording in brackets)")
+    table = Table(title=f"{title}: errors (the paper's own sensor and recording in brackets)")
     for heading in ("", "coefficients of (36)", "centre, µT", "semi-axes, µT", "semi-axes found, µT"):
         table.add_column(heading, justify="right" if heading else "left")
     for name, estimator in estimators.items():
@@ -83,7 +89,21 @@ def main() -> None:
             ", ".join(f"{v:.2f}" for v in fit.semi_axes_.tolist()),
         )
     table.add_row("truth", "", "", "", ", ".join(f"{v:.2f}" for v in truth.semi_axes_.tolist()))
-    Console(width=120).print(table)
+    return table
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("disturbed", nargs="?")
+    parser.add_argument("undisturbed", nargs="?")
+    arguments = parser.parse_args()
+    console = Console(width=120)
+    console.print(compared("simulated sensor", *simulated()))
+    if arguments.disturbed is None:
+        return
+    if arguments.undisturbed is None:
+        parser.error("the undisturbed recording is missing; give both, or none for the simulated sensor alone")
+    console.print(compared("recording", points(arguments.disturbed), points(arguments.undisturbed)))
 
 
 if __name__ == "__main__":

@@ -179,3 +179,12 @@ def test_all_has_every_script_of_the_papers():
     for script in module.SCRIPTS:
         values = {"out": "folder", "disturbed": "a.csv", "undisturbed": "b.csv"}
         assert all("{" not in word for small in (True, False) for word in script.arguments(small, values))
+
+
+def test_table_2_on_a_simulated_sensor(monkeypatch, capsys):
+    run(example("table_2"), monkeypatch)
+    rows = {
+        line.split("│")[1].strip(): line.split("│")[3] for line in capsys.readouterr().out.splitlines() if "│" in line
+    }
+    centre = {name: float(cell.split("(")[0]) for name, cell in rows.items() if name in ("LS", "MKC-EM")}
+    assert centre["MKC-EM"] < 0.1 < 0.5 < centre["LS"]
