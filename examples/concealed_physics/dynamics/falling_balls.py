@@ -16,10 +16,10 @@ class Ball(Dynamics):
     """A ball in free fall."""
 
     states = ("height", "speed")
-    units = {"height": "m", "speed": "m/s"}  # noqa: RUF012
+    units = {"height": "m", "speed": "m/s"}
     starts_from = 1.0
 
-    def derivative(self, time, x, u, p):  # type: ignore[no-untyped-def]
+    def derivative(self, time, x, u, p):
         return {"height": x.speed, "speed": torch.full_like(x.speed, -9.81)}
 
 

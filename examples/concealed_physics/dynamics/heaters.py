@@ -16,9 +16,9 @@ class Heaters(Dynamics):
 
     states = ("temperature_1", "temperature_2")
     inputs = ("heater_1", "heater_2")
-    units = {"temperature_1": "°C", "temperature_2": "°C"}  # noqa: RUF012
+    units = {"temperature_1": "°C", "temperature_2": "°C"}
     between = "held"
-    parameters = {  # noqa: RUF012
+    parameters = {
         "loss_1": Parameter(0.01, lower=0.0, unit="1/s"),
         "loss_2": Parameter(0.01, lower=0.0, unit="1/s"),
         "gain_1": Parameter(0.01, lower=0.0),
@@ -26,7 +26,7 @@ class Heaters(Dynamics):
         "room": Parameter(20.0, unit="°C"),
     }
 
-    def derivative(self, time, x, u, p):  # type: ignore[no-untyped-def]
+    def derivative(self, time, x, u, p):
         return {
             "temperature_1": p.loss_1 * (p.room - x.temperature_1) + p.gain_1 * u.heater_1,
             "temperature_2": p.loss_2 * (p.room - x.temperature_2) + p.gain_2 * u.heater_2,

@@ -24,16 +24,16 @@ class Servo(Dynamics):
     states = ("position", "speed")
     inputs = ("goal_position", "voltage", "kp", "torque_enable")
     outputs = ("position",)
-    units = {"position": "rad", "speed": "rad/s"}  # noqa: RUF012
+    units = {"position": "rad", "speed": "rad/s"}
     starts_from = 0.1
-    parameters = {  # noqa: RUF012
+    parameters = {
         "drive": Parameter(10.0, lower=0.0),
         "damping": Parameter(6.0, lower=0.0, unit="1/s"),
         "gravity": Parameter(75.0, lower=0.0, unit="1/s²"),
         "gain": Parameter(0.005, lower=0.0),
     }
 
-    def derivative(self, time, x, u, p):  # type: ignore[no-untyped-def]
+    def derivative(self, time, x, u, p):
         duty = torch.clamp(p.gain * u.kp * (u.goal_position - x.position), -1.0, 1.0) * u.torque_enable
         pull = p.gravity * torch.sin(x.position)
         return {"position": x.speed, "speed": p.drive * duty * u.voltage - p.damping * x.speed - pull}

@@ -23,14 +23,14 @@ class Silverbox(Dynamics):
     inputs = ("input",)
     between = "smooth"
     starts_from = 0.1
-    parameters = {  # noqa: RUF012
+    parameters = {
         "stiffness": Parameter(1.8e5, lower=0.0, unit="1/s²"),
         "damping": Parameter(20.0, lower=0.0, unit="1/s"),
         "gain": 1e5,
         "offset": 0.0,
     }
 
-    def derivative(self, time, x, u, p):  # type: ignore[no-untyped-def]
+    def derivative(self, time, x, u, p):
         return {
             "output": x.speed,
             "speed": p.gain * (u.input + p.offset) - p.stiffness * x.output - p.damping * x.speed,
