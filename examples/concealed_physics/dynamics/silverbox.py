@@ -11,7 +11,7 @@ from held_out import arguments, picture, prove, told
 from mkc_torch import Recording
 from mkc_torch.simulation import Dynamics, Parameter
 
-TRAIN, ROWS = 45_000, 2_000
+TRAIN, ROWS = 45_000, 8_192
 TESTS = {"multisine": (100_000, 8_192), "arrow": (0, 40_000)}
 """First row and number of rows."""
 
