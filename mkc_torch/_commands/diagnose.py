@@ -12,7 +12,17 @@ from typing import Annotated
 import torch
 import typer
 
-from mkc_torch._commands.console import Look, Steps, complain, err, out, parsed_columns, progress, refuse_same_names
+from mkc_torch._commands.console import (
+    FAILURES,
+    Look,
+    Steps,
+    complain,
+    err,
+    out,
+    parsed_columns,
+    progress,
+    refuse_same_names,
+)
 from mkc_torch._commands.diagnosis_files import (
     MAGNETOMETER,
     SIMULATIONS,
@@ -130,7 +140,7 @@ def _refuse_unusable(request: Request) -> None:
     """Said once, before anything is written, and not again for each recording."""
     try:
         simulation_of(request)
-    except Exception as error:
+    except FAILURES as error:
         complain(request.simulated or request.simulation, error)
         raise typer.Exit(1) from None
 
