@@ -33,6 +33,9 @@ MIN_INFORMATION = 0.003
 MAX_STANDARD_ERROR = 0.05
 """Largest standard error of the centre or a semi-axis, as a share of the radius, that identifies an ellipsoid."""
 
+_EXACT = 1e4
+"""Roundings by which a point may be off a surface that it is on."""
+
 
 class NotIdentifiableError(ValueError):
     """The points do not determine an ellipsoid.
@@ -333,7 +336,11 @@ class EllipsoidFit(Fitted):
         self.root_se_ = errors[..., 15:].unflatten(-1, (3, 3)) / scale.unsqueeze(-1)
 
     def _refuse_uncovered(self, field: Tensor, weight: Tensor | None) -> None:
-        in_use = self.weights_ >= 0.5 if weight is None else (self.weights_ >= 0.5) & (weight > 0)
+        # which of the points on the surface itself a trimmed fit keeps is a matter of rounding
+        on_it = self.residual_.abs() <= _EXACT * torch.finfo(field.dtype).eps * self.radius_.unsqueeze(-1)
+        in_use = (self.weights_ >= 0.5) | on_it
+        if weight is not None:
+            in_use = in_use & (weight > 0)
         flat = field.detach().reshape(-1, *field.shape[-2:])
         directions = [f[use] for f, use in zip(flat, in_use.reshape(flat.shape[0], -1), strict=True)]
         found = [coverage(d) for d in directions]
