@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -273,8 +274,9 @@ def linear_problem(
 
 def _common_batch(name: str, shape: torch.Size, other: str, other_shape: torch.Size) -> torch.Size:
     try:
-        return torch.broadcast_shapes(shape, other_shape)
-    except RuntimeError:
+        # torch's own loads a system of computer algebra
+        return torch.Size(np.broadcast_shapes(shape, other_shape))
+    except ValueError:
         raise ValueError(
             f"Expected batch dimensions of `{name}` and `{other}` that broadcast "
             f"but got {tuple(shape)} and {tuple(other_shape)}."
