@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.noise import (
     colour_of,
     cosines,
     dct,
+    dct_of_courses,
     enters_at_port,
     port_colour,
 )
@@ -60,12 +61,23 @@ class Tangents:
 
 @dataclass(frozen=True)
 class Slow:
-    """Slow courses of a port's channels: tangents (N, m, k), standard deviations in each family of wander (F, k)."""
+    """Slow courses of a port's channels: tangents (N, m, k), standard deviations in each family of wander (F, k).
+
+    ``pointwise`` is that of the port, (N, m, channels); None where it has none.
+    """
 
     port: str
     channels: int
     tangents: Tensor
     scales: Tensor
+    pointwise: Tensor | None
+
+    def transformed(self, counts: Float[Tensor, "N m"], kept: int) -> Float[Tensor, "K m k"]:
+        """The K slowest cosine coefficients of the tangents, where residuals count."""
+        if self.pointwise is None:
+            return dct(counts.unsqueeze(-1) * self.tangents, kept)
+        courses = self.tangents.shape[-1] // self.channels
+        return dct_of_courses(counts.unsqueeze(-1) * self.pointwise, courses, kept)
 
     def with_shares(self, shares: Float[Tensor, " c"]) -> Slow:
         """The same with so many times the variance in each channel."""
@@ -118,7 +130,8 @@ def _slow_courses(model: JointModel, parameters: Tensor, pointwise: dict[str, Te
     spread = (courses[:, None, :, None] * eye[:, None, :]).reshape(N, c, count * c)
     k = torch.arange(1, count + 1, dtype=courses.dtype).repeat_interleave(c)
     scales = torch.stack([1.0 / k, *((1.0 + (k / corner).square()).rsqrt() for corner in CORNERS)])
-    return Slow(name, c, through_port(model, parameters, name, spread, pointwise[name]), scales)
+    moved = through_port(model, parameters, name, spread, pointwise[name])
+    return Slow(name, c, moved, scales, pointwise[name])
 
 
 @dataclass(frozen=True)
@@ -226,11 +239,11 @@ class _Seen:
 
     @classmethod
     def of(cls, pseudo: Tensor, counts: Tensor, tangents: Tangents, slow: Slow | None, kept: int) -> _Seen:
-        courses = tangents.nuisance[..., :0] if slow is None else slow.tangents
-        parts = [pseudo.unsqueeze(-1), tangents.nuisance, *tangents.candidates, courses]
+        parts = [pseudo.unsqueeze(-1), tangents.nuisance, *tangents.candidates]
         joined = torch.cat(parts, -1)
         joined[..., 1:] *= counts.unsqueeze(-1)
-        values, nuisance, *candidates, moved = dct(joined, kept).split([t.shape[-1] for t in parts], -1)
+        values, nuisance, *candidates = dct(joined, kept).split([t.shape[-1] for t in parts], -1)
+        moved = nuisance[..., :0] if slow is None else slow.transformed(counts, kept)
         return cls(values.squeeze(-1), nuisance, tuple(candidates), moved)
 
 

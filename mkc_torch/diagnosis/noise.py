@@ -23,6 +23,7 @@ __all__ = [
     "colour_of",
     "cosines",
     "dct",
+    "dct_of_courses",
     "enters_at_port",
     "inverse_dct",
     "port_colour",
@@ -105,6 +106,30 @@ def cosines(count: int, N: int, dtype: torch.dtype = torch.float64) -> Float[Ten
     k = torch.arange(1, count + 1, dtype=dtype)
     n = torch.arange(N, dtype=dtype) + 0.5
     return math.sqrt(2.0) * torch.cos(math.pi / N * n.unsqueeze(-1) * k)
+
+
+def dct_of_courses(values: Float[Tensor, "N m c"], courses: int, count: int) -> Float[Tensor, "count m k"]:
+    """``dct(values[:, :, None] * cosines(courses, N)[:, None, :, None], count)``, k = courses · c, from c transforms.
+
+    A product of two cosines is the mean of those of the sum and of the difference of their frequencies.
+
+    Example:
+        >>> values = torch.randn(20, 1, 1, dtype=torch.float64)
+        >>> torch.allclose(dct_of_courses(values, 3, 20), dct(values * cosines(3, 20)[:, None]))
+        True
+    """
+    N, m, c = values.shape
+    count = min(count, N)
+    known = dct(values).flatten(1).mT.contiguous()  # (m c, N)
+    known[:, 0] *= math.sqrt(2.0)
+    # beyond the N-th frequency the transform of N samples goes back, with the other sign
+    beyond = torch.cat([known, torch.zeros_like(known[:, :1]), -known[:, 1:].flip(-1)], -1)
+    both = torch.cat([known[:, 1 : courses + 1].flip(-1), beyond[:, : count + courses + 1]], -1)
+    sums = beyond[:, 1 : count + courses].unfold(-1, count, 1)
+    differences = both[:, : count + courses - 1].unfold(-1, count, 1).flip(1)
+    out = (sums + differences).unflatten(0, (m, c)) * math.sqrt(0.5)  # (m, c, courses, count)
+    out[..., 0] *= math.sqrt(0.5)
+    return out.permute(3, 0, 2, 1).flatten(2)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.noise import (
     colour_of,
     cosines,
     dct,
+    dct_of_courses,
     enters_at_port,
     inverse_dct,
     port_colour,
@@ -49,6 +50,15 @@ def test_the_cosine_transform_is_scipys(N, rest):
     np.testing.assert_allclose(dct(values), expected, atol=1e-11)
     np.testing.assert_allclose(inverse_dct(values), scipy.fft.idct(values.numpy(), axis=0, norm="ortho"), atol=1e-11)
     torch.testing.assert_close(inverse_dct(dct(values)), values, rtol=0.0, atol=1e-11)
+
+
+@pytest.mark.parametrize(("N", "kept", "courses"), [(20, 20, 3), (21, 9, 4), (40, 40, 4), (61, 61, 6)])
+def test_the_transform_of_modulated_courses_is_that_of_their_products(N, kept, courses):
+    values = randn(N, 2, 3)
+    products = values[:, :, None, :] * cosines(courses, N)[:, None, :, None]
+    expected = scipy.fft.dct(products.flatten(2).numpy(), axis=0, norm="ortho")[:kept]
+    found = dct_of_courses(values, courses, kept)
+    torch.testing.assert_close(found, torch.from_numpy(expected), rtol=1e-12, atol=1e-12)
 
 
 def test_the_cosine_transform_keeps_the_precision_and_takes_nothing():
