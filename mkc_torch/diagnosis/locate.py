@@ -34,6 +34,7 @@ _PARTS, _BETTER = 2, 0.8
 _KEPT = 0.8
 _ROUNDS = 3
 _LEADING = 2
+_SHAPES = 5
 _RAW = 1000.0
 _OVERWHELMING = 150.0
 """Nats by which an account has to be likelier that no draws of noise are needed to tell."""
@@ -138,8 +139,10 @@ Listed = tuple[Term, Tensor, Tensor]
 """A candidate worth a joint refit, with the parameters and the γ to start from."""
 
 
-def _short_list(base: FittedModel, terms: tuple[Term, ...], starts: Sequence[Start], most: int) -> list[Listed]:
-    """Of each start the strongest candidates, noise taken for white."""
+def _short_list(
+    base: FittedModel, terms: tuple[Term, ...], starts: Sequence[Start], most: int, likeliest: Float[Tensor, " C"]
+) -> list[Listed]:
+    """Of each start the strongest candidates, noise taken for white; ``likeliest`` takes the log of each one's p."""
     chosen: dict[Key, Listed] = {}
     known: dict[int, Tangents] = {}
     for parameters, (pseudo, counts) in starts:
@@ -147,6 +150,7 @@ def _short_list(base: FittedModel, terms: tuple[Term, ...], starts: Sequence[Sta
             known[id(parameters)] = tangents_of(base.model, parameters, terms)
         plain = linearise(base.model, parameters, pseudo, counts, known[id(parameters)], white=True, wander=False)
         log_p = plain.search.gains(plain.series.unsqueeze(-1)).log_p[:, 0]
+        torch.minimum(likeliest, log_p, out=likeliest)
         taken = 0
         for number in log_p.argsort().tolist():
             term = terms[number]
@@ -188,9 +192,9 @@ def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *
     Candidates are ranked by the likelihood's own score and by a clipped one, which still sees a stretch of samples that
     the fit rejects; and, where one model over all of the recording runs away, around fits to parts of it.
     """
-    around = base.parameters
-    listed = _short_list(base, terms, [(around, base.pseudo)], _SHORT_LIST)
-    listed += _short_list(base, terms, [(around, clipped_residual(base.residual))], 2)
+    around, likeliest = base.parameters, base.parameters.new_zeros(len(terms))
+    listed = _short_list(base, terms, [(around, base.pseudo)], _SHORT_LIST, likeliest)
+    listed += _short_list(base, terms, [(around, clipped_residual(base.residual))], 2, likeliest)
     fits: dict[Key, FittedModel] = {}
     _refit_all(fits, base, listed, prefer)
     if parts:
@@ -198,11 +202,12 @@ def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *
         _refit_all(
             fits,
             base,
-            [one for start in _part_starts(base, least) for one in _short_list(base, terms, [start], 2)],
+            [one for start in _part_starts(base, least) for one in _short_list(base, terms, [start], 2, likeliest)],
             prefer,
         )
     leading = sorted(fits.values(), key=lambda fit: _score(fit, base, prefer), reverse=True)[:_LEADING]
-    shaped = [_refined(_best_shape(fit, base, terms, prefer), base) for fit in leading]
+    order = [terms[number] for number in likeliest.argsort().tolist()]
+    shaped = [_refined(_best_shape(fit, base, order, prefer), base) for fit in leading]
     return max(shaped, key=lambda fit: _score(fit, base, prefer))
 
 
@@ -225,13 +230,16 @@ def _score(fit: FittedModel, base: FittedModel, prefer: Preference) -> float:
     return score - prefer.handicap(fit.model.terms[-1], gain)
 
 
-def _best_shape(fit: FittedModel, base: FittedModel, terms: tuple[Term, ...], prefer: Preference) -> FittedModel:
-    """The fit, or a better one with another shape of the same effect; onsets are many, and closed in on later."""
+def _best_shape(fit: FittedModel, base: FittedModel, terms: Sequence[Term], prefer: Preference) -> FittedModel:
+    """The fit, or a better one with another shape of the same effect, the likeliest of ``terms`` first.
+
+    Onsets are many, and closed in on later.
+    """
     own = fit.model.terms[-1]
     others = [t for t in terms if t.key == own.key and t.shape != own.shape]
     if "onset" in own.shape or not others:
         return fit
-    refits = [_reshaped(fit, base, other) for other in others]
+    refits = [_reshaped(fit, base, other) for other in others[:_SHAPES]]
     return max([fit, *refits], key=lambda f: _score(f, base, prefer))
 
 
