@@ -12,7 +12,7 @@ from torch import Tensor
 from mkc_torch.diagnosis.drivers import Driver
 from mkc_torch.effects.protocol import BoundedEffect, Context, Effect, GainEffect, Shape, SignalEffect
 from mkc_torch.nonlinear import GaussianPrior
-from mkc_torch.simulation.protocol import Change, Changes, Port, PreparedSimulation
+from mkc_torch.simulation.protocol import Change, Changes, FreeChange, Port, PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -104,6 +104,7 @@ class JointModel:
         self.prepared = prepared
         self.terms = tuple(terms)
         self.base = len(prepared.parameter_names)
+        self._follow = tuple(follows_signal(t.effect) for t in self.terms)
         self.sizes = tuple(t.size(t.context(prepared, None)) for t in self.terms)
 
     @property
@@ -144,8 +145,9 @@ class JointModel:
     def changes(self, parameters: Float[Tensor, " p"]) -> dict[str, Change]:
         """What the effects add at each port."""
         total: dict[str, Change] = {}
-        for term, gamma in zip(self.terms, self.gammas(parameters), strict=True):
-            total[term.port] = summed(total.get(term.port), self._change(term, gamma))
+        for term, gamma, follows in zip(self.terms, self.gammas(parameters), self._follow, strict=True):
+            change = self._change(term, gamma)
+            total[term.port] = summed(total.get(term.port), change if follows else FreeChange(change))
         return total
 
     def _change(self, term: Term, gamma: Tensor) -> Change:
@@ -193,12 +195,16 @@ def summed(one: Change | None, other: Change) -> Change:
     if one is None:
         return other
     first = one
-    return lambda signal: first(signal) + other(signal)
+
+    def both(signal: Tensor) -> Tensor:
+        return first(signal) + other(signal)
+
+    return FreeChange(both) if isinstance(first, FreeChange) and isinstance(other, FreeChange) else both
 
 
 def with_constant(changes: Changes, port: str, change: Float[Tensor, "N c"]) -> Changes:
     """The same with a change at a port that does not depend on its signal."""
-    return {**changes, port: summed(changes.get(port), lambda _: change)}
+    return {**changes, port: summed(changes.get(port), FreeChange(lambda _: change))}
 
 
 def limits(effect: Effect) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from mkc_torch.linear import LeastTrimmedSquares
 from mkc_torch.linear._problem import RankDeficientError
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.recording import Recording
-from mkc_torch.simulation.protocol import Changes, Port
+from mkc_torch.simulation.protocol import Changes, FreeChange, Port
 from mkc_torch.simulation.rotation import from_quaternion, rotation_since
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ _MIN_ROWS = 50
 _REWEIGHTED, _RIDGE = 10, 1e-4
 _TURNED = 1e-3
 _AT_REST = 0.1
+_ENOUGH = 1500
 
 
 @dataclass(frozen=True)
@@ -144,16 +145,18 @@ class _View:
         return (self.measured - sensor - theta[:3]) @ self.matrix(theta).mT
 
     def _sensor_change(self, theta: Tensor, changes: Changes) -> Tensor:
-        nothing = self.measured.new_zeros(())
-        return changes["sensor"](self.simulated(theta)) if "sensor" in changes else nothing
+        if "sensor" not in changes:
+            return self.measured.new_zeros(())
+        change = changes["sensor"]
+        return change(torch.zeros_like(self.measured) if isinstance(change, FreeChange) else self.simulated(theta))
 
     def _field_change(self, changes: Changes) -> Tensor:
-        nothing = self.measured.new_zeros(())
+        nothing = self.measured.new_zeros(1, len(self.ports["field"].channels))
         return changes["field"](self.measured.new_zeros(len(self.measured), 0)) if "field" in changes else nothing
 
     def _ellipsoid(self, rows: Tensor | None) -> EllipsoidFit:
         points = self.measured if rows is None else self.measured[rows]
-        return EllipsoidFit(LeastTrimmedSquares(), finish=None).fit(points)
+        return EllipsoidFit(LeastTrimmedSquares(), finish=None).fit(_thinned(points))
 
 
 class NormView(_View):
@@ -186,17 +189,22 @@ class NormView(_View):
         return torch.cat([fit.center_, torch.stack([matrix[i, j] for i, j in _SYMMETRIC])])
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 1"]:
-        field = self.corrected(theta, self._sensor_change(theta, changes))
-        length = torch.linalg.vector_norm(field, dim=-1, keepdim=True)
-        steepness = torch.linalg.vector_norm(field @ self.matrix(theta), dim=-1, keepdim=True) / length
-        return (length - self.strength - self._field_change(changes)) / steepness
+        away = self.measured - self._sensor_change(theta, changes) - theta[:3]
+        length, outward = self._length(theta, away.mT)
+        distance = length - self.strength - self._field_change(changes).squeeze(-1)
+        return (distance * length / _length(outward)).unsqueeze(-1)
 
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
-        away = self.measured - theta[:3]
-        field = away @ self.matrix(theta).mT
-        outward = field @ self.matrix(theta)
-        outward = outward / torch.linalg.vector_norm(outward, dim=-1, keepdim=True)
-        return away - self.residual(theta, {}) * outward
+        away = (self.measured - theta[:3]).mT
+        length, outward = self._length(theta, away)
+        # a step against the steepest ascent of the length, as far as that is off
+        return (away - (length - self.strength) * length * outward / outward.square().sum(0)).mT
+
+    def _length(self, theta: Tensor, away: Float[Tensor, "3 N"]) -> tuple[Float[Tensor, " N"], Float[Tensor, "3 N"]]:
+        """Length of the calibrated field, and that times its gradient by the measurement."""
+        matrix = self.matrix(theta)
+        field = matrix @ away
+        return _length(field), matrix.mT @ field
 
 
 class AttitudeView(_View):
@@ -232,6 +240,8 @@ class AttitudeView(_View):
         turned = torch.einsum("kij,i->kj", self.to_world, ahead)
         offset, response = _response(self.measured, turned, offset)
         self._unbent = torch.linalg.inv(response)
+        self._to_frame = self._frame @ self.to_world @ self._unbent
+        self._from_world = self.to_world.movedim(1, 0).flatten(1).contiguous()
         self._full = torch.cat([offset, response.flatten(), offset.new_zeros(2)])
         self.warnings = _turned_too_little(self.corrected(self._full, offset.new_zeros(3)))
 
@@ -252,9 +262,10 @@ class AttitudeView(_View):
 
     def _offset_and_field(self) -> tuple[Tensor, Tensor]:
         """Offset and world field by least trimmed squares, the matrix taken for the identity."""
-        eye = torch.eye(3, dtype=self.to_world.dtype).expand(len(self.to_world), 3, 3)
+        to_world, measured = _thinned(self.to_world), _thinned(self.measured)
+        eye = torch.eye(3, dtype=to_world.dtype).expand(len(to_world), 3, 3)
         try:
-            coefficients = LeastTrimmedSquares().fit(torch.cat([eye, self.to_world.mT], -1), self.measured).coef_
+            coefficients = LeastTrimmedSquares().fit(torch.cat([eye, to_world.mT], -1), measured).coef_
         except RankDeficientError:
             raise _one_axis(self.to_world) from None
         return coefficients[:3], coefficients[3:]
@@ -263,11 +274,10 @@ class AttitudeView(_View):
         # the simulated vector, not the measured one, goes through the matrix: the noise of what a matrix is fitted to
         # would shrink it. A fixed matrix takes the difference back into the world.
         left = self.measured - self._sensor_change(theta, changes) - theta[:3] - self.simulated(theta)
-        world = torch.einsum("kij,kj->ki", self.to_world, left @ self._unbent.mT)
-        return (world - self._field_change(changes)) @ self._frame.mT
+        return torch.einsum("kij,kj->ki", self._to_frame, left) - self._field_change(changes) @ self._frame.mT
 
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
-        field = torch.einsum("kij,i->kj", self.to_world, self.ambient(theta))
+        field = (self.ambient(theta) @ self._from_world).unflatten(0, (-1, 3))
         return field @ theta[3:12].unflatten(0, (3, 3)).mT
 
 
@@ -397,6 +407,10 @@ class MagnetometerCorrection:
         return time | dict(zip(("field_x", "field_y", "field_z"), field.unbind(-1), strict=True))
 
 
+def _length(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
+    return vectors.square().sum(0).sqrt()
+
+
 def _symmetric(theta: Tensor) -> Tensor:
     xx, yy, zz, xy, xz, yz = theta[3:9].unbind()
     return torch.stack([torch.stack([xx, xy, xz]), torch.stack([xy, yy, yz]), torch.stack([xz, yz, zz])])
@@ -438,6 +452,11 @@ def _bias_prior() -> GaussianPrior:
     precision = torch.zeros(12, dtype=torch.float64)
     precision[9:] = GYRO_BIAS**-2
     return GaussianPrior(mean, precision)
+
+
+def _thinned(values: Float[Tensor, N * rest]) -> Float[Tensor, n * rest]:
+    """Evenly, to as many samples as a place to start a fit from needs."""
+    return values[:: max(1, len(values) // _ENOUGH)]
 
 
 def _refuse_at_rest(measured: Tensor) -> None:

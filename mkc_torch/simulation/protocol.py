@@ -15,12 +15,22 @@ from mkc_torch.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["Change", "Changes", "Clock", "Correction", "Port", "PreparedSimulation", "Simulation"]
+__all__ = ["Change", "Changes", "Clock", "Correction", "FreeChange", "Port", "PreparedSimulation", "Simulation"]
 
 Change = Callable[[Tensor], Tensor]
 """What effects add at a port, (N, c), as a function of the signal that passes through it."""
 
 Changes = Mapping[str, Change]
+
+
+@dataclass(frozen=True)
+class FreeChange:
+    """A change that is the same whatever passes through the port: nobody needs to simulate the signal for it."""
+
+    of: Change
+
+    def __call__(self, signal: Tensor) -> Tensor:
+        return self.of(signal)
 
 
 @dataclass(frozen=True)
