@@ -380,6 +380,13 @@ def test_challenge_of_nothing_is_refused(tmp_path):
     assert not (tmp_path / "a").exists()
 
 
+def test_a_length_is_refused_where_each_system_has_its_own(tmp_path):
+    command = ("challenge", "--family", "dynamics", "--duration", 20, "--output", tmp_path / "a")
+    refused(mkc(*command), "each system has a length of its own", code=2)
+    refused(mkc("challenge", "--family", "weather", "--output", tmp_path / "a"), "magnetometer", "dynamics", code=2)
+    assert not (tmp_path / "a").exists()
+
+
 def test_a_failed_diagnosis_is_not_scored_by_an_older_one(tmp_path):
     from mkc_torch._commands.challenge import diagnose_unseen
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,7 +15,7 @@ from rich.text import Text
 
 from mkc_torch._commands.apply import correct, read_correction
 from mkc_torch._commands.console import FAILURES, Look, complain, out, progress
-from mkc_torch._commands.diagnosis_files import Request, diagnose_file
+from mkc_torch._commands.diagnosis_files import Request, diagnose_file, named_simulation
 from mkc_torch._commands.processes import cores
 from mkc_torch.recording import Recording
 
@@ -22,23 +23,40 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from mkc_torch.challenge import Score
+    from mkc_torch.challenge.subject import Subject
 
 _QUIET = Look(terminal=False, width=100)
+
+
+class Family(str, Enum):
+    """What a proof is about."""
+
+    magnetometer = "magnetometer"
+    dynamics = "dynamics"
 
 
 def challenge(
     output: Annotated[Path, typer.Option(help="Folder for recordings, key, diagnoses and page.")] = Path(
         "mkc_challenge"
     ),
+    family: Annotated[
+        Family, typer.Option(help="A magnetometer, or differential equations as a user writes them.")
+    ] = Family.magnetometer,
     cases: Annotated[
-        int | None, typer.Option(metavar="N", min=0, help="Recordings with something hidden; default: 240.")
+        int | None,
+        typer.Option(metavar="N", min=0, help="Recordings with something hidden; default: 240, of dynamics 100."),
     ] = None,
     empty: Annotated[
         int | None,
-        typer.Option(metavar="M", min=0, help="Recordings with nothing hidden; default: five for three others."),
+        typer.Option(
+            metavar="M", min=0, help="Recordings with nothing hidden; default: 5 for 3 others, of dynamics 3 for 2."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(metavar="S", min=0, help="Of all that is drawn.")] = 1,
-    duration: Annotated[float, typer.Option(metavar="s", min=10.0, help="Length of a recording in s.")] = 90.0,
+    duration: Annotated[
+        float | None,
+        typer.Option(metavar="s", min=10.0, help="Length of a magnetometer's recording in s; default: 90."),
+    ] = None,
     workers: Annotated[
         int | None, typer.Option(metavar="W", min=1, help="Processes; default: as many as cores.")
     ] = None,
@@ -50,16 +68,18 @@ def challenge(
     """
     from mkc_torch.challenge import run
 
-    cases = run.CASES if cases is None else cases
-    empty = round(cases * run.EMPTY / run.CASES) if empty is None else empty
+    subject = _subject(family, duration)
+    cases = subject.cases if cases is None else cases
+    empty = round(cases * subject.empty / subject.cases) if empty is None else empty
     if cases + empty == 0:
         raise typer.BadParameter("--cases and --empty are both 0; ask for one recording at least.")
+    diagnose, correct_one = _JOBS[family]
     torch.set_num_threads(1)
     try:
         with progress(cases + empty) as step:
             score = run.run_challenge(
-                diagnose_unseen, correct_unseen, cases=cases, empty=empty, seed=seed, output=output, overwrite=force,
-                workers=min(workers or cores(), cases + empty), duration=duration, progress=step.count,
+                diagnose, correct_one, subject=subject, cases=cases, empty=empty, seed=seed, output=output,
+                overwrite=force, workers=min(workers or cores(), cases + empty), progress=step.count,
             )  # fmt: skip
     except FAILURES as error:
         complain(output, error)
@@ -67,20 +87,61 @@ def challenge(
     _show(score, cases, empty, output)
 
 
+def _subject(family: Family, duration: float | None) -> Subject:
+    from mkc_torch.challenge.magnetometer import magnetometer
+    from mkc_torch.challenge.systems.proof import dynamics
+
+    if family is Family.magnetometer:
+        return magnetometer() if duration is None else magnetometer(duration)
+    if duration is not None:
+        raise typer.BadParameter("--duration is of the magnetometer's recordings; each system has a length of its own.")
+    return dynamics()
+
+
 def diagnose_unseen(paths: list[Path], folder: Path) -> None:
     """Diagnose recordings as ``mkc diagnose`` does, but for the reports, which nobody reads in this number."""
     for path in paths:
-        place = folder / path.stem
-        for old in ("diagnosis.json", "model.json"):  # of an earlier run, which would be scored in place of a failure
-            (place / old).unlink(missing_ok=True)
-        for outcome in diagnose_file(path, place, Request(force=True, report=False), _QUIET):
-            if outcome.failed:
-                (folder / f"{path.stem}.error.txt").write_text(f"{outcome.text}\n", encoding="utf-8")
+        _diagnose(path, folder, Request(force=True, report=False))
+
+
+def diagnose_dynamics(paths: list[Path], folder: Path) -> None:
+    """The same with ``--simulation``, of the proof's own file."""
+    for path in paths:
+        _diagnose(path, folder, Request(simulation=_simulation(path), force=True, report=False))
+
+
+def _diagnose(path: Path, folder: Path, request: Request) -> None:
+    place = folder / path.stem
+    for old in ("diagnosis.json", "model.json"):  # of an earlier run, which would be scored in place of a failure
+        (place / old).unlink(missing_ok=True)
+    for outcome in diagnose_file(path, place, request, _QUIET):
+        if outcome.failed:
+            (folder / f"{path.stem}.error.txt").write_text(f"{outcome.text}\n", encoding="utf-8")
 
 
 def correct_unseen(model: Path, recording: Path) -> Mapping[str, Tensor]:
     """A recording corrected as ``mkc apply`` does."""
     return correct(read_correction(model), Recording.read(recording)).columns
+
+
+def correct_dynamics(model: Path, recording: Path) -> Mapping[str, Tensor]:
+    """The same with ``--simulation``."""
+    simulation = named_simulation(_simulation(recording))
+    return correct(read_correction(model, simulation), Recording.read(recording)).columns
+
+
+def _simulation(recording: Path) -> str:
+    """``FILE.py:CLASS`` of a recording in a proof's folder."""
+    from mkc_torch.challenge.run import SIMULATIONS
+    from mkc_torch.challenge.systems.proof import simulation_class
+
+    return f"{recording.parent.parent / SIMULATIONS}:{simulation_class(recording)}"
+
+
+_JOBS = {
+    Family.magnetometer: (diagnose_unseen, correct_unseen),
+    Family.dynamics: (diagnose_dynamics, correct_dynamics),
+}
 
 
 def _show(score: Score, cases: int, empty: int, output: Path) -> None:
@@ -105,7 +166,10 @@ def _show(score: Score, cases: int, empty: int, output: Path) -> None:
     facts.add_column(overflow="fold")
     facts.add_row("false alarms", share_text(score.false_alarms))
     facts.add_row("named right", share_text(score.named))
-    facts.add_row("driver right", share_text(score.driver))
+    if score.driver.total:
+        facts.add_row("driver right", share_text(score.driver))
+    if score.located.total:
+        facts.add_row("located right", share_text(score.located))
     facts.add_row("failed", ", ".join(score.failed) or "none")
     console.print(facts)
     for name in ("challenge.html", "summary.md", "key_hash.txt"):

@@ -25,16 +25,24 @@ class KeyParameter:
 
 @dataclass(frozen=True)
 class KeyRival:
-    """Another explanation, and the number of standard deviations by which the data speak against it."""
+    """Another explanation, and the number of standard deviations by which the data speak against it.
+
+    ``at`` is where it acts, of several places that a simulation has for it.
+    """
 
     effect: str
     drivers: tuple[str, ...]
     z_sep: float
+    at: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class KeyEffect:
-    """One hidden effect. ``drivers`` are the columns it follows, empty where there is none or it was withheld."""
+    """One hidden effect.
+
+    ``drivers`` are the columns it follows, empty where there is none or it was withheld; ``at`` the places of which a
+    diagnosis has to name one, of several that a simulation has, and empty where it has one only.
+    """
 
     effect: str
     form: str
@@ -47,6 +55,7 @@ class KeyEffect:
     z_sep: float
     rival: KeyRival | None
     inseparable: tuple[KeyRival, ...]
+    at: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -54,8 +63,10 @@ class Key:
     """What the diagnosis is not told.
 
     ``kind`` is ``empty``, ``single``, ``double`` or ``outside`` (of the catalogue); ``mode`` is what the recording
-    offers: ``norm``, ``gyro`` or ``attitude``. Outliers are sample numbers. ``oracle_rms`` is the residual, in µT, that
-    a fit which knows the effect's form and the noise leaves on the second recording's good samples.
+    offers: ``norm``, ``gyro`` or ``attitude``, or the name of a system. Outliers are sample numbers. ``sensor`` holds
+    the true parameters of the sensor or the system. ``oracle_rms`` is the residual that a fit which knows the effect's
+    form and the noise leaves on the second recording's good samples: in µT, or in standard deviations of a system's
+    errors.
     """
 
     name: str
@@ -111,6 +122,7 @@ def key_from(numbers: Mapping[str, Any]) -> Key:
 def _effect_from(numbers: Mapping[str, Any]) -> KeyEffect:
     plain = dict(numbers)
     plain["drivers"] = tuple(plain["drivers"])
+    plain["at"] = tuple(plain.get("at", ()))
     plain["parameters"] = tuple(KeyParameter(**parameter) for parameter in plain["parameters"])
     plain["rival"] = _rival_from(plain["rival"]) if plain["rival"] else None
     plain["inseparable"] = tuple(_rival_from(rival) for rival in plain["inseparable"])
@@ -118,4 +130,4 @@ def _effect_from(numbers: Mapping[str, Any]) -> KeyEffect:
 
 
 def _rival_from(numbers: Mapping[str, Any]) -> KeyRival:
-    return KeyRival(numbers["effect"], tuple(numbers["drivers"]), numbers["z_sep"])
+    return KeyRival(numbers["effect"], tuple(numbers["drivers"]), numbers["z_sep"], tuple(numbers.get("at", ())))

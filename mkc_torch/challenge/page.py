@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,17 +73,20 @@ def summary(score: Score, baselines: Mapping[str, Score], settings: Mapping[str,
 
 
 def comparison(score: Score, baselines: Mapping[str, Score]) -> list[tuple[str, list[str]]]:
-    """Rows of the table that sets the diagnosis beside the baselines."""
+    """Rows of the table that sets the diagnosis beside the baselines, but for what there were no recordings of."""
     scores = [score, *baselines.values()]
-    return [
-        ("false alarms on empty recordings", [share_text(s.false_alarms) for s in scores]),
-        ("named right, z and z_sep ≥ 10", [share_text(s.named) for s in scores]),
-        ("driver right", [share_text(s.driver) for s in scores]),
-        ("named right with the driver withheld", [share_text(s.withheld_named) for s in scores]),
-        ("more findings than effects", [share_text(s.extra) for s in scores]),
-        ("both of two named", [f"{s.doubles[2]} of {sum(s.doubles.values())}" for s in scores]),
-        ("failed", [str(len(s.failed)) for s in scores]),
-    ]
+    asked: Sequence[tuple[str, Callable[[Score], Share]]] = (
+        ("false alarms on empty recordings", lambda s: s.false_alarms),
+        ("named right, z and z_sep ≥ 10", lambda s: s.named),
+        ("driver right", lambda s: s.driver),
+        ("located right", lambda s: s.located),
+        ("named right with the driver withheld", lambda s: s.withheld_named),
+        ("more findings than effects", lambda s: s.extra),
+    )
+    rows = [(label, [share_text(of(s)) for s in scores]) for label, of in asked if any(of(s).total for s in scores)]
+    if sum(score.doubles.values()):
+        rows.append(("both of two named", [f"{s.doubles[2]} of {sum(s.doubles.values())}" for s in scores]))
+    return [*rows, ("failed", [str(len(s.failed)) for s in scores])]
 
 
 def hidden_table(keys: Sequence[Key]) -> list[dict[str, Any]]:

@@ -18,27 +18,26 @@ import torch
 from torch import Tensor
 
 from mkc_torch._files import claim_folder, write_atomically
-from mkc_torch.challenge.baselines import stepwise_bic
 from mkc_torch.challenge.draws import generator
-from mkc_torch.challenge.generator import draw
 from mkc_torch.challenge.key import Key, canonical, digest
-from mkc_torch.challenge.motion import DURATION
+from mkc_torch.challenge.magnetometer import magnetometer
 from mkc_torch.challenge.page import challenge_page, summary
 from mkc_torch.challenge.score import Score, score
-from mkc_torch.challenge.second import ratio_to_oracle
+from mkc_torch.challenge.subject import Subject
 from mkc_torch.recording import Recording, write_table
 
 Diagnose = Callable[[list[Path], Path], object]
 """Writes ``<folder>/<stem>/diagnosis.json`` and ``model.json`` for each recording."""
 
 Apply = Callable[[Path, Path], Mapping[str, Tensor]]
-"""From ``model.json`` and a recording the corrected ``field_x``, ``field_y``, ``field_z``, a row for a row."""
+"""From ``model.json`` and a recording the corrected columns, a row for a row."""
 
 Progress = Callable[[str, int, int], None]
 
-CASES = 240
-EMPTY = 400
 SEED = 1
+
+SIMULATIONS = "simulations.py"
+"""Name of the file with the simulations in the proof's folder."""
 
 _BATCH = 4
 """Recordings in one call of the diagnosis."""
@@ -51,48 +50,54 @@ R = TypeVar("R")
 class _Work:
     """What a worker needs to know; it has no key in it."""
 
+    subject: Subject
     seed: int
     output: Path
-    duration: float
 
 
 def run_challenge(
     diagnose: Diagnose,
     apply: Apply,
     *,
-    cases: int = CASES,
+    subject: Subject | None = None,
+    cases: int | None = None,
     empty: int | None = None,
     seed: int = SEED,
     output: Path,
     workers: int = 1,
-    duration: float = DURATION,
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Score:
     """Draw recordings, have them diagnosed, and only then compare with what was hidden.
 
     Into ``output`` go ``recordings/`` and ``second/`` (CSV), ``key_hash.txt`` before the first diagnosis,
-    ``diagnoses/``, then ``key.json``, ``score.json``, ``challenge.html`` and ``summary.md``.
+    ``diagnoses/``, then ``key.json``, ``score.json``, ``challenge.html`` and ``summary.md``; of differential equations
+    also ``simulations.py`` beside the recordings, what a user would have written.
 
     Args:
         diagnose: as a user would run it. A recording for which it writes nothing, or raises, counts as failed. With
             more than one worker it has to be picklable, and so has ``apply``.
         apply: corrects a second recording.
-        cases: recordings with something hidden.
-        empty: recordings with nothing hidden; default five for each three cases.
+        subject: what the proof is about; default the magnetometer.
+        cases: recordings with something hidden; default the subject's own number.
+        empty: recordings with nothing hidden; default in the subject's own proportion to the cases.
         seed: of everything that is drawn.
         output: a folder that is empty or does not exist.
         workers: processes.
-        duration: of a recording in s.
         overwrite: accept a folder with files in it.
         progress: called with a stage, how many are done, and of how many.
     """
-    empty = round(cases * EMPTY / CASES) if empty is None else empty
+    subject = magnetometer() if subject is None else subject
+    cases = subject.cases if cases is None else cases
+    empty = round(cases * subject.empty / subject.cases) if empty is None else empty
     started = time.perf_counter()
     output = claim_folder(output, overwrite=overwrite)
     for name in ("recordings", "second", "diagnoses"):
         claim_folder(output / name, overwrite=overwrite)
-    work = _Work(seed, output, duration)
+    if subject.simulations is not None:
+        source = subject.simulations.read_text(encoding="utf-8")
+        write_atomically(output / SIMULATIONS, source, overwrite=overwrite)
+    work = _Work(subject, seed, output)
     tell = progress or _silent
     addresses = list(enumerate(_which_are_empty(seed, cases, empty)))
     with _Pool(workers) as pool:
@@ -104,28 +109,33 @@ def run_challenge(
         _all(pool, partial(_diagnose_batch, diagnose, output / "diagnoses"), batches, partial(tell, "diagnose"))
         write_atomically(output / "key.json", f"{text}\n", overwrite=overwrite)
         hidden = [key for key in keys if key.kind != "empty"]
-        ratios = _all(pool, partial(_second_ratio, apply, output), hidden, partial(tell, "second recordings"))
-        naive = _all(pool, _baseline, paths, partial(tell, "baseline"))
+        ratios = _all(pool, partial(_second_ratio, apply, work), hidden, partial(tell, "second recordings"))
+        naive = {
+            name: _all(pool, competitor, paths, partial(tell, "baseline"))
+            for name, competitor in subject.baselines.items()
+        }
     names = [key.name for key in keys]
     diagnoses = {name: _read(output / "diagnoses" / name / "diagnosis.json") for name in names}
-    result = score(keys, diagnoses, {key.name: ratio for key, ratio in zip(hidden, ratios, strict=True)})
-    baseline = score(keys, dict(zip(names, naive, strict=True)))
+    found = {key.name: ratio for key, ratio in zip(hidden, ratios, strict=True)}
+    result = score(keys, diagnoses, found, subject.thresholds)
+    baselines = {
+        name: score(keys, dict(zip(names, told, strict=True)), thresholds=subject.thresholds)
+        for name, told in naive.items()
+    }
     settings = {
+        "family": subject.name,
         "seed": seed,
         "hidden": cases,
         "empty": empty,
-        "duration_s": duration,
+        **subject.settings,
         "workers": workers,
         "key_sha256": digest(text),
         "seconds": round(time.perf_counter() - started, 1),
     }
-    record = {"settings": settings, "score": result.numbers(), "least squares with stepwise BIC": baseline.numbers()}
+    record = {"settings": settings, "score": result.numbers()} | {name: b.numbers() for name, b in baselines.items()}
     write_atomically(output / "score.json", json.dumps(record, indent=1, allow_nan=False), overwrite=overwrite)
-    page = challenge_page(result, {"Least squares, stepwise BIC": baseline}, keys, settings)
-    write_atomically(output / "challenge.html", page, overwrite=overwrite)
-    write_atomically(
-        output / "summary.md", summary(result, {"Least squares, stepwise BIC": baseline}, settings), overwrite=overwrite
-    )
+    write_atomically(output / "challenge.html", challenge_page(result, baselines, keys, settings), overwrite=overwrite)
+    write_atomically(output / "summary.md", summary(result, baselines, settings), overwrite=overwrite)
     return result
 
 
@@ -136,7 +146,7 @@ def _which_are_empty(seed: int, cases: int, empty: int) -> list[bool]:
 
 def _write_case(work: _Work, address: tuple[int, bool]) -> Key:
     index, empty = address
-    case = draw(work.seed, index, empty=empty, duration=work.duration)
+    case = work.subject.draw(work.seed, index, empty)
     name = case.key.name
     write_table(work.output / "recordings" / f"{name}.csv", case.recording.columns, overwrite=True)
     if case.second is not None:
@@ -152,19 +162,16 @@ def _diagnose_batch(diagnose: Diagnose, folder: Path, paths: list[Path]) -> None
         (folder / f"{paths[0].stem}.error.txt").write_text(f"{type(error).__name__}: {error}\n", encoding="utf-8")
 
 
-def _second_ratio(apply: Apply, output: Path, key: Key) -> float:
-    model = output / "diagnoses" / key.name / "model.json"
+def _second_ratio(apply: Apply, work: _Work, key: Key) -> float:
+    model = work.output / "diagnoses" / key.name / "model.json"
     if not model.is_file():
         return math.inf
     try:
-        return ratio_to_oracle(apply(model, output / "second" / f"{key.name}.csv"), key)
+        path = work.output / "second" / f"{key.name}.csv"
+        return work.subject.ratio(apply(model, path), Recording.read(path), key)
     except Exception as error:
         (model.parent / "apply.error.txt").write_text(f"{type(error).__name__}: {error}\n", encoding="utf-8")
         return math.inf
-
-
-def _baseline(path: Path) -> dict[str, Any] | None:
-    return stepwise_bic(Recording.read(path))
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -14,7 +14,16 @@ import torch
 from mkc_torch.challenge.binomial import Share, share, uniformity
 from mkc_torch.challenge.key import Key, KeyEffect
 from mkc_torch.challenge.thresholds import INSEPARABLE_BELOW, STRONG_Z, THRESHOLDS, Threshold
-from mkc_torch.challenge.verdict import FAILED, NOTHING, Answer, answer, covered, driver_right, named_right
+from mkc_torch.challenge.verdict import (
+    FAILED,
+    NOTHING,
+    Answer,
+    answer,
+    covered,
+    driver_right,
+    located_right,
+    named_right,
+)
 
 BINS = (0.0, 3.0, 5.0, 7.0, 10.0, 15.0, 30.0, math.inf)
 """Edges of the bins of z and z_sep."""
@@ -50,8 +59,8 @@ class Score:
     """The result of a proof. Single effects with z and z_sep of at least ten are called strong.
 
     ``confusion`` counts what was hidden (an effect, ``nothing``, or an effect with its driver withheld) against what
-    was named first; ``doubles`` how many of two hidden effects were named; ``ratios`` are residuals on second
-    recordings relative to the oracle's.
+    was named first; ``located`` how many strong ones were put at the right of several places; ``doubles`` how many of
+    two hidden effects were named; ``ratios`` are residuals on second recordings relative to the oracle's.
     """
 
     false_alarms: Share
@@ -62,6 +71,7 @@ class Score:
     strong: int
     named: Share
     driver: Share
+    located: Share
     withheld_named: Share
     extra: Share
     separable: Share
@@ -101,11 +111,16 @@ class _Single:
     def driver(self) -> bool:
         return bool(self.said.findings) and driver_right(self.said.findings[0].named, self.truth)
 
+    @property
+    def located(self) -> bool:
+        return bool(self.said.findings) and located_right(self.said.findings[0].named, self.truth)
+
 
 def score(
     keys: Sequence[Key],
     diagnoses: Mapping[str, Mapping[str, Any] | None],
     ratios: Mapping[str, float] | None = None,
+    thresholds: Sequence[Threshold] = THRESHOLDS,
 ) -> Score:
     """Compare diagnoses with keys.
 
@@ -113,6 +128,7 @@ def score(
         keys: of all cases.
         diagnoses: name of a recording to the content of its ``diagnosis.json``; a name that is missing failed.
         ratios: name to the residual of the corrected second recording relative to the oracle's.
+        thresholds: what is asked for.
     """
     said = {key.name: answer(diagnoses.get(key.name)) for key in keys}
     singles = [_Single(key.effects[0], said[key.name]) for key in keys if key.kind == "single"]
@@ -131,7 +147,8 @@ def score(
         "confusion": confusion(keys, said),
         "strong": len(strong),
         "named": _share_of(strong, lambda case: case.named),
-        "driver": _share_of(strong, lambda case: case.driver),
+        "driver": _share_of([case for case in strong if not case.truth.at], lambda case: case.driver),
+        "located": _share_of([case for case in strong if case.truth.at], lambda case: case.located),
         "withheld_named": _share_of([case for case in strong if case.truth.withheld], lambda case: case.named),
         "extra": _share_of(strong, lambda case: len(case.said.findings) > 1),
         "separable": _share_of(told, lambda case: not case.said.findings[0].others),
@@ -146,7 +163,7 @@ def score(
         "doubles": doubles(keys, said),
         "failed": tuple(name for name, a in said.items() if a.verdict == FAILED),
     }
-    return Score(**results, measured=_measured(results))
+    return Score(**results, measured=_measured(results, thresholds))
 
 
 def confusion(keys: Sequence[Key], said: Mapping[str, Answer]) -> dict[str, dict[str, int]]:
@@ -219,7 +236,7 @@ def doubles(keys: Sequence[Key], said: Mapping[str, Answer]) -> dict[int, int]:
     return counts
 
 
-def _measured(results: Mapping[str, Any]) -> tuple[Measured, ...]:
+def _measured(results: Mapping[str, Any], thresholds: Sequence[Threshold]) -> tuple[Measured, ...]:
     onsets, ratios = results["onset_errors"], results["ratios"]
     values = {
         "empty_cases": float(results["false_alarms"].total),
@@ -228,13 +245,14 @@ def _measured(results: Mapping[str, Any]) -> tuple[Measured, ...]:
         "strong_cases": float(results["strong"]),
         "named_right": results["named"].value,
         "driver_right": results["driver"].value,
+        "located_right": results["located"].value,
         "separable_share": results["separable"].value,
         "candidates_named": results["candidates"],
         "step_within": _mean([float(error <= ONSET_TOLERANCE) for error in onsets]),
         "coverage": results["coverage"].value,
         "second_ratio": float(torch.tensor(ratios, dtype=torch.float64).median()) if ratios else math.nan,
     }
-    return tuple(Measured(threshold, values[threshold.measure]) for threshold in THRESHOLDS)
+    return tuple(Measured(threshold, values[threshold.measure]) for threshold in thresholds)
 
 
 def _share_of(cases: Sequence[Any], holds: Callable[[Any], bool]) -> Share:

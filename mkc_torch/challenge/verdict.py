@@ -22,8 +22,11 @@ _NO_DRIVERS = frozenset(("time", "field", "mag_x", "mag_y", "mag_z"))
 
 @dataclass(frozen=True)
 class Candidate:
+    """``at`` is where it acts: the channels of a finding."""
+
     effect: str
     drivers: frozenset[str]
+    at: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,11 @@ def _finding(numbers: Mapping[str, Any]) -> Finding:
 
 
 def _candidate(numbers: Mapping[str, Any]) -> Candidate:
-    return Candidate(numbers["effect"], frozenset(numbers.get("drivers") or ()) - _NO_DRIVERS)
+    return Candidate(
+        numbers["effect"],
+        frozenset(numbers.get("drivers") or ()) - _NO_DRIVERS,
+        frozenset(numbers.get("channels") or ()),
+    )
 
 
 def named_right(named: Candidate, truth: KeyEffect) -> bool:
@@ -96,8 +103,17 @@ def driver_right(named: Candidate, truth: KeyEffect) -> bool:
     return own or any(named.drivers == frozenset(rival.drivers) for rival in truth.inseparable)
 
 
+def located_right(named: Candidate, truth: KeyEffect) -> bool:
+    """It acts at one of the places of the hidden effect, or of a rival that the data cannot tell from it."""
+    return bool(named.at & set(truth.at)) or any(named.at & set(rival.at) for rival in truth.inseparable)
+
+
 def _is_inseparable(named: Candidate, truth: KeyEffect) -> bool:
-    return any((rival.effect, frozenset(rival.drivers)) == (named.effect, named.drivers) for rival in truth.inseparable)
+    return any(
+        (rival.effect, frozenset(rival.drivers)) == (named.effect, named.drivers)
+        and (not rival.at or bool(named.at & set(rival.at)))
+        for rival in truth.inseparable
+    )
 
 
 def covered(finding: Finding, truth: KeyParameter) -> list[bool] | None:

@@ -10,6 +10,7 @@ pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
 from mkc_torch.challenge.key import digest
+from mkc_torch.challenge.magnetometer import magnetometer
 from mkc_torch.challenge.run import run_challenge
 from mkc_torch.recording import Recording
 
@@ -41,7 +42,7 @@ def run(request, tmp_path_factory):
     output = tmp_path_factory.mktemp("challenge") / "out"
     told = []
     result = run_challenge(
-        diagnose, apply, cases=3, empty=3, seed=3, output=output, workers=request.param, duration=DURATION,
+        diagnose, apply, cases=3, empty=3, seed=3, output=output, workers=request.param, subject=magnetometer(DURATION),
         progress=lambda stage, done, total: told.append((stage, done, total)),
     )  # fmt: skip
     return result, output, told
@@ -110,7 +111,7 @@ def test_summary_and_score_are_written(run):
 
 def test_the_same_seed_gives_the_same_key(run, tmp_path):
     _, output, _ = run
-    run_challenge(diagnose, apply, cases=3, empty=3, seed=3, output=tmp_path / "again", duration=DURATION)
+    run_challenge(diagnose, apply, cases=3, empty=3, seed=3, output=tmp_path / "again", subject=magnetometer(DURATION))
     assert (tmp_path / "again" / "key_hash.txt").read_text() == (output / "key_hash.txt").read_text()
 
 
@@ -121,7 +122,7 @@ def test_a_folder_in_use_is_refused(tmp_path):
 
 
 def test_default_is_five_empty_for_three_hidden(tmp_path):
-    result = run_challenge(diagnose, apply, cases=3, output=tmp_path / "out", duration=DURATION)
+    result = run_challenge(diagnose, apply, cases=3, output=tmp_path / "out", subject=magnetometer(DURATION))
     assert result.false_alarms.total == 5
     assert all(math.isfinite(p) for p in result.p_values)
     assert torch.get_num_threads() == 1

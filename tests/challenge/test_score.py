@@ -149,6 +149,37 @@ def test_two_at_once_are_counted_once_each():
     assert score(keys, answers).doubles == {0: 1, 1: 1, 2: 1}
 
 
+def at(places, effect="coulomb_friction", **more):
+    """A key whose effect acts at one of several places."""
+    hidden = key("a", effect=effect, **more)
+    return dataclasses.replace(hidden, effects=(dataclasses.replace(hidden.effects[0], at=tuple(places)),))
+
+
+def test_places_are_asked_of_effects_that_have_several():
+    told = finding("coulomb_friction") | {"channels": ["rate of speed"]}
+    right, wrong = at(["rate of speed", "rate of turn"]), at(["rate of turn"])
+    assert score([right], {"a": says(told)}).located.count == 1
+    assert score([wrong], {"a": says(told)}).located.count == 0
+    assert score([wrong], {"a": says(told)}).driver.total == 0
+    assert score([key("a")], {"a": says(finding("hard_iron_step"))}).located.total == 0
+
+
+def test_an_inseparable_rival_is_right_at_its_own_place():
+    rival = KeyRival("linear_drag", (), 3.0, ("rate of speed",))
+    hidden = at(["rate of turn"])
+    hidden = dataclasses.replace(hidden, effects=(dataclasses.replace(hidden.effects[0], inseparable=(rival,)),))
+    for place, right in (("rate of speed", 1), ("rate of lift", 0)):
+        result = score([hidden], {"a": says(finding("linear_drag") | {"channels": [place]})})
+        assert (result.named.count, result.located.count) == (right, right)
+
+
+def test_other_thresholds_can_be_asked():
+    asked = (Threshold("located_right", 0.5, 1.0, "somewhere"),)
+    told = finding("coulomb_friction") | {"channels": ["rate of turn"]}
+    (found,) = score([at(["rate of turn"])], {"a": says(told)}, thresholds=asked).measured
+    assert found.holds
+
+
 def test_second_ratio_is_the_median_of_the_strong():
     keys = [key("a"), key("b"), key("c"), key("weak", z=3.0, z_sep=3.0)]
     result = score(keys, {}, {"a": 1.0, "b": 1.02, "c": math.inf, "weak": 9.0})

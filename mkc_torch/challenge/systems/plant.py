@@ -1,0 +1,110 @@
+"""A system as everybody knows it, the runs that are made with it, and what may be hidden in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+Rate = Callable[[Array, Array, Array], Array]
+"""From states (n, *), inputs (k, *) and parameters (p,) the rates of the states (n, *)."""
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A system without what is hidden, in state space.
+
+    Attributes:
+        name: of the system, with which the names of its recordings begin.
+        states, inputs: their names, in the order of ``rate``.
+        outputs: those states that are measured.
+        units: of states.
+        speeds: position to the state that is its speed.
+        parameters: name to true value, in the order of ``rate``.
+        fine: even number of steps of the integration between two samples.
+    """
+
+    name: str
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: Mapping[str, str]
+    speeds: Mapping[str, str]
+    parameters: Mapping[str, float]
+    rate: Rate
+    fine: int
+
+    def row(self, state: str) -> int:
+        return self.states.index(state)
+
+    @property
+    def values(self) -> Array:
+        """(p,) of the parameters."""
+        return np.array(list(self.parameters.values()))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Runs of one length: inputs (k, T, R) at the samples, between which they are linear, and first states (n, R)."""
+
+    step: float
+    inputs: Array
+    begin: Array
+
+    @property
+    def samples(self) -> int:
+        """T, of each run."""
+        return self.inputs.shape[1]
+
+    @property
+    def runs(self) -> int:
+        """R."""
+        return self.inputs.shape[2]
+
+
+RateChange = Callable[[Array, Array, Array, Array, Array], tuple[Array, Array]]
+"""From states (n, R), own states (e, R), inputs (k, R), known rates (n, R) and sizes (R,): rates (n, R), own (e, R)."""
+
+SignalChange = Callable[[Array, float, float], Array]
+"""From signals (channels, moments, R), the time between moments in s and a size: the signals as changed."""
+
+
+def _unchanged(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+    return values
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """An effect before its size is known; of size 0 it is not there.
+
+    Attributes:
+        effect: what a diagnosis should call it.
+        form: what it really is.
+        at: where a diagnosis may say that it acts, one place of several being enough.
+        large: a size that nobody could overlook.
+        rate: what it makes of the rates; None if it leaves them alone.
+        own: number of states of its own, at 0 when a run begins.
+        inputs, outputs: what it makes of inputs and of what is measured.
+    """
+
+    effect: str
+    form: str
+    at: tuple[str, ...]
+    large: float
+    rate: RateChange | None = None
+    own: int = 0
+    inputs: SignalChange = field(default=_unchanged)
+    outputs: SignalChange = field(default=_unchanged)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A plant, its runs, and those of the second recording."""
+
+    plant: Plant
+    trial: Trial
+    later: Trial
