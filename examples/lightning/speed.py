@@ -13,22 +13,10 @@ import time
 from collections.abc import Callable
 
 import torch
-from torch import Tensor, nn
+from peers import LearnedGaussianNLL
+from torch import nn
 
 from mkc_torch import MKCLoss
-
-
-class LearnedGaussianNLL(nn.Module):
-    """torch.nn.GaussianNLLLoss with one learned variance for each channel."""
-
-    def __init__(self, num_channels: int) -> None:
-        super().__init__()
-        self.log_variance = nn.Parameter(torch.zeros(num_channels))
-        self._nll = nn.GaussianNLLLoss()
-
-    def forward(self, input: Tensor, target: Tensor) -> Tensor:
-        loss: Tensor = self._nll(input, target, self.log_variance.exp().expand_as(input))
-        return loss
 
 
 def milliseconds(step: Callable[[], None], times: int, device: torch.device) -> float:
