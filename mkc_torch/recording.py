@@ -357,12 +357,19 @@ class Recording:
         ]
 
 
-def write_table(path: str | os.PathLike[str], columns: Mapping[str, Tensor], *, overwrite: bool = False) -> None:
+def write_table(
+    path: str | os.PathLike[str],
+    columns: Mapping[str, Tensor],
+    *,
+    labels: Mapping[str, Sequence[str]] | None = None,
+    overwrite: bool = False,
+) -> None:
     """Write columns to a file, whole or not at all, such that :meth:`Recording.read` gives the same float64 back.
 
     Args:
         path: the target; its ending says the format, ``.csv``, ``.tsv``, ``.txt`` (a CSV) or ``.parquet``.
         columns: name to values, 1-D tensors of one length; ``recording.columns`` for a recording.
+        labels: of columns of whole numbers 0, 1, …, what each stands for and is written instead; ``recording.labels``.
         overwrite: replace an existing file.
 
     Raises:
@@ -372,7 +379,12 @@ def write_table(path: str | os.PathLike[str], columns: Mapping[str, Tensor], *, 
     path = Path(path)
     check_ending(path)
     table = Recording(columns, name=path.name)
-    data = encoded(path, {name: values.numpy() for name, values in table.columns.items()})
+    known = labels or {}
+    told = {
+        name: np.array(known[name])[values.long().numpy()] if name in known else values.numpy()
+        for name, values in table.columns.items()
+    }
+    data = encoded(path, told)
     write_atomically(path, data, overwrite=overwrite)
 
 

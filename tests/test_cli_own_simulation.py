@@ -140,7 +140,8 @@ def test_a_model_simulates_another_recording(tank, tmp_path):
     assert result.exit_code == 0, result.output
     assert "300 rows of level simulated with what was found" in result.stdout
     corrected = Recording.read(output)
-    assert corrected.names == ("time", "level")
+    assert corrected.names == ("time", "experiment", "level")
+    assert torch.equal(corrected["experiment"], Recording.read(new)["experiment"])
     assert float((corrected["level"] - Recording.read(new)["level"]).square().mean().sqrt()) < 0.008
 
 

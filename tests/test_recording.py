@@ -406,6 +406,15 @@ def test_text_among_experiments_is_numbered_and_labelled(tmp_path):
     assert same(recording.experiments()["ball/2"]["a"], [1, 3])
 
 
+@pytest.mark.parametrize("ending", [".csv", ".parquet"])
+def test_labels_are_written_as_they_were_read(tmp_path, ending):
+    path = tmp_path / f"runs{ending}"
+    write_table(path, {"experiment": column(0, 0, 1), "x": column(1, 2, 3)}, labels={"experiment": ["up", "down"]})
+    again = Recording.read(path)
+    assert again.labels == {"experiment": ("up", "down")}
+    assert again["experiment"].tolist() == [0.0, 0.0, 1.0]
+
+
 def test_a_renamed_column_can_be_the_experiment(tmp_path):
     recording = read(tmp_path, "run,a\nx,1\ny,2\n", columns={"experiment": "run"})
     assert recording.labels == {"experiment": ("x", "y")}

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
     from mkc_torch.simulation import Simulation
 
+_NOT_MEASURED = ("time", "experiment")
+
 
 def apply(
     model: Annotated[
@@ -49,8 +51,8 @@ def apply(
     """Write what a calibration or a model makes of a recording.
 
     Of a magnetometer: time, field_x, field_y, field_z, the corrected field row by row. Of a simulation of your own, or
-    of a simulator's output: time and the outputs, simulated with what was found. Of a model's effects those are left
-    out that belong to the time or the place of the diagnosed recording.
+    of a simulator's output: time, the run if there are several, and the outputs, simulated with what was found. Of a
+    model's effects those are left out that belong to the time or the place of the diagnosed recording.
     """
     names = parsed_columns(columns)
     if simulation is not None and simulated is not None:
@@ -67,7 +69,7 @@ def apply(
         table = Recording.read(recording, columns=names)
         corrected = correct(known, table)
         subject = output
-        write_table(output, corrected.columns, overwrite=force)
+        write_table(output, corrected.columns, labels=table.labels, overwrite=force)
     except Exception as error:
         told = raised_in(simulation, error) if simulation and simulation not in SIMULATIONS else None
         if told is None and not isinstance(error, FAILURES):
@@ -79,7 +81,7 @@ def apply(
 
 def _show(table: Recording, corrected: Corrected, output: Path) -> None:
     console = out()
-    columns = {name: values for name, values in corrected.columns.items() if name != "time"}
+    columns = {name: values for name, values in corrected.columns.items() if name not in _NOT_MEASURED}
     values = torch.stack(list(columns.values()), -1)
     missing = int((~values.isfinite().all(-1)).sum())
     is_field = set(columns) == {f"field_{axis}" for axis in "xyz"}
