@@ -11,7 +11,14 @@ from torch import Tensor
 from mkc_torch.diagnosis.drivers import Driver
 from mkc_torch.diagnosis.model import Term
 from mkc_torch.diagnosis.preference import UNKNOWN
-from mkc_torch.effects.protocol import ChoosyEffect, ContinuousEffect, Effect, RelativeEffect, Shape
+from mkc_torch.effects.protocol import (
+    ChoosyEffect,
+    ContinuousEffect,
+    Effect,
+    OptionalDriverEffect,
+    RelativeEffect,
+    Shape,
+)
 from mkc_torch.simulation.protocol import Port, PreparedSimulation
 
 if TYPE_CHECKING:
@@ -30,7 +37,8 @@ def candidate_terms(
     for effect in effects:
         places = [name for name, port in prepared.ports.items() if _fits(effect, name, port)]
         # a role that is known says what the column does; an effect of unknown roles takes what is left over
-        fitting = [None] if not effect.roles else [d for d in drivers if _drives(d, effect)]
+        alone = not effect.roles or (isinstance(effect, OptionalDriverEffect) and effect.driver_optional)
+        fitting = [*([None] if alone else []), *(d for d in drivers if _drives(d, effect))]
         shapes = effect.shapes(prepared.time)
         terms += [
             Term(effect, driver, shape, "" if at == effect.port else at)
@@ -57,7 +65,7 @@ def absolute(effect: Effect, shape: Shape, port: Port) -> Shape:
 
 def _drives(driver: Driver, effect: Effect) -> bool:
     """Whether a driver has one of an effect's roles; a curve without a name follows any one column."""
-    return driver.role in effect.roles or (effect.id == UNKNOWN and len(driver.columns) == 1)
+    return driver.role in effect.roles or (bool(effect.roles) and effect.id == UNKNOWN and len(driver.columns) == 1)
 
 
 def finer(term: Term, name: str, time: Float[Tensor, " N"], rounds: int) -> tuple[Term, ...]:

@@ -16,7 +16,7 @@ from mkc_torch.diagnosis.estimate import Estimate
 from mkc_torch.diagnosis.model import Term, context_at, summed
 from mkc_torch.diagnosis.python_source import python_source
 from mkc_torch.effects import CATALOGUE
-from mkc_torch.effects.protocol import AnchoredEffect, Context, Effect, LastingEffect
+from mkc_torch.effects.protocol import AnchoredEffect, Context, Effect, LastingEffect, RelativeEffect
 from mkc_torch.recording import MissingColumnError, Recording
 from mkc_torch.simulation.protocol import Change, Correction, Simulation
 from mkc_torch.simulation.registry import correction_of
@@ -187,7 +187,7 @@ class DiagnosedModel(nn.Module):
             found = "missing" if schema is None else json.dumps(schema)
             raise ModelFileError(f'this is no model: its schema is {found} and not "{SCHEMA}".')
         try:
-            return _read(content, {effect.id: effect for effect in effects}, simulation)
+            return _read(content, effects, simulation)
         except (KeyError, TypeError, ValueError) as error:
             if isinstance(error, ModelFileError):
                 raise
@@ -220,13 +220,9 @@ def _columns(term: Term) -> tuple[Sequence[str], Sequence[float], Sequence[str]]
     return term.driver.columns, term.driver.reference.tolist(), term.driver.units
 
 
-def _read(content: Mapping[str, Any], known: Mapping[str, Effect], simulation: Simulation | None) -> DiagnosedModel:
+def _read(content: Mapping[str, Any], known: Sequence[Effect], simulation: Simulation | None) -> DiagnosedModel:
     terms, gammas = [], []
     for entry in content["effects"]:
-        if entry["effect"] not in known:
-            raise ModelFileError(
-                f'its effect "{entry["effect"]}" is not known; register it with `effects=` (known: {", ".join(known)}).'
-            )
         columns = entry["drivers"]
         driver = None
         if columns:
@@ -234,11 +230,24 @@ def _read(content: Mapping[str, Any], known: Mapping[str, Effect], simulation: S
             names, units = tuple(c["column"] for c in columns), tuple(c["unit"] for c in columns)
             driver = Driver(names, "", reference.new_zeros(0, len(columns)), reference, units)
         shape = {name: _finite(value) for name, value in entry["shape"].items()}
-        terms.append(Term(known[entry["effect"]], driver, shape, entry.get("port", "")))
+        terms.append(Term(_effect(entry, known), driver, shape, entry.get("port", "")))
         gammas.append(_vector(entry["parameters"]))
     return DiagnosedModel(
         content["simulation"], content["state"], _vector(content["parameters"]), terms, gammas, simulation
     )
+
+
+def _effect(entry: Mapping[str, Any], known: Sequence[Effect]) -> Effect:
+    """The one of that id; of several curves without a name, that with these numbers in its shape."""
+    same = [effect for effect in reversed(known) if effect.id == entry["effect"]]
+    if not same:
+        names = ", ".join(dict.fromkeys(effect.id for effect in known))
+        raise ModelFileError(
+            f'its effect "{entry["effect"]}" is not known; register it with `effects=` (known: {names}).'
+        )
+    numbers = set(entry["shape"])
+    of_shape = [one for one in same if not isinstance(one, RelativeEffect) or set(one.relative) <= numbers]
+    return (of_shape or same)[0]
 
 
 def _vector(values: Sequence[float]) -> Tensor:

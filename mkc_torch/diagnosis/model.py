@@ -89,6 +89,7 @@ def context_at(port: Port, time: Tensor, drivers: Tensor, units: tuple[str, ...]
         port.carries,
         port.parts,
         port.part_units,
+        port.run,
     )
 
 
@@ -197,9 +198,19 @@ def summed(one: Change | None, other: Change) -> Change:
     first = one
 
     def both(signal: Tensor) -> Tensor:
-        return first(signal) + other(signal)
+        added, more = first(signal), other(signal)
+        # the rate of a memory, where only one of them has it, comes last
+        width = max(added.shape[1], more.shape[1])
+        return _widened(added, width) + _widened(more, width)
 
     return FreeChange(both) if isinstance(first, FreeChange) and isinstance(other, FreeChange) else both
+
+
+def _widened(added: Float[Tensor, "N c"], width: int) -> Float[Tensor, "N w"]:
+    """With zeros beside it."""
+    if added.shape[1] == width:
+        return added
+    return torch.cat([added, added.new_zeros(len(added), width - added.shape[1])], -1)
 
 
 def with_constant(changes: Changes, port: str, change: Float[Tensor, "N c"]) -> Changes:

@@ -19,6 +19,7 @@ __all__ = ["SourceError", "python_source"]
 _DIGITS = 9
 _FROM_HERE: Mapping[str, str] = {
     "lagged(": "from mkc_torch.effects.protocol import lagged",
+    "played(": "from mkc_torch.effects.dynamics.backlash import played",
     "shifted(": "from mkc_torch.effects.paired.between import shifted",
     "SimpleNamespace(": "from types import SimpleNamespace",
     "Parameter(": "from mkc_torch.simulation import Parameter",
@@ -38,11 +39,13 @@ def python_source(model: DiagnosedModel, module: str | None = None) -> str:
             f"{'' if system else '; give its simulation with `simulation=`'}."
         )
     kind = type(system)
+    measured = tuple(map(str, model.state.get("outputs", system.outputs or system.states)))
     rates: list[str] = []
+    memories = tuple(_memory(state) for term in model.terms if (state := _remembering(term)))
     inputs: list[str] = []
     outputs: list[str] = []
     for term, gamma in zip(model.terms, model.gammas, strict=True):
-        lines = _lines(term, [_rounded(float(one)) for one in gamma], system)
+        lines = _lines(term, [_rounded(float(one)) for one in gamma], system, measured)
         place = outputs if term.port == "output" else inputs if term.port.startswith("input ") else rates
         place += [f"# {term.effect.id}: {term.effect.equation}", *lines]
     told = ", ".join(term.effect.id.replace("_", " ") for term in model.terms) or "nothing more"
@@ -53,8 +56,10 @@ def python_source(model: DiagnosedModel, module: str | None = None) -> str:
         "    parameters = {",
         *(f"        {line}" for line in _parameters(system, model.theta.tolist())),
         "    }",
-        *_derivative(inputs, rates),
-        *_output(outputs),
+        *_states(kind.__name__, memories),
+        *_actuated(inputs),
+        *_derivative(memories, rates),
+        *_sensed(outputs),
     ]
     text = "\n".join(body)
     module = module or kind.__module__.removeprefix("_simulation_")
@@ -90,14 +95,27 @@ def _parameters(system: Dynamics, theta: Sequence[float]) -> list[str]:
     return lines
 
 
-def _derivative(inputs: list[str], rates: list[str]) -> list[str]:
-    if not inputs and not rates:
+def _states(base: str, memories: Sequence[str]) -> list[str]:
+    """The states with the internal ones that effects bring."""
+    told = ", ".join(json.dumps(name) for name in memories)
+    return [f"    states = (*{base}.states, {told})"] if memories else []
+
+
+def _actuated(inputs: list[str]) -> list[str]:
+    if not inputs:
         return []
-    before = ["u = SimpleNamespace(**vars(u))", *inputs] if inputs else []
+    lines = ["acting = SimpleNamespace(**vars(u))", *inputs, "return super().actuated(time, acting, p, run)"]
+    return ["", "    def actuated(self, time, u, p, run):", *(f"        {line}" for line in lines)]
+
+
+def _derivative(memories: Sequence[str], rates: list[str]) -> list[str]:
+    if not rates:
+        return []
+    still = [f'rates["{name}"] = torch.zeros_like(x.{name})' for name in memories]
     return [
         "",
         "    def derivative(self, time, x, u, p):",
-        *(f"        {line}" for line in [*before, "rates = self.plain_rates(time, x, u, p)", *rates, "return rates"]),
+        *(f"        {line}" for line in ["rates = self.plain_rates(time, x, u, p)", *still, *rates, "return rates"]),
         "",
         "    def plain_rates(self, time, x, u, p):",
         "        rates = super().derivative(time, x, u, p)",
@@ -105,14 +123,24 @@ def _derivative(inputs: list[str], rates: list[str]) -> list[str]:
     ]
 
 
-def _output(outputs: list[str]) -> list[str]:
+def _sensed(outputs: list[str]) -> list[str]:
     if not outputs:
         return []
-    lines = ["y = dict(super().output(time, x, u, p))", *outputs, "return y"]
-    return ["", "    def output(self, time, x, u, p):", *(f"        {line}" for line in lines)]
+    lines = ["y = super().sensed(time, y, p, run)", "shown = dict(y)", *outputs, "return shown"]
+    return ["", "    def sensed(self, time, y, p, run):", *(f"        {line}" for line in lines)]
 
 
-def _lines(term: Term, gamma: Sequence[float], system: Dynamics) -> list[str]:
+def _remembering(term: Term) -> str:
+    """The state whose rate an effect with memory acts on; empty for others."""
+    kind, _, state = term.port.rpartition("rate of ")
+    return state if kind.startswith("hysteretic") else ""
+
+
+def _memory(state: str) -> str:
+    return f"memory_of_{state}"
+
+
+def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Sequence[str]) -> list[str]:
     """Assignments that add an effect to what it acts on."""
     if term.driver is not None or not isinstance(term.effect, CodedEffect):
         raise SourceError(
@@ -125,17 +153,16 @@ def _lines(term: Term, gamma: Sequence[float], system: Dynamics) -> list[str]:
         state = term.port.rpartition("rate of ")[2]
         targets, names = [f'rates["{state}"]'], _parts(state, system)
         before = _load(state) if term.port.startswith("loaded") else []
+        targets += [f'rates["{_memory(one)}"]' for one in [_remembering(term)] if one]
     elif term.port.startswith("exchange of "):
         one, _, other = term.port.removeprefix("exchange of ").partition(" and ")
         targets = [f'rates["{one}"]', f'rates["{other}"]']
         names = {"own": f"x.{one}", "other": f"x.{other}"}
     elif term.port.startswith("input "):
         name = term.port.removeprefix("input ")
-        targets, names = [f"u.{name}"], {"own": f"u.{name}"}
+        targets, names = [f"acting.{name}"], {"own": f"u.{name}"}
     else:
-        channels = system.outputs or system.states
-        targets = [f'y["{name}"]' for name in channels]
-        names = dict(zip(channels, targets, strict=True))
+        targets, names = [f'shown["{name}"]' for name in measured], {name: f'y["{name}"]' for name in measured}
     added = term.effect.code(gamma, shape, names)
     each = zip(targets, added, strict=False)
     return [*before, *(f"{target} = {target} {_signed(expression)}" for target, expression in each)]
@@ -154,6 +181,8 @@ def _parts(state: str, system: Dynamics) -> dict[str, str]:
         "own": f"x.{state}",
         **dict.fromkeys(("position", "angle", "deflection"), f"x.{position}"),
         "load": "load",
+        "rate": f'self.plain_rates(time, x, u, p)["{state}"]',
+        "memory": f"x.{_memory(state)}",
         "zero": "273.15" if celsius else "0.0",
     }
 

@@ -40,4 +40,4 @@ class DriverOffset(GainEffect):
         return tuple({"lag": lag} if lag else {} for lag in self.lags)
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
-        return lagged(context.drivers[:, 0], context.time, shape.get("lag", 0.0))
+        return lagged(context.drivers[:, 0], context.time, shape.get("lag", 0.0), context.runs)

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from mkc_torch.effects.runs import first_of_runs, passed_on, run_numbers
+
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
 __all__ = [
     "AnchoredEffect",
@@ -22,6 +24,7 @@ __all__ = [
     "Effect",
     "GainEffect",
     "LastingEffect",
+    "OptionalDriverEffect",
     "PartEffect",
     "Quantity",
     "RelativeEffect",
@@ -47,6 +50,7 @@ class Context:
         carries: names of the signal's components, where they are more than what is added to.
         parts: what components of the signal are to each other, such as ``{"own": "speed", "position": "angle"}``.
         part_units: of the parts.
+        run: number of each sample's run, where the simulation knows of runs.
     """
 
     time: Float[Tensor, " N"]
@@ -58,6 +62,20 @@ class Context:
     carries: tuple[str, ...] = ()
     parts: Mapping[str, str] = field(default_factory=dict)
     part_units: Mapping[str, str] = field(default_factory=dict)
+    run: Int[Tensor, " N"] | None = None
+
+    @property
+    def runs(self) -> Int[Tensor, " N"]:
+        """Number of each sample's run; where the simulation knows of none, one begins where time goes back."""
+        # the points of a curve, which are fewer, are of no run
+        known = self.run is not None and len(self.run) == len(self.time)
+        return self.run if known and self.run is not None else run_numbers(self.time)
+
+    @property
+    def memory(self) -> Float[Tensor, " N"] | None:
+        """The internal state of a port with memory, where a trajectory is being solved for; None elsewhere."""
+        known = len(self.carries or self.channels)
+        return self.signal[:, known] if self.signal.shape[1] > known else None
 
     def part(self, name: str) -> Float[Tensor, " N"]:
         """The component of the signal that is this part."""
@@ -165,6 +183,18 @@ class ChoosyEffect(Effect, Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]: ...
+
+
+@runtime_checkable
+class OptionalDriverEffect(Effect, Protocol):
+    """An effect with roles that is tried without a driver too.
+
+    Attributes:
+        driver_optional: whether it is.
+    """
+
+    @property
+    def driver_optional(self) -> bool: ...
 
 
 @runtime_checkable
@@ -300,11 +330,19 @@ def after(time: Float[Tensor, " N"], onset: float) -> Float[Tensor, " N"]:
     return (time >= onset).to(time.dtype)
 
 
-def lagged(values: Float[Tensor, " N"], time: Float[Tensor, " N"], lag: float) -> Float[Tensor, " N"]:
-    """Values behind a first-order lag with this time constant in s, at rest before the first sample.
+def lagged(
+    values: Float[Tensor, " N"], time: Float[Tensor, " N"], lag: float, run: Int[Tensor, " N"] | None = None
+) -> Float[Tensor, " N"]:
+    """Values behind a first-order lag with this time constant in s, at rest before the first sample of each run.
 
     Each value counts for the whole interval that ends at its sample: ``y[k] = a y[k-1] + (1 - a) x[k]`` with
     ``a = exp(-Δt / lag)``, exact for intervals of any length.
+
+    Args:
+        values: at the samples.
+        time: of the samples in s.
+        lag: in s; nothing changes where it is not positive.
+        run: of each sample's run; None where a run begins when time goes back, and only there.
 
     Example:
         >>> time = torch.arange(0.0, 5.0, 0.01, dtype=torch.float64)
@@ -313,17 +351,6 @@ def lagged(values: Float[Tensor, " N"], time: Float[Tensor, " N"], lag: float) -
     """
     if lag <= 0:
         return values
-    step = time.diff()
-    # where time goes back, another run begins, at rest
-    first, decay = values[0], torch.where(step < 0, 0.0, torch.exp(-step.clamp(min=0.0) / lag))
-    decay = torch.cat([decay.new_zeros(1), decay])
-    level = (1.0 - decay) * (values - first)
-    # y[k] = decay[k] y[k-1] + level[k], a prefix composition of affine maps by doubling
-    shift = 1
-    while shift < len(values):
-        head_decay, head_level = decay[:shift], level[:shift]
-        tail_level = decay[shift:] * level[:-shift] + level[shift:]
-        tail_decay = decay[shift:] * decay[:-shift]
-        decay, level = torch.cat([head_decay, tail_decay]), torch.cat([head_level, tail_level])
-        shift *= 2
-    return first + level
+    step = torch.cat([time.new_zeros(1), time.diff()]).clamp(min=0.0)
+    decay = torch.where(first_of_runs(run_numbers(time) if run is None else run), 0.0, torch.exp(-step / lag))
+    return values[0] + passed_on(decay, (1.0 - decay) * (values - values[0]))

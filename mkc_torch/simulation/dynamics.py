@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from mkc_torch.nonlinear import GaussianPrior, fit
+from mkc_torch.nonlinear import GaussianPrior, fit, load_forward_mode
 from mkc_torch.order_statistic import robust_scale
 from mkc_torch.recording import Recording
 from mkc_torch.simulation.between_samples import smooth_between
 from mkc_torch.simulation.first_guess import first_guess
-from mkc_torch.simulation.protocol import Changes, Clock, Port
+from mkc_torch.simulation.protocol import Changes, Clock, FreeChange, Port
+from mkc_torch.simulation.runs import experiment_runs
 from mkc_torch.simulation.trajectory import Grid, Trajectory, defect, marched, solve, stations
+from mkc_torch.simulation.undetermined import undetermined
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -30,7 +32,9 @@ _FINEST = 8
 _ROUGH = 0.02
 _REVERSED = 0.05
 _WINDOW = 4
-_RATES = ("rate", "loaded rate", "exchange")
+_NOUGHT = 1e-3
+_RATES = ("rate", "loaded rate", "hysteretic rate", "exchange")
+_HEIGHTS = ("height", "altitude", "elevation", "heave", "z")
 
 
 class SimulationError(ValueError):
@@ -121,6 +125,28 @@ class Dynamics:
         """What is measured, by the columns' names; by default the states themselves."""
         return vars(x)
 
+    def actuated(self, time: Tensor, u: Any, p: Any, run: Tensor) -> Mapping[str, Tensor]:  # noqa: ARG002
+        """What becomes of the inputs before they act, by their names; by default nothing.
+
+        Args:
+            time: (S,) in s, all of the recording.
+            u: the inputs, each (S,), as attributes.
+            p: the parameters as attributes.
+            run: (S,), number of the run that each moment is of; what an actuator remembers ends with it.
+        """
+        return vars(u)
+
+    def sensed(self, time: Tensor, y: Mapping[str, Tensor], p: Any, run: Tensor) -> Mapping[str, Tensor]:  # noqa: ARG002
+        """What sensors make of the outputs, by the columns' names; by default nothing.
+
+        Args:
+            time: (N,) in s, all of the recording.
+            y: the outputs, each (N,).
+            p: the parameters as attributes.
+            run: (N,), number of the run that each sample is of.
+        """
+        return y
+
     @property
     def name(self) -> str:
         return type(self).__name__
@@ -159,13 +185,13 @@ class PreparedDynamics:
         self.measured = recording.stack(*outputs)
         self.unit = _common(system.units.get(name, recording.units[name]) for name in outputs)
         self.independent = (True,) * len(outputs)
-        self.state: Mapping[str, object] = {"class": system.name}
-        self.warnings: tuple[str, ...] = ()
+        self.state: Mapping[str, object] = {"class": system.name, "outputs": list(outputs)}
         self.known = {
             name: one if isinstance(one, Parameter) else Parameter(float(one))
             for name, one in system.parameters.items()
         }
         self.begins, self.labels = _beginnings(recording, system)
+        self.run = experiment_runs(recording)
         _refuse_few(self.begins, system.name)
         self._kinematic = _kinematic(system, self.known)
         self._lay_out(1)
@@ -204,7 +230,7 @@ class PreparedDynamics:
         self.inputs = self._between(inputs)
         self.inputs_at_rows = inputs
         self._guess = first_guess(self, time, node_before, node_share)
-        self._last: Trajectory | None = None
+        self._last: dict[int, Trajectory] = {}
         self.__dict__.pop("ports", None)  # their clock is that of the stations
 
     def _between(self, inputs: Float[Tensor, "N u"]) -> Float[Tensor, "S u"]:
@@ -224,16 +250,22 @@ class PreparedDynamics:
             if state in self._kinematic:
                 continue
             parts = self._parts(state)
-            places[f"rate of {state}"] = self._rate_port(state, "rate", parts)
+            rate = {"rate": f"rate of {state}"} if "position" in parts else {}
+            places[f"rate of {state}"] = self._rate_port(state, "rate", {**parts, **rate})
             if "position" in parts and system.inputs:
                 places[f"loaded rate of {state}"] = self._rate_port(state, "loaded rate", {**parts, "load": "load"})
+            # segments of one run would each begin without what the one before remembers
+            if "position" in parts and system.segment is None:
+                port = self._rate_port(state, "hysteretic rate", parts)
+                places[f"hysteretic rate of {state}"] = replace(port, memory=f"memory_of_{state}")
         pairs = [
             (one, other)
             for one, other in combinations((s for s in system.states if s not in self._kinematic), 2)
             if self._unit_of(one) == self._unit_of(other)
         ]
         for one, other in pairs:
-            port = self._rate_port(one, "exchange", {"own": one, "other": other})
+            sideways = {"sideways": other} if self._is_way(one) and self._is_way(other) else {}
+            port = self._rate_port(one, "exchange", {"own": one, "other": other, **sideways})
             places[f"exchange of {one} and {other}"] = replace(port, channels=(one, other))
         for name in system.inputs:
             places[f"input {name}"] = Port(
@@ -245,8 +277,10 @@ class PreparedDynamics:
                 part_units={"own": self._unit_of(name)},
                 sizes={"own": _sizes(self.recording[name])},
                 clock=self.clock,
+                run=self.run[self.clock.before],
             )
-        return places | {"output": Port(self.channels, self.unit, pointwise=False, parts={"own": self.channels[0]})}
+        own = {"own": self.channels[0]}
+        return places | {"output": Port(self.channels, self.unit, pointwise=False, parts=own, run=self.run)}
 
     def _parts(self, state: str) -> dict[str, str]:
         """What an effect on the rate of a state can refer to."""
@@ -256,6 +290,8 @@ class PreparedDynamics:
             parts["angle"] = positions[0]
         if positions and self._reverses(positions[0]):
             parts["deflection"] = positions[0]
+        if positions and positions[0].lower().split("_")[0] in _HEIGHTS:
+            parts["height"] = positions[0]
         if self._reverses(state):
             parts["reversing"] = state
         if self._unit_of(state) in ("°C", "K"):
@@ -263,6 +299,11 @@ class PreparedDynamics:
         elif not positions:
             parts["level"] = state
         return parts
+
+    def _is_way(self, state: str) -> bool:
+        """Whether a state is the speed along a straight line, as far as names and units tell."""
+        positions = [i for i, j in self._kinematic.items() if j == state]
+        return self._unit_of(state) == "m/s" or (bool(positions) and self._unit_of(positions[0]) not in ("rad", "°"))
 
     def _reverses(self, state: str) -> bool:
         """Whether a state has either sign for a good part of the recording, as far as it is known beforehand."""
@@ -276,7 +317,7 @@ class PreparedDynamics:
             f"{unit}/s" if unit else "1/s",
             pointwise=False,
             kind=kind,
-            carries=(*self.system.states, *self.system.inputs, *(("load",) if "load" in parts else ())),
+            carries=(*self.system.states, *self.system.inputs, *(parts[of] for of in ("load", "rate") if of in parts)),
             parts=parts,
             part_units={part: self._unit_of(name) for part, name in parts.items()},
             sizes={
@@ -285,6 +326,7 @@ class PreparedDynamics:
                 if name in self.system.states
             },
             clock=self.clock,
+            run=self.run[self.clock.before],
         )
 
     def _unit_of(self, name: str) -> str:
@@ -317,6 +359,21 @@ class PreparedDynamics:
         spread = [robust_scale(self.residual(one, {}).nan_to_num(torch.inf, torch.inf, torch.inf)) for one in starts]
         return starts[0] if bool((spread[0] <= spread[-1]).all()) else starts[-1]
 
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """What of the parameters the recording leaves undetermined, near where the fit starts."""
+        if not self._p:
+            return ()
+        load_forward_mode()
+        theta = self.start()
+        tangents = torch.func.jacfwd(lambda values: self.residual(values, {}))(theta).flatten(0, 1)
+        # a value near 0 says nothing of the size that is meant
+        meant = theta.new_tensor([one.value for one in self.known.values()])
+        typical = self._guess.abs().median(0).values.repeat(int(self.begins.sum()))
+        meant = torch.cat([meant.abs(), typical])
+        size = torch.where(theta.abs() < _NOUGHT * meant, meant, theta.abs())
+        return undetermined(tangents, size, self.parameter_names, self._p)
+
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
         return self.measured - self.simulated(theta, changes)
 
@@ -330,11 +387,13 @@ class PreparedDynamics:
 
     def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Tensor]:
         found = self.trajectory(theta, changes)
-        inputs = self._inputs(changes)
+        inputs = self._inputs(theta, changes)
         at_stations = stations(self._rate(theta, changes), found.states, self.grid.step.unsqueeze(-1))
+        at_stations = at_stations[:, : len(self.system.states)]
         outputs = self._outputs(theta, found)
+        rates = self._rates(theta, at_stations, inputs)
         at = {
-            name: self._signal(port, theta, at_stations, inputs)
+            name: self._signal(port, theta, at_stations, inputs, rates)
             for name, port in self.ports.items()
             if port.kind in _RATES
         }
@@ -345,19 +404,19 @@ class PreparedDynamics:
         """The states at all moments, with what effects change."""
         begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
         rate = self._rate(theta, changes)
-        last = self._last
-        if last is None:
-            found = solve(rate, self.grid, begin, self._guess)
-        else:
-            found = solve(rate, self.grid, begin, self._guess, last)
+        more = len(self._remembering(changes))
+        begin = torch.cat([begin, begin.new_zeros(len(begin), more)], -1)
+        guess = torch.cat([self._guess, self._guess.new_zeros(len(self._guess), more)], -1)
+        last = self._last.get(begin.shape[1])
+        found = solve(rate, self.grid, begin, guess, last)
         if not found.converged and last is not None:
-            found = solve(rate, self.grid, begin, self._guess)
+            found = solve(rate, self.grid, begin, guess)
         if not found.converged and last is None:
-            nearer = marched(rate, self.grid, begin, self._guess)
+            nearer = marched(rate, self.grid, begin, guess)
             found = found if nearer is None else solve(rate, self.grid, begin, nearer)
         # a tensor of a transform must not outlive it
         if found.converged and not torch._C._functorch.is_functorch_wrapped_tensor(found.states):
-            self._last = replace(found, states=found.states.detach())
+            self._last[begin.shape[1]] = replace(found, states=found.states.detach())
         return found
 
     def since_begin(self) -> Float[Tensor, " N"]:
@@ -365,31 +424,56 @@ class PreparedDynamics:
         first = torch.where(self.begins, torch.arange(len(self.time)), 0).cummax(0).values
         return self.time - self.time[first]
 
+    def _remembering(self, changes: Changes) -> dict[str, str]:
+        """Ports at which an effect brings an internal state, with its name: one that adds its rate when it sees it."""
+        found = {}
+        for name, port in self.ports.items():
+            # what does not see the signal remembers nothing
+            if port.memory and name in changes and not isinstance(changes[name], FreeChange):
+                seen = self._guess.new_zeros(len(self.clock.time), len(port.carries) + 1)
+                if changes[name](seen).shape[1] > len(port.channels):
+                    found[name] = port.memory
+        return found
+
     def _rate(self, theta: Tensor, changes: Changes) -> Callable[[Tensor], Tensor]:
-        inputs = self._inputs(changes)
-        p = self._parameters(theta)
-        u = _namespace(self.system.inputs, inputs)
+        """Of the states, and of the internal states that effects bring, which come after them."""
+        inputs = self._inputs(theta, changes)
+        remembering = self._remembering(changes)
+        rows = [*self.system.states, *remembering.values()]
         acting = [
-            (port, [self.system.states.index(state) for state in port.channels], changes[name])
+            (port, [rows.index(row) for row in (*port.channels, *([port.memory] if name in remembering else []))], name)
             for name, port in self.ports.items()
             if port.kind in _RATES and name in changes
         ]
 
         def rate(states: Tensor) -> Tensor:
-            rates = self._derivative(self.clock.time, states, u, p)
-            for port, rows, change in acting:
-                signal = self._signal(port, theta, states, inputs)
-                for k, added in zip(rows, change(signal).unbind(-1), strict=True):
+            own, memories = states.split([len(self.system.states), len(remembering)], -1)
+            plain = self._rates(theta, own, inputs)
+            rates = [*plain, *(torch.zeros_like(one) for one in memories.unbind(-1))]
+            for port, places, name in acting:
+                signal = self._signal(port, theta, own, inputs, plain)
+                if name in remembering:
+                    signal = torch.cat([signal, states[:, places[-1:]]], -1)
+                for k, added in zip(places, changes[name](signal).unbind(-1), strict=True):
                     rates[k] = rates[k] + added
             return torch.stack(rates, -1)
 
         return rate
 
-    def _signal(self, port: Port, theta: Tensor, states: Tensor, inputs: Tensor) -> Float[Tensor, "S k"]:
-        """What passes through a port of rates: states and inputs, and the load where the port has one."""
+    def _rates(self, theta: Tensor, states: Tensor, inputs: Tensor) -> list[Tensor]:
+        """Of the states, by the simulation's own equations."""
+        u = _namespace(self.system.inputs, inputs)
+        return self._derivative(self.clock.time, states, u, self._parameters(theta))
+
+    def _signal(
+        self, port: Port, theta: Tensor, states: Tensor, inputs: Tensor, rates: Sequence[Tensor]
+    ) -> Float[Tensor, "S k"]:
+        """What passes through a port of rates: states and inputs, and where the port has them the load or the rate."""
+        own = self.system.states.index(port.parts["own"])
+        if "rate" in port.parts:
+            return torch.cat([states, inputs, rates[own].unsqueeze(-1)], -1)
         if "load" not in port.parts:
             return torch.cat([states, inputs], -1)
-        own = self.system.states.index(port.parts["own"])
         p = self._parameters(theta)
         at_rest = torch.cat([states[:, :own], torch.zeros_like(states[:, [own]]), states[:, own + 1 :]], -1)
         driven, held = (
@@ -404,21 +488,24 @@ class PreparedDynamics:
         values = [found[s] for s in self.system.states] if isinstance(found, Mapping) else list(found)
         return [v + torch.zeros_like(states[:, 0]) for v in values]
 
-    def _inputs(self, changes: Changes) -> Tensor:
+    def _inputs(self, theta: Tensor, changes: Changes) -> Tensor:
         if not self.system.inputs:
             return self.inputs
-        columns = [
-            self.inputs[:, [k]] + changes[f"input {name}"](self.inputs[:, [k]])
+        columns = {
+            name: self.inputs[:, k] + changes[f"input {name}"](self.inputs[:, [k]])[:, 0]
             if f"input {name}" in changes
-            else self.inputs[:, [k]]
+            else self.inputs[:, k]
             for k, name in enumerate(self.system.inputs)
-        ]
-        return torch.cat(columns, -1)
+        }
+        run = self.run[self.clock.before]
+        acting = self.system.actuated(self.clock.time, SimpleNamespace(**columns), self._parameters(theta), run)
+        return torch.stack([acting[name] for name in self.system.inputs], -1)
 
     def _outputs(self, theta: Tensor, found: Trajectory) -> Float[Tensor, "N m"]:
-        x = _namespace(self.system.states, found.states[self.rows])
+        p = self._parameters(theta)
+        x = _namespace(self.system.states, found.states[self.rows, : len(self.system.states)])
         u = _namespace(self.system.inputs, self.inputs_at_rows)
-        values = self.system.output(self.time, x, u, self._parameters(theta))
+        values = self.system.sensed(self.time, self.system.output(self.time, x, u, p), p, self.run)
         return torch.stack([values[name] for name in self.channels], -1)
 
     def _parameters(self, theta: Tensor) -> SimpleNamespace:
@@ -450,6 +537,15 @@ class PreparedDynamics:
         values = [found[s] for s in system.states] if isinstance(found, Mapping) else list(found)
         for state, value in zip(system.states, values, strict=True):
             _check_value(f"{self.name}.derivative: the rate of `{state}`", value, self.clock.time, x, p)
+        run = self.run[self.clock.before]
+        acting = system.actuated(self.clock.time, u, p, run)
+        for name in system.inputs:
+            if name not in acting:
+                raise SimulationError(
+                    f"{self.name}.actuated does not return `{name}`, which is one of its inputs; it returns "
+                    f"{', '.join(map(str, acting)) or 'nothing'}."
+                )
+            _check_value(f"{self.name}.actuated: `{name}`", acting[name], self.clock.time, x, p)
         at = _namespace(system.states, states[::3][:1].expand(len(self.time), -1))
         at_rows = _namespace(system.inputs, self.inputs_at_rows)
         outputs = system.output(self.time, at, at_rows, p)
@@ -497,7 +593,7 @@ class DynamicsCorrection:
         self.ports = self.prepared.ports
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
-        """The outputs as simulated."""
+        """The outputs as simulated, with the runs' numbers where there are several."""
         prepared = self.prepared
         p = len(prepared.known)
         seen = prepared.since_begin() <= (torch.inf if self.first is None else self.first)
@@ -509,7 +605,9 @@ class DynamicsCorrection:
             residual, prepared.start()[p:], weight=seen.to(theta.dtype), covariance=None, graduate=True, max_iter=60
         ).theta
         outputs = prepared.simulated(torch.cat([theta[:p], begin]), changes)
-        return {"time": self.time} | dict(zip(prepared.channels, outputs.unbind(-1), strict=True))
+        table = prepared.recording
+        runs = {"experiment": table["experiment"]} if "experiment" in table else {}
+        return {"time": self.time} | runs | dict(zip(prepared.channels, outputs.unbind(-1), strict=True))
 
 
 def _namespace(names: Sequence[str], values: Float[Tensor, "S n"]) -> SimpleNamespace:

@@ -112,6 +112,7 @@ class _View:
 
     name = "magnetometer"
     view: str
+    ports: dict[str, Port]
     bounds: tuple[Tensor, Tensor] | None = None
 
     def __init__(self, recording: Recording) -> None:

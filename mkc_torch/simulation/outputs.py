@@ -11,7 +11,7 @@ from torch import Tensor
 from mkc_torch.simulation.protocol import Changes, Port
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
 __all__ = ["ALL", "changed_outputs", "output_ports", "output_signals"]
 
@@ -25,6 +25,7 @@ def output_ports(
     unit: str,
     measured: Float[Tensor, "N m"],
     fixed: Collection[str] = (),
+    run: Int[Tensor, " N"] | None = None,
 ) -> dict[str, Port]:
     """The ports of columns.
 
@@ -34,13 +35,14 @@ def output_ports(
         unit: of all of them; empty where they differ.
         measured: for the sizes of what passes.
         fixed: those whose zero no parameter of the simulation moves; they have the part "fixed zero".
+        run: of each sample's run; None where the simulation knows of no runs.
 
     Example:
         >>> ports = output_ports(("angle",), {"angle": "rad"}, "rad", torch.ones(5, 1))
         >>> [(name, port.kind, port.unit) for name, port in ports.items()]
         [('all outputs', 'outputs', 'rad'), ('output angle', 'output', 'rad')]
     """
-    ports = {ALL: Port(tuple(channels), unit, wanders=True, kind="outputs")}
+    ports = {ALL: Port(tuple(channels), unit, wanders=True, kind="outputs", run=run)}
     for k, name in enumerate(channels):
         values = measured[:, k].abs()
         parts = {"own": name, "compared": name} | ({"fixed zero": name} if name in fixed else {})
@@ -51,6 +53,7 @@ def output_ports(
             parts=parts,
             part_units=dict.fromkeys(parts, units[name]),
             sizes={"own": (float(values.median()), float(values.amax()))},
+            run=run,
         )
     return ports
 

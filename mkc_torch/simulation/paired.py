@@ -14,6 +14,7 @@ from mkc_torch.recording import Recording
 from mkc_torch.simulation.dynamics import SimulationError
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
 from mkc_torch.simulation.protocol import Changes
+from mkc_torch.simulation.runs import successive_runs
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -150,7 +151,8 @@ class PreparedPaired:
         self.prior: GaussianPrior | None = GaussianPrior(torch.zeros_like(sizes), sizes.square().reciprocal())
         self._most = _FREE * sizes
         self.bounds = torch.full_like(sizes, -torch.inf), torch.full_like(sizes, torch.inf)
-        self.ports = output_ports(self.channels, self._units, self.unit, self.measured, self.channels)
+        run = successive_runs(curve.run, self.time)
+        self.ports = output_ports(self.channels, self._units, self.unit, self.measured, self.channels, run)
         self.warnings: tuple[str, ...] = tuple(
             f"Column `{name}` is the same in both tables: it counts as an input of the simulator and is not compared."
             for name in same
@@ -194,7 +196,8 @@ class PairedCorrection:
                 "all of the recording, or cut it."
             )
         units = {name: system.simulated.units[name] for name in self.channels}
-        self.ports = output_ports(self.channels, units, "", self._curve.at(self.time), self.channels)
+        run = successive_runs(self._curve.run, self.time)
+        self.ports = output_ports(self.channels, units, "", self._curve.at(self.time), self.channels, run)
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:  # noqa: ARG002
         """The simulated columns with the effects."""

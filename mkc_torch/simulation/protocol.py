@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 __all__ = ["Change", "Changes", "Clock", "Correction", "FreeChange", "Port", "PreparedSimulation", "Simulation"]
 
 Change = Callable[[Tensor], Tensor]
-"""What effects add at a port, (N, c), as a function of the signal that passes through it."""
+"""What effects add at a port, (N, c), as a function of the signal that passes through it.
+
+At a port with memory a signal can have one component more, the internal state; what is added then has one channel more,
+the internal state's rate.
+"""
 
 Changes = Mapping[str, Change]
 
@@ -68,6 +72,8 @@ class Port:
         parts: what components of the signal are to each other, such as ``{"own": "speed", "position": "angle"}``.
         part_units, sizes: of the parts; a size is a typical and the largest absolute value.
         clock: when; None for the recording's samples.
+        run: number of each moment's run; None where the simulation knows of no runs.
+        memory: name of the internal state that an effect here may bring; empty where none may.
     """
 
     channels: tuple[str, ...]
@@ -80,6 +86,8 @@ class Port:
     part_units: Mapping[str, str] = field(default_factory=dict)
     sizes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     clock: Clock | None = None
+    run: Int[Tensor, " G"] | None = None
+    memory: str = ""
 
     def at(self, values: Float[Tensor, N * rest]) -> Float[Tensor, G * rest]:
         """Values of the samples, at the moments of this port's signal."""

@@ -17,7 +17,12 @@ _TINY = 1e-6
 _NAMED = 0.1
 
 
-def undetermined(tangents: Float[Tensor, "R p"], theta: Float[Tensor, " p"], names: Sequence[str]) -> tuple[str, ...]:
+def undetermined(
+    tangents: Float[Tensor, "R p"],
+    theta: Float[Tensor, " p"],
+    names: Sequence[str],
+    of_interest: int | None = None,
+) -> tuple[str, ...]:
     """A sentence for each direction of the parameters along which the residual does not move.
 
     Each parameter is measured by its own size, and by one where it is zero, so that a direction is a relative one. What
@@ -27,6 +32,8 @@ def undetermined(tangents: Float[Tensor, "R p"], theta: Float[Tensor, " p"], nam
         tangents: of the R residuals with the p parameters.
         theta: the parameters.
         names: of the parameters.
+        of_interest: how many of the first parameters are asked for: a direction of the others alone is not told. None
+            for all.
 
     Example:
         A mass and a spring of which only the quotient shows:
@@ -44,7 +51,7 @@ def undetermined(tangents: Float[Tensor, "R p"], theta: Float[Tensor, " p"], nam
     return tuple(
         _sentence(direction, names)
         for one, direction in zip(length, directions, strict=True)
-        if float(one) <= _TINY * float(length.max())
+        if float(one) <= _TINY * float(length.max()) and bool((direction[:of_interest].abs() > _NAMED).any())
     )
 
 

@@ -8,6 +8,11 @@ import torch
 from scipy.integrate import solve_ivp
 
 from mkc_torch import Recording, diagnose
+from mkc_torch.diagnosis.candidates import candidate_terms
+from mkc_torch.diagnosis.linearise import linearise, tangents_of
+from mkc_torch.diagnosis.model import JointModel
+from mkc_torch.diagnosis.refit import fitted
+from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics, Parameter
 from tests.shared_data import shared_data
 
@@ -131,6 +136,178 @@ def test_a_pipe_between_two_tanks_is_named_and_sized():
 
 def test_two_tanks_apart_are_adequate():
     assert diagnose(Tanks(), filled(0.0), **QUICK).verdict == "adequate"
+
+
+# effects that remember, and fluids; each beside its nearest rivals
+
+
+def among(*names):
+    return tuple(effect for effect in DYNAMICS if effect.id in names)
+
+
+def measured(rate, first, time, noise, **columns):
+    """A recording of the first states of an equation that has something hidden in it, by their names and tolerances."""
+    exact = solve_ivp(rate, (0.0, time[-1]), first, t_eval=time, rtol=1e-8, atol=1e-9, max_step=0.02)
+    known = {name: spoilt(exact.y[k], noise, k) for k, name in enumerate(columns.pop("seen"))}
+    return Recording({name: torch.as_tensor(values) for name, values in {"time": time, **known, **columns}.items()})
+
+
+class Servo(Dynamics):
+    """Follows the angle that it is told."""
+
+    states = ("angle", "speed")
+    inputs = ("command",)
+    parameters = {"stiffness": 22.0, "damping": Parameter(3.5, lower=0.0)}  # noqa: RUF012
+    units = {"angle": "rad", "speed": "rad/s", "command": "rad"}  # noqa: RUF012
+    step = 0.04
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"angle": x.speed, "speed": p.stiffness * (u.command - x.angle) - p.damping * x.speed}
+
+
+def commanded(behind):
+    """140 samples of a servo that sees of its command only what is behind its gear, both linear between samples."""
+    time = np.arange(140) * 0.04
+    command = np.sin(1.7 * time) + 0.5 * np.sin(4.1 * time + 1.0)
+    seen = behind(command)
+
+    def rate(t, y):
+        return [y[1], 25.0 * (np.interp(t, time, seen) - y[0]) - 4.0 * y[1]]
+
+    return measured(rate, [0.0, 0.0], time, NOISE, seen=("angle",), command=command)
+
+
+def with_play(command):
+    """The load stands still until the drive has crossed the gap."""
+    load = command.copy()
+    for k in range(1, len(load)):
+        load[k] = load[k - 1] + np.sign(command[k] - load[k - 1]) * max(abs(command[k] - load[k - 1]) - 0.14, 0.0)
+    return load
+
+
+def without_small_ones(command):
+    return command - np.clip(command, -0.14, 0.14)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "name", "size"), [(with_play, "backlash", "half_gap"), (without_small_ones, "dead_zone", "width")]
+)
+def test_play_and_a_dead_zone_are_told_apart(hidden, name, size):
+    diagnosis = diagnose(Servo(), commanded(hidden), effects=among("backlash", "dead_zone"), **QUICK)
+    finding = explained(diagnosis, name)
+    assert value(finding, "share")[0] * value(finding, size)[0] == pytest.approx(0.14, abs=0.06)
+    assert all(alternative.separable for alternative in finding.alternatives)
+
+
+def test_a_hysteretic_spring_is_named_and_sized():
+    """Of a body between joints whose unloading is not that of the catalogue: three quarters of β, one of β′."""
+
+    def rate(_, y):
+        angle, v, z = y
+        return [v, -9.0 * math.sin(angle) - 0.05 * v - 2.0 * z, v - 3.0 * abs(v) * z - v * abs(z)]
+
+    recording = measured(rate, [1.2, 0.0, 0.0], np.arange(300) * 0.02, NOISE, seen=("angle",))
+    rivals = among("bouc_wen_hysteresis", "coulomb_friction")
+    finding = explained(diagnose(Pendulum(), recording, effects=rivals, **QUICK), "bouc_wen_hysteresis")
+    assert value(finding, "stiffness")[0] == pytest.approx(2.0, abs=0.5)
+    assert value(finding, "yield_deflection")[0] == pytest.approx(0.25, abs=0.1)
+    assert finding.channels == ("rate of speed",)
+
+
+class Buoy(Dynamics):
+    """On a spring, pushed by a force that is known; its weight is that of a body without water."""
+
+    states = ("heave", "speed")
+    inputs = ("push",)
+    parameters = {"drag": Parameter(0.2, lower=0.0)}  # noqa: RUF012
+    units = {"heave": "m", "speed": "m/s", "push": "m/s²"}  # noqa: RUF012
+    step = 0.05
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"heave": x.speed, "speed": u.push - 4.0 * x.heave - p.drag * x.speed}
+
+
+def test_water_that_moves_along_is_named_and_sized():
+    time = np.arange(140) * 0.05
+    push = np.sin(1.3 * time) + np.sin(2.9 * time)
+
+    def rate(t, y):
+        return [y[1], (np.interp(t, time, push) - 4.0 * y[0] - 0.3 * y[1]) / 1.1]
+
+    recording = measured(rate, [0.5, 0.0], time, NOISE, seen=("heave",), push=push)
+    rivals = among("added_mass", "cubic_stiffness")
+    finding = explained(diagnose(Buoy(), recording, effects=rivals, **QUICK), "added_mass")
+    share, error = value(finding, "share")
+    assert share == pytest.approx(0.1 / 1.1, abs=0.01)
+    assert 0.0 < error < 0.01
+
+
+class Ball(Dynamics):
+    states = ("x", "y", "vx", "vy")
+    parameters = {"drag": Parameter(0.01, lower=0.0)}  # noqa: RUF012
+    units = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}  # noqa: RUF012
+    step = 0.02
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        speed = torch.sqrt(x.vx.square() + x.vy.square() + 1e-6)
+        return {"x": x.vx, "y": x.vy, "vx": -p.drag * speed * x.vx, "vy": -9.81 - p.drag * speed * x.vy}
+
+
+def test_a_ball_that_spins_is_named_and_sized():
+    """With a spin that dies away."""
+
+    def rate(t, s):
+        _, _, vx, vy = s
+        speed, lift = math.hypot(vx, vy), 0.18 * math.exp(-t / 10.0)
+        return [vx, vy, -0.02 * speed * vx - lift * vy, -9.81 - 0.02 * speed * vy + lift * vx]
+
+    recording = measured(rate, [0.0, 1.0, 25.0, 8.0], np.arange(120) * 0.02, NOISE, seen=("x", "y"))
+    rivals = among("magnus_lift", "coupling")
+    finding = explained(diagnose(Ball(), recording, effects=rivals, **QUICK), "magnus_lift")
+    assert value(finding, "turning")[0] == pytest.approx(0.165, abs=0.02)
+    assert finding.channels == ("rate of vx", "rate of vy")
+
+
+def test_water_that_carries_leads_the_search_of_all_effects():
+    """A sphere, whose displaced volume is not linear in its depth; its refits would take long."""
+    time = np.arange(140) * 0.05
+    push = 1.5 * np.sin(1.3 * time) + np.sin(2.9 * time)
+
+    def rate(t, y):
+        deep = min(max(0.3 - y[0], 0.0), 0.6)
+        lift = 0.4 * deep**2 * (0.9 - deep) / 0.108
+        return [y[1], np.interp(t, time, push) - 4.0 * y[0] - 0.3 * y[1] + lift]
+
+    recording = measured(rate, [0.8, 0.0], time, NOISE, seen=("heave",), push=push)
+    simulation = Buoy().prepare(recording)
+    base = fitted(JointModel(simulation), simulation.start())
+    terms = candidate_terms(simulation, (), DYNAMICS)
+    tangents = tangents_of(base.model, base.parameters, terms)
+    search = linearise(base.model, base.parameters, *base.pseudo, tangents, white=True, wander=False)
+    order = search.search.gains(search.series.unsqueeze(-1)).log_p[:, 0].argsort().tolist()
+    assert terms[order[0]].effect.id == "buoyancy"
+    lift, _ = search.search.estimate(order[0], search.series)
+    assert -float(lift) == pytest.approx(0.4, abs=0.15)
+
+
+class Sinking(Dynamics):
+    states = ("height", "speed")
+    units = {"height": "m", "speed": "m/s"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"height": x.speed, "speed": -9.81 - 0.8 * x.speed}
+
+
+def test_what_is_under_all_the_time_is_pushed_by_a_constant_force():
+    """Archimedes' push and any other constant one are not told apart, and nobody claims it."""
+
+    def rate(_, y):
+        return [y[1], -9.81 - 0.8 * y[1] + 2.0]
+
+    recording = measured(rate, [5.0, 0.0], np.arange(120) * 0.02, NOISE, seen=("height",))
+    rivals = among("buoyancy", "constant_force")
+    finding = explained(diagnose(Sinking(), recording, effects=rivals, **QUICK), "constant_force")
+    assert [(a.effect, a.separable) for a in finding.alternatives] == [("buoyancy", False)]
 
 
 # balls dropped from a bridge

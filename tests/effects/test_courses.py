@@ -7,11 +7,11 @@ import pytest
 import torch
 from numpy.polynomial import legendre
 
-from mkc_torch.effects import CATALOGUE, Context
+from mkc_torch.effects import SENSOR, Context
 from mkc_torch.effects.protocol import after
 from tests.effects.contexts import make_context
 
-EFFECTS = {effect.id: effect for effect in CATALOGUE}
+EFFECTS = {effect.id: effect for effect in SENSOR}
 STEP, DRIFT = EFFECTS["hard_iron_step"], EFFECTS["offset_drift"]
 TEMPERATURE, CURRENT = EFFECTS["temperature_offset"], EFFECTS["current_field"]
 CUBIC, UNKNOWN, COLUMN = EFFECTS["cubic_nonlinearity"], EFFECTS["unknown"], EFFECTS["driver_offset"]

@@ -8,6 +8,7 @@ import torch
 
 from mkc_torch import Recording
 from mkc_torch.diagnosis.candidates import candidate_terms
+from mkc_torch.diagnosis.drivers import find_drivers
 from mkc_torch.diagnosis.model import limits
 from mkc_torch.effects import CATALOGUE, DYNAMICS, Context, ContinuousEffect
 from mkc_torch.effects.protocol import BoundedEffect, ChoosyEffect, PartEffect, RelativeEffect
@@ -17,12 +18,13 @@ from tests.effects.contexts import size_of
 IDS = (
     "constant_force", "linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction",
     "load_dependent_friction", "cubic_stiffness", "position_periodic_force", "coupling", "hard_stop", "overflow",
-    "thermal_loss", "input_delay", "input_saturation", "dead_zone", "sensor_lag",
+    "thermal_loss", "input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "bouc_wen_hysteresis",
+    "added_mass", "magnus_lift", "buoyancy",
 )  # fmt: skip
 
 LOSSES = ("linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction", "load_dependent_friction")
-EITHER_SIGN = ("constant_force", "cubic_stiffness", "position_periodic_force")
-SHARES = ("input_delay", "input_saturation", "dead_zone", "sensor_lag")
+EITHER_SIGN = ("constant_force", "cubic_stiffness", "position_periodic_force", "magnus_lift")
+SHARES = ("input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "added_mass")
 
 N = 80
 
@@ -41,12 +43,13 @@ def make_context(effect):
     if effect.port in ("input", "output"):
         parts, units = {"own": "force"}, {"own": "N"}
         return Context(time, none, (), signal("force"), "N", ("force",), parts=parts, part_units=units)
-    names = ("angle", "speed", "other", "load")
+    names = ("angle", "speed", "other", "load", "rate")
     parts = {
         "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "reversing": "speed",
         "temperature": "speed", "level": "speed", "other": "other", "load": "load",
+        "rate": "rate", "height": "angle", "sideways": "other",
     }  # fmt: skip
-    of = {"angle": "rad", "speed": "rad/s", "other": "rad/s", "load": "rad/s/s"}
+    of = {"angle": "rad", "speed": "rad/s", "other": "rad/s", "load": "rad/s/s", "rate": "rad/s/s"}
     units = {part: of[name] for part, name in parts.items()}
     channels = ("speed", "other") if effect.port == "exchange" else ("speed",)
     values = signal(*names)
@@ -73,7 +76,8 @@ def change(effect, gamma, shape, context):
 
 def test_ids_are_the_contract():
     assert {effect.id for effect in DYNAMICS} >= set(IDS)
-    assert len({effect.id for effect in CATALOGUE}) == len(CATALOGUE)
+    named = [effect.id for effect in CATALOGUE if effect.id != "unknown"]
+    assert len(set(named)) == len(named)
     assert set(DYNAMICS) < set(CATALOGUE)
 
 
@@ -189,9 +193,9 @@ class TestPhysics:
         effect = OF["thermal_loss"]
         for unit, room in (("°C", 20.0), ("K", 293.15)):
             context = replace(make_context(effect), part_units={"own": unit})
-            hot = context.signal.new_tensor([0.0, room, 0.0, 0.0]).expand(N, -1)
+            hot = context.signal.new_tensor([0.0, room, 0.0, 0.0, 0.0]).expand(N, -1)
             assert float(change(effect, [1.0], {}, replace(context, signal=hot))[0]) == pytest.approx(0.0, abs=1e-9)
-            hot = hot + hot.new_tensor([0.0, 0.01, 0.0, 0.0])  # a linear loss near room temperature
+            hot = hot + hot.new_tensor([0.0, 0.01, 0.0, 0.0, 0.0])  # a linear loss near room temperature
             lost = float(change(effect, [1.0], {}, replace(context, signal=hot))[0])
             assert lost == pytest.approx(-0.01, rel=1e-3)
 
@@ -222,6 +226,22 @@ def test_a_delay_does_not_reach_into_another_run():
     torch.testing.assert_close(delayed[40:], 1.0 + (time[40:] - 0.3).clamp(min=0.0))
 
 
+@pytest.mark.parametrize("name", ["input_delay", "sensor_lag", "backlash"])
+def test_runs_are_told_apart_by_their_number_whatever_their_clocks_do(name):
+    """On one clock that goes on, and on clocks that begin anew, what is remembered of a run ends with it."""
+    effect = OF[name]
+    one, other = torch.linspace(0.0, 2.0, 40).double(), torch.linspace(2.1, 3.9, 40).double()
+    course = torch.cat([7.0 + torch.sin(5.0 * one), torch.cos(5.0 * other)]).unsqueeze(-1)
+    run = torch.arange(2).repeat_interleave(40)
+    shape = effect.shapes(one)[-1]
+    for later in (other, other - 2.1):
+        both = replace(make_context(effect), time=torch.cat([one, later]), signal=course, run=run)
+        together = change(effect, [1.0], shape, both)
+        for part, time in ((slice(0, 40), one), (slice(40, 80), later)):
+            alone = replace(both, time=time, signal=course[part], run=None)
+            torch.testing.assert_close(together[part], change(effect, [1.0], shape, alone))
+
+
 def test_a_sensor_lags_by_its_time_constant():
     effect = OF["sensor_lag"]
     time = torch.linspace(0.0, 5.0, N, dtype=torch.float64)
@@ -239,7 +259,7 @@ def test_users_are_told_what_it_is(effect):
         assert sentence[0].isupper()
     assert len(effect.source) > 10
     assert effect.plausible > 0
-    assert effect.roles == ()
+    assert effect.roles == () or effect.driver_optional
     assert effect.follows_signal
     words = type(effect).__doc__
     for heading in ("Simulation:", "Drivers:", "Units:", "Plausible:", "Source:"):
@@ -317,6 +337,14 @@ class Fall(Dynamics):
         return {"height": x.speed, "speed": -9.81 + 0.0 * x.speed}
 
 
+class Ball(Dynamics):
+    states = ("x", "y", "vx", "vy")
+    units = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"x": x.vx, "y": x.vy, "vx": 0.0 * x.vx, "vy": -9.81 + 0.0 * x.vy}
+
+
 class Bodies(Dynamics):
     states = ("inner", "outer")
     parameters = {"loss": 0.1}  # noqa: RUF012
@@ -350,19 +378,55 @@ class TestNeeds:
 
     def test_of_a_pendulum(self):
         places = tried(prepared(Pendulum, angle=torch.cos(3.0 * TIME)))
-        of_speed = EVERYWHERE | REVERSING | {"cubic_stiffness", "hard_stop", "position_periodic_force"}
-        assert set(places) == {"rate of speed", "output"}
+        of_speed = EVERYWHERE | REVERSING | {"cubic_stiffness", "hard_stop", "position_periodic_force", "added_mass"}
+        assert set(places) == {"rate of speed", "hysteretic rate of speed", "output"}
+        assert places["hysteretic rate of speed"] == {"bouc_wen_hysteresis"}
         assert places["rate of speed"] & set(IDS) == of_speed
         assert places["output"] == {"sensor_lag"}
 
     def test_of_a_drive(self):
         places = tried(prepared(Motor, angle=torch.cos(3.0 * TIME), torque=torch.sin(TIME)))
         assert "load_dependent_friction" in set().union(*places.values())
-        assert places["input torque"] == {"input_delay", "input_saturation", "dead_zone"}
+        assert places["input torque"] == {"input_delay", "input_saturation", "dead_zone", "backlash"}
 
     def test_of_a_fall_that_does_not_reverse(self):
         places = tried(prepared(Fall, height=100.0 - 0.5 * TIME**2))
-        assert places["rate of speed"] & set(IDS) == EVERYWHERE | {"hard_stop"}
+        assert places["rate of speed"] & set(IDS) == EVERYWHERE | {"hard_stop", "added_mass"}
+        assert "hysteretic rate of speed" not in places
+
+    def test_what_floats_has_a_height(self):
+        assert "buoyancy" in tried(prepared(Fall, height=torch.cos(TIME)))["rate of speed"]
+
+        class Sway(Fall):
+            states = ("sway", "speed")
+            units = {"sway": "m", "speed": "m/s"}  # noqa: RUF012
+
+            def derivative(self, time, x, u, p):  # noqa: ARG002
+                return {"sway": x.speed, "speed": -9.81 + 0.0 * x.speed}
+
+        places = tried(prepared(Sway, sway=torch.cos(TIME)))
+        assert "buoyancy" not in places["rate of speed"]
+
+    def test_of_a_ball_that_may_spin(self):
+        fall = {"x": 20.0 * TIME, "y": 9.0 * TIME - 4.9 * TIME**2}
+        assert tried(prepared(Ball, **fall))["exchange of vx and vy"] == {"coupling", "magnus_lift"}
+        simulation = prepared(Ball, **fall, spin_z=50.0 - TIME)
+        roles = frozenset(role for effect in DYNAMICS for role in effect.roles)
+        drivers = find_drivers(simulation.recording, simulation.system.columns, roles)
+        terms = [t for t in candidate_terms(simulation, drivers.drivers, DYNAMICS) if t.effect.id == "magnus_lift"]
+        assert [term.columns for term in terms] == [(), ("spin_z",)]
+
+    def test_what_turns_is_not_driven_sideways(self):
+        class Joints(Ball):
+            units = {"x": "rad", "y": "rad", "vx": "rad/s", "vy": "rad/s"}  # noqa: RUF012
+
+        assert tried(prepared(Joints, x=TIME, y=TIME))["exchange of vx and vy"] == {"coupling"}
+
+    def test_segments_of_a_run_remember_nothing_of_each_other(self):
+        class Pieces(Pendulum):
+            segment = 2.0
+
+        assert "hysteretic rate of speed" not in prepared(Pieces, angle=torch.cos(3.0 * TIME)).ports
 
     def test_of_two_bodies(self):
         decay = torch.exp(-0.1 * TIME)
@@ -371,7 +435,10 @@ class TestNeeds:
         assert places["rate of inner"] & set(IDS) == EVERYWHERE | {"thermal_loss"}
 
     def test_every_need_is_a_part_that_some_port_has(self):
-        known = {"own", "position", "angle", "deflection", "reversing", "load", "temperature", "level", "other"}
+        known = {
+            "own", "position", "angle", "deflection", "reversing", "load", "temperature", "level", "other", "rate",
+            "height", "sideways",
+        }  # fmt: skip
         for effect in DYNAMICS:
             assert set(effect.needs if isinstance(effect, ChoosyEffect) else ()) <= known
 
@@ -395,7 +462,7 @@ def test_shapes_are_in_the_units_of_the_recording():
 def test_a_found_effect_acts_on_a_recording_that_shows_less(effect):
     """What was needed to tell it from others, such as a reversal, need not happen again."""
     context = make_context(effect)
-    lasting = {"own", "position", "angle", "other", "load", "temperature"}
+    lasting = {"own", "position", "angle", "other", "load", "temperature", "rate"}
     fewer = {part: name for part, name in context.parts.items() if part in lasting}
     for shape in effect.shapes(context.time):
         gamma = torch.ones(size_of(effect, shape, context), dtype=torch.float64)

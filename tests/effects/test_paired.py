@@ -27,7 +27,8 @@ def context(effect):
 def test_ids_are_the_contract():
     assert tuple(effect.id for effect in PAIRED) == IDS
     assert set(PAIRED) | set(DYNAMICS) < set(CATALOGUE)
-    assert len({effect.id for effect in CATALOGUE}) == len(CATALOGUE)
+    named = [effect.id for effect in CATALOGUE if effect.id != "unknown"]
+    assert len(set(named)) == len(named)
 
 
 @pytest.mark.parametrize("effect", PAIRED, ids=lambda e: e.id)

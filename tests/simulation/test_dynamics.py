@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from mkc_torch import Recording
+from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.model import JointModel
 from mkc_torch.diagnosis.refit import fitted
 from mkc_torch.recording import MissingColumnError
@@ -337,10 +337,11 @@ class TestPorts:
 
     def test_of_a_pendulum(self):
         ports = self.pendulum()
-        assert list(ports) == ["rate of speed", "output"]  # that of the angle is the speed, by what the words mean
+        # that of the angle is the speed, by what the words mean
+        assert list(ports) == ["rate of speed", "hysteretic rate of speed", "output"]
         port = ports["rate of speed"]
         assert (port.kind, port.channels, port.unit, port.pointwise) == ("rate", ("speed",), "rad/s/s", False)
-        assert port.carries == ("angle", "speed")
+        assert port.carries == ("angle", "speed", "rate of speed")
         assert {part: port.parts[part] for part in ("own", "position", "angle", "deflection", "reversing")} == {
             "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "reversing": "speed",
         }  # fmt: skip
@@ -456,6 +457,90 @@ class TestCorrection:
         without = correction.corrected(theta, {})
         assert float((with_it["angle"] - recording["angle"]).abs().max()) < 1e-3
         assert float((without["angle"] - recording["angle"]).abs().max()) > 0.1
+
+
+# what a recording leaves open
+
+
+class Oscillator(Dynamics):
+    """A mass on a spring, of which only the quotient moves anything."""
+
+    states = ("place", "speed")
+    parameters = {"mass": Parameter(2.0, lower=0.0), "spring": Parameter(15.0, lower=0.0), "damping": 0.1}  # noqa: RUF012
+    units = {"place": "m", "speed": "m/s"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"place": x.speed, "speed": -p.spring / p.mass * x.place - p.damping * x.speed}
+
+
+class TestUndetermined:
+    """What the recording cannot tell of the parameters is said, with the direction along which nothing moves."""
+
+    recording = table(time=TIME[:200], place=np.cos(3.0 * TIME[:200]))
+
+    def test_a_mass_and_a_spring_that_are_only_a_quotient(self):
+        (told,) = Oscillator().prepare(self.recording).warnings
+        assert told.startswith("The recording does not determine `mass` and `spring`, but only what they are together")
+        assert "direction 0.71 mass + 0.71 spring, relative" in told
+
+    def test_it_is_a_warning_of_the_diagnosis(self):
+        diagnosis = diagnose(made(Oscillator, step=0.02), self.recording, effects=(), surrogates=19)
+        assert sum("does not determine `mass` and `spring`" in warning for warning in diagnosis.warnings) == 1
+
+    def test_a_parameter_that_nothing_depends_on(self):
+        idle = made(Oscillator, parameters={**Oscillator.parameters, "mass": 1.0, "colour": 5.0})
+        assert "The recording does not determine `colour`: whatever it is, the residual is the same." in (
+            idle.prepare(self.recording).warnings
+        )
+
+    def test_what_is_determined_is_not_told(self):
+        assert Pendulum().prepare(table(time=TIME, angle=TRUTH[0])).warnings == ()
+        at_rest = table(time=TIME, angle=swings(TIME, (0.5, 0.0), damping=0.0)[0])
+        assert made(Pendulum, parameters={"stiffness": 9.0, "damping": 0.0}).prepare(at_rest).warnings == ()
+
+    def test_a_first_state_alone_is_not_told(self):
+        """Of a state that nothing is seen of there is nothing to know."""
+
+        def derivative(self, time, x, u, p):  # noqa: ARG001
+            return {"place": x.speed, "speed": -p.rate * x.place, "heat": -0.1 * x.heat}
+
+        system = type(
+            "Warm",
+            (Dynamics,),
+            {"states": ("place", "speed", "heat"), "parameters": {"rate": 8.0}, "derivative": derivative},
+        )
+        assert system().prepare(self.recording).warnings == ()
+
+
+# what becomes of inputs and outputs on their way
+
+
+class TestOnTheWay:
+    """A user's own actuator and sensor."""
+
+    def test_they_see_the_runs(self):
+        seen = {}
+
+        def actuated(self, time, u, p, run):  # noqa: ARG001
+            seen["run"] = run
+            return {"torque": 2.0 * u.torque}
+
+        def sensed(self, time, y, p, run):  # noqa: ARG001
+            assert run.tolist() == [0] * 50 + [1] * 50
+            return {"angle": y["angle"] + 0.5}
+
+        time = np.arange(100) * 0.02
+        recording = table(time=time, angle=0.0 * time, torque=np.sin(time), experiment=np.repeat([3.0, 5.0], 50))
+        theta = torch.tensor([STIFFNESS, DAMPING, 0.1, 0.0, 0.2, 0.0], dtype=torch.float64)
+        plain = made(Driven, step=0.02).prepare(recording)
+        own = made(Driven, step=0.02, actuated=actuated, sensed=sensed).prepare(recording)
+        doubled = plain.simulated(theta, {"input torque": lambda s: s})
+        torch.testing.assert_close(own.simulated(theta, {}), doubled + 0.5)
+        assert set(seen["run"].tolist()) == {0, 1}
+
+    def test_an_actuator_that_forgets_an_input_is_refused(self):
+        with pytest.raises(SimulationError, match=r"actuated does not return `torque`, which is one of its inputs"):
+            made(Driven, actuated=lambda *_: {}).prepare(table(**GOOD, torque=0.0 * TIME))
 
 
 # what cannot be simulated

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from mkc_torch.effects.dynamics.added_mass import AddedMass
+from mkc_torch.effects.dynamics.backlash import Backlash
+from mkc_torch.effects.dynamics.bouc_wen_hysteresis import BoucWenHysteresis
+from mkc_torch.effects.dynamics.buoyancy import Buoyancy
 from mkc_torch.effects.dynamics.constant_force import ConstantForce
 from mkc_torch.effects.dynamics.coulomb_friction import CoulombFriction
 from mkc_torch.effects.dynamics.coupling import Coupling
@@ -12,12 +16,14 @@ from mkc_torch.effects.dynamics.input_delay import InputDelay
 from mkc_torch.effects.dynamics.input_saturation import InputSaturation
 from mkc_torch.effects.dynamics.linear_drag import LinearDrag
 from mkc_torch.effects.dynamics.load_dependent_friction import LoadDependentFriction
+from mkc_torch.effects.dynamics.magnus_lift import MagnusLift
 from mkc_torch.effects.dynamics.overflow import Overflow
 from mkc_torch.effects.dynamics.position_periodic_force import PositionPeriodicForce
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from mkc_torch.effects.dynamics.sensor_lag import SensorLag
 from mkc_torch.effects.dynamics.stribeck_friction import StribeckFriction
 from mkc_torch.effects.dynamics.thermal_loss import ThermalLoss
+from mkc_torch.effects.dynamics.unknown_rate import UnknownRate
 from mkc_torch.effects.protocol import Effect
 
 __all__ = ["DYNAMICS"]
@@ -31,13 +37,20 @@ DYNAMICS: tuple[Effect, ...] = (
     LoadDependentFriction(),
     CubicStiffness(),
     PositionPeriodicForce(),
+    BoucWenHysteresis(),
+    AddedMass(),
+    Buoyancy(),
     Coupling(),
+    MagnusLift(),
     HardStop(),
     Overflow(),
     ThermalLoss(),
     InputDelay(),
     InputSaturation(),
     DeadZone(),
+    Backlash(),
     SensorLag(),
+    UnknownRate("own"),
+    UnknownRate("position"),
 )
 """The effects that a diagnosis of differential equations tries."""

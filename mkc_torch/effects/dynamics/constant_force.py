@@ -32,7 +32,7 @@ class ConstantForce(RateEffect):
     of = ""
     equation = "δẋ = γ"
     explanation = "Something pushes all the time."
-    advice = "Look for a bias of the actuator, a tilted base or an unbalanced weight."
+    advice = "Look for a bias of the actuator, a tilted base, an unbalanced weight or buoyancy."
     source = "Newton's second law"
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002

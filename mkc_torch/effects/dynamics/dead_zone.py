@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from mkc_torch.effects.protocol import Context, GainEffect, Quantity, Shape
+from mkc_torch.effects.protocol import Context, Shape
+from mkc_torch.effects.share import ShareEffect
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -16,8 +17,11 @@ WIDTHS = (0.03, 0.06, 0.1, 0.2, 0.3)
 """As shares of the largest input."""
 
 
-class DeadZone(GainEffect):
-    """Small commands do nothing, and large ones lose as much: valves with overlap, play, sticking amplifiers.
+class DeadZone(ShareEffect):
+    """Small commands do nothing, and large ones lose as much: valves with overlap, sticking amplifiers.
+
+    It has no memory: on its way back the actuator answers as on its way there. One that does not is
+    :class:`mkc_torch.effects.dynamics.backlash.Backlash`.
 
     Simulation: adds ``−γ clip(u, ±c)`` to an input; a γ of one is a full dead zone.
     Drivers: none but the input.
@@ -28,12 +32,6 @@ class DeadZone(GainEffect):
 
     id = "dead_zone"
     relative: Mapping[str, tuple[str, str]] = {"width": ("own", "largest")}
-    port = "input"
-    follows_signal = True
-    least, most = 0.0, 1.0
-    needs: tuple[str, ...] = ("own",)
-    plausible = 1.5
-    gain = "share"
     along = "own"
     equation = "δu = −γ clip(u, ±c)"
     explanation = "Small commands have no effect: the actuator has a dead zone."
@@ -42,9 +40,6 @@ class DeadZone(GainEffect):
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return tuple({"width": width} for width in WIDTHS)
-
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
-        return (Quantity(self.gain, 1, ""),)
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         width = shape["width"]

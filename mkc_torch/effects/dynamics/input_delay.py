@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
-from mkc_torch.effects.protocol import Context, GainEffect, Quantity, Shape
+from mkc_torch.effects.paired.between import shifted
+from mkc_torch.effects.protocol import Context, Shape
+from mkc_torch.effects.share import ShareEffect
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -17,7 +18,7 @@ SHARES = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05)
 """Delays that are searched, as shares of the longest run."""
 
 
-class InputDelay(GainEffect):
+class InputDelay(ShareEffect):
     """The system answers to what its input was a while ago.
 
     Simulation: adds ``γ (u(t − τ) − u(t))`` to an input; a γ of one is a pure delay.
@@ -28,12 +29,6 @@ class InputDelay(GainEffect):
     """
 
     id = "input_delay"
-    port = "input"
-    follows_signal = True
-    least, most = 0.0, 1.0
-    needs: tuple[str, ...] = ("own",)
-    plausible = 1.5
-    gain = "share"
     continuous: Mapping[str, tuple[float, float]] = {"delay": (0.0005, 0.1)}
     equation = "δu = γ (u(t − τ) − u(t))"
     explanation = "The system answers to its input late."
@@ -44,23 +39,10 @@ class InputDelay(GainEffect):
         length = float(time.max() - time.min())
         return tuple({"delay": share * length} for share in SHARES)
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
-        return (Quantity(self.gain, 1, ""),)
-
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
-        time, own = context.time, context.part("own")
-        # each run by itself: where time goes back, a new one begins
-        run = torch.cat([time.new_zeros(1), (time.diff() < 0).double()]).cumsum(0)
-        longest = float(time.max() - time.min()) + shape["delay"] + 1.0
-        axis = run * 2.0 * longest + time
-        then = axis - shape["delay"]
-        at = torch.searchsorted(axis, then, right=True) - 1
-        seen = (at >= 0) & (run[at.clamp(min=0)] == run)
-        at = torch.where(seen, at, torch.searchsorted(run, run))
-        after = torch.where(seen, at + 1, at).clamp(max=len(axis) - 1)
-        share = ((then - axis[at]) / (axis[after] - axis[at]).clamp(min=1e-300)).clamp(0.0, 1.0)
-        return torch.lerp(own[at], own[after], share) - own
+        own = context.part("own")
+        return shifted(own, context.time, -shape["delay"], context.runs) - own
 
     def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:
         own = names["own"]
-        return (f"{gamma[0]!r} * (shifted({own}, time, {-shape['delay']!r}) - {own})",)
+        return (f"{gamma[0]!r} * (shifted({own}, time, {-shape['delay']!r}, run) - {own})",)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.effects.protocol import Context, GainEffect, Quantity, Shape, lagged
+from mkc_torch.effects.protocol import Context, Shape, lagged
+from mkc_torch.effects.share import ShareEffect
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -17,7 +18,7 @@ SHARES = (0.002, 0.005, 0.01, 0.02, 0.05)
 """Time constants that are searched, as shares of the longest run."""
 
 
-class SensorLag(GainEffect):
+class SensorLag(ShareEffect):
     """The sensor follows what it measures with a lag, as a thermometer in its housing does.
 
     Simulation: adds ``γ_i (y_τ − y)`` to each output, y_τ the output behind a lag of first order; a γ of one is a
@@ -30,10 +31,7 @@ class SensorLag(GainEffect):
 
     id = "sensor_lag"
     port = "output"
-    follows_signal = True
-    least, most = 0.0, 1.0
-    plausible = 1.5
-    gain = "share"
+    needs = ()
     continuous: Mapping[str, tuple[float, float]] = {"lag": (0.0005, 0.2)}
     equation = "δy = γ (y_τ − y),  τ ẏ_τ = y − y_τ"
     explanation = "The sensor follows what it measures with a lag."
@@ -44,14 +42,11 @@ class SensorLag(GainEffect):
         length = float(time.max() - time.min())
         return tuple({"lag": share * length} for share in SHARES)
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
-        return (Quantity(self.gain, len(context.channels), ""),)
-
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        behind = [lagged(one, context.time, shape["lag"]) for one in context.signal.unbind(-1)]
+        behind = [lagged(one, context.time, shape["lag"], context.runs) for one in context.signal.unbind(-1)]
         return gamma * (torch.stack(behind, -1) - context.signal)
 
     def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:
         lag = shape["lag"]
         each = zip(gamma, names.values(), strict=True)
-        return tuple(f"{share!r} * (lagged({own}, time, {lag!r}) - {own})" for share, own in each)
+        return tuple(f"{share!r} * (lagged({own}, time, {lag!r}, run) - {own})" for share, own in each)

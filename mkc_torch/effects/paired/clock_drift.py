@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.effects.paired.between import run_numbers, shifted
+from mkc_torch.effects.paired.between import shifted
 from mkc_torch.effects.protocol import Context, Quantity, Shape
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
 
 class ClockDrift:
@@ -42,14 +42,13 @@ class ClockDrift:
         return (Quantity("rate", 1, ""),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:  # noqa: ARG002
-        since = _since_middle(context.time)
+        since = _since_middle(context.time, context.runs)
         later = gamma[0] * since
-        columns = [shifted(one, context.time, later) - one for one in context.signal.unbind(-1)]
+        columns = [shifted(one, context.time, later, context.runs) - one for one in context.signal.unbind(-1)]
         return torch.stack(columns, -1)
 
 
-def _since_middle(time: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    run = run_numbers(time)
+def _since_middle(time: Float[Tensor, " N"], run: Int[Tensor, " N"]) -> Float[Tensor, " N"]:
     count = int(run.max()) + 1
     low = time.new_full((count,), torch.inf).scatter_reduce(0, run, time, "amin")
     high = time.new_full((count,), -torch.inf).scatter_reduce(0, run, time, "amax")

@@ -43,4 +43,4 @@ class Delay:
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:  # noqa: ARG002
         own = context.part("own")
-        return (shifted(own, context.time, -gamma[0].expand(len(own))) - own).unsqueeze(-1)
+        return (shifted(own, context.time, -gamma[0].expand(len(own)), context.runs) - own).unsqueeze(-1)

@@ -1,0 +1,76 @@
+"""Play between a drive and its load."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.protocol import Context, Shape
+from mkc_torch.effects.runs import first_of_runs, passed_on_within, run_numbers
+from mkc_torch.effects.share import ShareEffect
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+__all__ = ["Backlash", "played"]
+
+GAPS = (0.03, 0.06, 0.1, 0.2, 0.3)
+"""Half the width of the gap, as shares of the largest input."""
+
+
+class Backlash(ShareEffect):
+    """A drive has to cross a gap before it moves its load: worn gears, couplings, linkages and valves with play.
+
+    It has memory: after each reversal the load stands still until the gap, 2 c wide, is crossed. A dead zone has none,
+    and takes off the same on the way there and back. At the beginning of a run the drive is in the middle of its gap.
+
+    Simulation: adds ``γ (y − u)`` to an input, y the load's side: ``y = max(u − c, min(u + c, y before))``; a γ of one
+        is a full gap.
+    Drivers: none but the input, all of its course since the run's beginning.
+    Units: γ is a share; the shape ``half_gap`` in the unit of what it is of.
+    Plausible: γ from 0 to 1.
+    Source: the play operator; Visintin, "Differential Models of Hysteresis" (1994), III.2; Nordin & Gutman, Automatica
+        38 (2002), for gears.
+    """
+
+    id = "backlash"
+    relative: Mapping[str, tuple[str, str]] = {"half_gap": ("own", "largest")}
+    equation = "δu = γ (y − u),  y = max(u − c, min(u + c, y before))"
+    explanation = "After each reversal the drive crosses a gap before it moves its load: there is play between them."
+    advice = "Put play of this width behind the input, or preload the gears."
+    source = "Visintin, Differential Models of Hysteresis (1994), III.2; Nordin & Gutman, Automatica 38 (2002)"
+
+    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+        return tuple({"half_gap": gap} for gap in GAPS)
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+        own = context.part("own")
+        return played(own, context.time, shape["half_gap"], context.runs) - own
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        own = names["own"]
+        return (f"{gamma[0]!r} * (played({own}, time, {shape['half_gap']!r}, run) - {own})",)
+
+
+def played(
+    values: Float[Tensor, " N"], time: Float[Tensor, " N"], half_gap: float, run: Int[Tensor, " N"] | None = None
+) -> Float[Tensor, " N"]:
+    """Values behind play, in the middle of the gap at the first sample of each run.
+
+    Args:
+        values: of the drive, at the samples.
+        time: of the samples in s.
+        half_gap: half the width of the gap, in the values' unit; at least 0.
+        run: of each sample's run; None where a run begins when time goes back, and only there.
+
+    Example:
+        >>> there_and_back = torch.tensor([0.0, 1.0, 3.0, 2.0, 1.0, 0.0])
+        >>> played(there_and_back, torch.arange(6.0), 1.0)
+        tensor([0., 0., 2., 2., 2., 1.])
+    """
+    first = first_of_runs(run_numbers(time) if run is None else run)
+    gap = torch.where(first, torch.zeros_like(values), half_gap)
+    return passed_on_within(values - gap, values + gap)

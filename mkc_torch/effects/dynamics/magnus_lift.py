@@ -1,0 +1,57 @@
+"""A spinning body is driven sideways."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.protocol import Context, Quantity, Shape, per
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class MagnusLift(RateEffect):
+    """A ball that spins drags air around with it, and is driven across its way, in proportion to spin and speed.
+
+    Forces of Coriolis on a turning frame and of Lorentz on a charge have the same form; no recording tells them apart.
+
+    Simulation: adds ``−γ v_y`` to the rate of a speed v_x and ``γ v_x`` to that of another one, v_y, square to it: it
+        turns the way and takes no energy. Where the spin w is recorded, γ is ``γ₁ + γ₂ (w − w̄)``, w̄ its mean.
+    Drivers: the states; a column whose name begins with ``spin``, if there is one.
+    Units: γ, γ₁ in 1/s; γ₂ in 1/s for each unit of the spin.
+    Plausible: either sign.
+    Source: Rayleigh (1877); Mehta, "Aerodynamics of Sports Balls", Annual Review of Fluid Mechanics 17 (1985).
+    """
+
+    id = "magnus_lift"
+    port = "exchange"
+    roles = ("spin",)
+    driver_optional = True
+    needs = ("own", "other", "sideways")
+    least = -math.inf
+    gain = "turning"
+    of = "other"
+    equation = "δv̇_x = −γ v_y,  δv̇_y = γ v_x"
+    explanation = "Something drives the motion across its way, in proportion to its speed, as air does a spinning ball."
+    advice = "Add a force across the way with this coefficient, and record the spin."
+    source = "Mehta, Aerodynamics of Sports Balls, Annual Review of Fluid Mechanics 17 (1985)"
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        mean = Quantity(self.gain, 1, "1/s")
+        if not context.units:
+            return (mean,)
+        unit = context.units[0]
+        return mean, Quantity(f"{self.gain}_per_spin", 1, per("1/s", f"({unit})" if "/" in unit else unit))
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 2"]:  # noqa: ARG002
+        turning = gamma[0] + gamma[1] * context.drivers[:, 0] if context.units else gamma[0]
+        return torch.stack([-turning * context.part("other"), turning * context.part("own")], -1)
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
+        return f"-({gamma[0]!r}) * {names['other']}", f"{gamma[0]!r} * {names['own']}"

@@ -1,0 +1,67 @@
+"""A smooth force that no named effect describes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.protocol import Context, Quantity, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+DEGREE = 4
+"""Of the curve."""
+
+
+class UnknownRate(RateEffect):
+    """The rate of a state follows a smooth curve over a part of the motion: physics that the catalogue does not have.
+
+    Simulation: adds ``Σ γ_j P_j(x / reach)`` to the rate, with Legendre polynomials P_1 to P_4 of the state itself, or
+    of the position whose speed it is; beyond the largest value of the recording the curve goes on as a constant.
+    Drivers: none but the state.
+    Units: γ in the state's unit per s; the reach in that of what the curve is over.
+    Plausible: any size, either sign.
+    Source: none; it is a curve and no physics.
+
+    Args:
+        of: the part that the curve is over, ``own`` or ``position``.
+    """
+
+    id = "unknown"
+    least = -math.inf
+    gain = "legendre"
+    equation = "δẋ = f(x), a smooth curve"
+    explanation = "The rate follows a curve that no effect of the catalogue describes."
+    advice = "Look at the curve; find out what acts there."
+    source = "none: a curve, not physics"
+
+    def __init__(self, of: str = "own") -> None:
+        self.of = of
+        self.needs = ("own", of)
+        self._reach = f"reach_of_{of}"
+        self.relative: Mapping[str, tuple[str, str]] = {self._reach: (of, "largest")}
+
+    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+        return ({self._reach: 1.0},)
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return tuple(Quantity(f"{self.gain}_{j}", 1, context.signal_unit) for j in range(1, DEGREE + 1))
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:
+        t = (context.part(self.of) / shape[self._reach]).clamp(-1.0, 1.0)
+        square = t.square()
+        fourth = (35.0 * square.square() - 30.0 * square + 3.0) / 8.0
+        curves = torch.stack([t, 1.5 * square - 0.5, 2.5 * t * square - 1.5 * t, fourth], -1)
+        return (curves @ gamma).unsqueeze(-1)
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        t = f"torch.clamp({names[self.of]} / {shape[self._reach]!r}, -1.0, 1.0)"
+        curves = (t, f"(1.5 * {t} ** 2 - 0.5)", f"(2.5 * {t} ** 3 - 1.5 * {t})")
+        fourth = f"(35.0 * {t} ** 4 - 30.0 * {t} ** 2 + 3.0) / 8.0"
+        return (" + ".join(f"({one!r}) * {curve}" for one, curve in zip(gamma, (*curves, fourth), strict=True)),)

@@ -1,0 +1,113 @@
+"""What is passed on from sample to sample, against loops and a differential equation."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from mkc_torch.effects.dynamics.backlash import played
+from mkc_torch.effects.dynamics.bouc_wen_hysteresis import hysteretic_path
+from mkc_torch.effects.paired.between import shifted
+from mkc_torch.effects.protocol import lagged
+from mkc_torch.effects.runs import passed_on, passed_on_within
+
+RANDOM = np.random.default_rng(11)
+TIME = torch.arange(60, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("N", [1, 2, 3, 64, 65, 300])
+def test_scans_are_loops(N):
+    factor, level = torch.from_numpy(RANDOM.uniform(-1.0, 1.0, (2, N)))
+    low = torch.from_numpy(RANDOM.standard_normal(N).cumsum())
+    high = low + torch.from_numpy(RANDOM.uniform(0.0, 2.0, N))
+    low[0] = high[0]
+    y, z, affine, within = 0.0, float(low[0]), [], []
+    for k in range(N):
+        y = float(factor[k]) * y + float(level[k])
+        z = max(float(low[k]), min(float(high[k]), z))
+        affine.append(y)
+        within.append(z)
+    np.testing.assert_allclose(passed_on(factor, level), affine, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(passed_on_within(low, high), within, rtol=0, atol=0)
+
+
+def test_play_has_memory_and_a_dead_zone_has_none():
+    there = torch.linspace(0.0, 3.0, 31, dtype=torch.float64)
+    back = played(torch.cat([there, there.flip(0)]), torch.arange(62.0), 0.5)
+    assert back[20].item() == pytest.approx(1.5)
+    assert back[41].item() == pytest.approx(2.5)  # at the same input on the way back
+    assert float((back[31:36] - 2.5).abs().max()) < 1e-12  # it crosses the gap
+
+
+@pytest.mark.parametrize("N", [40, 41])
+def test_play_is_the_play_operator(N):
+    u = RANDOM.standard_normal(N).cumsum()
+    y = [u[0]]
+    for one in u[1:]:
+        y.append(max(one - 0.8, min(one + 0.8, y[-1])))
+    np.testing.assert_allclose(played(torch.from_numpy(u), torch.arange(float(N)), 0.8), y, rtol=0, atol=1e-14)
+
+
+def test_play_without_a_gap_is_none():
+    u = torch.from_numpy(RANDOM.standard_normal(20))
+    assert torch.equal(played(u, torch.arange(20.0), 0.0), u)
+
+
+@pytest.mark.parametrize("of", ["play", "hysteresis", "lag", "shift"])
+def test_derivatives_go_through(of):
+    """In reverse and forward mode, and under vmap."""
+    function = {
+        "play": lambda v: played(v, TIME[:12], 0.7),
+        "hysteresis": lambda v: hysteretic_path(v, 0.7, torch.zeros(12, dtype=torch.long)),
+        "lag": lambda v: lagged(v, TIME[:12], 3.0),
+        "shift": lambda v: shifted(v, TIME[:12], -2.3),
+    }[of]
+    values = torch.from_numpy(RANDOM.standard_normal((3, 12)).cumsum(-1)).requires_grad_()
+    assert torch.autograd.gradcheck(function, (values[0].detach().requires_grad_(),), check_forward_ad=True)
+    together = torch.vmap(function)(values)
+    torch.testing.assert_close(together, torch.stack([function(one) for one in values]))
+    pushed = torch.vmap(lambda v: torch.func.jvp(function, (v,), (torch.ones_like(v),))[1])(values)
+    assert bool(pushed.isfinite().all())
+
+
+@pytest.mark.parametrize("yields", [0.05, 0.3, 2.0])
+def test_the_path_of_a_hysteretic_force_solves_bouc_and_wen_s_equation(yields):
+    time = np.linspace(0.0, 6.0, 3001)
+
+    def rate(t, z):
+        v = 1.3 * np.cos(1.3 * t) - 1.2 * np.sin(4.0 * t)
+        return v - (abs(v) * z + v * abs(z)) / (2.0 * yields)
+
+    exact = solve_ivp(rate, (0.0, 6.0), [0.0], t_eval=time, rtol=1e-9, atol=1e-10, max_step=0.005).y[0]
+    x = np.sin(1.3 * time) + 0.3 * np.cos(4.0 * time)
+    found = hysteretic_path(torch.from_numpy(x), yields, torch.zeros(3001, dtype=torch.long))
+    np.testing.assert_allclose(found, exact, rtol=0, atol=1e-3 * yields)
+    assert float(found.abs().max()) <= yields * (1.0 + 1e-9)
+
+
+def test_a_hysteretic_loop_takes_energy_out():
+    turn = torch.linspace(0.0, 2.0 * np.pi, 2001, dtype=torch.float64)
+    x = torch.cat([turn.sin(), turn.sin()[1:]])
+    z = hysteretic_path(x, 0.2, torch.zeros(4001, dtype=torch.long))
+    work = (0.5 * (z[1:] + z[:-1]) * x.diff())[2000:].sum()
+    assert float(work) > 0.5 * 4.0 * 0.2  # of a loop of half its largest area, at least
+
+
+def test_runs_begin_where_they_are_said_to():
+    """On one clock that goes on: each run is what it is alone."""
+    values = torch.from_numpy(RANDOM.standard_normal(60).cumsum())
+    run = torch.arange(3).repeat_interleave(20)
+    for function in (
+        lambda v, t, r: played(v, t, 0.5, r),
+        lambda v, t, r: lagged(v, t, 4.0, r),
+        lambda v, t, r: shifted(v, t, -3.7, r),
+        lambda v, t, r: shifted(v, t, 3.7, r),
+        lambda v, t, r: hysteretic_path(v, 0.5, torch.zeros_like(t, dtype=torch.long) if r is None else r),
+    ):
+        alone = [function(values[k : k + 20], TIME[k : k + 20], None) for k in (0, 20, 40)]
+        torch.testing.assert_close(function(values, TIME, run), torch.cat(alone))
+
+
+def test_a_run_of_one_sample_is_its_value():
+    late = shifted(torch.tensor([1.0, 2.0, 9.0]), torch.tensor([0.0, 1.0, 2.0]), -0.5, torch.tensor([0, 0, 1]))
+    assert late.tolist() == [1.0, 1.5, 9.0]

@@ -1,0 +1,275 @@
+"""What each of these effects adds to a system of differential equations, against a step-by-step solution of it."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch import Recording
+from mkc_torch.diagnosis.linearise import tangents_of
+from mkc_torch.diagnosis.model import JointModel, Term, with_constant
+from mkc_torch.effects import DYNAMICS
+from mkc_torch.simulation import Dynamics
+from tests.simulation.runge_kutta import runge_kutta
+
+OF = {effect.id: effect for effect in DYNAMICS}
+TIME = np.arange(150) * 0.04
+
+
+def table(**columns):
+    return Recording({name: torch.as_tensor(values) for name, values in columns.items()})
+
+
+class Mass(Dynamics):
+    """On a spring, pushed by a known force."""
+
+    states = ("height", "speed")
+    inputs = ("push",)
+    parameters = {"damping": 0.3}  # noqa: RUF012
+    units = {"height": "m", "speed": "m/s", "push": "m/s²"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"height": x.speed, "speed": u.push - 4.0 * x.height - p.damping * x.speed}
+
+
+class Ball(Dynamics):
+    states = ("x", "y", "vx", "vy")
+    parameters = {"drag": 0.05}  # noqa: RUF012
+    units = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"x": x.vx, "y": x.vy, "vx": -p.drag * x.vx, "vy": -9.81 - p.drag * x.vy}
+
+
+def push(t):
+    """Linear between the samples, as the simulation takes it."""
+    return np.interp(t, TIME, np.sin(2.3 * TIME) + np.sin(0.9 * TIME))
+
+
+def spun(t):
+    return np.interp(t, TIME, 30.0 + 10.0 * np.cos(3.0 * TIME))
+
+
+def played_back(gap):
+    """The push behind play, by its definition."""
+    u = push(TIME)
+    y = u.copy()
+    for k in range(1, len(u)):
+        y[k] = max(u[k] - gap, min(u[k] + gap, y[k - 1]))
+    return y
+
+
+def mass(force=lambda *_: 0.0, inertia=1.0):
+    def rate(t, y):
+        return [y[1], (push(t) - 4.0 * y[0] - 0.3 * y[1]) / inertia + force(*y)]
+
+    return rate
+
+
+def hysteretic(gamma, yields):
+    def rate(t, y):
+        x, v, z = y
+        plain = push(t) - 4.0 * x - 0.3 * v
+        return [v, plain - gamma * z, v - (abs(v) * z + v * abs(z)) / (2.0 * yields)]
+
+    return rate
+
+
+def turned(coefficient):
+    def rate(t, y):
+        _, _, vx, vy = y
+        w = coefficient(t)
+        return [vx, vy, -0.05 * vx - w * vy, -9.81 - 0.05 * vy + w * vx]
+
+    return rate
+
+
+def dipped(x, _):
+    return 6.0 * min(max((0.3 - x) / 0.5, 0.0), 1.0)
+
+
+def with_play():
+    behind = played_back(0.4)
+    # the load's side between the samples is not linear where the gap begins and ends
+    fine = np.linspace(0.0, TIME[-1], 40 * (len(TIME) - 1) + 1)
+    side = push(fine)
+    for k in range(1, len(side)):
+        side[k] = max(side[k] - 0.4, min(side[k] + 0.4, side[k - 1]))
+    assert np.abs(side[::40] - behind).max() < 1e-12
+
+    def rate(t, y):
+        return [y[1], np.interp(t, fine, side) - 4.0 * y[0] - 0.3 * y[1]]
+
+    return rate
+
+
+# effect, port, shape, γ, the equations with it, their first states, tolerance
+CASES = {
+    "backlash": ("input push", {"half_gap": 0.4}, [1.0], with_play(), [0.5, 0.0], 2e-3),
+    "bouc_wen_hysteresis": (
+        "hysteretic rate of speed", {"yield_deflection": 0.2}, [3.0], hysteretic(3.0, 0.2), [0.5, 0.0, 0.0], 2e-4,
+    ),
+    "added_mass": ("rate of speed", {}, [0.2], mass(inertia=1.25), [0.5, 0.0], 1e-4),
+    "buoyancy": ("rate of speed", {"surface": 0.3, "draught": 0.5}, [6.0], mass(dipped), [0.5, 0.0], 2e-4),
+    "magnus_lift": (
+        "exchange of vx and vy", {}, [0.4], turned(lambda _: 0.4), [0.0, 1.0, 20.0, 5.0], 1e-4,
+    ),
+}  # fmt: skip
+
+
+def prepared(name, rate, first, **attributes):
+    """The simulation of a recording of the system with the effect, the truth, and parameters that are the true ones."""
+    system = Ball if name == "magnus_lift" else Mass
+    known = list(system.states[:2])
+    truth = runge_kutta(rate, first, TIME)
+    columns = dict(zip(known, truth.T[:2], strict=True))
+    recording = table(time=TIME, **columns, **({} if system is Ball else {"push": push(TIME)}))
+    simulation = type(system.__name__, (system,), {"step": 0.01, **attributes})()
+    own = [0.05] if system is Ball else [0.3]
+    theta = torch.tensor([*own, *first[: len(system.states)]], dtype=torch.float64)
+    return simulation.prepare(recording), torch.from_numpy(truth[:, :2]), theta
+
+
+def joint(name, simulation, shape, gamma, theta):
+    term = Term(OF[name], None, shape, CASES[name][0])
+    model = JointModel(simulation, (term,))
+    return model, torch.cat([theta, torch.tensor(gamma, dtype=torch.float64)])
+
+
+@pytest.mark.parametrize("name", CASES)
+class TestAgainstSteps:
+    """The simulation with an effect solves the equations that have it in them."""
+
+    def test_it_is_the_solution(self, name):
+        _, shape, gamma, rate, first, tolerance = CASES[name]
+        simulation, truth, theta = prepared(name, rate, first)
+        model, parameters = joint(name, simulation, shape, gamma, theta)
+        assert float(model.residual(parameters).abs().max()) < tolerance * float(truth.abs().max())
+        without = simulation.residual(theta, {})
+        assert float(without.abs().max()) > 30.0 * tolerance * float(truth.abs().max())
+
+    def test_its_derivatives_are_differences(self, name):
+        """In forward mode, in reverse mode and under vmap, by the amplitude and all else."""
+        _, shape, gamma, rate, first, _ = CASES[name]
+        simulation, _, theta = prepared(name, rate, first, step=0.04)
+        model, parameters = joint(name, simulation, shape, gamma, theta)
+        slope = torch.func.jacfwd(model.residual)(parameters)  # vmap over jvp
+        step = 1e-5 * torch.eye(len(parameters), dtype=torch.float64)
+        near = [(model.residual(parameters + h) - model.residual(parameters - h)) / 2e-5 for h in step]
+        torch.testing.assert_close(slope, torch.stack(near, -1), rtol=1e-3, atol=1e-4 * float(slope.abs().max()))
+        pull = torch.linspace(-1.0, 1.0, slope[..., 0].numel(), dtype=torch.float64).reshape(slope.shape[:-1])
+        wanted = parameters.clone().requires_grad_()
+        (model.residual(wanted) * pull).sum().backward()
+        torch.testing.assert_close(wanted.grad, torch.einsum("nm,nmp->p", pull, slope), rtol=1e-6, atol=1e-9)
+
+    def test_the_search_sees_what_the_fit_does(self, name):
+        """The tangent of a candidate is the derivative of the joint model where the candidate has no amplitude yet."""
+        _, shape, gamma, rate, first, _ = CASES[name]
+        simulation, _, theta = prepared(name, rate, first, step=0.02)
+        model, parameters = joint(name, simulation, shape, [0.0] * len(gamma), theta)
+        found = tangents_of(JointModel(simulation), theta, model.terms).candidates[0]
+        exact = torch.func.jacfwd(model.residual)(parameters)[..., -1:]
+        torch.testing.assert_close(found, exact, rtol=0.0, atol=0.01 * float(exact.abs().max()))
+
+
+class TestMemory:
+    """An internal state that an effect brings."""
+
+    def model(self, **attributes):
+        _, shape, gamma, rate, first, _ = CASES["bouc_wen_hysteresis"]
+        simulation, _, theta = prepared("bouc_wen_hysteresis", rate, first, **attributes)
+        return joint("bouc_wen_hysteresis", simulation, shape, gamma, theta)
+
+    def test_a_constant_beside_it_does_not_act_on_its_internal_state(self):
+        model, parameters = self.model()
+        port = "hysteretic rate of speed"
+        changes = model.changes(parameters)
+        theta = parameters[: model.base]
+        seen = model.prepared.signals(theta, changes)
+        nothing, something = (torch.full((len(seen[port]), 1), one).double() for one in (0.0, 0.1))
+        plain = model.prepared.simulated(theta, changes)
+        same = model.prepared.simulated(theta, with_constant(changes, port, nothing))
+        torch.testing.assert_close(same, plain)
+        pushed = model.prepared.simulated(theta, with_constant(changes, port, something))
+        other = model.prepared.simulated(theta, with_constant(changes, "rate of speed", something))
+        torch.testing.assert_close(pushed, other, rtol=0.0, atol=1e-9)
+
+    def test_without_it_there_is_no_internal_state(self):
+        model, parameters = self.model()
+        theta = parameters[: model.base]
+        constant = {"hysteretic rate of speed": lambda s: torch.full_like(s[:, :1], 0.1)}
+        assert model.prepared.trajectory(theta, constant).states.shape[1] == 2
+        assert model.prepared.trajectory(theta, model.changes(parameters)).states.shape[1] == 3
+
+    def test_it_begins_anew_with_every_run(self):
+        """Two runs at once are each run by itself."""
+        _, shape, gamma, rate, first, _ = CASES["bouc_wen_hysteresis"]
+        firsts = (first, [-0.2, 1.0, 0.0])
+        parts = [runge_kutta(rate, one, TIME)[:, 0] for one in firsts]
+        both = table(
+            time=np.concatenate([TIME, TIME]),
+            push=np.tile(push(TIME), 2),
+            height=np.concatenate(parts),
+            experiment=np.repeat([0.0, 1.0], len(TIME)),
+        )
+        simulation = type("Mass", (Mass,), {"step": 0.01})().prepare(both)
+        theta = torch.tensor([0.3, *first[:2], -0.2, 1.0], dtype=torch.float64)
+        model, parameters = joint("bouc_wen_hysteresis", simulation, shape, gamma, theta)
+        assert float(model.residual(parameters).abs().max()) < 2e-4
+
+
+def test_a_recorded_spin_drives_the_lift():
+    """γ₁ at the mean spin, and γ₂ for each unit beyond."""
+    truth = runge_kutta(turned(lambda t: 0.01 * spun(t)), [0.0, 1.0, 20.0, 5.0], TIME)
+    recording = table(time=TIME, x=truth[:, 0], y=truth[:, 1], spin=spun(TIME))
+    simulation = type("Ball", (Ball,), {"step": 0.01})().prepare(recording)
+    from mkc_torch.diagnosis.drivers import find_drivers
+
+    (driver,) = find_drivers(simulation.recording, simulation.system.columns, frozenset({"spin"})).drivers
+    model = JointModel(simulation, (Term(OF["magnus_lift"], driver, {}, "exchange of vx and vy"),))
+    mean = 0.01 * float(driver.reference)
+    parameters = torch.tensor([0.05, 0.0, 1.0, 20.0, 5.0, mean, 0.01], dtype=torch.float64)
+    assert float(model.residual(parameters).abs().max()) < 1e-3
+    assert model.sizes == (2,)
+
+
+def test_what_scales_everything_is_no_added_mass():
+    """With an inertia of the simulation's own, which scales the whole rate, nothing is left of the tangent."""
+
+    class Own(Mass):
+        parameters = {"inertia": 1.0}  # noqa: RUF012
+        step = 0.02
+
+        def derivative(self, time, x, u, p):  # noqa: ARG002
+            return {"height": x.speed, "speed": (u.push - 4.0 * x.height - 0.3 * x.speed) / p.inertia}
+
+    truth = runge_kutta(mass(), [0.5, 0.0], TIME)
+    simulation = Own().prepare(table(time=TIME, push=push(TIME), height=truth[:, 0]))
+    theta = torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64)
+    found = tangents_of(JointModel(simulation), theta, (Term(OF["added_mass"], None, {}, "rate of speed"),))
+    own, tangent = found.nuisance[:, 0], found.candidates[0][:, 0]
+    left = tangent - own @ torch.linalg.lstsq(own, tangent).solution
+    assert float(left.norm()) < 1e-6 * float(tangent.norm())
+
+
+@pytest.mark.parametrize("name", ["backlash", "input_delay"])
+def test_runs_whose_clock_goes_on_do_not_see_each_other_s_inputs(name):
+    """The same runs on one clock and on clocks of their own are the same."""
+    first, second = np.arange(60) * 0.05, 3.0 + np.arange(60) * 0.05
+    torque = np.concatenate([2.0 + np.sin(3.0 * first), -2.0 + np.cos(4.0 * second)])
+    theta = torch.tensor([0.3, 0.1, 0.0, -0.1, 0.0], dtype=torch.float64)
+    shape = {"backlash": {"half_gap": 0.5}, "input_delay": {"delay": 0.4}}[name]
+    simulated = []
+    for later in (second, second - 3.0):
+        recording = table(
+            time=np.concatenate([first, later]),
+            push=torque,
+            height=0.0 * torque,
+            experiment=np.repeat([0.0, 1.0], 60),
+        )
+        simulation = type("Mass", (Mass,), {"step": 0.05})().prepare(recording)
+        model = JointModel(simulation, (Term(OF[name], None, shape, "input push"),))
+        simulated.append(model.residual(torch.cat([theta, theta.new_ones(1)])))
+    torch.testing.assert_close(simulated[0], simulated[1], rtol=0.0, atol=1e-9)
+    assert math.isfinite(float(simulated[0].abs().max()))
