@@ -45,8 +45,8 @@ def test_its_line_of_python_is_the_curve(context, of):
 
 @pytest.fixture(scope="module")
 def diagnosis():
-    """A ridge that the pendulum has to cross at the bottom."""
-    recording = swung(lambda angle, _: -1.2 * np.exp(-((angle / 0.25) ** 2)))
+    """A push to one side that grows with the square of the speed, whichever way the pendulum swings."""
+    recording = swung(lambda _, speed: 0.12 * speed**2)
     return diagnose(Pendulum(), recording, surrogates=19, max_findings=1)
 
 
@@ -63,5 +63,5 @@ def test_a_force_that_is_in_no_catalogue_is_found_without_a_name(diagnosis):
 
 def test_its_model_comes_back_with_the_same_curve(diagnosis):
     again = DiagnosedModel.from_json(diagnosis.model.to_json(), simulation=Pendulum())
-    assert again.terms[0].effect.of == diagnosis.model.terms[0].effect.of == "position"
+    assert again.terms[0].effect.of == diagnosis.model.terms[0].effect.of == "own"
     assert again.terms[0].shape == diagnosis.model.terms[0].shape
