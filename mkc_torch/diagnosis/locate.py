@@ -124,8 +124,10 @@ def locate(
     first = terms[ranking[0].number]
     if p_value <= level and first.key != best.model.terms[-1].key:
         other = _refitted(best, base, first, linearised, ranking[0].number)
-        # the search knows the noise's colour and is linear: where the joint fit loses much of the gain, it went too far
-        if _score(other, base, prefer) > max(_KEPT * _score(best, base, prefer), 0.0):
+        # the search is linear: where the joint fit loses much of the gain, it went too far. But it knows the noise: what
+        # the joint fits gain, where noise may wander, is that of whatever follows the wander
+        least = _KEPT * _score(best, base, prefer) if tangents.slow is None else 0.0
+        if _score(other, base, prefer) > max(least, 0.0):
             best = other
     if p_value <= level:
         best = _refined(best, base, again=True)

@@ -1,0 +1,12 @@
+"""An offset that wanders must not take the name of physics that is beside it."""
+
+from mkc_torch import diagnose
+from mkc_torch.challenge.generator import draw
+from mkc_torch.simulation import Magnetometer
+
+
+def test_a_nonlinearity_beside_a_wandering_offset_is_named_alone():
+    case = draw(7503, 42)
+    assert case.key.effects[0].effect == "cubic_nonlinearity"
+    result = diagnose(Magnetometer(), case.recording, surrogates=19)
+    assert [finding.effect for finding in result.findings] == ["cubic_nonlinearity"]
