@@ -6,6 +6,8 @@ import torch
 
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.diagnosed_model import DiagnosedModel
+from mkc_torch.effects.dynamics.linear_drag import LinearDrag
+from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from mkc_torch.effects.dynamics.unknown_rate import DEGREE, UnknownRate
 from mkc_torch.effects.protocol import Context
 from tests.diagnosis.test_dynamics_diagnosis import NOISE, Pendulum, swung
@@ -47,14 +49,16 @@ def test_its_line_of_python_is_the_curve(context, of):
 def diagnosis():
     """A push to one side that grows with the square of the speed, whichever way the pendulum swings."""
     recording = swung(lambda _, speed: 0.12 * speed**2)
-    return diagnose(Pendulum(), recording, surrogates=19, max_findings=1)
+    # a catalogue that has forces along the motion alone
+    effects = (LinearDrag(), QuadraticDrag(), UnknownRate("own"), UnknownRate("position"))
+    return diagnose(Pendulum(), recording, effects=effects, surrogates=19, max_findings=1)
 
 
 def test_a_force_that_is_in_no_catalogue_is_found_without_a_name(diagnosis):
     assert diagnosis.verdict == "unexplained"
     (finding,) = diagnosis.findings
     assert finding.effect == "unknown"
-    assert finding.at == "rate of speed"
+    assert finding.channels == ("rate of speed",)
     assert finding.held_out.confidence_interval[0] > 0.0
     assert finding.held_out.rmse_before > 1.5 * NOISE
     assert finding.held_out.rmse_after < finding.held_out.rmse_before
@@ -63,5 +67,5 @@ def test_a_force_that_is_in_no_catalogue_is_found_without_a_name(diagnosis):
 
 def test_its_model_comes_back_with_the_same_curve(diagnosis):
     again = DiagnosedModel.from_json(diagnosis.model.to_json(), simulation=Pendulum())
-    assert again.terms[0].effect.of == diagnosis.model.terms[0].effect.of == "own"
+    assert again.terms[0].effect.of == diagnosis.model.terms[0].effect.of
     assert again.terms[0].shape == diagnosis.model.terms[0].shape
