@@ -124,8 +124,8 @@ def locate(
     first = terms[ranking[0].number]
     if p_value <= level and first.key != best.model.terms[-1].key:
         other = _refitted(best, base, first, linearised, ranking[0].number)
-        # the search is linear: where the joint fit loses much of the gain, it went too far. But it knows the noise: what
-        # the joint fits gain, where noise may wander, is that of whatever follows the wander
+        # the search is linear: where the joint fit loses much of the gain, it went too far; but where noise may wander,
+        # what follows the wander gains most in joint fits, and the search knows better
         least = _KEPT * _score(best, base, prefer) if tangents.slow is None else 0.0
         if _score(other, base, prefer) > max(least, 0.0):
             best = other
