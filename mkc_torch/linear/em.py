@@ -198,7 +198,7 @@ class MKCRegression(LinearEstimator):
         covariance_: of the coefficients at the learned σ and d, (*, n, n).
         history_: mean negative log-likelihood per sample, summed over channels, at every alternation.
         exact_fit_: more than half of the values lie on the fit to rounding, (*,).
-        n_iter_, converged_: alternations made, and whether each problem came to rest.
+        n_iter_, converged_: alternations made, and whether each problem came to rest, as an exact fit has.
         differentiable_: after a fit as a layer, whether each problem's solution has a derivative, (*,).
 
     References:
@@ -315,7 +315,7 @@ class MKCRegression(LinearEstimator):
                 beta=maximum.beta,
                 kappa=state.kappa,
                 log_d=state.log_d,
-                converged=maximum.converged,
+                converged=maximum.converged | begin.exact,
                 log_bound=state.log_bound,
                 log_d_min=state.log_d_min,
                 free_kappa=state.free_kappa,
@@ -357,5 +357,5 @@ class MKCRegression(LinearEstimator):
         self.history_ = torch.stack([problem.restore(h) for h in maximum.history])
         self.exact_fit_ = problem.restore(begin.exact)
         self.n_iter_ = len(maximum.history) - 1
-        self.converged_ = problem.restore(maximum.converged)
+        self.converged_ = problem.restore(maximum.converged | begin.exact)
         self.covariance_ = coefficient_covariance(problem, maximum.beta, kappa, d, self.covariance, self.bandwidth)
