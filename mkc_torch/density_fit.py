@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from mkc_torch.functional import KAPPA_MAX, energy, head_rule, integrate, log_partition, tail_density
+from mkc_torch.functional import KAPPA_MAX, energy_value, head_rule, integrate, log_partition_value, tail_density
 from mkc_torch.order_statistic import robust_scale
 
 if TYPE_CHECKING:
@@ -121,11 +121,11 @@ class DensityState:
 def negative_log_likelihood(error: Tensor, weight: Tensor | None, state: DensityState) -> Float[Tensor, "*batch m"]:
     """Mean negative log-density of the residuals of each channel."""
     z = error * torch.exp(-state.log_d).unsqueeze(-2)
-    return _mean(energy(z, state.kappa.unsqueeze(-2)), weight) + state.log_d + _log_z(state)
+    return _mean(energy_value(z, state.kappa.unsqueeze(-2)), weight) + state.log_d + _log_z(state)
 
 
 def _log_z(state: DensityState) -> Tensor:
-    return log_partition(state.kappa, torch.exp(state.log_bound - state.log_d))
+    return log_partition_value(state.kappa, torch.exp(state.log_bound - state.log_d))
 
 
 def initial_state(

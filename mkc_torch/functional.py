@@ -81,7 +81,7 @@ class _Energy(torch.autograd.Function):
 
     @staticmethod
     def forward(z: Tensor, kappa: Tensor) -> Tensor:
-        return _energy_value(z, kappa)
+        return energy_value(z, kappa)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # noqa: ARG004
@@ -110,7 +110,8 @@ class _EnergyWithTangent(_Energy):
         return out
 
 
-def _energy_value(z: Tensor, kappa: Tensor) -> Tensor:
+def energy_value(z: Tensor, kappa: Tensor) -> Tensor:
+    """:func:`energy` where nothing is differentiated, without an autograd function's own cost."""
     q = 0.5 * z * z
     x = kappa * q
     divisor = torch.where(kappa > 0, kappa, 1.0)
@@ -228,6 +229,15 @@ def partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"]) -
     Args:
         kappa, length: as in :func:`log_partition`.
     """
+    return _partition(kappa, length, energy)
+
+
+def log_partition_value(kappa: Tensor, length: Tensor) -> Tensor:
+    """:func:`log_partition` where nothing is differentiated."""
+    return torch.log(_partition(kappa, length, energy_value))
+
+
+def _partition(kappa: Tensor, length: Tensor, energy: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
     kappa, length = torch.broadcast_tensors(kappa, length)
     tail = tail_density(kappa)
     nodes, weights = head_rule(kappa, length)
@@ -278,7 +288,7 @@ class _LogPartition(torch.autograd.Function):
 
     @staticmethod
     def forward(kappa: Tensor, length: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return _log_partition_and_slopes(kappa, length, _energy_value)
+        return _log_partition_and_slopes(kappa, length, energy_value)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, Tensor, Tensor]) -> None:

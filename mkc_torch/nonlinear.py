@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 
 from mkc_torch.density_fit import DensityState, conclusive, domain_rule, initial_state, newton_step, refuse_narrow_bound
-from mkc_torch.functional import energy
+from mkc_torch.functional import energy_value
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind, sandwich
 from mkc_torch.order_statistic import order_statistic
 
@@ -310,7 +310,7 @@ def _value(
     d: Tensor,
     penalty: _Penalty | None,
 ) -> Float[Tensor, " B"]:
-    energies = energy(residual / d.unsqueeze(-2), kappa.unsqueeze(-2))
+    energies = energy_value(residual / d.unsqueeze(-2), kappa.unsqueeze(-2))
     value = (energies if problem.weight is None else problem.weight * energies).sum((-2, -1))
     value = value + _prior_value(problem, theta)
     if penalty is not None and constraint is not None:

@@ -31,7 +31,7 @@ from mkc_torch._commands.diagnosis_files import (
     diagnose_file,
     simulation_of,
 )
-from mkc_torch._commands.processes import cores, in_processes
+from mkc_torch._commands.processes import in_processes, keep_memory
 from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
 
 
@@ -85,8 +85,8 @@ def diagnose(
     )
     refuse_same_names(recordings)
     _refuse_unusable(request)
-    # threads of processes that share the cores stall; one recording has them to itself
-    torch.set_num_threads(cores() if len(recordings) == 1 else 1)
+    torch.set_num_threads(1)  # the tensors of a recording are too small to share, and processes leave no cores
+    keep_memory()
     look = Look.of(out())
     work = partial(_diagnosed, output, request, look)
     total = failed = 0

@@ -192,7 +192,8 @@ class _Pool:
         if self._workers <= 1:
             return map
         # children read it when they start: one thread each, so that they do not fight over the cores
-        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+            os.environ.setdefault(name, "1")
         # torch's threads do not survive a fork
         context = multiprocessing.get_context("spawn")
         self._executor = ProcessPoolExecutor(self._workers, mp_context=context, initializer=_one_thread)

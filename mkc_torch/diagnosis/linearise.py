@@ -61,23 +61,34 @@ class Tangents:
 
 @dataclass(frozen=True)
 class Slow:
-    """Slow courses of a port's channels: tangents (N, m, k), standard deviations in each family of wander (F, k).
+    """Slow courses of a port's channels, and their standard deviations in each family of wander (F, k).
 
-    ``pointwise`` is that of the port, (N, m, channels); None where it has none.
+    ``tangents`` are those of each course of each channel, (N, m, k), or, where the port is ``pointwise``, those of the
+    channels, (N, m, c), which the courses modulate.
     """
 
     port: str
     channels: int
     tangents: Tensor
+    pointwise: bool
     scales: Tensor
-    pointwise: Tensor | None
+
+    @property
+    def count(self) -> int:
+        """Courses of each channel."""
+        return self.scales.shape[1] // self.channels
 
     def transformed(self, counts: Float[Tensor, "N m"], kept: int) -> Float[Tensor, "K m k"]:
         """The K slowest cosine coefficients of the tangents, where residuals count."""
-        if self.pointwise is None:
-            return dct(counts.unsqueeze(-1) * self.tangents, kept)
-        courses = self.tangents.shape[-1] // self.channels
-        return dct_of_courses(counts.unsqueeze(-1) * self.pointwise, courses, kept)
+        moved = counts.unsqueeze(-1) * self.tangents
+        return dct_of_courses(moved, self.count, kept) if self.pointwise else dct(moved, kept)
+
+    def course(self, amplitudes: Float[Tensor, " k"]) -> Float[Tensor, "N m"]:
+        """What courses of these amplitudes add to the residual."""
+        if not self.pointwise:
+            return self.tangents @ amplitudes
+        wander = cosines(self.count, len(self.tangents)) @ amplitudes.unflatten(0, (-1, self.channels))
+        return torch.einsum("nmc,nc->nm", self.tangents, wander)
 
     def with_shares(self, shares: Float[Tensor, " c"]) -> Slow:
         """The same with so many times the variance in each channel."""
@@ -125,13 +136,15 @@ def _slow_courses(model: JointModel, parameters: Tensor, pointwise: dict[str, Te
         return None
     name = wandering[0]
     c = len(model.prepared.ports[name].channels)
+    k = torch.arange(1, count + 1, dtype=parameters.dtype).repeat_interleave(c)
+    scales = torch.stack([1.0 / k, *((1.0 + (k / corner).square()).rsqrt() for corner in CORNERS)])
+    known = pointwise[name]
+    if known is not None:
+        return Slow(name, c, known, True, scales)
     courses = cosines(count, N)
     eye = torch.eye(c, dtype=courses.dtype)
     spread = (courses[:, None, :, None] * eye[:, None, :]).reshape(N, c, count * c)
-    k = torch.arange(1, count + 1, dtype=courses.dtype).repeat_interleave(c)
-    scales = torch.stack([1.0 / k, *((1.0 + (k / corner).square()).rsqrt() for corner in CORNERS)])
-    moved = through_port(model, parameters, name, spread, pointwise[name])
-    return Slow(name, c, moved, scales, pointwise[name])
+    return Slow(name, c, through_port(model, parameters, name, spread, None), False, scales)
 
 
 @dataclass(frozen=True)
@@ -222,7 +235,7 @@ def linearise(
         return found
     block = counts.unsqueeze(-1) * pointwise
     # the wander is drawn for itself
-    beside = pseudo - counts * (slow.tangents @ found.search.courses(found.series))
+    beside = pseudo - counts * slow.course(found.search.courses(found.series))
     if not enters_at_port(beside, block):
         return found
     return replace(found, entrance=(block, port_colour(beside, block)))

@@ -63,7 +63,7 @@ def beside_wander(fit: FittedModel, model: JointModel, parameters: Float[Tensor,
     noise = linearise(model, parameters, values, counts, tangents.bare, white=True)
     family = noise.search.noise_fit(noise.series).family
     for _ in range(_ROUNDS):
-        course = slow.tangents @ noise.search.courses(noise.series)
+        course = slow.course(noise.search.courses(noise.series))
         quick = fit.residual - course
         density = fit_density(quick, bound=fit.bound)
         before = counts

@@ -13,6 +13,7 @@ from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -88,7 +89,7 @@ class LinearSearch:
         self._dof = nuisance.shape[0] - nuisance.shape[1]
         self._wander = wander
         self._wander_basis = self._basis.mT @ wander
-        gram = wander.mT @ wander - self._wander_basis.mT @ self._wander_basis
+        gram = _gram(wander) - _gram(self._wander_basis)
         self._families = [_family(gram, scale) for scale in scales] if wander.shape[1] else []
         self._try(candidates)
 
@@ -335,9 +336,16 @@ class NoiseFit:
     gain: float
 
 
+# Of hundreds of courses NumPy's BLAS takes half the time that torch's does on half of today's processors.
+def _gram(columns: Float[Tensor, "M k"]) -> Float[Tensor, "k k"]:
+    """Inner products; NumPy sees that it is one matrix, and makes half of them."""
+    known = columns.numpy()
+    return torch.from_numpy(known.T @ known)
+
+
 def _family(gram: Tensor, scale: Tensor) -> _Wander:
-    strength, axes = torch.linalg.eigh(scale.unsqueeze(-1) * gram.double() * scale)
-    strength = strength.clamp(min=0.0)
+    values, vectors = np.linalg.eigh((scale.unsqueeze(-1) * gram.double() * scale).numpy())
+    strength, axes = torch.from_numpy(values).clamp(min=0.0), torch.from_numpy(vectors)
     sizes = torch.cat([strength.new_zeros(1), torch.logspace(-0.5, 5.0, _SIZES, dtype=torch.float64) / strength[-1]])
     return _Wander(scale, axes, strength, sizes)
 

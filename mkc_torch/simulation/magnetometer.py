@@ -141,19 +141,20 @@ class _View:
         """Calibration matrix of the parameters."""
         return _MATRIX_OF_VIEW[self.view](theta)
 
-    def corrected(self, theta: Float[Tensor, " p"], sensor: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    def corrected(self, theta: Float[Tensor, " p"], sensor: Tensor | float) -> Float[Tensor, "N 3"]:
         """The calibrated field, once ``sensor`` is taken off the measurement."""
         return (self.measured - sensor - theta[:3]) @ self.matrix(theta).mT
 
-    def _sensor_change(self, theta: Tensor, changes: Changes) -> Tensor:
+    # a constant beside what is differentiated costs forward mode as much as all the rest: nothing stays the number 0
+    def _sensor_change(self, theta: Tensor, changes: Changes) -> Tensor | float:
         if "sensor" not in changes:
-            return self.measured.new_zeros(())
+            return 0.0
         change = changes["sensor"]
         return change(torch.zeros_like(self.measured) if isinstance(change, FreeChange) else self.simulated(theta))
 
-    def _field_change(self, changes: Changes) -> Tensor:
-        nothing = self.measured.new_zeros(1, len(self.ports["field"].channels))
-        return changes["field"](self.measured.new_zeros(len(self.measured), 0)) if "field" in changes else nothing
+    def _field_change(self, changes: Changes) -> Tensor | float:
+        """What is added to the field, (N, channels of the port)."""
+        return changes["field"](self.measured.new_zeros(len(self.measured), 0)) if "field" in changes else 0.0
 
     def _ellipsoid(self, rows: Tensor | None) -> EllipsoidFit:
         points = self.measured if rows is None else self.measured[rows]
@@ -192,8 +193,8 @@ class NormView(_View):
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 1"]:
         away = self.measured - self._sensor_change(theta, changes) - theta[:3]
         length, outward = self._length(theta, away.mT)
-        distance = length - self.strength - self._field_change(changes).squeeze(-1)
-        return (distance * length / _length(outward)).unsqueeze(-1)
+        distance = (length - self.strength).unsqueeze(-1) - self._field_change(changes)
+        return distance * (length / _length(outward)).unsqueeze(-1)
 
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
         away = (self.measured - theta[:3]).mT
@@ -244,7 +245,7 @@ class AttitudeView(_View):
         self._to_frame = self._frame @ self.to_world @ self._unbent
         self._from_world = self.to_world.movedim(1, 0).flatten(1).contiguous()
         self._full = torch.cat([offset, response.flatten(), offset.new_zeros(2)])
-        self.warnings = _turned_too_little(self.corrected(self._full, offset.new_zeros(3)))
+        self.warnings = _turned_too_little(self.corrected(self._full, 0.0))
 
     def ambient(self, theta: Float[Tensor, " p"]) -> Float[Tensor, " 3"]:
         """The world's field."""
@@ -275,7 +276,9 @@ class AttitudeView(_View):
         # the simulated vector, not the measured one, goes through the matrix: the noise of what a matrix is fitted to
         # would shrink it. A fixed matrix takes the difference back into the world.
         left = self.measured - self._sensor_change(theta, changes) - theta[:3] - self.simulated(theta)
-        return torch.einsum("kij,kj->ki", self._to_frame, left) - self._field_change(changes) @ self._frame.mT
+        residual = torch.einsum("kij,kj->ki", self._to_frame, left)
+        added = self._field_change(changes)
+        return residual - added @ self._frame.mT if isinstance(added, Tensor) else residual
 
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
         field = (self.ambient(theta) @ self._from_world).unflatten(0, (-1, 3))
