@@ -20,7 +20,7 @@ def main() -> None:
     if missing is not None:
         sys.exit(f'mkc: {missing} is not installed; install the command line with `pip install "mkc-torch[cli]"`.')
     from mkc_torch._commands import app
-    from mkc_torch._commands.processes import keep_modules
+    from mkc_torch._processes import keep_modules
 
     keep_modules()
     for stream in (sys.stdout, sys.stderr):

@@ -16,7 +16,7 @@ from rich.text import Text
 from mkc_torch._commands.apply import correct, read_correction
 from mkc_torch._commands.console import FAILURES, Look, complain, out, progress
 from mkc_torch._commands.diagnosis_files import Request, diagnose_file, named_simulation
-from mkc_torch._commands.processes import cores
+from mkc_torch._processes import cores, keep_memory
 from mkc_torch.recording import Recording
 
 if TYPE_CHECKING:
@@ -75,6 +75,7 @@ def challenge(
         raise typer.BadParameter("--cases and --empty are both 0; ask for one recording at least.")
     diagnose, correct_one = _JOBS[family]
     torch.set_num_threads(1)
+    keep_memory()
     try:
         with progress(cases + empty) as step:
             score = run.run_challenge(

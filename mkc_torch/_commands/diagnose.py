@@ -31,7 +31,7 @@ from mkc_torch._commands.diagnosis_files import (
     diagnose_file,
     simulation_of,
 )
-from mkc_torch._commands.processes import in_processes, keep_memory
+from mkc_torch._processes import in_processes, keep_memory
 from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
 
 

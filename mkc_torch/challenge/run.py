@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._files import claim_folder, write_atomically
+from mkc_torch._processes import keep_memory
 from mkc_torch.challenge.draws import generator
 from mkc_torch.challenge.key import Key, canonical, digest
 from mkc_torch.challenge.magnetometer import magnetometer
@@ -196,7 +197,7 @@ class _Pool:
             os.environ.setdefault(name, "1")
         # torch's threads do not survive a fork
         context = multiprocessing.get_context("spawn")
-        self._executor = ProcessPoolExecutor(self._workers, mp_context=context, initializer=_one_thread)
+        self._executor = ProcessPoolExecutor(self._workers, mp_context=context, initializer=_alone_on_its_core)
         return self._executor.map
 
     def __exit__(self, *_: object) -> None:
@@ -204,8 +205,9 @@ class _Pool:
             self._executor.shutdown(cancel_futures=True)
 
 
-def _one_thread() -> None:
+def _alone_on_its_core() -> None:
     torch.set_num_threads(1)
+    keep_memory()
 
 
 def _all(
