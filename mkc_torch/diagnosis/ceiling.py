@@ -39,6 +39,7 @@ _ALIKE = 0.02
 """Share of the loss that is not worth another column, if it is within the error."""
 
 _TINY = 1e-9
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,8 @@ class _Problem:
 
     def penalised(self, gram: Float[Tensor, "q q"], index: Tensor, strength: float) -> Float[Tensor, "q q"]:
         """Products of the tangents in ``index``, which begin with the parameters', with the penalty on them."""
-        out = gram + torch.diag(strength * self.rough[index])
+        # of two tangents that are one, rounding alone would tell what is whose
+        out = gram + torch.diag(strength * self.rough[index] + _ROUNDING * gram.diagonal())
         out[: len(self.pull), : len(self.pull)] += self.prior
         return out
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,7 +20,7 @@ from mkc_torch.simulation.between_samples import smooth_between
 from mkc_torch.simulation.first_guess import first_guess
 from mkc_torch.simulation.protocol import Changes, Clock, FreeChange, Port
 from mkc_torch.simulation.runs import experiment_runs
-from mkc_torch.simulation.trajectory import Grid, Trajectory, defect, marched, solve, stations
+from mkc_torch.simulation.trajectory import Grid, Rate, Trajectory, defect, marched, solve, stations
 from mkc_torch.simulation.undetermined import undetermined
 
 if TYPE_CHECKING:
@@ -29,6 +30,9 @@ __all__ = ["Dynamics", "DynamicsCorrection", "Parameter", "SimulationError"]
 
 _FEWEST = 3
 _FINEST = 8
+_MOST_KEPT = 1 << 22
+"""Numbers in all trajectories that are kept."""
+
 _ROUGH = 0.02
 _REVERSED = 0.05
 _WINDOW = 4
@@ -231,6 +235,7 @@ class PreparedDynamics:
         self.inputs_at_rows = inputs
         self._guess = first_guess(self, time, node_before, node_share)
         self._last: dict[int, Trajectory] = {}
+        self._solved: OrderedDict[tuple[float, float], Tensor] = OrderedDict()
         self.__dict__.pop("ports", None)  # their clock is that of the stations
 
     def _between(self, inputs: Float[Tensor, "N u"]) -> Float[Tensor, "S u"]:
@@ -408,7 +413,13 @@ class PreparedDynamics:
         begin = torch.cat([begin, begin.new_zeros(len(begin), more)], -1)
         guess = torch.cat([self._guess, self._guess.new_zeros(len(self._guess), more)], -1)
         last = self._last.get(begin.shape[1])
-        found = solve(rate, self.grid, begin, guess, last)
+        mark = self._mark(rate, begin, guess)
+        known = self._solved.get(mark)
+        if known is None or (last is not None and known is last.states):
+            found = solve(rate, self.grid, begin, guess, last)
+        else:
+            # what was found on the way of a fit is not always found again from elsewhere
+            found = solve(rate, self.grid, begin, known)
         if not found.converged and last is not None:
             found = solve(rate, self.grid, begin, guess)
         if not found.converged and last is None:
@@ -416,8 +427,19 @@ class PreparedDynamics:
             found = found if nearer is None else solve(rate, self.grid, begin, nearer)
         # a tensor of a transform must not outlive it
         if found.converged and not torch._C._functorch.is_functorch_wrapped_tensor(found.states):
-            self._last[begin.shape[1]] = replace(found, states=found.states.detach())
+            states = found.states.detach()
+            self._last[begin.shape[1]] = replace(found, states=states)
+            self._solved[mark] = states
+            self._solved.move_to_end(mark)
+            while len(self._solved) * states.numel() > _MOST_KEPT:
+                self._solved.popitem(last=False)
         return found
+
+    def _mark(self, rate: Rate, begin: Tensor, guess: Tensor) -> tuple[float, float]:
+        """Numbers by which the same equations are known again."""
+        rates = rate(self.grid.spread(guess)).detach()
+        uneven = torch.linspace(1.0, 2.0, len(rates), dtype=rates.dtype).sqrt().unsqueeze(-1)
+        return float((uneven * rates).sum()), float((uneven[: len(begin)] * begin.detach()).sum())
 
     def since_begin(self) -> Float[Tensor, " N"]:
         """Time since the beginning of each sample's run, in s."""

@@ -27,6 +27,9 @@ Rate = Callable[[Tensor], Tensor]
 """Of change of the states, (S, n) → (S, n), at the stations of a grid."""
 
 _MOST_STEPS = 30
+_STALLED = 5
+"""Steps that together do not even halve what is left lead nowhere."""
+
 _SETTLED = 1e-9
 _HALVINGS = 6
 _QUICK = 0.01
@@ -128,6 +131,7 @@ def solve(
     recurrence = _recurrence(rate, states, step, grid) if known is None else known.recurrence
     converged = False
     settled = max(_SETTLED, _DIGITS * torch.finfo(states.dtype).eps)
+    norms = [at.norm]
     for _ in range(_MOST_STEPS):
         change = recurrence.solved(torch.zeros_like(states), at.left.detach())
         size = float((change / at.scale).abs().max())
@@ -147,6 +151,9 @@ def solve(
         if after is at or (not after.norm < at.norm and size * part > _ROUNDING):
             break
         at, fresh, moved_on = after, False, True
+        norms.append(at.norm)
+        if len(norms) > _STALLED and norms[-1] > 0.5 * norms[-1 - _STALLED] and size * part > _ROUNDING:
+            break
     states, left = at.states, at.left
 
     def renewed() -> Recurrence:
@@ -264,13 +271,7 @@ class Recurrence:
 def _recurrence(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], grid: Grid) -> Recurrence:
     n = states.shape[1]
     eye = torch.eye(n, dtype=states.dtype, device=states.device)
-    at = stations(rate, states, step).detach()
-
-    def along(direction: Tensor) -> Tensor:
-        return torch.func.jvp(rate, (at,), (direction.expand_as(at),))[1]
-
-    load_forward_mode()
-    slope = torch.stack([along(direction).detach() for direction in eye], -1)
+    slope = _slopes(rate, stations(rate, states, step).detach())
     left, middle, right = _ends(slope)
     h = step.unsqueeze(-1)
     behind = -eye - h / 6.0 * (left + 4.0 * middle @ (0.5 * eye + 0.125 * h * left))
@@ -285,3 +286,35 @@ def _recurrence(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G
         carries = torch.cat([carries[:shift], carries[shift:] @ carries[:-shift]])
         shift *= 2
     return Recurrence(tuple(products), inverse)
+
+
+def _slopes(rate: Rate, at: Float[Tensor, "S n"]) -> Float[Tensor, "S n n"]:
+    """Of the rates by the states of their own station: as a constant, in reverse mode where nothing else is watched.
+
+    Forward mode computes with the zeros of every constant in the user's function, for more than all the rest. Reverse
+    mode multiplies the branch that ``torch.where`` left out by 0, so an infinite slope there asks for forward mode.
+    """
+    with torch.enable_grad():
+        given = at.requires_grad_() if not torch._C._functorch.is_functorch_wrapped_tensor(at) else at
+        rates = rate(given)
+        if not torch._C._functorch.is_functorch_wrapped_tensor(rates):
+            n = at.shape[1]
+            if not rates.requires_grad:
+                return at.new_zeros(*at.shape, n)
+            rows = [
+                torch.autograd.grad(
+                    one.sum(), given, retain_graph=k + 1 < n, allow_unused=True, materialize_grads=True
+                )[0]
+                for k, one in enumerate(rates.unbind(-1))
+            ]
+            slope = torch.stack(rows, 1)
+            if bool(slope.isfinite().all()):
+                return slope
+    load_forward_mode()
+    at = at.detach()
+
+    def along(direction: Tensor) -> Tensor:
+        return torch.func.jvp(rate, (at,), (direction.expand_as(at),))[1]
+
+    eye = torch.eye(at.shape[1], dtype=at.dtype, device=at.device)
+    return torch.stack([along(direction).detach() for direction in eye], -1)

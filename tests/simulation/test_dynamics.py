@@ -11,7 +11,7 @@ from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.model import JointModel
 from mkc_torch.diagnosis.refit import fitted
 from mkc_torch.recording import MissingColumnError
-from mkc_torch.simulation import Dynamics, Parameter, SimulationError
+from mkc_torch.simulation import Dynamics, Parameter, SimulationError, dynamics, trajectory
 from mkc_torch.simulation.dynamics import DynamicsCorrection
 
 STIFFNESS, DAMPING = 9.0, 0.15
@@ -648,3 +648,24 @@ def test_rows_that_are_not_finite_are_left_out():
     prepared = Pendulum().prepare(table(time=TIME, angle=angle))
     assert len(prepared.time) == 498
     assert "Dropped 2 of 500" in prepared.recording.warnings[0]
+
+
+def test_a_trajectory_that_was_found_is_gone_on_from(monkeypatch):
+    """What a fit reached step by step is not always reached again from another model's states."""
+    started = []
+    real = trajectory.solve
+
+    def watched(rate, grid, begin, guess, known=None):
+        started.append((guess, known))
+        return real(rate, grid, begin, guess, known)
+
+    prepared = Pendulum().prepare(table(time=TIME, angle=TRUTH[0]))
+    first, other = torch.tensor([9.0, 0.1, 0.5, 0.0]).double(), torch.tensor([4.0, 0.3, 0.2, 0.1]).double()
+    states = prepared.trajectory(first, {}).states
+    prepared.trajectory(other, {})
+    monkeypatch.setattr(dynamics, "solve", watched)
+    again = prepared.trajectory(first, {}).states
+    (guess, known), *_ = started
+    assert known is None
+    assert torch.equal(guess, states)
+    assert torch.allclose(again, states, rtol=0.0, atol=1e-9)

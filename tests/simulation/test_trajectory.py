@@ -273,6 +273,45 @@ def test_a_known_linearisation_spares_new_ones(solution):
     assert calls < fresh
 
 
+def test_a_branch_left_out_by_where_has_no_slope():
+    """An empty tank fills: at level 0 the root's slope is infinite, but what flows out there is 0."""
+    time = even(10.0, 201)
+    inflow = torch.where(time > 2.0, 0.1, 0.0)
+    grid = one(time)
+    feed = grid.spread(inflow)
+
+    def level(x):
+        out = torch.where(x[:, 0] > 0.0, torch.sqrt(x[:, 0]), 0.0)
+        return (feed - 0.05 * out).unsqueeze(-1)
+
+    found = solve(level, grid, torch.zeros(1, 1, dtype=torch.float64), torch.zeros(201, 1, dtype=torch.float64))
+    assert found.converged
+    assert bool((found.states[time < 1.9] == 0.0).all())
+    filled = solve_ivp(lambda _, h: 0.1 - 0.05 * np.sqrt(np.maximum(h, 0.0)), (2.0, 10.0), [0.0], rtol=1e-9)
+    assert found.states[-1, 0] == pytest.approx(filled.y[0, -1], rel=0.01)
+
+
+def test_the_slopes_of_a_function_with_parameters_of_its_own_leave_its_graph_whole():
+    """The user's loss can still be differentiated after the trajectory was solved with a parameter that wants it."""
+    time = even(2.0, 41)
+    theta = torch.tensor(9.0, dtype=torch.float64, requires_grad=True)
+    begin = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
+    squared = theta.square()
+
+    def swing(x):
+        return torch.stack([x[:, 1], -squared / 9.0 * torch.sin(x[:, 0])], -1)
+
+    (slope,) = torch.autograd.grad(solve(swing, one(time), begin, begin.expand(41, 2)).states[-1, 0], theta)
+
+    def end(value):
+        fixed = value**2 / 9.0
+        return solve(
+            lambda x: torch.stack([x[:, 1], -fixed * torch.sin(x[:, 0])], -1), one(time), begin, begin.expand(41, 2)
+        ).states[-1, 0]
+
+    assert slope == pytest.approx(float(end(9.0 + 1e-4) - end(9.0 - 1e-4)) / 2e-4, rel=1e-5)
+
+
 def test_single_precision():
     time = even(10.0, 401)
     expected = reference(pendulum, [1.0, 0.0], time.numpy())

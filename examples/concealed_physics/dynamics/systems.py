@@ -85,7 +85,7 @@ class Silverbox(Dynamics):
 
 
 class Servo(Dynamics):
-    """A motor behind a proportional controller, which turns a pendulum."""
+    """A motor behind a proportional controller, which turns a pendulum; while it is driven, its own field brakes it."""
 
     states = ("position", "speed")
     inputs = ("goal_position", "voltage", "kp", "torque_enable")
@@ -94,15 +94,17 @@ class Servo(Dynamics):
     starts_from = 0.1
     parameters = {
         "drive": Parameter(10.0, lower=0.0),
-        "damping": Parameter(6.0, lower=0.0, unit="1/s"),
+        "back_emf": Parameter(3.0, lower=0.0, unit="1/s"),
+        "damping": Parameter(3.0, lower=0.0, unit="1/s"),
         "gravity": Parameter(75.0, lower=0.0, unit="1/s²"),
         "gain": Parameter(0.005, lower=0.0),
     }
 
     def derivative(self, time, x, u, p):
         duty = torch.clamp(p.gain * u.kp * (u.goal_position - x.position), -1.0, 1.0) * u.torque_enable
+        braking = (p.damping + p.back_emf * u.torque_enable) * x.speed
         pull = p.gravity * torch.sin(x.position)
-        return {"position": x.speed, "speed": p.drive * duty * u.voltage - p.damping * x.speed - pull}
+        return {"position": x.speed, "speed": p.drive * duty * u.voltage - braking - pull}
 
 
 @dataclass(frozen=True)
