@@ -102,6 +102,7 @@ class Slow:
 def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Sequence[Term] = ()) -> Tangents:
     """The tangents at these parameters, by forward mode."""
     prepared = model.prepared
+    signals = model.signals(parameters)
     pointwise = {
         name: port_jacobian(model, parameters, name) if port.pointwise else None
         for name, port in prepared.ports.items()
@@ -113,7 +114,6 @@ def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Seque
         if follows_signal(term.effect):
             nuisance[..., start : start + size] *= independent[:, None]
         start += size
-    signals = model.signals(parameters)
     courses = [directions(t, t.context(prepared, signals.get(t.port))) for t in terms]
     found: list[Tensor | None] = [None] * len(terms)
     for name in prepared.ports:

@@ -413,8 +413,9 @@ class PreparedDynamics:
         begin = torch.cat([begin, begin.new_zeros(len(begin), more)], -1)
         guess = torch.cat([self._guess, self._guess.new_zeros(len(self._guess), more)], -1)
         last = self._last.get(begin.shape[1])
-        mark = self._mark(rate, begin, guess)
-        known = self._solved.get(mark)
+        transformed = torch._C._functorch.is_functorch_wrapped_tensor
+        mark = None if transformed(begin) else self._mark(rate, begin, guess)
+        known = None if mark is None else self._solved.get(mark)
         if known is None or (last is not None and known is last.states):
             found = solve(rate, self.grid, begin, guess, last)
         else:
@@ -426,7 +427,7 @@ class PreparedDynamics:
             nearer = marched(rate, self.grid, begin, guess)
             found = found if nearer is None else solve(rate, self.grid, begin, nearer)
         # a tensor of a transform must not outlive it
-        if found.converged and not torch._C._functorch.is_functorch_wrapped_tensor(found.states):
+        if found.converged and mark is not None and not transformed(found.states):
             states = found.states.detach()
             self._last[begin.shape[1]] = replace(found, states=states)
             self._solved[mark] = states

@@ -10,11 +10,13 @@ parameters and inputs come with the last step, and a guess from measured states 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack
 
 from mkc_torch.nonlinear import load_forward_mode
 
@@ -155,11 +157,14 @@ def solve(
         if len(norms) > _STALLED and norms[-1] > 0.5 * norms[-1 - _STALLED] and size * part > _ROUNDING:
             break
     states, left = at.states, at.left
+    transformed = any(torch._C._functorch.is_functorch_wrapped_tensor(one) for one in (left, begin))
 
     def renewed() -> Recurrence:
-        return _recurrence(rate, states, step, grid)
+        # nothing here is of a transform that this is asked for in, and in one it would cost ten times as much
+        with nullcontext() if transformed else temporarily_clear_interpreter_stack():
+            return _recurrence(rate, states, step, grid)
 
-    if any(torch._C._functorch.is_functorch_wrapped_tensor(one) or one.requires_grad for one in (left, begin)):
+    if transformed or any(one.requires_grad for one in (left, begin)):
         # outside of the transform it is the same, and cheaper
         recurrence = renewed() if known is None or moved_on else known.renewed()
     # one more step, whose value is that of rounding and whose derivative is that of the solution
