@@ -33,7 +33,9 @@ _SHORT_LIST = 6
 _PARTS, _BETTER = 2, 0.8
 _KEPT = 0.8
 _ROUNDS = 3
-_LEADING = 2
+_LEADING, _THIRD, _MUCH = 2, 0.6, 50.0
+"""Fits whose shapes are tried; a third one, where it has this share of the first one's score and as many nats."""
+
 _SHAPES = 5
 _RAW = 1000.0
 _OVERWHELMING = 150.0
@@ -207,7 +209,9 @@ def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *
             [one for start in _part_starts(base, least) for one in _short_list(base, terms, [start], 2, likeliest)],
             prefer,
         )
-    leading = sorted(fits.values(), key=lambda fit: _score(fit, base, prefer), reverse=True)[:_LEADING]
+    leading = sorted(fits.values(), key=lambda fit: _score(fit, base, prefer), reverse=True)[: _LEADING + 1]
+    least = max(_THIRD * _score(leading[0], base, prefer), _MUCH)
+    leading = [fit for place, fit in enumerate(leading) if place < _LEADING or _score(fit, base, prefer) > least]
     order = [terms[number] for number in likeliest.argsort().tolist()]
     shaped = [_refined(_best_shape(fit, base, order, prefer), base) for fit in leading]
     return max(shaped, key=lambda fit: _score(fit, base, prefer))

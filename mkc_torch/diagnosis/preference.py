@@ -21,8 +21,11 @@ __all__ = ["ALIKE_COLUMNS", "UNKNOWN", "Preference", "alike"]
 UNKNOWN = "unknown"
 """Id of the effect that is a curve, not physics."""
 
-NAMELESS = (10.0, 0.25)
-"""A curve without a name can follow any named effect a little better: nats, and share of its gain, that it gives."""
+NAMELESS, OVER_DRIVER, OVER_MOTION = 10.0, 0.25, 0.5
+"""A curve without a name can follow any named effect a little better: nats, and shares of its gain, that it gives.
+
+Of the motion itself all forces are functions, and it repeats itself: there a curve follows them more closely.
+"""
 
 ROLELESS, FOLLOWER, ALIKE_COLUMNS = 0.3, 0.95, 0.9
 """A column of unknown role may be a consequence of a known driver; the second share holds above this correlation."""
@@ -49,7 +52,9 @@ class Preference:
 
     def handicap(self, term: Term, gain: float) -> float:
         """What a candidate's gain is lessened by before it is compared with others."""
-        fixed, share = NAMELESS if term.effect.id == UNKNOWN else (0.0, 0.0)
+        fixed = share = 0.0
+        if term.effect.id == UNKNOWN:
+            fixed, share = NAMELESS, OVER_MOTION if term.driver is None else OVER_DRIVER
         if term.driver is not None and term.driver.role == ANY:
             share += FOLLOWER if self._alike(term.driver.values[:, 0]) > ALIKE_COLUMNS else ROLELESS
         elif term.driver is None and isinstance(term.effect, GainEffect) and not follows_signal(term.effect):
