@@ -49,3 +49,14 @@ def test_nothing_is_found_on_a_heavy_ball(loaded):
     assert proof.diagnosis.verdict == "adequate"
     before, after = proof.mean_absolute(proof.time - proof.time[0] > 1.0)
     assert before == pytest.approx(after)
+
+
+def test_a_lag_of_the_heaters_sensors_is_not_taken_for_a_curve_without_a_name(loaded):
+    """A curve over the temperature gains more on the run it is fitted to, and is 4 °C worse than nothing on the other."""
+    shared_data("dynamics/heaters/run_1s.csv")
+    case = loaded("systems").heaters(shared_data("dynamics"))
+    (proof,) = loaded("held_out").prove(case.system, case.train, list(case.tests.values()), max_findings=1)
+    assert [finding.effect for finding in proof.diagnosis.findings] == ["sensor_lag"]
+    before, after = proof.root_mean_square()
+    assert before > 1.5
+    assert after < 0.9
