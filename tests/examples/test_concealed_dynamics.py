@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from mkc_torch import Recording
 from tests.shared_data import shared_data
@@ -51,8 +52,19 @@ def test_nothing_is_found_on_a_heavy_ball(loaded):
     assert before == pytest.approx(after)
 
 
+def test_the_number_of_the_run_is_no_output(loaded):
+    """Runs of one table come back with their numbers, which are always right."""
+    one, other = drops("Whiffle_Ball_1")
+    both = Recording(
+        {name: torch.cat([one[name], other[name]]) for name in ("time", "height")}
+        | {"experiment": torch.cat([torch.zeros(len(one)), torch.ones(len(other))])}
+    )
+    (proof,) = loaded("held_out").prove(loaded("falling_balls").Ball(), both, [both], max_findings=0)
+    assert proof.measured.shape == (len(both), 1)
+
+
 def test_a_lag_of_the_heaters_sensors_is_not_taken_for_a_curve_without_a_name(loaded):
-    """A curve over the temperature gains more on the run it is fitted to, and is 4 °C worse than nothing on the other."""
+    """A curve over the temperature gains more on the run it is fitted to, and makes the other one 4 °C worse."""
     shared_data("dynamics/heaters/run_1s.csv")
     case = loaded("systems").heaters(shared_data("dynamics"))
     (proof,) = loaded("held_out").prove(case.system, case.train, list(case.tests.values()), max_findings=1)

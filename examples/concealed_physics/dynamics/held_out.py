@@ -47,7 +47,7 @@ def prove(system: Dynamics, train: Recording, tests: Sequence[Recording], *, max
     proofs = []
     for test in tests:
         columns, plain = found.model(test), naive.model(test)
-        names = [name for name in columns if name != "time"]
+        names = [name for name in columns if name not in ("time", "experiment")]
         before, after = (torch.stack([one[name] for name in names], -1) for one in (plain, columns))
         proofs.append(Proof(found, columns["time"], test.stack(*names), before, after))
     return proofs
