@@ -210,8 +210,8 @@ def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *
             prefer,
         )
     leading = sorted(fits.values(), key=lambda fit: _score(fit, base, prefer), reverse=True)[: _LEADING + 1]
-    least = max(_THIRD * _score(leading[0], base, prefer), _MUCH)
-    leading = [fit for place, fit in enumerate(leading) if place < _LEADING or _score(fit, base, prefer) > least]
+    close = max(_THIRD * _score(leading[0], base, prefer), _MUCH)
+    leading = [fit for place, fit in enumerate(leading) if place < _LEADING or _score(fit, base, prefer) > close]
     order = [terms[number] for number in likeliest.argsort().tolist()]
     shaped = [_refined(_best_shape(fit, base, order, prefer), base) for fit in leading]
     return max(shaped, key=lambda fit: _score(fit, base, prefer))
