@@ -49,7 +49,7 @@ class Located:
     Attributes:
         term: the strongest candidate, at its best shape.
         fit: the joint refit with it.
-        p_value: after the whole search.
+        p_value: after the whole search, and no less than the candidate's own.
         beyond: nats by which it is rarer, by itself, than the strongest of the draws.
         ranking: for each candidate physics its best shape, gain in nats, and nats behind the first; best first.
         noise: the wander of the noise without the candidate.
@@ -131,6 +131,9 @@ def locate(
         least = _KEPT * _score(best, base, prefer) if tangents.slow is None else 0.0
         if _score(other, base, prefer) > max(least, 0.0):
             best = other
+    if p_value <= level:
+        # it was another candidate that no draw came up to, if this one by itself is nothing out of the ordinary
+        p_value = max(p_value, float(found.log_p[terms.index(best.model.terms[-1]), 0].exp()))
     if p_value <= level:
         best = _refined(best, base, again=True)
     return Located(best.model.terms[-1], best, p_value, beyond, ranking, noise, linearised, tangents, terms)
