@@ -37,8 +37,8 @@ def cores() -> int:
 def keep_memory() -> None:
     """Have the C library keep the memory of tensors that are gone, where it is glibc.
 
-    It gives that of each large tensor back to the system at once, which clears its pages for the next one: a tenth of a
-    diagnosis.
+    It gives that of each large tensor back to the system at once, which clears its pages for the next one: some 7 % of
+    a diagnosis.
     """
     with suppress(OSError, AttributeError, TypeError):
         library = ctypes.CDLL(None)
@@ -53,7 +53,7 @@ _KEPT = ((-3, 1 << 28), (-1, 1 << 30), (-2, 1 << 26))
 def keep_modules() -> None:
     """Have the collector of a process that is ours pass over what has been imported, also when the process ends.
 
-    It would look at torch's millions of objects several times over: a second or two of each command.
+    It would look at all of torch's objects several times over; at the end alone that is up to a second.
     """
     gc.freeze()
     gc.set_threshold(50_000)

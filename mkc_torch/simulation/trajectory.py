@@ -160,7 +160,7 @@ def solve(
     transformed = any(torch._C._functorch.is_functorch_wrapped_tensor(one) for one in (left, begin))
 
     def renewed() -> Recurrence:
-        # nothing here is of a transform that this is asked for in, and in one it would cost ten times as much
+        # nothing here is of a transform that this is asked for in, and in one it would be forward mode again
         with nullcontext() if transformed else temporarily_clear_interpreter_stack():
             return _recurrence(rate, states, step, grid)
 
