@@ -22,6 +22,10 @@ __all__ = ["Local", "beside_wander"]
 
 _ROUNDS = 4
 _NEAR = 3.0
+_FAR = 2.6
+"""Robust scales beyond which what is left beside the wander does not count. Where outliers five scales away are many,
+the likeliest density is so wide that most of them would, and in bursts of one sign they pass for a wander."""
+
 _SETTLED = 5e-3
 """Share of the residuals that may still come to count or cease to."""
 
@@ -68,6 +72,8 @@ def beside_wander(fit: FittedModel, model: JointModel, parameters: Float[Tensor,
         density = fit_density(quick, bound=fit.bound)
         before = counts
         values, counts = pseudo_residual(quick, density.sigma, density.d)
+        near = (quick.abs() <= _FAR * robust_scale(quick)).to(quick.dtype)
+        values, counts = values * near, counts * near
         values = values + counts * course
         if float((counts != before).double().mean()) < _SETTLED:
             break

@@ -127,8 +127,10 @@ def locate(
     if p_value <= level and first.key != best.model.terms[-1].key:
         other = _refitted(best, base, first, linearised, ranking[0].number)
         # the search is linear: where the joint fit loses much of the gain, it went too far; but where noise may wander,
-        # what follows the wander gains most in joint fits, and the search knows better
-        least = _KEPT * _score(best, base, prefer) if tangents.slow is None else 0.0
+        # what follows the wander gains most in joint fits, and the search knows better if it tells the two apart
+        behind = [one.gap for one in ranking if terms[one.number].key == best.model.terms[-1].key]
+        clear = tangents.slow is not None and not (behind and behind[0] < SEPARABLE)
+        least = 0.0 if clear else _KEPT * _score(best, base, prefer)
         if _score(other, base, prefer) > max(least, 0.0):
             best = other
     if p_value <= level:
