@@ -109,6 +109,17 @@ def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Seque
     }
     independent = parameters.new_tensor([float(one) for one in prepared.independent])
     nuisance = torch.func.jacfwd(model.residual)(parameters)
+    if not bool(nuisance.isfinite().all()):
+        effects = [
+            f"the size of {t.effect.id}" for t, n in zip(model.terms, model.sizes, strict=True) for _ in range(n)
+        ]
+        finite = nuisance.isfinite().flatten(0, 1).all(0).tolist()
+        names = zip((*prepared.parameter_names, *effects), finite, strict=True)
+        lost = dict.fromkeys(name for name, known in names if not known)
+        raise ValueError(
+            f"The simulation's outputs have no finite slope by {', '.join(lost)} at the fitted values. Bound "
+            "these parameters, or start them elsewhere."
+        )
     start = model.base
     for term, size in zip(model.terms, model.sizes, strict=True):
         if follows_signal(term.effect):
@@ -123,7 +134,9 @@ def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Seque
         joined = torch.cat([courses[i] for i in members], -1)
         moved = through_port(model, parameters, name, joined, pointwise[name])
         for i, part in zip(members, moved.split([courses[i].shape[-1] for i in members], -1), strict=True):
-            found[i] = independent[:, None] * part if follows_signal(terms[i].effect) else part
+            part = independent[:, None] * part if follows_signal(terms[i].effect) else part
+            # one that has no slope here is none that could be named
+            found[i] = part if bool(part.isfinite().all()) else torch.zeros_like(part)
     slow = _slow_courses(model, parameters, pointwise)
     return Tangents(nuisance, tuple(t for t in found if t is not None), pointwise, slow)
 

@@ -131,7 +131,7 @@ def locate(
         behind = [one.gap for one in ranking if terms[one.number].key == best.model.terms[-1].key]
         clear = tangents.slow is not None and not (behind and behind[0] < SEPARABLE)
         least = 0.0 if clear else _KEPT * _score(best, base, prefer)
-        if _score(other, base, prefer) > max(least, 0.0):
+        if _score(other, base, prefer) > max(least, 0.0) and _repeats(other):
             best = other
     if p_value <= level:
         # it was another candidate that no draw came up to, if this one by itself is nothing out of the ordinary
@@ -219,7 +219,18 @@ def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *
     leading = [fit for place, fit in enumerate(leading) if place < _LEADING or _score(fit, base, prefer) > close]
     order = [terms[number] for number in likeliest.argsort().tolist()]
     shaped = [_refined(_best_shape(fit, base, order, prefer), base) for fit in leading]
+    shaped = [fit for fit in shaped if _repeats(fit)] or [fit for fit in fits.values() if _repeats(fit)]
+    if not shaped:
+        raise ValueError(
+            f"The simulation gave finite outputs while {len(fits)} effects were fitted, and gives none now at the same "
+            "parameters: it is at the edge of what can be solved. Shorten the experiments, or give a `segment`."
+        )
     return max(shaped, key=lambda fit: _score(fit, base, prefer))
+
+
+def _repeats(fit: FittedModel) -> bool:
+    """Whether the simulation is finite there once more: a trajectory found on the way of a fit may be lost again."""
+    return bool(fit.model.residual(fit.parameters).isfinite().all())
 
 
 def _refit_all(fits: dict[Key, FittedModel], base: FittedModel, listed: Sequence[Listed], prefer: Preference) -> None:
