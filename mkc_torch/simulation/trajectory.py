@@ -38,6 +38,8 @@ _QUICK = 0.01
 _ROUNDING = 1e-6
 _HORIZON, _ROUGHLY = 32, 1e-4
 _DIGITS = 100.0
+_FEW = 256
+"""Moments from which on it is cheaper to join them all at once than one half to the other."""
 
 
 @dataclass(frozen=True)
@@ -257,20 +259,40 @@ def defect(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"
 
 @dataclass(frozen=True)
 class Recurrence:
-    """The recurrence ``δ[k+1] = A[k] δ[k] − B[k] D[k]``: products of A over 1, 2, 4 … intervals, and B."""
+    """The recurrence ``δ[k+1] = A[k] δ[k] − B[k] D[k]``: its A, those of every second moment and so on, and B.
 
+    Neighbours are joined until few are left, which takes a few times the work of one step after the other; those few
+    are joined over 1, 2, 4 … intervals, which takes fewer operations.
+    """
+
+    carries: tuple[Tensor, ...]
     products: tuple[Tensor, ...]
     inverse: Tensor
 
     def solved(self, start: Float[Tensor, "G n"], defect: Float[Tensor, "G-1 n"]) -> Float[Tensor, "G n"]:
         pushed = torch.einsum("kij,kj->ki", self.inverse, defect)
-        values = start - torch.cat([torch.zeros_like(pushed[:1]), pushed])
+        return self._passed_on(start - torch.cat([torch.zeros_like(pushed[:1]), pushed]), 0)
+
+    def _passed_on(self, values: Float[Tensor, "G n"], level: int) -> Float[Tensor, "G n"]:
+        if level < len(self.carries):
+            A = self.carries[level]
+            first = values[::2]
+            second = values[1::2] + torch.einsum("kij,kj->ki", A[1::2], first[: len(values) // 2])
+            second = self._passed_on(second, level + 1)
+            later = first[1:] + torch.einsum("kij,kj->ki", A[2::2], second[: len(first) - 1])
+            return _in_turn(torch.cat([first[:1], later]), second)
         shift = 1
         for product in self.products:
             carried = torch.einsum("kij,kj->ki", product, values[:-shift])
             values = torch.cat([values[:shift], values[shift:] + carried])
             shift *= 2
         return values
+
+
+def _in_turn(first: Float[Tensor, "G n"], second: Float[Tensor, "H n"]) -> Float[Tensor, "G+H n"]:
+    """Rows of the one and of the other, in turn; the first may have one more."""
+    paired = torch.stack([first[: len(second)], second], 1).flatten(0, 1)
+    return torch.cat([paired, first[len(second) :]])
 
 
 def _recurrence(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], grid: Grid) -> Recurrence:
@@ -285,12 +307,17 @@ def _recurrence(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G
     carries = torch.where(h > 0, -inverse @ behind, 0.0)
     # the first moment has none before it
     carries = torch.cat([torch.zeros_like(carries[:1]), carries])
+    longest, levels = grid.longest, []
+    while longest > _FEW:
+        levels.append(carries)
+        carries = carries[1::2] @ carries[: len(carries) // 2 * 2 : 2]
+        longest = longest // 2 + 1
     products, shift = [], 1
-    while shift < grid.longest:
+    while shift < longest:
         products.append(carries[shift:])
         carries = torch.cat([carries[:shift], carries[shift:] @ carries[:-shift]])
         shift *= 2
-    return Recurrence(tuple(products), inverse)
+    return Recurrence(tuple(levels), tuple(products), inverse)
 
 
 def _slopes(rate: Rate, at: Float[Tensor, "S n"]) -> Float[Tensor, "S n n"]:

@@ -46,7 +46,8 @@ def undetermined(
     scaled = tangents * size
     if not bool(scaled.isfinite().all()) or scaled.shape[1] == 0:
         return ()
-    _, length, directions = torch.linalg.svd(scaled, full_matrices=True)
+    # of many rows, what spans them has the same lengths and directions
+    _, length, directions = torch.linalg.svd(torch.linalg.qr(scaled, mode="r").R, full_matrices=True)
     length = torch.cat([length, length.new_zeros(len(directions) - len(length))])
     return tuple(
         _sentence(direction, names)
