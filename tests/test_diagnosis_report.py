@@ -8,7 +8,7 @@ import torch
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
-from mkc_torch.diagnosis.result import Candidate, Extrapolation, Separability
+from mkc_torch.diagnosis.result import Candidate, Extrapolation, Region, Separability, StateMap
 from mkc_torch.report import diagnosis_wording as say
 from mkc_torch.report.diagnosis import bars, diagnosis_report, heat_map
 from tests.diagnosis.factory import CHANNELS, make_candidates, make_diagnosis, make_separability
@@ -211,6 +211,26 @@ def test_whether_a_finding_extrapolates_is_said():
     ):
         text = text_of(diagnosis_report(first_changed(diagnosis, extrapolation=Extrapolation(gain, interval))))
         assert f"beyond its range fitted where its driver is low, {told}" in text
+
+
+def test_where_in_the_states_and_in_which_experiment_is_told_and_drawn():
+    edges = tuple(torch.linspace(-1.0, 1.0, 5, dtype=torch.float64) for _ in range(2))
+    nats = torch.arange(-3.0, 13.0, dtype=torch.float64).reshape(4, 4)
+    nats[0, 0] = torch.nan
+    page = diagnosis_report(
+        first_changed(
+            make_diagnosis(1, samples=240),
+            region=Region("angle", "rad", "far from zero", 0.8, 0.91, 0.2),
+            experiments=(0.25, 0.75),
+            map=StateMap(("angle", "speed"), ("rad", "rad/s"), edges, nats),
+        )
+    )
+    text = text_of(page)
+    assert "91 % of the gain where angle is beyond ±0.800 rad, 20 % of the time" in text
+    assert "experiment 2: 75 %, experiment 1: 25 %" in text
+    assert page.count("<svg ") == page_of(1, samples=240).count("<svg ") + 1
+    assert "speed (rad/s)" in page
+    assert "Gain of finding 1 over the states" in page
 
 
 def test_drivers_that_switch_are_constant_or_missing():

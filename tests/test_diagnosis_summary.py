@@ -9,6 +9,7 @@ pytest.importorskip("rich")
 from rich.console import Console
 
 from mkc_torch._commands.diagnosis_summary import show
+from mkc_torch.diagnosis.result import Region
 from tests.diagnosis.factory import make_diagnosis
 
 
@@ -42,6 +43,15 @@ def test_a_finding_in_a_dozen_lines():
         "written out/flight_07/diagnosis.json",
     ):
         assert words in flat(text)
+
+
+def test_where_in_the_states_a_finding_lies():
+    made = make_diagnosis(1)
+    region = Region("speed", "rad/s", "near zero", 0.31, 0.82, 0.2)
+    finding = dataclasses.replace(made.findings[0], region=region, experiments=(0.9, 0.1))
+    text = flat(shown(dataclasses.replace(made, findings=(finding,))))
+    assert "mostly 82 % of the gain where speed is within ±0.310 rad/s, 20 % of the time" in text
+    assert "in experiment 1: 90 %, experiment 2: 10 %" in text
 
 
 def test_nothing_found():

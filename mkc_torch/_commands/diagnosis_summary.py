@@ -48,6 +48,10 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis) -> Iterator[tuple[str, s
         yield "size", "\n".join(lines)
     acts = f"; acts on {say.several(f.channels)}" if f.channels else ""
     yield "where", say.where(f, say.clock_of(diagnosis.traces)) + acts
+    if f.region is not None:
+        yield "mostly", say.region(f.region)
+    if f.experiments:
+        yield "in", say.experiments(f.experiments)
     yield "driven by", say.several(f.drivers) if f.drivers else "no recorded column"
     yield "how sure", f"{say.evidence(f.p_value, diagnosis.surrogates)}, after the whole search"
     if f.held_out is None:

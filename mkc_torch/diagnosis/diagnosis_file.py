@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -147,6 +148,8 @@ def _finding(finding: Finding) -> dict[str, Any]:
         ],
         "plausible": f.plausible,
         "plausibility": f.plausibility,
+        **({} if f.region is None else {"region": asdict(f.region)}),
+        **({"experiments": f.experiments} if f.experiments else {}),
     }
 
 

@@ -14,6 +14,7 @@ from mkc_torch.diagnosis.estimate import Estimate
 from mkc_torch.diagnosis.evidence import scored
 from mkc_torch.diagnosis.locate import SEPARABLE, Located
 from mkc_torch.diagnosis.model import Term, follows_signal
+from mkc_torch.diagnosis.regions import attributed, map_of, region_of, shares_of_runs
 from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter
 from mkc_torch.effects.protocol import Context, PartEffect, RelativeEffect
 from mkc_torch.effects.units import tidy
@@ -45,6 +46,7 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
     context = _context(final, term)
     channels = places_of(term, context.channels)
     plausible, told = _plausibility(term, gamma, context)
+    where = attributed(final.fit, number)
     return Finding(
         effect=term.effect.id,
         drivers=term.columns,
@@ -61,6 +63,9 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
         plausible=plausible,
         plausibility=told,
         curve=_curve(term, gamma, covariance, context),
+        region=None if where is None else region_of(where),
+        experiments=() if where is None else shares_of_runs(where),
+        map=None if where is None else map_of(where),
     )
 
 

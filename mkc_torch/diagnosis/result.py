@@ -23,8 +23,10 @@ __all__ = [
     "HeldOut",
     "Noise",
     "Parameter",
+    "Region",
     "Separability",
     "Spread",
+    "StateMap",
     "Traces",
 ]
 
@@ -92,10 +94,37 @@ class Curve:
 
 
 @dataclass(frozen=True)
+class Region:
+    """A part of a state's range in which most of a finding's gain arises, in less of the time.
+
+    ``kind`` is "below", "above", "near zero" or "far from zero", each by ``bound``, in ``unit``.
+    """
+
+    state: str
+    unit: str
+    kind: str
+    bound: float
+    share_of_gain: float
+    share_of_time: float
+
+
+@dataclass(frozen=True)
+class StateMap:
+    """A finding's gain in nats over two states: sums over cells, NaN where the recording never was."""
+
+    states: tuple[str, str]
+    units: tuple[str, ...]
+    edges: tuple[Float[Tensor, " X"], Float[Tensor, " Y"]]
+    nats: Float[Tensor, "X Y"]
+
+
+@dataclass(frozen=True)
 class Finding:
     """A piece of physics that the simulation lacks, or the effect "unknown"; see ``diagnosis.json``.
 
-    ``extrapolation`` is for the report; None where it was not asked for or cannot be told.
+    ``extrapolation`` and ``map`` are for the report; None where they were not asked for or cannot be told. ``region``
+    is None where the gain arises all over the states, or where the simulation has none; ``experiments`` has each run's
+    share of the gain, and is empty for a single run.
     """
 
     effect: str
@@ -114,6 +143,9 @@ class Finding:
     plausibility: str
     curve: Curve | None = None
     extrapolation: Extrapolation | None = None
+    region: Region | None = None
+    experiments: tuple[float, ...] = ()
+    map: StateMap | None = None
 
 
 @dataclass(frozen=True)

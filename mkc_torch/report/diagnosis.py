@@ -45,6 +45,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
     """
     d = diagnosis
     figures = [pictures.of_finding(d, i) for i in range(len(d.findings))]
+    maps = [pictures.over_states(d, i) for i in range(len(d.findings))]
     return _render(
         "diagnosis.html.j2",
         d=d,
@@ -53,6 +54,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
         clock=diagnosis_wording.clock_of(d.traces),
         time_figure=Markup(pictures.over_time(d)) if len(d.traces.time) else None,
         figures=[None if svg is None else Markup(svg) for svg in figures],
+        maps=[None if svg is None else Markup(svg) for svg in maps],
         panels=[pictures.driver_panels(d, i) for i in range(len(d.findings))],
         curve_colors=pictures.CURVE_COLORS,
         bars=bars(d.candidates),

@@ -10,6 +10,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -17,7 +18,7 @@ from mkc_torch.diagnosis.result import Curve, Diagnosis, Finding, Traces
 from mkc_torch.report.diagnosis_wording import plain
 from mkc_torch.report.pictures import _SHADE, _STYLE, BLUE, GREY, INK, ORANGE, _svg
 
-__all__ = ["CURVE_COLORS", "Panel", "driver_panels", "of_finding", "over_time"]
+__all__ = ["CURVE_COLORS", "Panel", "driver_panels", "of_finding", "over_states", "over_time"]
 
 CURVE_COLORS = (BLUE, ORANGE, "#009E73", "#A8558A", "#B58900", INK)
 _USED, _REJECTED, _DARK = "#7FB8DA", "#F2C7AA", "#9A4300"
@@ -28,6 +29,9 @@ _MOST_BINS, _FEWEST_IN_A_BIN = 60, 12
 _MOST_LEVELS = 24  # of a driver that takes few values, such as a switch
 _MOST_LETTERS = 26
 _CLOSE = 0.03  # of the axis: numbers nearer than this would overlap
+_MAP, _MAP_HEIGHT = 5.6, 3.4  # inches
+_NEVER = "#E3E3E3"
+_GAIN = LinearSegmentedColormap.from_list("gain", [ORANGE, "#FFFFFF", BLUE])
 _ROW, _LEFT, _RIGHT, _BETWEEN, _OWN_AXIS = 1.75, 0.72, 0.1, 0.3, 0.45  # inches
 # a name from a file may hold a dollar sign; a title of given height spares a layout of every panel
 _OWN_STYLE = {"text.parse_math": False, "axes.titley": 1.0, "axes.titlesize": 10.0, "axes.titlepad": 5.0}
@@ -99,6 +103,32 @@ def of_finding(diagnosis: Diagnosis, index: int) -> str | None:
             ax = grid.axes(figure, 0, 2) if beside else grid.axes(figure, 0, 0, wide=True)
             _draw_curve(ax, curve, t.has_time)
         return _svg(figure, f"finding{index + 1}", f"What finding {index + 1} is, and the residual over its drivers")
+
+
+def over_states(diagnosis: Diagnosis, index: int) -> str | None:
+    """The map of a finding's gain over two states; None where it has none."""
+    found = diagnosis.findings[index].map
+    if found is None:
+        return None
+    nats = _array(found.nats)
+    shown = np.sign(nats) * np.sqrt(np.abs(nats))  # by the root: a few cells hold most
+    limit = float(np.nanmax(np.abs(shown)))
+    with _style():
+        figure = Figure(figsize=(_MAP, _MAP_HEIGHT))
+        ax = figure.add_axes((_LEFT / _MAP, 0.5 / _MAP_HEIGHT, 0.72, 1.0 - 0.85 / _MAP_HEIGHT))
+        x, y = (_array(edge) for edge in found.edges)
+        ax.set_facecolor(_NEVER)
+        drawn = ax.pcolormesh(x, y, shown.T, cmap=_GAIN, vmin=-limit, vmax=limit, rasterized=True)
+        for axis, name, unit in zip((ax.xaxis, ax.yaxis), found.states, found.units, strict=True):
+            axis.set_label_text(_with_unit(name, unit))
+        _title(ax, "Where the gain arises")
+        beside = figure.add_axes((0.86, 0.5 / _MAP_HEIGHT, 0.025, 1.0 - 0.85 / _MAP_HEIGHT))
+        bar = figure.colorbar(drawn, cax=beside)
+        beside.set_ylim(min(0.0, float(np.nanmin(shown))), limit)
+        ticks = [tick for tick in bar.get_ticks() if beside.get_ylim()[0] <= tick <= limit]
+        bar.set_ticks(ticks, labels=[f"{np.sign(tick) * tick**2:.3g}".replace("-", "−") for tick in ticks])
+        beside.set_ylabel("nats")
+        return _svg(figure, f"map{index + 1}", f"Gain of finding {index + 1} over the states")
 
 
 def driver_panels(diagnosis: Diagnosis, index: int) -> list[Panel]:

@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.result import (
     HeldOut,
     Noise,
     Number,
+    Region,
     Traces,
 )
 from mkc_torch.report.wording import bandwidth, decimals, number, share, size
@@ -27,6 +28,7 @@ __all__ = [
     "clock_of",
     "effect_name",
     "evidence",
+    "experiments",
     "extrapolation",
     "gain",
     "headline",
@@ -40,6 +42,7 @@ __all__ = [
     "noise_parameters",
     "plain",
     "probability",
+    "region",
     "residual_sizes",
     "rivals",
     "role",
@@ -51,6 +54,7 @@ __all__ = [
 
 _FEWEST_LARGE, _MOST_SMALL = 1e6, 1e-3  # beyond these a number is written with a power of ten
 _MOST_NUMBERS = 12
+_MOST_EXPERIMENTS = 6
 _NAMES = {"coulomb": "Coulomb", "stribeck": "Stribeck", "bouc": "Bouc", "wen": "Wen", "magnus": "Magnus"}
 _POWER = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -221,6 +225,39 @@ def where(finding: Finding, clock: Clock) -> str:
     else:
         mainly = "mainly " + " and ".join(filter(None, [", ".join(each[:-1]), *each[-1:]])) if each else ""
     return ", ".join(filter(None, [begins, mainly])) or "throughout the recording"
+
+
+def region(found: Region) -> str:
+    """In which states most of the gain arises.
+
+    Example:
+        >>> region(Region("speed", "rad/s", "near zero", 0.3, 0.824, 0.2))
+        '82 % of the gain where speed is within ±0.300 rad/s, 20 % of the time'
+        >>> region(Region("level", "cm", "above", 14.23, 0.91, 0.1))
+        '91 % of the gain where level is above 14.2 cm, 10 % of the time'
+    """
+    unit = f" {found.unit}" if found.unit else ""
+    told = {
+        "below": f"below {size(found.bound)}{unit}",
+        "above": f"above {size(found.bound)}{unit}",
+        "near zero": f"within ±{size(found.bound)}{unit}",
+        "far from zero": f"beyond ±{size(found.bound)}{unit}",
+    }[found.kind]
+    gain, time = (f"{100.0 * one:.0f} %" for one in (found.share_of_gain, found.share_of_time))
+    return f"{gain} of the gain where {plain(found.state)} is {told}, {time} of the time"
+
+
+def experiments(shares: Sequence[float]) -> str:
+    """Each experiment's share of the gain, the largest first.
+
+    Example:
+        >>> experiments((0.1, 0.7, 0.2))
+        'experiment 2: 70 %, experiment 3: 20 %, experiment 1: 10 %'
+    """
+    order = sorted(range(len(shares)), key=lambda k: -shares[k])
+    told = [f"experiment {k + 1}: {number(100.0 * shares[k], 0)} %" for k in order[:_MOST_EXPERIMENTS]]
+    more = len(shares) - len(told)
+    return ", ".join(told) + (f", and {more} more" if more else "")
 
 
 def probability(value: float) -> str:

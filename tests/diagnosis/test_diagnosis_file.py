@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("jsonschema")
 
 from mkc_torch.diagnosis.diagnosis_file import DiagnosisFileError, diagnosis_to_json, json_schema, validate
-from mkc_torch.diagnosis.result import Extrapolation, HeldOut, Parameter
+from mkc_torch.diagnosis.result import Extrapolation, HeldOut, Parameter, Region
 from tests.diagnosis.factory import make_diagnosis
 
 
@@ -59,6 +59,22 @@ def test_the_ceiling_is_written_as_the_other_models_are():
 def test_what_is_for_the_report_alone_is_not_written():
     diagnosis = with_finding(make_diagnosis(1), extrapolation=Extrapolation(0.2, (0.1, 0.3)))
     assert written(diagnosis) == written(make_diagnosis(1))
+
+
+def test_the_region_and_the_experiments_are_written_where_there_are_any():
+    region = Region("level", "cm", "above", 14.2, 0.91, 0.1)
+    (finding,) = written(with_finding(make_diagnosis(1), region=region, experiments=(0.25, 0.75)))["findings"]
+    assert finding["region"] == dataclasses.asdict(region)
+    assert finding["experiments"] == [0.25, 0.75]
+    (without,) = written(make_diagnosis(1))["findings"]
+    assert "region" not in without
+    assert "experiments" not in without
+
+
+def test_a_region_of_another_kind_is_refused(content):
+    content["findings"][0]["region"] = dataclasses.asdict(Region("level", "cm", "beside", 14.2, 0.91, 0.1))
+    with pytest.raises(DiagnosisFileError, match=r"findings\.0\.region\.kind"):
+        validate(content)
 
 
 def test_numbers_round_trip_exactly():
