@@ -12,8 +12,10 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.estimate import Estimate
 from mkc_torch.diagnosis.evidence import scored
+from mkc_torch.diagnosis.formula import formulas
 from mkc_torch.diagnosis.locate import SEPARABLE, Located
 from mkc_torch.diagnosis.model import Term, follows_signal
+from mkc_torch.diagnosis.preference import UNKNOWN
 from mkc_torch.diagnosis.regions import attributed, map_of, region_of, shares_of_runs
 from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter
 from mkc_torch.effects.protocol import Context, PartEffect, RelativeEffect
@@ -47,13 +49,15 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
     channels = places_of(term, context.channels)
     plausible, told = _plausibility(term, gamma, context)
     where = attributed(final.fit, number)
+    curve = _curve(term, gamma, covariance, context)
+    told_as = formulas(curve) if term.effect.id == UNKNOWN and curve is not None else ()
     return Finding(
         effect=term.effect.id,
         drivers=term.columns,
         channels=channels,
         intervals=intervals_of(final, number),
         onset=term.shape.get("onset"),
-        equation=term.effect.equation,
+        equation="; ".join([term.effect.equation, *told_as]),
         explanation=f"{term.effect.explanation} {term.effect.advice}".strip(),
         parameters=(*parameters_of(term, gamma, covariance, context), *_shape_parameters(term, context)),
         p_value=located.p_value,
@@ -62,7 +66,7 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
         alternatives=_alternatives(located, term),
         plausible=plausible,
         plausibility=told,
-        curve=_curve(term, gamma, covariance, context),
+        curve=curve,
         region=None if where is None else region_of(where),
         experiments=() if where is None else shares_of_runs(where),
         map=None if where is None else map_of(where),

@@ -63,6 +63,7 @@ def test_a_force_that_is_in_no_catalogue_is_found_without_a_name(diagnosis):
     assert finding.held_out.rmse_before > 1.5 * NOISE
     assert finding.held_out.rmse_after < finding.held_out.rmse_before
     assert [p.name for p in finding.parameters][:1] == ["legendre_1"]
+    assert "; δ(rate of speed) = " in finding.equation
 
 
 def test_its_model_comes_back_with_the_same_curve(diagnosis):

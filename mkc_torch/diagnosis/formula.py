@@ -1,0 +1,106 @@
+"""A curve without a name as a short formula, in the units of the data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.result import Curve
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["formulas"]
+
+_MOST_TERMS, _CLOSE, _INSIDE = 3, 0.02, 0.95
+"""Terms at most; and what a formula needs: so little misfit, over the curve's size, or so many points in its band."""
+
+_EVEN: dict[str, Callable[[Tensor], Tensor]] = {"{}": lambda x: x, "{}²": torch.square, "{}³": lambda x: x**3}
+_SIGNED: dict[str, Callable[[Tensor], Tensor]] = {
+    **_EVEN, "|{}|": torch.abs, "{0} |{0}|": lambda x: x * x.abs(), "sign({})": torch.sign
+}  # fmt: skip
+_POSITIVE: dict[str, Callable[[Tensor], Tensor]] = {**_EVEN, "√{}": torch.sqrt}
+
+
+def formulas(curve: Curve) -> tuple[str, ...]:
+    """For each channel the sum of the fewest terms, beside a constant, that stays in the curve's band.
+
+    Args:
+        curve: with its 95 % band.
+
+    Returns:
+        Formulas such as ``δ(rate of speed) = 0.44 − 0.46 speed + 0.027 speed |speed| rad/s²``, and how far they are
+        from the curve, root mean square over that of the curve.
+
+    Example:
+        >>> x = torch.linspace(-2.0, 2.0, 81, dtype=torch.float64)
+        >>> value = (-0.5 * x * x.abs()).unsqueeze(-1)
+        >>> band = torch.full_like(value, 0.01)
+        >>> formulas(Curve("speed", "m/s", x, value, band, ("rate of speed",), "m/s²"))
+        ('δ(rate of speed) = −0.5 speed |speed| m/s² (0 % off)',)
+    """
+    x = curve.x
+    signed = float(x.min()) < 0.0 < float(x.max())
+    library = _SIGNED if signed else _POSITIVE if float(x.min()) >= 0.0 else _EVEN
+    columns = {name: make(x) for name, make in library.items()}
+    name = curve.driver
+    return tuple(
+        _formula(channel, name, curve.value_unit, columns, curve.value[:, k], curve.band[:, k])
+        for k, channel in enumerate(curve.channels)
+    )
+
+
+def _formula(
+    channel: str,
+    driver: str,
+    unit: str,
+    columns: dict[str, Float[Tensor, " P"]],
+    value: Float[Tensor, " P"],
+    band: Float[Tensor, " P"],
+) -> str:
+    size = value.square().mean().sqrt()
+    best: tuple[float, tuple[str, ...], Tensor] | None = None
+    for count in range(1, _MOST_TERMS + 1):
+        fits = [_fitted(names, columns, value, band) for names in combinations(columns, count)]
+        best = min(fits, key=lambda fit: fit[0])
+        _, names, coefficients = best
+        off = (_summed(names, columns, coefficients) - value).abs()
+        if float(off.square().mean().sqrt()) <= _CLOSE * float(size) or float((off <= band).double().mean()) >= _INSIDE:
+            break
+    assert best is not None
+    _, names, coefficients = best
+    off = (_summed(names, columns, coefficients) - value).square().mean().sqrt()
+    told = _told(names, coefficients, driver, float(size))
+    return (
+        f"δ({channel}) = {told}{f' {unit}' if unit else ''} ({100.0 * float(off / size.clamp(min=1e-300)):.0f} % off)"
+    )
+
+
+def _fitted(
+    names: tuple[str, ...], columns: dict[str, Tensor], value: Tensor, band: Tensor
+) -> tuple[float, tuple[str, ...], Tensor]:
+    """Weighted misfit, terms and coefficients, the constant first."""
+    weight = (band + 0.01 * value.abs().max()).clamp(min=1e-300).reciprocal().unsqueeze(-1)
+    design = torch.stack([torch.ones_like(value), *(columns[name] for name in names)], -1)
+    scale = design.abs().amax(0)
+    found = torch.linalg.lstsq(weight * design / scale, weight * value.unsqueeze(-1)).solution
+    left = weight * (design / scale @ found - value.unsqueeze(-1))
+    return float(left.square().sum()), names, found.squeeze(-1) / scale
+
+
+def _summed(names: tuple[str, ...], columns: dict[str, Tensor], coefficients: Tensor) -> Tensor:
+    return coefficients[0] + sum(c * columns[name] for c, name in zip(coefficients[1:], names, strict=True))
+
+
+def _told(names: tuple[str, ...], coefficients: Tensor, driver: str, size: float) -> str:
+    constant, *others = coefficients.tolist()
+    terms = [(c < 0, f"{abs(c):.3g} {name.format(driver)}") for c, name in zip(others, names, strict=True)]
+    if abs(constant) > 1e-3 * size:
+        terms.insert(0, (constant < 0, f"{abs(constant):.3g}"))
+    first, *rest = terms
+    start = ("−" if first[0] else "") + first[1]
+    return start + "".join(f" {'−' if negative else '+'} {text}" for negative, text in rest)
