@@ -20,6 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch.partition_of_few import few, log_partition_and_slopes
+
 if TYPE_CHECKING:
     from jaxtyping import Float
 
@@ -288,6 +290,11 @@ class _LogPartition(torch.autograd.Function):
 
     @staticmethod
     def forward(kappa: Tensor, length: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        if few(kappa, length):
+            k, reach = (one.detach().double().numpy() for one in (kappa, length))
+            found = log_partition_and_slopes(k, reach, _NODES.numpy(), _WEIGHTS.numpy(), _HEAD_TOLERANCE)
+            value, by_kappa, by_length = (torch.as_tensor(one, dtype=kappa.dtype) for one in found)
+            return value, by_kappa, by_length
         return _log_partition_and_slopes(kappa, length, energy_value)
 
     @staticmethod

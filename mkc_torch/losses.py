@@ -221,7 +221,10 @@ class MKCLoss(nn.Module):
 
     def log_normalizer(self) -> Float[Tensor, " m"]:
         """``log(d Z)`` of each channel: what the negative log-likelihood adds to the energy."""
-        kappa, d, bound = as_computed(self.kappa, self.d, self.bound)
+        return self._log_normalizer(self.kappa, self.d)
+
+    def _log_normalizer(self, kappa: Tensor, d: Tensor) -> Float[Tensor, " m"]:
+        kappa, d, bound = as_computed(kappa, d, self.bound)
         return torch.log(d) + log_partition(kappa, bound / d)
 
     def param_groups(self, **options: Any) -> list[dict[str, Any]]:
@@ -273,8 +276,9 @@ class MKCLoss(nn.Module):
             _refuse_not_finite(target, None if weight is None else counts)
         shape = [1] * error.dim()
         shape[axis] = self.num_channels
-        kappa, d = (p.to(torch.promote_types(p.dtype, error.dtype)) for p in (self.kappa, self.d))
-        norm = self.log_normalizer().to(error.dtype) if self.normalize else None
+        kappa, d = self.kappa, self.d
+        norm = self._log_normalizer(kappa, d).to(error.dtype) if self.normalize else None
+        kappa, d = (p.to(torch.promote_types(p.dtype, error.dtype)) for p in (kappa, d))
         if self.reduction == "none":
             loss = energy(error / d.view(shape), kappa.view(shape))
             if norm is not None:

@@ -1,0 +1,77 @@
+"""The normaliser of a few channels in NumPy: for so few numbers, calling torch's operations is most of their time."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float64
+    from numpy import ndarray
+
+__all__ = ["few", "log_partition_and_slopes"]
+
+_FEW = 64
+"""Channels up to which this pays."""
+
+_SERIES = tuple((-1) ** n / (math.factorial(n) * (n + 2)) for n in range(8))
+"""Of ``(1 - exp(-x) (1 + x)) / x²``, which below 0.05 keeps all digits."""
+
+
+def few(*values: Tensor) -> bool:
+    """Whether these are plain tensors of few numbers on the CPU: no transform's, and no subclass's."""
+    return all(
+        type(one) is Tensor
+        and one.device.type == "cpu"
+        and one.numel() <= _FEW
+        and not torch._C._functorch.is_functorch_wrapped_tensor(one)
+        for one in values
+    )
+
+
+def log_partition_and_slopes(
+    kappa: Float64[ndarray, "*m"],
+    length: Float64[ndarray, "*m"],
+    nodes: Float64[ndarray, " q"],
+    weights: Float64[ndarray, " q"],
+    tolerance: float,
+) -> tuple[Float64[ndarray, "*m"], Float64[ndarray, "*m"], Float64[ndarray, "*m"]]:
+    """``log Z`` and its derivatives by kappa and by length, as :func:`mkc_torch.functional.log_partition` has them.
+
+    Args:
+        kappa, length: of each channel.
+        nodes, weights: of the head's quadrature.
+        tolerance: by which the density exceeds its flat tail where the head ends.
+    """
+    positive = kappa > 1e-3
+    safe = np.where(positive, kappa, 1.0)
+    tail = np.where(positive, np.exp(-1.0 / safe), 0.0)
+    least = np.maximum(kappa, 1e-3)
+    reach = np.sqrt(-2.0 * np.log(least * np.logaddexp(0.0, 1.0 / least + math.log(tolerance))) / least)
+    end = np.clip(length, -reach, reach)[..., None]
+    share = end * weights
+    q = 0.5 * (end * nodes) ** 2
+    own = kappa[..., None]
+    x = own * q
+    density = np.exp(-_energy(q, x, own))
+    small = x < 0.05
+    direct = np.where(small, 1.0, x)
+    curve = np.where(
+        small, np.polynomial.polynomial.polyval(np.where(small, x, 0.0), _SERIES),
+        (1.0 - np.exp(-direct) * (1.0 + direct)) / direct**2,
+    )  # fmt: skip
+    z = 2.0 * length * tail + (share * (density - tail[..., None])).sum(-1)
+    slope = tail / safe**2
+    by_kappa = (2.0 * length * slope + (share * (q * q * curve * density - slope[..., None])).sum(-1)) / z
+    half = 0.5 * length * length
+    by_length = 2.0 * np.exp(-_energy(half, kappa * half, kappa)) / z
+    return np.log(z), by_kappa, by_length
+
+
+def _energy(q: ndarray, x: ndarray, kappa: ndarray) -> ndarray:
+    """``(1 - exp(-x)) / kappa`` with ``x = kappa q``; q where x is 0."""
+    return np.where(x > 0, -np.expm1(-x) / np.where(kappa > 0, kappa, 1.0), q)
