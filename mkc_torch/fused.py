@@ -24,6 +24,10 @@ _SERIES_BELOW = {torch.float32: 0.02, torch.float64: 1e-3}
 
 _LEAST = {torch.float32: 2.0**-100, torch.float64: 2.0**-800}
 
+_LARGE, _PIECE, _ROW = 1 << 19, 1 << 18, 256
+"""Elements from which a batch is worked through in pieces that stay in the cache, how many a piece has, and about how
+many channels, repeated, make a row: operations on short rows take twice as long."""
+
 _NEARLY_GAUSSIAN = 1e-2
 """Below this kappa the sums by which it moves the energy are nearly equal."""
 
@@ -86,6 +90,9 @@ class _EnergySums(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         # a power of two that small scales exactly, and at kappa = 0 leaves z^2 / 2
         positive = kappa.clamp(min=_LEAST[error.dtype])
+        if weight is None and _large(error, axis) and not (by_kappa and _nearly_gaussian(kappa)):
+            sums, pull, stretch = _in_pieces(error, positive, d)
+            return sums, pull, (0.5 * stretch - sums) / positive, -stretch / d
         z = error / _shaped(d, error.dim(), axis)
         square = z * z
         minus_x = square * _shaped(-0.5 * positive, error.dim(), axis)
@@ -159,6 +166,41 @@ class _EnergySums(torch.autograd.Function):
         if weight_t is not None:
             change = change + energy(z, own) * weight_t
         return _summed(change, ctx.axis), None, None, None
+
+
+def _large(error: Tensor, axis: int) -> bool:
+    """Whether this is a plain tensor in the memory of the CPU, rows of channels, too large for the cache."""
+    return (
+        type(error) is Tensor
+        and error.device.type == "cpu"
+        and error.numel() >= _LARGE
+        and axis == error.dim() - 1
+        and not torch._C._functorch.is_functorch_wrapped_tensor(error)
+        and error.is_contiguous()
+    )
+
+
+def _in_pieces(
+    error: Float[Tensor, "*shape"], kappa: Float[Tensor, " m"], d: Float[Tensor, " m"]
+) -> tuple[Float[Tensor, " m"], Float[Tensor, "*shape"], Float[Tensor, " m"]]:
+    """Sums of the energy, ``z exp(-x)``, and the sums of its products with z, without a batch of anything else."""
+    m = len(d)
+    pull = torch.empty_like(error)
+    rows, out = error.view(-1, m), pull.view(-1, m)
+    repeats = max(_ROW // m, 1)
+    whole = len(rows) // repeats * repeats
+    value, stretch = kappa.new_zeros(m, dtype=torch.float64), kappa.new_zeros(m, dtype=torch.float64)
+    for part, into, r in ((rows[:whole], out[:whole], repeats), (rows[whole:], out[whole:], 1)):
+        scale, half = d.repeat(r), (-0.5 * kappa).repeat(r)
+        wide, into = part.view(-1, r * m), into.view(-1, r * m)
+        size = max(_PIECE // (r * m), 1)
+        for piece, pulled in zip(wide.split(size), into.split(size), strict=True):
+            z = piece / scale
+            minus = (z * z).mul_(half).clamp_(min=-1e4).expm1_()
+            value += minus.sum(0).double().view(r, m).sum(0)
+            torch.mul(z, minus.add_(1.0), out=pulled)
+            stretch += z.mul_(pulled).sum(0).double().view(r, m).sum(0)
+    return (-value / kappa).to(kappa.dtype), pull, stretch.to(kappa.dtype)
 
 
 def _nearly_gaussian(kappa: Tensor) -> bool:

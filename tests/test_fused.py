@@ -1,10 +1,12 @@
 """The summed energy against the plain formula: value, first and second gradients, forward mode, vmap, any layout."""
 
+import math
+
 import pytest
 import torch
 
 from mkc_torch.functional import energy
-from mkc_torch.fused import energy_sums
+from mkc_torch.fused import _LARGE, energy_sums
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
 
@@ -136,3 +138,32 @@ def test_without_a_gradient_the_value_is_the_same():
     with torch.no_grad():
         quiet = energy_sums(error, KAPPA, D)
     torch.testing.assert_close(quiet, energy_sums(error.requires_grad_(), KAPPA, D).detach())
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4, 700])
+@pytest.mark.parametrize("learned", [True, False])
+def test_large_batches_in_pieces_are_those_in_one(channels, learned, monkeypatch):
+    rows = _LARGE // channels + 5  # not a whole number of pieces, nor of long rows
+    generator = torch.Generator().manual_seed(0)
+    error = 3.0 * torch.randn(rows, channels, generator=generator, dtype=torch.float64)
+    kappa = torch.linspace(0.02, 2.0, channels, dtype=torch.float64)
+    d = torch.linspace(0.5, 1.5, channels, dtype=torch.float64)
+
+    def found():
+        inputs = [error.clone().requires_grad_(), *(one.clone().requires_grad_(learned) for one in (kappa, d))]
+        sums = energy_sums(*inputs)
+        wanted = [one for one in inputs if one.requires_grad]
+        return [sums.detach(), *torch.autograd.grad(sums.square().sum(), wanted)]
+
+    pieces = found()
+    monkeypatch.setattr("mkc_torch.fused._LARGE", math.inf)
+    for one, other in zip(pieces, found(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-8)
+
+
+def test_a_gaussian_in_pieces_is_half_the_squares():
+    error = torch.randn(_LARGE // 2 + 1, 2, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    sums = energy_sums(error, torch.zeros(2), torch.ones(2))
+    torch.testing.assert_close(sums, 0.5 * error.detach().square().sum(0), rtol=1e-5, atol=0.0)
+    (gradient,) = torch.autograd.grad(sums.sum(), error)
+    torch.testing.assert_close(gradient, error.detach())
