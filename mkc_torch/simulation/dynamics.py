@@ -297,6 +297,8 @@ class PreparedDynamics:
             parts["deflection"] = positions[0]
         if positions and positions[0].lower().split("_")[0] in _HEIGHTS:
             parts["height"] = positions[0]
+        if positions or not self._unit_of(state) or self._unit_of(state).endswith("/s"):
+            parts["speed"] = state
         if self._reverses(state):
             parts["reversing"] = state
         if self._unit_of(state) in ("°C", "K"):

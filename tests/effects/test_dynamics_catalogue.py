@@ -432,12 +432,12 @@ class TestNeeds:
         decay = torch.exp(-0.1 * TIME)
         places = tried(prepared(Bodies, inner=20.0 + 60.0 * decay, outer=20.0 + 20.0 * decay))
         assert places["exchange of inner and outer"] == {"coupling"}
-        assert places["rate of inner"] & set(IDS) == EVERYWHERE | {"thermal_loss"}
+        assert places["rate of inner"] & set(IDS) == {"constant_force", "linear_drag", "thermal_loss"}
 
     def test_every_need_is_a_part_that_some_port_has(self):
         known = {
             "own", "position", "angle", "deflection", "reversing", "load", "temperature", "level", "other", "rate",
-            "height", "sideways",
+            "height", "sideways", "speed",
         }  # fmt: skip
         for effect in DYNAMICS:
             assert set(effect.needs if isinstance(effect, ChoosyEffect) else ()) <= known

@@ -25,6 +25,7 @@ class QuadraticDrag(RateEffect):
     """
 
     id = "quadratic_drag"
+    needs = ("own", "speed")  # of a temperature or a level it is no physics
     gain = "drag"
     power = 2.0
     equation = "δv̇ = −γ v |v|"
