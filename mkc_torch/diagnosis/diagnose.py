@@ -16,7 +16,7 @@ from mkc_torch.diagnosis.density_check import density_warnings
 from mkc_torch.diagnosis.diagnosed_model import model_of
 from mkc_torch.diagnosis.drivers import Drivers, find_drivers
 from mkc_torch.diagnosis.estimate import Estimate, estimate
-from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
+from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out, innovation_gain
 from mkc_torch.diagnosis.extrapolation import extrapolated, extrapolation_warning
 from mkc_torch.diagnosis.findings import finding_of
 from mkc_torch.diagnosis.locate import Located, locate
@@ -120,13 +120,15 @@ def _holds(
     """Whether what was found counts.
 
     Blocks weigh samples as if their noise was white, and miss what is plain in coloured noise: of the first finding,
-    which the draws of noise have judged, they need only to lean its way. What comes after a finding also has what that
+    which the draws of noise have judged, they need only to lean its way, or to confirm it, by more than its number of
+    parameters is worth, once the noise is filtered white. What comes after a finding also has what that
     one's form left over, and they have to confirm it, or to lean its way where it is plain beyond all draws.
     """
     better = bool(after.log_likelihood.mean() > before.log_likelihood.mean())
     plain = located.beyond > _BEYOND_DOUBT
     if first:
-        return better or plain
+        price = 0.5 * located.fit.model.sizes[-1] * math.log(len(after.log_likelihood))
+        return better or plain or innovation_gain(before, after) > price
     return (better and plain) or _confirmed(before, after, blocks, seed)
 
 

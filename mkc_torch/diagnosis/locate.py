@@ -361,7 +361,7 @@ def _refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> Fi
             value = [_energy(best, base.model.with_term(shape)) for shape in shapes]
             term = shapes[min(range(len(shapes)), key=value.__getitem__)]
     moved = fitted_beside(base, base.model.with_term(term), best.parameters, graduate=False)
-    if moved.log_likelihood <= best.log_likelihood:
+    if not (moved.log_likelihood > best.log_likelihood and _repeats(moved)):
         return best
     return _refined(moved, base) if again else moved
 

@@ -19,12 +19,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Colour",
+    "autoregression",
     "autoregressive",
     "colour_of",
     "cosines",
     "dct",
     "dct_of_courses",
     "enters_at_port",
+    "filtered",
     "inverse_dct",
     "port_colour",
     "pseudo_residual",
@@ -195,6 +197,25 @@ def enters_at_port(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c
             own += float(product.sum().square() / len(product))
         lag = math.ceil(1.5 * lag)
     return through > _CLEARLY * own
+
+
+def autoregression(values: Float[Tensor, " N"]) -> Tensor:
+    """Coefficients of the autoregression of a series, of an order by BIC.
+
+    Example:
+        >>> draws = autoregressive(torch.tensor([0.8], dtype=torch.float64), 4000, 1, torch.Generator().manual_seed(0))
+        >>> autoregression(draws[:, 0])
+        tensor([0.7...], dtype=torch.float64)
+    """
+    return _levinson(_autocovariance(values.unsqueeze(-1), min(MAX_ORDER, len(values) // 10))[:, 0], len(values))
+
+
+def filtered(values: Float[Tensor, " N"], coefficients: Tensor) -> Float[Tensor, " N"]:
+    """What an autoregression does not predict from the samples before; of those before the first it knows nothing."""
+    left = values.clone()
+    for lag, coefficient in enumerate(coefficients, 1):
+        left[lag:] -= coefficient * values[:-lag]
+    return left
 
 
 def autoregressive(coefficients: Tensor, N: int, count: int, generator: torch.Generator) -> Float[Tensor, "N count"]:
