@@ -66,5 +66,8 @@ def estimate(fit: FittedModel) -> Estimate:
         parameters = parameters - step
         if model.bounds is not None:
             parameters = parameters.clamp(*model.bounds)
-        fit = replace(fit, parameters=parameters, residual=model.residual(parameters).detach())
+        residual = model.residual(parameters).detach()
+        # there may be no trajectory a step away
+        if bool(residual.isfinite().all()):
+            fit = replace(fit, parameters=parameters, residual=residual)
     return Estimate(fit, covariance, found.search.noise_fit(found.series), found)
