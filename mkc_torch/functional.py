@@ -261,7 +261,8 @@ def log_partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"
         >>> log_partition(torch.tensor(1 / 9.0).double(), torch.tensor(10.0).double()).exp()
         tensor(2.6348, dtype=torch.float64)
     """
-    kappa, length = torch.broadcast_tensors(kappa, length)
+    if kappa.shape != length.shape:
+        kappa, length = torch.broadcast_tensors(kappa, length)
     if torch.compiler.is_compiling():
         return torch.log(partition(kappa, length))
     value: Tensor = _LogPartition.apply(kappa, length)[0]  # type: ignore[no-untyped-call]

@@ -224,7 +224,9 @@ class MKCLoss(nn.Module):
         return self._log_normalizer(self.kappa, self.d)
 
     def _log_normalizer(self, kappa: Tensor, d: Tensor) -> Float[Tensor, " m"]:
-        kappa, d, bound = as_computed(kappa, d, self.bound)
+        bound = self.bound
+        if not kappa.dtype == d.dtype == bound.dtype:
+            kappa, d, bound = as_computed(kappa, d, bound)
         return torch.log(d) + log_partition(kappa, bound / d)
 
     def param_groups(self, **options: Any) -> list[dict[str, Any]]:

@@ -60,10 +60,13 @@ def log_partition_and_slopes(
     density = np.exp(-_energy(q, x, own))
     small = x < 0.05
     direct = np.where(small, 1.0, x)
-    curve = np.where(
-        small, np.polynomial.polynomial.polyval(np.where(small, x, 0.0), _SERIES),
-        (1.0 - np.exp(-direct) * (1.0 + direct)) / direct**2,
-    )  # fmt: skip
+    curve = (1.0 - np.exp(-direct) * (1.0 + direct)) / direct**2
+    if small.any():
+        near = np.where(small, x, 0.0)
+        series = _SERIES[-1]
+        for coefficient in _SERIES[-2::-1]:
+            series = coefficient + near * series
+        curve = np.where(small, series, curve)
     z = 2.0 * length * tail + (share * (density - tail[..., None])).sum(-1)
     slope = tail / safe**2
     by_kappa = (2.0 * length * slope + (share * (q * q * curve * density - slope[..., None])).sum(-1)) / z
