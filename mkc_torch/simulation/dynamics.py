@@ -297,14 +297,14 @@ class PreparedDynamics:
             parts["deflection"] = positions[0]
         if positions and positions[0].lower().split("_")[0] in _HEIGHTS:
             parts["height"] = positions[0]
-        if positions or not self._unit_of(state) or self._unit_of(state).endswith("/s"):
-            parts["speed"] = state
         if self._reverses(state):
             parts["reversing"] = state
         if self._unit_of(state) in ("°C", "K"):
             parts["temperature"] = state
-        elif not positions:
-            parts["level"] = state
+        else:
+            parts["flowing"] = state
+            if not positions:
+                parts["level"] = state
         return parts
 
     def _is_way(self, state: str) -> bool:

@@ -437,7 +437,7 @@ class TestNeeds:
     def test_every_need_is_a_part_that_some_port_has(self):
         known = {
             "own", "position", "angle", "deflection", "reversing", "load", "temperature", "level", "other", "rate",
-            "height", "sideways", "speed",
+            "height", "sideways", "flowing",
         }  # fmt: skip
         for effect in DYNAMICS:
             assert set(effect.needs if isinstance(effect, ChoosyEffect) else ()) <= known

@@ -25,7 +25,7 @@ class QuadraticDrag(RateEffect):
     """
 
     id = "quadratic_drag"
-    needs = ("own", "speed")  # of a temperature or a level it is no physics
+    needs = ("own", "flowing")  # of a temperature it is no physics
     gain = "drag"
     power = 2.0
     equation = "δv̇ = −γ v |v|"
