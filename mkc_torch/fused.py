@@ -91,7 +91,7 @@ class _EnergySums(torch.autograd.Function):
         # a power of two that small scales exactly, and at kappa = 0 leaves z^2 / 2
         positive = kappa.clamp(min=_LEAST[error.dtype])
         if weight is None and _large(error, axis) and not (by_kappa and _nearly_gaussian(kappa)):
-            sums, pull, stretch = _in_pieces(error, positive, d)
+            sums, pull, stretch = _in_pieces(error, positive, d, stretched=by_kappa or by_d)
             return sums, pull, (0.5 * stretch - sums) / positive, -stretch / d
         z = error / _shaped(d, error.dim(), axis)
         square = z * z
@@ -143,7 +143,7 @@ class _EnergySums(torch.autograd.Function):
                 *none[4:],
             )
         return (
-            pull * _shaped(grad / d, error.dim(), ctx.axis) if wants[0] else None,
+            _times(pull, grad / d, ctx.axis) if wants[0] else None,
             curve * grad if wants[1] else None,
             stretch * grad if wants[2] else None,
             *none[3:],
@@ -180,10 +180,18 @@ def _large(error: Tensor, axis: int) -> bool:
     )
 
 
+def _times(values: Float[Tensor, "*shape"], channels: Float[Tensor, " m"], axis: int) -> Float[Tensor, "*shape"]:
+    """Each channel times its number; on long rows where there are many."""
+    m, repeats = len(channels), max(_ROW // len(channels), 1)
+    if not _large(values, axis) or values.numel() % (repeats * m):
+        return values * _shaped(channels, values.dim(), axis)
+    return (values.view(-1, repeats * m) * channels.repeat(repeats)).view_as(values)
+
+
 def _in_pieces(
-    error: Float[Tensor, "*shape"], kappa: Float[Tensor, " m"], d: Float[Tensor, " m"]
+    error: Float[Tensor, "*shape"], kappa: Float[Tensor, " m"], d: Float[Tensor, " m"], *, stretched: bool
 ) -> tuple[Float[Tensor, " m"], Float[Tensor, "*shape"], Float[Tensor, " m"]]:
-    """Sums of the energy, ``z exp(-x)``, and the sums of its products with z, without a batch of anything else."""
+    """Sums of the energy, ``z exp(-x)``, and if asked the sums of its products with z; no batch of anything else."""
     m = len(d)
     pull = torch.empty_like(error)
     rows, out = error.view(-1, m), pull.view(-1, m)
@@ -199,7 +207,8 @@ def _in_pieces(
             minus = (z * z).mul_(half).clamp_(min=-1e4).expm1_()
             value += minus.sum(0).double().view(r, m).sum(0)
             torch.mul(z, minus.add_(1.0), out=pulled)
-            stretch += z.mul_(pulled).sum(0).double().view(r, m).sum(0)
+            if stretched:
+                stretch += z.mul_(pulled).sum(0).double().view(r, m).sum(0)
     return (-value / kappa).to(kappa.dtype), pull, stretch.to(kappa.dtype)
 
 
