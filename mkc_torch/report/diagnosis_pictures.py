@@ -31,7 +31,8 @@ _MOST_LETTERS = 26
 _CLOSE = 0.03  # of the axis: numbers nearer than this would overlap
 _MAP, _MAP_HEIGHT = 5.6, 3.4  # inches
 _NEVER = "#E3E3E3"
-_GAIN = LinearSegmentedColormap.from_list("gain", [ORANGE, "#FFFFFF", BLUE])
+# the pictures are transparent, so a ground of that colour would be lost
+_GAIN = LinearSegmentedColormap.from_list("gain", [ORANGE, "#FFFFFF", BLUE]).with_extremes(bad=_NEVER)
 _ROW, _LEFT, _RIGHT, _BETWEEN, _OWN_AXIS = 1.75, 0.72, 0.1, 0.3, 0.45  # inches
 # a name from a file may hold a dollar sign; a title of given height spares a layout of every panel
 _OWN_STYLE = {"text.parse_math": False, "axes.titley": 1.0, "axes.titlesize": 10.0, "axes.titlepad": 5.0}
@@ -117,7 +118,6 @@ def over_states(diagnosis: Diagnosis, index: int) -> str | None:
         figure = Figure(figsize=(_MAP, _MAP_HEIGHT))
         ax = figure.add_axes((_LEFT / _MAP, 0.5 / _MAP_HEIGHT, 0.72, 1.0 - 0.85 / _MAP_HEIGHT))
         x, y = (_array(edge) for edge in found.edges)
-        ax.set_facecolor(_NEVER)
         drawn = ax.pcolormesh(x, y, shown.T, cmap=_GAIN, vmin=-limit, vmax=limit, rasterized=True)
         for axis, name, unit in zip((ax.xaxis, ax.yaxis), found.states, found.units, strict=True):
             axis.set_label_text(_with_unit(name, unit))
