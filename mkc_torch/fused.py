@@ -7,6 +7,7 @@ than a first gradient is asked for, the same derivatives are differentiable func
 
 from __future__ import annotations
 
+from itertools import repeat
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -33,36 +34,45 @@ _NEARLY_GAUSSIAN = 1e-2
 
 
 def energy_sums(
-    error: Float[Tensor, "*shape"],
+    input: Float[Tensor, "*shape"],
     kappa: Float[Tensor, " m"],
     d: Float[Tensor, " m"],
     weight: Float[Tensor, "*shape"] | None = None,
     axis: int = -1,
+    *,
+    target: Float[Tensor, "*shape"] | None = None,
 ) -> Float[Tensor, " m"]:
     """The energy of each channel, summed over all other dimensions.
 
     Args:
-        error: errors, float32 or float64; dimension ``axis`` has the m channels.
+        input: predictions, or errors where there is no target; float32 or float64; dimension ``axis`` has the m
+            channels.
         kappa: ``1 / sigma^2 >= 0`` of each channel, of the same dtype.
         d: scale > 0 of each channel.
-        weight: non-negative, of the shape of ``error``.
+        weight: non-negative, of the shape of ``input``.
         axis: dimension of the channels.
+        target: what the predictions should be, of the shape and dtype of ``input``. A large batch of errors is then
+            never laid out.
 
     Returns:
-        ``sum(weight * energy(error / d, kappa))`` of each channel, differentiable to any order, under forward mode,
-        ``vmap`` and ``torch.compile``.
+        ``sum(weight * energy((input - target) / d, kappa))`` of each channel, differentiable to any order, under
+        forward mode, ``vmap`` and ``torch.compile``.
 
     Example:
         >>> energy_sums(torch.tensor([[1.0, 0.0], [3.0, 2.0]]), torch.zeros(2), torch.ones(2))
         tensor([5., 2.])
     """
-    axis = axis % error.dim()
+    axis = axis % input.dim()
     if torch.compiler.is_compiling() or not torch.is_grad_enabled():
         # compiled code fuses what it is given, and without a gradient there is nothing to keep
-        return _plain(error, kappa, d, weight, axis)
+        return _plain(_error(input, target), kappa, d, weight, axis)
     wanted = (kappa.requires_grad, d.requires_grad)
-    sums: Tensor = _EnergySums.apply(error, kappa, d, weight, axis, *wanted)[0]  # type: ignore[no-untyped-call]
+    sums: Tensor = _EnergySums.apply(input, target, kappa, d, weight, axis, *wanted)[0]  # type: ignore[no-untyped-call]
     return sums
+
+
+def _error(input: Tensor, target: Tensor | None) -> Tensor:
+    return input if target is None else input - target
 
 
 def _shaped(values: Tensor, dim: int, axis: int) -> Tensor:
@@ -86,13 +96,22 @@ class _EnergySums(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        error: Tensor, kappa: Tensor, d: Tensor, weight: Tensor | None, axis: int, by_kappa: bool, by_d: bool
+        input: Tensor,
+        target: Tensor | None,
+        kappa: Tensor,
+        d: Tensor,
+        weight: Tensor | None,
+        axis: int,
+        by_kappa: bool,
+        by_d: bool,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         # a power of two that small scales exactly, and at kappa = 0 leaves z^2 / 2
-        positive = kappa.clamp(min=_LEAST[error.dtype])
-        if weight is None and _large(error, axis) and not (by_kappa and _nearly_gaussian(kappa)):
-            sums, pull, stretch = _in_pieces(error, positive, d, stretched=by_kappa or by_d)
+        positive = kappa.clamp(min=_LEAST[input.dtype])
+        plain = weight is None and _large(input, axis) and (target is None or _large(target, axis))
+        if plain and not (by_kappa and _nearly_gaussian(kappa)):
+            sums, pull, stretch = _in_pieces(input, target, positive, d, stretched=by_kappa or by_d)
             return sums, pull, (0.5 * stretch - sums) / positive, -stretch / d
+        error = _error(input, target)
         z = error / _shaped(d, error.dim(), axis)
         square = z * z
         minus_x = square * _shaped(-0.5 * positive, error.dim(), axis)
@@ -114,49 +133,61 @@ class _EnergySums(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        error, kappa, d, weight, axis, _, _ = inputs
+        input, target, kappa, d, weight, axis, _, _ = inputs
         _, pull, curve, stretch = output
         ctx.axis = axis
         ctx.mark_non_differentiable(pull, curve, stretch)
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(error, kappa, d, weight, pull, curve, stretch)
-        ctx.save_for_forward(error, kappa, d, weight)
+        ctx.save_for_backward(input, target, kappa, d, weight, pull, curve, stretch)
+        ctx.save_for_forward(input, target, kappa, d, weight)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor | None, *_: Tensor | None) -> tuple[Tensor | None, ...]:
-        error, kappa, d, weight, pull, curve, stretch = ctx.saved_tensors
-        wants = ctx.needs_input_grad
-        none = (None, None, None, None, None, None, None)
+        input, target, kappa, d, weight, pull, curve, stretch = ctx.saved_tensors
+        of_input, of_target, of_kappa, of_d, of_weight, *_ = ctx.needs_input_grad
         if grad is None:
-            return none
-        if torch.is_grad_enabled() or wants[3]:
+            return (None,) * 8
+        if torch.is_grad_enabled() or of_weight:
+            error = _error(input, target)
             own, scale = _shaped(kappa, error.dim(), ctx.axis), _shaped(d, error.dim(), ctx.axis)
             z, share = error / scale, _shaped(grad, error.dim(), ctx.axis)
             if weight is not None:
                 share = share * weight
             slope = share * energy_dz(z, own)
+            toward = slope / scale if of_input or of_target else None
             return (
-                slope / scale if wants[0] else None,
-                _summed(share * energy_dkappa(z, own), ctx.axis) if wants[1] else None,
-                -_summed(slope * z, ctx.axis) / d if wants[2] else None,
-                _shaped(grad, error.dim(), ctx.axis) * energy(z, own) if wants[3] else None,
-                *none[4:],
+                toward,
+                -toward if of_target and toward is not None else None,
+                _summed(share * energy_dkappa(z, own), ctx.axis) if of_kappa else None,
+                -_summed(slope * z, ctx.axis) / d if of_d else None,
+                _shaped(grad, error.dim(), ctx.axis) * energy(z, own) if of_weight else None,
+                None,
+                None,
+                None,
             )
+        toward = _times(pull, grad / d, ctx.axis) if of_input or of_target else None
         return (
-            _times(pull, grad / d, ctx.axis) if wants[0] else None,
-            curve * grad if wants[1] else None,
-            stretch * grad if wants[2] else None,
-            *none[3:],
+            toward,
+            -toward if of_target and toward is not None else None,
+            curve * grad if of_kappa else None,
+            stretch * grad if of_d else None,
+            None,
+            None,
+            None,
+            None,
         )
 
     @staticmethod
-    def jvp(ctx: Any, error_t: Any, kappa_t: Any, d_t: Any, weight_t: Any, *_: Any) -> tuple[Any, ...]:
-        error, kappa, d, weight = ctx.saved_tensors
+    def jvp(ctx: Any, input_t: Any, target_t: Any, kappa_t: Any, d_t: Any, weight_t: Any, *_: Any) -> tuple[Any, ...]:
+        input, target, kappa, d, weight = ctx.saved_tensors
+        error = _error(input, target)
         own, scale = _shaped(kappa, error.dim(), ctx.axis), _shaped(d, error.dim(), ctx.axis)
         z = error / scale
         change = torch.zeros_like(z)
-        if error_t is not None:
-            change = change + energy_dz(z, own) * error_t / scale
+        if input_t is not None:
+            change = change + energy_dz(z, own) * input_t / scale
+        if target_t is not None:
+            change = change - energy_dz(z, own) * target_t / scale
         if kappa_t is not None:
             change = change + energy_dkappa(z, own) * _shaped(kappa_t, error.dim(), ctx.axis)
         if d_t is not None:
@@ -168,15 +199,15 @@ class _EnergySums(torch.autograd.Function):
         return _summed(change, ctx.axis), None, None, None
 
 
-def _large(error: Tensor, axis: int) -> bool:
+def _large(values: Tensor, axis: int) -> bool:
     """Whether this is a plain tensor in the memory of the CPU, rows of channels, too large for the cache."""
     return (
-        type(error) is Tensor
-        and error.device.type == "cpu"
-        and error.numel() >= _LARGE
-        and axis == error.dim() - 1
-        and not torch._C._functorch.is_functorch_wrapped_tensor(error)
-        and error.is_contiguous()
+        type(values) is Tensor
+        and values.device.type == "cpu"
+        and values.numel() >= _LARGE
+        and axis == values.dim() - 1
+        and not torch._C._functorch.is_functorch_wrapped_tensor(values)
+        and values.is_contiguous()
     )
 
 
@@ -189,22 +220,28 @@ def _times(values: Float[Tensor, "*shape"], channels: Float[Tensor, " m"], axis:
 
 
 def _in_pieces(
-    error: Float[Tensor, "*shape"], kappa: Float[Tensor, " m"], d: Float[Tensor, " m"], *, stretched: bool
+    input: Float[Tensor, "*shape"],
+    target: Float[Tensor, "*shape"] | None,
+    kappa: Float[Tensor, " m"],
+    d: Float[Tensor, " m"],
+    *,
+    stretched: bool,
 ) -> tuple[Float[Tensor, " m"], Float[Tensor, "*shape"], Float[Tensor, " m"]]:
     """Sums of the energy, ``z exp(-x)``, and if asked the sums of its products with z; no batch of anything else."""
-    m = len(d)
-    pull = torch.empty_like(error)
-    rows, out = error.view(-1, m), pull.view(-1, m)
-    repeats = max(_ROW // m, 1)
-    whole = len(rows) // repeats * repeats
+    m, repeats = len(d), max(_ROW // len(d), 1)
+    pull = torch.empty_like(input)
+    whole = len(input.view(-1, m)) // repeats * repeats
     value, stretch = kappa.new_zeros(m, dtype=torch.float64), kappa.new_zeros(m, dtype=torch.float64)
-    for part, into, r in ((rows[:whole], out[:whole], repeats), (rows[whole:], out[whole:], 1)):
-        scale, half = d.repeat(r), (-0.5 * kappa).repeat(r)
-        wide, into = part.view(-1, r * m), into.view(-1, r * m)
-        size = max(_PIECE // (r * m), 1)
-        for piece, pulled in zip(wide.split(size), into.split(size), strict=True):
-            z = piece / scale
-            minus = (z * z).mul_(half).clamp_(min=-1e4).expm1_()
+    for r, rows in ((repeats, slice(whole)), (1, slice(whole, None))):
+        scale, half, size = d.repeat(r), (-0.5 * kappa).repeat(r), max(_PIECE // (r * m), 1)
+
+        def pieces(values: Tensor, rows: slice = rows, r: int = r, size: int = size) -> tuple[Tensor, ...]:
+            return values.view(-1, m)[rows].view(-1, r * m).split(size)
+
+        wanted = repeat(None) if target is None else pieces(target)
+        for piece, other, pulled in zip(pieces(input), wanted, pieces(pull), strict=False):
+            z = piece / scale if other is None else (piece - other).div_(scale)
+            minus = (z * z).mul_(half).expm1_()
             value += minus.sum(0).double().view(r, m).sum(0)
             torch.mul(z, minus.add_(1.0), out=pulled)
             if stretched:

@@ -270,29 +270,35 @@ class MKCLoss(nn.Module):
         axis = self._checked_axis(input, target)
         if not torch.compiler.is_compiling():
             self._watch_scale()
-        error = input.to(_at_least_float32(input)) - target.to(_at_least_float32(target))
+        dtype = torch.promote_types(_at_least_float32(input), _at_least_float32(target))
+        input, wanted = input.to(dtype), target.to(dtype)
+        error: Tensor | None = None  # of a whole batch laid out only where it is needed
         if weight is not None:
-            weight, counts = self._checked_weight(weight, error, axis)
-            error = torch.where(counts, error, 0.0)
+            weight, counts = self._checked_weight(weight, input, axis)
+            error = torch.where(counts, input - wanted, 0.0)
         if not torch.compiler.is_compiling():
             _refuse_not_finite(target, None if weight is None else counts)
-        shape = [1] * error.dim()
-        shape[axis] = self.num_channels
         kappa, d = self.kappa, self.d
-        norm = self._log_normalizer(kappa, d).to(error.dtype) if self.normalize else None
-        kappa, d = (p.to(torch.promote_types(p.dtype, error.dtype)) for p in (kappa, d))
+        norm = self._log_normalizer(kappa, d).to(dtype) if self.normalize else None
+        kappa, d = (p.to(torch.promote_types(p.dtype, dtype)) for p in (kappa, d))
         if self.reduction == "none":
+            shape = [1] * input.dim()
+            shape[axis] = self.num_channels
+            error = input - wanted if error is None else error
             loss = energy(error / d.view(shape), kappa.view(shape))
             if norm is not None:
                 loss = loss + norm.view(shape)
             return loss if weight is None else weight * loss
-        total = energy_sums(error.to(kappa.dtype), kappa, d, weight, axis).sum()
-        elements = float(error.numel()) if weight is None else weight.sum()
+        if error is None:
+            total = energy_sums(input.to(kappa.dtype), kappa, d, None, axis, target=wanted.to(kappa.dtype)).sum()
+        else:
+            total = energy_sums(error.to(kappa.dtype), kappa, d, weight, axis).sum()
+        elements = float(input.numel()) if weight is None else weight.sum()
         if norm is not None:
             if weight is None:
                 total = total + norm.sum() * (elements / self.num_channels)
             else:
-                others = [i for i in range(error.dim()) if i != axis]
+                others = [i for i in range(input.dim()) if i != axis]
                 total = total + (norm * (weight.sum(others) if others else weight)).sum()
         if self.reduction == "sum":
             return total
@@ -343,18 +349,18 @@ class MKCLoss(nn.Module):
         return axis
 
     @staticmethod
-    def _checked_weight(weight: Tensor, error: Tensor, axis: int) -> tuple[Tensor, Tensor]:
-        samples = error.shape[:axis] + error.shape[axis + 1 :]
-        if weight.shape == samples and weight.shape != error.shape:
+    def _checked_weight(weight: Tensor, input: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+        samples = input.shape[:axis] + input.shape[axis + 1 :]
+        if weight.shape == samples and weight.shape != input.shape:
             weight = weight.unsqueeze(axis)
-        elif weight.shape != error.shape:
+        elif weight.shape != input.shape:
             raise ValueError(
-                f"Expected argument `weight` of shape {tuple(error.shape)} or {tuple(samples)} "
+                f"Expected argument `weight` of shape {tuple(input.shape)} or {tuple(samples)} "
                 f"but got {tuple(weight.shape)}."
             )
-        weight = weight.expand(error.shape)
+        weight = weight.expand(input.shape)
         counts = weight if weight.dtype == torch.bool else weight != 0
-        return weight.to(error.dtype), counts
+        return weight.to(input.dtype), counts
 
     def extra_repr(self) -> str:
         learned = [n for n, p in (("sigma", self.raw_kappa), ("d", self.raw_d)) if p is not None]

@@ -102,6 +102,23 @@ def test_derivatives_of_every_kind():
     assert torch.autograd.gradgradcheck(energy_sums, (error, kappa, d, weight))
 
 
+def test_derivatives_by_prediction_and_target():
+    input, target, kappa, d = leaves(
+        randn(5, 2), randn(5, 2, seed=3), torch.tensor([0.3, 2.0]).double(), torch.tensor([1.0, 0.7]).double()
+    )
+    weight = randn(5, 2, seed=1).abs().requires_grad_()
+
+    def sums(i, t, k, s, w):
+        return energy_sums(i, k, s, w, target=t)
+
+    inputs = (input, target, kappa, d, weight)
+    torch.testing.assert_close(sums(*inputs), plain(input - target, kappa, d, weight))
+    assert torch.autograd.gradcheck(sums, inputs, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(sums, inputs)
+    by_input, by_target = torch.autograd.grad(energy_sums(input, kappa, d, target=target).sum(), (input, target))
+    torch.testing.assert_close(by_target, -by_input)
+
+
 def test_hessians_by_forward_over_reverse_and_reverse_over_reverse():
     error = randn(6, 1)
 
@@ -156,7 +173,16 @@ def test_large_batches_in_pieces_are_those_in_one(channels, learned, monkeypatch
         wanted = [one for one in inputs if one.requires_grad]
         return [sums.detach(), *torch.autograd.grad(sums.square().sum(), wanted)]
 
+    def found_of_a_target():
+        shift = randn(*error.shape, seed=2)
+        input, target = leaves(error + shift, shift)
+        sums = energy_sums(input, kappa, d, target=target)
+        return [sums.detach(), *torch.autograd.grad(sums.square().sum(), (input, target))]
+
     pieces = found()
+    total, slope, *_ = pieces
+    for one, other in zip(found_of_a_target(), (total, slope, -slope), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-8)
     monkeypatch.setattr("mkc_torch.fused._LARGE", math.inf)
     for one, other in zip(pieces, found(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-8)
