@@ -47,7 +47,7 @@ FEWEST = 40
 
 _WIDER, _NEAR = 3.0, 0.05
 
-_BEYOND_DOUBT = 40.0
+_BEYOND_DOUBT = 20.0
 """Nats beyond all draws of noise from which unseen blocks are not asked to confirm it."""
 
 _REST = 0.5

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.diagnosis.gaps import Filling, Gaps
 from mkc_torch.diagnosis.model import JointModel, Term, directions, follows_signal, port_jacobian, through_port
 from mkc_torch.diagnosis.noise import (
     Colour,
@@ -20,12 +21,12 @@ from mkc_torch.diagnosis.noise import (
     enters_at_port,
     port_colour,
 )
-from mkc_torch.diagnosis.search import LinearSearch
+from mkc_torch.diagnosis.search import Gains, LinearSearch
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Linearised", "Slow", "Tangents", "linearise", "tangents_of"]
+__all__ = ["Linearised", "Slow", "Tangents", "candidate_tangents", "linearise", "tangents_of"]
 
 SLOW_COURSES = 150
 """Cosine courses of each wandering channel: on 90 s they reach 0.8 Hz."""
@@ -35,6 +36,9 @@ CORNERS = (25.0,)
 
 
 _MOST, _MARGIN, _FEWEST = 0.9, 3.0, 1000
+
+_ALTERNATIONS = 3
+"""Between the colour, and what it says of rejected samples and of the parameters' share of the noise."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +106,6 @@ class Slow:
 def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Sequence[Term] = ()) -> Tangents:
     """The tangents at these parameters, by forward mode."""
     prepared = model.prepared
-    signals = model.signals(parameters)
     pointwise = {
         name: port_jacobian(model, parameters, name) if port.pointwise else None
         for name, port in prepared.ports.items()
@@ -125,6 +128,23 @@ def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Seque
         if follows_signal(term.effect):
             nuisance[..., start : start + size] *= independent[:, None]
         start += size
+    slow = _slow_courses(model, parameters, pointwise)
+    return Tangents(nuisance, candidate_tangents(model, parameters, terms, pointwise), pointwise, slow)
+
+
+def candidate_tangents(
+    model: JointModel, parameters: Float[Tensor, " p"], terms: Sequence[Term], pointwise: dict[str, Tensor | None]
+) -> tuple[Float[Tensor, "N m q"], ...]:
+    """Those of each candidate's γ; zeros where they are not finite.
+
+    Args:
+        model, parameters: where.
+        terms: the candidates.
+        pointwise: as :class:`Tangents` has it.
+    """
+    prepared = model.prepared
+    signals = model.signals(parameters)
+    independent = parameters.new_tensor([float(one) for one in prepared.independent])
     courses = [directions(t, t.context(prepared, signals.get(t.port))) for t in terms]
     found: list[Tensor | None] = [None] * len(terms)
     for name in prepared.ports:
@@ -137,8 +157,7 @@ def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Seque
             part = independent[:, None] * part if follows_signal(terms[i].effect) else part
             # one that has no slope here is none that could be named
             found[i] = part if bool(part.isfinite().all()) else torch.zeros_like(part)
-    slow = _slow_courses(model, parameters, pointwise)
-    return Tangents(nuisance, tuple(t for t in found if t is not None), pointwise, slow)
+    return tuple(t for t in found if t is not None)
 
 
 def _slow_courses(model: JointModel, parameters: Tensor, pointwise: dict[str, Tensor | None]) -> Slow | None:
@@ -170,12 +189,14 @@ class Linearised:
         colour: of the stationary part of the noise.
         entrance: where wandering noise enters, coloured noise may too: the port's pointwise tangents, and the
             autoregression of noise that gives such residuals; None where there is no such port.
+        filling: what stands in for rejected samples.
     """
 
     search: LinearSearch
     series: Float[Tensor, " M"]
     colour: Colour
     entrance: tuple[Tensor, Tensor] | None
+    filling: Filling
 
     def colour_beside(self) -> Colour:
         """The colour of what is left beside the wander."""
@@ -186,7 +207,18 @@ class Linearised:
     @property
     def evidence(self) -> float:
         """Log-likelihood of the residuals by their own noise, up to a constant that all noise of a recording shares."""
-        return self.search.noise_fit(self.series).log_likelihood - float(self.colour.root.log().sum())
+        log_det = float(self.colour.root.log().sum()) + 0.5 * self.filling.log_det
+        return self.search.noise_fit(self.series).log_likelihood - log_det
+
+    def gains_of(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> Gains:
+        """The likelihood ratios of other candidates on the series."""
+        rows = len(self.series) - self.colour.root.numel()
+        columns = [self._whitened(counts.unsqueeze(-1) * t) for t in tangents]
+        below = [torch.cat([c, c.new_zeros(rows, c.shape[1])]) for c in columns]
+        return self.search.with_candidates(below).gains(self.series.unsqueeze(-1))
+
+    def _whitened(self, values: Float[Tensor, "N m c"]) -> Float[Tensor, "Km c"]:
+        return self.colour.scaled(self.filling(dct(values, len(self.colour.root))))
 
     def entering(self, count: int, generator: torch.Generator) -> Float[Tensor, "M B"] | None:
         """Draws of coloured noise that enters at the port, of variance one once whitened."""
@@ -195,7 +227,7 @@ class Linearised:
         pointwise, coefficients = self.entrance
         N, _, channels = pointwise.shape
         drawn = autoregressive(coefficients, N, channels * count, generator).reshape(N, channels, count)
-        flat = self.colour.whiten(torch.einsum("nmc,ncb->nmb", pointwise, drawn))
+        flat = self._whitened(torch.einsum("nmc,ncb->nmb", pointwise, drawn))
         rows = len(self.series) - len(flat)
         prior = torch.randn(rows, count, generator=generator, dtype=flat.dtype)
         # the colour knows how much there is at each frequency; the draws know how frequencies hang together
@@ -233,15 +265,19 @@ def linearise(
     kept = _bandwidth(tangents.nuisance)
     slow = tangents.slow if wander else None
     seen = _Seen.of(pseudo, counts, tangents, slow, kept)
+    gaps = Gaps(counts, kept)
     plain = Colour(tuple(pseudo.new_zeros(0) for _ in range(m)), pseudo.new_ones(kept, m) * _level(pseudo))
     if white:
-        return _searching(plain, pull, seen, slow)
+        return _searching(plain, pull, seen, slow, gaps)
     bare = replace(seen, candidates=())
     if joint:
-        own = _coloured(plain, near, pull, bare, slow).colour if colour is None else colour
-        return _searching(own, pull, seen, slow, joint=True)
-    found = _coloured(plain, near, pull, bare, slow) if colour is None else _searching(colour, pull, bare, slow)
-    candidates = [pull.below(found.colour.scaled(one)) for one in seen.candidates]
+        own = _coloured(plain, near, pull, bare, slow, gaps).colour if colour is None else colour
+        return _searching(own, pull, seen, slow, gaps, joint=True)
+    if colour is None:
+        found = _coloured(plain, near, pull, bare, slow, gaps)
+    else:
+        found = _searching(colour, pull, bare, slow, gaps)
+    candidates = [pull.below(found.colour.scaled(one)) for one in _together(seen.candidates, found.filling)]
     found = replace(found, search=found.search.with_candidates(candidates))
     pointwise = None if slow is None else tangents.pointwise[slow.port]
     if slow is None or pointwise is None or not tangents.candidates:
@@ -272,8 +308,26 @@ class _Seen:
         moved = nuisance[..., :0] if slow is None else slow.transformed(counts, kept)
         return cls(values.squeeze(-1), nuisance, tuple(candidates), moved)
 
+    def filled(self, filling: Filling) -> _Seen:
+        """The same with what noise is expected at rejected samples, in all of it alike."""
+        pseudo, nuisance, *candidates, slow = _together(
+            (self.pseudo.unsqueeze(-1), self.nuisance, *self.candidates, self.slow), filling
+        )
+        return _Seen(pseudo.squeeze(-1), nuisance, tuple(candidates), slow)
 
-def _searching(colour: Colour, pull: _Pull, seen: _Seen, slow: Slow | None, *, joint: bool = False) -> Linearised:
+
+def _together(columns: Sequence[Float[Tensor, "K m q"]], filling: Filling) -> tuple[Float[Tensor, "K m q"], ...]:
+    """Each of them filled."""
+    if not columns:
+        return ()
+    return filling(torch.cat([*columns], -1)).split([c.shape[-1] for c in columns], -1)
+
+
+def _searching(
+    colour: Colour, pull: _Pull, seen: _Seen, slow: Slow | None, gaps: Gaps, *, joint: bool = False
+) -> Linearised:
+    filling = gaps.filling(colour)
+    seen = seen.filled(filling)
     flat = colour.scaled(seen.pseudo)
     parameters = pull.under(colour.scaled(seen.nuisance), flat)
     candidates = [pull.below(colour.scaled(one)) for one in seen.candidates]
@@ -283,18 +337,23 @@ def _searching(colour: Colour, pull: _Pull, seen: _Seen, slow: Slow | None, *, j
         pull.below(colour.scaled(seen.slow)),
         flat.new_zeros(0, 0) if slow is None else slow.scales,
     )
-    return Linearised(search, pull.beside(flat), colour, None)
+    return Linearised(search, pull.beside(flat), colour, None, filling)
 
 
-def _coloured(plain: Colour, near: Colour | None, pull: _Pull, seen: _Seen, slow: Slow | None) -> Linearised:
+def _coloured(
+    plain: Colour, near: Colour | None, pull: _Pull, seen: _Seen, slow: Slow | None, gaps: Gaps
+) -> Linearised:
     """With the likeliest colour of the noise beside a wander at the port, by alternating between the two."""
-    best = _searching(plain, pull, replace(seen, slow=seen.slow[..., :0]), None).colour_beside()
-    tried = [_searching(best, pull, seen, slow)]
+    alone = replace(seen, slow=seen.slow[..., :0])
+    best = plain
+    for _ in range(_ALTERNATIONS):
+        best = _searching(best, pull, alone, None, gaps).colour_beside()
+    tried = [_searching(best, pull, seen, slow, gaps)]
     if slow is None:
         return tried[0]
     # from the side of no wander and from that of no colour: either could pass for the other
-    beside = _searching(plain, pull, seen, slow).colour_beside() if near is None else near
-    tried.append(_searching(beside, pull, seen, slow))
+    beside = _searching(plain, pull, seen, slow, gaps).colour_beside() if near is None else near
+    tried.append(_searching(beside, pull, seen, slow, gaps))
     return max(tried, key=lambda found: found.evidence)
 
 

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Local", "beside_wander"]
 
+_BURST, _CROWDED = 10, 0.4
+"""Samples to either side, and the share of them beyond which a sample among outliers counts as one."""
+
 _ROUNDS = 4
 _NEAR = 3.0
 _FAR = 2.6
@@ -72,7 +75,7 @@ def beside_wander(fit: FittedModel, model: JointModel, parameters: Float[Tensor,
         density = fit_density(quick, bound=fit.bound)
         before = counts
         values, counts = pseudo_residual(quick, density.sigma, density.d)
-        near = (quick.abs() <= _FAR * robust_scale(quick)).to(quick.dtype)
+        near = _out_of_bursts((quick.abs() <= _FAR * robust_scale(quick)).to(quick.dtype))
         values, counts = values * near, counts * near
         values = values + counts * course
         if float((counts != before).double().mean()) < _SETTLED:
@@ -89,4 +92,11 @@ def _near_median(residual: Float[Tensor, "N m"], width: int) -> Float[Tensor, "N
     half = max(width // 2, 1)
     padded = torch.nn.functional.pad(residual.mT, (half, half), mode="reflect")
     away = residual - padded.unfold(-1, 2 * half + 1, 1).median(-1).values.mT
-    return (away.abs() <= _NEAR * robust_scale(away)).to(residual.dtype)
+    return _out_of_bursts((away.abs() <= _NEAR * robust_scale(away)).to(residual.dtype))
+
+
+def _out_of_bursts(near: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
+    """0 also for what is in the midst of outliers: a course that follows a burst rejects its edges and its scatter."""
+    width = min(_BURST, (len(near) - 1) // 2)
+    far = torch.nn.functional.pad(1.0 - near.mT, (width, width), mode="reflect")
+    return near * (far.unfold(-1, 2 * width + 1, 1).mean(-1).mT <= _CROWDED)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.candidates import finer
-from mkc_torch.diagnosis.linearise import Linearised, Tangents, linearise, tangents_of
+from mkc_torch.diagnosis.linearise import Linearised, Tangents, candidate_tangents, linearise, tangents_of
 from mkc_torch.diagnosis.local import beside_wander
 from mkc_torch.diagnosis.model import JointModel, Key, Term, one_sided
 from mkc_torch.diagnosis.preference import Preference
@@ -121,6 +121,14 @@ def locate(
         # whether there is an effect is asked of the noise that has it in; which one it is, of the noise beside it
         linearised = linearise(base.model, parameters, pseudo, counts, tangents, colour=left.noise.colour)
         found = linearised.search.gains(linearised.series.unsqueeze(-1))
+        close = _ranking(terms, found, prefer, _possible(terms, linearised))
+        near = [terms[one.number] for one in close if one.gap < 2.0 * SEPARABLE]
+        more = _closer(near, best.model, best.parameters, tangents, counts, linearised)
+        terms = (*terms, *more)
+        beside = candidate_tangents(best.model, best.parameters, more, tangents.pointwise)
+        tangents = replace(tangents, candidates=(*tangents.candidates, *beside))
+        linearised = linearise(base.model, parameters, pseudo, counts, tangents, colour=left.noise.colour)
+        found = linearised.search.gains(linearised.series.unsqueeze(-1))
         possible = _possible(terms, linearised)
     ranking = _ranking(terms, found, prefer, possible)
     first = terms[ranking[0].number]
@@ -130,8 +138,9 @@ def locate(
         # what follows the wander gains most in joint fits, and the search knows better if it tells the two apart
         behind = [one.gap for one in ranking if terms[one.number].key == best.model.terms[-1].key]
         clear = tangents.slow is not None and not (behind and behind[0] < SEPARABLE)
-        least = 0.0 if clear else _KEPT * _score(best, base, prefer)
-        if _score(other, base, prefer) > max(least, 0.0) and _repeats(other):
+        least = 0.0 if clear else _KEPT * max(_score(best, base, prefer), 0.0)
+        gain = other.log_likelihood - base.log_likelihood if clear else _score(other, base, prefer)
+        if gain > least and _repeats(other):
             best = other
     if p_value <= level:
         # it was another candidate that no draw came up to, if this one by itself is nothing out of the ordinary
@@ -324,10 +333,12 @@ def _possible(terms: tuple[Term, ...], linearised: Linearised) -> Bool[Tensor, "
 def _ranking(
     terms: tuple[Term, ...], found: Gains, prefer: Preference, possible: Bool[Tensor, " C"]
 ) -> tuple[Ranked, ...]:
-    """By gain in nats less one for each parameter (Akaike's criterion), each physics at its best possible shape."""
+    """By gain in nats less one for each parameter and each number of the shape (Akaike's criterion), each physics at
+    its best possible shape."""
     gain = 0.5 * found.ratio[:, 0]
+    numbers = gain.new_tensor([float(len(_continuous(term))) for term in terms])
     handicap = [prefer.handicap(term, float(one)) for term, one in zip(terms, gain, strict=True)]
-    score = gain - found.dof - gain.new_tensor(handicap)
+    score = gain - found.dof - numbers - gain.new_tensor(handicap)
     score = torch.where((found.dof > 0) & possible, score, -torch.inf)
     best: dict[Key, int] = {}
     for number in score.argsort(descending=True).tolist():
@@ -351,8 +362,7 @@ def _refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> Fi
         again: once more from there, with the amplitudes that fit the new shape.
     """
     term = best.model.terms[-1]
-    free = term.effect.continuous if isinstance(term.effect, ContinuousEffect) else {}
-    names = [name for name in term.shape if name in free]
+    names = _continuous(term)
     if not names:
         return best
     for count in range(_ROUNDS):
@@ -364,6 +374,39 @@ def _refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> Fi
     if not (moved.log_likelihood > best.log_likelihood and _repeats(moved)):
         return best
     return _refined(moved, base) if again else moved
+
+
+def _closer(
+    terms: Sequence[Term],
+    model: JointModel,
+    parameters: Tensor,
+    tangents: Tangents,
+    counts: Float[Tensor, "N m"],
+    linearised: Linearised,
+) -> tuple[Term, ...]:
+    """Candidates with the continuous numbers of their shapes closed in on under the noise of the search.
+
+    Only where a port is pointwise: elsewhere each shape takes a trajectory of its own.
+    """
+    closer = []
+    for term in terms:
+        names = _continuous(term)
+        if not names or tangents.pointwise[term.port] is None:
+            continue
+        found = term
+        for count in range(_ROUNDS):
+            for name in names:
+                shapes = finer(found, name, model.prepared.time, count)
+                gains = linearised.gains_of(candidate_tangents(model, parameters, shapes, tangents.pointwise), counts)
+                found = shapes[int(gains.ratio[:, 0].argmax())]
+        if found.shape != term.shape:
+            closer.append(found)
+    return tuple(closer)
+
+
+def _continuous(term: Term) -> list[str]:
+    free = term.effect.continuous if isinstance(term.effect, ContinuousEffect) else {}
+    return [name for name in term.shape if name in free]
 
 
 def _energy(fit: FittedModel, model: JointModel) -> float:
