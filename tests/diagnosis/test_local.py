@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.linearise import linearise, tangents_of
-from mkc_torch.diagnosis.local import beside_wander
+from mkc_torch.diagnosis.local import _out_of_bursts, beside_wander
 from mkc_torch.diagnosis.model import JointModel
 from mkc_torch.diagnosis.refit import fitted
 from mkc_torch.simulation import Magnetometer
@@ -75,7 +75,18 @@ def test_the_small_ones_of_many_bursts_do_not_count_for_a_wander():
         _, _, local = local_of(added, "norm")
         kept.append(float(local.counts[hit].mean()))
         assert float(local.counts[~hit].mean()) > 0.98
-    assert sum(kept) / 3 < 0.78
+    assert sum(kept) / 3 < 0.65
+
+
+def test_what_is_in_the_midst_of_outliers_is_one():
+    near = torch.ones(100, 2, dtype=torch.float64)
+    near[40:60, 0] = 0.0
+    near[45::4, 0] = 1.0  # a course that follows the burst lets some of it through
+    near[10::7, 1] = 0.0  # single outliers, however many, take nothing with them
+    found = _out_of_bursts(near)
+    assert float(found[43:57, 0].sum()) == 0.0
+    assert float(found[:35, 0].min()) == float(found[66:, 0].min()) == 1.0
+    assert torch.equal(found[:, 1], near[:, 1])
 
 
 def test_what_counts_keeps_its_wander():

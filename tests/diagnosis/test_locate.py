@@ -1,0 +1,63 @@
+"""Rivals are compared at their own best shapes, under one noise."""
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch.diagnosis.candidates import candidate_terms
+from mkc_torch.diagnosis.linearise import candidate_tangents, linearise, tangents_of
+from mkc_torch.diagnosis.locate import locate
+from mkc_torch.diagnosis.model import JointModel
+from mkc_torch.diagnosis.refit import fitted
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.simulation import Magnetometer
+from tests.diagnosis.line import Line
+from tests.simulation.tumbling import tumbling
+
+N = 2000
+TIMED = tuple(effect for effect in CATALOGUE if effect.id in ("hard_iron_step", "offset_drift"))
+
+
+@pytest.fixture(scope="module")
+def found():
+    """A search beside a step of 0.7 µT a third of the way, between two of the onsets that are tried."""
+    sensor = np.zeros((N, 3))
+    sensor[671:] = [0.4, -0.4, 0.4]
+    prepared = Magnetometer("attitude").prepare(tumbling(N, noise=0.3, sensor=sensor, attitude=True, gyro=True))
+    base = fitted(JointModel(prepared), prepared.start())
+    terms = candidate_terms(prepared, (), TIMED)
+    generator = torch.Generator().manual_seed(0)
+    return prepared, terms, locate(base, terms, level=0.05, surrogates=19, generator=generator)
+
+
+def test_the_first_of_the_ranking_has_a_shape_between_those_tried(found):
+    prepared, terms, located = found
+    first = located.terms[located.ranking[0].number]
+    assert first.effect.id == located.term.effect.id == "hard_iron_step"
+    assert first not in terms
+    spacing = float(terms[1].shape["onset"] - terms[0].shape["onset"])
+    assert abs(first.shape["onset"] - float(prepared.time[671])) < 0.25 * spacing
+
+
+def test_its_gain_is_no_less_than_that_of_any_shape_tried(found):
+    _, _, located = found
+    gains = located.linearised.search.gains(located.linearised.series.unsqueeze(-1)).ratio[:, 0]
+    steps = [k for k, term in enumerate(located.terms) if term.effect.id == "hard_iron_step"]
+    assert float(gains[located.ranking[0].number]) == pytest.approx(float(gains[steps].max()))
+
+
+def test_gains_of_other_candidates_are_those_of_a_search_with_them():
+    line = Line(600)
+    model = JointModel(line)
+    fit = fitted(model, line.start())
+    terms = candidate_terms(line, (), CATALOGUE)[:3]
+    values, counts = fit.residual * 1.0, torch.ones_like(fit.residual)
+    counts[100:120, 0] = 0.0
+    values = values * counts
+    tangents = tangents_of(model, fit.parameters, terms)
+    whole = linearise(model, fit.parameters, values, counts, tangents)
+    bare = linearise(model, fit.parameters, values, counts, tangents.bare, colour=whole.colour)
+    beside = candidate_tangents(model, fit.parameters, terms, tangents.pointwise)
+    torch.testing.assert_close(
+        bare.gains_of(beside, counts).ratio, whole.search.gains(whole.series.unsqueeze(-1)).ratio
+    )
