@@ -111,8 +111,13 @@ class Filling:
     parts: tuple[_Part | None, ...]
     log_det: float
 
+    @property
+    def nothing(self) -> bool:
+        """Whether all is left as it is."""
+        return all(part is None for part in self.parts)
+
     def __call__(self, coefficients: Float[Tensor, "K m *rest"]) -> Float[Tensor, "K m *rest"]:
-        if all(part is None for part in self.parts) or coefficients.numel() == 0:
+        if self.nothing or coefficients.numel() == 0:
             return coefficients
         flat = coefficients.flatten(2) if coefficients.dim() > 2 else coefficients.unsqueeze(-1)
         filled = [

@@ -37,8 +37,8 @@ CORNERS = (25.0,)
 
 _MOST, _MARGIN, _FEWEST = 0.9, 3.0, 1000
 
-_ALTERNATIONS = 3
-"""Between the colour, and what it says of rejected samples and of the parameters' share of the noise."""
+_REFILLED = 2
+"""Times that the colour is read again, with what it says of rejected samples."""
 
 
 @dataclass(frozen=True)
@@ -345,9 +345,12 @@ def _coloured(
 ) -> Linearised:
     """With the likeliest colour of the noise beside a wander at the port, by alternating between the two."""
     alone = replace(seen, slow=seen.slow[..., :0])
-    best = plain
-    for _ in range(_ALTERNATIONS):
-        best = _searching(best, pull, alone, None, gaps).colour_beside()
+    best = _searching(plain, pull, alone, None, gaps).colour_beside()
+    for _ in range(_REFILLED):
+        found = _searching(best, pull, alone, None, gaps)
+        if found.filling.nothing:
+            break
+        best = found.colour_beside()
     tried = [_searching(best, pull, seen, slow, gaps)]
     if slow is None:
         return tried[0]

@@ -36,6 +36,9 @@ _ROUNDS = 3
 _LEADING, _THIRD, _MUCH = 2, 0.6, 50.0
 """Fits whose shapes are tried; a third one, where it has this share of the first one's score and as many nats."""
 
+_FEW, _HOPEFUL = 15, 0.3
+"""Steps of a refit in the first round, and the share of the best score from which it gets more."""
+
 _SHAPES = 5
 _RAW = 1000.0
 _OVERWHELMING = 150.0
@@ -243,15 +246,22 @@ def _repeats(fit: FittedModel) -> bool:
 
 
 def _refit_all(fits: dict[Key, FittedModel], base: FittedModel, listed: Sequence[Listed], prefer: Preference) -> None:
-    """Put the joint refit of each into ``fits``, where it is the better one of its physics."""
+    """Put the joint refit of each into ``fits``, where it is the better one of its physics.
+
+    One that is not at rest after a few steps goes on only if it may still come to lead.
+    """
     done: set[tuple[Key, int]] = set()
     for term, parameters, gamma in listed:
         if (term.key, id(parameters)) in done:
             continue
         done.add((term.key, id(parameters)))
-        fit = fitted_beside(base, base.model.with_term(term), torch.cat([parameters, gamma]))
+        fit = fitted_beside(base, base.model.with_term(term), torch.cat([parameters, gamma]), steps=_FEW)
         if term.key not in fits or _score(fit, base, prefer) > _score(fits[term.key], base, prefer):
             fits[term.key] = fit
+    least = _HOPEFUL * max((_score(fit, base, prefer) for fit in fits.values()), default=0.0)
+    for key, fit in fits.items():
+        if not fit.converged and _score(fit, base, prefer) > least:
+            fits[key] = fitted_beside(base, fit.model, fit.parameters, graduate=False)
 
 
 def _score(fit: FittedModel, base: FittedModel, prefer: Preference) -> float:
