@@ -8,7 +8,7 @@ import torch
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
-from mkc_torch.diagnosis.result import Candidate, Extrapolation, Region, Separability, StateMap
+from mkc_torch.diagnosis.result import Candidate, DriverShift, Extrapolation, Region, Separability, StateMap
 from mkc_torch.report import diagnosis_wording as say
 from mkc_torch.report.diagnosis import bars, diagnosis_report, heat_map
 from tests.diagnosis.factory import CHANNELS, make_candidates, make_diagnosis, make_separability
@@ -211,6 +211,15 @@ def test_whether_a_finding_extrapolates_is_said():
     ):
         text = text_of(diagnosis_report(first_changed(diagnosis, extrapolation=Extrapolation(gain, interval))))
         assert f"beyond its range fitted where its driver is low, {told}" in text
+
+
+def test_what_shifted_copies_of_the_driver_gain_is_said():
+    for as_good, told in ((0, "none of 38 copies"), (1, "one of 38 copies"), (12, "12 of 38 copies")):
+        changed = first_changed(
+            make_diagnosis(1, samples=240), drivers=("load",), driver_shift=DriverShift(38, as_good, 22.5)
+        )
+        verb = "gain" if as_good > 1 else "gains"
+        assert f"driven by load; {told} shifted by up to 22.5 s {verb} as much" in text_of(diagnosis_report(changed))
 
 
 def test_where_in_the_states_and_in_which_experiment_is_told_and_drawn():

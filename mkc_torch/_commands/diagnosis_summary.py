@@ -52,7 +52,7 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis) -> Iterator[tuple[str, s
         yield "mostly", say.region(f.region)
     if f.experiments:
         yield "in", say.experiments(f.experiments)
-    yield "driven by", say.several(f.drivers) if f.drivers else "no recorded column"
+    yield "driven by", say.driven_by(f)
     yield "how sure", f"{say.evidence(f.p_value, diagnosis.surrogates)}, after the whole search"
     if f.held_out is None:
         yield "held out", f"not measured: {say.plain(f.held_out_note)}"

@@ -27,6 +27,7 @@ from mkc_torch.diagnosis.refit import FittedModel, fitted
 from mkc_torch.diagnosis.remaining import remaining, remaining_warning
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Finding, HeldOut, Separability, Spread, Traces, Verdict
 from mkc_torch.diagnosis.separability import separability
+from mkc_torch.diagnosis.shifts import shift_warning, shifted
 from mkc_torch.diagnosis.units import unit_warnings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.protocol import Effect
@@ -235,6 +236,7 @@ def _assembled(
         replace(
             finding_of(s, final, k, *_held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, generator)),
             extrapolation=extrapolated(fits[k], s.fit, seed),
+            driver_shift=shifted(fits[k].model, s),
         )
         for k, s in enumerate(found)
     ]
@@ -266,6 +268,7 @@ def _assembled(
             *([_not_confirmed(search.unconfirmed)] if search.unconfirmed else []),
             *_time_warnings(prepared),
             *remaining_warning(left),
+            *(sentence for finding in findings for sentence in shift_warning(finding)),
             *(sentence for finding in findings for sentence in extrapolation_warning(finding)),
             *density_warnings(final.fit.residual, final.fit.sigma, final.fit.d, final.fit.bound, prepared.channels),
         ),

@@ -36,9 +36,6 @@ _ROUNDS = 3
 _LEADING, _THIRD, _MUCH = 2, 0.6, 50.0
 """Fits whose shapes are tried; a third one, where it has this share of the first one's score and as many nats."""
 
-_FEW, _HOPEFUL = 15, 0.3
-"""Steps of a refit in the first round, and the share of the best score from which it gets more."""
-
 _SHAPES = 5
 _RAW = 1000.0
 _OVERWHELMING = 150.0
@@ -56,6 +53,7 @@ class Located:
         beyond: nats by which it is rarer, by itself, than the strongest of the draws.
         ranking: for each candidate physics its best shape, gain in nats, and nats behind the first; best first.
         noise: the wander of the noise without the candidate.
+        values, counts: (N, m), the pseudo-residual without the candidate, and what counts of it.
         linearised: the search that the p-value is from; ``tangents`` and ``terms`` are its candidates.
     """
 
@@ -65,6 +63,8 @@ class Located:
     beyond: float
     ranking: tuple[Ranked, ...]
     noise: NoiseFit
+    values: Float[Tensor, "N m"]
+    counts: Float[Tensor, "N m"]
     linearised: Linearised
     tangents: Tangents
     terms: tuple[Term, ...]
@@ -101,11 +101,8 @@ def locate(
     terms = tuple(terms)
     prefer = Preference(terms, base.model.prepared)
     tried = len(terms)
-    best = _strongest(base, terms, prefer, parts=parts)
+    best, terms, tangents = _with_tangents(_strongest(base, terms, prefer, parts=parts), terms)
     parameters = best.parameters[: base.model.size]
-    if best.model.terms[-1] not in terms:
-        terms = (*terms, best.model.terms[-1])
-    tangents = tangents_of(best.model, best.parameters, terms)
     tangents = replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
     number = terms.index(best.model.terms[-1])
     gamma = best.parameters[base.model.size :]
@@ -150,7 +147,24 @@ def locate(
         p_value = max(p_value, float(found.log_p[terms.index(best.model.terms[-1]), 0].exp()))
     if p_value <= level:
         best = _refined(best, base, again=True)
-    return Located(best.model.terms[-1], best, p_value, beyond, ranking, noise, linearised, tangents, terms)
+    return Located(
+        best.model.terms[-1], best, p_value, beyond, ranking, noise, pseudo, counts, linearised, tangents, terms
+    )
+
+
+def _with_tangents(
+    fits: Sequence[FittedModel], terms: tuple[Term, ...]
+) -> tuple[FittedModel, tuple[Term, ...], Tangents]:
+    """The first fit that has finite tangents, with them and their candidates, its own shape included."""
+    for fit in fits:
+        own = fit.model.terms[-1]
+        tried = terms if own in terms else (*terms, own)
+        try:
+            return fit, tried, tangents_of(fit.model, fit.parameters, tried)
+        except ValueError:
+            if fit is fits[-1]:
+                raise
+    raise AssertionError
 
 
 Start = tuple[Tensor, tuple[Tensor, Tensor]]
@@ -207,8 +221,8 @@ def _part_starts(base: FittedModel, d: Float[Tensor, " m"]) -> list[Start]:
     return starts
 
 
-def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *, parts: bool) -> FittedModel:
-    """The likeliest of the joint refits, each of the leading ones at its best shape.
+def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *, parts: bool) -> list[FittedModel]:
+    """The joint refits, the likeliest first, each of the leading ones at its best shape.
 
     Candidates are ranked by the likelihood's own score and by a clipped one, which still sees a stretch of samples that
     the fit rejects; and, where one model over all of the recording runs away, around fits to parts of it.
@@ -237,7 +251,7 @@ def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *
             f"The simulation gave finite outputs while {len(fits)} effects were fitted, and gives none now at the same "
             "parameters: it is at the edge of what can be solved. Shorten the experiments, or give a `segment`."
         )
-    return max(shaped, key=lambda fit: _score(fit, base, prefer))
+    return sorted(shaped, key=lambda fit: _score(fit, base, prefer), reverse=True)
 
 
 def _repeats(fit: FittedModel) -> bool:
@@ -246,22 +260,15 @@ def _repeats(fit: FittedModel) -> bool:
 
 
 def _refit_all(fits: dict[Key, FittedModel], base: FittedModel, listed: Sequence[Listed], prefer: Preference) -> None:
-    """Put the joint refit of each into ``fits``, where it is the better one of its physics.
-
-    One that is not at rest after a few steps goes on only if it may still come to lead.
-    """
+    """Put the joint refit of each into ``fits``, where it is the better one of its physics."""
     done: set[tuple[Key, int]] = set()
     for term, parameters, gamma in listed:
         if (term.key, id(parameters)) in done:
             continue
         done.add((term.key, id(parameters)))
-        fit = fitted_beside(base, base.model.with_term(term), torch.cat([parameters, gamma]), steps=_FEW)
+        fit = fitted_beside(base, base.model.with_term(term), torch.cat([parameters, gamma]))
         if term.key not in fits or _score(fit, base, prefer) > _score(fits[term.key], base, prefer):
             fits[term.key] = fit
-    least = _HOPEFUL * max((_score(fit, base, prefer) for fit in fits.values()), default=0.0)
-    for key, fit in fits.items():
-        if not fit.converged and _score(fit, base, prefer) > least:
-            fits[key] = fitted_beside(base, fit.model, fit.parameters, graduate=False)
 
 
 def _score(fit: FittedModel, base: FittedModel, prefer: Preference) -> float:

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 __all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_beside"]
 
 _CLIP = 2.0
-_STEPS = 60
 _SHARES = (1.0, 0.3, 0.1, 0.01, 0.0)
 
 
@@ -32,7 +31,6 @@ class FittedModel:
         sigma, d, bound: (m,) of the MKC density.
         residual, weights: (N, m).
         log_likelihood: in nats, of all samples and channels.
-        converged: whether the fit came to rest within the steps it had.
     """
 
     model: JointModel
@@ -43,7 +41,6 @@ class FittedModel:
     residual: Float[Tensor, "N m"]
     weights: Float[Tensor, "N m"]
     log_likelihood: float
-    converged: bool = True
 
     @property
     def pseudo(self) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
@@ -58,7 +55,6 @@ def fitted(
     *,
     rows: Float[Tensor, " N"] | None = None,
     graduate: bool = True,
-    steps: int = _STEPS,
 ) -> FittedModel:
     """The most likely parameters of a joint model.
 
@@ -68,7 +64,6 @@ def fitted(
         bound: half-width of the density's domain; None for the rule of :func:`mkc_torch.nonlinear.fit`.
         rows: weights of the samples; 0 leaves one out.
         graduate: False for a start near the answer.
-        steps: at most, in the rough and in the final fit.
     """
     found = nonlinear.fit(
         model.residual,
@@ -80,7 +75,7 @@ def fitted(
         upper=None if model.bounds is None else model.bounds[1],
         graduate=graduate,
         covariance=None,
-        max_iter=steps,
+        max_iter=60,
         tol=1e-7,
     )
     return FittedModel(
@@ -92,16 +87,15 @@ def fitted(
         model.residual(found.theta).detach(),
         found.weights,
         float(found.log_likelihood) * len(model.prepared.time),
-        bool(found.converged),
     )
 
 
 def fitted_beside(
-    base: FittedModel, model: JointModel, start: Float[Tensor, " p"], *, graduate: bool = True, steps: int = _STEPS
+    base: FittedModel, model: JointModel, start: Float[Tensor, " p"], *, graduate: bool = True
 ) -> FittedModel:
     """A model with one more effect on the domain of a fit without it; that fit, where the effect has no answer."""
     try:
-        return fitted(model, start, base.bound, graduate=graduate, steps=steps)
+        return fitted(model, start, base.bound, graduate=graduate)
     except ValueError:
         none = base.parameters.new_zeros(model.size - base.model.size)
         return replace(base, model=model, parameters=torch.cat([base.parameters, none]))

@@ -18,6 +18,7 @@ __all__ = [
     "Candidate",
     "Curve",
     "Diagnosis",
+    "DriverShift",
     "Extrapolation",
     "Finding",
     "HeldOut",
@@ -61,6 +62,15 @@ class Extrapolation:
 
     log_likelihood_gain: float
     confidence_interval: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class DriverShift:
+    """Copies of a driver shifted in time, earlier and later by up to ``reach`` s, and how many gain as much."""
+
+    copies: int
+    as_good: int
+    reach: float
 
 
 @dataclass(frozen=True)
@@ -122,7 +132,8 @@ class StateMap:
 class Finding:
     """A piece of physics that the simulation lacks, or the effect "unknown"; see ``diagnosis.json``.
 
-    ``extrapolation`` and ``map`` are for the report; None where they were not asked for or cannot be told. ``region``
+    ``extrapolation`` and ``map`` are for the report; None where they were not asked for or cannot be told, as is
+    ``driver_shift`` of an effect without a recorded driver. ``region``
     is None where the gain arises all over the states, or where the simulation has none; ``experiments`` has each run's
     share of the gain, and is empty for a single run.
     """
@@ -143,6 +154,7 @@ class Finding:
     plausibility: str
     curve: Curve | None = None
     extrapolation: Extrapolation | None = None
+    driver_shift: DriverShift | None = None
     region: Region | None = None
     experiments: tuple[float, ...] = ()
     map: StateMap | None = None

@@ -26,6 +26,7 @@ __all__ = [
     "ceiling_reached",
     "chance",
     "clock_of",
+    "driven_by",
     "effect_name",
     "evidence",
     "experiments",
@@ -483,6 +484,18 @@ def ceiling_reached(diagnosis: Diagnosis) -> str:
         return ""
     unit = plain(diagnosis.traces.unit)
     return f"a smooth correction by all columns and by time reaches {size(diagnosis.ceiling.rmse)} {unit}".rstrip()
+
+
+def driven_by(finding: Finding) -> str:
+    """The driver, and how it compares with copies of it shifted in time."""
+    if not finding.drivers:
+        return "no recorded column"
+    named, found = several(finding.drivers), finding.driver_shift
+    if found is None:
+        return named
+    some = {0: "none", 1: "one"}.get(found.as_good, str(found.as_good))
+    gain = "gain" if found.as_good > 1 else "gains"
+    return f"{named}; {some} of {found.copies} copies shifted by up to {size(found.reach)} s {gain} as much"
 
 
 def extrapolation(found: Extrapolation) -> str:

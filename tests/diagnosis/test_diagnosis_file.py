@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("jsonschema")
 
 from mkc_torch.diagnosis.diagnosis_file import DiagnosisFileError, diagnosis_to_json, json_schema, validate
-from mkc_torch.diagnosis.result import Extrapolation, HeldOut, Parameter, Region
+from mkc_torch.diagnosis.result import DriverShift, Extrapolation, HeldOut, Parameter, Region
 from tests.diagnosis.factory import make_diagnosis
 
 
@@ -69,6 +69,12 @@ def test_the_region_and_the_experiments_are_written_where_there_are_any():
     (without,) = written(make_diagnosis(1))["findings"]
     assert "region" not in without
     assert "experiments" not in without
+
+
+def test_what_shifted_copies_of_a_driver_gain_is_written():
+    (finding,) = written(with_finding(make_diagnosis(1), driver_shift=DriverShift(38, 2, 22.5)))["findings"]
+    assert finding["driver_shift"] == {"copies": 38, "as_good": 2, "reach": 22.5}
+    assert "driver_shift" not in written(make_diagnosis(1))["findings"][0]
 
 
 def test_a_region_of_another_kind_is_refused(content):

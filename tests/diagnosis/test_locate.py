@@ -1,13 +1,15 @@
 """Rivals are compared at their own best shapes, under one noise."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
 from mkc_torch.diagnosis.candidates import candidate_terms
 from mkc_torch.diagnosis.linearise import candidate_tangents, linearise, tangents_of
-from mkc_torch.diagnosis.locate import locate
-from mkc_torch.diagnosis.model import JointModel
+from mkc_torch.diagnosis.locate import _with_tangents, locate
+from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.refit import fitted
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
@@ -16,6 +18,8 @@ from tests.simulation.tumbling import tumbling
 
 N = 2000
 TIMED = tuple(effect for effect in CATALOGUE if effect.id in ("hard_iron_step", "offset_drift"))
+STEP = next(effect for effect in TIMED if effect.id == "hard_iron_step")
+STEPS = tuple(Term(STEP, None, {"onset": onset}, "mixed") for onset in (0.4, 0.9, 1.3))
 
 
 @pytest.fixture(scope="module")
@@ -46,18 +50,37 @@ def test_its_gain_is_no_less_than_that_of_any_shape_tried(found):
     assert float(gains[located.ranking[0].number]) == pytest.approx(float(gains[steps].max()))
 
 
+def test_a_fit_without_slopes_gives_way_to_the_next(monkeypatch):
+    line = Line(100)
+    model = JointModel(line)
+    fit = fitted(model, line.start())
+    terms = STEPS[:2]
+    fits = [dataclasses.replace(fit, model=model.with_term(term)) for term in terms]
+    known = object()
+
+    def tangents(of, _parameters, _terms):
+        if of is fits[0].model:
+            raise ValueError("no finite slope")
+        return known
+
+    monkeypatch.setattr("mkc_torch.diagnosis.locate.tangents_of", tangents)
+    assert _with_tangents(fits, terms) == (fits[1], terms, known)
+    with pytest.raises(ValueError, match="no finite slope"):
+        _with_tangents(fits[:1], terms)
+
+
 def test_gains_of_other_candidates_are_those_of_a_search_with_them():
     line = Line(600)
     model = JointModel(line)
     fit = fitted(model, line.start())
-    terms = candidate_terms(line, (), CATALOGUE)[:3]
     values, counts = fit.residual * 1.0, torch.ones_like(fit.residual)
     counts[100:120, 0] = 0.0
     values = values * counts
-    tangents = tangents_of(model, fit.parameters, terms)
+    tangents = tangents_of(model, fit.parameters, STEPS)
     whole = linearise(model, fit.parameters, values, counts, tangents)
     bare = linearise(model, fit.parameters, values, counts, tangents.bare, colour=whole.colour)
-    beside = candidate_tangents(model, fit.parameters, terms, tangents.pointwise)
+    beside = candidate_tangents(model, fit.parameters, STEPS, tangents.pointwise)
+    assert len(beside) == 3
     torch.testing.assert_close(
         bare.gains_of(beside, counts).ratio, whole.search.gains(whole.series.unsqueeze(-1)).ratio
     )
