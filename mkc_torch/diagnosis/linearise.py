@@ -111,6 +111,8 @@ def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Seque
         for name, port in prepared.ports.items()
     }
     independent = parameters.new_tensor([float(one) for one in prepared.independent])
+    # forward mode starts from the trajectory that was found last, and has to find it again
+    model.residual(parameters)
     nuisance = torch.func.jacfwd(model.residual)(parameters)
     if not bool(nuisance.isfinite().all()):
         effects = [

@@ -73,3 +73,25 @@ def test_a_simulation_that_is_lost_again_says_so(monkeypatch):
     monkeypatch.setattr(MODULE, "_refit_all", then_lost)
     with pytest.raises(ValueError, match="gives none now at the same parameters"):
         locate(base, (Term(Offset(), None, {}),), level=0.05, surrogates=19, generator=torch.Generator(), parts=False)
+
+
+class Remembering(Line):
+    """A trajectory is found again under a transform only where it was the last one that was found."""
+
+    last = None
+
+    def residual(self, theta, changes):
+        left = super().residual(theta, changes)
+        if torch._C._functorch.is_functorch_wrapped_tensor(theta):
+            return left if self.last == self.searched else left * torch.nan
+        self.last = theta.tolist()
+        return left
+
+
+def test_slopes_are_looked_for_from_the_trajectory_at_the_same_parameters():
+    line = Remembering(60)
+    model = JointModel(line)
+    parameters = torch.tensor([0.9, 0.6], dtype=torch.float64)
+    line.searched = parameters.tolist()
+    model.residual(parameters + 1.0)
+    assert bool(tangents_of(model, parameters).nuisance.isfinite().all())
