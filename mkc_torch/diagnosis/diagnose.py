@@ -48,8 +48,9 @@ FEWEST = 40
 
 _WIDER, _NEAR = 3.0, 0.05
 
-_BEYOND_DOUBT = 20.0
-"""Nats beyond all draws of noise from which unseen blocks are not asked to confirm it."""
+_BEYOND_DOUBT, _FURTHER = 8.0, 20.0
+"""Nats beyond all draws of noise from which unseen blocks are not asked to confirm a first finding, and from which they
+need only to lean the way of a further one."""
 
 _REST = 0.5
 """A larger share of samples in which nothing moves is a sensor at rest, and is warned of."""
@@ -126,11 +127,11 @@ def _holds(
     one's form left over, and they have to confirm it, or to lean its way where it is plain beyond all draws.
     """
     better = bool(after.log_likelihood.mean() > before.log_likelihood.mean())
-    plain = located.beyond > _BEYOND_DOUBT
     if first:
+        plain = located.beyond > _BEYOND_DOUBT
         price = 0.5 * located.fit.model.sizes[-1] * math.log(len(after.log_likelihood))
         return better or plain or innovation_gain(before, after) > price
-    return (better and plain) or _confirmed(before, after, blocks, seed)
+    return (better and located.beyond > _FURTHER) or _confirmed(before, after, blocks, seed)
 
 
 def _confirmed(before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int) -> bool:
