@@ -27,8 +27,9 @@ _PLAIN = 0.3
 _END = 20
 """One in so many frequencies, the highest ones, show the level of the spectrum's end."""
 
-_MOST = 1000
-"""Frequencies at most that are not taken for white, those that are the farthest from it."""
+_MOST, _CELLS = 1000, 20_000_000
+"""Frequencies at most that are not taken for white, those that are the farthest from it; fewer where their products
+with all others would be more numbers than these."""
 
 
 class Gaps:
@@ -71,8 +72,9 @@ class Gaps:
             if len(rows) == 0 or not self._any[channel]:
                 parts.append(None)
                 continue
-            if len(rows) > _MOST:
-                rows = rows[far[rows].topk(_MOST).indices].sort().values
+            most = min(_MOST, max(_CELLS // K, 1))
+            if len(rows) > most:
+                rows = rows[far[rows].topk(most).indices].sort().values
             overlap = self.overlap(channel, rows)
             own = excess[rows, channel]
             system = torch.eye(len(rows), dtype=own.dtype) + own.unsqueeze(-1) * overlap[rows]

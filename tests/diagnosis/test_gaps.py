@@ -94,10 +94,11 @@ def test_amplitudes_are_left_what_they_are():
     torch.testing.assert_close(filling(dct(masked @ gamma)), filling(dct(masked)) @ gamma)
 
 
-def test_many_frequencies_are_reduced_to_those_that_matter_most(monkeypatch):
+@pytest.mark.parametrize(("limit", "value"), [("_MOST", 12), ("_CELLS", 12 * N + 5)])
+def test_many_frequencies_are_reduced_to_those_that_matter_most(limit, value, monkeypatch):
     counts = mask(7)
     values = counts * torch.randn(N, 1, generator=torch.Generator().manual_seed(8)).double()
-    monkeypatch.setattr(gaps, "_MOST", 12)
+    monkeypatch.setattr(gaps, limit, value)
     found = Gaps(counts, N).filling(colour(falling(N)))(dct(values))
     end = falling(N)[-3:].mean()
     series, _ = expected(values[:, 0], counts[:, 0], torch.where(torch.arange(N) < 12, falling(N), end) / end)
