@@ -36,6 +36,9 @@ _ROUNDS = 3
 _LEADING, _THIRD, _MUCH = 2, 0.6, 50.0
 """Fits whose shapes are tried; a third one, where it has this share of the first one's score and as many nats."""
 
+_WANDERS = 2.0
+"""Nats that a wander has to gain to be in the draws of noise."""
+
 _SHAPES = 5
 _RAW = 1000.0
 _OVERWHELMING = 150.0
@@ -308,15 +311,18 @@ def _judged(
 ) -> tuple[float, float]:
     """The p-value of the strongest candidate after the whole search, and how far it is beyond draws of fitted noise.
 
-    Coloured noise is drawn where it enters, at a port whose axes may turn against the residual. Each candidate's ratios
-    are first divided by how much the draws exceed their chi-square (Bartlett's correction), so that one whose noise is
-    larger than the model's does not set the level for all. A shape that was closed in on, beyond those that were
-    tried, is left out: the draws had no such choice. So is an amplitude of a sign that the physics does not allow.
+    Coloured noise is drawn where it enters, at a port whose axes may turn against the residual. A wander that chance
+    makes likely is not drawn: half of all white noise fits one. Each candidate's ratios are first divided by how much
+    the draws exceed their chi-square (Bartlett's correction), so that one whose noise is larger than the model's does
+    not set the level for all. A shape that was closed in on, beyond those that were tried, is left out: the draws had
+    no such choice. So is an amplitude of a sign that the physics does not allow.
     """
     stationary = linearised.entering(count, generator)
     if stationary is None:
         stationary = linearised.search.white(count, generator)
-    drawn = linearised.search.gains(stationary + linearised.search.wander(count, noise, generator))
+    if noise.gain > _WANDERS:
+        stationary = stationary + linearised.search.wander(count, noise, generator)
+    drawn = linearised.search.gains(stationary)
     dof = found.dof.clamp(min=1.0)
     excess = (drawn.ratio.mean(-1) / dof).clamp(min=1.0).unsqueeze(-1)
     tried = len(possible)

@@ -18,18 +18,18 @@ def gains(ratio):
     return Gains(ratio, log_survival(ratio, DOF.unsqueeze(-1)), DOF)
 
 
-def judged(own, tried, possible=None):
+def judged(own, tried, possible=None, *, gain=0.0, wandering=None):
     drawn = torch.distributions.Chi2(torch.tensor(3.0).double())
     torch.manual_seed(0)
     noise = drawn.sample((2, DRAWS))
     search = SimpleNamespace(
         white=lambda count, _: torch.zeros(1, count),
-        wander=lambda count, _noise, _generator: torch.zeros(1, count),
-        gains=lambda _series: gains(noise),
+        wander=lambda count, _noise, _generator: torch.ones(1, count),
+        gains=lambda series: gains(noise if wandering is None or not bool(series.any()) else wandering),
     )
     linearised = SimpleNamespace(entering=lambda _count, _generator: None, search=search)
     possible = torch.ones(tried, dtype=torch.bool) if possible is None else torch.tensor(possible)
-    return _judged(linearised, None, gains([[own[0]], [own[1]]]), possible, DRAWS, None)
+    return _judged(linearised, SimpleNamespace(gain=gain), gains([[own[0]], [own[1]]]), possible, DRAWS, None)
 
 
 def test_what_exceeds_all_draws_has_the_smallest_p_value_and_says_by_how_much():
@@ -41,6 +41,14 @@ def test_what_exceeds_all_draws_has_the_smallest_p_value_and_says_by_how_much():
 def test_an_amplitude_of_an_impossible_sign_does_not_count():
     assert judged((100.0, 1.0), 2, possible=(False, True))[0] > 0.3
     assert judged((100.0, 1.0), 2, possible=(False, False))[0] == 1.0
+
+
+def test_a_wander_is_drawn_where_it_is_more_than_chance():
+    """Half of all white noise fits one; draws with it would be harder to exceed."""
+    wandering = torch.full((2, DRAWS), 50.0, dtype=torch.float64)
+    without, _ = judged((20.0, 1.0), 2, gain=1.0, wandering=wandering)
+    assert without == pytest.approx(1.0 / (1 + DRAWS))
+    assert judged((20.0, 1.0), 2, gain=5.0, wandering=wandering)[0] > 0.3
 
 
 def test_a_shape_closed_in_on_is_left_out():
