@@ -234,8 +234,11 @@ def colour_of(power: Float[Tensor, "K m"]) -> Colour:
     (Whittle's likelihood); an autoregression by Levinson's recursion, of an order by BIC; and local averages of what
     these two miss, over the more coefficients the higher the frequency.
 
+    The constant says nothing of a spectrum: it may be an offset. Its neighbour stands in for it.
+
     Whittle, "Estimation and information in stationary time series", Arkiv för Matematik 2 (1953).
     """
+    power = torch.cat([power[1:2], power[1:]])
     found = [_shape(one) for one in power.unbind(-1)]
     root = torch.stack([shape.sqrt() for _, shape in found], -1)
     left = _local_mean(power / root.square())

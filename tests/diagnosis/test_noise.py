@@ -258,3 +258,10 @@ def test_where_noise_enters_is_seen_by_the_turns():
         right += enters_at_port(white + torch.einsum("nmc,nc->nm", axes, noise), axes)
         right += not enters_at_port(white + noise, axes)
     assert right >= 18
+
+
+def test_an_offset_is_no_colour():
+    power = torch.randn(400, 2, generator=torch.Generator().manual_seed(12), dtype=torch.float64).square()
+    shifted = power.clone()
+    shifted[0] = 1e5
+    torch.testing.assert_close(colour_of(shifted).root, colour_of(power).root)
