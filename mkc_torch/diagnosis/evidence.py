@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.noise import autoregression, filtered
-from mkc_torch.diagnosis.refit import FittedModel, fitted
+from mkc_torch.diagnosis.refit import FittedModel, each, fitted
 from mkc_torch.functional import mkc_nll
 from mkc_torch.order_statistic import robust_scale
 
@@ -84,16 +85,18 @@ def held_out(fit: FittedModel, blocks: HeldOutBlocks) -> Evidence:
     N = len(fit.residual)
     log_likelihood = fit.residual.new_zeros(N)
     residual = torch.zeros_like(fit.residual)
-    sigma, d, parameters = [], [], []
-    for number, train in enumerate(blocks.train):
-        found = fitted(fit.model, fit.parameters, fit.bound, rows=train.to(fit.residual.dtype), graduate=False)
+
+    def without(train: Bool[Tensor, " N"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        rows = train.to(fit.residual.dtype)
+        found = fitted(fit.model, fit.parameters, fit.bound, rows=rows, graduate=False)
+        return fit.model.residual(found.parameters).detach(), found.sigma, found.d, found.bound, found.parameters
+
+    folds = each(fit, [partial(without, train) for train in blocks.train])
+    for number, (out, *density, _) in enumerate(folds):
         seen = blocks.fold == number
-        out = fit.model.residual(found.parameters).detach()
         residual[seen] = out[seen]
-        log_likelihood[seen] = scored(out, found.sigma, found.d, found.bound)[seen]
-        sigma.append(found.sigma)
-        d.append(found.d)
-        parameters.append(found.parameters)
+        log_likelihood[seen] = scored(out, *density)[seen]
+    _, sigma, d, _, parameters = zip(*folds, strict=True)
     middle = torch.stack(sigma).median(0).values, torch.stack(d).median(0).values
     left_out = 1.0 - float(torch.stack(blocks.train).double().mean())
     return Evidence(log_likelihood, residual, *middle, torch.stack(parameters), left_out)

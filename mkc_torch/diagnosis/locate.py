@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -15,7 +16,7 @@ from mkc_torch.diagnosis.linearise import Linearised, Tangents, candidate_tangen
 from mkc_torch.diagnosis.local import beside_wander
 from mkc_torch.diagnosis.model import JointModel, Key, Term, one_sided
 from mkc_torch.diagnosis.preference import Preference
-from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted_beside
+from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted_beside, fitted_each
 from mkc_torch.diagnosis.search import Gains, NoiseFit, log_survival
 from mkc_torch.effects.protocol import ContinuousEffect
 from mkc_torch.functional import mkc_energy
@@ -247,7 +248,12 @@ def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *
     close = max(_THIRD * _score(leading[0], base, prefer), _MUCH)
     leading = [fit for place, fit in enumerate(leading) if place < _LEADING or _score(fit, base, prefer) > close]
     order = [terms[number] for number in likeliest.argsort().tolist()]
-    shaped = [_refined(_best_shape(fit, base, order, prefer), base) for fit in leading]
+
+    def shaped_best(fit: FittedModel) -> FittedModel:
+        fit.model.residual(fit.parameters)  # what other shapes of it begin with, where a simulation remembers
+        return _refined(_best_shape(fit, base, order, prefer), base)
+
+    shaped = fitted_each(base, [(fit.model, partial(shaped_best, fit)) for fit in leading])
     shaped = [fit for fit in shaped if _repeats(fit)] or [fit for fit in fits.values() if _repeats(fit)]
     if not shaped:
         raise ValueError(
@@ -264,14 +270,17 @@ def _repeats(fit: FittedModel) -> bool:
 
 def _refit_all(fits: dict[Key, FittedModel], base: FittedModel, listed: Sequence[Listed], prefer: Preference) -> None:
     """Put the joint refit of each into ``fits``, where it is the better one of its physics."""
-    done: set[tuple[Key, int]] = set()
-    for term, parameters, gamma in listed:
-        if (term.key, id(parameters)) in done:
-            continue
-        done.add((term.key, id(parameters)))
-        fit = fitted_beside(base, base.model.with_term(term), torch.cat([parameters, gamma]))
-        if term.key not in fits or _score(fit, base, prefer) > _score(fits[term.key], base, prefer):
-            fits[term.key] = fit
+    first: dict[tuple[Key, int], Listed] = {}
+    for one in listed:
+        first.setdefault((one[0].key, id(one[1])), one)
+    models = [base.model.with_term(term) for term, _, _ in first.values()]
+    works = [
+        (model, partial(fitted_beside, base, model, torch.cat([parameters, gamma])))
+        for model, (_, parameters, gamma) in zip(models, first.values(), strict=True)
+    ]
+    for (key, _), fit in zip(first, fitted_each(base, works), strict=True):
+        if key not in fits or _score(fit, base, prefer) > _score(fits[key], base, prefer):
+            fits[key] = fit
 
 
 def _score(fit: FittedModel, base: FittedModel, prefer: Preference) -> float:

@@ -45,6 +45,10 @@ class SimulationError(ValueError):
     """A simulation that cannot be computed; the sentence says where and why."""
 
 
+_Mark = tuple[float, float]
+_Memory = tuple[dict[int, Trajectory], OrderedDict[_Mark, Tensor]]
+
+
 @dataclass(frozen=True)
 class Parameter:
     """A parameter of a simulation.
@@ -235,7 +239,7 @@ class PreparedDynamics:
         self.inputs_at_rows = inputs
         self._guess = first_guess(self, time, node_before, node_share)
         self._last: dict[int, Trajectory] = {}
-        self._solved: OrderedDict[tuple[float, float], Tensor] = OrderedDict()
+        self._solved: OrderedDict[_Mark, Tensor] = OrderedDict()
         self.__dict__.pop("ports", None)  # their clock is that of the stations
 
     def _between(self, inputs: Float[Tensor, "N u"]) -> Float[Tensor, "S u"]:
@@ -432,13 +436,35 @@ class PreparedDynamics:
         if found.converged and mark is not None and not transformed(found.states):
             states = found.states.detach()
             self._last[begin.shape[1]] = replace(found, states=states)
-            self._solved[mark] = states
-            self._solved.move_to_end(mark)
-            while len(self._solved) * states.numel() > _MOST_KEPT:
-                self._solved.popitem(last=False)
+            self.learn((mark, states))
         return found
 
-    def _mark(self, rate: Rate, begin: Tensor, guess: Tensor) -> tuple[float, float]:
+    @property
+    def memory(self) -> _Memory:
+        """The trajectories found so far, by their number of states the last ones, and others."""
+        return dict(self._last), self._solved.copy()
+
+    @memory.setter
+    def memory(self, known: _Memory) -> None:
+        last, solved = known
+        self._last, self._solved = dict(last), solved.copy()
+
+    @property
+    def newest(self) -> tuple[_Mark, Tensor] | None:
+        """The last trajectory found, with its mark."""
+        return next(reversed(self._solved.items()), None)
+
+    def learn(self, newest: tuple[_Mark, Tensor] | None) -> None:
+        """Keep a trajectory; the oldest give way."""
+        if newest is None:
+            return
+        mark, states = newest
+        self._solved[mark] = states
+        self._solved.move_to_end(mark)
+        while len(self._solved) * states.numel() > _MOST_KEPT:
+            self._solved.popitem(last=False)
+
+    def _mark(self, rate: Rate, begin: Tensor, guess: Tensor) -> _Mark:
         """Numbers by which the same equations are known again."""
         rates = rate(self.grid.spread(guess)).detach()
         uneven = torch.linspace(1.0, 2.0, len(rates), dtype=rates.dtype).sqrt().unsqueeze(-1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -151,6 +151,26 @@ class PreparedSimulation(Protocol):
 
     def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Float[Tensor, "G k"]]:
         """What passes through each port: what an effect that depends on the signal is a function of."""
+        ...
+
+
+@runtime_checkable
+class Remembering(Protocol):
+    """A prepared simulation that begins with what it solved before: its answer depends on what it was asked, as far as
+    rounding goes, or as there are several.
+
+    Attributes:
+        memory: all of that, to be put back.
+        newest: the newest of it, that of the last answer, which can be pickled.
+    """
+
+    memory: Any
+
+    @property
+    def newest(self) -> Any: ...
+
+    def learn(self, newest: Any) -> None:
+        """Add what was solved in another copy."""
         ...
 
 
