@@ -1,20 +1,24 @@
-"""Independent work shared with forked copies of this process: they know all it knows, and nothing is sent to them."""
+"""Work shared with forked copies of this process: they know all that it knows, and nothing has to be sent to them."""
 
 from __future__ import annotations
 
 import gc
+import io
 import os
 import pickle
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
-from typing import BinaryIO, TypeVar
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Any, BinaryIO, TypeVar
+
+import torch
 
 from mkc_torch._processes import cores
 
-__all__ = ["allow_copies", "shared"]
+__all__ = ["allow_copies", "meanwhile", "shared"]
 
 T = TypeVar("T")
 
@@ -23,7 +27,7 @@ _BYTES = 4
 
 
 def allow_copies(most: int | None = None) -> None:
-    """Have :func:`shared` use all cores from now on, or so many copies beside this process.
+    """Have work be shared by all cores from now on, or by so many copies beside this process.
 
     For a command of our own, in which torch computes in one thread from the beginning: its threads, and a GPU, do not
     survive a fork. Nothing is forked elsewhere than on Linux.
@@ -32,38 +36,105 @@ def allow_copies(most: int | None = None) -> None:
     _copies = (cores() - 1 if most is None else most) if sys.platform == "linux" else 0
 
 
-def shared(works: Sequence[Callable[[], T]]) -> list[T]:
+def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) -> list[T]:
     """The results of all works, in their order; who works at which makes no difference to any.
 
     Args:
-        works: none needs what another one leaves behind, and the results can be pickled. What a copy could not do, or
-            not send, is done here.
+        works: none needs what another one leaves behind. What a copy could not do, or not send, is done here.
+        known: objects that results may hold and that copies need not send, as this process has them; the rest of a
+            result can be pickled.
 
     Example:
         >>> shared([lambda: 2 + 2, lambda: 3 + 3])
         [4, 6]
     """
-    copies = min(_copies, len(works) - 1)
-    if copies < 1:
+    count = min(_copies, len(works) - 1)
+    if count < 1:
         return [work() for work in works]
-    todo, entry = os.pipe()
-    os.write(entry, b"".join(number.to_bytes(_BYTES, "big") for number in range(len(works))))
-    os.close(entry)
-    started: list[tuple[int, BinaryIO]] = []
-    try:
-        started.extend(_copy(works, todo) for _ in range(copies))
+    with _todo(len(works)) as todo, _started(works, todo, count, known) as copies:
         done = {number: works[number]() for number in _taken(todo)}
-        for _, answer in started:
-            with suppress(EOFError, pickle.UnpicklingError):
-                done |= {number: pickle.loads(result) for number, result in pickle.load(answer).items()}
+        for copy in copies:
+            done |= copy.done()
+    return [done[number] if number in done else work() for number, work in enumerate(works)]
+
+
+@contextmanager
+def meanwhile(work: Callable[[], T], known: Iterable[object] = ()) -> Iterator[Callable[[], T | None] | None]:
+    """What a copy works at while this process goes on; ``known`` as of :func:`shared`.
+
+    Gives a function that waits for the result, which is None if the copy could not do or send it; None where there is
+    no core to spare.
+    """
+    global _copies
+    if _copies < 1:
+        yield None
+        return
+    _copies -= 1
+    try:
+        with _todo(1) as todo, _started([work], todo, 1, known) as (copy,):
+            yield lambda: copy.done().get(0)
+    finally:
+        _copies += 1
+
+
+@dataclass(frozen=True)
+class _Copy:
+    """A copy of this process, and where it writes what it has done in the end."""
+
+    process: int
+    answer: BinaryIO
+    known: dict[int, object]
+
+    def done(self) -> dict[int, Any]:
+        """The results by the numbers of the works."""
+        try:
+            sent: dict[int, bytes] = pickle.load(self.answer)
+        except (EOFError, pickle.UnpicklingError):
+            return {}
+        return {number: _Receiver(io.BytesIO(result), self.known).load() for number, result in sent.items()}
+
+    def end(self) -> None:
+        self.answer.close()
+        with suppress(ProcessLookupError):
+            os.kill(self.process, signal.SIGKILL)
+        os.waitpid(self.process, 0)
+
+
+class _Sender(pickle.Pickler):
+    """Pickles all but what both processes have at the same address; of a tensor its own numbers, not its storage."""
+
+    def __init__(self, file: io.BytesIO, known: dict[int, object]) -> None:
+        super().__init__(file, pickle.HIGHEST_PROTOCOL)
+        self.known = known
+
+    def persistent_id(self, obj: object) -> int | None:
+        return id(obj) if id(obj) in self.known else None
+
+    def reducer_override(self, obj: object) -> Any:
+        if type(obj) is torch.Tensor:
+            return torch.from_numpy, (obj.detach().numpy(),)
+        return NotImplemented
+
+
+class _Receiver(pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, known: dict[int, object]) -> None:
+        super().__init__(file)
+        self.known = known
+
+    def persistent_load(self, pid: int) -> object:
+        return self.known[pid]
+
+
+@contextmanager
+def _todo(count: int) -> Iterator[int]:
+    """Where the numbers of works are taken from: whoever reads one has it."""
+    todo, entry = os.pipe()
+    os.write(entry, b"".join(number.to_bytes(_BYTES, "big") for number in range(count)))
+    os.close(entry)
+    try:
+        yield todo
     finally:
         os.close(todo)
-        for process, answer in started:
-            answer.close()
-            with suppress(ProcessLookupError):
-                os.kill(process, signal.SIGKILL)
-            os.waitpid(process, 0)
-    return [done[number] if number in done else work() for number, work in enumerate(works)]
 
 
 def _taken(todo: int) -> Iterator[int]:
@@ -72,17 +143,31 @@ def _taken(todo: int) -> Iterator[int]:
         yield int.from_bytes(taken, "big")
 
 
-def _copy(works: Sequence[Callable[[], object]], todo: int) -> tuple[int, BinaryIO]:
-    """A copy of this process that takes part: its number, and where it writes what it has done in the end."""
+@contextmanager
+def _started(
+    works: Sequence[Callable[[], object]], todo: int, count: int, known: Iterable[object]
+) -> Iterator[list[_Copy]]:
+    """Copies that take part, and are gone in the end."""
+    by_address = {id(one): one for one in known}
+    copies: list[_Copy] = []
+    try:
+        copies.extend(_copy(works, todo, by_address) for _ in range(count))
+        yield copies
+    finally:
+        for copy in copies:
+            copy.end()
+
+
+def _copy(works: Sequence[Callable[[], object]], todo: int, known: dict[int, object]) -> _Copy:
     answer, entry = os.pipe()
     parent = os.getpid()
     with warnings.catch_warnings():
-        # that other threads may hold locks: those that there are, of the progress and of tables, are not used here
+        # that other threads may hold locks: those that there are, of progress bars and tables, do nothing that is used
         warnings.simplefilter("ignore", DeprecationWarning)
         process = os.fork()
     if process:
         os.close(entry)
-        return process, os.fdopen(answer, "rb")
+        return _Copy(process, os.fdopen(answer, "rb"), known)
     try:
         os.close(answer)
         signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -93,7 +178,8 @@ def _copy(works: Sequence[Callable[[], object]], todo: int) -> tuple[int, Binary
             if os.getppid() != parent:
                 break
             with suppress(Exception):
-                done[number] = pickle.dumps(works[number]())
+                _Sender(result := io.BytesIO(), known).dump(works[number]())
+                done[number] = result.getvalue()
         with os.fdopen(entry, "wb") as file:
             pickle.dump(done, file)
     finally:

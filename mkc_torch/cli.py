@@ -20,9 +20,11 @@ def main() -> None:
     if missing is not None:
         sys.exit(f'mkc: {missing} is not installed; install the command line with `pip install "mkc-torch[cli]"`.')
     from mkc_torch._commands import app
+    from mkc_torch._forked import allow_copies
     from mkc_torch._processes import keep_modules
 
     keep_modules()
+    allow_copies()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a pipe's encoding may lack σ and ±

@@ -16,6 +16,7 @@ from rich.text import Text
 from mkc_torch._commands.apply import correct, read_correction
 from mkc_torch._commands.console import FAILURES, Look, complain, out, progress
 from mkc_torch._commands.diagnosis_files import Request, diagnose_file, named_simulation
+from mkc_torch._forked import allow_copies
 from mkc_torch._processes import cores, keep_memory
 from mkc_torch.recording import Recording
 
@@ -76,6 +77,7 @@ def challenge(
     diagnose, correct_one = _JOBS[family]
     torch.set_num_threads(1)
     keep_memory()
+    allow_copies(0)  # the workers are as many processes as was asked for
     try:
         with progress(cases + empty) as step:
             score = run.run_challenge(

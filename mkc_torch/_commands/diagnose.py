@@ -31,7 +31,6 @@ from mkc_torch._commands.diagnosis_files import (
     diagnose_file,
     simulation_of,
 )
-from mkc_torch._forked import allow_copies
 from mkc_torch._processes import in_processes, keep_memory
 from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
 
@@ -88,8 +87,6 @@ def diagnose(
     _refuse_unusable(request)
     torch.set_num_threads(1)  # the tensors of a recording are too small to share, and processes leave no cores
     keep_memory()
-    if len(recordings) == 1:
-        allow_copies()
     look = Look.of(out())
     work = partial(_diagnosed, output, request, look)
     total = failed = 0

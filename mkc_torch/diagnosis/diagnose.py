@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._forked import meanwhile
 from mkc_torch.diagnosis.candidates import candidate_terms, described
 from mkc_torch.diagnosis.ceiling import ceiling
 from mkc_torch.diagnosis.density_check import density_warnings
@@ -28,6 +29,7 @@ from mkc_torch.diagnosis.remaining import remaining, remaining_warning
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Finding, HeldOut, Separability, Spread, Traces, Verdict
 from mkc_torch.diagnosis.separability import separability
 from mkc_torch.diagnosis.shifts import shift_warning, shifted
+from mkc_torch.diagnosis.side_by_side import known_of, learn, memory_kept, with_memory
 from mkc_torch.diagnosis.units import unit_warnings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.protocol import Effect
@@ -109,11 +111,44 @@ def diagnose(
     roles = frozenset(role for effect in effects for role in effect.roles)
     drivers = find_drivers(prepared.recording, simulation.columns, roles)
     terms = candidate_terms(prepared, drivers.drivers, effects)
+    asked = _Asked(level, surrogates, max_findings, seed)
     generator = torch.Generator().manual_seed(seed)
     base = _base(prepared)
-    search = _searched(base, terms, level, surrogates, max_findings, seed, generator)
-    final = estimate(search.found[-1].fit if search.found else base).at_least(search.evidence[-1].jackknife)
-    return _assembled(simulation, prepared, drivers, terms, base, search, final, level, surrogates, seed, generator)
+    search = _begun(base, terms, asked, generator)
+
+    def finished() -> Diagnosis:
+        final = estimate(search.found[-1].fit if search.found else base).at_least(search.evidence[-1].jackknife)
+        return _assembled(simulation, prepared, drivers, len(terms), base, search, final, asked)
+
+    def following() -> tuple[_Search, Tensor]:
+        return _continued(search, asked, generator), generator.get_state()
+
+    while search.left:
+        diagnosis = sent = None
+        work = with_memory(prepared, following)
+        with meanwhile(work, [*search.parts, *known_of(prepared, terms)]) as answer:
+            if answer is not None:
+                # most often there is nothing more
+                with memory_kept(prepared):
+                    diagnosis = finished()
+                sent = answer()
+        (after, state), newest = work() if sent is None else sent
+        generator.set_state(state)
+        learn(prepared, newest)
+        if diagnosis is not None and len(after.found) == len(search.found) and after.unconfirmed is None:
+            return diagnosis
+        search = after
+    return finished()
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """The arguments of :func:`diagnose` that are numbers."""
+
+    level: float
+    surrogates: int
+    max_findings: int
+    seed: int
 
 
 def _holds(
@@ -163,7 +198,8 @@ def _check(level: float, surrogates: int, max_findings: int) -> None:
 class _Search:
     """One search after the other: the first one, what was found, and what unseen blocks did not confirm.
 
-    ``evidence`` is that of the simulation alone and with one finding more each.
+    ``evidence`` is that of the simulation alone and with one finding more each; ``left`` are candidates that are still
+    to be searched beside what was found, none once the search is over.
     """
 
     first: Located | None
@@ -171,37 +207,45 @@ class _Search:
     unconfirmed: Located | None
     blocks: HeldOutBlocks
     evidence: tuple[Evidence, ...]
+    left: tuple[Term, ...]
+
+    @property
+    def parts(self) -> tuple[object, ...]:
+        """What the next search goes on with."""
+        return self.first, *self.found, self.blocks, *self.evidence
 
 
-def _searched(
-    base: FittedModel,
-    terms: tuple[Term, ...],
-    level: float,
-    surrogates: int,
-    max_findings: int,
-    seed: int,
-    generator: torch.Generator,
-) -> _Search:
-    """Search beside what was found, as long as something is found that unseen blocks confirm."""
-    N, fit = len(base.residual), base
+def _begun(base: FittedModel, terms: tuple[Term, ...], asked: _Asked, generator: torch.Generator) -> _Search:
+    """The first search, and its finding, if unseen blocks confirm it."""
     first: Located | None = None
-    found: list[Located] = []
     if terms:
-        first = locate(fit, terms, level=level, surrogates=surrogates, generator=generator)
-    blocks = blocks_of(N, 1 if first is None else 1 + first.linearised.colour.order)
-    evidence = [held_out(base, blocks)]
-    last = first
-    while last is not None and last.p_value <= level and len(found) < max_findings:
-        evidence.append(held_out(last.fit, blocks))
-        if not _holds(last, evidence[-2], evidence[-1], blocks, seed, first=not found):
-            return _Search(first, tuple(found), last, blocks, tuple(evidence[:-1]))
-        found.append(last)
-        near = _NEAR * float(base.model.prepared.time[-1] - base.model.prepared.time[0])
-        terms = tuple(t for t in terms if not _same(t, last.term, near))
-        if len(found) == max_findings or not terms:
-            break
-        last = locate(last.fit, terms, level=level, surrogates=surrogates, generator=generator, parts=False)
-    return _Search(first, tuple(found), None, blocks, tuple(evidence))
+        first = locate(base, terms, level=asked.level, surrogates=asked.surrogates, generator=generator)
+    blocks = blocks_of(len(base.residual), 1 if first is None else 1 + first.linearised.colour.order)
+    search = _Search(first, (), None, blocks, (held_out(base, blocks),), terms)
+    return search if first is None else _taken_up(search, first, asked)
+
+
+def _continued(search: _Search, asked: _Asked, generator: torch.Generator) -> _Search:
+    """The next search, beside what was found."""
+    fit = search.found[-1].fit
+    located = locate(fit, search.left, level=asked.level, surrogates=asked.surrogates, generator=generator, parts=False)
+    return _taken_up(search, located, asked)
+
+
+def _taken_up(search: _Search, located: Located, asked: _Asked) -> _Search:
+    """With what was located, if it counts."""
+    over = replace(search, left=())
+    if located.p_value > asked.level or asked.max_findings == 0:
+        return over
+    before, after = search.evidence[-1], held_out(located.fit, search.blocks)
+    if not _holds(located, before, after, search.blocks, asked.seed, first=not search.found):
+        return replace(over, unconfirmed=located)
+    found = (*search.found, located)
+    time = located.fit.model.prepared.time
+    near = _NEAR * float(time[-1] - time[0])
+    left = tuple(t for t in search.left if not _same(t, located.term, near))
+    evidence = (*search.evidence, after)
+    return replace(search, found=found, evidence=evidence, left=left if len(found) < asked.max_findings else ())
 
 
 def _same(term: Term, found: Term, near: float) -> bool:
@@ -221,22 +265,20 @@ def _assembled(
     simulation: Simulation,
     prepared: PreparedSimulation,
     drivers: Drivers,
-    terms: tuple[Term, ...],
+    tried: int,
     base: FittedModel,
     search: _Search,
     final: Estimate,
-    level: float,
-    surrogates: int,
-    seed: int,
-    generator: torch.Generator,
+    asked: _Asked,
 ) -> Diagnosis:
+    generator = torch.Generator().manual_seed(asked.seed)
     found, blocks, evidence, first = search.found, search.blocks, search.evidence, search.first
     inliers = (evidence[-1].residual.abs() <= 3.0 * evidence[-1].d) & (final.fit.weights > _REST)
     fits = [base, *(s.fit for s in found)]
     findings = [
         replace(
             finding_of(s, final, k, *_held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, generator)),
-            extrapolation=extrapolated(fits[k], s.fit, seed),
+            extrapolation=extrapolated(fits[k], s.fit, asked.seed),
             driver_shift=shifted(fits[k].model, s),
         )
         for k, s in enumerate(found)
@@ -244,16 +286,16 @@ def _assembled(
     nameless = any(f.effect == UNKNOWN for f in findings)
     verdict: Verdict = "adequate" if not findings else "unexplained" if nameless else "explained"
     any_fit = ceiling(base.model, _answerable(base, final.fit), drivers.drivers, blocks)
-    left = () if nameless else remaining(any_fit, evidence[-1], final.fit, drivers.drivers, blocks, seed)
+    left = () if nameless else remaining(any_fit, evidence[-1], final.fit, drivers.drivers, blocks, asked.seed)
     return Diagnosis(
         recording=prepared.recording.name,
         simulation=prepared.name,
         samples=len(prepared.time),
-        level=level,
+        level=asked.level,
         noise=noise_summary(final),
-        candidates_tried=len(terms),
-        surrogates=surrogates,
-        seed=seed,
+        candidates_tried=tried,
+        surrogates=asked.surrogates,
+        seed=asked.seed,
         p_value=first.p_value if first else 1.0,
         verdict=verdict,
         findings=tuple(findings),

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.noise import autoregression, filtered
-from mkc_torch.diagnosis.refit import FittedModel, each, fitted
+from mkc_torch.diagnosis.refit import FittedModel, fitted
+from mkc_torch.diagnosis.side_by_side import each
 from mkc_torch.functional import mkc_nll
 from mkc_torch.order_statistic import robust_scale
 

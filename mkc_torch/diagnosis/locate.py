@@ -16,8 +16,9 @@ from mkc_torch.diagnosis.linearise import Linearised, Tangents, candidate_tangen
 from mkc_torch.diagnosis.local import beside_wander
 from mkc_torch.diagnosis.model import JointModel, Key, Term, one_sided
 from mkc_torch.diagnosis.preference import Preference
-from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted_beside, fitted_each
+from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted_beside
 from mkc_torch.diagnosis.search import Gains, NoiseFit, log_survival
+from mkc_torch.diagnosis.side_by_side import fitted_each
 from mkc_torch.effects.protocol import ContinuousEffect
 from mkc_torch.functional import mkc_energy
 from mkc_torch.order_statistic import robust_scale
@@ -253,7 +254,7 @@ def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *
         fit.model.residual(fit.parameters)  # what other shapes of it begin with, where a simulation remembers
         return _refined(_best_shape(fit, base, order, prefer), base)
 
-    shaped = fitted_each(base, [(fit.model, partial(shaped_best, fit)) for fit in leading])
+    shaped = fitted_each(base, [partial(shaped_best, fit) for fit in leading], terms)
     shaped = [fit for fit in shaped if _repeats(fit)] or [fit for fit in fits.values() if _repeats(fit)]
     if not shaped:
         raise ValueError(
@@ -273,12 +274,12 @@ def _refit_all(fits: dict[Key, FittedModel], base: FittedModel, listed: Sequence
     first: dict[tuple[Key, int], Listed] = {}
     for one in listed:
         first.setdefault((one[0].key, id(one[1])), one)
-    models = [base.model.with_term(term) for term, _, _ in first.values()]
     works = [
-        (model, partial(fitted_beside, base, model, torch.cat([parameters, gamma])))
-        for model, (_, parameters, gamma) in zip(models, first.values(), strict=True)
+        partial(fitted_beside, base, base.model.with_term(term), torch.cat([parameters, gamma]))
+        for term, parameters, gamma in first.values()
     ]
-    for (key, _), fit in zip(first, fitted_each(base, works), strict=True):
+    found = fitted_each(base, works, [term for term, _, _ in first.values()])
+    for (key, _), fit in zip(first, found, strict=True):
         if key not in fits or _score(fit, base, prefer) > _score(fits[key], base, prefer):
             fits[key] = fit
 

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from mkc_torch import nonlinear
-from mkc_torch._forked import shared
 from mkc_torch.diagnosis.model import JointModel
 from mkc_torch.diagnosis.noise import pseudo_residual
-from mkc_torch.effects.protocol import Shape
 from mkc_torch.order_statistic import robust_scale
-from mkc_torch.simulation.protocol import Remembering
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FittedModel", "clipped_residual", "each", "fitted", "fitted_beside", "fitted_each"]
-
-T = TypeVar("T")
+__all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_beside"]
 
 _CLIP = 2.0
 _SHARES = (1.0, 0.3, 0.1, 0.01, 0.0)
@@ -106,51 +99,6 @@ def fitted_beside(
     except ValueError:
         none = base.parameters.new_zeros(model.size - base.model.size)
         return replace(base, model=model, parameters=torch.cat([base.parameters, none]))
-
-
-def fitted_each(
-    around: FittedModel, works: Sequence[tuple[JointModel, Callable[[], FittedModel]]]
-) -> list[FittedModel]:
-    """:func:`each` for fits.
-
-    Args:
-        around: the fit that they are near.
-        works: for each a model that differs from the one to be fitted in the shape of its last effect alone, and what
-            fits it.
-    """
-
-    def found(work: Callable[[], FittedModel]) -> tuple[Shape, dict[str, Any]]:
-        fit = work()
-        fit.model.residual(fit.parameters)  # to be the newest that a simulation remembers
-        return fit.model.terms[-1].shape, {name: value for name, value in vars(fit).items() if name != "model"}
-
-    results = each(around, [partial(found, work) for _, work in works])
-    return [
-        FittedModel(model.with_shape(shape), **fit) for (model, _), (shape, fit) in zip(works, results, strict=True)
-    ]
-
-
-def each(around: FittedModel, fits: Sequence[Callable[[], T]]) -> list[T]:
-    """The results of fits near another fit, on all cores that may be used.
-
-    A simulation that remembers begins each of them with what it gave for that fit, and in the end also knows the last
-    answer of each.
-    """
-    prepared = around.model.prepared
-    if not isinstance(prepared, Remembering):
-        return shared(fits)
-    around.model.residual(around.parameters)
-    known = prepared.memory
-
-    def remembered(fit: Callable[[], T]) -> tuple[T, object]:
-        prepared.memory = known
-        return fit(), prepared.newest
-
-    results = shared([partial(remembered, fit) for fit in fits])
-    prepared.memory = known
-    for _, newest in results:
-        prepared.learn(newest)
-    return [result for result, _ in results]
 
 
 def _usable(model: JointModel, start: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
