@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.drivers import Driver
 from mkc_torch.effects.protocol import BoundedEffect, Context, Effect, GainEffect, Shape, SignalEffect
-from mkc_torch.nonlinear import GaussianPrior
+from mkc_torch.nonlinear import GaussianPrior, beside
 from mkc_torch.simulation.protocol import Change, Changes, FreeChange, Port, PreparedSimulation
 
 if TYPE_CHECKING:
@@ -175,13 +175,13 @@ class JointModel:
 
 def port_jacobian(model: JointModel, parameters: Float[Tensor, " p"], port: str) -> Float[Tensor, "N m c"]:
     """How the residual of each sample changes with what enters at a pointwise port, by forward mode."""
-    changes = model.changes(parameters)
     known = model.prepared.ports[port]
     N = len(model.prepared.time)
     zero = parameters.new_zeros(N, len(known.channels))
 
     def residual(change: Tensor) -> Tensor:
-        return model.prepared.residual(parameters[: model.base], with_constant(changes, port, change))
+        moving = beside(parameters, change[0, 0])
+        return model.prepared.residual(moving[: model.base], with_constant(model.changes(moving), port, change))
 
     columns = []
     for k in range(len(known.channels)):
@@ -239,8 +239,11 @@ def directions(term: Term, context: Context) -> Float[Tensor, "N c q"]:
         # a gain on a course: the derivative is the course, channel by channel
         eye = torch.eye(len(context.channels), dtype=context.signal.dtype)
         return term.effect.course(term.shape, context)[:, None, None] * eye
-    zero = context.signal.new_zeros(term.size(context))
-    return torch.func.jacfwd(lambda gamma: term.effect.change(gamma, term.shape, context))(zero)
+
+    def change(gamma: Tensor) -> Tensor:
+        return term.effect.change(gamma, term.shape, replace(context, signal=beside(context.signal, gamma[0])))
+
+    return torch.func.jacfwd(change)(context.signal.new_zeros(term.size(context)))
 
 
 def through_port(

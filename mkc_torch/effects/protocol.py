@@ -312,7 +312,7 @@ class GainEffect:
         return (Quantity(self.gain, len(context.channels), self.unit(context)),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        return self.course(shape, context).unsqueeze(-1) * gamma
+        return self.course(shape, context).unsqueeze(-1) @ gamma.unsqueeze(0)
 
 
 def per(unit: str, other: str) -> str:

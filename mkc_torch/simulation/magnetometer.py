@@ -15,7 +15,7 @@ from mkc_torch.coverage import coverage
 from mkc_torch.ellipsoid import MIN_INFORMATION, EllipsoidFit, NotIdentifiableError
 from mkc_torch.linear import LeastTrimmedSquares
 from mkc_torch.linear._problem import RankDeficientError
-from mkc_torch.nonlinear import GaussianPrior
+from mkc_torch.nonlinear import GaussianPrior, beside
 from mkc_torch.recording import Recording
 from mkc_torch.simulation.protocol import Changes, FreeChange, Port
 from mkc_torch.simulation.rotation import from_quaternion, rotation_since
@@ -113,6 +113,7 @@ class _View:
     name = "magnetometer"
     view: str
     ports: dict[str, Port]
+    strength: float
     bounds: tuple[Tensor, Tensor] | None = None
 
     def __init__(self, recording: Recording) -> None:
@@ -141,20 +142,27 @@ class _View:
         """Calibration matrix of the parameters."""
         return _MATRIX_OF_VIEW[self.view](theta)
 
-    def corrected(self, theta: Float[Tensor, " p"], sensor: Tensor | float) -> Float[Tensor, "N 3"]:
-        """The calibrated field, once ``sensor`` is taken off the measurement."""
-        return (self.measured - sensor - theta[:3]) @ self.matrix(theta).mT
+    def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
+        """The calibrated field, with what changes the sensor taken off the measurement."""
+        return self._away(theta, changes) @ self.matrix(theta).mT
 
-    # forward mode takes half a millisecond for each constant beside what is differentiated: nothing stays the number 0
-    def _sensor_change(self, theta: Tensor, changes: Changes) -> Tensor | float:
-        if "sensor" not in changes:
-            return 0.0
-        change = changes["sensor"]
-        return change(torch.zeros_like(self.measured) if isinstance(change, FreeChange) else self.simulated(theta))
+    def _away(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
+        """The measurement from the offset, with what changes the sensor taken off it."""
+        away = beside(self.measured, theta[0])
+        if "sensor" in changes:
+            change = changes["sensor"]
+            away = away - change(
+                torch.zeros_like(self.measured) if isinstance(change, FreeChange) else self.simulated(theta)
+            )
+        return away - theta[:3]
 
-    def _field_change(self, changes: Changes) -> Tensor | float:
-        """What is added to the field, (N, channels of the port)."""
-        return changes["field"](self.measured.new_zeros(len(self.measured), 0)) if "field" in changes else 0.0
+    def _field_change(self, changes: Changes) -> Tensor | None:
+        """What is added to the field, (N, channels of the port), if anything."""
+        return changes["field"](self.measured.new_zeros(len(self.measured), 0)) if "field" in changes else None
+
+    def _strength(self, theta: Float[Tensor, " p"]) -> Float[Tensor, ""]:
+        """Length of the field."""
+        return beside(self.measured.new_tensor(self.strength), theta[0])
 
     def _ellipsoid(self, rows: Tensor | None) -> EllipsoidFit:
         points = self.measured if rows is None else self.measured[rows]
@@ -191,16 +199,16 @@ class NormView(_View):
         return torch.cat([fit.center_, torch.stack([matrix[i, j] for i, j in _SYMMETRIC])])
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 1"]:
-        away = self.measured - self._sensor_change(theta, changes) - theta[:3]
-        length, outward = self._length(theta, away.mT)
-        distance = (length - self.strength).unsqueeze(-1) - self._field_change(changes)
+        length, outward = self._length(theta, self._away(theta, changes).mT)
+        distance, added = (length - self._strength(theta)).unsqueeze(-1), self._field_change(changes)
+        distance = distance if added is None else distance - added
         return distance * (length / _length(outward)).unsqueeze(-1)
 
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
-        away = (self.measured - theta[:3]).mT
+        away = self._away(theta, {}).mT
         length, outward = self._length(theta, away)
         # a step against the steepest ascent of the length, as far as that is off
-        return (away - (length - self.strength) * length * outward / outward.square().sum(0)).mT
+        return (away - (length - self._strength(theta)) * length * outward / outward.square().sum(0)).mT
 
     def _length(self, theta: Tensor, away: Float[Tensor, "3 N"]) -> tuple[Float[Tensor, " N"], Float[Tensor, "3 N"]]:
         """Length of the calibrated field, and that times its gradient by the measurement."""
@@ -245,12 +253,12 @@ class AttitudeView(_View):
         self._to_frame = self._frame @ self.to_world @ self._unbent
         self._from_world = self.to_world.movedim(1, 0).flatten(1).contiguous()
         self._full = torch.cat([offset, response.flatten(), offset.new_zeros(2)])
-        self.warnings = _turned_too_little(self.corrected(self._full, 0.0))
+        self.warnings = _turned_too_little(self.corrected(self._full, {}))
 
     def ambient(self, theta: Float[Tensor, " p"]) -> Float[Tensor, " 3"]:
         """The world's field."""
-        direction = self._ahead + theta[12:14] @ self._across
-        return self.strength * direction / torch.linalg.vector_norm(direction)
+        direction = beside(self._ahead, theta[0]) + theta[12:14] @ self._across
+        return self._strength(theta) * direction / torch.linalg.vector_norm(direction)
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Tensor:
         if rows is None:
@@ -275,10 +283,10 @@ class AttitudeView(_View):
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
         # the simulated vector, not the measured one, goes through the matrix: the noise of what a matrix is fitted to
         # would shrink it. A fixed matrix takes the difference back into the world.
-        left = self.measured - self._sensor_change(theta, changes) - theta[:3] - self.simulated(theta)
+        left = self._away(theta, changes) - self.simulated(theta)
         residual = torch.einsum("kij,kj->ki", self._to_frame, left)
         added = self._field_change(changes)
-        return residual - added @ self._frame.mT if isinstance(added, Tensor) else residual
+        return residual if added is None else residual - added @ self._frame.mT
 
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
         field = (self.ambient(theta) @ self._from_world).unflatten(0, (-1, 3))
@@ -347,11 +355,11 @@ class GyroView(_View):
         return torch.cat([fit.center_, torch.stack([matrix[i, j] for i, j in _SYMMETRIC]), fit.center_.new_zeros(3)])
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
-        field = self.corrected(theta, self._sensor_change(theta, changes))
-        along = self._steadied(theta, field)
+        along = self._steadied(theta, self.corrected(theta, changes))
         middle = self._window_mean(along, self._weights(along.detach()))
         direction = middle / torch.linalg.vector_norm(middle, dim=-1, keepdim=True)
-        ambient = (self.strength + self._field_change(changes)) * direction[self.window]
+        strength, added = self._strength(theta), self._field_change(changes)
+        ambient = (strength if added is None else strength + added) * direction[self.window]
         frame = _frame(direction.detach())[self.window]
         return torch.einsum("kij,kj->ki", frame, along - ambient)
 
@@ -362,10 +370,10 @@ class GyroView(_View):
         return along - torch.linalg.cross(self.summed @ theta[9:12], along)
 
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
-        along = self._steadied(theta, (self.measured - theta[:3]) @ self.matrix(theta).mT)
+        along = self._steadied(theta, self.corrected(theta, {}))
         middle = self._window_mean(along, self._weights(along.detach()))
         direction = middle / torch.linalg.vector_norm(middle, dim=-1, keepdim=True)
-        field = torch.einsum("kij,ki->kj", self.turned, self.strength * direction[self.window])
+        field = torch.einsum("kij,ki->kj", self.turned, self._strength(theta) * direction[self.window])
         return torch.linalg.solve(self.matrix(theta), field.mT).mT
 
     def _window_mean(self, values: Tensor, weight: Tensor) -> Tensor:
