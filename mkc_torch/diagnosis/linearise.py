@@ -214,10 +214,16 @@ class Linearised:
 
     def gains_of(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> Gains:
         """The likelihood ratios of other candidates on the series."""
+        return self.search.with_candidates(self._columns(tangents, counts)).gains(self.series.unsqueeze(-1))
+
+    def with_more(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> Linearised:
+        """The same with other candidates after its own."""
+        return replace(self, search=self.search.with_more(self._columns(tangents, counts)))
+
+    def _columns(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> list[Tensor]:
         rows = len(self.series) - self.colour.root.numel()
         columns = [self._whitened(counts.unsqueeze(-1) * t) for t in tangents]
-        below = [torch.cat([c, c.new_zeros(rows, c.shape[1])]) for c in columns]
-        return self.search.with_candidates(below).gains(self.series.unsqueeze(-1))
+        return [torch.cat([c, c.new_zeros(rows, c.shape[1])]) for c in columns]
 
     def _whitened(self, values: Float[Tensor, "N m c"]) -> Float[Tensor, "Km c"]:
         return self.colour.scaled(self.filling(dct(values, len(self.colour.root))))

@@ -132,7 +132,7 @@ def locate(
         terms = (*terms, *more)
         beside = candidate_tangents(best.model, best.parameters, more, tangents.pointwise)
         tangents = replace(tangents, candidates=(*tangents.candidates, *beside))
-        linearised = linearise(base.model, parameters, pseudo, counts, tangents, colour=left.noise.colour)
+        linearised = linearised.with_more(beside, counts)
         found = linearised.search.gains(linearised.series.unsqueeze(-1))
         possible = _possible(terms, linearised)
     ranking = _ranking(terms, found, prefer, possible)

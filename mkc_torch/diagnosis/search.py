@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -65,7 +66,13 @@ class _Wander:
     scale: Tensor  # (k,) standard deviations of the courses at size 1
     axes: Tensor  # (k, k)
     strength: Tensor  # (k,)
-    sizes: Tensor  # (S,) squared sizes, the first one 0
+    sizes: Tensor  # (1 + S,) squared sizes, the first one 0
+
+    @cached_property
+    def shares(self) -> Float[Tensor, "S k"]:
+        """What a wander of each size, but none, takes of each course's power."""
+        sizes = self.sizes[1:].unsqueeze(-1)
+        return sizes / (1.0 + sizes * self.strength)
 
 
 class LinearSearch:
@@ -106,6 +113,10 @@ class LinearSearch:
         other = copy(self)
         other._try(candidates)
         return other
+
+    def with_more(self, candidates: Sequence[Float[Tensor, "M q"]]) -> LinearSearch:
+        """The same with these candidates after its own."""
+        return self.with_candidates([*self._flat.split(self._widths, -1), *candidates])
 
     def _grouped(self, columns: Tensor, on_basis: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
         """For each width: numbers of the candidates, their columns, whitening (C, q, q) and degrees of freedom."""
@@ -173,12 +184,13 @@ class LinearSearch:
         none = float(-0.5 * self._dof * power.log())
         best = NoiseFit(0, 0.0, float(power / self._dof), none, 0.0)
         for number, family in enumerate(self._families):
-            rotated = family.axes.mT @ (family.scale.unsqueeze(-1) * slow)
-            for size in family.sizes[1:]:
-                left, log_det = _without_wander(power, rotated, family, size)
-                value = float(-0.5 * log_det - 0.5 * self._dof * left.log())
-                if value > best.log_likelihood:
-                    best = NoiseFit(number, float(size), float(left / self._dof), value, value - none)
+            left, log_det = _without_wander(power, family.axes.mT @ (family.scale.unsqueeze(-1) * slow), family)
+            values = (-0.5 * log_det - 0.5 * self._dof * left.log()).squeeze(-1)
+            place = int(values.argmax())
+            value = float(values[place])
+            if value > best.log_likelihood:
+                size = float(family.sizes[1 + place])
+                best = NoiseFit(number, size, float(left[place] / self._dof), value, value - none)
         return best
 
     def estimate(self, number: int, series: Float[Tensor, " M"]) -> tuple[Tensor, Tensor]:
@@ -201,8 +213,7 @@ class LinearSearch:
         for family in self._families:
             cross = family.axes.mT @ (family.scale.unsqueeze(-1) * self._cross[:, index])
             rotated = family.axes.mT @ (family.scale * slow)
-            sizes = family.sizes[1:].unsqueeze(-1)
-            share = sizes / (1.0 + sizes * family.strength)
+            share, sizes = family.shares, family.sizes[1:].unsqueeze(-1)
             grams.append(gram.flatten() - share @ (cross.unsqueeze(-1) * cross.unsqueeze(-2)).flatten(1))
             inners.append(inner - share @ (cross * rotated.unsqueeze(-1)))
             powers.append(power - share @ rotated.square())
@@ -292,12 +303,11 @@ class LinearSearch:
         for family in self._families:
             rotated = family.axes.mT @ (family.scale.unsqueeze(-1) * slow)
             cross = family.axes.mT @ (family.scale.unsqueeze(-1) * self._cross.double())
-            for size in family.sizes[1:]:
-                left, log_det = _without_wander(power, rotated, family, size)
-                null = torch.maximum(null, -0.5 * log_det - 0.5 * self._dof * left.log())
-                share = size / (1.0 + size * family.strength)
+            left, log_det = _without_wander(power, rotated, family)
+            null = torch.maximum(null, (-0.5 * log_det - 0.5 * self._dof * left.log()).amax(0))
+            for at, share in enumerate(family.shares):
                 at_size = inner - cross.mT @ (share.unsqueeze(-1) * rotated)
-                self._update(best, left, at_size, cross, share, log_det)
+                self._update(best, left[at], at_size, cross, share, log_det[at])
         return null, best
 
     def _update(
@@ -311,7 +321,8 @@ class LinearSearch:
                 shadow = own.mT @ cross.mT[index]  # (C, q, k)
                 live = (own != 0).any(-2).double()
                 gram = torch.diag_embed(torch.ones_like(live)) - shadow * share @ shadow.mT
-                explained = (score * torch.linalg.solve(gram, score)).sum(-2)
+                solved = score / gram if gram.shape[-1] == 1 else torch.linalg.solve(gram, score)
+                explained = (score * solved).sum(-2)
             left = (power - explained).clamp(min=1e-12 * power)
             value = -0.5 * log_det - 0.5 * self._dof * left.log()
             value = torch.where(dof.unsqueeze(-1) > 0, value, -torch.inf)
@@ -350,8 +361,7 @@ def _family(gram: Tensor, scale: Tensor) -> _Wander:
     return _Wander(scale, axes, strength, sizes)
 
 
-def _without_wander(power: Tensor, rotated: Tensor, family: _Wander, size: Tensor) -> tuple[Tensor, Tensor]:
-    """Weighted sum of squares (B,) and log-determinant at a size of wander."""
-    share = size / (1.0 + size * family.strength)
-    left = (power - (share.unsqueeze(-1) * rotated.square()).sum(0)).clamp(min=1e-12 * power)
-    return left, torch.log1p(size * family.strength).sum()
+def _without_wander(power: Tensor, rotated: Tensor, family: _Wander) -> tuple[Tensor, Tensor]:
+    """Weighted sum of squares (S, B) and log-determinant (S, 1) at each size of wander."""
+    left = torch.maximum(power - family.shares @ rotated.square(), 1e-12 * power)
+    return left, torch.log1p(family.sizes[1:].unsqueeze(-1) * family.strength).sum(-1, keepdim=True)
