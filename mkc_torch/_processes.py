@@ -16,7 +16,7 @@ from typing import Protocol, TypeVar
 
 import torch
 
-__all__ = ["cores", "in_processes", "keep_memory", "keep_modules"]
+__all__ = ["cores", "in_processes", "keep_memory", "keep_modules", "one_thread"]
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -32,6 +32,17 @@ def cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def one_thread() -> None:
+    """Have torch, and the linear algebra of NumPy, compute in one thread in this process.
+
+    What a recording asks for is too small to share: with a second one, a diagnosis takes a sixth longer.
+    """
+    from threadpoolctl import threadpool_limits
+
+    torch.set_num_threads(1)
+    threadpool_limits(1, user_api="blas")
 
 
 def keep_memory() -> None:
@@ -72,7 +83,6 @@ def in_processes(work: Callable[[T], R], items: Sequence[T]) -> Iterator[Iterato
         yield (lambda item=item: work(item) for item in items)  # type: ignore[misc]
         return
     before = set(multiprocessing.active_children())
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # NumPy's, which reads it when a process begins
     # spawned, for torch's threads do not survive a fork
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
@@ -104,7 +114,7 @@ def _start(stop: _Stop) -> None:
     _stop = stop
     keep_memory()
     keep_modules()
-    torch.set_num_threads(1)  # as many processes as cores leave none for more
+    one_thread()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

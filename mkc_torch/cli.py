@@ -6,7 +6,7 @@ import io
 import sys
 from importlib.util import find_spec
 
-_EXTRA = ("typer", "rich", "polars", "matplotlib", "jinja2", "jsonschema")
+_EXTRA = ("typer", "rich", "polars", "matplotlib", "jinja2", "jsonschema", "threadpoolctl")
 
 
 def main() -> None:

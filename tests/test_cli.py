@@ -334,7 +334,7 @@ def test_a_pipe_that_knows_no_greek(calibrated, tmp_path):
     assert "offset" in done.stdout
 
 
-@pytest.mark.parametrize("missing", ["typer", "rich", "polars", "matplotlib", "jinja2", "jsonschema"])
+@pytest.mark.parametrize("missing", ["typer", "rich", "polars", "matplotlib", "jinja2", "jsonschema", "threadpoolctl"])
 def test_missing_extra_is_one_line(missing):
     code = f"import sys; sys.modules[{missing!r}] = None; from mkc_torch.cli import main; main()"
     done = run("-c", code, "demo")

@@ -24,3 +24,13 @@ def test_kept_memory_serves_as_before():
     values = torch.ones(5_000_000)
     del values
     assert float(torch.ones(5_000_000).sum()) == 5_000_000.0
+
+
+def test_linear_algebra_computes_in_one_thread():
+    code = (
+        "import torch, numpy\nfrom threadpoolctl import threadpool_info\nfrom mkc_torch._processes import one_thread\n"
+        "one_thread()\nknown = [i['num_threads'] for i in threadpool_info() if i['user_api'] == 'blas']\n"
+        "print(torch.get_num_threads(), len(known) > 0, set(known))"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert told == "1 True {1}\n"

@@ -8,7 +8,6 @@ from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import torch
 import typer
 from rich.table import Table
 from rich.text import Text
@@ -17,7 +16,7 @@ from mkc_torch._commands.apply import correct, read_correction
 from mkc_torch._commands.console import FAILURES, Look, complain, out, progress
 from mkc_torch._commands.diagnosis_files import Request, diagnose_file, named_simulation
 from mkc_torch._forked import allow_copies
-from mkc_torch._processes import cores, keep_memory
+from mkc_torch._processes import cores, keep_memory, one_thread
 from mkc_torch.recording import Recording
 
 if TYPE_CHECKING:
@@ -75,7 +74,7 @@ def challenge(
     if cases + empty == 0:
         raise typer.BadParameter("--cases and --empty are both 0; ask for one recording at least.")
     diagnose, correct_one = _JOBS[family]
-    torch.set_num_threads(1)
+    one_thread()
     keep_memory()
     allow_copies(0)  # the workers are as many processes as was asked for
     try:

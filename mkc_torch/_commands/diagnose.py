@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import typer
 
 from mkc_torch._commands.console import (
@@ -31,7 +30,7 @@ from mkc_torch._commands.diagnosis_files import (
     diagnose_file,
     simulation_of,
 )
-from mkc_torch._processes import in_processes, keep_memory
+from mkc_torch._processes import in_processes, keep_memory, one_thread
 from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
 
 
@@ -85,7 +84,7 @@ def diagnose(
     )
     refuse_same_names(recordings)
     _refuse_unusable(request)
-    torch.set_num_threads(1)  # the tensors of a recording are too small to share, and processes leave no cores
+    one_thread()
     keep_memory()
     look = Look.of(out())
     work = partial(_diagnosed, output, request, look)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import multiprocessing
-import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -18,7 +17,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._files import claim_folder, write_atomically
-from mkc_torch._processes import keep_memory
+from mkc_torch._processes import keep_memory, one_thread
 from mkc_torch.challenge.draws import generator
 from mkc_torch.challenge.key import Key, canonical, digest
 from mkc_torch.challenge.magnetometer import magnetometer
@@ -192,9 +191,6 @@ class _Pool:
     def __enter__(self) -> Callable[[Callable[[T], R], Sequence[T]], Iterable[R]]:
         if self._workers <= 1:
             return map
-        # children read it when they start: one thread each, so that they do not fight over the cores
-        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-            os.environ.setdefault(name, "1")
         # torch's threads do not survive a fork
         context = multiprocessing.get_context("spawn")
         self._executor = ProcessPoolExecutor(self._workers, mp_context=context, initializer=_alone_on_its_core)
@@ -206,7 +202,7 @@ class _Pool:
 
 
 def _alone_on_its_core() -> None:
-    torch.set_num_threads(1)
+    one_thread()
     keep_memory()
 
 
