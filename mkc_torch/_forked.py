@@ -71,8 +71,8 @@ def meanwhile(work: Callable[[], T], known: Iterable[object] = ()) -> Iterator[C
         return
     _copies -= 1
     try:
-        with _todo(1) as todo, _started([work], todo, 1, known) as (copy,):
-            yield lambda: copy.done().get(0)
+        with _todo(1) as todo, _started([work], todo, 1, known) as copies:
+            yield (lambda: copies[0].done().get(0)) if copies else None
     finally:
         _copies += 1
 
@@ -151,7 +151,8 @@ def _started(
     by_address = {id(one): one for one in known}
     copies: list[_Copy] = []
     try:
-        copies.extend(_copy(works, todo, by_address) for _ in range(count))
+        with suppress(OSError):  # no memory for another process: those that there are do it
+            copies.extend(_copy(works, todo, by_address) for _ in range(count))
         yield copies
     finally:
         for copy in copies:
@@ -171,6 +172,7 @@ def _copy(works: Sequence[Callable[[], object]], todo: int, known: dict[int, obj
     try:
         os.close(answer)
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+        warnings.simplefilter("ignore")  # another thread may have held the lock of where they are written
         allow_copies(0)
         gc.disable()
         done = {}

@@ -75,6 +75,16 @@ def test_what_a_copy_left_undone_is_done_here():
     assert shared([dies] * 5) == [HERE] * 5
 
 
+def test_without_memory_for_a_copy_all_is_done_here(monkeypatch):
+    def fails():
+        raise BlockingIOError
+
+    monkeypatch.setattr(os, "fork", fails)
+    assert shared([os.getpid] * 3) == [HERE] * 3
+    with meanwhile(os.getpid) as answer:
+        assert answer is None
+
+
 def test_an_error_is_raised_here():
     def fails():
         raise ArithmeticError(f"in {os.getpid() == HERE}")
