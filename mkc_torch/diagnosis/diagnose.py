@@ -121,7 +121,10 @@ def diagnose(
         return _assembled(simulation, prepared, drivers, len(terms), base, search, final, asked)
 
     def following() -> tuple[_Search, Tensor]:
-        return _continued(search, asked, generator), generator.get_state()
+        after = _continued(search, asked, generator)
+        fit = after.found[-1].fit
+        fit.model.residual(fit.parameters)  # to be the newest that a simulation remembers
+        return after, generator.get_state()
 
     while search.left:
         diagnosis = sent = None
@@ -135,7 +138,7 @@ def diagnose(
         (after, state), newest = work() if sent is None else sent
         generator.set_state(state)
         learn(prepared, newest)
-        if diagnosis is not None and len(after.found) == len(search.found) and after.unconfirmed is None:
+        if diagnosis is not None and (after.found, after.unconfirmed, after.given_up) == (search.found, None, ""):
             return diagnosis
         search = after
     return finished()
@@ -199,7 +202,7 @@ class _Search:
     """One search after the other: the first one, what was found, and what unseen blocks did not confirm.
 
     ``evidence`` is that of the simulation alone and with one finding more each; ``left`` are candidates that are still
-    to be searched beside what was found, none once the search is over.
+    to be searched beside what was found, none once the search is over; ``given_up`` says why there was no next one.
     """
 
     first: Located | None
@@ -208,6 +211,7 @@ class _Search:
     blocks: HeldOutBlocks
     evidence: tuple[Evidence, ...]
     left: tuple[Term, ...]
+    given_up: str = ""
 
     @property
     def parts(self) -> tuple[object, ...]:
@@ -228,7 +232,12 @@ def _begun(base: FittedModel, terms: tuple[Term, ...], asked: _Asked, generator:
 def _continued(search: _Search, asked: _Asked, generator: torch.Generator) -> _Search:
     """The next search, beside what was found."""
     fit = search.found[-1].fit
-    located = locate(fit, search.left, level=asked.level, surrogates=asked.surrogates, generator=generator, parts=False)
+    try:
+        located = locate(
+            fit, search.left, level=asked.level, surrogates=asked.surrogates, generator=generator, parts=False
+        )
+    except ValueError as error:
+        return replace(search, left=(), given_up=str(error))  # what was found before is not to be lost
     return _taken_up(search, located, asked)
 
 
@@ -309,6 +318,7 @@ def _assembled(
             *prepared.warnings,
             *drivers.warnings,
             *([_not_confirmed(search.unconfirmed)] if search.unconfirmed else []),
+            *([f"The search beside what was found was given up. {search.given_up}"] if search.given_up else []),
             *_time_warnings(prepared),
             *remaining_warning(left),
             *(sentence for finding in findings for sentence in shift_warning(finding)),

@@ -204,7 +204,14 @@ def _short_list(
                 taken += 1
             if taken >= most:
                 break
+    if not chosen:
+        # none has a size of a sign that its physics allows; one of them is still to be told to be nothing
+        chosen[terms[0].key] = terms[0], starts[0][0], starts[0][0].new_zeros(_size(terms[0], base))
     return list(chosen.values())
+
+
+def _size(term: Term, base: FittedModel) -> int:
+    return base.model.with_term(term).sizes[-1]
 
 
 def _part_starts(base: FittedModel, d: Float[Tensor, " m"]) -> list[Start]:

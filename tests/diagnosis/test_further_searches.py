@@ -1,0 +1,83 @@
+"""The searches beside what was found: what they leave behind, and that one that fails takes nothing along."""
+
+import importlib
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.recording import Recording
+from mkc_torch.simulation import Dynamics
+
+diagnosis_of = importlib.import_module("mkc_torch.diagnosis.diagnose")
+
+
+EFFECTS = [effect for effect in CATALOGUE if effect.id in ("cubic_stiffness", "quadratic_drag")]
+
+
+class Sled(Dynamics):
+    states = ("place", "speed")
+    inputs = ("force",)
+    parameters = {"damping": 0.5}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"place": x.speed, "speed": u.force - p.damping * x.speed}
+
+
+@pytest.fixture(scope="module")
+def recording():
+    time = torch.arange(0.0, 10.0, 0.04, dtype=torch.float64)
+    force = torch.sin(1.3 * time) + torch.sin(0.31 * time)
+    place, speed, places = 0.0, 0.0, []
+    for now in force.tolist():
+        places.append(place)
+        for _ in range(8):
+            speed += 0.005 * (now - 0.5 * speed - 0.8 * place**3)
+            place += 0.005 * speed
+    noise = 0.002 * torch.randn(len(time), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    return Recording({"time": time, "force": force, "place": torch.tensor(places).double() + noise})
+
+
+@pytest.fixture
+def diagnosed(recording, monkeypatch):
+    """A diagnosis whose search beside the first finding is the one given, and what it had the simulation remember."""
+
+    def run(beside):
+        searches, learned, first = [], [], []
+        locate, learn = diagnosis_of.locate, diagnosis_of.learn
+
+        def search(base, terms, **options):
+            searches.append(base)
+            if len(searches) == 1:
+                first.append(locate(base, terms, **options))
+                return first[0]
+            return beside(base, first[0])
+
+        monkeypatch.setattr(diagnosis_of, "locate", search)
+        monkeypatch.setattr(diagnosis_of, "learn", lambda *one: learned.append(one) or learn(*one))
+        return diagnosis_of.diagnose(Sled(), recording, effects=EFFECTS), searches, learned
+
+    return run
+
+
+def test_a_search_that_fails_leaves_what_was_found(diagnosed):
+    def fails(*_):
+        raise ValueError("No slope by damping.")
+
+    diagnosis, searches, _ = diagnosed(fails)
+    assert len(searches) == 2
+    assert len(diagnosis.findings) == 1
+    assert "The search beside what was found was given up. No slope by damping." in diagnosis.warnings
+
+
+def test_the_simulation_goes_on_with_the_trajectory_of_what_was_found(diagnosed):
+    def wanders_off(base, first):
+        base.model.residual(1.01 * base.parameters)
+        return replace(first, p_value=1.0)
+
+    _, searches, learned = diagnosed(wanders_off)
+    ((prepared, (_, states)),) = learned
+    fit = searches[1]
+    fit.model.residual(fit.parameters)
+    torch.testing.assert_close(prepared.newest[1], states)
