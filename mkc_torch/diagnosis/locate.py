@@ -137,7 +137,7 @@ def locate(
         possible = _possible(terms, linearised)
     ranking = _ranking(terms, found, prefer, possible)
     first = terms[ranking[0].number]
-    if p_value <= level and first.key != best.model.terms[-1].key:
+    if p_value <= level and (first.key != best.model.terms[-1].key or _own_p(found, terms, best) > level):
         other = _refitted(best, base, first, linearised, ranking[0].number)
         # the search is linear: where the joint fit loses much of the gain, it went too far; but where noise may wander,
         # what follows the wander gains most in joint fits, and the search knows better if it tells the two apart
@@ -149,12 +149,17 @@ def locate(
             best = other
     if p_value <= level:
         # it was another candidate that no draw came up to, if this one by itself is nothing out of the ordinary
-        p_value = max(p_value, float(found.log_p[terms.index(best.model.terms[-1]), 0].exp()))
+        p_value = max(p_value, _own_p(found, terms, best))
     if p_value <= level:
         best = _refined(best, base, again=True)
     return Located(
         best.model.terms[-1], best, p_value, beyond, ranking, noise, pseudo, counts, linearised, tangents, terms
     )
+
+
+def _own_p(found: Gains, terms: tuple[Term, ...], fit: FittedModel) -> float:
+    """Of a fit's candidate, as if it were the only one."""
+    return float(found.log_p[terms.index(fit.model.terms[-1]), 0].exp())
 
 
 def _with_tangents(
