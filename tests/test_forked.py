@@ -19,13 +19,21 @@ HERE = os.getpid()
 
 
 @pytest.fixture(autouse=True)
-def copies():
+def copies(monkeypatch):
+    started, copy = [], _forked._copy
+
+    def noted(*arguments):
+        started.append(copy(*arguments))
+        return started[-1]
+
+    monkeypatch.setattr(_forked, "_copy", noted)
     # this process has threads that a copy lacks, so no work here computes with tensors of more than a few numbers
     allow_copies(2)
-    yield
+    yield started
     allow_copies(0)
-    with pytest.raises(ChildProcessError):
-        os.waitpid(-1, os.WNOHANG)
+    for one in started:
+        with pytest.raises(ChildProcessError):
+            os.waitpid(one.process, os.WNOHANG)
 
 
 def elsewhere(value):
@@ -121,9 +129,10 @@ def test_meanwhile_nothing_comes_of_a_work_that_fails():
         assert answer() is None
 
 
-def test_a_copy_that_is_not_waited_for_is_ended():
+def test_a_copy_that_is_not_waited_for_is_ended(copies):
     with meanwhile(lambda: signal.pause()):
-        pass  # the fixture looks for what is left
+        pass
+    assert len(copies) == 1  # the fixture looks for what is left of it
 
 
 CODE = """
