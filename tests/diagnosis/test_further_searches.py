@@ -81,3 +81,9 @@ def test_the_simulation_goes_on_with_the_trajectory_of_what_was_found(diagnosed)
     fit = searches[1]
     fit.model.residual(fit.parameters)
     torch.testing.assert_close(prepared.newest[1], states)
+
+
+def test_a_search_without_an_effect_of_a_possible_sign_finds_nothing(recording):
+    diagnosis = diagnosis_of.diagnose(Sled(), recording, effects=EFFECTS)
+    assert len(diagnosis.findings) == 1  # beside it only a drag that drives would fit
+    assert not any("given up" in warning for warning in diagnosis.warnings)
