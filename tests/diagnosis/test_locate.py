@@ -84,3 +84,21 @@ def test_gains_of_other_candidates_are_those_of_a_search_with_them():
     torch.testing.assert_close(
         bare.gains_of(beside, counts).ratio, whole.search.gains(whole.series.unsqueeze(-1)).ratio
     )
+
+
+def test_a_joint_fit_at_another_moment_gives_way_to_that_of_the_search(monkeypatch):
+    sensor = np.zeros((N, 3))
+    sensor[671:] = [0.7, -0.7, 0.7]
+    prepared = Magnetometer("attitude").prepare(tumbling(N, noise=0.3, sensor=sensor, attitude=True, gyro=True))
+    base = fitted(JointModel(prepared), prepared.start())
+    terms = candidate_terms(prepared, (), (STEP,))
+    late = max(terms, key=lambda term: term.shape["onset"])
+
+    def strongest(base, terms, prefer, *, parts):  # noqa: ARG001
+        model = base.model.with_term(late)
+        return [fitted(model, torch.cat([base.parameters, torch.zeros(3)]), base.bound)]
+
+    monkeypatch.setattr("mkc_torch.diagnosis.locate._strongest", strongest)
+    located = locate(base, terms, level=0.05, surrogates=19, generator=torch.Generator().manual_seed(0))
+    assert located.p_value <= 0.05
+    assert located.term.shape["onset"] == pytest.approx(float(prepared.time[671]), abs=0.1)
