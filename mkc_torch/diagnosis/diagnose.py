@@ -236,9 +236,9 @@ def _continued(search: _Search, asked: _Asked, generator: torch.Generator) -> _S
         located = locate(
             fit, search.left, level=asked.level, surrogates=asked.surrogates, generator=generator, parts=False
         )
+        return _taken_up(search, located, asked)
     except ValueError as error:
         return replace(search, left=(), given_up=str(error))  # what was found before is not to be lost
-    return _taken_up(search, located, asked)
 
 
 def _taken_up(search: _Search, located: Located, asked: _Asked) -> _Search:
