@@ -13,7 +13,7 @@ import torch
 from mkc_torch import _forked
 from mkc_torch._forked import allow_copies, meanwhile, shared
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere nothing is forked")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="copies are forked on Linux alone")
 
 HERE = os.getpid()
 
