@@ -18,13 +18,14 @@ from mkc_torch.effects.protocol import (
     OptionalDriverEffect,
     RelativeEffect,
     Shape,
+    ShapedEffect,
 )
 from mkc_torch.simulation.protocol import Port, PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["candidate_terms", "described", "finer"]
+__all__ = ["candidate_terms", "described", "finer", "reach_of"]
 
 _STEPS = 8
 
@@ -61,6 +62,18 @@ def absolute(effect: Effect, shape: Shape, port: Port) -> Shape:
         return shape
     sizes = {name: dict(zip(("typical", "largest"), values, strict=True)) for name, values in port.sizes.items()}
     return {**shape} | {name: shape[name] * sizes[part][which] for name, (part, which) in effect.relative.items()}
+
+
+def reach_of(term: Term, prepared: PreparedSimulation) -> dict[str, tuple[float, float]]:
+    """Least and greatest values, in units, of the numbers of a shape that are fitted together with γ."""
+    if not isinstance(term.effect, ShapedEffect):
+        return {}
+    port, reach = prepared.ports[term.port], term.effect.fitted_shape
+    of_length = term.effect.continuous if isinstance(term.effect, ContinuousEffect) else {}
+    length = float(prepared.time[-1] - prepared.time[0])
+    ends = [absolute(term.effect, {**term.shape, **{n: r[k] for n, r in reach.items()}}, port) for k in (0, 1)]
+    least, most = ({name: end[name] * (length if name in of_length else 1.0) for name in reach} for end in ends)
+    return {name: (least[name], most[name]) for name in reach}
 
 
 def _drives(driver: Driver, effect: Effect) -> bool:

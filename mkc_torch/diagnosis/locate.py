@@ -18,6 +18,7 @@ from mkc_torch.diagnosis.model import JointModel, Key, Term, one_sided
 from mkc_torch.diagnosis.preference import Preference
 from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted_beside
 from mkc_torch.diagnosis.search import Gains, NoiseFit, log_survival
+from mkc_torch.diagnosis.shape_fit import shape_fitted
 from mkc_torch.diagnosis.side_by_side import fitted_each
 from mkc_torch.effects.protocol import ContinuousEffect
 from mkc_torch.functional import mkc_energy
@@ -152,6 +153,8 @@ def locate(
         p_value = max(p_value, _own_p(found, terms, best))
     if p_value <= level:
         best = _refined(best, base, again=True)
+        shaped = shape_fitted(best)
+        best = shaped if _repeats(shaped) else best
     return Located(
         best.model.terms[-1], best, p_value, beyond, ranking, noise, pseudo, counts, linearised, tangents, terms
     )

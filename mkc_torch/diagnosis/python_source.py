@@ -21,6 +21,7 @@ _FROM_HERE: Mapping[str, str] = {
     "lagged(": "from mkc_torch.effects.protocol import lagged",
     "played(": "from mkc_torch.effects.dynamics.backlash import played",
     "shifted(": "from mkc_torch.effects.paired.between import shifted",
+    "soft_clip(": "from mkc_torch.effects.share import soft_clip",
     "SimpleNamespace(": "from types import SimpleNamespace",
     "Parameter(": "from mkc_torch.simulation import Parameter",
 }

@@ -29,6 +29,7 @@ __all__ = [
     "Quantity",
     "RelativeEffect",
     "Shape",
+    "ShapedEffect",
     "SignalEffect",
 ]
 
@@ -102,7 +103,7 @@ class Effect(Protocol):
     """A piece of physics. At γ = 0 it changes nothing.
 
     Some effects can do more: :class:`SignalEffect`, :class:`ContinuousEffect`, :class:`LastingEffect`,
-    :class:`AnchoredEffect`.
+    :class:`ShapedEffect`, :class:`AnchoredEffect`.
 
     Attributes:
         id: its name in ``diagnosis.json``.
@@ -231,6 +232,21 @@ class ContinuousEffect(Effect, Protocol):
 
     @property
     def continuous(self) -> Mapping[str, tuple[float, float]]: ...
+
+
+@runtime_checkable
+class ShapedEffect(Effect, Protocol):
+    """An effect with positive numbers in its shape that are fitted together with γ once it is known to be there.
+
+    Its ``change`` and ``quantities`` have to take such a number as a tensor, and ``change`` to have a slope in it.
+
+    Attributes:
+        fitted_shape: their names, each with its least and greatest value, in the same shares as ``relative`` and
+            ``continuous`` where it is one of those.
+    """
+
+    @property
+    def fitted_shape(self) -> Mapping[str, tuple[float, float]]: ...
 
 
 @runtime_checkable

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from mkc_torch.effects.protocol import Context, GainEffect, Quantity, Shape
@@ -12,7 +13,13 @@ from mkc_torch.effects.protocol import Context, GainEffect, Quantity, Shape
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Saturation", "ShareEffect"]
+__all__ = ["CORNER", "SOFTNESS", "Saturation", "ShareEffect", "soft_clip"]
+
+CORNER = 0.1
+"""Softness of a corner that is searched; see :func:`soft_clip`."""
+
+SOFTNESS = 0.02, 2.0
+"""Of a corner that is fitted."""
 
 
 class ShareEffect(GainEffect):
@@ -33,6 +40,7 @@ class Saturation(ShareEffect):
     """A signal that goes no further than a limit on either side. Give it its ``limits``, as shares of the largest."""
 
     relative: Mapping[str, tuple[str, str]] = {"limit": ("own", "largest")}
+    fitted_shape: Mapping[str, tuple[float, float]] = {"limit": (0.2, 0.99)}
     along = "own"
     limits: tuple[float, ...]
     source = "Khalil, Nonlinear Systems (2002), 1.2.7"
@@ -47,3 +55,32 @@ class Saturation(ShareEffect):
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
         own, limit = names["own"], shape["limit"]
         return (f"{gamma[0]!r} * ({own}.clamp({-limit!r}, {limit!r}) - {own})",)
+
+
+def soft_clip(values: Float[Tensor, " N"], limit: float | Tensor, softness: float | Tensor) -> Float[Tensor, " N"]:
+    """Values that go no further than a limit on either side, with a rounded corner there.
+
+    ``s c ln(cosh((u + b) / w) / cosh((u − b) / w))`` with the corner at ``b = c tanh(1 / (2 s))`` and ``w = 2 s b``:
+    its slope at zero is one and its limit is c, whatever the softness s. A small one is a hard clip, a large one
+    ``c tanh(u / c)``.
+
+    Args:
+        values: u.
+        limit: c, in the values' unit; positive.
+        softness: s, the corner's width as a share of where it is; positive.
+
+    Example:
+        >>> [round(float(one), 2) for one in soft_clip(torch.tensor([0.5, 1.0, 4.0]), 1.0, 0.02)]
+        [0.5, 0.99, 1.0]
+        >>> [round(float(one), 2) for one in soft_clip(torch.tensor([0.5, 1.0, 4.0]), 1.0, 3.0)]
+        [0.46, 0.76, 1.0]
+    """
+    softness = torch.as_tensor(softness, dtype=values.dtype, device=values.device)
+    corner = limit * torch.tanh(0.5 / softness)
+    width = 2.0 * softness * corner
+    return softness * limit * (_log_cosh((values + corner) / width) - _log_cosh((values - corner) / width))
+
+
+def _log_cosh(values: Tensor) -> Tensor:
+    """Less its constant."""
+    return values.abs() + torch.nn.functional.softplus(-2.0 * values.abs())

@@ -11,7 +11,7 @@ from mkc_torch.diagnosis.candidates import candidate_terms
 from mkc_torch.diagnosis.drivers import find_drivers
 from mkc_torch.diagnosis.model import limits
 from mkc_torch.effects import CATALOGUE, DYNAMICS, Context, ContinuousEffect
-from mkc_torch.effects.protocol import BoundedEffect, ChoosyEffect, PartEffect, RelativeEffect
+from mkc_torch.effects.protocol import BoundedEffect, ChoosyEffect, PartEffect, RelativeEffect, ShapedEffect
 from mkc_torch.simulation import Dynamics
 from tests.effects.contexts import size_of
 
@@ -111,6 +111,24 @@ def test_each_amplitude_has_a_tangent_of_its_own(effect, shape, context):
 
 
 @pytest.mark.parametrize(("effect", "shape", "context"), CASES)
+def test_the_change_has_a_slope_in_what_is_fitted_of_its_shape(effect, shape, context):
+    names = list(effect.fitted_shape) if isinstance(effect, ShapedEffect) else []
+    gamma = torch.ones(size_of(effect, shape, context), dtype=torch.float64)
+
+    def changed(values):
+        return effect.change(gamma, {**shape, **dict(zip(names, values.unbind(), strict=True))}, context)
+
+    values = torch.tensor([shape[name] for name in names], dtype=torch.float64)
+    slopes = torch.func.jacfwd(changed)(values) if names else torch.zeros(1, 0)
+    for k, value in enumerate(values.tolist()):
+        step = torch.zeros_like(values)
+        step[k] = 1e-6 * value
+        numerical = (changed(values + step) - changed(values - step)) / (2.0 * step[k])
+        assert float(numerical.abs().max()) > 0.0
+        torch.testing.assert_close(slopes[..., k], numerical, rtol=1e-4, atol=1e-4 * float(numerical.abs().max()))
+
+
+@pytest.mark.parametrize(("effect", "shape", "context"), CASES)
 def test_its_slope_along_the_signal_is_finite_everywhere(effect, shape, context):
     """Trajectories are found by Newton's method: standstill and rest must not break it."""
     gamma = torch.ones(size_of(effect, shape, context), dtype=torch.float64)
@@ -200,9 +218,10 @@ class TestPhysics:
             assert lost == pytest.approx(-0.01, rel=1e-3)
 
     def test_inputs_are_limited_and_small_ones_lost(self):
+        limit, width = {"limit": 1.0, "softness": 0.01}, {"width": 1.0, "softness": 0.01}
         for u, limited, dead in ((3.0, 1.0, 2.0), (-3.0, -1.0, -2.0), (0.5, 0.5, 0.0)):
-            assert u + self.at("input_saturation", [1.0], {"limit": 1.0}, force=u)[0] == pytest.approx(limited)
-            assert u + self.at("dead_zone", [1.0], {"width": 1.0}, force=u)[0] == pytest.approx(dead)
+            assert u + self.at("input_saturation", [1.0], limit, force=u)[0] == pytest.approx(limited)
+            assert u + self.at("dead_zone", [1.0], width, force=u)[0] == pytest.approx(dead, abs=1e-9)
 
 
 def test_a_delay_shows_what_was_also_between_the_samples():
@@ -306,6 +325,12 @@ def test_what_is_said_of_shapes_is_of_shapes(effect):
     if isinstance(effect, ContinuousEffect):
         assert set(effect.continuous) <= numbers
         assert all(low < high for low, high in effect.continuous.values())
+    assert isinstance(effect, ShapedEffect) == hasattr(effect, "fitted_shape")
+    if isinstance(effect, ShapedEffect):
+        assert set(effect.fitted_shape) <= numbers
+        for name, (low, high) in effect.fitted_shape.items():
+            grid = [shape[name] for shape in effect.shapes(torch.linspace(0.0, 1.0, N).double())]
+            assert 0.0 < low < min(grid) <= max(grid) < high
     if isinstance(effect, PartEffect) and effect.along:
         assert effect.along in make_context(effect).parts
 

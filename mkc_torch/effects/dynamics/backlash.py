@@ -38,6 +38,7 @@ class Backlash(ShareEffect):
 
     id = "backlash"
     relative: Mapping[str, tuple[str, str]] = {"half_gap": ("own", "largest")}
+    fitted_shape: Mapping[str, tuple[float, float]] = {"half_gap": (0.01, 0.5)}
     equation = "δu = γ (y − u),  y = max(u − c, min(u + c, y before))"
     explanation = "After each reversal the drive crosses a gap before it moves its load: there is play between them."
     advice = "Put play of this width behind the input, or preload the gears."

@@ -41,6 +41,7 @@ class BoucWenHysteresis(RateEffect):
     id = "bouc_wen_hysteresis"
     port = "hysteretic rate"
     relative: Mapping[str, tuple[str, str]] = {"yield_deflection": ("position", "largest")}
+    fitted_shape: Mapping[str, tuple[float, float]] = {"yield_deflection": (0.02, 2.0)}
     needs = ("position", "reversing")  # without a reversal it is a spring that yields
     gain = "stiffness"
     of = "position"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from mkc_torch.effects.protocol import Context, Shape
-from mkc_torch.effects.share import ShareEffect
+from mkc_torch.effects.share import CORNER, SOFTNESS, ShareEffect, soft_clip
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -23,15 +23,17 @@ class DeadZone(ShareEffect):
     It has no memory: on its way back the actuator answers as on its way there. One that does not is
     :class:`mkc_torch.effects.dynamics.backlash.Backlash`.
 
-    Simulation: adds ``−γ clip(u, ±c)`` to an input; a γ of one is a full dead zone.
+    Simulation: adds ``−γ clip(u, ±c)`` to an input, by :func:`mkc_torch.effects.share.soft_clip`; a γ of one and no
+        softness is a full dead zone.
     Drivers: none but the input.
-    Units: γ is a share; the shape ``width`` in the unit of what it is of.
+    Units: γ is a share; the shape ``width`` in the unit of what it is of, ``softness`` a share of the width.
     Plausible: γ from 0 to 1.
     Source: Khalil, "Nonlinear Systems" (2002), 1.2.7.
     """
 
     id = "dead_zone"
     relative: Mapping[str, tuple[str, str]] = {"width": ("own", "largest")}
+    fitted_shape: Mapping[str, tuple[float, float]] = {"width": (0.01, 0.7), "softness": SOFTNESS}
     along = "own"
     equation = "δu = −γ clip(u, ±c)"
     explanation = "Small commands have no effect: the actuator has a dead zone."
@@ -39,12 +41,10 @@ class DeadZone(ShareEffect):
     source = "Khalil, Nonlinear Systems (2002), 1.2.7"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
-        return tuple({"width": width} for width in WIDTHS)
+        return tuple({"width": width, "softness": CORNER} for width in WIDTHS)
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
-        width = shape["width"]
-        return -context.part("own").clamp(-width, width)
+        return -soft_clip(context.part("own"), shape["width"], shape["softness"])
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
-        own, width = names["own"], shape["width"]
-        return (f"-{gamma[0]!r} * {own}.clamp({-width!r}, {width!r})",)
+        return (f"-{gamma[0]!r} * soft_clip({names['own']}, {shape['width']!r}, {shape['softness']!r})",)

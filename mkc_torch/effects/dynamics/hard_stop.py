@@ -31,6 +31,7 @@ class HardStop(RateEffect):
 
     id = "hard_stop"
     relative: Mapping[str, tuple[str, str]] = {"place": ("position", "largest")}
+    fitted_shape: Mapping[str, tuple[float, float]] = {"place": (0.4, 0.98)}
     needs = ("position",)
     gain = "stiffness"
     of = "position"

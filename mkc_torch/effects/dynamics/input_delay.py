@@ -30,6 +30,7 @@ class InputDelay(ShareEffect):
 
     id = "input_delay"
     continuous: Mapping[str, tuple[float, float]] = {"delay": (0.0005, 0.1)}
+    fitted_shape: Mapping[str, tuple[float, float]] = {"delay": (0.0005, 0.1)}
     equation = "δu = γ (u(t − τ) − u(t))"
     explanation = "The system answers to its input late."
     advice = "Delay the input by this time."

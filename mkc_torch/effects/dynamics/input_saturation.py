@@ -2,21 +2,43 @@
 
 from __future__ import annotations
 
-from mkc_torch.effects.share import Saturation
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.effects.protocol import Context, Shape
+from mkc_torch.effects.share import CORNER, SOFTNESS, Saturation, soft_clip
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 
 class InputSaturation(Saturation):
-    """Beyond a limit the actuator gives no more.
+    """Beyond a limit the actuator gives no more; amplifiers and magnets give way before they reach it.
 
-    Simulation: adds ``−γ (u − clip(u, ±c))`` to an input; a γ of one is a hard limit.
+    Simulation: adds ``−γ (u − clip(u, ±c))`` to an input, by :func:`mkc_torch.effects.share.soft_clip`; a γ of one and
+        no softness is a hard limit.
     Drivers: none but the input.
-    Units: γ is a share; the shape ``limit`` in the unit of what it is of.
+    Units: γ is a share; the shape ``limit`` in the unit of what it is of, ``softness`` a share of the limit.
     Plausible: γ from 0 to 1.
     Source: Khalil, "Nonlinear Systems" (2002), 1.2.7.
     """
 
     id = "input_saturation"
     limits = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+    fitted_shape: Mapping[str, tuple[float, float]] = {"limit": (0.2, 1.5), "softness": SOFTNESS}
     equation = "δu = −γ (u − clip(u, ±c))"
     explanation = "The actuator reaches its limit: beyond it, a larger command has no more effect."
     advice = "Limit the input to this size."
+
+    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+        return tuple({"limit": limit, "softness": CORNER} for limit in self.limits)
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+        own = context.part("own")
+        return soft_clip(own, shape["limit"], shape["softness"]) - own
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        own = names["own"]
+        return (f"{gamma[0]!r} * (soft_clip({own}, {shape['limit']!r}, {shape['softness']!r}) - {own})",)

@@ -30,6 +30,7 @@ class Overflow(RateEffect):
 
     id = "overflow"
     relative: Mapping[str, tuple[str, str]] = {"rim": ("own", "largest")}
+    fitted_shape: Mapping[str, tuple[float, float]] = {"rim": (0.4, 0.98)}
     needs = ("level",)
     gain = "loss"
     power = 1.0

@@ -33,6 +33,7 @@ class SensorLag(ShareEffect):
     port = "output"
     needs = ()
     continuous: Mapping[str, tuple[float, float]] = {"lag": (0.0005, 0.2)}
+    fitted_shape: Mapping[str, tuple[float, float]] = {"lag": (0.0005, 0.2)}
     equation = "δy = γ (y_τ − y),  τ ẏ_τ = y − y_τ"
     explanation = "The sensor follows what it measures with a lag."
     advice = "Put a lag of this time constant behind the output."

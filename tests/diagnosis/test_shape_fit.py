@@ -1,0 +1,122 @@
+"""Once an effect is known, the numbers of its shape are fitted with all else, and not only tried on a grid."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mkc_torch import Recording
+from mkc_torch.diagnosis.candidates import candidate_terms, reach_of
+from mkc_torch.diagnosis.model import JointModel
+from mkc_torch.diagnosis.refit import fitted
+from mkc_torch.diagnosis.shape_fit import ShapedModel, shape_fitted
+from mkc_torch.effects import DYNAMICS
+from mkc_torch.simulation import Dynamics, Parameter
+
+OF = {effect.id: effect for effect in DYNAMICS}
+N = 400
+
+
+class Lag(Dynamics):
+    """Follows what drives it."""
+
+    states = ("level",)
+    inputs = ("drive",)
+    parameters = {"rate": Parameter(2.0, lower=0.0)}  # noqa: RUF012
+    step = 0.05
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"level": p.rate * (u.drive - x.level)}
+
+
+def driven(act, seed=0):
+    """The level behind a drive that acts otherwise than it is told, in 20 steps a sample."""
+    generator = torch.Generator().manual_seed(seed)
+    time = 0.05 * torch.arange(N, dtype=torch.float64)
+    drive = 2.0 * torch.sin(0.9 * time) + torch.sin(2.3 * time + 1.0)
+    fine = torch.linspace(0.0, float(time[-1]), 20 * (N - 1) + 1, dtype=torch.float64)
+    seen = act(2.0 * torch.sin(0.9 * fine) + torch.sin(2.3 * fine + 1.0))
+    step = float(fine[1])
+    level = [0.0]
+    for one, other in zip(seen[:-1].tolist(), seen[1:].tolist(), strict=True):
+        level.append(level[-1] + step * 1.7 * (0.5 * (one + other) - level[-1]))
+    noise = 0.01 * torch.randn(N, generator=generator, dtype=torch.float64)
+    return Recording({"time": time, "drive": drive, "level": torch.tensor(level[::20], dtype=torch.float64) + noise})
+
+
+def found(recording, effect, shape):
+    """The joint fit with an effect at a shape of its grid."""
+    prepared = Lag().prepare(recording)
+    terms = candidate_terms(prepared, (), (effect,))
+    model = JointModel(prepared, (replace(terms[0], shape={**terms[0].shape, **shape}),))
+    base = fitted(JointModel(prepared), prepared.start())
+    return fitted(model, torch.cat([base.parameters, base.parameters.new_full((1,), 0.5)]), base.bound)
+
+
+def test_a_limit_between_two_of_the_grid_is_found():
+    recording = driven(lambda u: 1.37 * torch.tanh(u / 1.37))
+    before = found(recording, OF["input_saturation"], {"limit": 1.8})
+    after = shape_fitted(before)
+    assert before.model.terms[-1].shape["limit"] == 1.8
+    assert after.log_likelihood > before.log_likelihood + 100.0
+    # the limit of a hyperbolic tangent whose share is not known either, as nothing reaches it
+    shape = after.model.terms[-1].shape
+    reached = after.parameters[-1] * (shape["limit"] - 2.8) + 2.8
+    assert float(reached) == pytest.approx(1.37, abs=0.03)
+    assert shape["softness"] > 0.3
+    assert float(after.residual.square().mean().sqrt()) < 0.0115
+
+
+def test_a_hard_limit_stays_hard():
+    recording = driven(lambda u: u.clamp(-1.37, 1.37))
+    after = shape_fitted(found(recording, OF["input_saturation"], {"limit": 1.2}))
+    shape = after.model.terms[-1].shape
+    assert shape["limit"] == pytest.approx(1.37, abs=0.01)
+    assert shape["softness"] < 0.05
+    assert float(after.parameters[-1]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_delay_is_found_with_its_share():
+    late = driven(lambda u: torch.cat([u[:1].expand(123), u[:-123]]))  # 123 of 20 for each 0.05 s
+    after = shape_fitted(found(late, OF["input_delay"], {"delay": 0.2}))
+    assert after.model.terms[-1].shape["delay"] == pytest.approx(0.3075, abs=0.01)
+    assert float(after.parameters[-1]) == pytest.approx(1.0, abs=0.02)
+
+
+def test_an_effect_without_such_numbers_stays_as_it_is():
+    prepared = Lag().prepare(driven(lambda u: u))
+    (term,) = candidate_terms(prepared, (), (OF["constant_force"],))
+    model = JointModel(prepared, (term,))
+    fit = fitted(model, torch.cat([prepared.start(), prepared.time.new_zeros(1)]))
+    assert shape_fitted(fit) is fit
+
+
+class Broken(type(OF["input_saturation"])):
+    """An effect that has no value but at the limits of its grid."""
+
+    def course(self, shape, context):
+        course = super().course(shape, context)
+        return course if isinstance(shape["limit"], float) else course * torch.nan
+
+
+def test_where_the_simulation_has_no_answer_the_grid_s_shape_stays():
+    recording = driven(lambda u: u.clamp(-1.37, 1.37))
+    fit = found(recording, Broken(), {"limit": 1.2})
+    assert shape_fitted(fit) is fit
+
+
+def test_its_parameters_are_the_joint_ones_and_the_logarithms_of_the_shape():
+    recording = driven(lambda u: u.clamp(-1.37, 1.37))
+    fit = found(recording, OF["input_saturation"], {"limit": 1.2})
+    reach = reach_of(fit.model.terms[-1], fit.model.prepared)
+    largest = float(recording["drive"].abs().max())
+    assert reach["limit"] == pytest.approx((0.2 * largest, 1.5 * largest))
+    model = ShapedModel(fit.model, reach)
+    start = model.start(fit.parameters)
+    assert model.size == len(start) == fit.model.size + 2
+    low, high = model.bounds
+    assert len(low) == len(high) == model.size
+    assert bool(((low <= start) & (start <= high)).all())
+    assert float(high[-2].exp()) == pytest.approx(1.5 * largest)
+    torch.testing.assert_close(model.residual(start), fit.model.residual(fit.parameters))
+    assert model.prior is None or len(model.prior.mean) == model.size

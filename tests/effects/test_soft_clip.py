@@ -1,0 +1,43 @@
+"""A clip with a rounded corner: a hard one, a hyperbolic tangent, and all between."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mkc_torch.effects.share import soft_clip
+
+VALUES = torch.linspace(-5.0, 5.0, 201, dtype=torch.float64)
+POSITIVE = st.floats(0.05, 20.0)
+SOFT = st.floats(0.01, 5.0)
+
+
+def test_without_softness_it_is_a_clip():
+    torch.testing.assert_close(soft_clip(VALUES, 1.5, 1e-4), VALUES.clamp(-1.5, 1.5), rtol=0.0, atol=3e-4)
+
+
+def test_with_much_softness_it_is_a_hyperbolic_tangent():
+    torch.testing.assert_close(soft_clip(VALUES, 1.5, 50.0), 1.5 * torch.tanh(VALUES / 1.5), rtol=0.0, atol=1e-3)
+
+
+@settings(deadline=None)
+@given(limit=POSITIVE, softness=SOFT)
+def test_its_slope_at_zero_is_one_and_its_limit_is_reached_by_no_less(limit, softness):
+    at = torch.tensor([1e-6 * limit, 40.0 * limit * (1.0 + softness)], dtype=torch.float64)
+    near, far = soft_clip(at, limit, softness).tolist()
+    assert near / float(at[0]) == pytest.approx(1.0, abs=1e-4)
+    assert far == pytest.approx(limit, rel=1e-9)
+    course = soft_clip(limit * VALUES, limit, softness)
+    assert bool((course.diff() >= -1e-12 * limit).all())
+    assert float(course.abs().max()) <= limit * (1.0 + 1e-12)
+    torch.testing.assert_close(course, -course.flip(0), rtol=0.0, atol=1e-12 * limit)
+
+
+def test_its_slopes_are_those_of_its_formula():
+    numbers = (VALUES[::20].clone(), torch.tensor(1.3).double(), torch.tensor(0.4).double())
+    assert torch.autograd.gradcheck(soft_clip, [n.requires_grad_() for n in numbers])
+    assert torch.autograd.gradcheck(soft_clip, numbers, check_forward_ad=True, check_backward_ad=False)
+
+
+def test_it_keeps_the_precision_of_its_values():
+    assert soft_clip(VALUES.float(), 1.5, 0.1).dtype == torch.float32
