@@ -22,6 +22,7 @@ _FROM_HERE: Mapping[str, str] = {
     "played(": "from mkc_torch.effects.dynamics.backlash import played",
     "shifted(": "from mkc_torch.effects.paired.between import shifted",
     "soft_clip(": "from mkc_torch.effects.share import soft_clip",
+    "beyond(": "from mkc_torch.effects.dynamics.rate import beyond",
     "SimpleNamespace(": "from types import SimpleNamespace",
     "Parameter(": "from mkc_torch.simulation import Parameter",
 }

@@ -65,19 +65,27 @@ def fitted(
         rows: weights of the samples; 0 leaves one out.
         graduate: False for a start near the answer.
     """
-    found = nonlinear.fit(
-        model.residual,
-        _usable(model, start),
-        bound=bound,
-        weight=rows,
-        prior=model.prior,
-        lower=None if model.bounds is None else model.bounds[0],
-        upper=None if model.bounds is None else model.bounds[1],
-        graduate=graduate,
-        covariance=None,
-        max_iter=60,
-        tol=1e-7,
-    )
+
+    def found_from(start: Tensor, *, graduate: bool) -> nonlinear.NonlinearFit:
+        return nonlinear.fit(
+            model.residual,
+            start,
+            bound=bound,
+            weight=rows,
+            prior=model.prior,
+            lower=None if model.bounds is None else model.bounds[0],
+            upper=None if model.bounds is None else model.bounds[1],
+            graduate=graduate,
+            covariance=None,
+            max_iter=60,
+            tol=1e-7,
+        )
+
+    found = found_from(_usable(model, start), graduate=graduate)
+    if not bool(found.converged):
+        # damped steps on the parameters can wait for a scale that is still far too large; begun anew they do not
+        again = found_from(found.theta, graduate=False)
+        found = again if bool(again.log_likelihood > found.log_likelihood) else found
     return FittedModel(
         model,
         found.theta,

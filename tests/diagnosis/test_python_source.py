@@ -11,6 +11,7 @@ from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.python_source import SourceError
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.effects.dynamics.backlash import played
+from mkc_torch.effects.dynamics.rate import beyond
 from mkc_torch.effects.dynamics.thermal_loss import ThermalLoss
 from mkc_torch.effects.paired.between import shifted
 from mkc_torch.effects.protocol import CodedEffect, Context, lagged
@@ -46,7 +47,7 @@ def test_the_line_is_the_change(effect):
     names = {"speed": "x.speed"} if outputs else EXPRESSIONS
     x = SimpleNamespace(**dict(zip(NAMES, signal.unbind(-1), strict=True)), memory=torch.cos(time))
     known = {"x": x, "torch": torch, "time": time, "run": torch.zeros(N, dtype=torch.long)}
-    known |= {"lagged": lagged, "shifted": shifted, "played": played, "soft_clip": soft_clip}
+    known |= {"lagged": lagged, "shifted": shifted, "played": played, "soft_clip": soft_clip, "beyond": beyond}
     written = [eval(line, known) + torch.zeros_like(time) for line in effect.code(gamma.tolist(), shape, names)]
     torch.testing.assert_close(torch.stack(written, -1), effect.change(gamma, shape, seen), rtol=1e-9, atol=1e-9)
 

@@ -198,14 +198,21 @@ class TestPhysics:
         assert self.at("coupling", [0.3, 0.2], speed=1.0, other=3.0) == pytest.approx([0.6, -0.4])
 
     def test_stops_push_back(self):
-        shape = {"place": 1.0}
+        shape = {"place": 1.0, "exponent": 1.0}
         assert self.at("hard_stop", [5.0, 3.0], shape, angle=1.2) == pytest.approx([-1.0])
         assert self.at("hard_stop", [5.0, 3.0], shape, angle=-1.2) == pytest.approx([0.6])
         assert self.at("hard_stop", [5.0, 3.0], shape, angle=0.9) == [0.0]
 
     def test_only_what_is_above_the_rim_runs_over(self):
-        assert self.at("overflow", [2.0], {"rim": 1.0}, speed=1.5) == pytest.approx([-1.0])
-        assert self.at("overflow", [2.0], {"rim": 1.0}, speed=0.5) == [0.0]
+        assert self.at("overflow", [2.0], {"rim": 1.0, "exponent": 1.0}, speed=1.5) == pytest.approx([-1.0])
+        assert self.at("overflow", [2.0], {"rim": 1.0, "exponent": 1.0}, speed=0.5) == [0.0]
+
+    def test_weirs_and_balls_are_stiffer_the_farther_they_are_in(self):
+        for lost, exponent in ((0.5, 1.0), (0.5**1.5, 1.5), (0.5**2.5, 2.5)):
+            shape = {"rim": 1.0, "exponent": exponent}
+            assert self.at("overflow", [2.0], shape, speed=1.5) == pytest.approx([-2.0 * lost])
+            shape = {"place": 1.0, "exponent": exponent}
+            assert self.at("hard_stop", [2.0, 4.0], shape, angle=-1.5) == pytest.approx([4.0 * lost])
 
     def test_radiation_in_either_unit(self):
         effect = OF["thermal_loss"]
@@ -330,7 +337,7 @@ def test_what_is_said_of_shapes_is_of_shapes(effect):
         assert set(effect.fitted_shape) <= numbers
         for name, (low, high) in effect.fitted_shape.items():
             grid = [shape[name] for shape in effect.shapes(torch.linspace(0.0, 1.0, N).double())]
-            assert 0.0 < low < min(grid) <= max(grid) < high
+            assert 0.0 < low <= min(grid) <= max(grid) < high
     if isinstance(effect, PartEffect) and effect.along:
         assert effect.along in make_context(effect).parts
 

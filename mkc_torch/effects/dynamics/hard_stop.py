@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.dynamics.rate import RateEffect, beyond
 from mkc_torch.effects.protocol import Context, Quantity, Shape
 
 if TYPE_CHECKING:
@@ -22,37 +22,40 @@ PLACES = (0.5, 0.65, 0.8, 0.9)
 class HardStop(RateEffect):
     """A bumper or the end of the way: beyond a place a stiff spring pushes back.
 
-    Simulation: adds ``−γ₁ max(x − c, 0) + γ₂ max(−c − x, 0)`` to the rate of the speed whose position is x.
+    Simulation: adds ``−γ₁ h (h/c)ⁿ⁻¹`` with ``h = max(x − c, 0)``, and γ₂ on the other side, to the rate of the speed
+        whose position is x. The exponent n is 1 for a spring and 3/2 for a ball on a plate; it is searched at 1, and
+        fitted.
     Drivers: none but the position.
-    Units: γ in the speed's unit per s and unit of position; the shape ``place`` in the unit of what it is of.
+    Units: γ in the speed's unit per s and unit of position; the shape ``place`` in the unit of what it is of;
+        ``exponent`` is a number.
     Plausible: γ ≥ 0.
     Source: penalty contact; Gilardi & Sharf, Mechanism and Machine Theory 37 (2002).
     """
 
     id = "hard_stop"
     relative: Mapping[str, tuple[str, str]] = {"place": ("position", "largest")}
-    fitted_shape: Mapping[str, tuple[float, float]] = {"place": (0.4, 0.98)}
+    fitted_shape: Mapping[str, tuple[float, float]] = {"place": (0.4, 0.98), "exponent": (1.0, 3.0)}
     needs = ("position",)
     gain = "stiffness"
     of = "position"
     power = 1.0
-    equation = "δv̇ = −γ₁ max(x − c, 0) + γ₂ max(−c − x, 0)"
+    equation = "δv̇ = −γ₁ h (h/c)ⁿ⁻¹ + γ₂ h' (h'/c)ⁿ⁻¹,  h = max(x − c, 0), h' = max(−c − x, 0)"
     explanation = "The motion runs into a stop: beyond a place something pushes back."
     advice = "Add a stop at this place."
     source = "penalty contact; Gilardi & Sharf (2002)"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
-        return tuple({"place": place} for place in PLACES)
+        return tuple({"place": place, "exponent": 1.0} for place in PLACES)
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity("upper_stiffness", 1, self.unit(context)), Quantity("lower_stiffness", 1, self.unit(context)))
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:
-        x, place = context.part("position"), shape["place"]
-        push = torch.stack([-(x - place).clamp(min=0.0), (-place - x).clamp(min=0.0)], -1)
+        x, place, exponent = context.part("position"), shape["place"], shape["exponent"]
+        push = torch.stack([-beyond(x, place, exponent), beyond(-x, place, exponent)], -1)
         return (push @ gamma).unsqueeze(-1)
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
-        x, place = names["position"], shape["place"]
-        below = f"{gamma[1]!r} * (-{place!r} - {x}).clamp(min=0.0)"
-        return (f"-{gamma[0]!r} * ({x} - {place!r}).clamp(min=0.0) + {below}",)
+        x, place, exponent = names["position"], shape["place"], shape["exponent"]
+        below = f"{gamma[1]!r} * beyond(-{x}, {place!r}, {exponent!r})"
+        return (f"-{gamma[0]!r} * beyond({x}, {place!r}, {exponent!r}) + {below}",)

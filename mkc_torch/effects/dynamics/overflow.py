@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.dynamics.rate import RateEffect, beyond
 from mkc_torch.effects.protocol import Context, Shape
 
 if TYPE_CHECKING:
@@ -21,29 +21,30 @@ RIMS = (0.5, 0.65, 0.8, 0.9)
 class Overflow(RateEffect):
     """Above the rim a vessel loses what comes in.
 
-    Simulation: adds ``−γ max(x − c, 0)`` to the rate of a level x.
+    Simulation: adds ``−γ h (h/c)ⁿ⁻¹`` with ``h = max(x − c, 0)`` to the rate of a level x. The exponent n is 3/2 for a
+        wide weir and 5/2 for a V-notch; it is searched at 1, and fitted.
     Drivers: none but the state.
-    Units: γ in 1/s; the shape ``rim`` in the unit of what it is of.
+    Units: γ in 1/s; the shape ``rim`` in the unit of what it is of; ``exponent`` is a number.
     Plausible: γ ≥ 0.
-    Source: flow over a weir, linearised; Henderson, "Open Channel Flow" (1966).
+    Source: flow over weirs; Henderson, "Open Channel Flow" (1966), ch. 6.
     """
 
     id = "overflow"
     relative: Mapping[str, tuple[str, str]] = {"rim": ("own", "largest")}
-    fitted_shape: Mapping[str, tuple[float, float]] = {"rim": (0.4, 0.98)}
+    fitted_shape: Mapping[str, tuple[float, float]] = {"rim": (0.4, 0.98), "exponent": (1.0, 3.0)}
     needs = ("level",)
     gain = "loss"
     power = 1.0
-    equation = "δẋ = −γ max(x − c, 0)"
+    equation = "δẋ = −γ h (h/c)ⁿ⁻¹,  h = max(x − c, 0)"
     explanation = "Above a level something is lost, as when a vessel runs over its rim."
     advice = "Add a loss above this level."
-    source = "flow over a weir, linearised"
+    source = "flow over weirs; Henderson, Open Channel Flow (1966)"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
-        return tuple({"rim": rim} for rim in RIMS)
+        return tuple({"rim": rim, "exponent": 1.0} for rim in RIMS)
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
-        return -(context.part("own") - shape["rim"]).clamp(min=0.0)
+        return -beyond(context.part("own"), shape["rim"], shape["exponent"])
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
-        return (f"-{gamma[0]!r} * ({names['own']} - {shape['rim']!r}).clamp(min=0.0)",)
+        return (f"-{gamma[0]!r} * beyond({names['own']}, {shape['rim']!r}, {shape['exponent']!r})",)

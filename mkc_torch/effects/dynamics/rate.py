@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
 
 from mkc_torch.effects.protocol import Context, GainEffect, Quantity, Shape
 from mkc_torch.effects.units import quotient
 
-__all__ = ["RateEffect"]
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["RateEffect", "beyond"]
+
+_LEAST = 1e-30
 
 
 class RateEffect(GainEffect):
@@ -44,3 +52,21 @@ class RateEffect(GainEffect):
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity(self.gain, 1, self.unit(context)),)
+
+
+def beyond(values: Float[Tensor, " N"], place: float | Tensor, exponent: float | Tensor) -> Float[Tensor, " N"]:
+    """How far values are beyond a place, by a power law: ``h (h / c)ⁿ⁻¹`` with ``h = max(x − c, 0)``.
+
+    Args:
+        values: x.
+        place: c, in the values' unit; positive.
+        exponent: n, at least one.
+
+    Example:
+        >>> import torch
+        >>> beyond(torch.tensor([1.0, 3.0, 4.0]), 2.0, 1.0), beyond(torch.tensor([1.0, 3.0, 4.0]), 2.0, 2.0)
+        (tensor([0., 1., 2.]), tensor([0.0000, 0.5000, 2.0000]))
+    """
+    height = (values - place).clamp(min=0.0)
+    # the power's slope in its exponent is a logarithm
+    return height * (height / place).clamp(min=_LEAST) ** (exponent - 1.0)
