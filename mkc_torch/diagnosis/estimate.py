@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.linearise import Linearised, linearise, tangents_of
-from mkc_torch.diagnosis.local import beside_wander
+from mkc_torch.diagnosis.candidates import reach_of
+from mkc_torch.diagnosis.linearise import Linearised, Tangents, linearise, tangents_of
+from mkc_torch.diagnosis.local import Local, beside_wander
+from mkc_torch.diagnosis.model import Term
 from mkc_torch.diagnosis.refit import FittedModel
 from mkc_torch.diagnosis.search import NoiseFit
+from mkc_torch.diagnosis.shape_fit import ShapedModel
+from mkc_torch.nonlinear import beside
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -20,15 +25,23 @@ __all__ = ["Estimate", "estimate"]
 
 _MOST_ERRORS = 5.0
 
+_AT_END = 1e-6
+_UNKNOWN = 0.5
+"""Share of a number beyond which its error says no more than that it is not known."""
+
 
 @dataclass(frozen=True)
 class Estimate:
-    """A fit with its final parameters, their covariance (p, p), and the noise that is left."""
+    """A fit with its final parameters, their covariance (p, p), and the noise that is left.
+
+    ``shape_errors`` are standard errors of the numbers of each effect's shape that were fitted and are known.
+    """
 
     fit: FittedModel
     covariance: Float[Tensor, "p p"]
     noise: NoiseFit
     linearised: Linearised
+    shape_errors: tuple[Mapping[str, float], ...]
 
     @property
     def standard_error(self) -> Float[Tensor, " p"]:
@@ -70,4 +83,43 @@ def estimate(fit: FittedModel) -> Estimate:
         # there may be no trajectory a step away
         if bool(residual.isfinite().all()):
             fit = replace(fit, parameters=parameters, residual=residual)
-    return Estimate(fit, covariance, found.search.noise_fit(found.series), found)
+    plain = Estimate(fit, covariance, found.search.noise_fit(found.series), found, tuple({} for _ in fit.model.terms))
+    return _shapes_free(plain, tangents, local)
+
+
+def _shapes_free(plain: Estimate, tangents: Tangents, local: Local) -> Estimate:
+    """The same with what the fitted numbers of shapes leave unknown of the parameters, and of themselves.
+
+    A number at the end of its range is held there, as it was in the fit.
+    """
+    model, parameters = plain.fit.model, plain.fit.parameters
+    inside = [_inside(term, reach_of(term, model.prepared)) for term in model.terms]
+    shaped = ShapedModel(model, inside)
+    start = shaped.start(parameters)
+    if shaped.size == shaped.joint:
+        return plain
+
+    def residual(numbers: Tensor) -> Tensor:
+        return shaped.residual(torch.cat([beside(parameters, numbers[0]), numbers]))
+
+    model.residual(parameters)  # forward mode starts from the trajectory that was found last
+    columns = torch.func.jacfwd(residual)(start[shaped.joint :])
+    if not bool(columns.isfinite().all()):
+        return plain
+    wide = replace(tangents, nuisance=torch.cat([tangents.nuisance, columns], -1), slow=local.slow)
+    found = linearise(shaped, start, local.values, local.counts, wide, colour=local.noise.colour, joint=True)
+    error = found.search.estimate(0, found.series)[1].diagonal().clamp(min=0.0).sqrt()
+    known = [
+        {name: share * term.shape[name] for name, share in shares.items() if 0.0 < share < _UNKNOWN}
+        for term, shares in zip(model.terms, shaped.per_effect(error[shaped.joint :].tolist()), strict=True)
+    ]
+    return replace(plain.at_least(error[: shaped.joint]), shape_errors=tuple(known))
+
+
+def _inside(term: Term, reach: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    """The numbers of a shape that are not at an end of their range."""
+    return {
+        name: ends
+        for name, ends in reach.items()
+        if ends[0] * (1.0 + _AT_END) < term.shape[name] < ends[1] * (1.0 - _AT_END)
+    }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -50,6 +50,7 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
     plausible, told = _plausibility(term, gamma, context)
     where = attributed(final.fit, number)
     curve = _curve(term, gamma, covariance, context)
+    shape = _shape_parameters(term, context, final.shape_errors[number])
     told_as = formulas(curve) if term.effect.id == UNKNOWN and curve is not None else ()
     return Finding(
         effect=term.effect.id,
@@ -59,7 +60,7 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
         onset=term.shape.get("onset"),
         equation="; ".join([term.effect.equation, *told_as]),
         explanation=f"{term.effect.explanation} {term.effect.advice}".strip(),
-        parameters=(*parameters_of(term, gamma, covariance, context), *_shape_parameters(term, context)),
+        parameters=(*parameters_of(term, gamma, covariance, context), *shape),
         p_value=located.p_value,
         held_out=held,
         held_out_note=note,
@@ -110,9 +111,9 @@ def parameters_of(
     return tuple(parameters)
 
 
-def _shape_parameters(term: Term, context: Context) -> tuple[Parameter, ...]:
+def _shape_parameters(term: Term, context: Context, errors: Mapping[str, float]) -> tuple[Parameter, ...]:
     return tuple(
-        Parameter(name, value, None, _unit_of_shape(term, name, context))
+        Parameter(name, value, errors.get(name), _unit_of_shape(term, name, context))
         for name, value in term.shape.items()
         if name != "onset"
     )

@@ -1,62 +1,78 @@
-"""Numbers of an effect's shape fitted together with all else, once the effect is known."""
+"""Numbers of effects' shapes fitted together with all else, once the effects are known."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.candidates import reach_of
-from mkc_torch.diagnosis.model import JointModel
+from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.refit import FittedModel, fitted
-from mkc_torch.effects.protocol import Shape
 from mkc_torch.simulation.protocol import Change
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["shape_fitted"]
+__all__ = ["ShapedModel", "shape_fitted"]
 
 
 class ShapedModel(JointModel):
-    """A joint model that has, as its last parameters, the logarithms of numbers in its last effect's shape.
+    """A joint model that has, as its last parameters, the logarithms of numbers in its effects' shapes.
 
     Args:
         model: the joint model.
-        reach: name of each number to its least and greatest value, positive.
+        reach: of each effect, the name of each such number to its least and greatest value, positive.
     """
 
-    def __init__(self, model: JointModel, reach: Mapping[str, tuple[float, float]]) -> None:
+    def __init__(self, model: JointModel, reach: Sequence[Mapping[str, tuple[float, float]]]) -> None:
         super().__init__(model.prepared, model.terms)
-        self._reach = dict(reach)
+        self._reach = tuple(reach)
+
+    @classmethod
+    def of(cls, model: JointModel) -> ShapedModel:
+        """With all numbers that can be fitted."""
+        return cls(model, [reach_of(term, model.prepared) for term in model.terms])
+
+    @property
+    def joint(self) -> int:
+        """Number of parameters without the shapes' numbers."""
+        return super().size
 
     @property
     def size(self) -> int:
-        return super().size + len(self._reach)
+        return self.joint + sum(map(len, self._reach))
 
     @property
     def bounds(self) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"]]:
-        shapes = self.prepared.time.new_tensor(list(self._reach.values())).log()
+        ends = [end for reach in self._reach for end in reach.values()]
+        shapes = self.prepared.time.new_tensor(ends).reshape(-1, 2).log()
         known = super().bounds
         if known is None:
-            free = shapes.new_full((super().size,), torch.inf)
+            free = shapes.new_full((self.joint,), torch.inf)
             known = -free, free
         return torch.cat([known[0], shapes[:, 0]]), torch.cat([known[1], shapes[:, 1]])
 
     def start(self, parameters: Float[Tensor, " q"]) -> Float[Tensor, " p"]:
-        """The joint model's parameters with its last effect's shape beside them."""
-        shape = self.terms[-1].shape
-        return torch.cat([parameters, parameters.new_tensor([shape[name] for name in self._reach]).log()])
+        """The joint model's parameters with its effects' shapes beside them."""
+        values = [term.shape[name] for term, reach in zip(self.terms, self._reach, strict=True) for name in reach]
+        return torch.cat([parameters, parameters.new_tensor(values).log()])
 
-    def shape(self, parameters: Float[Tensor, " p"]) -> Shape:
-        """The last effect's shape; what is fitted of it as tensors, to be differentiated."""
-        values: tuple[Any, ...] = parameters[-len(self._reach) :].exp().unbind()
-        return {**self.terms[-1].shape, **dict(zip(self._reach, values, strict=True))}
+    def per_effect(self, values: Sequence[Any]) -> list[dict[str, Any]]:
+        """Values of the numbers, by the names that they have in each effect's shape."""
+        left = iter(values)
+        return [{name: next(left) for name in reach} for reach in self._reach]
+
+    def shaped(self, parameters: Float[Tensor, " p"]) -> tuple[Term, ...]:
+        """The effects with these shapes; as tensors what is fitted of them, to be differentiated."""
+        fitted = self.per_effect(parameters[self.joint :].exp().unbind())
+        return tuple(replace(t, shape={**t.shape, **new}) for t, new in zip(self.terms, fitted, strict=True))
 
     def changes(self, parameters: Float[Tensor, " p"]) -> dict[str, Change]:
-        return self.with_shape(self.shape(parameters)).changes(parameters[: -len(self._reach)])
+        return JointModel(self.prepared, self.shaped(parameters)).changes(parameters[: self.joint])
 
 
 def shape_fitted(fit: FittedModel) -> FittedModel:
@@ -68,14 +84,15 @@ def shape_fitted(fit: FittedModel) -> FittedModel:
     Returns:
         A fit at that shape; the same one where no number can be fitted, or the simulation gives none that is likelier.
     """
-    reach = reach_of(fit.model.terms[-1], fit.model.prepared)
+    last = fit.model.terms[-1]
+    reach = reach_of(last, fit.model.prepared)
     if not reach:
         return fit
-    model = ShapedModel(fit.model, reach)
+    model = ShapedModel(fit.model, [*({} for _ in fit.model.terms[:-1]), reach])
     try:
         both = fitted(model, model.start(fit.parameters), fit.bound, graduate=False)
-        shape = {name: float(value) for name, value in model.shape(both.parameters).items()}
-        moved = fitted(fit.model.with_shape(shape), both.parameters[: fit.model.size], fit.bound, graduate=False)
+        shape = {name: float(value) for name, value in model.shaped(both.parameters)[-1].shape.items()}
+        moved = fitted(fit.model.with_shape(shape), both.parameters[: model.joint], fit.bound, graduate=False)
     except ValueError:
         return fit
     return moved if moved.log_likelihood > fit.log_likelihood else fit

@@ -7,6 +7,7 @@ import torch
 
 from mkc_torch import Recording
 from mkc_torch.diagnosis.candidates import candidate_terms, reach_of
+from mkc_torch.diagnosis.estimate import estimate
 from mkc_torch.diagnosis.model import JointModel
 from mkc_torch.diagnosis.refit import fitted
 from mkc_torch.diagnosis.shape_fit import ShapedModel, shape_fitted
@@ -111,7 +112,7 @@ def test_its_parameters_are_the_joint_ones_and_the_logarithms_of_the_shape():
     reach = reach_of(fit.model.terms[-1], fit.model.prepared)
     largest = float(recording["drive"].abs().max())
     assert reach["limit"] == pytest.approx((0.2 * largest, 1.5 * largest))
-    model = ShapedModel(fit.model, reach)
+    model = ShapedModel.of(fit.model)
     start = model.start(fit.parameters)
     assert model.size == len(start) == fit.model.size + 2
     low, high = model.bounds
@@ -120,3 +121,31 @@ def test_its_parameters_are_the_joint_ones_and_the_logarithms_of_the_shape():
     assert float(high[-2].exp()) == pytest.approx(1.5 * largest)
     torch.testing.assert_close(model.residual(start), fit.model.residual(fit.parameters))
     assert model.prior is None or len(model.prior.mean) == model.size
+
+
+def test_errors_are_those_of_least_squares_with_the_shape_among_the_parameters():
+    """In white normal noise: σ² (JᵀJ)⁻¹, J by differences of parameters and limit."""
+    fit = shape_fitted(found(driven(lambda u: u.clamp(-1.37, 1.37), seed=2), OF["input_saturation"], {"limit": 1.2}))
+    final = estimate(fit)
+    shape, theta = final.fit.model.terms[-1].shape, final.fit.parameters
+    (errors,) = final.shape_errors
+    assert set(errors) == {"limit"}  # its corner is as hard as can be
+
+    def residual(values):
+        moved = final.fit.model.with_shape({**shape, "limit": float(values[-1])})
+        return moved.residual(values[:-1]).squeeze(-1)
+
+    at = torch.cat([theta, theta.new_tensor([shape["limit"]])])
+    columns = []
+    for k in range(len(at)):
+        step = torch.zeros_like(at)
+        step[k] = 1e-4 * at[k]
+        columns.append((residual(at + step) - residual(at - step)) / (2.0 * step[k]))
+    slopes = torch.stack(columns, -1)
+    covariance = float(residual(at).square().sum()) / (N - len(at)) * torch.linalg.inv(slopes.mT @ slopes)
+    known = covariance.diagonal().sqrt()
+    assert errors["limit"] == pytest.approx(float(known[-1]), rel=0.2)
+    assert float(final.standard_error[-1]) == pytest.approx(float(known[-2]), rel=0.2)
+    alone = float(torch.linalg.inv(covariance).diagonal()[-2].rsqrt())
+    assert float(final.standard_error[-1]) > 2.0 * alone  # without the limit's freedom it is far too sure
+    assert shape["limit"] == pytest.approx(1.37, abs=3.0 * errors["limit"])
