@@ -23,6 +23,7 @@ from mkc_torch.diagnosis.side_by_side import fitted_each
 from mkc_torch.effects.protocol import ContinuousEffect
 from mkc_torch.functional import mkc_energy
 from mkc_torch.order_statistic import robust_scale
+from mkc_torch.simulation.protocol import Beginning
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -34,6 +35,9 @@ SEPARABLE = 4.5
 
 _SHORT_LIST = 6
 _PARTS, _BETTER = 2, 0.8
+_AWAY = 5.0
+"""Times that a parameter is larger, or smaller, than where its fit began."""
+
 _KEPT = 0.8
 _ROUNDS = 3
 _LEADING, _THIRD, _MUCH = 2, 0.6, 50.0
@@ -241,11 +245,25 @@ def _part_starts(base: FittedModel, d: Float[Tensor, " m"]) -> list[Start]:
     return starts
 
 
+def _first_start(base: FittedModel) -> list[Start]:
+    """Around where the fit began, if a parameter went far from there: what is left out can drive it away."""
+    prepared = base.model.prepared
+    theta = prepared.start()
+    own = base.model.base - (prepared.beginnings if isinstance(prepared, Beginning) else 0)
+    sizes = torch.stack([theta[:own], base.parameters[:own]]).abs()
+    if not bool((sizes.amax(0) > _AWAY * sizes.amin(0)).any()):
+        return []
+    parameters = torch.cat([theta, base.parameters[base.model.base :]])
+    residual = base.model.residual(parameters)
+    return [(parameters, clipped_residual(residual))] if bool(residual.isfinite().all()) else []
+
+
 def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *, parts: bool) -> list[FittedModel]:
     """The joint refits, the likeliest first, each of the leading ones at its best shape.
 
     Candidates are ranked by the likelihood's own score and by a clipped one, which still sees a stretch of samples that
-    the fit rejects; and, where one model over all of the recording runs away, around fits to parts of it.
+    the fit rejects; and, where one model over all of the recording runs away, around fits to parts of it, and around
+    where its fit began.
     """
     around, likeliest = base.parameters, base.parameters.new_zeros(len(terms))
     listed = _short_list(base, terms, [(around, base.pseudo)], _SHORT_LIST, likeliest)
@@ -254,10 +272,11 @@ def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *
     _refit_all(fits, base, listed, prefer)
     if parts:
         least = torch.stack([fit.d for fit in fits.values()]).amin(0)
+        starts = [*_part_starts(base, least), *_first_start(base)]
         _refit_all(
             fits,
             base,
-            [one for start in _part_starts(base, least) for one in _short_list(base, terms, [start], 2, likeliest)],
+            [one for start in starts for one in _short_list(base, terms, [start], 2, likeliest)],
             prefer,
         )
     leading = sorted(fits.values(), key=lambda fit: _score(fit, base, prefer), reverse=True)[: _LEADING + 1]

@@ -343,6 +343,11 @@ class PreparedDynamics:
     def _unit_of(self, name: str) -> str:
         return self.system.units.get(name, self.recording.units[name] if name in self.recording else "")
 
+    @property
+    def beginnings(self) -> int:
+        """Number of the parameters that are states at the start of a run; they come last."""
+        return len(self.parameter_names) - self._p
+
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
         return self._start.clone()
 

@@ -15,7 +15,18 @@ from mkc_torch.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["Change", "Changes", "Clock", "Correction", "FreeChange", "Port", "PreparedSimulation", "Simulation"]
+__all__ = [
+    "Beginning",
+    "Change",
+    "Changes",
+    "Clock",
+    "Correction",
+    "FreeChange",
+    "Port",
+    "PreparedSimulation",
+    "Remembering",
+    "Simulation",
+]
 
 Change = Callable[[Tensor], Tensor]
 """What effects add at a port, (N, c), as a function of the signal that passes through it.
@@ -172,6 +183,18 @@ class Remembering(Protocol):
     def learn(self, newest: Any) -> None:
         """Add what was solved in another copy."""
         ...
+
+
+@runtime_checkable
+class Beginning(Protocol):
+    """A prepared simulation whose last parameters are the states that its runs begin in.
+
+    Attributes:
+        beginnings: how many.
+    """
+
+    @property
+    def beginnings(self) -> int: ...
 
 
 class Correction(Protocol):

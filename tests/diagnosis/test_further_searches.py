@@ -87,3 +87,15 @@ def test_a_search_without_an_effect_of_a_possible_sign_finds_nothing(recording):
     diagnosis = diagnosis_of.diagnose(Sled(), recording, effects=EFFECTS)
     assert len(diagnosis.findings) == 1  # beside it only a drag that drives would fit
     assert not any("given up" in warning for warning in diagnosis.warnings)
+
+
+def test_what_drives_the_simulation_away_is_found_from_where_it_began(recording):
+    """Without its spring the sled is fitted with a damping of thousands, and beside that no spring has its size."""
+    diagnosis = diagnosis_of.diagnose(Sled(), recording, effects=EFFECTS)
+    assert float(diagnosis.baseline.d[0]) > 0.3
+    (finding,) = diagnosis.findings
+    assert finding.effect == "cubic_stiffness"
+    (stiffness,) = finding.parameters
+    assert stiffness.value == pytest.approx(0.8, rel=0.05)
+    assert diagnosis.model is not None
+    assert float(diagnosis.model.theta[0]) == pytest.approx(0.5, rel=0.05)
