@@ -422,8 +422,10 @@ class PreparedDynamics:
         rate = self._rate(theta, changes)
         more = len(self._remembering(changes))
         begin = torch.cat([begin, begin.new_zeros(len(begin), more)], -1)
-        guess = torch.cat([self._guess, self._guess.new_zeros(len(self._guess), more)], -1)
         last = self._last.get(begin.shape[1])
+        without = self._last.get(len(self.system.states)) if more else None
+        guess = self._guess if without is None else without.states
+        guess = torch.cat([guess, guess.new_zeros(len(guess), more)], -1)
         transformed = torch._C._functorch.is_functorch_wrapped_tensor
         mark = None if transformed(begin) else self._mark(rate, begin, guess)
         known = None if mark is None else self._solved.get(mark)
