@@ -156,7 +156,7 @@ def locate(
         # it was another candidate that no draw came up to, if this one by itself is nothing out of the ordinary
         p_value = max(p_value, _own_p(found, terms, best))
     if p_value <= level:
-        best = _refined(best, base, again=True)
+        best = _settled(_refined(best, base, again=True), base)
         shaped = shape_fitted(best)
         best = shaped if _repeats(shaped) else best
     return Located(
@@ -441,6 +441,14 @@ def _refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> Fi
     if not (moved.log_likelihood > best.log_likelihood and _repeats(moved)):
         return best
     return _refined(moved, base) if again else moved
+
+
+def _settled(fit: FittedModel, base: FittedModel) -> FittedModel:
+    """The fit; begun anew where it ran out of steps: they can wait for a scale that is still far too large."""
+    if fit.converged:
+        return fit
+    again = fitted_beside(base, fit.model, fit.parameters, graduate=False)
+    return again if again.log_likelihood > fit.log_likelihood and _repeats(again) else fit
 
 
 def _closer(

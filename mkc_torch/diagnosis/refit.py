@@ -31,6 +31,7 @@ class FittedModel:
         sigma, d, bound: (m,) of the MKC density.
         residual, weights: (N, m).
         log_likelihood: in nats, of all samples and channels.
+        converged: whether another step would bring nothing.
     """
 
     model: JointModel
@@ -41,6 +42,7 @@ class FittedModel:
     residual: Float[Tensor, "N m"]
     weights: Float[Tensor, "N m"]
     log_likelihood: float
+    converged: bool
 
     @property
     def pseudo(self) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
@@ -65,27 +67,19 @@ def fitted(
         rows: weights of the samples; 0 leaves one out.
         graduate: False for a start near the answer.
     """
-
-    def found_from(start: Tensor, *, graduate: bool) -> nonlinear.NonlinearFit:
-        return nonlinear.fit(
-            model.residual,
-            start,
-            bound=bound,
-            weight=rows,
-            prior=model.prior,
-            lower=None if model.bounds is None else model.bounds[0],
-            upper=None if model.bounds is None else model.bounds[1],
-            graduate=graduate,
-            covariance=None,
-            max_iter=60,
-            tol=1e-7,
-        )
-
-    found = found_from(_usable(model, start), graduate=graduate)
-    if not bool(found.converged):
-        # damped steps on the parameters can wait for a scale that is still far too large; begun anew they do not
-        again = found_from(found.theta, graduate=False)
-        found = again if bool(again.log_likelihood > found.log_likelihood) else found
+    found = nonlinear.fit(
+        model.residual,
+        _usable(model, start),
+        bound=bound,
+        weight=rows,
+        prior=model.prior,
+        lower=None if model.bounds is None else model.bounds[0],
+        upper=None if model.bounds is None else model.bounds[1],
+        graduate=graduate,
+        covariance=None,
+        max_iter=60,
+        tol=1e-7,
+    )
     return FittedModel(
         model,
         found.theta,
@@ -95,6 +89,7 @@ def fitted(
         model.residual(found.theta).detach(),
         found.weights,
         float(found.log_likelihood) * len(model.prepared.time),
+        bool(found.converged),
     )
 
 

@@ -32,7 +32,6 @@ class CoulombFriction(RateEffect):
 
     id = "coulomb_friction"
     relative: Mapping[str, tuple[str, str]] = {"width": ("own", "typical")}
-    fitted_shape: Mapping[str, tuple[float, float]] = {"width": (0.01, 0.5)}
     needs = ("reversing",)  # at speeds of one sign it is a constant force
     gain = "friction"
     equation = "δv̇ = −γ tanh(v / w)"

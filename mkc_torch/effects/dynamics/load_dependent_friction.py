@@ -34,7 +34,6 @@ class LoadDependentFriction(RateEffect):
     port = "loaded rate"
     needs = ("reversing", "load")  # at speeds of one sign it is a constant force
     relative: Mapping[str, tuple[str, str]] = {"width": ("own", "typical")}
-    fitted_shape: Mapping[str, tuple[float, float]] = {"width": (0.01, 0.5)}
     gain = "friction"
     most: float = math.inf
     equation = "δv̇ = −(γ₁ + γ₂ |a − h|) tanh(v / w)"

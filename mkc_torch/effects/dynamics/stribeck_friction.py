@@ -31,7 +31,7 @@ class StribeckFriction(RateEffect):
 
     id = "stribeck_friction"
     relative: Mapping[str, tuple[str, str]] = {"width": ("own", "typical"), "stribeck_speed": ("own", "typical")}
-    fitted_shape: Mapping[str, tuple[float, float]] = {"width": (0.01, 0.5), "stribeck_speed": (0.05, 2.0)}
+    fitted_shape: Mapping[str, tuple[float, float]] = {"stribeck_speed": (0.05, 2.0)}
     needs = ("reversing",)  # at speeds of one sign it is a constant force
     gain = "friction"
     equation = "δv̇ = −(γ₁ + γ₂ exp(−(v/v_s)²)) tanh(v / w)"
