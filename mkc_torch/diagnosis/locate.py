@@ -246,10 +246,11 @@ def _part_starts(base: FittedModel, d: Float[Tensor, " m"]) -> list[Start]:
 
 
 def _first_start(base: FittedModel) -> list[Start]:
-    """Around where the fit began, if a parameter went far from there: what is left out can drive it away."""
+    """Around where the fit began, if a parameter of the equations went far from there: what they lack can drive it."""
     prepared = base.model.prepared
-    theta = prepared.start()
-    own = base.model.base - (prepared.beginnings if isinstance(prepared, Beginning) else 0)
+    if not isinstance(prepared, Beginning):
+        return []
+    theta, own = prepared.start(), base.model.base - prepared.beginnings
     sizes = torch.stack([theta[:own], base.parameters[:own]]).abs()
     if not bool((sizes.amax(0) > _AWAY * sizes.amin(0)).any()):
         return []

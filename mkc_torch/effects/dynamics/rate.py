@@ -68,5 +68,7 @@ def beyond(values: Float[Tensor, " N"], place: float | Tensor, exponent: float |
         (tensor([0., 1., 2.]), tensor([0.0000, 0.5000, 2.0000]))
     """
     height = (values - place).clamp(min=0.0)
+    if isinstance(exponent, float) and exponent == 1.0:
+        return height  # as it is searched, and far quicker than a power
     # the power's slope in its exponent is a logarithm
     return height * (height / place).clamp(min=_LEAST) ** (exponent - 1.0)
