@@ -16,7 +16,7 @@ from mkc_torch.diagnosis.estimate import Estimate
 from mkc_torch.diagnosis.model import Term, context_at, summed
 from mkc_torch.diagnosis.python_source import python_source
 from mkc_torch.effects import CATALOGUE
-from mkc_torch.effects.protocol import AnchoredEffect, Context, Effect, LastingEffect, RelativeEffect
+from mkc_torch.effects.protocol import AnchoredEffect, Context, Effect, LastingEffect, RelativeEffect, ShapedEffect
 from mkc_torch.recording import MissingColumnError, Recording
 from mkc_torch.simulation.protocol import Change, Correction, Simulation
 from mkc_torch.simulation.registry import correction_of
@@ -247,7 +247,14 @@ def _effect(entry: Mapping[str, Any], known: Sequence[Effect]) -> Effect:
         )
     numbers = set(entry["shape"])
     of_shape = [one for one in same if not isinstance(one, RelativeEffect) or set(one.relative) <= numbers]
-    return (of_shape or same)[0]
+    effect = (of_shape or same)[0]
+    lost = sorted(set(effect.fitted_shape) - numbers) if isinstance(effect, ShapedEffect) else []
+    if lost:
+        raise ModelFileError(
+            f'the shape of its effect "{effect.id}" lacks {", ".join(lost)}; it may be of another version: diagnose the '
+            "recording again."
+        )
+    return effect
 
 
 def _vector(values: Sequence[float]) -> Tensor:

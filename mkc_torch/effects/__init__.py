@@ -24,6 +24,7 @@ from mkc_torch.effects.protocol import (
     LastingEffect,
     Quantity,
     Shape,
+    ShapedEffect,
     SignalEffect,
 )
 from mkc_torch.effects.temperature_offset import TemperatureOffset
@@ -42,6 +43,7 @@ __all__ = [
     "LastingEffect",
     "Quantity",
     "Shape",
+    "ShapedEffect",
     "SignalEffect",
 ]
 

@@ -144,6 +144,11 @@ def test_without_its_driver_a_model_refuses():
             '"effects": [{"effect": "magic", "drivers": [], "shape": {}, "parameters": []}]}',
             '"magic" is not known',
         ),
+        (
+            '{"schema": "mkc-model/1", "simulation": "a", "state": {}, "parameters": [], "effects": '
+            '[{"effect": "dead_zone", "drivers": [], "shape": {"width": 1.0}, "parameters": [1.0]}]}',
+            'shape of its effect "dead_zone" lacks softness.*diagnose the recording again',
+        ),
     ],
 )
 def test_a_text_that_is_no_model_is_refused(text, said):
