@@ -251,8 +251,8 @@ def _effect(entry: Mapping[str, Any], known: Sequence[Effect]) -> Effect:
     lost = sorted(set(effect.fitted_shape) - numbers) if isinstance(effect, ShapedEffect) else []
     if lost:
         raise ModelFileError(
-            f'the shape of its effect "{effect.id}" lacks {", ".join(lost)}; it may be of another version: diagnose the '
-            "recording again."
+            f'the shape of its effect "{effect.id}" lacks {", ".join(lost)}; it may be of another version: diagnose '
+            "the recording again."
         )
     return effect
 
