@@ -8,7 +8,7 @@ import torch
 
 from mkc_torch.diagnosis.candidates import candidate_terms
 from mkc_torch.diagnosis.linearise import candidate_tangents, linearise, tangents_of
-from mkc_torch.diagnosis.locate import _with_tangents, locate
+from mkc_torch.diagnosis.locate import _first_start, _settled, _with_tangents, locate
 from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.refit import fitted
 from mkc_torch.effects import CATALOGUE
@@ -102,3 +102,41 @@ def test_a_joint_fit_at_another_moment_gives_way_to_that_of_the_search(monkeypat
     located = locate(base, terms, level=0.05, surrogates=19, generator=torch.Generator().manual_seed(0))
     assert located.p_value <= 0.05
     assert located.term.shape["onset"] == pytest.approx(float(prepared.time[671]), abs=0.1)
+
+
+def test_a_fit_that_ran_out_of_steps_is_begun_anew():
+    line = Line(200)
+    base = fitted(JointModel(line), line.start())
+    settled = fitted(base.model.with_term(STEPS[0]), torch.cat([base.parameters, torch.zeros(3)]), base.bound)
+    assert settled.converged
+    assert _settled(settled, base) is settled
+    stopped = dataclasses.replace(
+        settled, parameters=settled.parameters + 0.01, log_likelihood=settled.log_likelihood - 10.0, converged=False
+    )
+    again = _settled(stopped, base)
+    assert again.log_likelihood == pytest.approx(settled.log_likelihood, abs=1e-3)
+    torch.testing.assert_close(again.parameters, settled.parameters, rtol=0.0, atol=1e-4)
+
+
+class Driven(Line):
+    """One whose last parameter is a state at the beginning."""
+
+    beginnings = 1
+
+
+@pytest.mark.parametrize(
+    ("line", "now", "starts"),
+    [
+        (Driven(), [4.1, 0.4], 1),  # more than five times its start
+        (Driven(), [0.1, 0.4], 1),  # and less than a fifth
+        (Driven(), [-0.9, 0.4], 0),
+        (Driven(), [0.9, 9.0], 0),  # a state begins wherever it does
+        (Line(), [4.1, 0.4], 0),  # its start is no guess of a user's
+    ],
+)
+def test_where_a_fit_began_is_looked_at_if_it_went_far_from_there(line, now, starts):
+    fit = fitted(JointModel(line), line.start())
+    found = _first_start(dataclasses.replace(fit, parameters=torch.tensor(now, dtype=torch.float64)))
+    assert len(found) == starts
+    for parameters, _ in found:
+        torch.testing.assert_close(parameters, line.start())
