@@ -30,6 +30,9 @@ __all__ = ["Dynamics", "DynamicsCorrection", "Parameter", "SimulationError"]
 
 _FEWEST = 3
 _FINEST = 8
+_PATIENT = 2
+"""Moments at a time of a march that has to find its way."""
+
 _MOST_KEPT = 1 << 22
 """Numbers in all trajectories that are kept."""
 
@@ -416,8 +419,8 @@ class PreparedDynamics:
         at |= {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
         return at | {"output": outputs}
 
-    def trajectory(self, theta: Float[Tensor, " p"], changes: Changes) -> Trajectory:
-        """The states at all moments, with what effects change."""
+    def trajectory(self, theta: Float[Tensor, " p"], changes: Changes, *, patient: bool = False) -> Trajectory:
+        """The states at all moments, with what effects change; ``patient`` goes from moment to moment if it must."""
         begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
         rate = self._rate(theta, changes)
         more = len(self._remembering(changes))
@@ -438,6 +441,9 @@ class PreparedDynamics:
             found = solve(rate, self.grid, begin, guess)
         if not found.converged and last is None:
             nearer = marched(rate, self.grid, begin, guess)
+            found = found if nearer is None else solve(rate, self.grid, begin, nearer)
+        if not found.converged and patient:
+            nearer = marched(rate, self.grid, begin, guess, stride=_PATIENT)
             found = found if nearer is None else solve(rate, self.grid, begin, nearer)
         # a tensor of a transform must not outlive it
         if found.converged and mark is not None and not transformed(found.states):
@@ -659,9 +665,10 @@ class DynamicsCorrection:
         def residual(begin: Tensor) -> Tensor:
             return prepared.residual(torch.cat([theta[:p], begin]), changes)
 
-        begin = fit(
-            residual, prepared.start()[p:], weight=seen.to(theta.dtype), covariance=None, graduate=True, max_iter=60
-        ).theta
+        first = prepared.start()[p:]
+        # friction that sticks at once leaves Newton's method far behind; a fit then begins with what was found
+        prepared.trajectory(torch.cat([theta[:p], first]), changes, patient=True)
+        begin = fit(residual, first, weight=seen.to(theta.dtype), covariance=None, graduate=True, max_iter=60).theta
         outputs = prepared.simulated(torch.cat([theta[:p], begin]), changes)
         table = prepared.recording
         runs = {"experiment": table["experiment"]} if "experiment" in table else {}

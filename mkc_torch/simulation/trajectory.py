@@ -175,13 +175,14 @@ def solve(
 
 
 def marched(
-    rate: Rate, grid: Grid, begin: Float[Tensor, "K n"], guess: Float[Tensor, "G n"]
+    rate: Rate, grid: Grid, begin: Float[Tensor, "K n"], guess: Float[Tensor, "G n"], *, stride: int = _HORIZON
 ) -> Float[Tensor, "G n"] | None:
     """A guess that is near the trajectories, from one that is not: they are solved over a horizon that grows.
 
     Args:
         rate, grid, begin: as of :func:`solve`.
         guess: of all states.
+        stride: moments by which the horizon grows; fewer find more, and take longer.
 
     Returns:
         The states, to a rough tolerance; None where even a short horizon has no solution.
@@ -191,9 +192,9 @@ def marched(
     first = torch.where(grid.begins, index, 0).cummax(0).values
     place = index - first
     states = torch.where(grid.begins.unsqueeze(-1), begin.detach()[grid.begins.long().cumsum(0) - 1], guess.detach())
-    for horizon in range(_HORIZON, grid.longest + _HORIZON, _HORIZON):
+    for horizon in range(stride, grid.longest + stride, stride):
         # beyond what is solved the last state stays
-        states = states[torch.minimum(index, first + horizon - _HORIZON)]
+        states = states[torch.minimum(index, first + horizon - stride)]
         inside = (place <= horizon).unsqueeze(-1)
         for _ in range(_MOST_STEPS):
             at = _Point.of(rate, states, step)

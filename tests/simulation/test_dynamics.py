@@ -1,6 +1,7 @@
 """A user's differential equations fitted to recordings whose truth is known, by scipy's integrator."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -457,6 +458,48 @@ class TestCorrection:
         without = correction.corrected(theta, {})
         assert float((with_it["angle"] - recording["angle"]).abs().max()) < 1e-3
         assert float((without["angle"] - recording["angle"]).abs().max()) > 0.1
+
+
+class Block(Dynamics):
+    """Pulled by a spring over a table to which it sticks, but for a creep of 0.5 mm/s."""
+
+    states = ("place", "speed")
+    inputs = ("pull",)
+    outputs = ("place",)
+    parameters = {"friction": Parameter(20.0, lower=0.0)}  # noqa: RUF012
+    step = 0.02
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        spring = 200.0 * torch.clamp(u.pull - x.place, -0.3, 0.3)
+        return {"place": x.speed, "speed": spring - x.speed - p.friction * torch.tanh(x.speed / 0.0005)}
+
+
+def dragged(pull):
+    """Its place if it sticks altogether, by short steps; the last pull holds on."""
+    place, speed, places = 0.0, 0.0, []
+    for now in pull:
+        places.append(place)
+        for _ in range(200):
+            free = speed + 1e-4 * (200.0 * np.clip(now - place, -0.3, 0.3) - speed)
+            speed = math.copysign(max(abs(free) - 20.0 * 1e-4, 0.0), free)
+            place += 1e-4 * speed
+    return np.array(places)
+
+
+def test_a_simulation_that_sticks_is_gone_through_moment_by_moment(monkeypatch):
+    """Friction that is nearly a jump: no trajectory is found at once, and a corrected simulation must have one."""
+    time = np.arange(80) * 0.02
+    pull = 0.6 * np.sin(1.1 * time) + 0.3 * np.sign(np.sin(0.7 * time))
+    truth = dragged(pull)
+    correction = DynamicsCorrection(Block(), table(time=time, pull=pull, place=noisy(truth, 0.003)), first=0.3)
+    theta = correction.prepared.start()
+    assert not correction.prepared.trajectory(theta, {}).converged
+    # the first states as they are measured
+    monkeypatch.setattr(dynamics, "fit", lambda _, start, **__: SimpleNamespace(theta=start))
+    place = correction.corrected(theta, {})["place"]
+    # the pull goes linearly between the samples here, and in steps there
+    assert float((place - torch.from_numpy(truth)).abs().max()) < 0.1
+    assert float((place - torch.from_numpy(truth)).abs().median()) < 0.03
 
 
 # what a recording leaves open
