@@ -667,7 +667,12 @@ class DynamicsCorrection:
 
         first = prepared.start()[p:]
         # friction that sticks at once leaves Newton's method far behind; a fit then begins with what was found
-        prepared.trajectory(torch.cat([theta[:p], first]), changes, patient=True)
+        found = prepared.trajectory(torch.cat([theta[:p], first]), changes, patient=True)
+        if not found.converged:
+            raise SimulationError(
+                f"{prepared.name}: with the parameters and effects of this model no trajectory was found that begins "
+                "as this recording does. Give a smaller `step`, or split the recording into shorter experiments."
+            )
         begin = fit(residual, first, weight=seen.to(theta.dtype), covariance=None, graduate=True, max_iter=60).theta
         outputs = prepared.simulated(torch.cat([theta[:p], begin]), changes)
         table = prepared.recording

@@ -494,6 +494,10 @@ def test_a_simulation_that_sticks_is_gone_through_moment_by_moment(monkeypatch):
     correction = DynamicsCorrection(Block(), table(time=time, pull=pull, place=noisy(truth, 0.003)), first=0.3)
     theta = correction.prepared.start()
     assert not correction.prepared.trajectory(theta, {}).converged
+    with monkeypatch.context() as without:
+        without.setattr(dynamics, "marched", lambda *_, **__: None)
+        with pytest.raises(SimulationError, match=r"no trajectory was found.*`step`"):
+            correction.corrected(theta, {})
     # the first states as they are measured
     monkeypatch.setattr(dynamics, "fit", lambda _, start, **__: SimpleNamespace(theta=start))
     place = correction.corrected(theta, {})["place"]
