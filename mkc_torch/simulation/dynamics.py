@@ -30,6 +30,9 @@ __all__ = ["Dynamics", "DynamicsCorrection", "Parameter", "SimulationError"]
 
 _FEWEST = 3
 _FINEST = 8
+_HORIZONS, _ENOUGH = (0.1, 0.3, 1.0), 5
+"""Shares of a recording from which first states are estimated one after the other, and samples for each of them."""
+
 _PATIENT = 2
 """Moments at a time of a march that has to find its way."""
 
@@ -660,7 +663,6 @@ class DynamicsCorrection:
         """The outputs as simulated, with the runs' numbers where there are several."""
         prepared = self.prepared
         p = len(prepared.known)
-        seen = prepared.since_begin() <= (torch.inf if self.first is None else self.first)
 
         def residual(begin: Tensor) -> Tensor:
             return prepared.residual(torch.cat([theta[:p], begin]), changes)
@@ -673,11 +675,25 @@ class DynamicsCorrection:
                 f"{prepared.name}: with the parameters and effects of this model no trajectory was found that begins "
                 "as this recording does. Give a smaller `step`, or split the recording into shorter experiments."
             )
-        begin = fit(residual, first, weight=seen.to(theta.dtype), covariance=None, graduate=True, max_iter=60).theta
+        begin = first
+        for seen in self._horizons():
+            if int(seen.sum()) > _ENOUGH * len(begin) or bool(seen.all()) or self.first is not None:
+                weight = seen.to(theta.dtype)
+                begin = fit(residual, begin, weight=weight, covariance=None, graduate=True, max_iter=60).theta
         outputs = prepared.simulated(torch.cat([theta[:p], begin]), changes)
         table = prepared.recording
         runs = {"experiment": table["experiment"]} if "experiment" in table else {}
         return {"time": self.time} | runs | dict(zip(prepared.channels, outputs.unbind(-1), strict=True))
+
+    def _horizons(self) -> list[Bool[Tensor, " N"]]:
+        """The samples that the first states are estimated from, first those soon after a run's beginning.
+
+        A pendulum that is a little too fast goes over the top, and from there nothing leads back.
+        """
+        since = self.prepared.since_begin()
+        if self.first is not None:
+            return [since <= self.first]
+        return [since <= share * since.max() for share in _HORIZONS]
 
 
 def _namespace(names: Sequence[str], values: Float[Tensor, "S n"]) -> SimpleNamespace:

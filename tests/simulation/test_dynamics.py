@@ -460,6 +460,27 @@ class TestCorrection:
         assert float((without["angle"] - recording["angle"]).abs().max()) > 0.1
 
 
+@pytest.mark.parametrize(("first", "seconds"), [(None, [1.0, 3.0, 10.0]), (2.0, [2.0])])
+def test_first_states_are_estimated_from_what_comes_soon_and_then_from_more(monkeypatch, first, seconds):
+    """A pendulum that seems a little too fast goes over the top, and no fit to all of it leads back."""
+    correction = DynamicsCorrection(Pendulum(), table(time=TIME, angle=TRUTH[0]), first=first)
+    theta, asked = correction.prepared.start(), []
+
+    def watched(_, start, *, weight, **__):
+        asked.append((start, weight))
+        return SimpleNamespace(theta=start + 0.01)
+
+    monkeypatch.setattr(dynamics, "fit", watched)
+    correction.corrected(theta, {})
+    starts, weights = zip(*asked, strict=True)
+    length = float(TIME[-1] - TIME[0])
+    for weight, until in zip(weights, seconds, strict=True):
+        until = until * length / 10.0 if first is None else until
+        assert torch.equal(weight, torch.as_tensor(TIME - TIME[0] <= until + 1e-9).double())
+    for k, start in enumerate(starts):
+        torch.testing.assert_close(start, theta[2:] + 0.01 * k)
+
+
 class Block(Dynamics):
     """Pulled by a spring over a table to which it sticks, but for a creep of 0.5 mm/s."""
 
