@@ -65,10 +65,21 @@ def absolute(effect: Effect, shape: Shape, port: Port) -> Shape:
 
 
 def reach_of(term: Term, prepared: PreparedSimulation) -> dict[str, tuple[float, float]]:
-    """Least and greatest values, in units, of the numbers of a shape that are fitted together with γ."""
+    """Least and greatest values, in units, of the numbers of a shape that are fitted together with γ.
+
+    Raises:
+        ValueError: the effect names a number that its shape does not have, or a range that is not of positive numbers.
+    """
     if not isinstance(term.effect, ShapedEffect):
         return {}
     port, reach = prepared.ports[term.port], term.effect.fitted_shape
+    for name, (low, high) in reach.items():
+        if name not in term.shape or not 0.0 < low < high:
+            raise ValueError(
+                f"Expected `fitted_shape` of {term.effect.id} to hold numbers of its shape ({', '.join(term.shape)}) "
+                f"with a least and a greatest value, both positive, but got `{name}`: ({low}, {high}); mend it or "
+                "leave it out."
+            )
     of_length = term.effect.continuous if isinstance(term.effect, ContinuousEffect) else {}
     length = float(prepared.time[-1] - prepared.time[0])
     ends = [absolute(term.effect, {**term.shape, **{n: r[k] for n, r in reach.items()}}, port) for k in (0, 1)]

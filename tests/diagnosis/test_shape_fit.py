@@ -149,3 +149,12 @@ def test_errors_are_those_of_least_squares_with_the_shape_among_the_parameters()
     alone = float(torch.linalg.inv(covariance).diagonal()[-2].rsqrt())
     assert float(final.standard_error[-1]) > 2.0 * alone  # without the limit's freedom it is far too sure
     assert shape["limit"] == pytest.approx(1.37, abs=3.0 * errors["limit"])
+
+
+@pytest.mark.parametrize("wrong", [{"limit": (0.0, 1.0)}, {"limit": (2.0, 1.0)}, {"magic": (1.0, 2.0)}])
+def test_a_range_that_is_none_is_refused(wrong):
+    fit = found(driven(lambda u: u.clamp(-1.37, 1.37)), OF["input_saturation"], {"limit": 1.2})
+    term = fit.model.terms[-1]
+    effect = type("Mine", (type(term.effect),), {"fitted_shape": wrong})()
+    with pytest.raises(ValueError, match=r"`fitted_shape` of input_saturation .*limit, softness.* but got `\w+`"):
+        reach_of(replace(term, effect=effect), fit.model.prepared)
