@@ -15,6 +15,7 @@ from mkc_torch.diagnosis.candidates import finer
 from mkc_torch.diagnosis.linearise import Linearised, Tangents, candidate_tangents, linearise, tangents_of
 from mkc_torch.diagnosis.local import beside_wander
 from mkc_torch.diagnosis.model import JointModel, Key, Term, one_sided
+from mkc_torch.diagnosis.own_colour import own_colour_gains
 from mkc_torch.diagnosis.preference import Preference
 from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted_beside
 from mkc_torch.diagnosis.search import Gains, NoiseFit, log_survival
@@ -361,6 +362,9 @@ def _judged(
     the draws exceed their chi-square (Bartlett's correction), so that one whose noise is larger than the model's does
     not set the level for all. A shape that was closed in on, beyond those that were tried, is left out: the draws had
     no such choice. So is an amplitude of a sign that the physics does not allow.
+
+    Where draws come up to the strongest candidate, recording and draws are compared a second time, by
+    :func:`own_colour_gains`; the p-value is that of the smaller of both ranks.
     """
     stationary = linearised.entering(count, generator)
     if stationary is None:
@@ -374,7 +378,23 @@ def _judged(
     own = log_survival(found.ratio / excess, dof.unsqueeze(-1))[:tried, 0]
     own = torch.where(possible, own, 0.0).amin()
     others = log_survival(drawn.ratio / excess, dof.unsqueeze(-1))[:tried].amin(0)
-    return (1 + int((others <= own).sum())) / (1 + count), float(others.min() - own)
+    beyond = float(others.min() - own)
+    if beyond > 0 or not bool(possible.any()):
+        return (1 + int((others <= own).sum())) / (1 + count), beyond
+    series = torch.cat([linearised.series.unsqueeze(-1), stationary], -1)
+    allowed = torch.cat([possible, possible.new_zeros(len(found.dof) - tried)])
+    gains = own_colour_gains(linearised, series, allowed)
+    return _either(-torch.cat([own.unsqueeze(0), others]), gains), beyond
+
+
+def _either(one: Float[Tensor, " B"], other: Float[Tensor, " B"]) -> float:
+    """The p-value of the first of B series, by the better of its ranks in two statistics that are large for effects.
+
+    Of series that could change places no more than a share p has a p-value of p or less, however the statistics hang
+    together.
+    """
+    rank = torch.minimum(*[(values >= values.unsqueeze(-1)).sum(-1) for values in (one, other)])
+    return float((rank <= rank[0]).double().mean())
 
 
 def _overwhelming(best: FittedModel, base: FittedModel, without: Linearised, beside: Linearised) -> bool:

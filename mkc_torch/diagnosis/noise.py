@@ -30,6 +30,7 @@ __all__ = [
     "inverse_dct",
     "port_colour",
     "pseudo_residual",
+    "whittle",
 ]
 
 MAX_ORDER = 12
@@ -175,7 +176,7 @@ def port_colour(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c"])
     ratio = overlap / overlap[0]
     # where the port has turned away, the residuals say too little about it
     known = int((ratio < _SHARED).long().argmax()) if bool((ratio < _SHARED).any()) else len(ratio)
-    return _levinson(covariance[:known] / ratio[:known], N * values.shape[1])
+    return _up_to_order(_levinson((covariance[:known] / ratio[:known]).unsqueeze(-1), N * values.shape[1])[:, 0])
 
 
 def enters_at_port(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c"]) -> bool:
@@ -207,7 +208,9 @@ def autoregression(values: Float[Tensor, " N"]) -> Tensor:
         >>> autoregression(draws[:, 0])
         tensor([0.7...], dtype=torch.float64)
     """
-    return _levinson(_autocovariance(values.unsqueeze(-1), min(MAX_ORDER, len(values) // 10))[:, 0], len(values))
+    return _up_to_order(
+        _levinson(_autocovariance(values.unsqueeze(-1), min(MAX_ORDER, len(values) // 10)), len(values))[:, 0]
+    )
 
 
 def filtered(values: Float[Tensor, " N"], coefficients: Tensor) -> Float[Tensor, " N"]:
@@ -238,31 +241,60 @@ def colour_of(power: Float[Tensor, "K m"]) -> Colour:
 
     Whittle, "Estimation and information in stationary time series", Arkiv för Matematik 2 (1953).
     """
+    phi, spectrum = _spectra(power)
+    return Colour(tuple(_up_to_order(one) for one in phi.unbind(-1)), spectrum.sqrt())
+
+
+def _up_to_order(phi: Float[Tensor, " highest"]) -> Float[Tensor, " order"]:
+    """Without the zeros beyond the last coefficient."""
+    known = torch.nonzero(phi).flatten().tolist()
+    return phi[: known[-1] + 1 if known else 0]
+
+
+def whittle(power: Float[Tensor, "K B"]) -> Float[Tensor, " B"]:
+    """Log-likelihood of series by the colour that :func:`colour_of` finds for each, up to a constant.
+
+    Args:
+        power: squares of the K slowest cosine coefficients of each.
+
+    Example:
+        >>> white = torch.randn(400, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> slow = white / torch.arange(1, 401)  # as much as one number of a white series is worth
+        >>> of_white, of_slow = whittle(torch.stack([white, slow], -1).square())
+        >>> bool(of_slow > of_white)
+        True
+    """
+    spectrum = _spectra(power)[1]
+    return -0.5 * (spectrum.log().sum(0) + len(power) * (power / spectrum).mean(0).clamp(min=1e-300).log())
+
+
+def _spectra(power: Float[Tensor, "K B"]) -> tuple[Float[Tensor, "order B"], Float[Tensor, "K B"]]:
+    """Autoregression and spectrum of each series."""
     power = torch.cat([power[1:2], power[1:]])
-    found = [_shape(one) for one in power.unbind(-1)]
-    root = torch.stack([shape.sqrt() for _, shape in found], -1)
-    left = _local_mean(power / root.square())
-    return Colour(tuple(phi for phi, _ in found), root * left.sqrt())
+    phi, shape = _shape(power)
+    return phi, shape * _local_mean(power / shape)
 
 
-def _shape(power: Float[Tensor, " K"]) -> tuple[Tensor, Tensor]:
+def _shape(power: Float[Tensor, "K B"]) -> tuple[Float[Tensor, "order B"], Float[Tensor, "K B"]]:
     """Autoregression, and the spectrum that it and a slow part make, whichever of the two is read first."""
     K = len(power)
     alone = _autoregression(power)
     first = _spectrum(alone, K)
     slow = _slow_part(power)
     beside = _autoregression(power / slow)
-    pairs = [(alone, first * _slow_part(power / first)), (beside, slow * _spectrum(beside, K))]
-    return min(pairs, key=lambda pair: float(pair[1].log().mean() + (power / pair[1]).mean().log()))
+    one, other = first * _slow_part(power / first), slow * _spectrum(beside, K)
+    lack = [spectrum.log().mean(0) + (power / spectrum).mean(0).log() for spectrum in (one, other)]
+    nearer = lack[0] <= lack[1]
+    return torch.where(nearer, alone, beside), torch.where(nearer, one, other)
 
 
-def _autoregression(power: Float[Tensor, " K"]) -> Tensor:
+def _autoregression(power: Float[Tensor, "K B"]) -> Float[Tensor, "order B"]:
     K = len(power)
     lag = torch.arange(min(MAX_ORDER, K // 10) + 1, dtype=power.dtype)
     return _levinson(torch.cos(lag.unsqueeze(-1) * _frequencies(K, power)) @ power / K, K)
 
 
-def _spectrum(phi: Tensor, K: int) -> Float[Tensor, " K"]:
+def _spectrum(phi: Float[Tensor, "order B"], K: int) -> Float[Tensor, "K B"]:
     return _root(phi, _frequencies(K, phi)).square()
 
 
@@ -271,7 +303,7 @@ def _frequencies(K: int, like: Tensor) -> Float[Tensor, " K"]:
     return (torch.arange(K, dtype=like.dtype) + 0.5) * (math.pi / K)
 
 
-def _slow_part(power: Float[Tensor, " K"]) -> Float[Tensor, " K"]:
+def _slow_part(power: Float[Tensor, "K B"]) -> Float[Tensor, "K B"]:
     """``1 + size · shape`` with the likeliest of a grid of sizes and shapes; the level is profiled out."""
     K = len(power)
     k = torch.arange(K, dtype=power.dtype).clamp(min=1.0)  # the first one is the constant
@@ -279,8 +311,8 @@ def _slow_part(power: Float[Tensor, " K"]) -> Float[Tensor, " K"]:
     sizes = torch.logspace(-1.0, 7.0, 25, dtype=power.dtype)
     spectra = 1.0 + (torch.stack(shapes).unsqueeze(1) * sizes.unsqueeze(-1)).flatten(0, 1)
     spectra = torch.cat([torch.ones_like(spectra[:1]), spectra])
-    value = spectra.log().sum(-1) + K * (power / spectra).mean(-1).clamp(min=1e-300).log()
-    return spectra[int(value.argmin())]
+    value = spectra.log().sum(-1, keepdim=True) + K * (spectra.reciprocal() @ power / K).clamp(min=1e-300).log()
+    return spectra[value.argmin(0)].mT
 
 
 def _local_mean(values: Float[Tensor, "K m"]) -> Float[Tensor, "K m"]:
@@ -295,7 +327,7 @@ def _local_mean(values: Float[Tensor, "K m"]) -> Float[Tensor, "K m"]:
     return (total[high] - total[low]) / (high - low).unsqueeze(-1)
 
 
-def _root(phi: Tensor, frequency: Tensor) -> Tensor:
+def _root(phi: Float[Tensor, order * B], frequency: Float[Tensor, " K"]) -> Float[Tensor, K * B]:
     """Root of the spectrum of an autoregression with innovations of variance one."""
     phase = frequency.unsqueeze(-1) * torch.arange(1, len(phi) + 1, dtype=frequency.dtype)
     return torch.hypot(1.0 - torch.cos(phase) @ phi, torch.sin(phase) @ phi).reciprocal()
@@ -307,20 +339,20 @@ def _autocovariance(values: Tensor, highest: int) -> Float[Tensor, "lags m"]:
     return torch.fft.irfft(spectrum.abs().square(), n=2 * N, dim=0)[: highest + 1] / N
 
 
-def _levinson(covariance: Float[Tensor, " lags"], N: int) -> Tensor:
-    """Autoregression from autocovariances by Levinson's recursion, its order by BIC on N samples."""
-    phi = covariance.new_zeros(0)
-    if float(covariance[0]) <= 0:
-        return phi
-    variance = float(covariance[0])
-    best, lowest = phi, N * math.log(variance)
-    for order in range(1, len(covariance)):
-        known = float(phi @ covariance[1:order].flip(0)) if order > 1 else 0.0
-        reflection = (float(covariance[order]) - known) / variance
-        reflection = min(max(reflection, -0.999), 0.999)
-        phi = torch.cat([phi - reflection * phi.flip(0), phi.new_tensor([reflection])])
-        variance *= 1.0 - reflection * reflection
-        score = N * math.log(variance) + order * math.log(N)
-        if score < lowest:
-            best, lowest = phi, score
+def _levinson(covariance: Float[Tensor, "lags B"], N: int) -> Float[Tensor, "order B"]:
+    """Autoregressions from autocovariances by Levinson's recursion, their orders by BIC on N samples; 0 beyond them."""
+    highest = len(covariance) - 1
+    some = covariance[0] > 0
+    variance = torch.where(some, covariance[0], 1.0)
+    phi = torch.zeros_like(covariance[1:])
+    best, lowest = phi.clone(), N * variance.log()
+    for order in range(1, highest + 1):
+        past = phi[: order - 1]
+        reflection = (covariance[order] - (past * covariance[1:order].flip(0)).sum(0)) / variance
+        reflection = reflection.clamp(-0.999, 0.999)
+        phi = torch.cat([past - reflection * past.flip(0), reflection.unsqueeze(0), phi[order:]])
+        variance = variance * (1.0 - reflection.square())
+        score = N * variance.log() + order * math.log(N)
+        better = some & (score < lowest)
+        best, lowest = torch.where(better, phi, best), torch.where(better, score, lowest)
     return best

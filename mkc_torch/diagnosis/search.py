@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 __all__ = ["Gains", "LinearSearch", "log_survival"]
 
@@ -136,6 +136,12 @@ class LinearSearch:
             groups.append((member, index, size.unsqueeze(-1) * vectors * root.unsqueeze(-2), kept.sum(-1).double()))
         return groups
 
+    def coloured(self, factor: Float[Tensor, " K"]) -> LinearSearch:
+        """The same on the first K rows times these factors, without a wander."""
+        rows = len(factor)
+        nuisance, columns = (factor.unsqueeze(-1) * known[:rows] for known in (self._basis, self._flat))
+        return LinearSearch(nuisance, columns.split(self._widths, -1), nuisance[:, :0], nuisance.new_zeros(0, 0))
+
     @property
     def dof(self) -> Float[Tensor, " C"]:
         """Directions of each candidate that the simulation's own parameters leave."""
@@ -174,6 +180,35 @@ class LinearSearch:
         dof = self.dof
         log_p = log_survival(ratio, dof.clamp(min=1.0).unsqueeze(-1))
         return Gains(ratio, torch.where(dof.unsqueeze(-1) > 0, log_p, 0.0), dof)
+
+    def beside_likeliest(
+        self, series: Float[Tensor, "M B"], possible: Bool[Tensor, " C"]
+    ) -> tuple[Float[Tensor, "M B"], Float[Tensor, "M B"], Float[Tensor, " B"]]:
+        """What the simulation's own parameters leave of each series, and what they and one candidate leave.
+
+        It is the likeliest one where all of the noise is white (Akaike's criterion); its degrees of freedom come third.
+
+        Args:
+            series: B of them.
+            possible: candidates that may be chosen.
+        """
+        left = series - self._basis @ (self._basis.mT @ series)
+        found = self.gains(series)
+        score = torch.where(possible.unsqueeze(-1), 0.5 * found.ratio - found.dof.unsqueeze(-1), -torch.inf)
+        beside, chosen = left.clone(), score.argmax(0)
+        for number in chosen.unique().tolist():
+            mine = chosen == number
+            basis = self._space(number)
+            beside[:, mine] -= basis @ (basis.mT @ left[:, mine])
+        return left, beside, found.dof[chosen]
+
+    def _space(self, number: int) -> Float[Tensor, "M q"]:
+        """Orthonormal directions of a candidate that the nuisance leaves; zeros in place of those that it does not."""
+        for member, index, own, _ in self._groups:
+            for place in torch.nonzero(member == number).flatten().tolist():
+                columns = self._flat[:, index[place]]
+                return (columns - self._basis @ (self._basis.mT @ columns)) @ own[place].to(columns)
+        raise IndexError(number)
 
     def noise_fit(self, series: Float[Tensor, " M"]) -> NoiseFit:
         """Family and squared size of the wander without any candidate."""

@@ -5,8 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from mkc_torch.diagnosis.locate import _judged
+from mkc_torch.diagnosis import locate
+from mkc_torch.diagnosis.locate import _either, _judged
 from mkc_torch.diagnosis.search import Gains, log_survival
 
 DRAWS = 99
@@ -18,6 +21,12 @@ def gains(ratio):
     return Gains(ratio, log_survival(ratio, DOF.unsqueeze(-1)), DOF)
 
 
+@pytest.fixture(autouse=True)
+def alike(monkeypatch):
+    """Noise of its own colour tells no series from another."""
+    monkeypatch.setattr(locate, "own_colour_gains", lambda _linearised, series, _possible: torch.zeros(series.shape[1]))
+
+
 def judged(own, tried, possible=None, *, gain=0.0, wandering=None):
     drawn = torch.distributions.Chi2(torch.tensor(3.0).double())
     torch.manual_seed(0)
@@ -27,7 +36,7 @@ def judged(own, tried, possible=None, *, gain=0.0, wandering=None):
         wander=lambda count, _noise, _generator: torch.ones(1, count),
         gains=lambda series: gains(noise if wandering is None or not bool(series.any()) else wandering),
     )
-    linearised = SimpleNamespace(entering=lambda _count, _generator: None, search=search)
+    linearised = SimpleNamespace(entering=lambda _count, _generator: None, search=search, series=torch.zeros(1))
     possible = torch.ones(tried, dtype=torch.bool) if possible is None else torch.tensor(possible)
     return _judged(linearised, SimpleNamespace(gain=gain), gains([[own[0]], [own[1]]]), possible, DRAWS, None)
 
@@ -58,3 +67,28 @@ def test_a_shape_closed_in_on_is_left_out():
     assert without > 0.3
     assert beyond < 0.0
     assert math.isfinite(beyond)
+
+
+def test_what_stands_out_by_its_own_colour_is_seen_where_the_search_sees_nothing(monkeypatch):
+    asked = []
+
+    def gains_of(_linearised, series, possible):
+        asked.append(possible.tolist())
+        return torch.linspace(1.0, 0.0, series.shape[1])
+
+    monkeypatch.setattr(locate, "own_colour_gains", gains_of)
+    assert judged((1.0, 1.0), 1)[0] <= 0.02
+    assert asked == [[True, False]], "a shape that was closed in on has no say here either"
+    assert judged((100.0, 1.0), 2)[0] == pytest.approx(1.0 / (1 + DRAWS))
+    assert len(asked) == 1
+
+
+@settings(deadline=None)
+@given(st.integers(0, 10_000), st.integers(5, 60), st.floats(-1.0, 1.0), st.booleans())
+def test_either_statistic_may_speak_and_the_p_value_keeps_its_level(seed, count, common, ties):
+    both = torch.randn(2, count, generator=torch.Generator().manual_seed(seed))
+    both[1] += 3.0 * common * both[0]
+    both = both.round() if ties else both
+    p_values = torch.tensor([_either(*both.roll(-place, -1)) for place in range(count)])
+    for level in p_values.unique().tolist():
+        assert float((p_values <= level).double().mean()) <= level + 1e-6

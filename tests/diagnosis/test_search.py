@@ -96,6 +96,19 @@ def test_without_wander_gains_are_the_likelihood_ratios_of_least_squares(plain):
             assert float(found.log_p[c, b]) == pytest.approx(expected, rel=1e-8)
 
 
+def test_beside_the_likeliest_candidate_is_left_what_least_squares_leaves(plain):
+    series = randn(M, 4, seed=8) + torch.cat([2.0 * CANDIDATES[1][:, :1], CANDIDATES[0], 0 * WANDER[:, :2]], -1)
+    possible = torch.tensor([True, True, True, False])
+    left, beside, dof = plain.beside_likeliest(series, possible)
+    torch.testing.assert_close(left, series - NUISANCE @ torch.linalg.lstsq(NUISANCE, series).solution)
+    assert dof[:2].tolist() == [3.0, 1.0]
+    score = 0.5 * plain.gains(series).ratio - plain.dof.unsqueeze(-1)
+    for b, number in enumerate(score[:3].argmax(0).tolist()):
+        columns = torch.cat([NUISANCE, CANDIDATES[number]], -1)
+        rest = series[:, b] - columns @ torch.linalg.lstsq(columns, series[:, b]).solution
+        torch.testing.assert_close(beside[:, b], rest)
+
+
 @pytest.mark.parametrize(("family", "size"), [(0, 0.0), (0, 1.0), (0, 300.0), (1, 0.05), (1, 5.0)])
 def test_with_wander_gains_are_those_of_the_dense_covariance(search, family, size):
     dense, series = Dense(search), wandering(size, family, seed=10) + 0.3 * CANDIDATES[2].squeeze(-1)
