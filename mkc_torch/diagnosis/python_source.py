@@ -190,13 +190,13 @@ def _parts(state: str, system: Dynamics) -> dict[str, str]:
 
 
 def _load(state: str) -> list[str]:
-    """Lines that compute how hard the inputs work against what holds them, at standstill."""
+    """Lines that compute how hard the inputs work, at this speed, against what acts at standstill without them."""
     return [
         f'still = SimpleNamespace(**{{**vars(x), "{state}": torch.zeros_like(x.{state})}})',
         "idle = SimpleNamespace(**{name: torch.zeros_like(one) for name, one in vars(u).items()})",
-        f'driven = self.plain_rates(time, still, u, p)["{state}"]',
+        f'coasting = self.plain_rates(time, x, idle, p)["{state}"]',
         f'held = self.plain_rates(time, still, idle, p)["{state}"]',
-        "load = (driven - 2.0 * held).abs()",
+        f'load = (self.plain_rates(time, x, u, p)["{state}"] - coasting - held).abs()',
     ]
 
 

@@ -541,13 +541,10 @@ class PreparedDynamics:
             return torch.cat([states, inputs, rates[own].unsqueeze(-1)], -1)
         if "load" not in port.parts:
             return torch.cat([states, inputs], -1)
-        p = self._parameters(theta)
+        p, idle = self._parameters(theta), _namespace(self.system.inputs, torch.zeros_like(inputs))
         at_rest = torch.cat([states[:, :own], torch.zeros_like(states[:, [own]]), states[:, own + 1 :]], -1)
-        driven, held = (
-            self._derivative(self.clock.time, at_rest, _namespace(self.system.inputs, u), p)[own]
-            for u in (inputs, torch.zeros_like(inputs))
-        )
-        load = (driven - 2.0 * held).abs().unsqueeze(-1)  # of the drive against what holds it
+        coasting, held = (self._derivative(self.clock.time, x, idle, p)[own] for x in (states, at_rest))
+        load = (rates[own] - coasting - held).abs().unsqueeze(-1)  # of the drive against what holds it
         return torch.cat([states, inputs, load], -1)
 
     def _derivative(self, time: Tensor, states: Tensor, u: Any, p: Any) -> list[Tensor]:

@@ -107,6 +107,7 @@ PLACES = {
     "backlash": ("input push", {"half_gap": 0.3}),
     "bouc_wen_hysteresis": ("hysteretic rate of speed", {"yield_deflection": 0.2}),
     "added_mass": ("rate of speed", {}),
+    "load_dependent_friction": ("loaded rate of speed", {"width": 0.05}),
     "buoyancy": ("rate of speed", {"surface": 0.1, "draught": 0.3}),
     "magnus_lift": ("exchange of speed and drift", {}),
     "input_delay": ("input push", {"delay": 0.23}),

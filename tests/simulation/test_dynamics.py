@@ -427,6 +427,21 @@ class TestPorts:
             torch.testing.assert_close(told[name], seen[name], rtol=0.0, atol=1e-4)
         assert prepared.ports["rate of speed"].clock.time.shape == told["rate of speed"][:, 0].shape
 
+    def test_the_load_is_the_drive_at_this_speed_against_what_acts_at_standstill(self):
+        """A motor brakes itself by the field of its own turning, while it is switched on."""
+
+        def derivative(self, time, x, u, p):  # noqa: ARG001
+            braking = (p.damping + 2.0 * u.enabled) * x.speed
+            return {"angle": x.speed, "speed": 5.0 * u.drive - braking - p.stiffness * x.angle}
+
+        system = made(Pendulum, inputs=("drive", "enabled"), derivative=derivative)
+        inputs = {"drive": np.sin(TIME), "enabled": (TIME > 2.0).astype(float)}
+        prepared = system.prepare(table(time=TIME, angle=TRUTH[0], **inputs))
+        told = prepared.signals(torch.tensor([STIFFNESS, DAMPING, *FIRST], dtype=torch.float64), {})
+        angle, speed, drive, enabled, load = told["loaded rate of speed"].unbind(-1)
+        torch.testing.assert_close(load, (5.0 * drive - 2.0 * enabled * speed + STIFFNESS * angle).abs())
+        assert float((2.0 * enabled * speed).abs().max()) > 0.1
+
 
 # a model on a new recording
 

@@ -212,8 +212,8 @@ def servo_terms(x: SimpleNamespace, u: SimpleNamespace, p: SimpleNamespace, shap
 
 
 def servo_drive(x: SimpleNamespace, u: SimpleNamespace, p: SimpleNamespace) -> Tensor:
-    """The motor's voltage, by the law of control that the simulation assumes."""
-    return u.voltage * u.torque_enable * torch.clamp(p.gain * u.kp * (u.goal_position - x.position), -1.0, 1.0)
+    """The motor's share of its supply, by the law of control that the simulation assumes."""
+    return u.torque_enable * torch.clamp(p.gain * u.kp * (u.goal_position - x.position), -1.0, 1.0)
 
 
 FRICTION = ("sign(v)", "sign(v) exp(-(v/s)^2)", "sign(v) |load|")

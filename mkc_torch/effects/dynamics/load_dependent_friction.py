@@ -22,8 +22,8 @@ WIDTHS = (0.3, 0.1, 0.03, 0.01)
 class LoadDependentFriction(RateEffect):
     """Dry friction of a gear: a part that is always there, and a part in proportion to what presses the teeth together.
 
-    Simulation: adds ``−(γ₁ + γ₂ |a − h|) tanh(v / w)`` to the rate of a speed v, with a what the inputs drive it by and
-    h what acts on it without them, both at standstill.
+    Simulation: adds ``−(γ₁ + γ₂ |a − h|) tanh(v / w)`` to the rate of a speed v, with a what the inputs add to it at
+    this speed, a motor's braking field included, and h what acts on it at standstill without them.
     Drivers: none but the states and inputs.
     Units: γ₁ in the speed's unit per s; γ₂ is a share; ``width`` in the unit of the speed.
     Plausible: γ ≥ 0.
