@@ -20,7 +20,7 @@ from mkc_torch.diagnosis.preference import Preference
 from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted_beside
 from mkc_torch.diagnosis.search import Gains, NoiseFit, log_survival
 from mkc_torch.diagnosis.shape_fit import shape_fitted
-from mkc_torch.diagnosis.side_by_side import fitted_each
+from mkc_torch.diagnosis.side_by_side import fitted_each, memory_kept
 from mkc_torch.effects.protocol import ContinuousEffect
 from mkc_torch.functional import mkc_energy
 from mkc_torch.order_statistic import robust_scale
@@ -157,12 +157,59 @@ def locate(
         # it was another candidate that no draw came up to, if this one by itself is nothing out of the ordinary
         p_value = max(p_value, _own_p(found, terms, best))
     if p_value <= level:
+        best, ranking = _by_joint_fits(best, base, ranking, terms, linearised, tangents, prefer)
         best = _settled(_refined(best, base, again=True), base)
         shaped = shape_fitted(best)
         best = shaped if _repeats(shaped) else best
     return Located(
         best.model.terms[-1], best, p_value, beyond, ranking, noise, pseudo, counts, linearised, tangents, terms
     )
+
+
+def _by_joint_fits(
+    best: FittedModel,
+    base: FittedModel,
+    ranking: tuple[Ranked, ...],
+    terms: tuple[Term, ...],
+    linearised: Linearised,
+    tangents: Tangents,
+    prefer: Preference,
+) -> tuple[FittedModel, tuple[Ranked, ...]]:
+    """The fit, or a simpler one that is no worse; and the ranking, with rivals that lose much of their gain put back.
+
+    A port that is not pointwise bends the trajectory: a rival of the search can follow the one that the effect has
+    made, and yet not make one like it. So those that the search has as near as the effect are fitted.
+    """
+    own = best.model.terms[-1].key
+    reach = SEPARABLE + max([one.gap for one in ranking if terms[one.number].key == own], default=0.0)
+    near = [
+        one
+        for one in ranking
+        if one.gap < reach and terms[one.number].key != own and tangents.pointwise[terms[one.number].port] is None
+    ]
+    works = [partial(_tried, best, base, terms[one.number], linearised, one.number) for one in near]
+    with memory_kept(base.model.prepared):
+        fits = fitted_each(base, works, [terms[one.number] for one in near])
+    scores = [_score(fit, base, prefer) for fit in (best, *fits)]
+    behind = {
+        one.number: scores[0] - score for one, score in zip(near, scores[1:], strict=True) if score < _KEPT * scores[0]
+    }
+    told = sorted((replace(one, gap=max(one.gap, behind.get(one.number, 0.0))) for one in ranking), key=_gap)
+    told = [replace(one, gap=one.gap - told[0].gap) for one in told]
+    simpler = [
+        (score, fit)
+        for score, fit in zip(scores[1:], fits, strict=True)
+        if fit.model.sizes[-1] < best.model.sizes[-1] and score >= scores[0] and _repeats(fit)
+    ]
+    return max(simpler, key=lambda one: one[0])[1] if simpler else best, tuple(told)
+
+
+def _tried(best: FittedModel, base: FittedModel, term: Term, linearised: Linearised, number: int) -> FittedModel:
+    return _refined(_refitted(best, base, term, linearised, number), base)
+
+
+def _gap(ranked: Ranked) -> float:
+    return ranked.gap
 
 
 def _own_p(found: Gains, terms: tuple[Term, ...], fit: FittedModel) -> float:

@@ -1,0 +1,82 @@
+"""Rivals that follow the trajectory an effect has made are fitted before they count as not told apart."""
+
+from contextlib import nullcontext
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis import locate
+from mkc_torch.diagnosis.locate import Ranked, _by_joint_fits
+
+BENT, POINTWISE = "rate", "sensor"
+PREFER = SimpleNamespace(handicap=lambda _term, _gain: 0.0)
+
+
+def term(key, port=BENT):
+    return SimpleNamespace(key=key, port=port)
+
+
+def fit_of(own, gain, size=1):
+    """A fit that is so much likelier than that without an effect, after the price of its size."""
+    model = SimpleNamespace(terms=[own], sizes=[size], residual=lambda _: torch.zeros(1), prepared=None)
+    return SimpleNamespace(model=model, log_likelihood=gain, residual=torch.ones(1), parameters=None)
+
+
+FRICTION, MASS, DRY, DRAG, OFFSET = term("friction"), term("mass"), term("dry"), term("drag"), term("o", POINTWISE)
+TERMS = (FRICTION, MASS, DRY, DRAG, OFFSET)
+
+
+@pytest.fixture
+def judged(monkeypatch):
+    """``judged(ranking, fits)``: best and ranking, where joint fits of rivals come out so."""
+
+    def run(ranking, fits, size=2):
+        asked = []
+
+        def tried(_best, _base, one, _linearised, _number):
+            asked.append(one.key)
+            return fits[one.key]
+
+        monkeypatch.setattr(locate, "_tried", tried)
+        monkeypatch.setattr(locate, "fitted_each", lambda _base, works, _terms: [work() for work in works])
+        monkeypatch.setattr(locate, "memory_kept", lambda _prepared: nullcontext())
+        best = fit_of(FRICTION, 100.0, size)
+        tangents = SimpleNamespace(pointwise={BENT: None, POINTWISE: torch.ones(1)})
+        found, told = _by_joint_fits(best, fit_of(None, 0.0), ranking, TERMS, None, tangents, PREFER)
+        return found.model.terms[-1].key, {TERMS[one.number].key: one.gap for one in told}, asked
+
+    return run
+
+
+def test_a_rival_that_makes_no_such_trajectory_is_as_far_behind_as_its_fit(judged):
+    ranking = (Ranked(0, 50.0, 0.0), Ranked(1, 49.0, 0.7), Ranked(3, 20.0, 30.0))
+    found, gaps, asked = judged(ranking, {"mass": fit_of(MASS, 40.0)})
+    assert found == "friction"
+    assert gaps == {"friction": 0.0, "drag": 30.0, "mass": 60.0}
+    assert list(gaps) == ["friction", "drag", "mass"]
+    assert asked == ["mass"]
+
+
+def test_one_whose_fit_keeps_the_gain_is_not_told_apart(judged):
+    _, gaps, _ = judged((Ranked(0, 50.0, 0.0), Ranked(1, 49.0, 0.7)), {"mass": fit_of(MASS, 95.0)})
+    assert gaps == {"friction": 0.0, "mass": 0.7}
+
+
+def test_gaps_are_those_to_the_first_that_is_left(judged):
+    ranking = (Ranked(1, 60.0, 0.0), Ranked(0, 52.0, 7.5), Ranked(2, 52.0, 8.0), Ranked(3, 20.0, 40.0))
+    found, gaps, asked = judged(ranking, {"mass": fit_of(MASS, -5.0), "dry": fit_of(DRY, 99.0, 2)})
+    assert found == "friction"
+    assert asked == ["mass", "dry"], "as near as the effect itself is to the first"
+    assert gaps == pytest.approx({"friction": 0.0, "dry": 0.5, "drag": 32.5, "mass": 97.5})
+
+
+@pytest.mark.parametrize(("size", "gain", "found"), [(1, 100.0, "dry"), (1, 99.0, "friction"), (2, 105.0, "friction")])
+def test_a_simpler_one_that_is_no_worse_is_taken(judged, size, gain, found):
+    assert judged((Ranked(0, 50.0, 0.0), Ranked(2, 50.0, 0.0)), {"dry": fit_of(DRY, gain, size)})[0] == found
+
+
+def test_where_a_port_is_pointwise_the_search_is_exact(judged):
+    _, gaps, asked = judged((Ranked(0, 50.0, 0.0), Ranked(4, 50.0, 0.5)), {})
+    assert asked == []
+    assert gaps == {"friction": 0.0, "o": 0.5}
