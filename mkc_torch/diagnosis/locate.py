@@ -48,9 +48,6 @@ _WANDERS = 2.0
 """Nats that a wander has to gain to be in the draws of noise."""
 
 _SHAPES = 5
-_RAW = 1000.0
-_OVERWHELMING = 150.0
-"""Nats by which an account has to be likelier that no draws of noise are needed to tell."""
 
 
 @dataclass(frozen=True)
@@ -126,8 +123,6 @@ def locate(
     found = linearised.search.gains(linearised.series.unsqueeze(-1))
     possible = _possible(terms, linearised)
     p_value, beyond = _judged(linearised, noise, found, possible[:tried], surrogates, generator)
-    if p_value > level and _overwhelming(best, base, linearised, left.noise):
-        p_value, beyond = 1.0 / (1 + surrogates), math.inf
     if p_value <= level:
         # whether there is an effect is asked of the noise that has it in; which one it is, of the noise beside it
         linearised = linearise(base.model, parameters, pseudo, counts, tangents, colour=left.noise.colour)
@@ -442,18 +437,6 @@ def _either(one: Float[Tensor, " B"], other: Float[Tensor, " B"]) -> float:
     """
     rank = torch.minimum(*[(values >= values.unsqueeze(-1)).sum(-1) for values in (one, other)])
     return float((rank <= rank[0]).double().mean())
-
-
-def _overwhelming(best: FittedModel, base: FittedModel, without: Linearised, beside: Linearised) -> bool:
-    """Whether an effect is so large that noise which includes it is the unlikelier account by far.
-
-    The search holds the noise's colour as the residuals without the effect show it, and an effect a hundred times the
-    noise hides in that. Here either account has the noise that fits it.
-    """
-    if best.log_likelihood - base.log_likelihood < _RAW:
-        return False
-    price = 0.5 * best.model.sizes[-1] * math.log(len(best.residual))
-    return beside.evidence - without.evidence - price > _OVERWHELMING
 
 
 def _possible(terms: tuple[Term, ...], linearised: Linearised) -> Bool[Tensor, " C"]:
