@@ -340,7 +340,11 @@ def _autocovariance(values: Tensor, highest: int) -> Float[Tensor, "lags m"]:
 
 
 def _levinson(covariance: Float[Tensor, "lags B"], N: int) -> Float[Tensor, "order B"]:
-    """Autoregressions from autocovariances by Levinson's recursion, their orders by BIC on N samples; 0 beyond them."""
+    """Autoregressions from autocovariances by Levinson's recursion, their orders by BIC on N samples; 0 beyond them.
+
+    Estimates that are those of no series, as where the turns of a port have been divided out, count up to where they
+    could be; one lag that is larger than the variance is the slowest noise there is.
+    """
     highest = len(covariance) - 1
     some = covariance[0] > 0
     variance = torch.where(some, covariance[0], 1.0)
@@ -349,10 +353,12 @@ def _levinson(covariance: Float[Tensor, "lags B"], N: int) -> Float[Tensor, "ord
     for order in range(1, highest + 1):
         past = phi[: order - 1]
         reflection = (covariance[order] - (past * covariance[1:order].flip(0)).sum(0)) / variance
+        known = reflection.abs() < 1.0
         reflection = reflection.clamp(-0.999, 0.999)
         phi = torch.cat([past - reflection * past.flip(0), reflection.unsqueeze(0), phi[order:]])
         variance = variance * (1.0 - reflection.square())
         score = N * variance.log() + order * math.log(N)
-        better = some & (score < lowest)
+        better = (some if order == 1 else some & known) & (score < lowest)
         best, lowest = torch.where(better, phi, best), torch.where(better, score, lowest)
+        some = some & known
     return best

@@ -12,6 +12,7 @@ from scipy import signal, stats
 from mkc_torch.density_fit import fit_density
 from mkc_torch.diagnosis.noise import (
     Colour,
+    _levinson,
     autoregressive,
     colour_of,
     cosines,
@@ -193,6 +194,16 @@ def test_noise_of_a_turning_port_is_read_through_the_turns():
     assert colour_of(dct(residual).square()).order > 1
     assert port_colour(residual, direction).tolist() == [pytest.approx(0.9, abs=0.02)]
     assert len(port_colour(randn(2000, 1), direction[:2000])) == 0
+
+
+@pytest.mark.parametrize(
+    ("covariance", "kept"), [([1.0, 1.02, 1.01, 1.0, 0.95], [0.999]), ([1.0, 0.8, 0.1, 0.2, 0.95], [0.8])]
+)
+def test_covariances_that_no_series_has_are_gone_by_as_far_as_they_can_be(covariance, kept):
+    """As those of what hardly changes behind a turning port are, once the turns are divided out."""
+    found = _levinson(torch.tensor(covariance).double().unsqueeze(-1), 1000)[:, 0]
+    assert found.tolist() == pytest.approx([*kept, *[0.0] * (4 - len(kept))])
+    assert bool(autoregressive(found, 500, 3, generator()).isfinite().all())
 
 
 def test_noise_of_a_port_that_turns_fast_has_a_stationary_colour():
