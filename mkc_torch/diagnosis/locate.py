@@ -109,7 +109,8 @@ def locate(
     terms = tuple(terms)
     prefer = Preference(terms, base.model.prepared)
     tried = len(terms)
-    best, terms, tangents = _with_tangents(_strongest(base, terms, prefer, parts=parts), terms)
+    fits = _strongest(base, terms, prefer, parts=parts)
+    best, terms, tangents = _with_tangents(fits, terms)
     parameters = best.parameters[: base.model.size]
     tangents = replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
     number = terms.index(best.model.terms[-1])
@@ -152,7 +153,7 @@ def locate(
         # it was another candidate that no draw came up to, if this one by itself is nothing out of the ordinary
         p_value = max(p_value, _own_p(found, terms, best))
     if p_value <= level:
-        best, ranking = _by_joint_fits(best, base, ranking, terms, linearised, tangents, prefer)
+        best, ranking = _by_joint_fits(best, base, ranking, terms, linearised, tangents, prefer, fits)
         best = _settled(_refined(best, base, again=True), base)
         shaped = shape_fitted(best)
         best = shaped if _repeats(shaped) else best
@@ -169,11 +170,13 @@ def _by_joint_fits(
     linearised: Linearised,
     tangents: Tangents,
     prefer: Preference,
+    known: Sequence[FittedModel],
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
     """The fit, or a simpler one that is no worse; and the ranking, with rivals that lose much of their gain put back.
 
     A port that is not pointwise bends the trajectory: a rival of the search can follow the one that the effect has
-    made, and yet not make one like it. So those that the search has as near as the effect are fitted.
+    made, and yet not make one like it. So those that the search has as near as the effect are fitted, unless a
+    ``known`` fit keeps the gain.
     """
     own = best.model.terms[-1].key
     reach = SEPARABLE + max([one.gap for one in ranking if terms[one.number].key == own], default=0.0)
@@ -182,19 +185,22 @@ def _by_joint_fits(
         for one in ranking
         if one.gap < reach and terms[one.number].key != own and tangents.pointwise[terms[one.number].port] is None
     ]
-    works = [partial(_tried, best, base, terms[one.number], linearised, one.number) for one in near]
+    won = _score(best, base, prefer)
+    fitted = {fit.model.terms[-1].key: fit for fit in reversed(known) if _score(fit, base, prefer) >= _KEPT * won}
+    new = [one for one in near if terms[one.number].key not in fitted]
+    works = [partial(_tried, best, base, terms[one.number], linearised, one.number) for one in new]
     with memory_kept(base.model.prepared):
-        fits = fitted_each(base, works, [terms[one.number] for one in near])
-    scores = [_score(fit, base, prefer) for fit in (best, *fits)]
-    behind = {
-        one.number: scores[0] - score for one, score in zip(near, scores[1:], strict=True) if score < _KEPT * scores[0]
-    }
+        for fit in fitted_each(best, works, [terms[one.number] for one in new]) if new else ():
+            fitted[fit.model.terms[-1].key] = fit
+    fits = [fitted[terms[one.number].key] for one in near]
+    scores = [_score(fit, base, prefer) for fit in fits]
+    behind = {one.number: won - score for one, score in zip(near, scores, strict=True) if score < _KEPT * won}
     told = sorted((replace(one, gap=max(one.gap, behind.get(one.number, 0.0))) for one in ranking), key=_gap)
     told = [replace(one, gap=one.gap - told[0].gap) for one in told]
     simpler = [
         (score, fit)
-        for score, fit in zip(scores[1:], fits, strict=True)
-        if fit.model.sizes[-1] < best.model.sizes[-1] and score >= scores[0] and _repeats(fit)
+        for score, fit in zip(scores, fits, strict=True)
+        if fit.model.sizes[-1] < best.model.sizes[-1] and score >= won and _repeats(fit)
     ]
     return max(simpler, key=lambda one: one[0])[1] if simpler else best, tuple(told)
 
@@ -303,7 +309,7 @@ def _first_start(base: FittedModel) -> list[Start]:
 
 
 def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *, parts: bool) -> list[FittedModel]:
-    """The joint refits, the likeliest first, each of the leading ones at its best shape.
+    """The joint refits, the likeliest first; the leading ones each at its best shape, and behind them the others.
 
     Candidates are ranked by the likelihood's own score and by a clipped one, which still sees a stretch of samples that
     the fit rejects; and, where one model over all of the recording runs away, around fits to parts of it, and around
@@ -339,7 +345,9 @@ def _strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *
             f"The simulation gave finite outputs while {len(fits)} effects were fitted, and gives none now at the same "
             "parameters: it is at the edge of what can be solved. Shorten the experiments, or give a `segment`."
         )
-    return sorted(shaped, key=lambda fit: _score(fit, base, prefer), reverse=True)
+    keys = {fit.model.terms[-1].key for fit in shaped}
+    parted = shaped, [fit for key, fit in fits.items() if key not in keys]
+    return [fit for part in parted for fit in sorted(part, key=lambda fit: _score(fit, base, prefer), reverse=True)]
 
 
 def _repeats(fit: FittedModel) -> bool:

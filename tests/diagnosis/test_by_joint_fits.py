@@ -31,7 +31,7 @@ TERMS = (FRICTION, MASS, DRY, DRAG, OFFSET)
 def judged(monkeypatch):
     """``judged(ranking, fits)``: best and ranking, where joint fits of rivals come out so."""
 
-    def run(ranking, fits, size=2):
+    def run(ranking, fits, size=2, known=()):
         asked = []
 
         def tried(_best, _base, one, _linearised, _number):
@@ -43,7 +43,7 @@ def judged(monkeypatch):
         monkeypatch.setattr(locate, "memory_kept", lambda _prepared: nullcontext())
         best = fit_of(FRICTION, 100.0, size)
         tangents = SimpleNamespace(pointwise={BENT: None, POINTWISE: torch.ones(1)})
-        found, told = _by_joint_fits(best, fit_of(None, 0.0), ranking, TERMS, None, tangents, PREFER)
+        found, told = _by_joint_fits(best, fit_of(None, 0.0), ranking, TERMS, None, tangents, PREFER, known)
         return found.model.terms[-1].key, {TERMS[one.number].key: one.gap for one in told}, asked
 
     return run
@@ -80,3 +80,11 @@ def test_where_a_port_is_pointwise_the_search_is_exact(judged):
     _, gaps, asked = judged((Ranked(0, 50.0, 0.0), Ranked(4, 50.0, 0.5)), {})
     assert asked == []
     assert gaps == {"friction": 0.0, "o": 0.5}
+
+
+def test_what_was_fitted_before_and_keeps_the_gain_is_not_fitted_again(judged):
+    ranking = (Ranked(0, 50.0, 0.0), Ranked(1, 49.0, 0.7))
+    _, gaps, asked = judged(ranking, {}, known=[fit_of(MASS, 95.0), fit_of(MASS, 90.0)])
+    assert (asked, gaps["mass"]) == ([], 0.7)
+    _, gaps, asked = judged(ranking, {"mass": fit_of(MASS, 40.0)}, known=[fit_of(MASS, 30.0)])
+    assert (asked, gaps["mass"]) == (["mass"], 60.0)
