@@ -47,7 +47,17 @@ class Gaps:
         known[0] *= math.sqrt(2.0)
         # sums of cosines at the rejected samples; beyond the N-th frequency they go back, with the other sign
         self._sums = torch.cat([known, torch.zeros_like(known[:1]), -known[1:].flip(0)])
-        self._any = (counts == 0).any(0).tolist()
+        self._lost = [torch.nonzero(one == 0).flatten() for one in counts.unbind(1)]
+        self._bases: dict[int, Tensor] = {}
+
+    def basis(self, channel: int) -> Float[Tensor, "K n"]:
+        """The basis at the rejected samples of a channel."""
+        if channel not in self._bases:
+            k = torch.arange(self._kept, dtype=self._sums.dtype).unsqueeze(-1)
+            basis = torch.cos(math.pi / self._N * k * (self._lost[channel] + 0.5)) * math.sqrt(2.0 / self._N)
+            basis[0] *= math.sqrt(0.5)
+            self._bases[channel] = basis
+        return self._bases[channel]
 
     def overlap(self, channel: int, rows: Tensor) -> Float[Tensor, "K J"]:
         """Inner products of the basis with its functions of these numbers, over the rejected samples of a channel."""
@@ -69,32 +79,47 @@ class Gaps:
         for channel in range(m):
             far = excess[:, channel].abs()
             rows = torch.nonzero(far > _PLAIN).flatten()
-            if len(rows) == 0 or not self._any[channel]:
+            lost = len(self._lost[channel])
+            if len(rows) == 0 or lost == 0:
                 parts.append(None)
                 continue
             most = min(_MOST, max(_CELLS // K, 1))
             if len(rows) > most:
                 rows = rows[far[rows].topk(most).indices].sort().values
-            overlap = self.overlap(channel, rows)
             own = excess[rows, channel]
-            system = torch.eye(len(rows), dtype=own.dtype) + own.unsqueeze(-1) * overlap[rows]
-            factors, pivots = torch.linalg.lu_factor(system)
-            log_det += float(factors.diagonal().abs().log().sum())
-            parts.append(_Part(rows, own, overlap, factors, pivots))
+            # the same by either identity; what is solved is as large as the rejected samples, or as the frequencies
+            part = self._by_sample(channel, rows, own) if lost < len(rows) else self._by_frequency(channel, rows, own)
+            log_det += part.log_det
+            parts.append(part)
         return Filling(tuple(parts), log_det)
+
+    def _by_sample(self, channel: int, rows: Tensor, excess: Tensor) -> _Part:
+        basis = self.basis(channel)
+        near = basis[rows]
+        eye = torch.eye(basis.shape[1], dtype=basis.dtype)
+        root = torch.linalg.cholesky(eye + near.mT @ (excess.unsqueeze(-1) * near))
+        pulling = torch.cholesky_solve(near.mT * excess, root)
+        return _Part(rows, basis, pulling, 2.0 * float(root.diagonal().log().sum()))
+
+    def _by_frequency(self, channel: int, rows: Tensor, excess: Tensor) -> _Part:
+        overlap = self.overlap(channel, rows)
+        eye = torch.eye(len(rows), dtype=overlap.dtype)
+        factors, pivots = torch.linalg.lu_factor(eye + excess.unsqueeze(-1) * overlap[rows])
+        pulling = torch.linalg.lu_solve(factors, pivots, torch.diag(excess))
+        return _Part(rows, overlap, pulling, float(factors.diagonal().abs().log().sum()))
 
 
 @dataclass(frozen=True)
 class _Part:
-    rows: Tensor
-    excess: Tensor
-    overlap: Tensor
-    factors: Tensor
-    pivots: Tensor
+    """What the rejected samples of a channel take: ``spread @ pulling`` times the coefficients of these rows."""
+
+    rows: Tensor  # (J,)
+    spread: Tensor  # (K, n)
+    pulling: Tensor  # (n, J)
+    log_det: float
 
     def __call__(self, values: Float[Tensor, "K c"]) -> Float[Tensor, "K c"]:
-        pulled = torch.linalg.lu_solve(self.factors, self.pivots, self.excess.unsqueeze(-1) * values[self.rows])
-        return values - self.overlap @ pulled
+        return values - self.spread @ (self.pulling @ values[self.rows])
 
 
 @dataclass(frozen=True)
