@@ -23,6 +23,7 @@ __all__ = ["allow_copies", "meanwhile", "shared"]
 T = TypeVar("T")
 
 _copies = 0
+_working: list[_Copy] = []
 _BYTES = 4
 
 
@@ -48,7 +49,7 @@ def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) -> li
         >>> shared([lambda: 2 + 2, lambda: 3 + 3])
         [4, 6]
     """
-    count = min(_copies, len(works) - 1)
+    count = min(_to_spare(), len(works) - 1)
     if count < 1:
         return [work() for work in works]
     with _todo(len(works)) as todo, _started(works, todo, count, known) as copies:
@@ -63,18 +64,18 @@ def meanwhile(work: Callable[[], T], known: Iterable[object] = ()) -> Iterator[C
     """What a copy works at while this process goes on; ``known`` as of :func:`shared`.
 
     Gives a function that waits for the result, which is None if the copy could not do or send it; None where there is
-    no core to spare.
+    no core to spare. Once the copy is done its core is free for others.
     """
-    global _copies
-    if _copies < 1:
+    if _to_spare() < 1:
         yield None
         return
-    _copies -= 1
-    try:
-        with _todo(1) as todo, _started([work], todo, 1, known) as copies:
-            yield (lambda: copies[0].done().get(0)) if copies else None
-    finally:
-        _copies += 1
+    with _todo(1) as todo, _started([work], todo, 1, known) as copies:
+        yield (lambda: copies[0].done().get(0)) if copies else None
+
+
+def _to_spare() -> int:
+    """Copies that may still be started."""
+    return _copies - sum(copy.at_work for copy in _working)
 
 
 @dataclass(frozen=True)
@@ -85,8 +86,14 @@ class _Copy:
     answer: BinaryIO
     known: dict[int, object]
 
+    @property
+    def at_work(self) -> bool:
+        return os.waitid(os.P_PID, self.process, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None
+
     def done(self) -> dict[int, Any]:
         """The results by the numbers of the works."""
+        os.waitid(os.P_PID, self.process, os.WEXITED | os.WNOWAIT)
+        self.answer.seek(0)
         try:
             sent: dict[int, bytes] = pickle.load(self.answer)
         except (EOFError, pickle.UnpicklingError):
@@ -152,28 +159,35 @@ def _started(
     copies: list[_Copy] = []
     try:
         with suppress(OSError):  # no memory for another process: those that there are do it
-            copies.extend(_copy(works, todo, by_address) for _ in range(count))
+            for _ in range(count):
+                copies.append(_copy(works, todo, by_address))
+                _working.append(copies[-1])
         yield copies
     finally:
         for copy in copies:
+            _working.remove(copy)
             copy.end()
 
 
 def _copy(works: Sequence[Callable[[], object]], todo: int, known: dict[int, object]) -> _Copy:
-    answer, entry = os.pipe()
+    # a file, for a copy that waits until it is read would keep its core
+    answer = os.fdopen(os.memfd_create("answer"), "w+b")
     parent = os.getpid()
     with warnings.catch_warnings():
         # that other threads may hold locks: those that there are, of progress bars and tables, do nothing that is used
         warnings.simplefilter("ignore", DeprecationWarning)
-        process = os.fork()
+        try:
+            process = os.fork()
+        except OSError:
+            answer.close()
+            raise
     if process:
-        os.close(entry)
-        return _Copy(process, os.fdopen(answer, "rb"), known)
+        return _Copy(process, answer, known)
     try:
-        os.close(answer)
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         warnings.simplefilter("ignore")  # another thread may have held the lock of where they are written
         allow_copies(0)
+        _working.clear()
         gc.disable()
         done = {}
         for number in _taken(todo):
@@ -182,7 +196,7 @@ def _copy(works: Sequence[Callable[[], object]], todo: int, known: dict[int, obj
             with suppress(Exception):
                 _Sender(result := io.BytesIO(), known).dump(works[number]())
                 done[number] = result.getvalue()
-        with os.fdopen(entry, "wb") as file:
-            pickle.dump(done, file)
+        pickle.dump(done, answer)
+        answer.flush()
     finally:
         os._exit(0)

@@ -124,6 +124,30 @@ def test_a_copy_works_meanwhile():
     assert _forked._copies == 2
 
 
+def test_within_a_copy_all_is_done_there():
+    """Also where others are at work, which are no copies of its own."""
+
+    def work():
+        time.sleep(0.05)
+        return {os.getpid(), *shared([os.getpid, os.getpid])}
+
+    assert all(len(processes) == 1 for processes in shared([work] * 6) if HERE not in processes)
+    with meanwhile(signal.pause), meanwhile(work) as answer:
+        assert len(answer()) == 1
+
+
+def test_the_core_of_a_copy_that_is_done_is_free(copies):
+    allow_copies(1)
+    with meanwhile(elsewhere(bytes(1_000_000))) as answer:
+        assert {process for _, process in shared([elsewhere(k) for k in range(4)])} == {HERE}
+        while copies[0].at_work:
+            time.sleep(0.01)
+        assert len({process for _, process in shared([elsewhere(k) for k in range(4)])}) == 2
+        with meanwhile(os.getpid) as another:
+            assert another() != HERE
+        assert answer()[1] != HERE
+
+
 def test_meanwhile_nothing_comes_of_a_work_that_fails():
     with meanwhile(lambda: 1 / 0) as answer:
         assert answer() is None

@@ -29,7 +29,7 @@ from mkc_torch.diagnosis.remaining import remaining, remaining_warning
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Finding, HeldOut, Separability, Spread, Traces, Verdict
 from mkc_torch.diagnosis.separability import separability
 from mkc_torch.diagnosis.shifts import shift_warning, shifted
-from mkc_torch.diagnosis.side_by_side import known_of, learn, memory_kept, with_memory
+from mkc_torch.diagnosis.side_by_side import known_of, learn, with_memory
 from mkc_torch.diagnosis.units import unit_warnings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.protocol import Effect
@@ -117,31 +117,28 @@ def diagnose(
     search = _begun(base, terms, asked, generator)
 
     def finished() -> Diagnosis:
-        final = estimate(search.found[-1].fit if search.found else base).at_least(search.evidence[-1].jackknife)
+        fit = search.found[-1].fit if search.found else base
+        fit.model.residual(fit.parameters)  # to be the newest that a simulation remembers
+        final = estimate(fit).at_least(search.evidence[-1].jackknife)
         return _assembled(simulation, prepared, drivers, len(terms), base, search, final, asked)
 
-    def following() -> tuple[_Search, Tensor]:
+    def following() -> _Search:
         after = _continued(search, asked, generator)
         fit = after.found[-1].fit
-        fit.model.residual(fit.parameters)  # to be the newest that a simulation remembers
-        return after, generator.get_state()
+        fit.model.residual(fit.parameters)
+        return after
 
     while search.left:
-        diagnosis = sent = None
-        work = with_memory(prepared, following)
-        with meanwhile(work, [*search.parts, *known_of(prepared, terms)]) as answer:
-            if answer is not None:
-                # most often there is nothing more
-                with memory_kept(prepared):
-                    diagnosis = finished()
-                sent = answer()
-        (after, state), newest = work() if sent is None else sent
-        generator.set_state(state)
+        # most often there is nothing more
+        work = with_memory(prepared, finished)
+        with meanwhile(work, [simulation, *search.parts, *known_of(prepared, terms)]) as answer:
+            after, newest = with_memory(prepared, following)()
+            if after.found == search.found:
+                sent = None if answer is None else answer()
+                return _with_rest(finished() if sent is None else sent[0], after)
         learn(prepared, newest)
-        if diagnosis is not None and (after.found, after.unconfirmed, after.given_up) == (search.found, None, ""):
-            return diagnosis
         search = after
-    return finished()
+    return _with_rest(finished(), search)
 
 
 @dataclass(frozen=True)
@@ -317,8 +314,6 @@ def _assembled(
             *unit_warnings(prepared.recording),
             *prepared.warnings,
             *drivers.warnings,
-            *([_not_confirmed(search.unconfirmed)] if search.unconfirmed else []),
-            *([f"The search beside what was found was given up. {search.given_up}"] if search.given_up else []),
             *_time_warnings(prepared),
             *remaining_warning(left),
             *(sentence for finding in findings for sentence in shift_warning(finding)),
@@ -330,6 +325,14 @@ def _assembled(
         traces=_traces(prepared, drivers, base, final),
         model=model_of(final, simulation),
     )
+
+
+def _with_rest(diagnosis: Diagnosis, search: _Search) -> Diagnosis:
+    """With what the last search found that does not count, and why there was no other."""
+    more = [_not_confirmed(search.unconfirmed)] if search.unconfirmed else []
+    if search.given_up:
+        more.append(f"The search beside what was found was given up. {search.given_up}")
+    return replace(diagnosis, warnings=(*diagnosis.warnings, *more))
 
 
 def _answerable(base: FittedModel, final: FittedModel) -> FittedModel:

@@ -58,6 +58,12 @@ class Tangents:
     slow: Slow | None
 
     @property
+    def parts(self) -> tuple[Tensor, ...]:
+        """All that are numbers of their own."""
+        slow = () if self.slow is None else (self.slow.tangents, self.slow.scales)
+        return (self.nuisance, *self.candidates, *(one for one in self.pointwise.values() if one is not None), *slow)
+
+    @property
     def bare(self) -> Tangents:
         """The same without candidates."""
         return replace(self, candidates=())

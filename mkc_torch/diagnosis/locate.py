@@ -11,16 +11,18 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._forked import meanwhile
 from mkc_torch.diagnosis.candidates import finer
 from mkc_torch.diagnosis.linearise import Linearised, Tangents, candidate_tangents, linearise, tangents_of
 from mkc_torch.diagnosis.local import beside_wander
 from mkc_torch.diagnosis.model import JointModel, Key, Term, one_sided
+from mkc_torch.diagnosis.noise import Colour
 from mkc_torch.diagnosis.own_colour import own_colour_gains
 from mkc_torch.diagnosis.preference import Preference
 from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted_beside
 from mkc_torch.diagnosis.search import Gains, NoiseFit, log_survival
 from mkc_torch.diagnosis.shape_fit import shape_fitted
-from mkc_torch.diagnosis.side_by_side import fitted_each, memory_kept
+from mkc_torch.diagnosis.side_by_side import fitted_each, known_of, learn, memory_kept, with_memory
 from mkc_torch.effects.protocol import ContinuousEffect
 from mkc_torch.functional import mkc_energy
 from mkc_torch.order_statistic import robust_scale
@@ -119,27 +121,75 @@ def locate(
     left = beside_wander(best, base.model, parameters, tangents)
     counts, tangents = left.counts, replace(tangents, slow=left.slow)
     pseudo = left.values - counts * torch.einsum("nmq,q->nm", tangents.candidates[number], gamma)
-    linearised = linearise(base.model, parameters, pseudo, counts, tangents)
-    noise = linearised.search.noise_fit(linearised.series)
-    found = linearised.search.gains(linearised.series.unsqueeze(-1))
-    possible = _possible(terms, linearised)
-    p_value, beyond = _judged(linearised, noise, found, possible[:tried], surrogates, generator)
-    if p_value <= level:
-        # whether there is an effect is asked of the noise that has it in; which one it is, of the noise beside it
-        linearised = linearise(base.model, parameters, pseudo, counts, tangents, colour=left.noise.colour)
-        found = linearised.search.gains(linearised.series.unsqueeze(-1))
-        close = _ranking(terms, found, prefer, _possible(terms, linearised))
-        near = [terms[one.number] for one in close if one.gap < 2.0 * SEPARABLE]
-        more = _closer(near, best.model, best.parameters, tangents, counts, linearised)
-        terms = (*terms, *more)
-        beside = candidate_tangents(best.model, best.parameters, more, tangents.pointwise)
-        tangents = replace(tangents, candidates=(*tangents.candidates, *beside))
-        linearised = linearised.with_more(beside, counts)
+    prepared = base.model.prepared
+    naming = with_memory(
+        prepared, partial(_named, best, base, terms, tangents, pseudo, counts, left.noise.colour, prefer, level)
+    )
+    # a copy names it already, while this process asks whether there is anything to be named
+    with meanwhile(naming, [base, best, *terms, *tangents.parts, *known_of(prepared, terms)]) as answer:
+        linearised = linearise(base.model, parameters, pseudo, counts, tangents)
+        noise = linearised.search.noise_fit(linearised.series)
         found = linearised.search.gains(linearised.series.unsqueeze(-1))
         possible = _possible(terms, linearised)
-    ranking = _ranking(terms, found, prefer, possible)
+        p_value, beyond = _judged(linearised, noise, found, possible[:tried], surrogates, generator)
+        ranking = _ranking(terms, found, prefer, possible)
+        if p_value <= level:
+            named, newest = (None if answer is None else answer()) or naming()
+            learn(prepared, newest)
+            best, ranking, linearised = named.fit, named.ranking, named.linearised
+            terms, tangents = named.terms, named.tangents
+            # it was another candidate that no draw came up to, if this one by itself is nothing out of the ordinary
+            p_value = max(p_value, named.own_p)
+    if p_value <= level:
+        best, ranking = _by_joint_fits(best, base, ranking, terms, linearised, tangents, prefer, fits)
+        best = _settled(_refined(best, base, again=True), base)
+        shaped = shape_fitted(best)
+        best = shaped if _repeats(shaped) else best
+    return Located(
+        best.model.terms[-1], best, p_value, beyond, ranking, noise, pseudo, counts, linearised, tangents, terms
+    )
+
+
+@dataclass(frozen=True)
+class _Named:
+    """What an effect is, if there is one: the fit with it, and the search that told it from others.
+
+    ``own_p`` is the p-value of its candidate, as if it were the only one.
+    """
+
+    fit: FittedModel
+    ranking: tuple[Ranked, ...]
+    linearised: Linearised
+    tangents: Tangents
+    terms: tuple[Term, ...]
+    own_p: float
+
+
+def _named(
+    best: FittedModel,
+    base: FittedModel,
+    terms: tuple[Term, ...],
+    tangents: Tangents,
+    pseudo: Float[Tensor, "N m"],
+    counts: Float[Tensor, "N m"],
+    colour: Colour,
+    prefer: Preference,
+    level: float,
+) -> _Named:
+    """Whether there is an effect is asked of the noise that has it in; which one it is, of the noise beside it."""
+    linearised = linearise(base.model, best.parameters[: base.model.size], pseudo, counts, tangents, colour=colour)
+    found = linearised.search.gains(linearised.series.unsqueeze(-1))
+    close = _ranking(terms, found, prefer, _possible(terms, linearised))
+    near = [terms[one.number] for one in close if one.gap < 2.0 * SEPARABLE]
+    more = _closer(near, best.model, best.parameters, tangents, counts, linearised)
+    terms = (*terms, *more)
+    beside = candidate_tangents(best.model, best.parameters, more, tangents.pointwise)
+    tangents = replace(tangents, candidates=(*tangents.candidates, *beside))
+    linearised = linearised.with_more(beside, counts)
+    found = linearised.search.gains(linearised.series.unsqueeze(-1))
+    ranking = _ranking(terms, found, prefer, _possible(terms, linearised))
     first = terms[ranking[0].number]
-    if p_value <= level and (first.key != best.model.terms[-1].key or _own_p(found, terms, best) > level):
+    if first.key != best.model.terms[-1].key or _own_p(found, terms, best) > level:
         other = _refitted(best, base, first, linearised, ranking[0].number)
         # the search is linear: where the joint fit loses much of the gain, it went too far; but where noise may wander,
         # what follows the wander gains most in joint fits, and the search knows better if it tells the two apart
@@ -149,17 +199,8 @@ def locate(
         gain = other.log_likelihood - base.log_likelihood if clear else _score(other, base, prefer)
         if gain > least and _repeats(other):
             best = other
-    if p_value <= level:
-        # it was another candidate that no draw came up to, if this one by itself is nothing out of the ordinary
-        p_value = max(p_value, _own_p(found, terms, best))
-    if p_value <= level:
-        best, ranking = _by_joint_fits(best, base, ranking, terms, linearised, tangents, prefer, fits)
-        best = _settled(_refined(best, base, again=True), base)
-        shaped = shape_fitted(best)
-        best = shaped if _repeats(shaped) else best
-    return Located(
-        best.model.terms[-1], best, p_value, beyond, ranking, noise, pseudo, counts, linearised, tangents, terms
-    )
+    best.model.residual(best.parameters)  # to be the newest that a simulation remembers
+    return _Named(best, ranking, linearised, tangents, terms, _own_p(found, terms, best))
 
 
 def _by_joint_fits(

@@ -41,11 +41,12 @@ def recording():
 
 @pytest.fixture
 def diagnosed(recording, monkeypatch):
-    """A diagnosis whose search beside the first finding is the one given, and what it had the simulation remember."""
+    """A diagnosis whose search beside the first finding is the one given, and the trajectory that its
+    final fit begins with."""
 
     def run(beside):
-        searches, learned, first = [], [], []
-        locate, learn = diagnosis_of.locate, diagnosis_of.learn
+        searches, begun, first = [], [], []
+        locate, estimate = diagnosis_of.locate, diagnosis_of.estimate
 
         def search(base, terms, **options):
             searches.append(base)
@@ -55,8 +56,10 @@ def diagnosed(recording, monkeypatch):
             return beside(base, first[0])
 
         monkeypatch.setattr(diagnosis_of, "locate", search)
-        monkeypatch.setattr(diagnosis_of, "learn", lambda *one: learned.append(one) or learn(*one))
-        return diagnosis_of.diagnose(Sled(), recording, effects=EFFECTS), searches, learned
+        monkeypatch.setattr(
+            diagnosis_of, "estimate", lambda fit: begun.append(fit.model.prepared.newest[1]) or estimate(fit)
+        )
+        return diagnosis_of.diagnose(Sled(), recording, effects=EFFECTS), searches, begun
 
     return run
 
@@ -76,11 +79,10 @@ def test_the_simulation_goes_on_with_the_trajectory_of_what_was_found(diagnosed)
         base.model.residual(1.01 * base.parameters)
         return replace(first, p_value=1.0)
 
-    _, searches, learned = diagnosed(wanders_off)
-    ((prepared, (_, states)),) = learned
+    _, searches, (begun,) = diagnosed(wanders_off)
     fit = searches[1]
     fit.model.residual(fit.parameters)
-    torch.testing.assert_close(prepared.newest[1], states)
+    torch.testing.assert_close(fit.model.prepared.newest[1], begun)
 
 
 def test_a_search_without_an_effect_of_a_possible_sign_finds_nothing(recording):
