@@ -13,9 +13,10 @@ from torch import Tensor
 from mkc_torch.diagnosis.estimate import Estimate
 from mkc_torch.diagnosis.evidence import scored
 from mkc_torch.diagnosis.formula import formulas
-from mkc_torch.diagnosis.locate import SEPARABLE, Located
+from mkc_torch.diagnosis.locate import Located
 from mkc_torch.diagnosis.model import Term, follows_signal
 from mkc_torch.diagnosis.preference import UNKNOWN
+from mkc_torch.diagnosis.ranking import SEPARABLE
 from mkc_torch.diagnosis.regions import attributed, map_of, region_of, shares_of_runs
 from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter
 from mkc_torch.effects.protocol import Context, PartEffect, RelativeEffect

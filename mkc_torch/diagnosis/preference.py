@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.drivers import ANY, Driver
 from mkc_torch.diagnosis.model import Term, follows_signal
+from mkc_torch.diagnosis.refit import FittedModel
 from mkc_torch.effects.protocol import GainEffect
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -61,6 +63,12 @@ class Preference:
             course = term.effect.course(term.shape, term.context(self._prepared, None))
             share += EVENT if self._alike(course) > ALIKE_EVENT else 0.0
         return fixed + share * max(gain, 0.0)
+
+    def score(self, fit: FittedModel, base: FittedModel) -> float:
+        """Gain in nats less Schwarz's penalty, and less the handicap."""
+        gain = fit.log_likelihood - base.log_likelihood
+        score = gain - 0.5 * fit.model.sizes[-1] * math.log(len(fit.residual))
+        return score - self.handicap(fit.model.terms[-1], gain)
 
     def _alike(self, course: Float[Tensor, " N"]) -> float:
         """Largest correlation with one of the known drivers, either sign."""

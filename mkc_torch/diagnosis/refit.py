@@ -16,7 +16,7 @@ from mkc_torch.order_statistic import robust_scale
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_beside"]
+__all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_beside", "repeats"]
 
 _CLIP = 2.0
 _SHARES = (1.0, 0.3, 0.1, 0.01, 0.0)
@@ -124,3 +124,8 @@ def clipped_residual(residual: Float[Tensor, "N m"]) -> tuple[Float[Tensor, "N m
     z = residual / scale.clamp(min=1e-300)
     slope = (z.abs() < _CLIP).to(z.dtype).mean(0).clamp(min=0.2)
     return scale * z.clamp(-_CLIP, _CLIP) / slope, torch.ones_like(residual)
+
+
+def repeats(fit: FittedModel) -> bool:
+    """Whether the simulation is finite there once more: a trajectory found on the way of a fit may be lost again."""
+    return bool(fit.model.residual(fit.parameters).isfinite().all())

@@ -7,10 +7,22 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis import locate
-from mkc_torch.diagnosis.locate import Ranked, _by_joint_fits
+from mkc_torch.diagnosis.locate import _by_joint_fits
+from mkc_torch.diagnosis.preference import Preference
+from mkc_torch.diagnosis.ranking import Ranked
 
 BENT, POINTWISE = "rate", "sensor"
-PREFER = SimpleNamespace(handicap=lambda _term, _gain: 0.0)
+
+
+class Indifferent(Preference):
+    def __init__(self):
+        pass
+
+    def handicap(self, _term, _gain):
+        return 0.0
+
+
+PREFER = Indifferent()
 
 
 def term(key, port=BENT):

@@ -8,8 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mkc_torch.diagnosis import locate
-from mkc_torch.diagnosis.locate import _either, _judged
+from mkc_torch.diagnosis import judge
+from mkc_torch.diagnosis.judge import either
 from mkc_torch.diagnosis.search import Gains, log_survival
 
 DRAWS = 99
@@ -24,7 +24,7 @@ def gains(ratio):
 @pytest.fixture(autouse=True)
 def alike(monkeypatch):
     """Noise of its own colour tells no series from another."""
-    monkeypatch.setattr(locate, "own_colour_gains", lambda _linearised, series, _possible: torch.zeros(series.shape[1]))
+    monkeypatch.setattr(judge, "own_colour_gains", lambda _linearised, series, _possible: torch.zeros(series.shape[1]))
 
 
 def judged(own, tried, possible=None, *, gain=0.0, wandering=None):
@@ -38,7 +38,7 @@ def judged(own, tried, possible=None, *, gain=0.0, wandering=None):
     )
     linearised = SimpleNamespace(entering=lambda _count, _generator: None, search=search, series=torch.zeros(1))
     possible = torch.ones(tried, dtype=torch.bool) if possible is None else torch.tensor(possible)
-    return _judged(linearised, SimpleNamespace(gain=gain), gains([[own[0]], [own[1]]]), possible, DRAWS, None)
+    return judge.judged(linearised, SimpleNamespace(gain=gain), gains([[own[0]], [own[1]]]), possible, DRAWS, None)
 
 
 def test_what_exceeds_all_draws_has_the_smallest_p_value_and_says_by_how_much():
@@ -76,7 +76,7 @@ def test_what_stands_out_by_its_own_colour_is_seen_where_the_search_sees_nothing
         asked.append(possible.tolist())
         return torch.linspace(1.0, 0.0, series.shape[1])
 
-    monkeypatch.setattr(locate, "own_colour_gains", gains_of)
+    monkeypatch.setattr(judge, "own_colour_gains", gains_of)
     assert judged((1.0, 1.0), 1)[0] <= 0.02
     assert asked == [[True, False]], "a shape that was closed in on has no say here either"
     assert judged((100.0, 1.0), 2)[0] == pytest.approx(1.0 / (1 + DRAWS))
@@ -89,6 +89,6 @@ def test_either_statistic_may_speak_and_the_p_value_keeps_its_level(seed, count,
     both = torch.randn(2, count, generator=torch.Generator().manual_seed(seed))
     both[1] += 3.0 * common * both[0]
     both = both.round() if ties else both
-    p_values = torch.tensor([_either(*both.roll(-place, -1)) for place in range(count)])
+    p_values = torch.tensor([either(*both.roll(-place, -1)) for place in range(count)])
     for level in p_values.unique().tolist():
         assert float((p_values <= level).double().mean()) <= level + 1e-6

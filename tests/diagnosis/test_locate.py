@@ -8,9 +8,10 @@ import torch
 
 from mkc_torch.diagnosis.candidates import candidate_terms
 from mkc_torch.diagnosis.linearise import candidate_tangents, linearise, tangents_of
-from mkc_torch.diagnosis.locate import _first_start, _settled, _with_tangents, locate
+from mkc_torch.diagnosis.locate import _settled, _with_tangents, locate
 from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.refit import fitted
+from mkc_torch.diagnosis.strongest import _first_start
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.line import Line
@@ -98,7 +99,7 @@ def test_a_joint_fit_at_another_moment_gives_way_to_that_of_the_search(monkeypat
         model = base.model.with_term(late)
         return [fitted(model, torch.cat([base.parameters, torch.zeros(3)]), base.bound)]
 
-    monkeypatch.setattr("mkc_torch.diagnosis.locate._strongest", strongest)
+    monkeypatch.setattr("mkc_torch.diagnosis.locate.strongest", strongest)
     located = locate(base, terms, level=0.05, surrogates=19, generator=torch.Generator().manual_seed(0))
     assert located.p_value <= 0.05
     assert located.term.shape["onset"] == pytest.approx(float(prepared.time[671]), abs=0.1)

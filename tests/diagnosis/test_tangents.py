@@ -9,10 +9,11 @@ from mkc_torch.diagnosis.linearise import tangents_of
 from mkc_torch.diagnosis.locate import locate
 from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.refit import fitted
+from mkc_torch.diagnosis.strongest import strongest
 from mkc_torch.effects.protocol import GainEffect
 from tests.diagnosis.line import Line
 
-MODULE = sys.modules[locate.__module__]
+MODULE = sys.modules[strongest.__module__]
 
 
 class Edge(Line):
