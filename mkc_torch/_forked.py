@@ -49,12 +49,15 @@ def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) -> li
         >>> shared([lambda: 2 + 2, lambda: 3 + 3])
         [4, 6]
     """
-    count = min(_to_spare(), len(works) - 1)
-    if count < 1:
+    if min(_copies, len(works) - 1) < 1:
         return [work() for work in works]
-    with _todo(len(works)) as todo, _started(works, todo, count, known) as copies:
-        done = {number: works[number]() for number in _taken(todo)}
-        for copy in copies:
+    done: dict[int, T] = {}
+    with _todo(len(works)) as todo, _crew(works, todo, known) as crew:
+        for number in _taken(todo):
+            # also a core that has become free since
+            crew.fill(len(works) - len(done) - 1)
+            done[number] = works[number]()
+        for copy in crew.copies:
             done |= copy.done()
     return [done[number] if number in done else work() for number, work in enumerate(works)]
 
@@ -69,8 +72,9 @@ def meanwhile(work: Callable[[], T], known: Iterable[object] = ()) -> Iterator[C
     if _to_spare() < 1:
         yield None
         return
-    with _todo(1) as todo, _started([work], todo, 1, known) as copies:
-        yield (lambda: copies[0].done().get(0)) if copies else None
+    with _todo(1) as todo, _crew([work], todo, known) as crew:
+        crew.fill(1)
+        yield (lambda: crew.copies[0].done().get(0)) if crew.copies else None
 
 
 def _to_spare() -> int:
@@ -136,7 +140,8 @@ class _Receiver(pickle.Unpickler):
 def _todo(count: int) -> Iterator[int]:
     """Where the numbers of works are taken from: whoever reads one has it."""
     todo, entry = os.pipe()
-    os.write(entry, b"".join(number.to_bytes(_BYTES, "big") for number in range(count)))
+    # the last ones first: works are listed by how likely they are, and the fit of what does not fit takes longest
+    os.write(entry, b"".join(number.to_bytes(_BYTES, "big") for number in reversed(range(count))))
     os.close(entry)
     try:
         yield todo
@@ -150,21 +155,31 @@ def _taken(todo: int) -> Iterator[int]:
         yield int.from_bytes(taken, "big")
 
 
-@contextmanager
-def _started(
-    works: Sequence[Callable[[], object]], todo: int, count: int, known: Iterable[object]
-) -> Iterator[list[_Copy]]:
-    """Copies that take part, and are gone in the end."""
-    by_address = {id(one): one for one in known}
-    copies: list[_Copy] = []
-    try:
+@dataclass(frozen=True)
+class _Crew:
+    """Copies that take part."""
+
+    works: Sequence[Callable[[], object]]
+    todo: int
+    known: dict[int, object]
+    copies: list[_Copy]
+
+    def fill(self, most: int) -> None:
+        """Start copies where there are cores to spare."""
         with suppress(OSError):  # no memory for another process: those that there are do it
-            for _ in range(count):
-                copies.append(_copy(works, todo, by_address))
-                _working.append(copies[-1])
-        yield copies
+            while len(self.copies) < most and _to_spare() > 0:
+                self.copies.append(_copy(self.works, self.todo, self.known))
+                _working.append(self.copies[-1])
+
+
+@contextmanager
+def _crew(works: Sequence[Callable[[], object]], todo: int, known: Iterable[object]) -> Iterator[_Crew]:
+    """Copies that are gone in the end."""
+    crew = _Crew(works, todo, {id(one): one for one in known}, [])
+    try:
+        yield crew
     finally:
-        for copy in copies:
+        for copy in crew.copies:
             _working.remove(copy)
             copy.end()
 

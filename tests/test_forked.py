@@ -136,13 +136,23 @@ def test_within_a_copy_all_is_done_there():
         assert len(answer()) == 1
 
 
+def test_the_core_of_a_copy_at_work_is_not_there():
+    allow_copies(1)
+    with meanwhile(signal.pause):
+        assert {process for _, process in shared([elsewhere(k) for k in range(4)])} == {HERE}
+        with meanwhile(os.getpid) as another:
+            assert another is None
+
+
 def test_the_core_of_a_copy_that_is_done_is_free(copies):
     allow_copies(1)
     with meanwhile(elsewhere(bytes(1_000_000))) as answer:
-        assert {process for _, process in shared([elsewhere(k) for k in range(4)])} == {HERE}
+        # it is done while these are worked at, and what it has to say is not waited for
+        results = shared([elsewhere(k) for k in range(9)])
+        assert [value for value, _ in results] == list(range(9))
+        assert len({process for _, process in results}) == 2
         while copies[0].at_work:
             time.sleep(0.01)
-        assert len({process for _, process in shared([elsewhere(k) for k in range(4)])}) == 2
         with meanwhile(os.getpid) as another:
             assert another() != HERE
         assert answer()[1] != HERE

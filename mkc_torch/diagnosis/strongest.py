@@ -48,19 +48,17 @@ def strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *,
     where its fit began.
     """
     around, likeliest = base.parameters, base.parameters.new_zeros(len(terms))
-    listed = _short_list(base, terms, [(around, base.pseudo)], _SHORT_LIST, likeliest)
-    listed += _short_list(base, terms, [(around, clipped_residual(base.residual))], 2, likeliest)
+    tangents = tangents_of(base.model, around, terms)
+    listed = _short_list(base, terms, (around, base.pseudo), tangents, _SHORT_LIST, likeliest)
+    listed += _short_list(base, terms, (around, clipped_residual(base.residual)), tangents, 2, likeliest)
     fits: dict[Key, FittedModel] = {}
     _refit_all(fits, base, listed, prefer)
     if parts:
         least = torch.stack([fit.d for fit in fits.values()]).amin(0)
-        starts = [*_part_starts(base, least), *_first_start(base)]
-        _refit_all(
-            fits,
-            base,
-            [one for start in starts for one in _short_list(base, terms, [start], 2, likeliest)],
-            prefer,
-        )
+        listed = []
+        for start in (*_part_starts(base, least), *_first_start(base)):
+            listed += _short_list(base, terms, start, tangents_of(base.model, start[0], terms), 2, likeliest)
+        _refit_all(fits, base, listed, prefer)
     leading = sorted(fits.values(), key=lambda fit: prefer.score(fit, base), reverse=True)[: _LEADING + 1]
     close = max(_THIRD * prefer.score(leading[0], base), _MUCH)
     leading = [fit for place, fit in enumerate(leading) if place < _LEADING or prefer.score(fit, base) > close]
@@ -83,33 +81,33 @@ def strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *,
 
 
 def _short_list(
-    base: FittedModel, terms: tuple[Term, ...], starts: Sequence[Start], most: int, likeliest: Float[Tensor, " C"]
+    base: FittedModel,
+    terms: tuple[Term, ...],
+    start: Start,
+    tangents: Tangents,
+    most: int,
+    likeliest: Float[Tensor, " C"],
 ) -> list[Listed]:
-    """Of each start the strongest candidates, noise taken for white; ``likeliest`` takes the log of each one's p."""
+    """The strongest candidates, noise taken for white; ``likeliest`` takes the log of each one's p."""
+    parameters, (pseudo, counts) = start
+    plain = linearise(base.model, parameters, pseudo, counts, tangents, white=True, wander=False)
+    log_p = plain.search.gains(plain.series.unsqueeze(-1)).log_p[:, 0]
+    torch.minimum(likeliest, log_p, out=likeliest)
     chosen: dict[Key, Listed] = {}
-    known: dict[int, Tangents] = {}
-    for parameters, (pseudo, counts) in starts:
-        if id(parameters) not in known:
-            known[id(parameters)] = tangents_of(base.model, parameters, terms)
-        plain = linearise(base.model, parameters, pseudo, counts, known[id(parameters)], white=True, wander=False)
-        log_p = plain.search.gains(plain.series.unsqueeze(-1)).log_p[:, 0]
-        torch.minimum(likeliest, log_p, out=likeliest)
-        taken = 0
-        for number in log_p.argsort().tolist():
-            term = terms[number]
-            if term.key not in chosen:
-                gamma, _ = plain.search.estimate(number, plain.series)
-                if one_sided(term.effect):
-                    gamma = gamma.clamp(max=0.0)
-                    if not bool(gamma.any()):
-                        continue
-                chosen[term.key] = term, parameters, -gamma
-                taken += 1
-            if taken >= most:
-                break
+    for number in log_p.argsort().tolist():
+        term = terms[number]
+        if term.key not in chosen:
+            gamma, _ = plain.search.estimate(number, plain.series)
+            if one_sided(term.effect):
+                gamma = gamma.clamp(max=0.0)
+                if not bool(gamma.any()):
+                    continue
+            chosen[term.key] = term, parameters, -gamma
+        if len(chosen) >= most:
+            break
     if not chosen:
         # none has a size of a sign that its physics allows; one of them is still to be told to be nothing
-        chosen[terms[0].key] = terms[0], starts[0][0], starts[0][0].new_zeros(_size(terms[0], base))
+        chosen[terms[0].key] = terms[0], parameters, parameters.new_zeros(_size(terms[0], base))
     return list(chosen.values())
 
 
