@@ -1,0 +1,12 @@
+"""Robust Levenberg-Marquardt and MKC-EM on any differentiable residual.
+
+:func:`minimise` minimises the MKC energy of a residual over its parameters at given σ and d; :func:`fit` learns σ and d
+of each channel too. Both take a prior, bounds, equalities and inequalities, and a batch of problems at once.
+"""
+
+from mkc_torch.nonlinear._forward import beside, load_forward_mode
+from mkc_torch.nonlinear.energy import Solution, minimise
+from mkc_torch.nonlinear.likelihood import NonlinearFit, fit
+from mkc_torch.nonlinear.prior import GaussianPrior
+
+__all__ = ["GaussianPrior", "NonlinearFit", "Solution", "beside", "fit", "load_forward_mode", "minimise"]

@@ -1,0 +1,171 @@
+"""MKC-EM: the density of the residual and the parameters in turn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.density_fit import DensityState, conclusive, initial_state, newton_step
+from mkc_torch.nonlinear._constraints import constrained
+from mkc_torch.nonlinear._descent import damped_step
+from mkc_torch.nonlinear._problem import Point, Problem
+from mkc_torch.nonlinear._quadratic import Penalty, positive, prior_value, quadratic_about
+
+if TYPE_CHECKING:
+    pass
+
+__all__ = ["alternated", "gaussian_candidate", "likelihood_of"]
+
+
+@dataclass(frozen=True)
+class _Likelihood:
+    """What the E-step needs of a problem: normalised weights (B, N, m) and the total of each channel (B, m)."""
+
+    weight: Tensor | None
+    total: Tensor
+
+    def select(self, index: Tensor) -> _Likelihood:
+        return _Likelihood(None if self.weight is None else self.weight[index], self.total[index])
+
+
+def likelihood_of(problem: Problem, residual: Tensor) -> _Likelihood:
+    if problem.weight is None:
+        count = residual.new_full((residual.shape[0], residual.shape[2]), residual.shape[1])
+        return _Likelihood(None, count)
+    total = problem.weight.sum(-2)
+    return _Likelihood(problem.weight / total.unsqueeze(-2), total)
+
+
+@dataclass(frozen=True)
+class _Maximum:
+    point: Point
+    state: DensityState
+    value: Tensor  # mean negative log-likelihood and prior, in nats per sample
+    converged: Tensor
+    n_iter: int
+    penalty: Penalty | None
+
+
+def alternated(
+    problem: Problem,
+    likelihood: _Likelihood,
+    point: Point,
+    state: DensityState,
+    *,
+    max_iter: int,
+    tol: float,
+    exact: bool = True,
+    penalty: Penalty | None = None,
+) -> _Maximum:
+    """E-steps on (σ, d) and damped steps on θ in turn, until they bring less than ``tol`` nats and promise no more."""
+    eps = torch.finfo(point.theta.dtype).eps
+    share = likelihood.total / likelihood.total.mean(-1, keepdim=True)
+    samples = likelihood.total.mean(-1)
+    previous = torch.full_like(samples, torch.inf)
+    done = torch.zeros_like(samples, dtype=torch.bool)
+    stepped = done
+    calm = settled = torch.zeros_like(state.value, dtype=torch.bool)
+    damping: Tensor | None = None
+    n_iter = 0
+    while n_iter < max_iter:
+        before = state
+        state = newton_step(point.residual, likelihood.weight, before)
+        value = (share * state.value).sum(-1) + prior_value(problem, point.theta) / samples
+        change = (previous - value).abs() if problem.is_inequality is not None else previous - value
+        improved = change > tol + 8 * eps * value.abs()
+        # rounding can make a Newton step that has nothing left to gain look like a failed one
+        earlier, settled = settled, conclusive(before, state)
+        calm = ~improved.unsqueeze(-1) & (calm | settled | earlier)
+        done = calm.all(-1) & stepped
+        previous = value
+        if bool(done.all()):
+            break
+        kappa, d = state.kappa, torch.exp(state.log_d)
+        found, penalty = constrained(
+            problem,
+            point,
+            kappa,
+            d,
+            max_iter=1 if penalty is None and problem.is_inequality is None else 30,
+            tol=0.0,
+            penalty=penalty,
+            damping=damping,
+            allowance=tol * samples,
+            exact=exact,
+        )
+        n_iter += found.n_iter
+        damping, stepped, point = found.damping, found.quiet, found.point
+        if found.tired:
+            point = problem.refreshed(point)
+    return _Maximum(point, state, previous, done, n_iter, penalty)
+
+
+def gaussian_candidate(
+    problem: Problem, likelihood: _Likelihood, maximum: _Maximum, *, max_iter: int, tol: float
+) -> _Maximum:
+    """Where a Gaussian density at weighted least squares is likelier than what was found, go on from there instead."""
+    state = maximum.state
+    point = problem.refreshed(maximum.point)
+    tailed = (state.kappa > 0).any(-1)
+    if not bool(tailed.any()):
+        return replace(maximum, point=point)
+    d_min = torch.exp(state.log_d_min)
+
+    def spread(residual: Tensor) -> Tensor:
+        square = residual.square()
+        mean = square.mean(-2) if likelihood.weight is None else (likelihood.weight * square).sum(-2)
+        return torch.maximum(mean.sqrt(), d_min)
+
+    # the linear model of the residual shows whether the Gaussian stands a chance before any fit is made
+    d = spread(point.residual)
+    residual = point.residual
+    for _ in range(1 if d.shape[-1] == 1 else 2):
+        quadratic = quadratic_about(problem, point, torch.zeros_like(d), d, None)
+        scaling = positive(quadratic.majoriser.diagonal(dim1=-2, dim2=-1))
+        step, _, _ = damped_step(
+            replace(problem, box=None),
+            point.theta,
+            quadratic.gradient,
+            quadratic.majoriser,
+            scaling,
+            torch.full_like(scaling[:, 0], 1e-9),
+        )
+        change = torch.matmul(step.unsqueeze(-2), point.tangents).squeeze(-2).unflatten(-1, residual.shape[1:])
+        residual = point.residual + change
+        d = spread(residual)
+    share = likelihood.total / likelihood.total.mean(-1, keepdim=True)
+    gaussian = initial_state(
+        residual, likelihood.weight, d_min, torch.exp(state.log_bound), d_min, kappa=torch.zeros_like(d_min)
+    )
+    better = tailed & ((share * gaussian.value).sum(-1) < maximum.value + tol)
+    index = better.nonzero().squeeze(-1)
+    if index.numel() == 0:
+        return replace(maximum, point=point)
+    part, part_likelihood = problem.select(index), likelihood.select(index)
+    begun = replace(gaussian.select(index), free_kappa=False)
+    again = alternated(part, part_likelihood, point.select(index), begun, max_iter=max_iter, tol=tol)
+    freed = replace(again.state, free_kappa=True, damping=torch.full_like(again.state.damping, 1e-3))
+    again = alternated(part, part_likelihood, again.point, freed, max_iter=max_iter, tol=tol, penalty=again.penalty)
+    won = (again.value < maximum.value[index]).nonzero().squeeze(-1)
+    if won.numel() == 0:
+        return replace(maximum, point=point, n_iter=maximum.n_iter + again.n_iter)
+    index, winner = index[won], problem.select(index).refreshed(again.point).select(won)
+    fields = ("kappa", "log_d", "log_bound", "log_d_min", "damping", "value")
+    merged = {f: getattr(state, f).index_copy(0, index, getattr(again.state, f)[won]) for f in fields}
+    penalty = maximum.penalty
+    if penalty is not None and again.penalty is not None:
+        penalty = Penalty(
+            penalty.multiplier.index_copy(0, index, again.penalty.multiplier[won]),
+            penalty.rho.index_copy(0, index, again.penalty.rho[won]),
+        )
+    return _Maximum(
+        point=point.write(index, winner),
+        state=replace(state, **merged),
+        value=maximum.value.index_copy(0, index, again.value[won]),
+        converged=maximum.converged.index_copy(0, index, again.converged[won]),
+        n_iter=maximum.n_iter + again.n_iter,
+        penalty=penalty,
+    )

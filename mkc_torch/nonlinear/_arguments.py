@@ -1,0 +1,202 @@
+"""The arguments of a problem, checked."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_leaves, tree_map
+
+from mkc_torch.nonlinear._descent import within
+from mkc_torch.nonlinear._forward import Residual
+from mkc_torch.nonlinear._problem import Constraint, Point, Problem
+from mkc_torch.nonlinear.prior import GaussianPrior
+
+if TYPE_CHECKING:
+    pass
+
+__all__ = ["per_channel", "prepared"]
+
+
+def prepared(
+    residual: Residual,
+    start: Tensor,
+    *,
+    data: Any,
+    weight: Tensor | None,
+    prior: GaussianPrior | None,
+    lower: Tensor | None,
+    upper: Tensor | None,
+    equality: Constraint | None,
+    inequality: Constraint | None,
+    jacobian: str,
+) -> tuple[Problem, Point]:
+    """The checked problem and its start."""
+    if not isinstance(start, Tensor) or not start.is_floating_point():
+        got = start.dtype if isinstance(start, Tensor) else type(start).__name__
+        raise TypeError(f"Expected argument `start` to be a real floating-point tensor but got {got}.")
+    if start.dim() == 0 or start.shape[-1] == 0 or start.numel() == 0:
+        raise ValueError(f"Expected argument `start` of shape (*, p >= 1) but got {tuple(start.shape)}.")
+    if not bool(torch.isfinite(start).all()):
+        raise ValueError(
+            f"Expected argument `start` to be finite but got {int((~torch.isfinite(start)).sum())} values that are not."
+        )
+    if jacobian not in ("forward", "reverse"):
+        raise ValueError(f"Expected argument `jacobian` to be 'forward' or 'reverse' but got {jacobian!r}.")
+    batch, p = start.shape[:-1], start.shape[-1]
+    theta = start.detach().reshape(-1, p)
+    box = _checked_box(lower, upper, theta)
+    theta = within(box, theta)
+    for leaf in tree_leaves(data):
+        if isinstance(leaf, Tensor) and leaf.shape[: len(batch)] != batch:
+            raise ValueError(
+                f"Expected every tensor in argument `data` to begin with the batch dimensions {tuple(batch)} of "
+                f"`start` but got {tuple(leaf.shape)}."
+            )
+    flat = None if data is None else tree_map(lambda t: t.reshape(theta.shape[0], *t.shape[len(batch) :]), data)
+    mean, precision = _checked_prior(prior, theta)
+    problem = Problem(
+        residual,
+        flat,
+        batch,
+        jacobian == "forward",
+        prior_mean=mean,
+        prior_precision=precision,
+        box=box,
+        equality=equality,
+        inequality=inequality,
+    )
+    first = problem.raw_residual(theta)
+    if first.dim() != 3 or first.shape[1] == 0 or first.shape[2] == 0:
+        raise ValueError(
+            f"Expected `residual` to return a tensor (N, m) but got shape {tuple(first.shape[1:])}; "
+            "one channel is (N, 1)."
+        )
+    if first.dtype != theta.dtype:
+        raise TypeError(
+            f"Expected `residual` to return the dtype of `start`, {theta.dtype}, but got {first.dtype}; convert one."
+        )
+    full_weight, used = _checked_weight(weight, first, batch)
+    count = torch.full_like(theta[:, 0], float(first[0].numel())) if used is None else used.sum((-2, -1)).to(theta)
+    strength = 0 if precision is None else int(torch.linalg.matrix_rank(precision, hermitian=True))
+    if float(count.min()) + strength < p:
+        raise ValueError(
+            f"Expected at least as many residuals as parameters, {p}, but got {int(count.min())}; "
+            "add samples or a prior."
+        )
+    wrong = ~torch.isfinite(first) if used is None else ~torch.isfinite(first) & used
+    if bool(wrong.any()):
+        raise ValueError(
+            f"Expected `residual` to be finite at `start` but got {int(wrong.sum())} of {first.numel()} values that "
+            "are not; start elsewhere, or leave those samples out by a weight of 0."
+        )
+    kinds = [
+        torch.full((_constraint_count(name, c, theta[0]),), name == "inequality", device=theta.device)
+        for name, c in (("equality", equality), ("inequality", inequality))
+        if c is not None
+    ]
+    problem = replace(problem, weight=full_weight, used=used, is_inequality=torch.cat(kinds) if kinds else None)
+    point = problem.at(theta)
+    broken = int((~torch.isfinite(point.tangents)).sum())
+    if broken:
+        raise ValueError(
+            f"Expected `residual` to have finite derivatives at `start` but got {broken} values that are not; "
+            "start elsewhere."
+        )
+    return problem, point
+
+
+def per_channel(name: str, value: float | Tensor, like: Tensor, batch: torch.Size, *, infinite: bool) -> Tensor:
+    """A positive parameter of every channel, (B, m), from a number, (m,) or (*, m)."""
+    t = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    if not bool(((t > 0) & (torch.isfinite(t) | infinite)).all()):
+        kind = "positive" if infinite else "positive and finite"
+        raise ValueError(f"Expected argument `{name}` to be {kind} but got {value}.")
+    m = like.shape[-1]
+    try:
+        return t.expand(*batch, m).reshape(-1, m)
+    except RuntimeError:
+        raise ValueError(
+            f"Expected argument `{name}` to be a number, ({m},) or {(*batch, m)} but got {tuple(t.shape)}."
+        ) from None
+
+
+def _checked_box(lower: Tensor | None, upper: Tensor | None, theta: Tensor) -> tuple[Tensor, Tensor] | None:
+    if lower is None and upper is None:
+        return None
+    p = theta.shape[-1]
+    sides = []
+    for name, side, default in (("lower", lower, -math.inf), ("upper", upper, math.inf)):
+        t = torch.as_tensor(default if side is None else side, dtype=theta.dtype, device=theta.device)
+        if t.dim() > 1 or (t.dim() == 1 and t.shape[0] != p) or bool(torch.isnan(t).any()):
+            raise ValueError(
+                f"Expected argument `{name}` to be {p} numbers, infinite for no bound, but got "
+                f"{'NaN' if bool(torch.isnan(t).any()) else tuple(t.shape)}."
+            )
+        sides.append(t.expand(p))
+    low, high = sides
+    crossed = (low > high).nonzero().squeeze(-1).tolist()
+    if crossed:
+        raise ValueError(
+            f"Expected argument `lower` to be at most `upper` but got more for the parameters {crossed}; swap them."
+        )
+    return low, high
+
+
+def _checked_prior(prior: GaussianPrior | None, theta: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    if prior is None:
+        return None, None
+    p = theta.shape[-1]
+    mean, precision = torch.as_tensor(prior.mean).to(theta), torch.as_tensor(prior.precision).to(theta)
+    if mean.shape != (p,) or precision.shape not in ((p,), (p, p)):
+        raise ValueError(
+            f"Expected argument `prior` with a mean ({p},) and a precision ({p},) or ({p}, {p}) but got "
+            f"{tuple(mean.shape)} and {tuple(precision.shape)}."
+        )
+    matrix = torch.diag(precision) if precision.dim() == 1 else precision
+    finite = bool(torch.isfinite(mean).all()) and bool(torch.isfinite(matrix).all())
+    if finite:
+        size = matrix.diagonal().abs().clamp(min=torch.finfo(matrix.dtype).tiny).rsqrt()
+        scaled = matrix * size.unsqueeze(-1) * size
+        slack = 1e3 * torch.finfo(matrix.dtype).eps
+        definite = float(torch.linalg.eigvalsh(scaled)[0]) >= -slack
+        symmetric = bool(((scaled - scaled.mT).abs() <= slack).all())
+    if not finite or not definite or not symmetric:
+        raise ValueError(
+            "Expected argument `prior` with finite values and a symmetric positive semi-definite precision but got "
+            f"{precision.tolist()}."
+        )
+    return mean, matrix
+
+
+def _checked_weight(weight: Tensor | None, first: Tensor, batch: torch.Size) -> tuple[Tensor | None, Tensor | None]:
+    """Weights (B, N, m) and which of them are positive; None where all are."""
+    if weight is None:
+        return None, None
+    N, m = first.shape[1:]
+    w = torch.as_tensor(weight).to(first)
+    if w.shape == (N,):
+        w = w.unsqueeze(-1)
+    try:
+        w = w.expand(*batch, N, m).reshape(-1, N, m)
+    except RuntimeError:
+        raise ValueError(
+            f"Expected argument `weight` of shape ({N},), ({N}, {m}) or {(*batch, N, m)} but got {tuple(w.shape)}."
+        ) from None
+    if not bool(torch.isfinite(w).all()) or bool((w < 0).any()) or bool((w.sum(-2) <= 0).any()):
+        raise ValueError("Expected argument `weight` to be finite, >= 0 and positive somewhere in every channel.")
+    used = w > 0
+    return w, None if bool(used.all()) else used
+
+
+def _constraint_count(name: str, constraint: Constraint, theta: Tensor) -> int:
+    value = constraint(theta)
+    if value.dim() != 1 or not bool(torch.isfinite(value).all()):
+        raise ValueError(
+            f"Expected argument `{name}` to return finite values (k,) at `start` but got {value.tolist()}; "
+            "one constraint is (1,)."
+        )
+    return value.shape[0]

@@ -1,0 +1,111 @@
+"""Equalities and inequalities: descents with better and better multipliers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.nonlinear._descent import Descent, descended
+from mkc_torch.nonlinear._problem import Point, Problem
+from mkc_torch.nonlinear._quadratic import Penalty, positive, quadratic_about
+
+if TYPE_CHECKING:
+    pass
+
+__all__ = ["constrained"]
+
+_MULTIPLIERS = 30
+"""Sets of multipliers at most."""
+
+_STIFFNESS = 100.0
+"""Curvature of the penalty over that of the objective along a constraint: each outer step gains about this factor."""
+
+
+def constrained(
+    problem: Problem,
+    point: Point,
+    kappa: Tensor,
+    d: Tensor,
+    *,
+    max_iter: int,
+    tol: float,
+    penalty: Penalty | None = None,
+    damping: Tensor | None = None,
+    allowance: Tensor | None = None,
+    exact: bool = True,
+) -> tuple[Descent, Penalty | None]:
+    """A descent, repeated with better multipliers until the constraints hold."""
+    if penalty is None and problem.is_inequality is not None:
+        penalty = _first_penalty(problem, problem.refreshed(point), kappa, d)
+    if penalty is None:
+        found = descended(
+            problem,
+            point,
+            kappa,
+            d,
+            None,
+            max_iter=max_iter,
+            tol=tol,
+            damping=damping,
+            allowance=allowance,
+            exact=exact,
+        )
+        return found, None
+    n_iter = 0
+    strict = 1e-9 if point.theta.dtype == torch.float64 else 1e-5
+    holds = torch.zeros_like(point.theta[:, 0], dtype=torch.bool)
+    previous: Tensor | None = None
+    for outer in range(_MULTIPLIERS):
+        found = descended(
+            problem,
+            problem.refreshed(point),
+            kappa,
+            d,
+            penalty,
+            max_iter=max_iter,
+            tol=max(tol, 10.0 ** (-3 - 2 * outer)),
+            allowance=allowance,
+        )
+        n_iter += found.n_iter
+        point = found.point
+        assert point.constraint is not None
+        assert point.normals is not None
+        assert problem.is_inequality is not None
+        multiplier = penalty.rho * penalty.excess(problem, point.constraint)
+        # a constraint rests when it holds and, where it is an inequality with slack, pulls no more
+        off = torch.where(
+            problem.is_inequality,
+            torch.maximum(point.constraint, multiplier / penalty.rho).abs(),
+            point.constraint.abs(),
+        )
+        off = torch.where(problem.is_inequality & (multiplier == 0), (-point.constraint).clamp(min=0.0), off)
+        size = 1.0 + (point.normals.abs() * point.theta.abs().unsqueeze(-2)).sum(-1)
+        holds = (off <= strict * size).all(-1)
+        rho = penalty.rho
+        if previous is not None:
+            rho = torch.where(off > 0.25 * previous, 10.0 * rho, rho)
+        stiff = _first_penalty(problem, point, kappa, d)
+        assert stiff is not None
+        rho = torch.maximum(rho, stiff.rho)
+        if bool((holds & found.quiet).all()) and 10.0 ** (-3 - 2 * outer) <= max(tol, 1e-9):
+            break
+        previous = off
+        penalty = Penalty(multiplier, rho)
+    return replace(found, n_iter=n_iter, quiet=found.quiet & holds), penalty
+
+
+def _first_penalty(problem: Problem, point: Point, kappa: Tensor, d: Tensor) -> Penalty | None:
+    """Multipliers 0 and a ρ that is stiff against the objective along each constraint."""
+    if point.constraint is None or point.normals is None:
+        return None
+    majoriser = quadratic_about(problem, point, kappa, d, None).majoriser
+    scale = positive(majoriser.diagonal(dim1=-2, dim2=-1)).rsqrt()
+    scaled = majoriser * scale.unsqueeze(-1) * scale.unsqueeze(-2)
+    eye = torch.eye(scale.shape[-1], dtype=scale.dtype, device=scale.device)
+    normals = point.normals * scale.unsqueeze(-2)
+    yielding = (normals * torch.linalg.solve(scaled + 1e-6 * eye, normals.mT).mT).sum(-1)
+    rho = _STIFFNESS / torch.where(yielding > 0, yielding, 1.0)
+    return Penalty(torch.zeros_like(rho), rho)

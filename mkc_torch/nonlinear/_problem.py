@@ -1,0 +1,147 @@
+"""A batch of problems, flattened, and the points at which they are looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_map
+
+from mkc_torch.nonlinear._forward import Residual, forward_tangents, reverse_tangents
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["Constraint", "Point", "Problem", "kernel_weights", "shaped_jacobian"]
+
+Constraint = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A batch of problems, flattened to B of them."""
+
+    function: Residual
+    data: Any
+    batch: torch.Size
+    forward: bool
+    weight: Tensor | None = None
+    used: Tensor | None = None  # None: all residuals are
+    prior_mean: Tensor | None = None
+    prior_precision: Tensor | None = None
+    box: tuple[Tensor, Tensor] | None = None  # (p,) each
+    equality: Constraint | None = None
+    inequality: Constraint | None = None
+    is_inequality: Tensor | None = None  # (k,); None: unconstrained
+
+    def _over_batch(self, function: Callable[..., Tensor], theta: Tensor) -> Tensor:
+        arguments = (theta,) if self.data is None else (theta, self.data)
+        if theta.shape[0] == 1:
+            return function(*tree_map(lambda t: t[0], arguments)).unsqueeze(0)
+        return torch.func.vmap(function)(*arguments)
+
+    def raw_residual(self, theta: Float[Tensor, "B p"]) -> Float[Tensor, "B N m"]:
+        return self._over_batch(self.function, theta)
+
+    def residual(self, theta: Float[Tensor, "B p"]) -> Float[Tensor, "B N m"]:
+        residual = self.raw_residual(theta)
+        return residual if self.used is None else torch.where(self.used, residual, 0.0)
+
+    def tangents(self, theta: Float[Tensor, "B p"]) -> Float[Tensor, "B p N*m"]:
+        """The transposed Jacobian: a row for each parameter, as forward mode makes them."""
+        rows = self._over_batch(
+            forward_tangents(self.function) if self.forward else reverse_tangents(self.function), theta
+        )
+        if self.used is not None:
+            rows = torch.where(self.used.unsqueeze(1), rows, 0.0)
+        return rows.flatten(2)
+
+    def _constraints(self, theta: Tensor) -> Tensor:
+        """Equalities and inequalities of one problem, (k,)."""
+        return torch.cat([c(theta) for c in (self.equality, self.inequality) if c is not None])
+
+    def constraints(self, theta: Float[Tensor, "B p"]) -> Float[Tensor, "B k"] | None:
+        return None if self.is_inequality is None else replace(self, data=None)._over_batch(self._constraints, theta)
+
+    def normals(self, theta: Float[Tensor, "B p"]) -> Float[Tensor, "B k p"] | None:
+        if self.is_inequality is None:
+            return None
+        return replace(self, data=None)._over_batch(torch.func.jacrev(self._constraints), theta)
+
+    def at(self, theta: Float[Tensor, "B p"]) -> Point:
+        return Point(theta, self.residual(theta), self.tangents(theta), self.constraints(theta), self.normals(theta))
+
+    def refreshed(self, point: Point) -> Point:
+        """The point with derivatives taken at its own parameters."""
+        if not point.stale:
+            return point
+        return replace(point, tangents=self.tangents(point.theta), normals=self.normals(point.theta), stale=False)
+
+    def select(self, index: Tensor) -> Problem:
+        def take(value: Tensor | None) -> Tensor | None:
+            return None if value is None else value[index]
+
+        return replace(
+            self,
+            data=None if self.data is None else tree_map(lambda t: t[index], self.data),
+            weight=take(self.weight),
+            used=take(self.used),
+        )
+
+    def restore(self, value: Tensor) -> Tensor:
+        return value.reshape((*self.batch, *value.shape[1:]))
+
+
+@dataclass(frozen=True)
+class Point:
+    theta: Float[Tensor, "B p"]
+    residual: Float[Tensor, "B N m"]
+    tangents: Float[Tensor, "B p N*m"]
+    constraint: Float[Tensor, "B k"] | None = None
+    normals: Float[Tensor, "B k p"] | None = None
+    stale: bool = False  # the derivatives are those of a point nearby
+
+    def moved(self, accept: Tensor, theta: Tensor, residual: Tensor, constraint: Tensor | None) -> Point:
+        return replace(
+            self,
+            theta=torch.where(accept[:, None], theta, self.theta),
+            residual=torch.where(accept[:, None, None], residual, self.residual),
+            constraint=None
+            if constraint is None or self.constraint is None
+            else torch.where(accept[:, None], constraint, self.constraint),
+            stale=True,
+        )
+
+    def select(self, index: Tensor) -> Point:
+        return Point(
+            self.theta[index],
+            self.residual[index],
+            self.tangents[index],
+            None if self.constraint is None else self.constraint[index],
+            None if self.normals is None else self.normals[index],
+            self.stale,
+        )
+
+    def write(self, index: Tensor, part: Point) -> Point:
+        def merged(whole: Tensor | None, some: Tensor | None) -> Tensor | None:
+            return None if whole is None or some is None else whole.index_copy(0, index, some)
+
+        return Point(
+            self.theta.index_copy(0, index, part.theta),
+            self.residual.index_copy(0, index, part.residual),
+            self.tangents.index_copy(0, index, part.tangents),
+            merged(self.constraint, part.constraint),
+            merged(self.normals, part.normals),
+            self.stale or part.stale,
+        )
+
+
+def kernel_weights(residual: Tensor, kappa: Tensor, d: Tensor) -> Tensor:
+    return torch.exp((-0.5 * kappa / d.square()).unsqueeze(-2) * residual.square())
+
+
+def shaped_jacobian(problem: Problem, point: Point) -> Tensor:
+    return problem.restore(point.tangents.unflatten(-1, point.residual.shape[1:]).movedim(1, -1))

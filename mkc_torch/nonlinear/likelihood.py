@@ -1,0 +1,206 @@
+"""Most likely parameters, with σ and d of each channel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from torch import Tensor
+
+from mkc_torch.density_fit import DensityState, domain_rule, initial_state, refuse_narrow_bound
+from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
+from mkc_torch.nonlinear._alternate import alternated, gaussian_candidate, likelihood_of
+from mkc_torch.nonlinear._arguments import per_channel, prepared
+from mkc_torch.nonlinear._covariance import parameter_covariance
+from mkc_torch.nonlinear._forward import Residual
+from mkc_torch.nonlinear._graduated import LEAST_SCALE, graduated, residual_scale
+from mkc_torch.nonlinear._problem import Constraint, Point, kernel_weights, shaped_jacobian
+from mkc_torch.nonlinear.prior import GaussianPrior
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["NonlinearFit", "fit"]
+
+
+@dataclass(frozen=True)
+class NonlinearFit:
+    """What :func:`fit` found.
+
+    Attributes:
+        theta: (*, p).
+        sigma, d, bound: bandwidth (``inf`` for a Gaussian channel), scale and half-width of the domain, (*, m).
+        log_likelihood: nats per sample: the mean over the samples of each channel, summed over the channels, (*,),
+            without the prior; compare only at equal ``bound``.
+        weights: ``exp(-e² / (2 d² σ²))`` of each residual, (*, N, m).
+        residual: (*, N, m) at ``theta``; 0 where the weight is 0.
+        covariance: of ``theta`` at the learned σ and d, (*, p, p), or None. It is 0 along active bounds and
+            constraints, and infinite for parameters that the residual does not determine.
+        jacobian: of the residual at ``theta``, (*, N, m, p).
+        n_iter: trial steps made.
+        converged: (*,).
+    """
+
+    theta: Float[Tensor, "*batch p"]
+    sigma: Float[Tensor, "*batch m"]
+    d: Float[Tensor, "*batch m"]
+    bound: Float[Tensor, "*batch m"]
+    log_likelihood: Float[Tensor, " *batch"]
+    weights: Float[Tensor, "*batch N m"]
+    residual: Float[Tensor, "*batch N m"]
+    covariance: Float[Tensor, "*batch p p"] | None
+    jacobian: Float[Tensor, "*batch N m p"]
+    n_iter: int
+    converged: Bool[Tensor, " *batch"]
+
+    def standard_error(self) -> Float[Tensor, "*batch p"]:
+        """Square root of the diagonal of ``covariance``, in the units of the parameters."""
+        if self.covariance is None:
+            raise ValueError("Expected a fit with a covariance but it was made with covariance=None; name a kind.")
+        return self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
+
+
+@torch.no_grad()
+def fit(
+    residual: Residual,
+    start: Float[Tensor, "*batch p"],
+    *,
+    bound: float | Tensor | None = None,
+    sigma: float | Tensor | None = None,
+    d: float | Tensor | None = None,
+    graduate: bool = True,
+    data: Any = None,
+    weight: Tensor | None = None,
+    prior: GaussianPrior | None = None,
+    lower: Float[Tensor, " p"] | None = None,
+    upper: Float[Tensor, " p"] | None = None,
+    equality: Constraint | None = None,
+    inequality: Constraint | None = None,
+    max_iter: int = 200,
+    tol: float = 1e-10,
+    jacobian: Literal["forward", "reverse"] = "forward",
+    covariance: CovarianceKind | None = "sandwich",
+    bandwidth: float | None = None,
+) -> NonlinearFit:
+    """Parameters, bandwidths and scales of a residual by maximum likelihood of the MKC density: MKC-EM.
+
+    Newton steps on (σ, d) of each channel and a damped step on θ in turn, as in :class:`mkc_torch.linear.MKCRegression`
+    and with its safeguards: a domain that stays fixed, d no less than 0.3 robust scales, and a second attempt from
+    weighted least squares where a Gaussian is likelier than what was found. A graduated start leads in: fits with a
+    kernel of ten robust scales of the residuals and fewer and fewer of them, so that a start from which most residuals
+    are large is survived.
+
+    The prior is weighed against the likelihood of all residuals; the E-step does not see it.
+
+    Args:
+        residual: as in :func:`minimise`.
+        start: (*, p).
+        bound: half-width of the domain in the unit of the residual, at least two robust scales: a number, (m,) or
+            (*, m); None takes :func:`mkc_torch.density_fit.domain_rule` on a rough robust fit.
+        sigma: None learns σ; a value keeps it.
+        d: None learns d; a value keeps it.
+        graduate: False begins at ``start`` as it is; only for starts near the answer.
+        data, weight, prior, lower, upper, equality, inequality, jacobian: as in :func:`minimise`.
+        max_iter: trial steps at most in each of the rough and the final fit.
+        tol: converged when two alternations in a row each raise the mean log-likelihood by less (nats per sample).
+        covariance: "sandwich" for independent samples, "hac" for a time series, None for none. The curvature is the
+            objective's, without the residual's second derivatives; the scores of a sample's channels are summed.
+        bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
+
+    Raises:
+        TypeError, ValueError: as :func:`minimise`, or a domain that the head of the density does not fit in.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (17), (29)-(31), Algorithm 2.
+
+    Example:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> t = torch.linspace(0, 4, 200, dtype=torch.float64)
+        >>> y = 3.0 * torch.exp(-0.7 * t) + 0.05 * torch.randn(200, generator=generator, dtype=torch.float64)
+        >>> y[::4] += 2.0
+        >>> found = fit(lambda a: (a[0] * torch.exp(-a[1] * t) - y).unsqueeze(-1), torch.tensor([1.0, 0.1]).double())
+        >>> [round(v, 1) for v in found.theta.tolist()], bool(found.standard_error().max() < 0.05)
+        ([3.0, 0.7], True)
+    """
+    if max_iter < 1:
+        raise ValueError(f"Expected argument `max_iter` to be at least 1 but got {max_iter}.")
+    kind = None if covariance is None else checked_kind(covariance)
+    checked_bandwidth(bandwidth)
+    problem, point = prepared(
+        residual,
+        start,
+        data=data,
+        weight=weight,
+        prior=prior,
+        lower=lower,
+        upper=upper,
+        equality=equality,
+        inequality=inequality,
+        jacobian=jacobian,
+    )
+    fixed_sigma = None if sigma is None else per_channel("sigma", sigma, point.residual, problem.batch, infinite=True)
+    fixed_d = None if d is None else per_channel("d", d, point.residual, problem.batch, infinite=False)
+    fixed_bound = None if bound is None else per_channel("bound", bound, point.residual, problem.batch, infinite=False)
+    steps = 0
+    if graduate:
+        point, steps = graduated(problem, point, max_iter)
+    likelihood = likelihood_of(problem, point.residual)
+    scale = residual_scale(problem, point)
+    d_min = LEAST_SCALE * scale if fixed_d is None else torch.minimum(fixed_d, LEAST_SCALE * scale)
+
+    def begun(at: Point, size: Tensor, domain: Tensor, tails: Sequence[float | Tensor]) -> DensityState:
+        return initial_state(
+            at.residual,
+            likelihood.weight,
+            size,
+            domain,
+            d_min,
+            kappa=None if fixed_sigma is None else fixed_sigma.pow(-2),
+            d=fixed_d,
+            tails=tails,
+        )
+
+    if fixed_bound is None:
+        tight = domain_rule(point.residual, scale, problem.used, scales=5.0)
+        rough = alternated(
+            problem,
+            likelihood,
+            point,
+            begun(point, scale, tight, (0.1, 0.4, 1.5)),
+            max_iter=max_iter,
+            tol=1e-4,
+            exact=False,
+        )
+        steps += rough.n_iter
+        point = rough.point
+        size = torch.exp(rough.state.log_d)
+        domain = domain_rule(point.residual, size, problem.used)
+        state = begun(point, size, domain, (rough.state.kappa,))
+        penalty = rough.penalty
+    else:
+        refuse_narrow_bound(fixed_bound, scale)
+        state = begun(point, scale, fixed_bound, (0.1, 0.4, 1.5))
+        penalty = None
+    maximum = alternated(problem, likelihood, point, state, max_iter=max_iter, tol=tol, penalty=penalty)
+    if state.free_kappa and state.free_d:
+        maximum = gaussian_candidate(problem, likelihood, maximum, max_iter=max_iter, tol=tol)
+    point = problem.refreshed(maximum.point)
+    kappa, scale = maximum.state.kappa, torch.exp(maximum.state.log_d)
+    found = None
+    if kind is not None:
+        found = problem.restore(parameter_covariance(problem, point, kappa, scale, maximum.penalty, kind, bandwidth))
+    return NonlinearFit(
+        theta=problem.restore(point.theta),
+        sigma=problem.restore(kappa.rsqrt()),
+        d=problem.restore(scale),
+        bound=problem.restore(torch.exp(maximum.state.log_bound)),
+        log_likelihood=problem.restore(-maximum.state.value.sum(-1)),
+        weights=problem.restore(kernel_weights(point.residual, kappa, scale)),
+        residual=problem.restore(point.residual),
+        covariance=found,
+        jacobian=shaped_jacobian(problem, point),
+        n_iter=steps + maximum.n_iter,
+        converged=problem.restore(maximum.converged),
+    )
