@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 
 from mkc_torch.effects.protocol import CodedEffect
 from mkc_torch.recording import DEFAULT_UNITS
-from mkc_torch.simulation.dynamics import Dynamics, Parameter, _kinematic
+from mkc_torch.simulation.dynamics import Dynamics
+from mkc_torch.simulation.parameter import Parameter
+from mkc_torch.simulation.user_functions import kinematic
 
 if TYPE_CHECKING:
     from mkc_torch.diagnosis.diagnosed_model import DiagnosedModel
@@ -177,7 +179,7 @@ def _signed(expression: str) -> str:
 def _parts(state: str, system: Dynamics) -> dict[str, str]:
     """Expressions of what an effect on the rate of a state refers to."""
     known = {name: one if isinstance(one, Parameter) else Parameter(one) for name, one in system.parameters.items()}
-    position = next((name for name, rate in _kinematic(system, known).items() if rate == state), state)
+    position = next((name for name, rate in kinematic(system, known).items() if rate == state), state)
     celsius = system.units.get(state, DEFAULT_UNITS.get(state, "")) == "°C"
     return {
         "own": f"x.{state}",

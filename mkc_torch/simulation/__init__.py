@@ -1,9 +1,10 @@
 """Simulations: what predicts a recording, with ports through which an effect can act on it."""
 
-from mkc_torch.simulation.dynamics import Dynamics, Parameter, SimulationError
+from mkc_torch.simulation.dynamics import Dynamics
 from mkc_torch.simulation.load import SimulationFileError, load_simulation
 from mkc_torch.simulation.magnetometer import Magnetometer
 from mkc_torch.simulation.paired import Paired
+from mkc_torch.simulation.parameter import Parameter, SimulationError
 from mkc_torch.simulation.protocol import Correction, Port, PreparedSimulation, Simulation
 from mkc_torch.simulation.static import Static
 

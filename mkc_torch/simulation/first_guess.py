@@ -10,7 +10,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-    from mkc_torch.simulation.dynamics import PreparedDynamics
+    from mkc_torch.simulation.prepared_dynamics import PreparedDynamics
 
 __all__ = ["first_guess"]
 

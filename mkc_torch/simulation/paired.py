@@ -11,8 +11,8 @@ from torch import Tensor
 
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.recording import Recording
-from mkc_torch.simulation.dynamics import SimulationError
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
+from mkc_torch.simulation.parameter import SimulationError
 from mkc_torch.simulation.protocol import Changes
 from mkc_torch.simulation.runs import successive_runs
 

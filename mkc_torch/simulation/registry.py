@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from mkc_torch.recording import Recording
-from mkc_torch.simulation.dynamics import Dynamics, DynamicsCorrection
+from mkc_torch.simulation.dynamics import Dynamics
+from mkc_torch.simulation.dynamics_correction import DynamicsCorrection
 from mkc_torch.simulation.magnetometer import MagnetometerCorrection
 from mkc_torch.simulation.paired import Paired, PairedCorrection
 from mkc_torch.simulation.protocol import Correction, Simulation

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
 from mkc_torch.recording import Recording
-from mkc_torch.simulation.dynamics import Parameter, SimulationError
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
+from mkc_torch.simulation.parameter import Parameter, SimulationError
 from mkc_torch.simulation.protocol import Changes, Port
 from mkc_torch.simulation.undetermined import undetermined
 

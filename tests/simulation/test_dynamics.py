@@ -13,7 +13,7 @@ from mkc_torch.diagnosis.model import JointModel
 from mkc_torch.diagnosis.refit import fitted
 from mkc_torch.recording import MissingColumnError
 from mkc_torch.simulation import Dynamics, Parameter, SimulationError, dynamics, trajectory
-from mkc_torch.simulation.dynamics import DynamicsCorrection
+from mkc_torch.simulation.dynamics_correction import DynamicsCorrection
 
 STIFFNESS, DAMPING = 9.0, 0.15
 FIRST = (1.2, 0.4)
