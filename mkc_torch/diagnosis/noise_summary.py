@@ -33,7 +33,9 @@ def noise_summary(final: Estimate) -> Noise:
     if coloured:
         parameters["autoregression"] = tuple(tuple(phi.tolist()) for phi in orders)
     if clear and wander.family == 0:
-        model, told = "random_walk", f"an offset that wanders like a random walk, by {parameters['wander']:.2g} in all"
+        unit = next(port.unit for port in fit.model.prepared.ports.values() if port.wanders)
+        model = "random_walk"
+        told = f"noise around an offset that wanders like a random walk, by {parameters['wander']:.2g} {unit} in all"
     elif clear or coloured:
         model, told = "ar", "coloured noise" + (", with a slow part that enters with the offset" if clear else "")
     else:
