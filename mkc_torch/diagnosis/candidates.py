@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.drivers import Driver
@@ -45,7 +46,7 @@ def candidate_terms(
             Term(effect, driver, shape, "" if at == effect.port else at)
             for at in places
             for driver in fitting
-            for shape in (absolute(effect, shape, prepared.ports[at]) for shape in shapes)
+            for shape in (absolute(effect, shape, prepared.ports[at], driver) for shape in shapes)
         ]
     return tuple(terms)
 
@@ -56,11 +57,15 @@ def _fits(effect: Effect, name: str, port: Port) -> bool:
     return effect.port in (name, port.kind) and set(needs) <= set(port.parts)
 
 
-def absolute(effect: Effect, shape: Shape, port: Port) -> Shape:
-    """A shape in units, of one in shares of what passes through the port."""
+def absolute(effect: Effect, shape: Shape, port: Port, driver: Driver | None = None) -> Shape:
+    """A shape in units, of one in shares of what passes through the port or of what drives the effect."""
     if not isinstance(effect, RelativeEffect):
         return shape
-    sizes = {name: dict(zip(("typical", "largest"), values, strict=True)) for name, values in port.sizes.items()}
+    known = dict(port.sizes)
+    if driver is not None:
+        away = torch.linalg.vector_norm(driver.values, dim=-1)
+        known["driver"] = float(away.median()), float(away.max())
+    sizes = {name: dict(zip(("typical", "largest"), values, strict=True)) for name, values in known.items()}
     return {**shape} | {name: shape[name] * sizes[part][which] for name, (part, which) in effect.relative.items()}
 
 
@@ -68,21 +73,23 @@ def reach_of(term: Term, prepared: PreparedSimulation) -> dict[str, tuple[float,
     """Least and greatest values, in units, of the numbers of a shape that are fitted together with γ.
 
     Raises:
-        ValueError: the effect names a number that its shape does not have, or a range that is not of positive numbers.
+        ValueError: the effect names a number that its shape does not have, or a range with nothing in it.
     """
     if not isinstance(term.effect, ShapedEffect):
         return {}
     port, reach = prepared.ports[term.port], term.effect.fitted_shape
     for name, (low, high) in reach.items():
-        if name not in term.shape or not 0.0 < low < high:
+        if name not in term.shape or not low < high:
             raise ValueError(
                 f"Expected `fitted_shape` of {term.effect.id} to hold numbers of its shape ({', '.join(term.shape)}) "
-                f"with a least and a greatest value, both positive, but got `{name}`: ({low}, {high}); mend it or "
+                f"with a least and a greater value but got `{name}`: ({low}, {high}); mend it or "
                 "leave it out."
             )
     of_length = term.effect.continuous if isinstance(term.effect, ContinuousEffect) else {}
     length = float(prepared.time[-1] - prepared.time[0])
-    ends = [absolute(term.effect, {**term.shape, **{n: r[k] for n, r in reach.items()}}, port) for k in (0, 1)]
+    ends = [
+        absolute(term.effect, {**term.shape, **{n: r[k] for n, r in reach.items()}}, port, term.driver) for k in (0, 1)
+    ]
     least, most = ({name: end[name] * (length if name in of_length else 1.0) for name in reach} for end in ends)
     return {name: (least[name], most[name]) for name in reach}
 

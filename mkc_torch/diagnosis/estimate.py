@@ -109,9 +109,15 @@ def _shapes_free(plain: Estimate, tangents: Tangents, local: Local) -> Estimate:
     wide = replace(tangents, nuisance=torch.cat([tangents.nuisance, columns], -1), slow=local.slow)
     found = linearise(shaped, start, local.values, local.counts, wide, colour=local.noise.colour, joint=True)
     error = found.search.estimate(0, found.series)[1].diagonal().clamp(min=0.0).sqrt()
+    numbers = [term.shape[name] for term, reach in zip(model.terms, inside, strict=True) for name in reach]
+    errors = shaped.per_effect(shaped.spread(numbers, error[shaped.joint :]).tolist())
     known = [
-        {name: share * term.shape[name] for name, share in shares.items() if 0.0 < share < _UNKNOWN}
-        for term, shares in zip(model.terms, shaped.per_effect(error[shaped.joint :].tolist()), strict=True)
+        {
+            name: one
+            for name, one in found.items()
+            if 0.0 < one < _UNKNOWN * (term.shape[name] if reach[name][0] > 0 else reach[name][1])
+        }
+        for term, reach, found in zip(model.terms, inside, errors, strict=True)
     ]
     return replace(plain.at_least(error[: shaped.joint]), shape_errors=tuple(known))
 
@@ -119,7 +125,7 @@ def _shapes_free(plain: Estimate, tangents: Tangents, local: Local) -> Estimate:
 def _inside(term: Term, reach: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
     """The numbers of a shape that are not at an end of their range."""
     return {
-        name: ends
-        for name, ends in reach.items()
-        if ends[0] * (1.0 + _AT_END) < term.shape[name] < ends[1] * (1.0 - _AT_END)
+        name: (low, high)
+        for name, (low, high) in reach.items()
+        if low + _AT_END * abs(low) < term.shape[name] < high - _AT_END * abs(high)
     }

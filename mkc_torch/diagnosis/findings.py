@@ -122,7 +122,8 @@ def _shape_parameters(term: Term, context: Context, errors: Mapping[str, float])
 
 def _unit_of_shape(term: Term, name: str, context: Context) -> str:
     if isinstance(term.effect, RelativeEffect) and name in term.effect.relative:
-        return context.unit_of(term.effect.relative[name][0])
+        part = term.effect.relative[name][0]
+        return context.units[0] if part == "driver" else context.unit_of(part)
     return "s" if name in _SECONDS else ""
 
 

@@ -21,16 +21,18 @@ __all__ = ["ShapedModel", "shape_fitted"]
 
 
 class ShapedModel(JointModel):
-    """A joint model that has, as its last parameters, the logarithms of numbers in its effects' shapes.
+    """A joint model that has numbers of its effects' shapes as its last parameters, of positive ones the logarithms.
 
     Args:
         model: the joint model.
-        reach: of each effect, the name of each such number to its least and greatest value, positive.
+        reach: of each effect, the name of each such number to its least and greatest value.
     """
 
     def __init__(self, model: JointModel, reach: Sequence[Mapping[str, tuple[float, float]]]) -> None:
         super().__init__(model.prepared, model.terms)
         self._reach = tuple(reach)
+        least = [low for one in reach for low, _ in one.values()]
+        self._positive = torch.tensor([low > 0.0 for low in least], dtype=torch.bool)
 
     @classmethod
     def of(cls, model: JointModel) -> ShapedModel:
@@ -49,7 +51,7 @@ class ShapedModel(JointModel):
     @property
     def bounds(self) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"]]:
         ends = [end for reach in self._reach for end in reach.values()]
-        shapes = self.prepared.time.new_tensor(ends).reshape(-1, 2).log()
+        shapes = self._free(self.prepared.time.new_tensor(ends).reshape(-1, 2).mT).mT
         known = super().bounds
         if known is None:
             free = shapes.new_full((self.joint,), torch.inf)
@@ -59,7 +61,7 @@ class ShapedModel(JointModel):
     def start(self, parameters: Float[Tensor, " q"]) -> Float[Tensor, " p"]:
         """The joint model's parameters with its effects' shapes beside them."""
         values = [term.shape[name] for term, reach in zip(self.terms, self._reach, strict=True) for name in reach]
-        return torch.cat([parameters, parameters.new_tensor(values).log()])
+        return torch.cat([parameters, self._free(parameters.new_tensor(values))])
 
     def per_effect(self, values: Sequence[Any]) -> list[dict[str, Any]]:
         """Values of the numbers, by the names that they have in each effect's shape."""
@@ -68,8 +70,17 @@ class ShapedModel(JointModel):
 
     def shaped(self, parameters: Float[Tensor, " p"]) -> tuple[Term, ...]:
         """The effects with these shapes; as tensors what is fitted of them, to be differentiated."""
-        fitted = self.per_effect(parameters[self.joint :].exp().unbind())
+        free = parameters[self.joint :]
+        values = torch.where(self._positive, torch.where(self._positive, free, 0.0).exp(), free)
+        fitted = self.per_effect(values.unbind())
         return tuple(replace(t, shape={**t.shape, **new}) for t, new in zip(self.terms, fitted, strict=True))
+
+    def spread(self, values: Sequence[float], errors: Float[Tensor, " s"]) -> Float[Tensor, " s"]:
+        """Standard errors of numbers of the shapes, from those of the parameters that stand for them."""
+        return torch.where(self._positive, errors * errors.new_tensor(values), errors)
+
+    def _free(self, values: Float[Tensor, "*a s"]) -> Float[Tensor, "*a s"]:
+        return torch.where(self._positive, torch.where(self._positive, values, 1.0).log(), values)
 
     def changes(self, parameters: Float[Tensor, " p"]) -> dict[str, Change]:
         return JointModel(self.prepared, self.shaped(parameters)).changes(parameters[: self.joint])

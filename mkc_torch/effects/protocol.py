@@ -200,10 +200,10 @@ class OptionalDriverEffect(Effect, Protocol):
 
 @runtime_checkable
 class RelativeEffect(Effect, Protocol):
-    """An effect whose grid of shapes is in shares of how large a part of the signal is.
+    """An effect whose grid of shapes is in shares of how large a part of the signal is, or what drives it.
 
     Attributes:
-        relative: name of a number in its shapes to the part, and "typical" or "largest".
+        relative: name of a number in its shapes to the part, or "driver", and "typical" or "largest".
     """
 
     @property
@@ -236,13 +236,13 @@ class ContinuousEffect(Effect, Protocol):
 
 @runtime_checkable
 class ShapedEffect(Effect, Protocol):
-    """An effect with positive numbers in its shape that are fitted together with γ once it is known to be there.
+    """An effect with numbers in its shape that are fitted together with γ once it is known to be there.
 
     Its ``change`` and ``quantities`` have to take such a number as a tensor, and ``change`` to have a slope in it.
 
     Attributes:
         fitted_shape: their names, each with its least and greatest value, in the same shares as ``relative`` and
-            ``continuous`` where it is one of those.
+            ``continuous`` where it is one of those. A number that is always positive is fitted as its logarithm.
     """
 
     @property
