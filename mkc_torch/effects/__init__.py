@@ -13,6 +13,7 @@ from mkc_torch.effects.driver_offset import DriverOffset
 from mkc_torch.effects.dynamics import DYNAMICS
 from mkc_torch.effects.field_gradient import FieldGradient
 from mkc_torch.effects.hard_iron_step import HardIronStep
+from mkc_torch.effects.magnetic_pole import MagneticPole
 from mkc_torch.effects.offset_drift import OffsetDrift
 from mkc_torch.effects.paired import PAIRED
 from mkc_torch.effects.protocol import (
@@ -53,6 +54,7 @@ SENSOR: tuple[Effect, ...] = (
     TemperatureOffset(),
     CurrentField(),
     FieldGradient(),
+    MagneticPole(),
     CubicNonlinearity(),
     DriverOffset(),
     Unknown(),

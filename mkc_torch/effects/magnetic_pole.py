@@ -1,0 +1,63 @@
+"""An ambient field with a magnetic pole in it, as the end of a beam or a bar is one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.protocol import Context, Quantity, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+_GRID, _RADIUS = (-0.8, -0.4, 0.0, 0.4, 0.8), 0.1
+"""Places that are searched along each axis, and the radius, over the distance of the farthest sample."""
+
+_FAR = 3.0
+
+
+class MagneticPole:
+    """The end of a magnetised beam, bar or pipe bends the field around it.
+
+    Simulation: adds to the ambient field that of a pole at a place c, ``p r / (r² + s²)^(3/2)`` with r from c to the
+    sensor and s a tenth of the distance of c from the middle of the path, for no pole is a point. Where the port
+    carries the field's vector (east, north, up) there is one amplitude, p; where it carries the strength alone there
+    are three, p along the axes, for the direction of the ambient field is not known.
+    Drivers: the position, three columns.
+    Units: p in µT·m², the place in m from the middle of the path.
+    Plausible: up to 100 µT·m², a beam of 0.01 m² magnetised to 10⁵ A/m.
+    Source: Telford, Geldart & Sheriff, Applied Geophysics (1990), 3.6, the isolated pole.
+    """
+
+    id = "field_gradient"
+    port = "field"
+    roles: tuple[str, ...] = ("position",)
+    equation = "B(p) = B₀ + p r / r³,  r = p - c"
+    explanation = "The ambient field is not the same everywhere: the end of a beam or a bar of iron is near."
+    advice = "Record in the open, or turn the sensor on the spot."
+    plausible = 100.0
+    source = "a beam of 0.01 m² magnetised to 10⁵ A/m; Telford et al., Applied Geophysics (1990), 3.6"
+    relative: Mapping[str, tuple[str, str]] = dict.fromkeys(
+        ("place_x", "place_y", "place_z", "radius"), ("driver", "largest")
+    )
+    fitted_shape: Mapping[str, tuple[float, float]] = {f"place_{axis}": (-_FAR, _FAR) for axis in "xyz"}
+
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
+        return tuple(
+            {"place_x": x, "place_y": y, "place_z": z, "radius": _RADIUS} for x, y, z in product(_GRID, repeat=3)
+        )
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        unit = f"{context.signal_unit}·{context.units[0]}²" if context.units[0] else context.signal_unit
+        return (Quantity("pole", 3 if len(context.channels) == 1 else 1, unit),)
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
+        p = context.drivers
+        place = [torch.as_tensor(shape[f"place_{axis}"], dtype=p.dtype, device=p.device) for axis in "xyz"]
+        away = p - torch.stack(place)
+        field = away * (away.square().sum(-1, keepdim=True) + shape["radius"] ** 2) ** -1.5
+        return (field @ gamma).unsqueeze(-1) if len(context.channels) == 1 else field * gamma
