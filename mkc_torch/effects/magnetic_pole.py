@@ -18,17 +18,18 @@ _GRID, _RADIUS = (-0.8, -0.4, 0.0, 0.4, 0.8), 0.1
 """Places that are searched along each axis, and the radius, over the distance of the farthest sample."""
 
 _FAR = 3.0
+"""Places that are fitted, likewise: from farther away a field looks like a polynomial."""
 
 
 class MagneticPole:
     """The end of a magnetised beam, bar or pipe bends the field around it.
 
-    Simulation: adds to the ambient field that of a pole at a place c, ``p r / (r² + s²)^(3/2)`` with r from c to the
-    sensor and s a tenth of the distance of c from the middle of the path, for no pole is a point. Where the port
-    carries the field's vector (east, north, up) there is one amplitude, p; where it carries the strength alone there
-    are three, p along the axes, for the direction of the ambient field is not known.
+    Simulation: adds to the ambient field that of a pole at a place c, ``q r / (r² + s²)^(3/2)`` with r from c to the
+    sensor and s a tenth of how far the path reaches from its middle, for no pole is a point. Where the port carries
+    the field's vector (east, north, up) there is one amplitude, q; where it carries the strength alone there are three,
+    q along the axes, for the direction of the ambient field is not known.
     Drivers: the position, three columns.
-    Units: p in µT·m², the place in m from the middle of the path.
+    Units: q in µT·m², the place in m from the middle of the path.
     Plausible: up to 100 µT·m², a beam of 0.01 m² magnetised to 10⁵ A/m.
     Source: Telford, Geldart & Sheriff, Applied Geophysics (1990), 3.6, the isolated pole.
     """
@@ -36,8 +37,11 @@ class MagneticPole:
     id = "field_gradient"
     port = "field"
     roles: tuple[str, ...] = ("position",)
-    equation = "B(p) = B₀ + p r / r³,  r = p - c"
-    explanation = "The ambient field is not the same everywhere: the end of a beam or a bar of iron is near."
+    equation = "B(p) = B₀ + q r / r³,  r = p - c"
+    explanation = (
+        "The ambient field is not the same everywhere: the end of a beam or a bar of iron is near. Its place is given "
+        "from the middle of the path."
+    )
     advice = "Record in the open, or turn the sensor on the spot."
     plausible = 100.0
     source = "a beam of 0.01 m² magnetised to 10⁵ A/m; Telford et al., Applied Geophysics (1990), 3.6"
