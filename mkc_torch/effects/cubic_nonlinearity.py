@@ -17,9 +17,10 @@ class CubicNonlinearity:
     """The sensing element's response to the field is not quite a straight line.
 
     Simulation: adds ``α_i B_i³`` to each axis of the sensor, with B the simulated measurement less its offset: the
-    first odd term beyond a linear response.
+    first odd term beyond a linear response; or ``α_i B_i³ + β_i B_i²``, where the element also feels a magnet beside
+    it, which is an offset of the measurement: the cube of a sum has a square in it.
     Drivers: none but the field itself.
-    Units: α in 1/µT².
+    Units: α in 1/µT², β in 1/µT.
     Plausible: up to 4e-5 /µT², 10 % at 50 µT.
     Source: data sheets of AMR, Hall and TMR sensors, linearity of 0.1-1 % of full scale.
 
@@ -36,7 +37,7 @@ class CubicNonlinearity:
     port = "sensor"
     follows_signal = True
     roles: tuple[str, ...] = ()
-    equation = "δB_i = α_i B_i³"
+    equation = "δB_i = α_i B_i³ (+ β_i B_i²)"
     explanation = "The sensor's response is not a straight line: it bends at large fields."
     advice = "Correct with the fitted coefficients; check the sensor's range setting."
     plausible = 4e-5
@@ -45,10 +46,17 @@ class CubicNonlinearity:
     )
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
-        return ({},)
+        return ({}, {"terms": 2.0})
 
-    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
-        return (Quantity("coefficient", len(context.channels), f"1/{context.signal_unit}²"),)
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
+        cubic = Quantity("coefficient", len(context.channels), f"1/{context.signal_unit}²")
+        if "terms" not in shape:
+            return (cubic,)
+        return cubic, Quantity("quadratic_coefficient", len(context.channels), f"1/{context.signal_unit}")
 
-    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:  # noqa: ARG002
-        return gamma * context.signal.pow(3)
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
+        field = context.signal
+        if "terms" not in shape:
+            return gamma * field.pow(3)
+        cubic, quadratic = gamma.unflatten(-1, (2, -1)).unbind(-2)
+        return cubic * field.pow(3) + quadratic * field.square()

@@ -30,7 +30,6 @@ QUANTITIES = {
     "offset_drift": [("offset_change", 3, "µT")],
     "temperature_offset": [("offset_per_kelvin", 3, "µT/K")],
     "current_field": [("field_per_ampere", 3, "µT/A")],
-    "cubic_nonlinearity": [("coefficient", 3, "1/µT²")],
     "driver_offset": [("offset_per_unit", 3, "µT/V")],
     "unknown": [("legendre_1", 3, "µT"), ("legendre_2", 3, "µT"), ("legendre_3", 3, "µT")],
 }
@@ -96,6 +95,26 @@ def test_quantities_have_their_names_and_units(effect):
     context = make_context(effect)
     for shape in effect.shapes(context.time):
         assert [tuple(q) for q in effect.quantities(shape, context)] == QUANTITIES[effect.id]
+
+
+def test_the_cubic_s_are_of_two_forms():
+    effect = next(e for e in SENSOR if e.id == "cubic_nonlinearity")
+    context = make_context(effect)
+    told = [[tuple(q) for q in effect.quantities(shape, context)] for shape in effect.shapes(context.time)]
+    cubic, quadratic = ("coefficient", 3, "1/µT²"), ("quadratic_coefficient", 3, "1/µT")
+    assert told == [[cubic], [cubic, quadratic]]
+
+
+def test_a_magnet_that_the_element_feels_is_a_square_beside_the_cube():
+    """``α (B + h)³`` but for what an offset and a gain take over."""
+    effect = next(e for e in SENSOR if e.id == "cubic_nonlinearity")
+    context = make_context(effect)
+    alpha, magnet = 1e-6 * torch.tensor([3.0, -2.0, 5.0]).double(), torch.tensor([20.0, -35.0, 8.0]).double()
+    field = context.signal
+    whole = alpha * (field + magnet).pow(3)
+    left = whole - 3.0 * alpha * magnet.square() * field - alpha * magnet.pow(3)
+    change = effect.change(torch.cat([alpha, 3.0 * alpha * magnet]), {"terms": 2.0}, context)
+    torch.testing.assert_close(change, left)
 
 
 def test_units_of_drivers_without_a_unit():
