@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.drivers import Driver
-from mkc_torch.effects.protocol import BoundedEffect, Context, Effect, GainEffect, Shape, SignalEffect
+from mkc_torch.effects.protocol import BoundedEffect, Context, Effect, GainEffect, LinearEffect, Shape, SignalEffect
 from mkc_torch.nonlinear import GaussianPrior, beside
 from mkc_torch.simulation.protocol import Change, Changes, FreeChange, Port, PreparedSimulation
 
@@ -234,7 +234,9 @@ def follows_signal(effect: Effect) -> bool:
 
 
 def directions(term: Term, context: Context) -> Float[Tensor, "N c q"]:
-    """How an effect's change at its port grows with γ at γ = 0, by forward mode."""
+    """How an effect's change at its port grows with γ at γ = 0, by forward mode where the effect does not say."""
+    if isinstance(term.effect, LinearEffect):
+        return term.effect.basis(term.shape, context)
     if isinstance(term.effect, GainEffect) and type(term.effect).change is GainEffect.change:
         # a gain on a course: the derivative is the course, channel by channel
         eye = torch.eye(len(context.channels), dtype=context.signal.dtype)

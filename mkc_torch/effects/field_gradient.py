@@ -46,10 +46,12 @@ class FieldGradient:
         gradient, curvature = Quantity("gradient", sizes[0], first), Quantity("curvature", sizes[1], second)
         return (gradient,) if shape["degree"] < 2 else (gradient, curvature)
 
-    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
+    def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]:
         terms = _polynomials if len(context.channels) == 1 else _harmonic_gradients
-        basis = terms(context.drivers, int(shape["degree"]))
-        return torch.einsum("nfc,f->nc", basis, gamma)
+        return terms(context.drivers, int(shape["degree"])).mT
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
+        return self.basis(shape, context) @ gamma
 
 
 def _polynomials(p: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N f 1"]:

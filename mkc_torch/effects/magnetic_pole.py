@@ -59,9 +59,12 @@ class MagneticPole:
         unit = f"{context.signal_unit}·{context.units[0]}²" if context.units[0] else context.signal_unit
         return (Quantity("pole", 3 if len(context.channels) == 1 else 1, unit),)
 
-    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
+    def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]:
         p = context.drivers
         place = [torch.as_tensor(shape[f"place_{axis}"], dtype=p.dtype, device=p.device) for axis in "xyz"]
         away = p - torch.stack(place)
         field = away * (away.square().sum(-1, keepdim=True) + shape["radius"] ** 2) ** -1.5
-        return (field @ gamma).unsqueeze(-1) if len(context.channels) == 1 else field * gamma
+        return field.unsqueeze(1 if len(context.channels) == 1 else -1)
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
+        return self.basis(shape, context) @ gamma

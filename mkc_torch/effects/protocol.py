@@ -102,8 +102,8 @@ class Quantity(NamedTuple):
 class Effect(Protocol):
     """A piece of physics. At γ = 0 it changes nothing.
 
-    Some effects can do more: :class:`SignalEffect`, :class:`ContinuousEffect`, :class:`LastingEffect`,
-    :class:`ShapedEffect`, :class:`AnchoredEffect`.
+    Some effects can do more: :class:`SignalEffect`, :class:`ContinuousEffect`, :class:`LinearEffect`,
+    :class:`LastingEffect`, :class:`ShapedEffect`, :class:`AnchoredEffect`.
 
     Attributes:
         id: its name in ``diagnosis.json``.
@@ -247,6 +247,13 @@ class ShapedEffect(Effect, Protocol):
 
     @property
     def fitted_shape(self) -> Mapping[str, tuple[float, float]]: ...
+
+
+@runtime_checkable
+class LinearEffect(Effect, Protocol):
+    """An effect that is ``basis @ γ`` and gives its basis: many shapes of it are tried in no time."""
+
+    def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]: ...
 
 
 @runtime_checkable

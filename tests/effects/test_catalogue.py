@@ -12,6 +12,7 @@ from mkc_torch.effects import (
     ContinuousEffect,
     GainEffect,
     LastingEffect,
+    LinearEffect,
     SignalEffect,
 )
 from mkc_torch.effects.field_gradient import FieldGradient
@@ -90,6 +91,13 @@ def test_forward_tangents_are_finite_differences(effect, shape, context):
     assert bool((tangent.flatten(0, 1).abs().sum(0) > 0).all())
 
 
+@pytest.mark.parametrize(("effect", "shape", "context"), [c for c in CASES if isinstance(c.values[0], LinearEffect)])
+def test_a_basis_is_the_slope_of_the_change(effect, shape, context):
+    gamma = torch.zeros(size_of(effect, shape, context), dtype=torch.float64)
+    slope = torch.func.jacfwd(lambda g: effect.change(g, shape, context))(gamma)
+    torch.testing.assert_close(effect.basis(shape, context), slope)
+
+
 @pytest.mark.parametrize("effect", [e for e in SENSOR if e.id in QUANTITIES], ids=lambda e: e.id)
 def test_quantities_have_their_names_and_units(effect):
     context = make_context(effect)
@@ -160,6 +168,7 @@ def test_what_effects_can_do_beside():
     assert lasting == {"hard_iron_step", "offset_drift"}
     assert anchored == {"unknown"}
     assert continuous == {"hard_iron_step", "offset_drift", "temperature_offset"}
+    assert {type(e) for e in SENSOR if isinstance(e, LinearEffect)} == {FieldGradient, MagneticPole}
 
 
 @pytest.mark.parametrize(("effect", "shape", "context"), CASES)
