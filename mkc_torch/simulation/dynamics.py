@@ -40,6 +40,7 @@ class Dynamics:
             follows is a prediction; None for all of it.
 
     Example:
+        >>> import torch
         >>> class Pendulum(Dynamics):
         ...     states = ("angle", "speed")
         ...     inputs = ("torque",)

@@ -12,7 +12,14 @@ from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.model import JointModel
 from mkc_torch.diagnosis.refit import fitted
 from mkc_torch.recording import MissingColumnError
-from mkc_torch.simulation import Dynamics, Parameter, SimulationError, dynamics, trajectory
+from mkc_torch.simulation import (
+    Dynamics,
+    Parameter,
+    SimulationError,
+    dynamics_correction,
+    prepared_dynamics,
+    trajectory,
+)
 from mkc_torch.simulation.dynamics_correction import DynamicsCorrection
 
 STIFFNESS, DAMPING = 9.0, 0.15
@@ -485,7 +492,7 @@ def test_first_states_are_estimated_from_what_comes_soon_and_then_from_more(monk
         asked.append((start, weight))
         return SimpleNamespace(theta=start + 0.01)
 
-    monkeypatch.setattr(dynamics, "fit", watched)
+    monkeypatch.setattr(dynamics_correction, "fit", watched)
     correction.corrected(theta, {})
     starts, weights = zip(*asked, strict=True)
     length = float(TIME[-1] - TIME[0])
@@ -531,11 +538,11 @@ def test_a_simulation_that_sticks_is_gone_through_moment_by_moment(monkeypatch):
     theta = correction.prepared.start()
     assert not correction.prepared.trajectory(theta, {}).converged
     with monkeypatch.context() as without:
-        without.setattr(dynamics, "marched", lambda *_, **__: None)
+        without.setattr(prepared_dynamics, "marched", lambda *_, **__: None)
         with pytest.raises(SimulationError, match=r"no trajectory was found.*`step`"):
             correction.corrected(theta, {})
     # the first states as they are measured
-    monkeypatch.setattr(dynamics, "fit", lambda _, start, **__: SimpleNamespace(theta=start))
+    monkeypatch.setattr(dynamics_correction, "fit", lambda _, start, **__: SimpleNamespace(theta=start))
     place = correction.corrected(theta, {})["place"]
     # the pull goes linearly between the samples here, and in steps there
     assert float((place - torch.from_numpy(truth)).abs().max()) < 0.1
@@ -746,7 +753,7 @@ def test_a_trajectory_that_was_found_is_gone_on_from(monkeypatch):
     first, other = torch.tensor([9.0, 0.1, 0.5, 0.0]).double(), torch.tensor([4.0, 0.3, 0.2, 0.1]).double()
     states = prepared.trajectory(first, {}).states
     prepared.trajectory(other, {})
-    monkeypatch.setattr(dynamics, "solve", watched)
+    monkeypatch.setattr(prepared_dynamics, "solve", watched)
     again = prepared.trajectory(first, {}).states
     (guess, known), *_ = started
     assert known is None
