@@ -64,6 +64,18 @@ def test_it_is_the_conditional_expectation(seed, share):
     assert filling.log_det == pytest.approx(total, abs=1e-8)
 
 
+@pytest.mark.parametrize("share", [0.1, 0.7])
+def test_solving_for_samples_or_for_frequencies_is_the_same(share):
+    counts = mask(11, share=share)
+    known, rows = Gaps(counts, N), torch.arange(0, N, 2)
+    excess = (falling(N)[-1] / falling(N) - 1.0)[rows]
+    one, other = known._by_sample(0, rows, excess), known._by_frequency(0, rows, excess)
+    values = torch.randn(N, 3, generator=torch.Generator().manual_seed(12), dtype=torch.float64)
+    assert float((one(values) - values).abs().max()) > 0.01
+    torch.testing.assert_close(one(values), other(values))
+    assert one.log_det == pytest.approx(other.log_det)
+
+
 def test_frequencies_that_are_left_out_count_as_white():
     counts = mask(1)
     values = counts * torch.randn(N, 1, generator=torch.Generator().manual_seed(2)).double()
