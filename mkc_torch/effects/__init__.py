@@ -13,6 +13,7 @@ from mkc_torch.effects.driver_offset import DriverOffset
 from mkc_torch.effects.dynamics import DYNAMICS
 from mkc_torch.effects.field_gradient import FieldGradient
 from mkc_torch.effects.hard_iron_step import HardIronStep
+from mkc_torch.effects.heading_reset import HeadingReset
 from mkc_torch.effects.magnetic_pole import MagneticPole
 from mkc_torch.effects.offset_drift import OffsetDrift
 from mkc_torch.effects.paired import PAIRED
@@ -33,6 +34,7 @@ from mkc_torch.effects.temperature_offset import TemperatureOffset
 from mkc_torch.effects.unknown import Unknown
 
 __all__ = [
+    "ATTITUDE",
     "CATALOGUE",
     "DYNAMICS",
     "PAIRED",
@@ -63,5 +65,8 @@ SENSOR: tuple[Effect, ...] = (
 )
 """The effects that a diagnosis of a sensor tries."""
 
-CATALOGUE: tuple[Effect, ...] = (*SENSOR, *DYNAMICS, *PAIRED)
+ATTITUDE: tuple[Effect, ...] = (HeadingReset(),)
+"""The effects of an attitude that is recorded beside a sensor."""
+
+CATALOGUE: tuple[Effect, ...] = (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED)
 """All effects; each is tried where a simulation has its port."""

@@ -17,6 +17,7 @@ from mkc_torch.linear import LeastTrimmedSquares
 from mkc_torch.linear._problem import RankDeficientError
 from mkc_torch.nonlinear import GaussianPrior, beside
 from mkc_torch.recording import Recording
+from mkc_torch.simulation.heading import HeadingJump, heading_jumps
 from mkc_torch.simulation.protocol import Changes, FreeChange, Port
 from mkc_torch.simulation.rotation import from_quaternion, rotation_since
 
@@ -220,7 +221,8 @@ class NormView(_View):
 class AttitudeView(_View):
     """The vector, turned into the world by a recorded attitude: along the world's field, and in two axes across it.
 
-    Errors of the attitude turn the field, so they enter across it alone, as noise that knows nothing of the motion.
+    Errors of the attitude turn the field, so they enter across it alone, as noise that knows nothing of the motion; but
+    for jumps of the heading, which a gyroscope shows, and which are for an effect at the port "heading" to say.
     """
 
     view = "attitude"
@@ -240,6 +242,12 @@ class AttitudeView(_View):
             "sensor": Port(_AXES, self.unit, wanders=True),
             "field": Port(("east", "north", "up"), self.unit),
         }
+        jumps = _jumps(recording, self.to_world)
+        number = torch.arange(len(recording))
+        self._since = torch.stack([number > jump.after for jump in jumps], -1).to(self.measured) if jumps else None
+        if jumps:
+            carries = tuple(f"since_{k}" for k in range(1, len(jumps) + 1))
+            self.ports["heading"] = Port(("heading",), "°", carries=carries)
         self.prior = _matrix_prior(len(self.parameter_names))
         self.strength, self._ahead = 1.0, self.measured.new_zeros(3)
         offset, ahead = self._offset_and_field()
@@ -253,7 +261,7 @@ class AttitudeView(_View):
         self._to_frame = self._frame @ self.to_world @ self._unbent
         self._from_world = self.to_world.movedim(1, 0).flatten(1).contiguous()
         self._full = torch.cat([offset, response.flatten(), offset.new_zeros(2)])
-        self.warnings = _turned_too_little(self.corrected(self._full, {}))
+        self.warnings = (*_turned_too_little(self.corrected(self._full, {})), *_told(jumps, self.time))
 
     def ambient(self, theta: Float[Tensor, " p"]) -> Float[Tensor, " 3"]:
         """The world's field."""
@@ -283,13 +291,32 @@ class AttitudeView(_View):
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
         # the simulated vector, not the measured one, goes through the matrix: the noise of what a matrix is fitted to
         # would shrink it. A fixed matrix takes the difference back into the world.
-        left = self._away(theta, changes) - self.simulated(theta)
+        left = self._away(theta, changes) - self._sensed(self._seen(theta, changes), theta)
         residual = torch.einsum("kij,kj->ki", self._to_frame, left)
         added = self._field_change(changes)
         return residual if added is None else residual - added @ self._frame.mT
 
+    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Float[Tensor, "N k"]]:
+        """Beside the others, at the port "heading", 1 from each of the heading's jumps on."""
+        since = {} if self._since is None else {"heading": self._since}
+        return {**super().signals(theta, changes), **since}
+
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
-        field = (self.ambient(theta) @ self._from_world).unflatten(0, (-1, 3))
+        return self._sensed(self._seen(theta, {}), theta)
+
+    def _seen(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
+        """The world's field in the body's axes, turned about the vertical by what the recorded heading is off."""
+        ambient = self.ambient(theta)
+        if self._since is None or "heading" not in changes:
+            return (ambient @ self._from_world).unflatten(0, (-1, 3))
+        angle = torch.deg2rad(changes["heading"](self._since)[:, 0])
+        cos, sin = torch.cos(angle), torch.sin(angle)
+        east, north, up = ambient
+        turned = torch.stack([cos * east - sin * north, sin * east + cos * north, up.expand_as(angle)], -1)
+        return torch.einsum("ki,kij->kj", turned, self.to_world)
+
+    def _sensed(self, field: Float[Tensor, "N 3"], theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
+        """What the sensor makes of a field in its axes, less its offset."""
         return field @ theta[3:12].unflatten(0, (3, 3)).mT
 
 
@@ -498,6 +525,26 @@ def _with_attitude(recording: Recording) -> Recording:
         columns, name=recording.name, units=recording.units, warnings=recording.warnings, labels=recording.labels
     )
     return marked.finite(*_QUATERNION)
+
+
+def _jumps(recording: Recording, to_world: Tensor) -> tuple[HeadingJump, ...]:
+    """Of the heading, as far as the recording has a gyroscope that knows."""
+    if recording.time is None or not all(name in recording for name in _GYRO):
+        return ()
+    return heading_jumps(recording.time, to_world, recording.stack(*_GYRO))
+
+
+def _told(jumps: tuple[HeadingJump, ...], time: Tensor) -> tuple[str, ...]:
+    """A sentence about the heading's jumps."""
+    if not jumps:
+        return ()
+    told = ", ".join(
+        f"by {jump.size:.1f}° at {float(time[jump.after]):.1f} s (gyroscope: {jump.turned:.1f}°)" for jump in jumps
+    )
+    return (
+        f"The recorded heading jumps where the gyroscope does not: {told}. The attitude is off by as much, before or "
+        "after, and an effect that seems to begin there may be that.",
+    )
 
 
 def _one_axis(to_world: Tensor) -> NotIdentifiableError:

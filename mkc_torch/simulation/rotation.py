@@ -10,7 +10,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["from_quaternion", "rotation_since"]
+__all__ = ["from_quaternion", "rotation_since", "turns"]
 
 
 def from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
@@ -35,6 +35,18 @@ def _product(a: Tensor, b: Tensor) -> Tensor:
     return torch.cat([w, w1 * v2 + w2 * v1 + torch.linalg.cross(v1, v2)], -1)
 
 
+def _steps(time: Float[Tensor, " N"], rate: Float[Tensor, "N 3"]) -> Float[Tensor, "n 4"]:
+    """Quaternions of the turn from each sample to the next."""
+    turn = 0.5 * (rate[1:] + rate[:-1]) * time.diff().unsqueeze(-1)
+    angle = torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
+    return torch.cat([torch.cos(0.5 * angle), 0.5 * torch.sinc(0.5 * angle / torch.pi) * turn], -1)
+
+
+def turns(time: Float[Tensor, " N"], rate: Float[Tensor, "N 3"]) -> Float[Tensor, "n 3 3"]:
+    """Rotation matrices from the body at each sample but the first to the body at the one before, from a gyroscope."""
+    return from_quaternion(_steps(time, rate))
+
+
 def rotation_since(time: Float[Tensor, " N"], rate: Float[Tensor, "N 3"], first: Tensor) -> Float[Tensor, "N 3 3"]:
     """Rotation matrices from the body at each sample to the body at sample ``first`` of its window, from a gyroscope.
 
@@ -50,9 +62,7 @@ def rotation_since(time: Float[Tensor, " N"], rate: Float[Tensor, "N 3"], first:
         >>> (turned[-1] @ torch.tensor([1.0, 0.0, 0.0])).round(decimals=3) + 0.0
         tensor([0., 1., 0.])
     """
-    turn = 0.5 * (rate[1:] + rate[:-1]) * time.diff().unsqueeze(-1)
-    angle = torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
-    step = torch.cat([torch.cos(0.5 * angle), 0.5 * torch.sinc(0.5 * angle / torch.pi) * turn], -1)
+    step = _steps(time, rate)
     identity = step.new_tensor([[1.0, 0.0, 0.0, 0.0]])
     total = torch.cat([identity, step])
     # a prefix product by doubling: q[k] becomes the product of the 2^j steps that end at k

@@ -1,0 +1,68 @@
+"""Where a recorded heading jumps and the gyroscope says that nothing turned."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from mkc_torch.order_statistic import robust_scale
+from mkc_torch.simulation.rotation import turns
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["HeadingJump", "heading_jumps"]
+
+LEAST = 3.0
+"""A smaller jump, in °, is not told of."""
+
+_CLEAR = 30.0
+"""Times the robust scale of how far attitude and gyroscope are apart from one sample to the next."""
+
+
+class HeadingJump(NamedTuple):
+    """Between two samples, the first ``after`` which the heading is another; by how much, in °; and the gyroscope's."""
+
+    after: int
+    size: float
+    turned: float
+
+
+def heading_jumps(
+    time: Float[Tensor, " N"], to_world: Float[Tensor, "N 3 3"], rate: Float[Tensor, "N 3"]
+) -> tuple[HeadingJump, ...]:
+    """The intervals in which a recorded attitude turns about the vertical, and the gyroscope clearly does not.
+
+    Filters of autopilots set their heading anew by the compass, at arming or take-off: the attitude is recorded with an
+    error until then, or from then on. A jump larger than the turn of the gyroscope in the same interval counts.
+
+    Args:
+        time: in s, ascending.
+        to_world: rotations from the body to a world whose third axis is vertical.
+        rate: angular rate in the body's axes, in rad/s; NaN where it is not known.
+
+    Example:
+        >>> time = torch.arange(100.0)
+        >>> heading = torch.where(time < 40.0, 0.0, 0.5)
+        >>> cos, sin, o = heading.cos(), heading.sin(), torch.zeros(100)
+        >>> to_world = torch.stack([cos, -sin, o, sin, cos, o, o, o, o + 1.0], -1).unflatten(-1, (3, 3))
+        >>> [(jump.after, round(jump.size, 1)) for jump in heading_jumps(time, to_world, torch.zeros(100, 3))]
+        [(39, 28.6)]
+    """
+    if len(time) < 2:
+        return ()
+    apart = to_world[1:] @ (to_world[:-1] @ turns(time, rate)).mT
+    # the heading of the rotation that is nearest
+    size = torch.rad2deg(torch.atan2(apart[:, 1, 0] - apart[:, 0, 1], apart[:, 0, 0] + apart[:, 1, 1]))
+    turned = torch.rad2deg(0.5 * torch.linalg.vector_norm(rate[1:] + rate[:-1], dim=-1) * time.diff())
+    known = size.isfinite()
+    if not bool(known.any()):
+        return ()
+    least = max(LEAST, _CLEAR * float(robust_scale(size[known].unsqueeze(-1))))
+    clear = (size.abs() > least) & (size.abs() > turned)
+    return tuple(
+        HeadingJump(number, float(size[number]), float(turned[number]))
+        for number in clear.nonzero().squeeze(-1).tolist()
+    )
