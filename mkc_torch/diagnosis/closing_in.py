@@ -17,9 +17,15 @@ from mkc_torch.functional import mkc_energy
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["closer", "continuous", "refined"]
+__all__ = ["closer", "coloured", "continuous", "middle", "refined"]
 
 _ROUNDS = 3
+
+_CLEAR = 4.0
+"""Nats by which the noise of the search has to prefer another shape to the one of the joint fit."""
+
+_FLAT = 0.5
+"""Nats within which it does not tell neighbouring shapes apart."""
 
 
 def refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> FittedModel:
@@ -71,6 +77,57 @@ def closer(
         if found.shape != term.shape:
             closer.append(found)
     return tuple(closer)
+
+
+def coloured(
+    best: FittedModel,
+    base: FittedModel,
+    tangents: Tangents,
+    counts: Float[Tensor, "N m"],
+    linearised: Linearised,
+) -> FittedModel:
+    """The fit with the shape that the noise of the search makes of its own: a joint fit takes the noise for white.
+
+    That is another one where it is clearly better, else the middle one of those that are not told apart, as all onsets
+    within a burst of rejected samples are.
+    """
+    own = best.model.terms[-1]
+    names = continuous(own)
+    if not names or tangents.pointwise[own.port] is None:
+        return best
+
+    def gains(terms: Sequence[Term]) -> list[float]:
+        beside = candidate_tangents(best.model, best.parameters, terms, tangents.pointwise)
+        return linearised.gains_of(beside, counts).ratio[:, 0].tolist()
+
+    others = closer([own], best.model, best.parameters, tangents, counts, linearised)
+    here, *there = gains([own, *others])
+    if there and there[0] > here + _CLEAR:
+        moved = others[0]
+    else:
+        moved = own
+        for name in names:
+            shapes = finer(moved, name, base.model.prepared.time, 1)
+            moved = shapes[middle(gains(shapes), [shape.shape for shape in shapes].index(moved.shape))]
+    if moved.shape == own.shape:
+        return best
+    fit = fitted_beside(base, best.model.with_shape(moved.shape), best.parameters, graduate=False)
+    return fit if fit.converged and repeats(fit) else best
+
+
+def middle(values: Sequence[float], place: int) -> int:
+    """The middle one of the neighbours of a place that are not told apart from it, by values in nats.
+
+    Example:
+        >>> middle([1.0, 7.0, 7.2, 7.1, 7.0, 7.2, 2.0, 7.2], 1)
+        3
+    """
+    first = last = place
+    while first > 0 and abs(values[first - 1] - values[place]) < _FLAT:
+        first -= 1
+    while last < len(values) - 1 and abs(values[last + 1] - values[place]) < _FLAT:
+        last += 1
+    return (first + last) // 2
 
 
 def continuous(term: Term) -> list[str]:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._forked import meanwhile
-from mkc_torch.diagnosis.closing_in import closer, refined
+from mkc_torch.diagnosis.closing_in import closer, coloured, refined
 from mkc_torch.diagnosis.judge import judged
 from mkc_torch.diagnosis.linearise import Linearised, Tangents, candidate_tangents, linearise, tangents_of
 from mkc_torch.diagnosis.local import beside_wander
@@ -115,6 +115,7 @@ def locate(
     if p_value <= level:
         best, ranking = _by_joint_fits(best, base, ranking, terms, linearised, tangents, prefer, fits)
         best = _settled(refined(best, base, again=True), base)
+        best = coloured(best, base, tangents, counts, linearised)
         shaped = shape_fitted(best)
         best = shaped if repeats(shaped) else best
     return Located(
