@@ -106,7 +106,7 @@ def coloured(
         moved = others[0]
     else:
         moved = own
-        for name in names:
+        for name in names * _ROUNDS:
             shapes = finer(moved, name, base.model.prepared.time, 1)
             moved = shapes[middle(gains(shapes), [shape.shape for shape in shapes].index(moved.shape))]
     if moved.shape == own.shape:
