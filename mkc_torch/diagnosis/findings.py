@@ -139,7 +139,7 @@ def _plausibility(term: Term, gamma: Tensor, context: Context) -> tuple[bool, st
     largest = float(gamma[: first.size].abs().max())
     if not math.isfinite(limit):
         return True, "No plausible size is known for this effect; judge it by its equation."
-    if first.unit and "µT" not in first.unit:
+    if first.unit and first.unit != "°" and "µT" not in first.unit:
         return True, f"Its size is in {first.unit}; plausible sizes are known for µT alone."
     unit = f" {first.unit}" if first.unit else ""
     told = f"Its largest value, {largest:.3g}{unit}, is"

@@ -103,6 +103,7 @@ def test_a_reset_is_named_with_its_size_and_the_current_beside_it_is_right():
     assert set(found) == {"heading_reset", "current_field"}
     reset = found["heading_reset"].parameters[0]
     assert reset.unit == "°"
+    assert "within the 180 ° that is plausible" in found["heading_reset"].plausibility
     assert reset.value == pytest.approx(14.0, abs=3.0 * reset.standard_error)
     gain = found["current_field"].parameters[0]
     np.testing.assert_allclose(gain.value, [0.3, -0.4, 0.8], atol=0.05)
