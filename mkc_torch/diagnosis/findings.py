@@ -241,9 +241,9 @@ def _along(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | N
         none = context.drivers.new_zeros(_POINTS, 0)
         return "field on the axis", context.signal_unit, x, replace(context, time=time, signal=signal, drivers=none)
     index = torch.linspace(0, len(context.time) - 1, 4 * _POINTS).long()
-    flat = context.signal.new_zeros(len(index), context.signal.shape[1])
-    time = context.time[index]
-    return "time", "s", time, replace(context, time=time, drivers=context.drivers.new_zeros(len(index), 0), signal=flat)
+    time, signal = context.time[index], context.signal[index]
+    none = context.drivers.new_zeros(len(index), 0)
+    return "time", "s", time, replace(context, time=time, drivers=none, signal=signal)
 
 
 def _along_part(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | None:

@@ -105,6 +105,10 @@ def test_a_reset_is_named_with_its_size_and_the_current_beside_it_is_right():
     assert reset.unit == "°"
     assert "within the 180 ° that is plausible" in found["heading_reset"].plausibility
     assert reset.value == pytest.approx(14.0, abs=3.0 * reset.standard_error)
+    curve = found["heading_reset"].curve
+    assert (curve.driver, curve.value_unit) == ("time", "°")
+    expected = torch.where(curve.x > time[699], reset.value, 0.0).unsqueeze(-1)
+    torch.testing.assert_close(curve.value, expected, check_dtype=False)
     gain = found["current_field"].parameters[0]
     np.testing.assert_allclose(gain.value, [0.3, -0.4, 0.8], atol=0.05)
     assert any("by 14.0° at 14.0 s (gyroscope: " in sentence for sentence in result.warnings)
@@ -118,6 +122,14 @@ def test_the_autopilot_of_a_quadrotor_set_its_heading_anew_at_take_off(name):
     assert "by 15.6° at 61.1 s (gyroscope: 0.2°)" in told
     assert "at 77.8 s" in told
     assert "at 103.2 s" in told
+
+
+def test_what_was_said_of_the_compass_that_steers_the_heading_is_the_heading_s():
+    result = diagnose(Magnetometer(), Recording.read(shared_data("magnetometer/quadrotor_compass1.csv")))
+    first = result.findings[0]
+    assert first.effect == "heading_reset"
+    assert first.parameters[0].value[0] == pytest.approx(10.2, abs=3.0)  # of the 15.6° that are recorded
+    assert result.corrected.rmse < 0.5 * result.baseline.rmse
 
 
 def test_a_quadrotor_s_current_is_found_beside_its_heading_s_jumps():
