@@ -18,8 +18,14 @@ __all__ = ["HeadingJump", "heading_jumps"]
 LEAST = 3.0
 """A smaller jump, in °, is not told of."""
 
+MOST = 8
+"""Of more jumps the largest are told of."""
+
 _CLEAR = 30.0
 """Times the robust scale of how far attitude and gyroscope are apart from one sample to the next."""
+
+_LASTS = 1.0
+"""A jump that others take back within so many s is a glitch of the attitude, whose samples are outliers."""
 
 
 class HeadingJump(NamedTuple):
@@ -36,7 +42,8 @@ def heading_jumps(
     """The intervals in which a recorded attitude turns about the vertical, and the gyroscope clearly does not.
 
     Filters of autopilots set their heading anew by the compass, at arming or take-off: the attitude is recorded with an
-    error until then, or from then on. A jump larger than the turn of the gyroscope in the same interval counts.
+    error until then, or from then on. A jump counts that is larger than the turn of the gyroscope in the same interval
+    and is not taken back within a second; of more than eight the largest.
 
     Args:
         time: in s, ascending.
@@ -62,7 +69,9 @@ def heading_jumps(
         return ()
     least = max(LEAST, _CLEAR * float(robust_scale(size[known].unsqueeze(-1))))
     clear = (size.abs() > least) & (size.abs() > turned)
-    return tuple(
-        HeadingJump(number, float(size[number]), float(turned[number]))
-        for number in clear.nonzero().squeeze(-1).tolist()
-    )
+    at = clear.nonzero().squeeze(-1)
+    near = (time[at, None] - time[at]).abs() < _LASTS
+    left = (near * size[at]).sum(-1).abs()
+    at = at[left > 0.5 * size[at].abs()]
+    at = at[size[at].abs().argsort(descending=True)[:MOST]].sort().values
+    return tuple(HeadingJump(number, float(size[number]), float(turned[number])) for number in at.tolist())

@@ -37,7 +37,7 @@ def jumps_of(N, jumps, rate=None):
 @settings(deadline=None, max_examples=40)
 @given(
     first=st.integers(2, 150),
-    between=st.integers(2, 140),
+    between=st.integers(60, 140),
     sizes=st.tuples(*[st.floats(5.0, 170.0) | st.floats(-170.0, -5.0)] * 2),
 )
 def test_every_jump_is_found_with_its_size_whatever_the_motion(first, between, sizes):
@@ -69,6 +69,19 @@ def test_in_a_gap_in_which_the_sensor_turns_more_there_is_none():
     assert heading_jumps(torch.from_numpy(time), attitude, rate) == ()
     still = torch.where((torch.arange(280) - 100).abs()[:, None] < 3, 0.0, rate)
     assert [jump.after for jump in heading_jumps(torch.from_numpy(time), attitude, still)] == [99]
+
+
+@pytest.mark.parametrize("length", [1, 10, 40])
+def test_an_attitude_that_comes_back_was_not_set_anew(length):
+    assert jumps_of(300, {100: 50.0, 100 + length: -50.0}) == ()
+    found = jumps_of(300, {100: 50.0, 100 + length: -50.0, 220: 30.0})
+    assert [jump.after for jump in found] == [219]
+
+
+def test_of_many_jumps_the_largest_are_told_in_their_order():
+    sizes = {60 * k: 10.0 + 7.0 * ((5 * k) % 12) for k in range(1, 12)}
+    largest = sorted(sorted(sizes, key=sizes.get, reverse=True)[:8])
+    assert [jump.after + 1 for jump in jumps_of(780, sizes)] == largest
 
 
 def test_too_few_samples_have_none():
