@@ -9,15 +9,14 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.candidates import finer
 from mkc_torch.diagnosis.linearise import Linearised, Tangents, candidate_tangents
-from mkc_torch.diagnosis.model import JointModel, Term
+from mkc_torch.diagnosis.model import JointModel, Term, continuous
 from mkc_torch.diagnosis.refit import FittedModel, fitted_beside, repeats
-from mkc_torch.effects.protocol import ContinuousEffect
 from mkc_torch.functional import mkc_energy
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["closer", "coloured", "continuous", "middle", "refined"]
+__all__ = ["closer", "coloured", "middle", "refined"]
 
 _ROUNDS = 3
 
@@ -128,11 +127,6 @@ def middle(values: Sequence[float], place: int) -> int:
     while last < len(values) - 1 and abs(values[last + 1] - values[place]) < _FLAT:
         last += 1
     return (first + last) // 2
-
-
-def continuous(term: Term) -> list[str]:
-    free = term.effect.continuous if isinstance(term.effect, ContinuousEffect) else {}
-    return [name for name in term.shape if name in free]
 
 
 def _energy(fit: FittedModel, model: JointModel) -> float:

@@ -17,9 +17,10 @@ from mkc_torch.diagnosis.density_check import density_warnings
 from mkc_torch.diagnosis.diagnosed_model import model_of
 from mkc_torch.diagnosis.drivers import Drivers, find_drivers
 from mkc_torch.diagnosis.estimate import Estimate, estimate
-from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out, innovation_gain
+from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
 from mkc_torch.diagnosis.extrapolation import extrapolated, extrapolation_warning
 from mkc_torch.diagnosis.findings import finding_of
+from mkc_torch.diagnosis.innovations import innovation_gain, innovation_gains
 from mkc_torch.diagnosis.locate import Located, locate
 from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.noise_summary import noise_summary
@@ -30,6 +31,7 @@ from mkc_torch.diagnosis.result import Candidate, Diagnosis, Finding, HeldOut, S
 from mkc_torch.diagnosis.separability import separability
 from mkc_torch.diagnosis.shifts import shift_warning, shifted
 from mkc_torch.diagnosis.side_by_side import known_of, learn, with_memory
+from mkc_torch.diagnosis.simplified import simplified
 from mkc_torch.diagnosis.units import unit_warnings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.protocol import Effect
@@ -37,7 +39,7 @@ from mkc_torch.recording import Recording
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool
+    from jaxtyping import Bool, Float
 
 __all__ = ["diagnose"]
 
@@ -165,12 +167,15 @@ def _holds(
     if first:
         plain = located.beyond > _BEYOND_DOUBT
         price = 0.5 * located.fit.model.sizes[-1] * math.log(len(after.log_likelihood))
-        return better or plain or innovation_gain(before, after) > price
-    return (better and located.beyond > _FURTHER) or _confirmed(before, after, blocks, seed)
+        return better or plain or innovation_gain(before.residual, after.residual) > price
+    if better and located.beyond > _FURTHER:
+        return True
+    likelier = after.log_likelihood - before.log_likelihood
+    newer = innovation_gains(before.residual, after.residual)
+    return _confirmed(likelier, blocks, seed) or (better and _confirmed(newer, blocks, seed))
 
 
-def _confirmed(before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int) -> bool:
-    difference = after.log_likelihood - before.log_likelihood
+def _confirmed(difference: Float[Tensor, " N"], blocks: HeldOutBlocks, seed: int) -> bool:
     _, (low, _) = gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))
     return low > 0.0
 
@@ -246,7 +251,8 @@ def _taken_up(search: _Search, located: Located, asked: _Asked) -> _Search:
     before, after = search.evidence[-1], held_out(located.fit, search.blocks)
     if not _holds(located, before, after, search.blocks, asked.seed, first=not search.found):
         return replace(over, unconfirmed=located)
-    found = (*search.found, located)
+    fit, after = simplified(located.fit, after, search.blocks)
+    found = (*search.found, replace(located, fit=fit))
     time = located.fit.model.prepared.time
     near = _NEAR * float(time[-1] - time[0])
     left = tuple(t for t in search.left if not _same(t, located.term, near))

@@ -10,20 +10,17 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.noise import autoregression, filtered
 from mkc_torch.diagnosis.refit import FittedModel, fitted
 from mkc_torch.diagnosis.side_by_side import each
 from mkc_torch.functional import mkc_nll
-from mkc_torch.order_statistic import robust_scale
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Evidence", "HeldOutBlocks", "blocks_of", "gain_interval", "held_out", "innovation_gain", "scored"]
+__all__ = ["Evidence", "HeldOutBlocks", "blocks_of", "gain_interval", "held_out", "scored"]
 
 FOLDS = 5
 BLOCKS_PER_FOLD = 5
-_CLIPPED = 3.0
 _GAP = 0.01
 """Left out beside a held-out block, as a share of the recording; a correlation time at least."""
 
@@ -106,24 +103,6 @@ def held_out(fit: FittedModel, blocks: HeldOutBlocks) -> Evidence:
 def scored(residual: Tensor, sigma: Tensor, d: Tensor, bound: Tensor) -> Float[Tensor, " N"]:
     """Log-likelihood of each sample, over its channels."""
     return -mkc_nll(residual, sigma, d, bound).sum(-1)
-
-
-def innovation_gain(before: Evidence, after: Evidence) -> float:
-    """Gain in nats on held-out samples, their noise taken for coloured instead of white.
-
-    Both residuals, clipped, are filtered by the autoregression of the latter; what is left of each is compared by
-    squares, which end at three scales (Hampel et al., "Robust Statistics", 1986, 2.6).
-    """
-    reach = _CLIPPED * robust_scale(after.residual)
-    total = 0.0
-    for earlier, later, most in zip(before.residual.unbind(-1), after.residual.unbind(-1), reach, strict=True):
-        one, other = earlier.clamp(-most, most), later.clamp(-most, most)
-        coefficients = autoregression(other)
-        one, other = filtered(one, coefficients), filtered(other, coefficients)
-        squares = torch.stack([one, other]) / robust_scale(other.unsqueeze(-1))
-        size = squares.square().clamp(max=_CLIPPED**2).sum(-1)
-        total += 0.5 * float(size[0] - size[1])
-    return total
 
 
 def gain_interval(

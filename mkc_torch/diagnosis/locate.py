@@ -15,7 +15,7 @@ from mkc_torch.diagnosis.closing_in import closer, coloured, refined
 from mkc_torch.diagnosis.judge import judged
 from mkc_torch.diagnosis.linearise import Linearised, Tangents, candidate_tangents, linearise, tangents_of
 from mkc_torch.diagnosis.local import beside_wander
-from mkc_torch.diagnosis.model import Term
+from mkc_torch.diagnosis.model import Key, Term
 from mkc_torch.diagnosis.noise import Colour
 from mkc_torch.diagnosis.preference import Preference
 from mkc_torch.diagnosis.ranking import SEPARABLE, Ranked, own_p, possible_of, ranked
@@ -161,16 +161,18 @@ def _named(
     linearised = linearised.with_more(beside, counts)
     found = linearised.search.gains(linearised.series.unsqueeze(-1))
     ranking = ranked(terms, found, prefer, possible_of(terms, linearised))
-    first = terms[ranking[0].number]
-    if first.key != best.model.terms[-1].key or own_p(found, terms, best) > level:
+    first, own = terms[ranking[0].number], best.model.terms[-1]
+    bends = any(tangents.pointwise[term.port] is None for term in (first, own))
+    if first.key != own.key or own_p(found, terms, best) > level:
         other = refitted(best, base, first, linearised, ranking[0].number)
         # the search is linear: where the joint fit loses much of the gain, it went too far; but where noise may wander,
         # what follows the wander gains most in joint fits, and the search knows better if it tells the two apart
-        behind = [one.gap for one in ranking if terms[one.number].key == best.model.terms[-1].key]
+        behind = [one.gap for one in ranking if terms[one.number].key == own.key]
         clear = tangents.slow is not None and not (behind and behind[0] < SEPARABLE)
         least = 0.0 if clear else _KEPT * max(prefer.score(best, base), 0.0)
         gain = other.log_likelihood - base.log_likelihood if clear else prefer.score(other, base)
-        if gain > least and repeats(other):
+        kept = gain > least or (bends and prefer.by_innovations(best, other, base) > 0.0)
+        if kept and repeats(other):
             best = other
     best.model.residual(best.parameters)  # to be the newest that a simulation remembers
     return _Named(best, ranking, linearised, tangents, terms, own_p(found, terms, best))
@@ -214,9 +216,46 @@ def _by_joint_fits(
     simpler = [
         (score, fit)
         for score, fit in zip(scores, fits, strict=True)
-        if fit.model.sizes[-1] < best.model.sizes[-1] and score >= won and repeats(fit)
+        if fit.model.sizes[-1] < best.model.sizes[-1]
+        and score >= won
+        and prefer.by_innovations(best, fit, base) > -SEPARABLE
+        and repeats(fit)
     ]
-    return max(simpler, key=lambda one: one[0])[1] if simpler else best, tuple(told)
+    if simpler:
+        return max(simpler, key=lambda one: one[0])[1], tuple(told)
+    bent = [fit for fit in known if tangents.pointwise[fit.model.terms[-1].port] is None]
+    return _by_innovations(best, base, tuple(told), terms, prefer, [*fits, *bent])
+
+
+def _by_innovations(
+    best: FittedModel,
+    base: FittedModel,
+    ranking: tuple[Ranked, ...],
+    terms: tuple[Term, ...],
+    prefer: Preference,
+    fits: Sequence[FittedModel],
+) -> tuple[FittedModel, tuple[Ranked, ...]]:
+    """The fit, or one of another physics that clearly leaves less in coloured noise; and the ranking by that.
+
+    Joint fits take noise for white, and one that follows its slow course wins by it. What is new in each sample tells
+    two physics apart that are alike in the long run.
+    """
+    if not fits:
+        return best, ranking
+    for fit in fits:
+        another = fit.model.terms[-1].key != best.model.terms[-1].key
+        if another and prefer.by_innovations(best, fit, base) > SEPARABLE and repeats(fit):
+            best = fit
+    own = best.model.terms[-1].key
+    behind: dict[Key, float] = {}
+    for fit in fits:
+        key, gap = fit.model.terms[-1].key, prefer.by_innovations(fit, best, base)
+        behind[key] = min(gap, behind.get(key, gap))
+    told = [
+        replace(one, gap=0.0 if key == own else max(one.gap, behind.get(key, 0.0)))
+        for one, key in ((one, terms[one.number].key) for one in ranking)
+    ]
+    return best, tuple(sorted(told, key=_gap))
 
 
 def _tried(best: FittedModel, base: FittedModel, term: Term, linearised: Linearised, number: int) -> FittedModel:

@@ -10,7 +10,16 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.drivers import Driver
-from mkc_torch.effects.protocol import BoundedEffect, Context, Effect, GainEffect, LinearEffect, Shape, SignalEffect
+from mkc_torch.effects.protocol import (
+    BoundedEffect,
+    Context,
+    ContinuousEffect,
+    Effect,
+    GainEffect,
+    LinearEffect,
+    Shape,
+    SignalEffect,
+)
 from mkc_torch.nonlinear import GaussianPrior, beside
 from mkc_torch.simulation.protocol import Change, Changes, FreeChange, Port, PreparedSimulation
 
@@ -22,6 +31,7 @@ __all__ = [
     "Key",
     "Term",
     "context_at",
+    "continuous",
     "directions",
     "follows_signal",
     "one_sided",
@@ -226,6 +236,12 @@ def limits(effect: Effect) -> tuple[float, float]:
 def one_sided(effect: Effect) -> bool:
     """Whether an effect's γ cannot be negative."""
     return limits(effect)[0] >= 0.0
+
+
+def continuous(term: Term) -> list[str]:
+    """The numbers of a candidate's shape that are closed in on."""
+    free = term.effect.continuous if isinstance(term.effect, ContinuousEffect) else {}
+    return [name for name in term.shape if name in free]
 
 
 def follows_signal(effect: Effect) -> bool:

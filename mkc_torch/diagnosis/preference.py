@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.drivers import ANY, Driver
-from mkc_torch.diagnosis.model import Term, follows_signal
+from mkc_torch.diagnosis.innovations import either_way
+from mkc_torch.diagnosis.model import Term, continuous, follows_signal
 from mkc_torch.diagnosis.refit import FittedModel
 from mkc_torch.effects.protocol import GainEffect
 from mkc_torch.simulation.protocol import PreparedSimulation
@@ -69,6 +70,20 @@ class Preference:
         gain = fit.log_likelihood - base.log_likelihood
         score = gain - 0.5 * fit.model.sizes[-1] * math.log(len(fit.residual))
         return score - self.handicap(fit.model.terms[-1], gain)
+
+    def by_innovations(self, one: FittedModel, other: FittedModel, base: FittedModel) -> float:
+        """Nats by which the other of two fits is preferred, their noise taken for coloured: as a joint fit does not.
+
+        Each pays one for every number it has (Akaike's criterion), and its handicap.
+        """
+        gain = either_way(one.residual, other.residual)
+        costs = [
+            fit.model.sizes[-1]
+            + len(continuous(fit.model.terms[-1]))
+            + self.handicap(fit.model.terms[-1], fit.log_likelihood - base.log_likelihood)
+            for fit in (one, other)
+        ]
+        return gain - costs[1] + costs[0]
 
     def _alike(self, course: Float[Tensor, " N"]) -> float:
         """Largest correlation with one of the known drivers, either sign."""

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.closing_in import continuous
 from mkc_torch.diagnosis.linearise import Linearised
-from mkc_torch.diagnosis.model import Key, Term, one_sided
+from mkc_torch.diagnosis.model import Key, Term, continuous, one_sided
 from mkc_torch.diagnosis.preference import Preference
 from mkc_torch.diagnosis.refit import FittedModel
 from mkc_torch.diagnosis.search import Gains

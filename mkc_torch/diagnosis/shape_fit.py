@@ -87,23 +87,27 @@ class ShapedModel(JointModel):
 
 
 def shape_fitted(fit: FittedModel) -> FittedModel:
-    """The fit with its last effect's shape at the likeliest values of the numbers that can be fitted.
+    """The fit with its effects' shapes at the likeliest values of the numbers that can be fitted.
 
     Args:
-        fit: at the likeliest parameters for the shape that it has.
+        fit: at the likeliest parameters for the shapes that it has.
 
     Returns:
-        A fit at that shape; the same one where no number can be fitted, or the simulation gives none that is likelier.
+        A fit at those shapes; the same one where no number can be fitted, or the simulation gives none that is
+        likelier.
     """
-    last = fit.model.terms[-1]
-    reach = reach_of(last, fit.model.prepared)
-    if not reach:
+    model = ShapedModel.of(fit.model)
+    if model.size == model.joint:
         return fit
-    model = ShapedModel(fit.model, [*({} for _ in fit.model.terms[:-1]), reach])
     try:
         both = fitted(model, model.start(fit.parameters), fit.bound, graduate=False)
-        shape = {name: float(value) for name, value in model.shaped(both.parameters)[-1].shape.items()}
-        moved = fitted(fit.model.with_shape(shape), both.parameters[: model.joint], fit.bound, graduate=False)
+        moved = JointModel(model.prepared, [_told(term) for term in model.shaped(both.parameters)])
+        again = fitted(moved, both.parameters[: model.joint], fit.bound, graduate=False)
     except ValueError:
         return fit
-    return moved if moved.log_likelihood > fit.log_likelihood else fit
+    return again if again.log_likelihood > fit.log_likelihood else fit
+
+
+def _told(term: Term) -> Term:
+    """The same with plain numbers as its shape."""
+    return replace(term, shape={name: float(value) for name, value in term.shape.items()})

@@ -24,6 +24,8 @@ __all__ = [
     "Effect",
     "GainEffect",
     "LastingEffect",
+    "LinearEffect",
+    "NestedEffect",
     "OptionalDriverEffect",
     "PartEffect",
     "Quantity",
@@ -247,6 +249,19 @@ class ShapedEffect(Effect, Protocol):
 
     @property
     def fitted_shape(self) -> Mapping[str, tuple[float, float]]: ...
+
+
+@runtime_checkable
+class NestedEffect(Effect, Protocol):
+    """An effect of which a simpler one is a special case.
+
+    Attributes:
+        simpler: the same physics with fewer numbers in γ, of which each stands for several of this one's, one after the
+            other; its shapes are the same. It is taken where it predicts unseen blocks as well.
+    """
+
+    @property
+    def simpler(self) -> Effect: ...
 
 
 @runtime_checkable

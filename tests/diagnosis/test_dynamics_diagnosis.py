@@ -129,8 +129,8 @@ def filled(leak, seed=0):
 def test_a_pipe_between_two_tanks_is_named_and_sized():
     finding = explained(diagnose(Tanks(), filled(0.15), **QUICK), "coupling")
     exchange, error = value(finding, "exchange")
-    assert exchange == pytest.approx((0.15, 0.15), abs=0.03)
-    assert max(error) < 0.03
+    assert exchange == pytest.approx(0.15, abs=0.03)  # what leaves one tank enters the other
+    assert error < 0.03
     assert finding.held_out.rmse_after == pytest.approx(0.02, rel=0.25)
 
 

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.diagnosis.evidence import blocks_of, innovation_gain
+from mkc_torch.diagnosis.evidence import blocks_of
+from mkc_torch.diagnosis.innovations import innovation_gain
 
 holds = importlib.import_module("mkc_torch.diagnosis.diagnose")._holds
 N = 2000
@@ -54,14 +55,14 @@ def walks(step):
 
 def test_what_is_plain_beside_a_wander_counts_though_blocks_see_the_wander_alone():
     before, after = walks(0.5)
-    assert innovation_gain(before, after) > 50.0
+    assert innovation_gain(before.residual, after.residual) > 50.0
     assert holds(located(0.0), before, after, BLOCKS, 0, first=True)
     assert not holds(located(0.0), before, after, BLOCKS, 0, first=False)
 
 
 def test_what_is_worth_less_than_its_parameters_does_not():
     before, after = walks(0.05)
-    assert innovation_gain(before, after) < 10.0
+    assert innovation_gain(before.residual, after.residual) < 10.0
     assert not holds(located(0.0), before, after, BLOCKS, 0, first=True)
 
 
@@ -70,4 +71,4 @@ def test_the_gain_of_innovations_is_that_of_least_squares_in_white_noise():
     course = 0.2 * torch.sin(torch.arange(N, dtype=torch.float64)).unsqueeze(-1)
     before, after = SimpleNamespace(residual=draws + course), SimpleNamespace(residual=draws)
     expected = 0.5 * float(((draws + course).square() - draws.square()).sum())
-    assert innovation_gain(before, after) == pytest.approx(expected, rel=0.15)
+    assert innovation_gain(before.residual, after.residual) == pytest.approx(expected, rel=0.15)

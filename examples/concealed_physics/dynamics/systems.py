@@ -3,7 +3,8 @@
 Data:
     falling balls: de Silva et al., "Discovery of Physics from Data: Universal Laws and Discrepancies", Frontiers in AI
         3:25 (2020).
-    heaters: Hedengren, "Temperature Control Lab", github.com/APMonitor/arduino, Apache-2.0.
+    heaters: Hedengren, "Temperature Control Lab", github.com/APMonitor/arduino, Apache-2.0; its energy balance in
+        github.com/APMonitor/pdc, Module_22.
     Silverbox: Wigren & Schoukens, "Three free data sets for development and benchmarking in nonlinear system
         identification", European Control Conference 2013.
     servo: Duclusaud et al., "Extended Friction Models for the Physics Simulation of Servo Actuators", ICRA 2025,
@@ -42,24 +43,26 @@ class Ball(Dynamics):
 
 
 class Heaters(Dynamics):
-    """Each heater warms its own sensor, which cools to the room."""
+    """Each heater warms its own sensor, which cools to the room.
+
+    The energy balance that is published with the board, m c Ṫ = U A (Tₐ − T) + α Q with Tₐ = 23 °C and one U for both,
+    without what passes from one heater to the other and without radiation. U and both α are fitted, as they are there.
+    """
 
     states = ("temperature_1", "temperature_2")
     inputs = ("heater_1", "heater_2")
     units = {"temperature_1": "°C", "temperature_2": "°C"}
     between = "held"
     parameters = {
-        "loss_1": Parameter(0.01, lower=0.0, unit="1/s"),
-        "loss_2": Parameter(0.01, lower=0.0, unit="1/s"),
-        "gain_1": Parameter(0.01, lower=0.0),
-        "gain_2": Parameter(0.005, lower=0.0),
-        "room": Parameter(20.0, unit="°C"),
+        "loss": Parameter(0.005, lower=0.0, unit="1/s"),
+        "gain_1": Parameter(0.005, lower=0.0),
+        "gain_2": Parameter(0.004, lower=0.0),
     }
 
     def derivative(self, time, x, u, p):
         return {
-            "temperature_1": p.loss_1 * (p.room - x.temperature_1) + p.gain_1 * u.heater_1,
-            "temperature_2": p.loss_2 * (p.room - x.temperature_2) + p.gain_2 * u.heater_2,
+            "temperature_1": p.loss * (23.0 - x.temperature_1) + p.gain_1 * u.heater_1,
+            "temperature_2": p.loss * (23.0 - x.temperature_2) + p.gain_2 * u.heater_2,
         }
 
 

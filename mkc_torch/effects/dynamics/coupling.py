@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.effects.dynamics.rate import RateEffect
-from mkc_torch.effects.protocol import Context, Quantity, Shape
+from mkc_torch.effects.protocol import Context, Effect, Quantity, Shape
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 class Coupling(RateEffect):
     """Two states exchange: heat between bodies, fluid between tanks, force between masses.
 
-    Simulation: adds ``γ₁ (y − x)`` to the rate of a state x, and ``γ₂ (x − y)`` to that of y, a state in the same unit.
+    Simulation: adds ``γ₁ (y − x)`` to the rate of a state x, and ``γ₂ (x − y)`` to that of y, a state in the same unit;
+    between equals γ₁ = γ₂.
     Drivers: none but the states.
     Units: γ in 1/s.
     Plausible: γ ≥ 0: exchange evens out.
@@ -36,13 +37,24 @@ class Coupling(RateEffect):
     advice = "Couple the two with this coefficient."
     source = "Fourier's law of conduction, Fick's law of diffusion"
 
+    @property
+    def simpler(self) -> Effect:
+        return EqualCoupling()
+
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity(self.gain, 2, "1/s"),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 2"]:  # noqa: ARG002
         away = context.part("other") - context.part("own")
-        return torch.stack([gamma[0] * away, -gamma[1] * away], -1)
+        return torch.stack([gamma[0] * away, -gamma[-1] * away], -1)
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
         away = f"({names['other']} - {names['own']})"
-        return f"{gamma[0]!r} * {away}", f"-{gamma[1]!r} * {away}"
+        return f"{gamma[0]!r} * {away}", f"-{gamma[-1]!r} * {away}"
+
+
+class EqualCoupling(Coupling):
+    """The same between equals: what one gives off, the other takes up."""
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return (Quantity(self.gain, 1, "1/s"),)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.effects.protocol import Context, Shape, lagged
+from mkc_torch.effects.protocol import Context, Effect, Quantity, Shape, lagged
 from mkc_torch.effects.share import ShareEffect
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ class SensorLag(ShareEffect):
     """The sensor follows what it measures with a lag, as a thermometer in its housing does.
 
     Simulation: adds ``γ_i (y_τ − y)`` to each output, y_τ the output behind a lag of first order; a γ of one is a
-    plain lag.
+    plain lag. Where all sensors are alike there is one γ.
     Drivers: none but the output.
     Units: γ is a share; the time constant in s.
     Plausible: γ from 0 to 1.
@@ -43,11 +43,23 @@ class SensorLag(ShareEffect):
         length = float(time.max() - time.min())
         return tuple({"lag": share * length} for share in SHARES)
 
+    @property
+    def simpler(self) -> Effect:
+        return AlikeSensorLag()
+
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
         behind = [lagged(one, context.time, shape["lag"], context.runs) for one in context.signal.unbind(-1)]
         return gamma * (torch.stack(behind, -1) - context.signal)
 
     def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:
         lag = shape["lag"]
-        each = zip(gamma, names.values(), strict=True)
+        shares = tuple(gamma) * (len(names) // len(gamma))
+        each = zip(shares, names.values(), strict=True)
         return tuple(f"{share!r} * (lagged({own}, time, {lag!r}, run) - {own})" for share, own in each)
+
+
+class AlikeSensorLag(SensorLag):
+    """The same where all sensors are alike: one share for all outputs."""
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return (Quantity(self.gain, 1, ""),)

@@ -1,0 +1,68 @@
+"""Simpler forms of what was found, where blocks that the fit has not seen are predicted as well by them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, held_out
+from mkc_torch.diagnosis.innovations import either_way
+from mkc_torch.diagnosis.model import JointModel
+from mkc_torch.diagnosis.refit import FittedModel, fitted, repeats
+from mkc_torch.diagnosis.shape_fit import shape_fitted
+from mkc_torch.effects.protocol import NestedEffect
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+__all__ = ["simplified"]
+
+
+def simplified(fit: FittedModel, evidence: Evidence, blocks: HeldOutBlocks) -> tuple[FittedModel, Evidence]:
+    """The fit with the simpler form of each effect that unseen blocks do not speak against, and its evidence.
+
+    They speak against one whose blocks are less likely, with their noise taken for white, or whose samples bring more
+    that is new, with it taken for coloured. What an effect needed while another was missing, it may not need any more.
+
+    Args:
+        fit: with all effects that were found.
+        evidence: of it, on the blocks.
+        blocks: held out.
+    """
+    for number in range(len(fit.model.terms)):
+        start = _simpler(fit, number)
+        if start is None:
+            continue
+        try:
+            other = shape_fitted(fitted(*start, fit.bound, graduate=False))
+        except ValueError:
+            continue
+        if not repeats(other):
+            continue
+        after = held_out(other, blocks)
+        likelier = bool(after.log_likelihood.mean() >= evidence.log_likelihood.mean())
+        if likelier and either_way(evidence.residual, after.residual) >= 0.0:
+            fit, evidence = other, after
+    return fit, evidence
+
+
+def _simpler(fit: FittedModel, number: int) -> tuple[JointModel, Float[Tensor, " p"]] | None:
+    """The model with the simpler form of one effect, and where to start; None where there is none."""
+    terms = list(fit.model.terms)
+    effect = terms[number].effect
+    if not isinstance(effect, NestedEffect):
+        return None
+    terms[number] = replace(terms[number], effect=effect.simpler)
+    model = JointModel(fit.model.prepared, terms)
+    size = model.sizes[number]
+    if size >= fit.model.sizes[number]:
+        return None
+    before, own, behind = fit.parameters.split(
+        [
+            fit.model.base + sum(fit.model.sizes[:number]),
+            fit.model.sizes[number],
+            sum(fit.model.sizes[number + 1 :]),
+        ]
+    )
+    return model, fit.parameters.new_tensor([*before, *own.reshape(size, -1).mean(-1), *behind])
