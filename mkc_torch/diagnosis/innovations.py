@@ -17,22 +17,35 @@ __all__ = ["either_way", "innovation_gain", "innovation_gains"]
 
 _CLIPPED = 3.0
 
+_NEAR = 10
+"""Samples to either side whose median a sample is compared with, to tell an outlier from a course."""
+
 
 def innovation_gains(before: Float[Tensor, "N m"], after: Float[Tensor, "N m"]) -> Float[Tensor, " N"]:
     """Gain of each sample in nats, over its channels.
 
-    Both residuals, clipped, are filtered by the autoregression of the latter; what is left of each is compared by
-    squares, which end at three scales (Hampel et al., "Robust Statistics", 1986, 2.6).
+    Both residuals, clipped around their running medians, are filtered by the autoregression of the latter; what is left
+    of each is compared by squares, which end at three scales (Hampel et al., "Robust Statistics", 1986, 2.6).
     """
-    reach = _CLIPPED * robust_scale(after)
+    courses = [_running_median(residual) for residual in (before, after)]
+    reach = _CLIPPED * robust_scale(after - courses[1])
+    tame = [
+        course + (residual - course).clamp(-reach, reach)
+        for residual, course in zip((before, after), courses, strict=True)
+    ]
     total = torch.zeros_like(after[:, 0])
-    for earlier, later, most in zip(before.unbind(-1), after.unbind(-1), reach, strict=True):
-        one, other = earlier.clamp(-most, most), later.clamp(-most, most)
+    for one, other in zip(*(values.unbind(-1) for values in tame), strict=True):
         coefficients = autoregression(other)
-        one, other = filtered(one, coefficients), filtered(other, coefficients)
-        size = (torch.stack([one, other]) / robust_scale(other.unsqueeze(-1))).square().clamp(max=_CLIPPED**2)
+        new = torch.stack([filtered(one, coefficients), filtered(other, coefficients)])
+        size = (new / robust_scale(new[1].unsqueeze(-1))).square().clamp(max=_CLIPPED**2)
         total = total + 0.5 * (size[0] - size[1])
     return total
+
+
+def _running_median(values: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
+    near = min(_NEAR, len(values) - 1)
+    padded = torch.nn.functional.pad(values.mT, (near, near), mode="reflect")
+    return padded.unfold(-1, 2 * near + 1, 1).median(-1).values.mT
 
 
 def innovation_gain(before: Float[Tensor, "N m"], after: Float[Tensor, "N m"]) -> float:
@@ -46,8 +59,8 @@ def either_way(one: Float[Tensor, "N m"], other: Float[Tensor, "N m"]) -> float:
     Example:
         >>> generator = torch.Generator().manual_seed(0)
         >>> noise = torch.randn(400, 1, generator=generator, dtype=torch.float64)
-        >>> wave = 0.8 * torch.linspace(0.0, 90.0, 400, dtype=torch.float64).sin().unsqueeze(-1)
-        >>> either_way(noise + wave, noise) > 40.0 > -40.0 > either_way(noise, noise + wave)
+        >>> decay = 2.0 * torch.exp(-(torch.arange(400) % 100) / 10.0).unsqueeze(-1)
+        >>> either_way(noise + decay, noise) > 10.0 > -10.0 > either_way(noise, noise + decay)
         True
     """
     gains = innovation_gain(one, other), -innovation_gain(other, one)

@@ -242,6 +242,7 @@ def _by_innovations(
     """
     if not fits:
         return best, ranking
+    fits = [best, *fits]
     for fit in fits:
         another = fit.model.terms[-1].key != best.model.terms[-1].key
         if another and prefer.by_innovations(best, fit, base) > SEPARABLE and repeats(fit):

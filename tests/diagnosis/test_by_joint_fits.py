@@ -15,14 +15,16 @@ BENT, POINTWISE = "rate", "sensor"
 
 
 class Indifferent(Preference):
-    def __init__(self):
-        pass
+    """No handicaps; in coloured noise a fit gains so much more than one that is not named."""
+
+    def __init__(self, **new):
+        self.new = new
 
     def handicap(self, _term, _gain):
         return 0.0
 
-
-PREFER = Indifferent()
+    def by_innovations(self, one, other, _base):
+        return self.new.get(other.model.terms[-1].key, 0.0) - self.new.get(one.model.terms[-1].key, 0.0)
 
 
 def term(key, port=BENT):
@@ -43,7 +45,7 @@ TERMS = (FRICTION, MASS, DRY, DRAG, OFFSET)
 def judged(monkeypatch):
     """``judged(ranking, fits)``: best and ranking, where joint fits of rivals come out so."""
 
-    def run(ranking, fits, size=2, known=()):
+    def run(ranking, fits, size=2, known=(), **new):
         asked = []
 
         def tried(_best, _base, one, _linearised, _number):
@@ -55,7 +57,7 @@ def judged(monkeypatch):
         monkeypatch.setattr(locate, "memory_kept", lambda _prepared: nullcontext())
         best = fit_of(FRICTION, 100.0, size)
         tangents = SimpleNamespace(pointwise={BENT: None, POINTWISE: torch.ones(1)})
-        found, told = _by_joint_fits(best, fit_of(None, 0.0), ranking, TERMS, None, tangents, PREFER, known)
+        found, told = _by_joint_fits(best, fit_of(None, 0.0), ranking, TERMS, None, tangents, Indifferent(**new), known)
         return found.model.terms[-1].key, {TERMS[one.number].key: one.gap for one in told}, asked
 
     return run
@@ -100,3 +102,34 @@ def test_what_was_fitted_before_and_keeps_the_gain_is_not_fitted_again(judged):
     assert (asked, gaps["mass"]) == ([], 0.7)
     _, gaps, asked = judged(ranking, {"mass": fit_of(MASS, 40.0)}, known=[fit_of(MASS, 30.0)])
     assert (asked, gaps["mass"]) == (["mass"], 60.0)
+
+
+def test_in_coloured_noise_the_rival_that_leaves_less_that_is_new_is_named(judged):
+    """However much likelier the other one is with its noise taken for white."""
+    ranking = (Ranked(0, 50.0, 0.0), Ranked(1, 49.0, 0.7), Ranked(3, 30.0, 22.0))
+    found, gaps, _ = judged(ranking, {"mass": fit_of(MASS, 85.0)}, mass=6.0)
+    assert (found, gaps) == ("mass", {"mass": 0.0, "friction": 6.0, "drag": 22.0})
+
+
+def test_a_few_nats_do_not_change_the_name(judged):
+    ranking = (Ranked(0, 50.0, 0.0), Ranked(1, 49.0, 0.7))
+    found, gaps, _ = judged(ranking, {"mass": fit_of(MASS, 85.0)}, mass=4.0)
+    assert (found, gaps) == ("friction", {"friction": 0.0, "mass": 0.7})
+
+
+def test_one_that_leaves_more_is_told_apart(judged):
+    ranking = (Ranked(1, 51.0, 0.0), Ranked(0, 50.0, 0.7))
+    _, gaps, _ = judged(ranking, {"mass": fit_of(MASS, 100.0)}, friction=9.0)
+    assert gaps == {"friction": 0.0, "mass": 9.0}
+
+
+def test_a_simpler_one_that_leaves_more_is_not_taken(judged):
+    ranking = (Ranked(0, 50.0, 0.0), Ranked(2, 50.0, 0.0))
+    assert judged(ranking, {"dry": fit_of(DRY, 130.0, 1)}, friction=9.0)[0] == "friction"
+
+
+def test_what_was_fitted_before_is_compared_though_the_search_has_it_far_behind(judged):
+    ranking = (Ranked(0, 50.0, 0.0), Ranked(3, 20.0, 30.0), Ranked(4, 20.0, 30.0))
+    known = [fit_of(DRAG, 90.0), fit_of(OFFSET, 90.0)]
+    found, gaps, _ = judged(ranking, {}, known=known, drag=7.0, o=50.0)
+    assert (found, gaps["o"]) == ("drag", 30.0), "where a port is pointwise the search says it"

@@ -60,6 +60,15 @@ def test_what_is_plain_beside_a_wander_counts_though_blocks_see_the_wander_alone
     assert not holds(located(0.0), before, after, BLOCKS, 0, first=False)
 
 
+def test_a_further_one_may_be_confirmed_by_what_is_new_in_unseen_samples_if_they_lean_its_way():
+    before, after = walks(0.5)
+    leans = SimpleNamespace(log_likelihood=evidence(0.01, 1.0).log_likelihood, residual=after.residual)
+    assert holds(located(0.0), before, leans, BLOCKS, 0, first=False)
+    before, after = walks(0.02)
+    leans = SimpleNamespace(log_likelihood=leans.log_likelihood, residual=after.residual)
+    assert not holds(located(0.0), before, leans, BLOCKS, 0, first=False)
+
+
 def test_what_is_worth_less_than_its_parameters_does_not():
     before, after = walks(0.05)
     assert innovation_gain(before.residual, after.residual) < 10.0
