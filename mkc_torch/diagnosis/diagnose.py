@@ -17,10 +17,10 @@ from mkc_torch.diagnosis.density_check import density_warnings
 from mkc_torch.diagnosis.diagnosed_model import model_of
 from mkc_torch.diagnosis.drivers import Drivers, find_drivers
 from mkc_torch.diagnosis.estimate import Estimate, estimate
-from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
+from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, blocks_of, confirmed, gain_interval, held_out
 from mkc_torch.diagnosis.extrapolation import extrapolated, extrapolation_warning
 from mkc_torch.diagnosis.findings import finding_of
-from mkc_torch.diagnosis.innovations import innovation_gain, innovation_gains
+from mkc_torch.diagnosis.innovations import innovation_gain
 from mkc_torch.diagnosis.locate import Located, locate
 from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.noise_summary import noise_summary
@@ -39,7 +39,7 @@ from mkc_torch.recording import Recording
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool
 
 __all__ = ["diagnose"]
 
@@ -168,16 +168,7 @@ def _holds(
         plain = located.beyond > _BEYOND_DOUBT
         price = 0.5 * located.fit.model.sizes[-1] * math.log(len(after.log_likelihood))
         return better or plain or innovation_gain(before.residual, after.residual) > price
-    if better and located.beyond > _FURTHER:
-        return True
-    likelier = after.log_likelihood - before.log_likelihood
-    newer = innovation_gains(before.residual, after.residual)
-    return _confirmed(likelier, blocks, seed) or (better and _confirmed(newer, blocks, seed))
-
-
-def _confirmed(difference: Float[Tensor, " N"], blocks: HeldOutBlocks, seed: int) -> bool:
-    _, (low, _) = gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))
-    return low > 0.0
+    return (better and located.beyond > _FURTHER) or confirmed(before, after, blocks, seed)
 
 
 def _base(prepared: PreparedSimulation) -> FittedModel:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, held_out
 from mkc_torch.diagnosis.innovations import either_way
 from mkc_torch.diagnosis.model import JointModel
+from mkc_torch.diagnosis.ranking import SEPARABLE
 from mkc_torch.diagnosis.refit import FittedModel, fitted, repeats
 from mkc_torch.diagnosis.shape_fit import shape_fitted
 from mkc_torch.effects.protocol import NestedEffect
@@ -22,8 +23,11 @@ __all__ = ["simplified"]
 def simplified(fit: FittedModel, evidence: Evidence, blocks: HeldOutBlocks) -> tuple[FittedModel, Evidence]:
     """The fit with the simpler form of each effect that unseen blocks do not speak against, and its evidence.
 
-    They speak against one whose blocks are less likely, with their noise taken for white, or whose samples bring more
-    that is new, with it taken for coloured. What an effect needed while another was missing, it may not need any more.
+    They do where they are clearly less likely by it, with their noise taken for white, and it leaves more that is new
+    in their samples, with it taken for coloured.
+
+    All effects are asked again with each that is found: what one needed while another was missing, it may not need any
+    more.
 
     Args:
         fit: with all effects that were found.
@@ -41,8 +45,8 @@ def simplified(fit: FittedModel, evidence: Evidence, blocks: HeldOutBlocks) -> t
         if not repeats(other):
             continue
         after = held_out(other, blocks)
-        likelier = bool(after.log_likelihood.mean() >= evidence.log_likelihood.mean())
-        if likelier and either_way(evidence.residual, after.residual) >= 0.0:
+        lost = float((evidence.log_likelihood - after.log_likelihood).sum())
+        if lost <= SEPARABLE or either_way(after.residual, evidence.residual) <= 0.0:
             fit, evidence = other, after
     return fit, evidence
 

@@ -35,6 +35,8 @@ __all__ = [
     "SignalEffect",
 ]
 
+_LEAST = 1e-12
+
 Shape = Mapping[str, float]
 """Numbers that an effect is not linear in, such as its onset or a time constant in s; they are searched, not fitted."""
 
@@ -373,22 +375,26 @@ def lagged(
 ) -> Float[Tensor, " N"]:
     """Values behind a first-order lag with this time constant in s, at rest before the first sample of each run.
 
-    Each value counts for the whole interval that ends at its sample: ``y[k] = a y[k-1] + (1 - a) x[k]`` with
-    ``a = exp(-Δt / lag)``, exact for intervals of any length.
+    ``lag ẏ = x − y``, exact for intervals of any length where x goes straight from sample to sample.
 
     Args:
-        values: at the samples.
+        values: x at the samples.
         time: of the samples in s.
         lag: in s; nothing changes where it is not positive.
         run: of each sample's run; None where a run begins when time goes back, and only there.
 
     Example:
         >>> time = torch.arange(0.0, 5.0, 0.01, dtype=torch.float64)
-        >>> float(lagged((time >= 1.0).double(), time, 1.0)[200])
-        0.63...
+        >>> float(lagged((time - 1.0).clamp(min=0.0), time, 1.0)[200])  # a ramp: 1 - (1 - 1 / e)
+        0.367...
     """
     if lag <= 0:
         return values
-    step = torch.cat([time.new_zeros(1), time.diff()]).clamp(min=0.0)
-    decay = torch.where(first_of_runs(run_numbers(time) if run is None else run), 0.0, torch.exp(-step / lag))
-    return values[0] + passed_on(decay, (1.0 - decay) * (values - values[0]))
+    first = first_of_runs(run_numbers(time) if run is None else run)
+    ratio = torch.cat([time.new_zeros(1), time.diff()]).clamp(min=0.0) / lag
+    keep = torch.where(first, 0.0, torch.exp(-ratio))
+    ratio = ratio.clamp(min=_LEAST)
+    late = torch.where(first, 0.0, -torch.expm1(-ratio) / ratio)
+    away = values - values[0]
+    before = torch.cat([away[:1], away[:-1]])
+    return values[0] + passed_on(keep, (late - keep) * before + (1.0 - late) * away)
