@@ -17,7 +17,7 @@ from mkc_torch.diagnosis.linearise import Linearised, Tangents, candidate_tangen
 from mkc_torch.diagnosis.local import beside_wander
 from mkc_torch.diagnosis.model import Key, Term
 from mkc_torch.diagnosis.noise import Colour
-from mkc_torch.diagnosis.preference import Preference
+from mkc_torch.diagnosis.preference import Preference, schwarz
 from mkc_torch.diagnosis.ranking import SEPARABLE, Ranked, own_p, possible_of, ranked
 from mkc_torch.diagnosis.refit import FittedModel, fitted_beside, repeats
 from mkc_torch.diagnosis.search import NoiseFit
@@ -218,7 +218,7 @@ def _by_joint_fits(
         for score, fit in zip(scores, fits, strict=True)
         if fit.model.sizes[-1] < best.model.sizes[-1]
         and score >= won
-        and prefer.by_innovations(best, fit, base) > -SEPARABLE
+        and prefer.by_innovations(best, fit, base, schwarz(best)) >= 0.0
         and repeats(fit)
     ]
     if simpler:

@@ -13,13 +13,13 @@ from mkc_torch.diagnosis.drivers import ANY, Driver
 from mkc_torch.diagnosis.innovations import either_way
 from mkc_torch.diagnosis.model import Term, continuous, follows_signal
 from mkc_torch.diagnosis.refit import FittedModel
-from mkc_torch.effects.protocol import GainEffect
+from mkc_torch.effects.protocol import GainEffect, ShapedEffect
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["ALIKE_COLUMNS", "UNKNOWN", "Preference", "alike"]
+__all__ = ["ALIKE_COLUMNS", "UNKNOWN", "Preference", "alike", "schwarz"]
 
 UNKNOWN = "unknown"
 """Id of the effect that is a curve, not physics."""
@@ -35,6 +35,10 @@ ROLELESS, FOLLOWER, ALIKE_COLUMNS = 0.3, 0.95, 0.9
 
 EVENT, ALIKE_EVENT = 0.05, 0.85
 """An event in time that goes along with a known driver to more than this correlation gives this share."""
+
+
+AKAIKE = 1.0
+"""Nats for every number (Akaike's criterion)."""
 
 
 class Preference:
@@ -68,18 +72,17 @@ class Preference:
     def score(self, fit: FittedModel, base: FittedModel) -> float:
         """Gain in nats less Schwarz's penalty, and less the handicap."""
         gain = fit.log_likelihood - base.log_likelihood
-        score = gain - 0.5 * fit.model.sizes[-1] * math.log(len(fit.residual))
+        score = gain - schwarz(fit) * fit.model.sizes[-1]
         return score - self.handicap(fit.model.terms[-1], gain)
 
-    def by_innovations(self, one: FittedModel, other: FittedModel, base: FittedModel) -> float:
+    def by_innovations(self, one: FittedModel, other: FittedModel, base: FittedModel, price: float = AKAIKE) -> float:
         """Nats by which the other of two fits is preferred, their noise taken for coloured: as a joint fit does not.
 
-        Each pays one for every number it has (Akaike's criterion), and its handicap.
+        Each pays its handicap, and a price for every number it has.
         """
         gain = either_way(one.residual, other.residual)
         costs = [
-            fit.model.sizes[-1]
-            + len(continuous(fit.model.terms[-1]))
+            price * (fit.model.sizes[-1] + _fitted_numbers(fit.model.terms[-1]))
             + self.handicap(fit.model.terms[-1], fit.log_likelihood - base.log_likelihood)
             for fit in (one, other)
         ]
@@ -88,6 +91,17 @@ class Preference:
     def _alike(self, course: Float[Tensor, " N"]) -> float:
         """Largest correlation with one of the known drivers, either sign."""
         return float((self._known @ _unit(course)).abs().max()) if len(self._known) else 0.0
+
+
+def _fitted_numbers(term: Term) -> int:
+    """Of its shape."""
+    shaped = term.effect.fitted_shape if isinstance(term.effect, ShapedEffect) else {}
+    return len({*continuous(term), *shaped})
+
+
+def schwarz(fit: FittedModel) -> float:
+    """Nats for every number by Schwarz's criterion."""
+    return 0.5 * math.log(len(fit.residual))
 
 
 def alike(one: Driver, other: Driver) -> float:
