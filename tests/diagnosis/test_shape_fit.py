@@ -30,8 +30,8 @@ class Lag(Dynamics):
         return {"level": p.rate * (u.drive - x.level)}
 
 
-def driven(act, seed=0):
-    """The level behind a drive that acts otherwise than it is told, in 20 steps a sample."""
+def driven(act, seed=0, behind=0.0):
+    """The level behind a drive that acts otherwise than it is told, by a sensor that may lag; in 20 steps a sample."""
     generator = torch.Generator().manual_seed(seed)
     time = 0.05 * torch.arange(N, dtype=torch.float64)
     drive = 2.0 * torch.sin(0.9 * time) + torch.sin(2.3 * time + 1.0)
@@ -41,17 +41,23 @@ def driven(act, seed=0):
     level = [0.0]
     for one, other in zip(seen[:-1].tolist(), seen[1:].tolist(), strict=True):
         level.append(level[-1] + step * 1.7 * (0.5 * (one + other) - level[-1]))
+    shown = [0.0]
+    for one in level[1:]:
+        shown.append(one if behind == 0.0 else shown[-1] + step / behind * (one - shown[-1]))
     noise = 0.01 * torch.randn(N, generator=generator, dtype=torch.float64)
-    return Recording({"time": time, "drive": drive, "level": torch.tensor(level[::20], dtype=torch.float64) + noise})
+    return Recording({"time": time, "drive": drive, "level": torch.tensor(shown[::20], dtype=torch.float64) + noise})
 
 
-def found(recording, effect, shape):
-    """The joint fit with an effect at a shape of its grid."""
+def found(recording, *known):
+    """The joint fit with effects, each followed by its shape on the grid."""
     prepared = Lag().prepare(recording)
-    terms = candidate_terms(prepared, (), (effect,))
-    model = JointModel(prepared, (replace(terms[0], shape={**terms[0].shape, **shape}),))
+    terms = []
+    for effect, shape in zip(known[::2], known[1::2], strict=True):
+        (term, *_) = candidate_terms(prepared, (), (effect,))
+        terms.append(replace(term, shape={**term.shape, **shape}))
     base = fitted(JointModel(prepared), prepared.start())
-    return fitted(model, torch.cat([base.parameters, base.parameters.new_full((1,), 0.5)]), base.bound)
+    half = base.parameters.new_full((len(terms),), 0.5)
+    return fitted(JointModel(prepared, terms), torch.cat([base.parameters, half]), base.bound)
 
 
 def test_a_limit_between_two_of_the_grid_is_found():
@@ -82,6 +88,15 @@ def test_a_delay_is_found_with_its_share():
     after = shape_fitted(found(late, OF["input_delay"], {"delay": 0.2}))
     assert after.model.terms[-1].shape["delay"] == pytest.approx(0.3075, abs=0.01)
     assert float(after.parameters[-1]) == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_shape_of_an_earlier_effect_moves_with_that_of_a_later_one():
+    recording = driven(lambda u: u.clamp(-1.37, 1.37), behind=0.15)
+    before = found(recording, OF["input_saturation"], {"limit": 1.2}, OF["sensor_lag"], {"lag": 0.3})
+    limit, lag = (term.shape for term in shape_fitted(before).model.terms)
+    assert limit["limit"] == pytest.approx(1.37, abs=0.02)
+    assert lag["lag"] == pytest.approx(0.15, abs=0.03)
+    assert all(isinstance(value, float) for value in (*limit.values(), *lag.values()))
 
 
 def test_an_effect_without_such_numbers_stays_as_it_is():

@@ -63,12 +63,16 @@ def test_the_number_of_the_run_is_no_output(loaded):
     assert proof.measured.shape == (len(both), 1)
 
 
-def test_a_lag_of_the_heaters_sensors_is_not_taken_for_a_curve_without_a_name(loaded):
+def test_the_heaters_lag_and_what_passes_between_them_are_named(loaded):
     """A curve over the temperature gains more on the run it is fitted to, and makes the other one 4 °C worse."""
     shared_data("dynamics/heaters/run_1s.csv")
     case = loaded("systems").heaters(shared_data("dynamics"))
-    (proof,) = loaded("held_out").prove(case.system, case.train, list(case.tests.values()), max_findings=1)
-    assert [finding.effect for finding in proof.diagnosis.findings] == ["sensor_lag"]
+    (proof,) = loaded("held_out").prove(case.system, case.train, list(case.tests.values()), max_findings=2)
+    lag, coupling = proof.diagnosis.findings
+    assert (lag.effect, coupling.effect) == ("sensor_lag", "coupling")
+    assert coupling.p_value <= 0.05
+    assert [p.name for p in coupling.parameters] == ["exchange"]
+    assert isinstance(coupling.parameters[0].value, float), "what one gives off, the other takes up"
     before, after = proof.root_mean_square()
     assert before > 1.5
-    assert after < 0.9
+    assert after < 0.8
