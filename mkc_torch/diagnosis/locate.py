@@ -15,22 +15,21 @@ from mkc_torch.diagnosis.closing_in import closer, coloured, refined
 from mkc_torch.diagnosis.judge import judged
 from mkc_torch.diagnosis.linearise import Linearised, Tangents, candidate_tangents, linearise, tangents_of
 from mkc_torch.diagnosis.local import beside_wander
-from mkc_torch.diagnosis.model import Key, Term
+from mkc_torch.diagnosis.model import Term
 from mkc_torch.diagnosis.noise import Colour
-from mkc_torch.diagnosis.preference import Preference, schwarz
+from mkc_torch.diagnosis.preference import Preference
 from mkc_torch.diagnosis.ranking import SEPARABLE, Ranked, own_p, possible_of, ranked
 from mkc_torch.diagnosis.refit import FittedModel, fitted_beside, repeats
+from mkc_torch.diagnosis.rivals import KEPT, by_joint_fits
 from mkc_torch.diagnosis.search import NoiseFit
 from mkc_torch.diagnosis.shape_fit import shape_fitted
-from mkc_torch.diagnosis.side_by_side import fitted_each, known_of, learn, memory_kept, with_memory
+from mkc_torch.diagnosis.side_by_side import known_of, learn, with_memory
 from mkc_torch.diagnosis.strongest import refitted, strongest
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = ["Located", "locate"]
-
-_KEPT = 0.8
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ def locate(
             # it was another candidate that no draw came up to, if this one by itself is nothing out of the ordinary
             p_value = max(p_value, named.own_p)
     if p_value <= level:
-        best, ranking = _by_joint_fits(best, base, ranking, terms, linearised, tangents, prefer, fits)
+        best, ranking = by_joint_fits(best, base, ranking, terms, linearised, tangents, prefer, fits)
         best = _settled(refined(best, base, again=True), base)
         best = coloured(best, base, tangents, counts, linearised)
         shaped = shape_fitted(best)
@@ -169,102 +168,13 @@ def _named(
         # what follows the wander gains most in joint fits, and the search knows better if it tells the two apart
         behind = [one.gap for one in ranking if terms[one.number].key == own.key]
         clear = tangents.slow is not None and not (behind and behind[0] < SEPARABLE)
-        least = 0.0 if clear else _KEPT * max(prefer.score(best, base), 0.0)
+        least = 0.0 if clear else KEPT * max(prefer.score(best, base), 0.0)
         gain = other.log_likelihood - base.log_likelihood if clear else prefer.score(other, base)
         kept = gain > least or (bends and prefer.by_innovations(best, other, base) > 0.0)
         if kept and repeats(other):
             best = other
     best.model.residual(best.parameters)  # to be the newest that a simulation remembers
     return _Named(best, ranking, linearised, tangents, terms, own_p(found, terms, best))
-
-
-def _by_joint_fits(
-    best: FittedModel,
-    base: FittedModel,
-    ranking: tuple[Ranked, ...],
-    terms: tuple[Term, ...],
-    linearised: Linearised,
-    tangents: Tangents,
-    prefer: Preference,
-    known: Sequence[FittedModel],
-) -> tuple[FittedModel, tuple[Ranked, ...]]:
-    """The fit, or a simpler one that is no worse; and the ranking, with rivals that lose much of their gain put back.
-
-    A port that is not pointwise bends the trajectory: a rival of the search can follow the one that the effect has
-    made, and yet not make one like it. So those that the search has as near as the effect are fitted, unless a
-    ``known`` fit keeps the gain.
-    """
-    own = best.model.terms[-1].key
-    reach = SEPARABLE + max([one.gap for one in ranking if terms[one.number].key == own], default=0.0)
-    near = [
-        one
-        for one in ranking
-        if one.gap < reach and terms[one.number].key != own and tangents.pointwise[terms[one.number].port] is None
-    ]
-    won = prefer.score(best, base)
-    fitted = {fit.model.terms[-1].key: fit for fit in reversed(known) if prefer.score(fit, base) >= _KEPT * won}
-    new = [one for one in near if terms[one.number].key not in fitted]
-    works = [partial(_tried, best, base, terms[one.number], linearised, one.number) for one in new]
-    with memory_kept(base.model.prepared):
-        for fit in fitted_each(best, works, [terms[one.number] for one in new]) if new else ():
-            fitted[fit.model.terms[-1].key] = fit
-    fits = [fitted[terms[one.number].key] for one in near]
-    scores = [prefer.score(fit, base) for fit in fits]
-    behind = {one.number: won - score for one, score in zip(near, scores, strict=True) if score < _KEPT * won}
-    told = sorted((replace(one, gap=max(one.gap, behind.get(one.number, 0.0))) for one in ranking), key=_gap)
-    told = [replace(one, gap=one.gap - told[0].gap) for one in told]
-    simpler = [
-        (score, fit)
-        for score, fit in zip(scores, fits, strict=True)
-        if fit.model.sizes[-1] < best.model.sizes[-1]
-        and score >= won
-        and prefer.by_innovations(best, fit, base, schwarz(best)) >= 0.0
-        and repeats(fit)
-    ]
-    if simpler:
-        return max(simpler, key=lambda one: one[0])[1], tuple(told)
-    bent = [fit for fit in known if tangents.pointwise[fit.model.terms[-1].port] is None]
-    return _by_innovations(best, base, tuple(told), terms, prefer, [*fits, *bent])
-
-
-def _by_innovations(
-    best: FittedModel,
-    base: FittedModel,
-    ranking: tuple[Ranked, ...],
-    terms: tuple[Term, ...],
-    prefer: Preference,
-    fits: Sequence[FittedModel],
-) -> tuple[FittedModel, tuple[Ranked, ...]]:
-    """The fit, or one of another physics that clearly leaves less in coloured noise; and the ranking by that.
-
-    Joint fits take noise for white, and one that follows its slow course wins by it. What is new in each sample tells
-    two physics apart that are alike in the long run.
-    """
-    if not fits:
-        return best, ranking
-    fits = [best, *fits]
-    for fit in fits:
-        another = fit.model.terms[-1].key != best.model.terms[-1].key
-        if another and prefer.by_innovations(best, fit, base) > SEPARABLE and repeats(fit):
-            best = fit
-    own = best.model.terms[-1].key
-    behind: dict[Key, float] = {}
-    for fit in fits:
-        key, gap = fit.model.terms[-1].key, prefer.by_innovations(fit, best, base)
-        behind[key] = min(gap, behind.get(key, gap))
-    told = [
-        replace(one, gap=0.0 if key == own else max(one.gap, behind.get(key, 0.0)))
-        for one, key in ((one, terms[one.number].key) for one in ranking)
-    ]
-    return best, tuple(sorted(told, key=_gap))
-
-
-def _tried(best: FittedModel, base: FittedModel, term: Term, linearised: Linearised, number: int) -> FittedModel:
-    return refined(refitted(best, base, term, linearised, number), base)
-
-
-def _gap(one: Ranked) -> float:
-    return one.gap
 
 
 def _with_tangents(

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.diagnosis import locate
-from mkc_torch.diagnosis.locate import _by_joint_fits
+from mkc_torch.diagnosis import rivals
 from mkc_torch.diagnosis.preference import Preference
 from mkc_torch.diagnosis.ranking import Ranked
+from mkc_torch.diagnosis.rivals import by_joint_fits
 
 BENT, POINTWISE = "rate", "sensor"
 
@@ -52,12 +52,12 @@ def judged(monkeypatch):
             asked.append(one.key)
             return fits[one.key]
 
-        monkeypatch.setattr(locate, "_tried", tried)
-        monkeypatch.setattr(locate, "fitted_each", lambda _base, works, _terms: [work() for work in works])
-        monkeypatch.setattr(locate, "memory_kept", lambda _prepared: nullcontext())
+        monkeypatch.setattr(rivals, "_tried", tried)
+        monkeypatch.setattr(rivals, "fitted_each", lambda _base, works, _terms: [work() for work in works])
+        monkeypatch.setattr(rivals, "memory_kept", lambda _prepared: nullcontext())
         best = fit_of(FRICTION, 100.0, size)
         tangents = SimpleNamespace(pointwise={BENT: None, POINTWISE: torch.ones(1)})
-        found, told = _by_joint_fits(best, fit_of(None, 0.0), ranking, TERMS, None, tangents, Indifferent(**new), known)
+        found, told = by_joint_fits(best, fit_of(None, 0.0), ranking, TERMS, None, tangents, Indifferent(**new), known)
         return found.model.terms[-1].key, {TERMS[one.number].key: one.gap for one in told}, asked
 
     return run
