@@ -67,6 +67,7 @@ def test_several_findings_are_numbered():
         assert line in text.splitlines()
     assert "doubtful A curve has no size to compare." in flat(text)
     assert "together residual" in flat(text)
+    assert "less) Blocks of 4 s with gaps of 1 s." in flat(text)
 
 
 def test_structure_that_remains():

@@ -58,7 +58,8 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis) -> Iterator[tuple[str, s
         yield "held out", f"not measured: {say.plain(f.held_out_note)}"
     else:
         residual = say.improvement(f.held_out.rmse_before, f.held_out.rmse_after, f.held_out.unit)
-        yield "held out", f"{say.gain(f.held_out)}, residual {residual}"
+        note = f"\n{say.plain(f.held_out_note)}" if f.held_out_note else ""
+        yield "held out", f"{say.gain(f.held_out)}, residual {residual}{note}"
     if say.inseparable(f):
         yield "!or", f"{say.rivals(f)}: this recording cannot tell"
     if not f.plausible:

@@ -56,6 +56,8 @@ _BEYOND_DOUBT, _FURTHER = 8.0, 20.0
 """Nats beyond all draws of noise from which unseen blocks are not asked to confirm a first finding, and from which they
 need only to lean the way of a further one."""
 
+_NEW = "The interval takes noise for white; what is new in each sample of these blocks confirms it."
+
 _REST = 0.5
 """A larger share of samples in which nothing moves is a sensor at rest, and is warned of."""
 
@@ -240,9 +242,14 @@ def _taken_up(search: _Search, located: Located, asked: _Asked) -> _Search:
     if located.p_value > asked.level or asked.max_findings == 0:
         return over
     before, after = search.evidence[-1], held_out(located.fit, search.blocks)
-    if not _holds(located, before, after, search.blocks, asked.seed, first=not search.found):
+
+    def holds(fit: FittedModel, evidence: Evidence) -> bool:
+        one = replace(located, fit=fit)
+        return _holds(one, before, evidence, search.blocks, asked.seed, first=not search.found)
+
+    if not holds(located.fit, after):
         return replace(over, unconfirmed=located)
-    fit, after = simplified(located.fit, after, search.blocks)
+    fit, after = simplified(located.fit, after, search.blocks, holds)
     found = (*search.found, replace(located, fit=fit))
     time = located.fit.model.prepared.time
     near = _NEAR * float(time[-1] - time[0])
@@ -278,9 +285,13 @@ def _assembled(
     found, blocks, evidence, first = search.found, search.blocks, search.evidence, search.first
     inliers = (evidence[-1].residual.abs() <= 3.0 * evidence[-1].d) & (final.fit.weights > _REST)
     fits = [base, *(s.fit for s in found)]
+    held = [
+        _held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, asked.seed, generator)
+        for k, s in enumerate(found)
+    ]
     findings = [
         replace(
-            finding_of(s, final, k, *_held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, generator)),
+            finding_of(s, final, k, *held[k]),
             extrapolation=extrapolated(fits[k], s.fit, asked.seed),
             driver_shift=shifted(fits[k].model, s),
         )
@@ -345,9 +356,10 @@ def _held(
     inliers: Bool[Tensor, "N m"],
     term: Term,
     prepared: PreparedSimulation,
+    seed: int,
     generator: torch.Generator,
 ) -> tuple[HeldOut | None, str]:
-    """The held-out evidence of one effect, or why there is none."""
+    """The held-out evidence of one effect and what to know about it, or why there is none."""
     onset, time = term.shape.get("onset"), prepared.time
     if onset is not None:
         shorter = min(int((time < onset).sum()), int((time >= onset).sum()))
@@ -355,7 +367,8 @@ def _held(
             return None, "one side of the step is shorter than two of the held-out blocks"
     difference = after.log_likelihood - before.log_likelihood
     gain, interval = gain_interval(difference, blocks.block, generator)
-    return HeldOut(gain, interval, _rms(before, inliers), _rms(after, inliers), prepared.unit), ""
+    note = _NEW if interval[0] <= 0.0 and confirmed(before, after, blocks, seed) else ""
+    return HeldOut(gain, interval, _rms(before, inliers), _rms(after, inliers), prepared.unit), note
 
 
 def _rms(evidence: Evidence, inliers: Bool[Tensor, "N m"]) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -19,8 +20,12 @@ if TYPE_CHECKING:
 
 __all__ = ["simplified"]
 
+Holds = Callable[[FittedModel, Evidence], bool]
 
-def simplified(fit: FittedModel, evidence: Evidence, blocks: HeldOutBlocks) -> tuple[FittedModel, Evidence]:
+
+def simplified(
+    fit: FittedModel, evidence: Evidence, blocks: HeldOutBlocks, holds: Holds
+) -> tuple[FittedModel, Evidence]:
     """The fit with the simpler form of each effect that unseen blocks do not speak against, and its evidence.
 
     They do where they are clearly less likely by it, with their noise taken for white, and it leaves more that is new
@@ -33,6 +38,7 @@ def simplified(fit: FittedModel, evidence: Evidence, blocks: HeldOutBlocks) -> t
         fit: with all effects that were found.
         evidence: of it, on the blocks.
         blocks: held out.
+        holds: whether a fit, with its evidence, still makes a finding of the last effect.
     """
     for number in range(len(fit.model.terms)):
         start = _simpler(fit, number)
@@ -46,7 +52,8 @@ def simplified(fit: FittedModel, evidence: Evidence, blocks: HeldOutBlocks) -> t
             continue
         after = held_out(other, blocks)
         lost = float((evidence.log_likelihood - after.log_likelihood).sum())
-        if lost <= SEPARABLE or either_way(after.residual, evidence.residual) <= 0.0:
+        as_well = lost <= SEPARABLE or either_way(after.residual, evidence.residual) <= 0.0
+        if as_well and holds(other, after):
             fit, evidence = other, after
     return fit, evidence
 

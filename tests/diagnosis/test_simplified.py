@@ -68,11 +68,15 @@ def fit_of(recording, *effects, start=0.3):
     return fit, held_out(fit, blocks), blocks
 
 
+def always(_fit, _evidence):
+    return True
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_sensors_that_are_alike_share_one_number(seed):
     fit, evidence, blocks = fit_of(recorded(share=(1.0, 1.0), seed=seed), OF["sensor_lag"])
     assert fit.model.sizes == (2,)
-    simple, after = simplified(fit, evidence, blocks)
+    simple, after = simplified(fit, evidence, blocks, always)
     assert simple.model.sizes == (1,)
     lag = simple.model.terms[0].shape["lag"]  # fitted again
     assert lag != 0.5
@@ -83,7 +87,7 @@ def test_sensors_that_are_alike_share_one_number(seed):
 
 def test_where_one_sensor_is_quick_each_keeps_its_own():
     fit, evidence, blocks = fit_of(recorded(share=(1.0, 0.0)), OF["sensor_lag"])
-    kept, after = simplified(fit, evidence, blocks)
+    kept, after = simplified(fit, evidence, blocks, always)
     assert kept is fit
     assert after is evidence
     assert fit.parameters[-2:].tolist() == pytest.approx([1.0, 0.0], abs=0.2)
@@ -92,26 +96,38 @@ def test_where_one_sensor_is_quick_each_keeps_its_own():
 @pytest.mark.parametrize(("exchange", "size"), [((0.2, 0.2), 1), ((0.3, 0.1), 2)])
 def test_what_equals_exchange_is_one_number(exchange, size):
     fit, evidence, blocks = fit_of(recorded(exchange), OF["coupling"], start=0.1)
-    simple, _ = simplified(fit, evidence, blocks)
+    simple, _ = simplified(fit, evidence, blocks, always)
     assert simple.model.sizes == (size,)
     assert simple.parameters[-size:].tolist() == pytest.approx(list(exchange[:size]), abs=0.02)
 
 
+def test_a_form_that_makes_no_finding_any_more_is_not_taken():
+    fit, evidence, blocks = fit_of(recorded((0.2, 0.2)), OF["coupling"], start=0.1)
+    asked = []
+
+    def never(other, after):
+        asked.append((other.model.sizes, len(after.log_likelihood)))
+        return False
+
+    assert simplified(fit, evidence, blocks, never) == (fit, evidence)
+    assert asked == [((1,), N)]
+
+
 def test_an_earlier_effect_is_simplified_beside_a_later_one():
     fit, evidence, blocks = fit_of(recorded((0.3, 0.1), (1.0, 1.0)), OF["sensor_lag"], OF["coupling"], start=0.2)
-    simple, _ = simplified(fit, evidence, blocks)
+    simple, _ = simplified(fit, evidence, blocks, always)
     assert simple.model.sizes == (1, 2)
     assert simple.parameters[simple.model.base :].tolist() == pytest.approx([1.0, 0.3, 0.1], abs=0.1)
 
 
 def test_an_effect_without_a_simpler_form_stays():
     fit, evidence, blocks = fit_of(recorded(), OF["linear_drag"], start=0.0)
-    assert simplified(fit, evidence, blocks) == (fit, evidence)
+    assert simplified(fit, evidence, blocks, always) == (fit, evidence)
 
 
 def test_the_simpler_form_is_written_and_read_like_the_other():
     recording = recorded((0.2, 0.2))
-    simple, _ = simplified(*fit_of(recording, OF["coupling"], start=0.1))
+    simple, _ = simplified(*fit_of(recording, OF["coupling"], start=0.1), always)
     model = model_of(estimate(simple), Bodies())
     again = DiagnosedModel.from_json(model.to_json(), simulation=Bodies())
     torch.testing.assert_close(again(recording)["left"], model(recording)["left"])
