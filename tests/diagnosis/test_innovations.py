@@ -52,9 +52,9 @@ def test_gains_are_of_samples_and_their_sum_is_the_gain():
     assert float(innovation_gains(one, one).abs().max()) == 0.0
 
 
-def test_a_unit_changes_nothing_and_one_wild_sample_little():
-    one, other = wanders(0) + FAST, wanders(0)
+def test_a_unit_changes_nothing_and_wild_samples_little():
+    one, other = wanders(3) + FAST, wanders(3)
     assert either_way(1e3 * one, 1e3 * other) == pytest.approx(either_way(one, other))
     wild = torch.zeros_like(one)
-    wild[700] = 1e6
+    wild[700], wild[300] = 1e6, -20.0
     assert either_way(one + wild, other + wild) == pytest.approx(either_way(one, other), rel=0.1)
