@@ -1,0 +1,6 @@
+"""The magnetometer: a constant ambient field, an offset and a matrix; what else it senses is for effects to say."""
+
+from mkc_torch.simulation.magnetometer.correction import MagnetometerCorrection
+from mkc_torch.simulation.magnetometer.sensor import Magnetometer
+
+__all__ = ["Magnetometer", "MagnetometerCorrection"]

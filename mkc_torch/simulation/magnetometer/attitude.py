@@ -1,0 +1,213 @@
+"""A magnetometer compared by the field's vector, where the attitude is recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.coverage import coverage
+from mkc_torch.ellipsoid import MIN_INFORMATION, NotIdentifiableError
+from mkc_torch.linear import LeastTrimmedSquares
+from mkc_torch.linear._problem import RankDeficientError
+from mkc_torch.nonlinear import GaussianPrior, beside
+from mkc_torch.recording import Recording
+from mkc_torch.simulation.heading import HeadingJump, heading_jumps
+from mkc_torch.simulation.magnetometer.view import AXES, GYRO, INDEPENDENT, QUATERNION, VECTOR, View, thinned
+from mkc_torch.simulation.protocol import Changes, Port
+from mkc_torch.simulation.rotation import from_quaternion
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["AttitudeView", "with_attitude"]
+
+SOFT_IRON = 0.1
+"""Standard deviation, before the data speak, of what soft iron, gains and misalignment add to the unit matrix. Weak
+against a sensor that is turned through all directions; it decides for the identity where a vehicle never tilts."""
+
+_MIN_ROWS = 50
+_REWEIGHTED, _RIDGE = 10, 1e-4
+
+
+class AttitudeView(View):
+    """The vector, turned into the world by a recorded attitude: along the world's field, and in two axes across it.
+
+    Errors of the attitude turn the field, so they enter across it alone, as noise that knows nothing of the motion; but
+    for jumps of the heading, which a gyroscope shows, and which are for an effect at the port "heading" to say.
+    """
+
+    view = "attitude"
+    channels = VECTOR
+    independent = INDEPENDENT
+    parameter_names = (
+        *(f"offset_{a}" for a in AXES),
+        *(f"response_{a}{b}" for a in AXES for b in AXES),
+        "field_tilt_1",
+        "field_tilt_2",
+    )
+
+    def __init__(self, recording: Recording) -> None:
+        super().__init__(recording)
+        self.to_world = from_quaternion(recording.stack(*QUATERNION))
+        self.ports = {
+            "sensor": Port(AXES, self.unit, wanders=True),
+            "field": Port(("east", "north", "up"), self.unit),
+        }
+        jumps = _jumps(recording, self.to_world)
+        number = torch.arange(len(recording))
+        self._since = torch.stack([number > jump.after for jump in jumps], -1).to(self.measured) if jumps else None
+        if jumps:
+            carries = tuple(f"since_{k}" for k in range(1, len(jumps) + 1))
+            self.ports["heading"] = Port(("heading",), "°", carries=carries)
+        self.prior = _matrix_prior(len(self.parameter_names))
+        self.strength, self._ahead = 1.0, self.measured.new_zeros(3)
+        offset, ahead = self._offset_and_field()
+        self.strength = float(torch.linalg.vector_norm(ahead))
+        self._ahead = ahead / self.strength
+        self._across = torch.linalg.svd(self._ahead.unsqueeze(0)).Vh[1:]
+        self._frame = torch.cat([self._ahead.unsqueeze(0), self._across])
+        turned = torch.einsum("kij,i->kj", self.to_world, ahead)
+        offset, response = _response(self.measured, turned, offset)
+        self._unbent = torch.linalg.inv(response)
+        self._to_frame = self._frame @ self.to_world @ self._unbent
+        self._from_world = self.to_world.movedim(1, 0).flatten(1).contiguous()
+        self._full = torch.cat([offset, response.flatten(), offset.new_zeros(2)])
+        self.warnings = (*_turned_too_little(self.corrected(self._full, {})), *_told(jumps, self.time))
+
+    def ambient(self, theta: Float[Tensor, " p"]) -> Float[Tensor, " 3"]:
+        """The world's field."""
+        direction = beside(self._ahead, theta[0]) + theta[12:14] @ self._across
+        return self._strength(theta) * direction / torch.linalg.vector_norm(direction)
+
+    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Tensor:
+        if rows is None:
+            return self._full.clone()
+        if int(rows.sum()) < _MIN_ROWS:
+            raise ValueError(f"{int(rows.sum())} samples are too few for the offset and the response.")
+        turned = torch.einsum("kij,i->kj", self.to_world[rows], self.strength * self._ahead)
+        offset = (self.measured[rows] - turned).median(0).values
+        offset, response = _response(self.measured[rows], turned, offset)
+        return torch.cat([offset, response.flatten(), offset.new_zeros(2)])
+
+    def _offset_and_field(self) -> tuple[Tensor, Tensor]:
+        """Offset and world field by least trimmed squares, the matrix taken for the identity."""
+        to_world, measured = thinned(self.to_world), thinned(self.measured)
+        eye = torch.eye(3, dtype=to_world.dtype).expand(len(to_world), 3, 3)
+        try:
+            coefficients = LeastTrimmedSquares().fit(torch.cat([eye, to_world.mT], -1), measured).coef_
+        except RankDeficientError:
+            raise _one_axis(self.to_world) from None
+        return coefficients[:3], coefficients[3:]
+
+    def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
+        # the simulated vector, not the measured one, goes through the matrix: the noise of what a matrix is fitted to
+        # would shrink it. A fixed matrix takes the difference back into the world.
+        left = self._away(theta, changes) - self._sensed(self._seen(theta, changes), theta)
+        residual = torch.einsum("kij,kj->ki", self._to_frame, left)
+        added = self._field_change(changes)
+        return residual if added is None else residual - added @ self._frame.mT
+
+    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Float[Tensor, "N k"]]:
+        """Beside the others, at the port "heading", 1 from each of the heading's jumps on."""
+        since = {} if self._since is None else {"heading": self._since}
+        return {**super().signals(theta, changes), **since}
+
+    def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
+        return self._sensed(self._seen(theta, {}), theta)
+
+    def _seen(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
+        """The world's field in the body's axes, turned about the vertical by what the recorded heading is off."""
+        ambient = self.ambient(theta)
+        if self._since is None or "heading" not in changes:
+            return (ambient @ self._from_world).unflatten(0, (-1, 3))
+        angle = torch.deg2rad(changes["heading"](self._since)[:, 0])
+        cos, sin = torch.cos(angle), torch.sin(angle)
+        east, north, up = ambient
+        turned = torch.stack([cos * east - sin * north, sin * east + cos * north, up.expand_as(angle)], -1)
+        return torch.einsum("ki,kij->kj", turned, self.to_world)
+
+    def _sensed(self, field: Float[Tensor, "N 3"], theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
+        """What the sensor makes of a field in its axes, less its offset."""
+        return field @ theta[3:12].unflatten(0, (3, 3)).mT
+
+
+def with_attitude(recording: Recording) -> Recording:
+    """The samples that have an attitude; a quaternion of length zero is none."""
+    length = torch.linalg.vector_norm(recording.stack(*QUATERNION), dim=-1)
+    columns = {
+        name: torch.where(length > 0.0, values, torch.nan) if name in QUATERNION else values
+        for name, values in recording.columns.items()
+    }
+    marked = Recording(
+        columns, name=recording.name, units=recording.units, warnings=recording.warnings, labels=recording.labels
+    )
+    return marked.finite(*QUATERNION)
+
+
+def _matrix_prior(count: int) -> GaussianPrior:
+    mean = torch.zeros(count, dtype=torch.float64)
+    precision = torch.zeros(count, dtype=torch.float64)
+    mean[3:12] = torch.eye(3, dtype=torch.float64).flatten()
+    precision[3:12] = SOFT_IRON**-2
+    return GaussianPrior(mean, precision)
+
+
+def _response(measured: Tensor, turned: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Offset and response by reweighted least squares of the measurement on the turned field, near the identity."""
+    response = torch.eye(3, dtype=turned.dtype)
+    ridge = len(turned) * _RIDGE * turned.square().sum(-1).mean()
+    for _ in range(_REWEIGHTED):
+        left = torch.linalg.vector_norm(measured - offset - turned @ response.mT, dim=-1)
+        scale = left.median().clamp(min=1e-9 * turned.abs().max())
+        weight = torch.exp(-0.5 * (left / (2.0 * scale)).square()).unsqueeze(-1)
+        regressors = torch.cat([turned, torch.ones_like(turned[:, :1])], -1)
+        pull = torch.diag(torch.cat([ridge.expand(3), ridge.new_zeros(1)]))
+        gram = regressors.mT @ (weight * regressors) + pull
+        known = torch.cat([torch.eye(3, dtype=turned.dtype), turned.new_zeros(1, 3)])
+        solved = torch.linalg.solve(gram, regressors.mT @ (weight * measured) + pull @ known)
+        response, offset = solved[:3].mT, solved[3]
+    return offset, response
+
+
+def _jumps(recording: Recording, to_world: Tensor) -> tuple[HeadingJump, ...]:
+    """Of the heading, as far as the recording has a gyroscope that knows."""
+    if recording.time is None or not all(name in recording for name in GYRO):
+        return ()
+    return heading_jumps(recording.time, to_world, recording.stack(*GYRO))
+
+
+def _told(jumps: tuple[HeadingJump, ...], time: Tensor) -> tuple[str, ...]:
+    """A sentence about the heading's jumps."""
+    if not jumps:
+        return ()
+    told = ", ".join(
+        f"by {jump.size:.1f}° at {float(time[jump.after]):.1f} s (gyroscope: {jump.turned:.1f}°)" for jump in jumps
+    )
+    return (
+        f"The recorded heading jumps where the gyroscope does not: {told}. The attitude is off by as much, before or "
+        "after, and an effect that seems to begin there may be that.",
+    )
+
+
+def _one_axis(to_world: Tensor) -> NotIdentifiableError:
+    """The refusal of a recording that turns about one axis of the sensor alone, or not at all."""
+    turned = (to_world - to_world.mean(0)).square().sum((0, 1))
+    axis = AXES[int(turned.argmin())]
+    return NotIdentifiableError(
+        f"Not identifiable: the sensor turns about its {axis} axis alone, or not at all, so the offset along +{axis} "
+        "cannot be told from the field. Turn it about another axis too."
+    )
+
+
+def _turned_too_little(field: Tensor) -> tuple[str, ...]:
+    found = coverage(field)
+    if found.information >= MIN_INFORMATION:
+        return ()
+    missing = "; ".join(str(gap) for gap in found.gaps)
+    return (
+        "The ellipsoid alone is not identifiable from this recording; the attitude stands in for the missing turns"
+        + (f". Directions not covered: {missing}." if missing else "."),
+    )

@@ -1,0 +1,46 @@
+"""The field that a calibrated magnetometer saw, in any recording of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from mkc_torch.recording import Recording
+from mkc_torch.simulation.magnetometer.matrix import MATRIX_OF_VIEW
+from mkc_torch.simulation.magnetometer.view import AXES
+from mkc_torch.simulation.protocol import Changes, Port
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+__all__ = ["MagnetometerCorrection"]
+
+
+class MagnetometerCorrection:
+    """``matrix @ (measured - change - offset)`` on any recording of the sensor.
+
+    Args:
+        state: of the view that was fitted.
+        recording: with ``mag_x``, ``mag_y``, ``mag_z``.
+    """
+
+    def __init__(self, state: Mapping[str, Any], recording: Recording) -> None:
+        if state.get("view") not in MATRIX_OF_VIEW:
+            raise ValueError(f"The model's view is {state.get('view')!r} and not one of {', '.join(MATRIX_OF_VIEW)}.")
+        self._matrix = MATRIX_OF_VIEW[state["view"]]
+        self.measured = recording.magnetometer()
+        self.recording = recording
+        known = recording.time
+        self.time = torch.arange(len(recording), dtype=torch.float64) if known is None else known
+        self.ports = {"sensor": Port(AXES, recording.units["mag_x"])}
+
+    def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
+        away = self.measured - theta[:3]
+        if "sensor" in changes:
+            away = away - changes["sensor"](away)
+        field = away @ self._matrix(theta).mT
+        time = {} if self.recording.time is None else {"time": self.recording.time}
+        return time | dict(zip(("field_x", "field_y", "field_z"), field.unbind(-1), strict=True))

@@ -1,0 +1,160 @@
+"""A magnetometer compared by the field's vector within seconds, along which a gyroscope turns it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.ellipsoid import EllipsoidFit, NotIdentifiableError
+from mkc_torch.nonlinear import GaussianPrior
+from mkc_torch.recording import Recording
+from mkc_torch.simulation.magnetometer.matrix import SYMMETRIC
+from mkc_torch.simulation.magnetometer.norm import NormView
+from mkc_torch.simulation.magnetometer.view import AXES, GYRO, INDEPENDENT, VECTOR, View
+from mkc_torch.simulation.protocol import Changes, Port
+from mkc_torch.simulation.rotation import rotation_since
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["GyroView"]
+
+WINDOW = 2.0
+"""Length in s over which a gyroscope's rotation is trusted; each window has its own unknown direction of the field."""
+
+GYRO_BIAS = 0.02
+"""Standard deviation of a gyroscope's bias in rad/s before the data speak."""
+
+_REWEIGHTED, _TURNED = 10, 1e-3
+
+
+class GyroView(View):
+    """The vector, turned by the gyroscope to the first sample of its window: along that window's field, and across."""
+
+    view = "gyro"
+    channels = VECTOR
+    independent = INDEPENDENT
+    parameter_names = (*NormView.parameter_names, *(f"gyro_bias_{a}" for a in AXES))
+
+    def __init__(self, recording: Recording) -> None:
+        super().__init__(recording)
+        self.ports = {
+            "sensor": Port(AXES, self.unit, wanders=True, pointwise=False),
+            "field": Port(("strength",), self.unit, pointwise=False),
+        }
+        self.prior = _bias_prior()
+        self.window, first = _windows(self.time)
+        self.turned = rotation_since(self.time, recording.stack(*GYRO), first)
+        self.summed = _summed(self.turned, self.time, first)
+        self.count = int(self.window.max()) + 1
+        try:
+            fit = self._ellipsoid(None)
+        except NotIdentifiableError as error:
+            offset = self._offset_by_turns(error)
+            self.strength = float(torch.linalg.vector_norm(self.measured - offset, dim=-1).median())
+            self._full = torch.cat([offset, offset.new_tensor([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]), offset.new_zeros(3)])
+            self.warnings = (f"The gyroscope stands in for turns that are missing: {error}",)
+        else:
+            self.strength = float(fit.radius_)
+            self._full = self._theta(fit)
+
+    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Tensor:
+        return self._full.clone() if rows is None else self._theta(self._ellipsoid(rows))
+
+    def _offset_by_turns(self, error: NotIdentifiableError) -> Tensor:
+        """The offset that leaves the field of each window steady, by reweighted least squares; the matrix is 1.
+
+        Raises:
+            NotIdentifiableError: ``error``, where the turns do not determine the offset either.
+        """
+        seen = torch.einsum("kij,kj->ki", self.turned, self.measured)
+        weight = seen.new_ones(len(seen), 1)
+        offset = seen.new_zeros(3)
+        for _ in range(_REWEIGHTED):
+            mean = self._window_mean(seen, weight)[self.window]
+            turned = self._window_mean(self.turned.flatten(1), weight)[self.window].unflatten(-1, (3, 3))
+            regressors, target = (self.turned - turned), seen - mean
+            gram = torch.einsum("kai,k,kaj->ij", regressors, weight[:, 0], regressors)
+            known = torch.linalg.eigvalsh(gram)
+            if not bool(known[0] > _TURNED * known[-1]):
+                raise error
+            offset = torch.linalg.lstsq(
+                gram, torch.einsum("kai,k,ka->i", regressors, weight[:, 0], target).unsqueeze(-1)
+            ).solution.squeeze(-1)
+            left = torch.linalg.vector_norm(target - regressors @ offset, dim=-1, keepdim=True)
+            weight = torch.exp(-0.5 * (left / (2.0 * left.median().clamp(min=1e-9))).square()).clamp(min=1e-12)
+        return offset
+
+    def _theta(self, fit: EllipsoidFit) -> Tensor:
+        matrix = fit.calibration_matrix_ * (self.strength / float(fit.radius_))
+        return torch.cat([fit.center_, torch.stack([matrix[i, j] for i, j in SYMMETRIC]), fit.center_.new_zeros(3)])
+
+    def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
+        along = self._steadied(theta, self.corrected(theta, changes))
+        middle = self._window_mean(along, self._weights(along.detach()))
+        direction = middle / torch.linalg.vector_norm(middle, dim=-1, keepdim=True)
+        strength, added = self._strength(theta), self._field_change(changes)
+        ambient = (strength if added is None else strength + added) * direction[self.window]
+        frame = _frame(direction.detach())[self.window]
+        return torch.einsum("kij,kj->ki", frame, along - ambient)
+
+    def _steadied(self, theta: Tensor, field: Tensor) -> Tensor:
+        """The calibrated field in the axes of its window's first sample."""
+        along = torch.einsum("kij,kj->ki", self.turned, field)
+        # a bias b, small, turns what has been summed up since the window's first sample by the integral of turned · b
+        return along - torch.linalg.cross(self.summed @ theta[9:12], along)
+
+    def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
+        along = self._steadied(theta, self.corrected(theta, {}))
+        middle = self._window_mean(along, self._weights(along.detach()))
+        direction = middle / torch.linalg.vector_norm(middle, dim=-1, keepdim=True)
+        field = torch.einsum("kij,ki->kj", self.turned, self._strength(theta) * direction[self.window])
+        return torch.linalg.solve(self.matrix(theta), field.mT).mT
+
+    def _window_mean(self, values: Tensor, weight: Tensor) -> Tensor:
+        total = values.new_zeros(self.count, values.shape[-1]).index_add(0, self.window, weight * values)
+        return total / weight.new_zeros(self.count, 1).index_add(0, self.window, weight)[:, :1]
+
+    def _weights(self, along: Tensor) -> Tensor:
+        """Of each sample in its window's mean: one step of Welsch's estimator from a Huber mean, as constants."""
+        weight = along.new_ones(len(along), 1)
+        for cut in (2.0, 1.0, 1.0):
+            distance = torch.linalg.vector_norm(
+                along - self._window_mean(along, weight)[self.window], dim=-1, keepdim=True
+            )
+            scale = distance.median() + 1e-9 * self.strength
+            weight = 1.0 / torch.clamp(distance / (cut * scale), min=1.0).square()
+        return weight
+
+
+def _frame(direction: Float[Tensor, "W 3"]) -> Float[Tensor, "W 3 3"]:
+    """Orthonormal axes as rows, the first along each direction."""
+    smallest = torch.nn.functional.one_hot(direction.abs().argmin(-1), 3).to(direction)
+    second = torch.linalg.cross(direction, smallest)
+    second = second / torch.linalg.vector_norm(second, dim=-1, keepdim=True)
+    return torch.stack([direction, second, torch.linalg.cross(direction, second)], -2)
+
+
+def _windows(time: Tensor) -> tuple[Tensor, Tensor]:
+    """The window of each sample, and the first sample of that window; a gap of more than a window starts a new one."""
+    number = torch.floor((time - time[0]) / WINDOW).long()
+    _, window, counts = torch.unique_consecutive(number, return_inverse=True, return_counts=True)
+    start = torch.cat([counts.new_zeros(1), counts.cumsum(0)[:-1]])
+    return window, start[window]
+
+
+def _bias_prior() -> GaussianPrior:
+    mean = torch.zeros(12, dtype=torch.float64)
+    precision = torch.zeros(12, dtype=torch.float64)
+    precision[9:] = GYRO_BIAS**-2
+    return GaussianPrior(mean, precision)
+
+
+def _summed(turned: Tensor, time: Tensor, first: Tensor) -> Tensor:
+    """Integral of the rotation over time since the first sample of each window, (N, 3, 3), by trapezoids."""
+    step = 0.5 * (turned[1:] + turned[:-1]) * time.diff()[:, None, None]
+    total = torch.cat([torch.zeros_like(turned[:1]), step.cumsum(0)])
+    # between windows the frames differ, but what was summed before a window's first sample is taken off
+    return total - total[first]

@@ -1,0 +1,23 @@
+"""Calibration matrices of a magnetometer's parameters, by what it is compared with."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["MATRIX_OF_VIEW", "SYMMETRIC"]
+
+SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Entries of a symmetric matrix, in the order of its parameters."""
+
+
+def _symmetric(theta: Tensor) -> Tensor:
+    xx, yy, zz, xy, xz, yz = theta[3:9].unbind()
+    return torch.stack([torch.stack([xx, xy, xz]), torch.stack([xy, yy, yz]), torch.stack([xz, yz, zz])])
+
+
+def _inverse(theta: Tensor) -> Tensor:
+    return torch.linalg.inv(theta[3:12].unflatten(0, (3, 3)))
+
+
+MATRIX_OF_VIEW = {"norm": _symmetric, "gyro": _symmetric, "attitude": _inverse}

@@ -1,0 +1,72 @@
+"""The magnetometer as a simulation: which view of a recording is compared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mkc_torch.calibration import prepared
+from mkc_torch.ellipsoid import NotIdentifiableError
+from mkc_torch.recording import Recording
+from mkc_torch.simulation.magnetometer.attitude import AttitudeView, with_attitude
+from mkc_torch.simulation.magnetometer.gyro import GyroView
+from mkc_torch.simulation.magnetometer.norm import NormView
+from mkc_torch.simulation.magnetometer.view import ACCEL, AXES, GYRO, QUATERNION
+
+__all__ = ["Magnetometer"]
+
+
+@dataclass(frozen=True)
+class Magnetometer:
+    """``matrix @ (measured - offset)`` is the ambient field in the sensor's axes, of constant strength and direction.
+
+    What is compared depends on the recording. With an attitude, the vector with the world's field. Otherwise, its
+    length with the field's, as a distance in the units of the measurement; and where the turns of the sensor do not
+    determine it from the length, but there is a gyroscope, the vector with the field of the same two seconds turned
+    along.
+
+    Attributes:
+        use: "attitude", "norm" or "gyro"; None takes the first of these that the recording allows. The length goes
+            before the gyroscope because the drift of a gyroscope enters the vector as structure of its own.
+
+    Example:
+        >>> from mkc_torch.demo import simulated_recording
+        >>> prepared_simulation = Magnetometer().prepare(simulated_recording()[0])
+        >>> prepared_simulation.channels, prepared_simulation.unit
+        (('norm',), 'µT')
+    """
+
+    use: str | None = None
+    name: str = "magnetometer"
+
+    @property
+    def joins_experiments(self) -> bool:
+        return False
+
+    @property
+    def columns(self) -> frozenset[str]:
+        return frozenset({"time", *(f"mag_{a}" for a in AXES), *GYRO, *ACCEL, *QUATERNION})
+
+    def prepare(self, recording: Recording) -> NormView | AttitudeView | GyroView:
+        """The magnetometer of a recording.
+
+        Raises:
+            MissingColumnError: a column of the magnetometer, or of what ``use`` asks for, is not there.
+            RecordingError: too few usable samples.
+            NotIdentifiableError: no view determines the sensor; the message names the directions that are missing.
+            ValueError: ``use`` is none of the three.
+        """
+        if self.use not in (None, "attitude", "gyro", "norm"):
+            raise ValueError(f"Expected argument `use` to be 'attitude', 'gyro', 'norm' or None but got {self.use!r}.")
+        has_attitude = all(name in recording for name in QUATERNION)
+        has_gyro = all(name in recording for name in GYRO) and recording.time is not None
+        if self.use == "attitude" or (self.use is None and has_attitude):
+            return AttitudeView(prepared(with_attitude(recording)))
+        if self.use == "gyro":
+            recording["time"]
+            return GyroView(prepared(recording.finite(*GYRO)))
+        try:
+            return NormView(prepared(recording))
+        except NotIdentifiableError:
+            if self.use == "norm" or not has_gyro:
+                raise
+        return GyroView(prepared(recording.finite(*GYRO)))

@@ -1,0 +1,123 @@
+"""What all comparisons of a magnetometer share: the measured field and the sensor's model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.ellipsoid import EllipsoidFit, NotIdentifiableError
+from mkc_torch.linear import LeastTrimmedSquares
+from mkc_torch.nonlinear import beside
+from mkc_torch.recording import Recording
+from mkc_torch.simulation.magnetometer.matrix import MATRIX_OF_VIEW
+from mkc_torch.simulation.protocol import Changes, FreeChange, Port
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["ACCEL", "AXES", "GYRO", "INDEPENDENT", "QUATERNION", "VECTOR", "View", "length_of", "thinned"]
+
+QUATERNION = ("q_w", "q_x", "q_y", "q_z")
+GYRO = ("gyro_x", "gyro_y", "gyro_z")
+ACCEL = ("accel_x", "accel_y", "accel_z")
+AXES = ("x", "y", "z")
+
+VECTOR = ("along", "across_1", "across_2")
+"""Channels of a compared vector."""
+
+INDEPENDENT = (True, False, False)
+"""The error of a rotation is across the field, in residual and signal alike."""
+
+_AT_REST = 0.1
+_ENOUGH = 1500
+
+
+class View:
+    """The measured field, the sensor's model, and what is compared."""
+
+    name = "magnetometer"
+    view: str
+    ports: dict[str, Port]
+    strength: float
+    bounds: tuple[Tensor, Tensor] | None = None
+
+    def __init__(self, recording: Recording) -> None:
+        self.recording = recording
+        self.measured = recording.magnetometer()
+        _refuse_at_rest(self.measured)
+        self.unit = recording.units["mag_x"]
+        self.state = {"view": self.view}
+        self.warnings: tuple[str, ...] = ()
+
+    @cached_property
+    def time(self) -> Float[Tensor, " N"]:
+        known = self.recording.time
+        return torch.arange(len(self.recording), dtype=torch.float64) if known is None else known
+
+    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Float[Tensor, "N 3"]]:  # noqa: ARG002
+        """At the port "sensor", the simulated field as the sensor's own axes and gains show it."""
+        # not the measured one: its noise is the residual's too, and would pass for a nonlinearity
+        return {"sensor": self.simulated(theta)}
+
+    def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
+        """The measurement as simulated, less its offset."""
+        raise NotImplementedError
+
+    def matrix(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "3 3"]:
+        """Calibration matrix of the parameters."""
+        return MATRIX_OF_VIEW[self.view](theta)
+
+    def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
+        """The calibrated field, with what changes the sensor taken off the measurement."""
+        return self._away(theta, changes) @ self.matrix(theta).mT
+
+    def _away(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
+        """The measurement from the offset, with what changes the sensor taken off it."""
+        away = beside(self.measured, theta[0])
+        if "sensor" in changes:
+            change = changes["sensor"]
+            away = away - change(
+                torch.zeros_like(self.measured) if isinstance(change, FreeChange) else self.simulated(theta)
+            )
+        return away - theta[:3]
+
+    def _field_change(self, changes: Changes) -> Tensor | None:
+        """What is added to the field, (N, channels of the port), if anything."""
+        return changes["field"](self.measured.new_zeros(len(self.measured), 0)) if "field" in changes else None
+
+    def _strength(self, theta: Float[Tensor, " p"]) -> Float[Tensor, ""]:
+        """Length of the field."""
+        return beside(self.measured.new_tensor(self.strength), theta[0])
+
+    def _ellipsoid(self, rows: Tensor | None) -> EllipsoidFit:
+        points = self.measured if rows is None else self.measured[rows]
+        return EllipsoidFit(LeastTrimmedSquares(), finish=None).fit(thinned(points))
+
+
+def length_of(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
+    return vectors.square().sum(0).sqrt()
+
+
+def thinned(values: Float[Tensor, N * rest]) -> Float[Tensor, n * rest]:
+    """Evenly, to as many samples as a place to start a fit from needs."""
+    return values[:: max(1, len(values) // _ENOUGH)]
+
+
+def _refuse_at_rest(measured: Tensor) -> None:
+    """Refuse a sensor that does not turn: a ball of noise would pass for a small ellipsoid.
+
+    Raises:
+        NotIdentifiableError: the measurements lie close together, and those that follow one another no closer.
+    """
+    middle = measured.median(0).values
+    spread = (measured - middle).square().sum(-1).median()
+    apart = measured.diff(dim=0).square().sum(-1).median()
+    if bool(spread < (_AT_REST * torch.linalg.vector_norm(middle)).square()) and bool(apart > 0.5 * spread):
+        raise NotIdentifiableError(
+            f"Not identifiable: the sensor is at rest, its measurements stay within {float(spread.sqrt()):.3g} of one "
+            "another. Turn the sensor through all directions while recording."
+        )
