@@ -17,7 +17,7 @@ from mkc_torch.diagnosis.density_check import density_warnings
 from mkc_torch.diagnosis.diagnosed_model import model_of
 from mkc_torch.diagnosis.drivers import Drivers, find_drivers
 from mkc_torch.diagnosis.estimate import Estimate, estimate
-from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, blocks_of, confirmed, gain_interval, held_out
+from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
 from mkc_torch.diagnosis.extrapolation import extrapolated, extrapolation_warning
 from mkc_torch.diagnosis.findings import finding_of
 from mkc_torch.diagnosis.innovations import innovation_gain
@@ -55,8 +55,6 @@ _WIDER, _NEAR = 3.0, 0.05
 _BEYOND_DOUBT, _FURTHER = 8.0, 20.0
 """Nats beyond all draws of noise from which unseen blocks are not asked to confirm a first finding, and from which they
 need only to lean the way of a further one."""
-
-_NEW = "The interval takes noise for white; what is new in each sample of these blocks confirms it."
 
 _REST = 0.5
 """A larger share of samples in which nothing moves is a sensor at rest, and is warned of."""
@@ -170,7 +168,13 @@ def _holds(
         plain = located.beyond > _BEYOND_DOUBT
         price = 0.5 * located.fit.model.sizes[-1] * math.log(len(after.log_likelihood))
         return better or plain or innovation_gain(before.residual, after.residual) > price
-    return (better and located.beyond > _FURTHER) or confirmed(before, after, blocks, seed)
+    return (better and located.beyond > _FURTHER) or _confirmed(before, after, blocks, seed)
+
+
+def _confirmed(before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int) -> bool:
+    difference = after.log_likelihood - before.log_likelihood
+    _, (low, _) = gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))
+    return low > 0.0
 
 
 def _base(prepared: PreparedSimulation) -> FittedModel:
@@ -285,13 +289,9 @@ def _assembled(
     found, blocks, evidence, first = search.found, search.blocks, search.evidence, search.first
     inliers = (evidence[-1].residual.abs() <= 3.0 * evidence[-1].d) & (final.fit.weights > _REST)
     fits = [base, *(s.fit for s in found)]
-    held = [
-        _held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, asked.seed, generator)
-        for k, s in enumerate(found)
-    ]
     findings = [
         replace(
-            finding_of(s, final, k, *held[k]),
+            finding_of(s, final, k, *_held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, generator)),
             extrapolation=extrapolated(fits[k], s.fit, asked.seed),
             driver_shift=shifted(fits[k].model, s),
         )
@@ -356,10 +356,9 @@ def _held(
     inliers: Bool[Tensor, "N m"],
     term: Term,
     prepared: PreparedSimulation,
-    seed: int,
     generator: torch.Generator,
 ) -> tuple[HeldOut | None, str]:
-    """The held-out evidence of one effect and what to know about it, or why there is none."""
+    """The held-out evidence of one effect, or why there is none."""
     onset, time = term.shape.get("onset"), prepared.time
     if onset is not None:
         shorter = min(int((time < onset).sum()), int((time >= onset).sum()))
@@ -367,8 +366,7 @@ def _held(
             return None, "one side of the step is shorter than two of the held-out blocks"
     difference = after.log_likelihood - before.log_likelihood
     gain, interval = gain_interval(difference, blocks.block, generator)
-    note = _NEW if interval[0] <= 0.0 and confirmed(before, after, blocks, seed) else ""
-    return HeldOut(gain, interval, _rms(before, inliers), _rms(after, inliers), prepared.unit), note
+    return HeldOut(gain, interval, _rms(before, inliers), _rms(after, inliers), prepared.unit), ""
 
 
 def _rms(evidence: Evidence, inliers: Bool[Tensor, "N m"]) -> float:

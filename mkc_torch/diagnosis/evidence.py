@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.innovations import innovation_gains
 from mkc_torch.diagnosis.refit import FittedModel, fitted
 from mkc_torch.diagnosis.side_by_side import each
 from mkc_torch.functional import mkc_nll
@@ -18,7 +17,7 @@ from mkc_torch.functional import mkc_nll
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Evidence", "HeldOutBlocks", "blocks_of", "confirmed", "gain_interval", "held_out", "scored"]
+__all__ = ["Evidence", "HeldOutBlocks", "blocks_of", "gain_interval", "held_out", "scored"]
 
 FOLDS = 5
 BLOCKS_PER_FOLD = 5
@@ -104,23 +103,6 @@ def held_out(fit: FittedModel, blocks: HeldOutBlocks) -> Evidence:
 def scored(residual: Tensor, sigma: Tensor, d: Tensor, bound: Tensor) -> Float[Tensor, " N"]:
     """Log-likelihood of each sample, over its channels."""
     return -mkc_nll(residual, sigma, d, bound).sum(-1)
-
-
-def confirmed(before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int) -> bool:
-    """Whether unseen blocks confirm what the latter has more: its interval of the gain leaves out zero.
-
-    That of the likelihood, where noise counts as white; or, if that leans the same way, of what is new in each sample.
-    """
-    likelier = after.log_likelihood - before.log_likelihood
-    if _above_zero(likelier, blocks, seed):
-        return True
-    leans = bool(after.log_likelihood.mean() > before.log_likelihood.mean())
-    return leans and _above_zero(innovation_gains(before.residual, after.residual), blocks, seed)
-
-
-def _above_zero(difference: Float[Tensor, " N"], blocks: HeldOutBlocks, seed: int) -> bool:
-    _, (low, _) = gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))
-    return low > 0.0
 
 
 def gain_interval(

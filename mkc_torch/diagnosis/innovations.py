@@ -13,7 +13,7 @@ from mkc_torch.order_statistic import robust_scale
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["either_way", "innovation_gain", "innovation_gains"]
+__all__ = ["either_way", "innovation_gain"]
 
 _CLIPPED = 3.0
 
@@ -21,8 +21,8 @@ _NEAR = 10
 """Samples to either side whose median a sample is compared with, to tell an outlier from a course."""
 
 
-def innovation_gains(before: Float[Tensor, "N m"], after: Float[Tensor, "N m"]) -> Float[Tensor, " N"]:
-    """Gain of each sample in nats, over its channels.
+def innovation_gain(before: Float[Tensor, "N m"], after: Float[Tensor, "N m"]) -> float:
+    """Gain in nats of the latter.
 
     Both residuals, clipped around their running medians, are filtered by the autoregression of the latter; what is left
     of each is compared by squares, which end at three scales (Hampel et al., "Robust Statistics", 1986, 2.6).
@@ -33,12 +33,12 @@ def innovation_gains(before: Float[Tensor, "N m"], after: Float[Tensor, "N m"]) 
         course + (residual - course).clamp(-reach, reach)
         for residual, course in zip((before, after), courses, strict=True)
     ]
-    total = torch.zeros_like(after[:, 0])
+    total = 0.0
     for one, other in zip(*(values.unbind(-1) for values in tame), strict=True):
         coefficients = autoregression(other)
         new = torch.stack([filtered(one, coefficients), filtered(other, coefficients)])
-        size = (new / robust_scale(new[1].unsqueeze(-1))).square().clamp(max=_CLIPPED**2)
-        total = total + 0.5 * (size[0] - size[1])
+        size = (new / robust_scale(new[1].unsqueeze(-1))).square().clamp(max=_CLIPPED**2).sum(-1)
+        total += 0.5 * float(size[0] - size[1])
     return total
 
 
@@ -46,11 +46,6 @@ def _running_median(values: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
     near = min(_NEAR, len(values) - 1)
     padded = torch.nn.functional.pad(values.mT, (near, near), mode="reflect")
     return padded.unfold(-1, 2 * near + 1, 1).median(-1).values.mT
-
-
-def innovation_gain(before: Float[Tensor, "N m"], after: Float[Tensor, "N m"]) -> float:
-    """The sum of :func:`innovation_gains`."""
-    return float(innovation_gains(before, after).sum())
 
 
 def either_way(one: Float[Tensor, "N m"], other: Float[Tensor, "N m"]) -> float:

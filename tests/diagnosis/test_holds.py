@@ -9,8 +9,7 @@ import torch
 from mkc_torch.diagnosis.evidence import blocks_of
 from mkc_torch.diagnosis.innovations import innovation_gain
 
-diagnose = importlib.import_module("mkc_torch.diagnosis.diagnose")
-holds = diagnose._holds
+holds = importlib.import_module("mkc_torch.diagnosis.diagnose")._holds
 N = 2000
 BLOCKS = blocks_of(N, 1)
 
@@ -59,32 +58,6 @@ def test_what_is_plain_beside_a_wander_counts_though_blocks_see_the_wander_alone
     assert innovation_gain(before.residual, after.residual) > 50.0
     assert holds(located(0.0), before, after, BLOCKS, 0, first=True)
     assert not holds(located(0.0), before, after, BLOCKS, 0, first=False)
-
-
-def test_a_further_one_may_be_confirmed_by_what_is_new_in_unseen_samples_if_they_lean_its_way():
-    before, after = walks(0.5)
-    leans = SimpleNamespace(log_likelihood=evidence(0.01, 1.0).log_likelihood, residual=after.residual)
-    assert holds(located(0.0), before, leans, BLOCKS, 0, first=False)
-    before, after = walks(0.02)
-    leans = SimpleNamespace(log_likelihood=leans.log_likelihood, residual=after.residual)
-    assert not holds(located(0.0), before, leans, BLOCKS, 0, first=False)
-
-
-def told(before, after):
-    """The note beside held-out evidence."""
-    term, prepared = SimpleNamespace(shape={}), SimpleNamespace(time=torch.arange(float(N)), unit="")
-    every = torch.ones(N, 1, dtype=torch.bool)
-    return diagnose._held(before, after, BLOCKS, every, term, prepared, 0, torch.Generator().manual_seed(0))
-
-
-def test_where_an_interval_takes_in_zero_it_is_said_what_confirms():
-    before, after = walks(0.5)
-    leans = SimpleNamespace(log_likelihood=evidence(0.01, 1.0).log_likelihood, residual=after.residual)
-    held, note = told(before, leans)
-    assert held.confidence_interval[0] < 0.0 < held.log_likelihood_gain
-    assert "what is new in each sample" in note
-    assert told(before, SimpleNamespace(log_likelihood=leans.log_likelihood, residual=before.residual))[1] == ""
-    assert told(NOTHING, evidence(0.5, 1.0))[1] == ""
 
 
 def test_what_is_worth_less_than_its_parameters_does_not():
