@@ -159,8 +159,10 @@ class PreparedDynamics:
                 clock=self.clock,
                 run=self.run[self.clock.before],
             )
-        own = {"own": self.channels[0]}
-        return places | {"output": Port(self.channels, self.unit, pointwise=False, parts=own, run=self.run)}
+        parts = {"own": self.channels[0], **{f"output {name}": name for name in self.channels[1:]}}
+        units = {part: self._unit_of(name) for part, name in parts.items()}
+        output = Port(self.channels, self.unit, pointwise=False, parts=parts, part_units=units, run=self.run)
+        return places | {"output": output}
 
     def _parts(self, state: str) -> dict[str, str]:
         """What an effect on the rate of a state can refer to."""

@@ -71,6 +71,7 @@ def test_the_heaters_lag_and_what_passes_between_them_are_named(loaded):
     lag, coupling = proof.diagnosis.findings
     assert (lag.effect, coupling.effect) == ("sensor_lag", "coupling")
     assert coupling.p_value <= 0.05
+    assert lag.region is None or lag.region.unit == "°C"
     assert coupling.held_out.confidence_interval[0] > 0.0
     assert [p.name for p in coupling.parameters] == ["exchange"]
     before, after = proof.root_mean_square()

@@ -385,6 +385,8 @@ class TestPorts:
         assert pump.sizes["own"] == pytest.approx((0.3, 0.4), rel=0.1)
         assert ports["output"].channels == ("upper", "lower")
         assert ports["output"].unit == "m"
+        units = {name: ports["output"].part_units[part] for part, name in ports["output"].parts.items()}
+        assert units == {"upper": "m", "lower": "m"}
 
     def test_states_of_different_units_exchange_nothing(self):
         time = np.arange(50) * 0.1
