@@ -170,7 +170,7 @@ def _named(
         clear = tangents.slow is not None and not (behind and behind[0] < SEPARABLE)
         least = 0.0 if clear else KEPT * max(prefer.score(best, base), 0.0)
         gain = other.log_likelihood - base.log_likelihood if clear else prefer.score(other, base)
-        kept = gain > least or (bends and prefer.by_innovations(best, other, base) > 0.0)
+        kept = gain > least or (bends and prefer.by_innovations(best, other) > 0.0)
         if kept and repeats(other):
             best = other
     best.model.residual(best.parameters)  # to be the newest that a simulation remembers

@@ -75,18 +75,16 @@ class Preference:
         score = gain - schwarz(fit) * fit.model.sizes[-1]
         return score - self.handicap(fit.model.terms[-1], gain)
 
-    def by_innovations(self, one: FittedModel, other: FittedModel, base: FittedModel, price: float = AKAIKE) -> float:
+    def by_innovations(self, one: FittedModel, other: FittedModel, price: float = AKAIKE) -> float:
         """Nats by which the other of two fits is preferred, their noise taken for coloured: as a joint fit does not.
 
-        Each pays its handicap, and a price for every number it has.
+        Each pays a price for every number it has. 0 where one has a handicap, which is meant for likelihoods.
         """
-        gain = either_way(one.residual, other.residual)
-        costs = [
-            price * (fit.model.sizes[-1] + _fitted_numbers(fit.model.terms[-1]))
-            + self.handicap(fit.model.terms[-1], fit.log_likelihood - base.log_likelihood)
-            for fit in (one, other)
-        ]
-        return gain - costs[1] + costs[0]
+        terms = [fit.model.terms[-1] for fit in (one, other)]
+        if any(self.handicap(term, 1.0) > 0.0 for term in terms):
+            return 0.0
+        sizes = [fit.model.sizes[-1] + _fitted_numbers(fit.model.terms[-1]) for fit in (one, other)]
+        return either_way(one.residual, other.residual) - price * (sizes[1] - sizes[0])
 
     def _alike(self, course: Float[Tensor, " N"]) -> float:
         """Largest correlation with one of the known drivers, either sign."""

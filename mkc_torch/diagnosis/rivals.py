@@ -61,18 +61,17 @@ def by_joint_fits(
         for score, fit in zip(scores, fits, strict=True)
         if fit.model.sizes[-1] < best.model.sizes[-1]
         and score >= won
-        and prefer.by_innovations(best, fit, base, schwarz(best)) >= 0.0
+        and prefer.by_innovations(best, fit, schwarz(best)) >= 0.0
         and repeats(fit)
     ]
     if simpler:
         return max(simpler, key=lambda one: one[0])[1], tuple(told)
     bent = [fit for fit in known if tangents.pointwise[fit.model.terms[-1].port] is None]
-    return _by_innovations(best, base, tuple(told), terms, prefer, [*fits, *bent])
+    return _by_innovations(best, tuple(told), terms, prefer, [*fits, *bent])
 
 
 def _by_innovations(
     best: FittedModel,
-    base: FittedModel,
     ranking: tuple[Ranked, ...],
     terms: tuple[Term, ...],
     prefer: Preference,
@@ -88,12 +87,12 @@ def _by_innovations(
     fits = [best, *fits]
     for fit in fits:
         another = fit.model.terms[-1].key != best.model.terms[-1].key
-        if another and prefer.by_innovations(best, fit, base) > SEPARABLE and repeats(fit):
+        if another and prefer.by_innovations(best, fit) > SEPARABLE and repeats(fit):
             best = fit
     own = best.model.terms[-1].key
     behind: dict[Key, float] = {}
     for fit in fits:
-        key, gap = fit.model.terms[-1].key, prefer.by_innovations(fit, best, base)
+        key, gap = fit.model.terms[-1].key, prefer.by_innovations(fit, best)
         behind[key] = min(gap, behind.get(key, gap))
     told = [
         replace(one, gap=0.0 if key == own else max(one.gap, behind.get(key, 0.0)))

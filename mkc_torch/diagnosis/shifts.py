@@ -34,6 +34,9 @@ _FEWEST = 200
 _MANY = 0.1
 """A larger share of copies that gain as much is warned of."""
 
+_AS_MUCH = 0.999
+"""Share of the gain that a copy has to have: those of a ramp are the ramp again, to rounding."""
+
 
 def shifted(model: JointModel, located: Located) -> DriverShift | None:
     """Compare the gain of an effect with its gains when its driver comes earlier or later.
@@ -74,7 +77,9 @@ def shifted(model: JointModel, located: Located) -> DriverShift | None:
     steps = [most * k // _COPIES for k in range(-_COPIES, _COPIES + 1) if k]
     found = torch.cat([gains(steps[k : k + _AT_ONCE]) for k in range(0, len(steps), _AT_ONCE)])
     time = model.prepared.time
-    return DriverShift(len(steps), int((found >= gains([0])).sum()), most * float(time[-1] - time[0]) / (N - 1))
+    return DriverShift(
+        len(steps), int((found >= _AS_MUCH * gains([0])).sum()), most * float(time[-1] - time[0]) / (N - 1)
+    )
 
 
 def _moved(term: Term, by: int) -> Term:

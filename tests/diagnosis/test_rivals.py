@@ -23,7 +23,7 @@ class Indifferent(Preference):
     def handicap(self, _term, _gain):
         return 0.0
 
-    def by_innovations(self, one, other, _base, _price=1.0):
+    def by_innovations(self, one, other, _price=1.0):
         return self.new.get(other.model.terms[-1].key, 0.0) - self.new.get(one.model.terms[-1].key, 0.0)
 
 

@@ -102,12 +102,11 @@ def test_a_temperature_can_be_lagged_and_bent():
     assert [dict(s) for s in shapes] == [{}, {"lag": 1.0}, {"lag": 5.0}, {"curvature": 0.02}, {"curvature": -0.02}]
     bent = TEMPERATURE.course({"curvature": 0.02}, context)
     np.testing.assert_allclose(bent, [0.0, 12.0, 12.0, -4.5])
-    a = np.exp(-0.1)
-    first = 10.0 * (1.0 - a)
+    a = np.exp(-0.1)  # of samples 0.1 s apart, between which the temperature goes straight
+    first = 10.0 * (1.0 - (1.0 - a) / 0.1)
     second = a * first + 10.0 * (1.0 - a)
-    np.testing.assert_allclose(
-        TEMPERATURE.course({"lag": 1.0}, context), [0.0, first, second, a * second - 5.0 * (1.0 - a)]
-    )
+    third = a * second + 10.0 * ((1.0 - a) / 0.1 - a) - 5.0 * (1.0 - (1.0 - a) / 0.1)
+    np.testing.assert_allclose(TEMPERATURE.course({"lag": 1.0}, context), [0.0, first, second, third])
 
 
 def test_the_cubic_bends_each_axis_by_its_own_field():

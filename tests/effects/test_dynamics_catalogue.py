@@ -272,10 +272,10 @@ def test_runs_are_told_apart_by_their_number_whatever_their_clocks_do(name):
 def test_a_sensor_lags_by_its_time_constant():
     effect = OF["sensor_lag"]
     time = torch.linspace(0.0, 5.0, N, dtype=torch.float64)
-    step = (time > 0.0).double().unsqueeze(-1)
-    context = replace(make_context(effect), time=time, signal=step)
-    shown = (step + change(effect, [1.0], {"lag": 0.8}, context))[:, 0]
-    torch.testing.assert_close(shown, 1.0 - torch.exp(-time / 0.8))
+    ramp = 3.0 * time.unsqueeze(-1)
+    context = replace(make_context(effect), time=time, signal=ramp)
+    shown = (ramp + change(effect, [1.0], {"lag": 0.8}, context))[:, 0]
+    torch.testing.assert_close(shown, 3.0 * (time - 0.8 * (1.0 - torch.exp(-time / 0.8))))
 
 
 @EFFECTS
