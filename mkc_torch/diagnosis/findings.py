@@ -21,6 +21,7 @@ from mkc_torch.diagnosis.regions import attributed, map_of, region_of, shares_of
 from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter
 from mkc_torch.effects.protocol import Context, PartEffect, RelativeEffect
 from mkc_torch.effects.units import tidy
+from mkc_torch.nonlinear import beside
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -207,7 +208,7 @@ def _curve(term: Term, gamma: Tensor, covariance: Tensor, context: Context) -> C
     shape = {name: value for name, value in term.shape.items() if name != "lag"}
 
     def change(gamma: Tensor) -> Tensor:
-        return term.effect.change(gamma, shape, synthetic)
+        return term.effect.change(gamma, shape, replace(synthetic, signal=beside(synthetic.signal, gamma[0])))
 
     slope = torch.func.jacfwd(change)(gamma)
     variance = torch.einsum("ncq,qr,ncr->nc", slope, covariance, slope).clamp(min=0.0)

@@ -33,6 +33,9 @@ _SIZES = 36
 """Sizes of wander tried, from none to a few times the largest that could fit."""
 
 
+_CELLS = 3_000_000
+"""Numbers of candidates' inner products with series, over several sizes, that are held at once."""
+
 _EQUAL = 3.0
 
 
@@ -331,37 +334,38 @@ class LinearSearch:
 
     def _profile(self, power: Tensor, inner: Tensor, slow: Tensor) -> tuple[Tensor, Tensor]:
         """Largest log-likelihood over the noise's sizes: of nothing (B,), and of each candidate (C, B)."""
-        B = power.shape[0]
-        null = -0.5 * self._dof * power.log()
-        best = torch.full((len(self._widths), B), -torch.inf, dtype=torch.float64)
-        self._update(best, power, inner, None, None, power.new_zeros(()))
-        for family in self._families:
-            rotated = family.axes.mT @ (family.scale.unsqueeze(-1) * slow)
-            cross = family.axes.mT @ (family.scale.unsqueeze(-1) * self._cross.double())
-            left, log_det = _without_wander(power, rotated, family)
-            null = torch.maximum(null, (-0.5 * log_det - 0.5 * self._dof * left.log()).amax(0))
-            for at, share in enumerate(family.shares):
-                at_size = inner - cross.mT @ (share.unsqueeze(-1) * rotated)
-                self._update(best, left[at], at_size, cross, share, log_det[at])
-        return null, best
-
-    def _update(
-        self, best: Tensor, power: Tensor, inner: Tensor, cross: Tensor | None, share: Tensor | None, log_det: Tensor
-    ) -> None:
+        null = self._log_likelihood(power)
+        best = torch.full((len(self._widths), len(power)), -torch.inf, dtype=torch.float64)
+        in_family = [
+            (family, family.axes.mT @ (family.scale.unsqueeze(-1) * slow), self._cross_in(family))
+            for family in self._families
+        ]
+        lefts = [_without_wander(power, rotated, family) for family, rotated, _ in in_family]
+        for left, log_det in lefts:
+            null = torch.maximum(null, (self._log_likelihood(left) - 0.5 * log_det).amax(0))
         for member, index, own, dof in self._groups:
             score = own.mT @ inner[index]  # (C, q, B)
-            if cross is None or share is None:
-                explained = score.square().sum(-2)
-            else:
-                shadow = own.mT @ cross.mT[index]  # (C, q, k)
-                live = (own != 0).any(-2).double()
-                gram = torch.diag_embed(torch.ones_like(live)) - shadow * share @ shadow.mT
-                solved = score / gram if gram.shape[-1] == 1 else torch.linalg.solve(gram, score)
-                explained = (score * solved).sum(-2)
-            left = (power - explained).clamp(min=1e-12 * power)
-            value = -0.5 * log_det - 0.5 * self._dof * left.log()
-            value = torch.where(dof.unsqueeze(-1) > 0, value, -torch.inf)
-            best[member] = torch.maximum(best[member], value)
+            found = self._log_likelihood(_beside(power, score.square().sum(-2)))
+            for (family, rotated, cross), (left, log_det) in zip(in_family, lefts, strict=True):
+                shadow = own.mT @ cross[index]  # (C, q, k)
+                live = torch.diag_embed((own != 0).any(-2).double())
+                several = max(1, _CELLS // max(score.numel(), 1))
+                for share, rest, price in zip(
+                    family.shares.split(several), left.split(several), log_det.split(several), strict=True
+                ):
+                    explained = _explained(score, shadow, live, share, rotated)
+                    value = self._log_likelihood(_beside(rest.unsqueeze(1), explained)) - 0.5 * price.unsqueeze(-1)
+                    found = torch.maximum(found, value.amax(0))
+            best[member] = torch.where(dof.unsqueeze(-1) > 0, found, -torch.inf)
+        return null, best
+
+    def _cross_in(self, family: _Wander) -> Float[Tensor, "cols k"]:
+        """Inner products of the candidates' columns with a wander's own axes."""
+        return self._cross.double().mT @ (family.scale.unsqueeze(-1) * family.axes)
+
+    def _log_likelihood(self, left: Tensor) -> Tensor:
+        """Of what is left of series, its level profiled out, up to a constant."""
+        return -0.5 * self._dof * left.log()
 
 
 @dataclass(frozen=True)
@@ -394,6 +398,36 @@ def _family(gram: Tensor, scale: Tensor) -> _Wander:
     strength, axes = torch.from_numpy(values).clamp(min=0.0), torch.from_numpy(vectors)
     sizes = torch.cat([strength.new_zeros(1), torch.logspace(-0.5, 5.0, _SIZES, dtype=torch.float64) / strength[-1]])
     return _Wander(scale, axes, strength, sizes)
+
+
+def _beside(power: Tensor, explained: Tensor) -> Tensor:
+    """What is left of a power."""
+    return (power - explained).clamp(min=1e-12 * power)
+
+
+def _explained(
+    score: Float[Tensor, "C q B"],
+    shadow: Float[Tensor, "C q k"],
+    live: Float[Tensor, "C q q"],
+    share: Float[Tensor, "S k"],
+    rotated: Float[Tensor, "k B"],
+) -> Float[Tensor, "S C B"]:
+    """What candidates explain of series beside wanders of S sizes.
+
+    Args:
+        score: inner products of the candidates' directions with the series.
+        shadow: those with the wander's axes.
+        live: the directions' own; the unit matrix, but for dropped ones.
+        share: what the wander takes of each of its axes.
+        rotated: inner products of its axes with the series.
+    """
+    C, q, B = score.shape
+    taken = shadow.flatten(0, 1) @ (share.mT.unsqueeze(-1) * rotated.unsqueeze(1)).flatten(1)
+    score = score - taken.unflatten(0, (C, q)).unflatten(-1, (len(share), B)).movedim(-2, 0)
+    pairs = (shadow.unsqueeze(2) * shadow.unsqueeze(1)).flatten(0, 2)  # (C q q, k)
+    gram = live - (share @ pairs.mT).unflatten(-1, (C, q, q))
+    solved = score / gram if q == 1 else torch.linalg.solve(gram, score)
+    return (score * solved).sum(-2)
 
 
 def _without_wander(power: Tensor, rotated: Tensor, family: _Wander) -> tuple[Tensor, Tensor]:

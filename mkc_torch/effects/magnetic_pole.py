@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.effects.protocol import Context, Quantity, Shape
+from mkc_torch.nonlinear import beside
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -61,9 +62,9 @@ class MagneticPole:
 
     def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]:
         p = context.drivers
-        place = [torch.as_tensor(shape[f"place_{axis}"], dtype=p.dtype, device=p.device) for axis in "xyz"]
-        away = p - torch.stack(place)
-        field = away * (away.square().sum(-1, keepdim=True) + shape["radius"] ** 2) ** -1.5
+        place = torch.stack([torch.as_tensor(shape[f"place_{a}"], dtype=p.dtype, device=p.device) for a in "xyz"])
+        away, least = beside(p, place[0]) - place, beside(p.new_tensor(shape["radius"] ** 2), place[0])
+        field = away * (away.square().sum(-1, keepdim=True) + least) ** -1.5
         return field.unsqueeze(1 if len(context.channels) == 1 else -1)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
