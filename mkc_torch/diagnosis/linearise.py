@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import Tensor
@@ -26,6 +26,8 @@ from mkc_torch.diagnosis.search import Gains, LinearSearch
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+T = TypeVar("T")
+
 __all__ = ["Linearised", "Slow", "Tangents", "candidate_tangents", "linearise", "tangents_of"]
 
 SLOW_COURSES = 150
@@ -36,6 +38,9 @@ CORNERS = (25.0,)
 
 
 _MOST, _MARGIN, _FEWEST = 0.9, 3.0, 1000
+
+_AT_ONCE = 8
+"""Candidates whose tangents are moved about together: they stay in a core's own memory."""
 
 _REFILLED = 2
 """Times that the colour is read again, with what it says of rejected samples."""
@@ -155,17 +160,25 @@ def candidate_tangents(
     independent = parameters.new_tensor([float(one) for one in prepared.independent])
     courses = [directions(t, t.context(prepared, signals.get(t.port))) for t in terms]
     found: list[Tensor | None] = [None] * len(terms)
-    for name in prepared.ports:
+    for name, known in pointwise.items():
         members = [i for i, term in enumerate(terms) if term.port == name]
-        if not members:
-            continue
-        joined = torch.cat([courses[i] for i in members], -1)
-        moved = through_port(model, parameters, name, joined, pointwise[name])
-        for i, part in zip(members, moved.split([courses[i].shape[-1] for i in members], -1), strict=True):
-            part = independent[:, None] * part if follows_signal(terms[i].effect) else part
-            # one that has no slope here is none that could be named
-            found[i] = part if bool(part.isfinite().all()) else torch.zeros_like(part)
+        # trajectories are solved for side by side; products of samples are small enough for a core's own memory
+        for block in [members] if known is None else _blocks(members):
+            if not block:
+                continue
+            joined = torch.cat([courses[i] for i in block], -1)
+            moved = through_port(model, parameters, name, joined, known)
+            finite = bool(moved.isfinite().all())
+            for i, part in zip(block, moved.split([courses[i].shape[-1] for i in block], -1), strict=True):
+                part = independent[:, None] * part if follows_signal(terms[i].effect) else part
+                # one that has no slope here is none that could be named
+                found[i] = part if finite or bool(part.isfinite().all()) else torch.zeros_like(part)
     return tuple(t for t in found if t is not None)
+
+
+def _blocks(items: Sequence[T]) -> list[Sequence[T]]:
+    """A few at a time."""
+    return [items[first : first + _AT_ONCE] for first in range(0, len(items), _AT_ONCE)]
 
 
 def _slow_courses(model: JointModel, parameters: Tensor, pointwise: dict[str, Tensor | None]) -> Slow | None:
@@ -291,7 +304,7 @@ def linearise(
         found = _coloured(plain, near, pull, bare, slow, gaps)
     else:
         found = _searching(colour, pull, bare, slow, gaps)
-    candidates = [pull.below(found.colour.scaled(one)) for one in _together(seen.candidates, found.filling)]
+    candidates = [pull.below(found.colour.scaled(one)) for one in _each(found.filling, seen.candidates)]
     found = replace(found, search=found.search.with_candidates(candidates))
     pointwise = None if slow is None else tangents.pointwise[slow.port]
     if slow is None or pointwise is None or not tangents.candidates:
@@ -315,26 +328,26 @@ class _Seen:
 
     @classmethod
     def of(cls, pseudo: Tensor, counts: Tensor, tangents: Tangents, slow: Slow | None, kept: int) -> _Seen:
-        parts = [pseudo.unsqueeze(-1), tangents.nuisance, *tangents.candidates]
-        joined = torch.cat(parts, -1)
-        joined[..., 1:] *= counts.unsqueeze(-1)
-        values, nuisance, *candidates = dct(joined, kept).split([t.shape[-1] for t in parts], -1)
+        values = dct(pseudo, kept)
+        nuisance, *candidates = _each(
+            lambda joined: dct(counts.unsqueeze(-1) * joined, kept), [tangents.nuisance, *tangents.candidates]
+        )
         moved = nuisance[..., :0] if slow is None else slow.transformed(counts, kept)
-        return cls(values.squeeze(-1), nuisance, tuple(candidates), moved)
+        return cls(values, nuisance, tuple(candidates), moved)
 
     def filled(self, filling: Filling) -> _Seen:
         """The same with what noise is expected at rejected samples, in all of it alike."""
-        pseudo, nuisance, *candidates, slow = _together(
-            (self.pseudo.unsqueeze(-1), self.nuisance, *self.candidates, self.slow), filling
-        )
-        return _Seen(pseudo.squeeze(-1), nuisance, tuple(candidates), slow)
+        pseudo, nuisance, *candidates = _each(filling, [self.pseudo.unsqueeze(-1), self.nuisance, *self.candidates])
+        return _Seen(pseudo.squeeze(-1), nuisance, tuple(candidates), filling(self.slow))
 
 
-def _together(columns: Sequence[Float[Tensor, "K m q"]], filling: Filling) -> tuple[Float[Tensor, "K m q"], ...]:
-    """Each of them filled."""
-    if not columns:
-        return ()
-    return filling(torch.cat([*columns], -1)).split([c.shape[-1] for c in columns], -1)
+def _each(function: Callable[[Tensor], Tensor], columns: Sequence[Tensor]) -> list[Tensor]:
+    """A function of columns, of each of these matrices."""
+    return [
+        done
+        for block in _blocks(columns)
+        for done in function(torch.cat([*block], -1)).split([c.shape[-1] for c in block], -1)
+    ]
 
 
 def _searching(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.effects.protocol import Context, Quantity, Shape, per
+from mkc_torch.effects.protocol import Context, Quantity, Shape, combined, per
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -51,7 +51,7 @@ class FieldGradient:
         return terms(context.drivers, int(shape["degree"])).mT
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        return self.basis(shape, context) @ gamma
+        return combined(self.basis(shape, context), gamma)
 
 
 def _polynomials(p: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N f 1"]:

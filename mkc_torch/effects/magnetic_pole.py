@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.effects.protocol import Context, Quantity, Shape
+from mkc_torch.effects.protocol import Context, Quantity, Shape, combined
 from mkc_torch.nonlinear import beside
 
 if TYPE_CHECKING:
@@ -68,4 +68,4 @@ class MagneticPole:
         return field.unsqueeze(1 if len(context.channels) == 1 else -1)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        return self.basis(shape, context) @ gamma
+        return combined(self.basis(shape, context), gamma)

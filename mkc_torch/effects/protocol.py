@@ -370,6 +370,12 @@ def after(time: Float[Tensor, " N"], onset: float) -> Float[Tensor, " N"]:
     return (time >= onset).to(time.dtype)
 
 
+def combined(basis: Float[Tensor, "N c q"], gamma: Float[Tensor, " q"]) -> Float[Tensor, "N c"]:
+    """``basis @ γ``."""
+    # as one matrix: with many γ at once the basis of each sample would be copied for each of them
+    return (basis.flatten(0, 1) @ gamma).unflatten(0, basis.shape[:2])
+
+
 def lagged(
     values: Float[Tensor, " N"], time: Float[Tensor, " N"], lag: float, run: Int[Tensor, " N"] | None = None
 ) -> Float[Tensor, " N"]:

@@ -10,7 +10,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["from_quaternion", "rotation_since", "turns"]
+__all__ = ["from_quaternion", "rotated", "rotation_since", "turns"]
 
 
 def from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
@@ -27,6 +27,17 @@ def from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*ba
         [2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z],
     ]
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def rotated(vectors: Float[Tensor, "N 3"], by: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 3"]:
+    """Each vector by a matrix of its own.
+
+    Example:
+        >>> rotated(torch.tensor([[1.0, 2.0, 3.0]]), 2.0 * torch.eye(3).unsqueeze(0))
+        tensor([[2., 4., 6.]])
+    """
+    # an einsum takes three times as long in forward mode
+    return (by @ vectors.unsqueeze(-1)).squeeze(-1)
 
 
 def _product(a: Tensor, b: Tensor) -> Tensor:

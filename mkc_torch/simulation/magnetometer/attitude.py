@@ -17,7 +17,7 @@ from mkc_torch.recording import Recording
 from mkc_torch.simulation.heading import HeadingJump, heading_jumps
 from mkc_torch.simulation.magnetometer.view import AXES, GYRO, INDEPENDENT, QUATERNION, VECTOR, View, thinned
 from mkc_torch.simulation.protocol import Changes, Port
-from mkc_torch.simulation.rotation import from_quaternion
+from mkc_torch.simulation.rotation import from_quaternion, rotated
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -106,7 +106,7 @@ class AttitudeView(View):
         # the simulated vector, not the measured one, goes through the matrix: the noise of what a matrix is fitted to
         # would shrink it. A fixed matrix takes the difference back into the world.
         left = self._away(theta, changes) - self._sensed(self._seen(theta, changes), theta)
-        residual = torch.einsum("kij,kj->ki", self._to_frame, left)
+        residual = rotated(left, self._to_frame)
         added = self._field_change(changes)
         return residual if added is None else residual - added @ self._frame.mT
 
@@ -127,7 +127,7 @@ class AttitudeView(View):
         cos, sin = torch.cos(angle), torch.sin(angle)
         east, north, up = ambient
         turned = torch.stack([cos * east - sin * north, sin * east + cos * north, up.expand_as(angle)], -1)
-        return torch.einsum("ki,kij->kj", turned, self.to_world)
+        return rotated(turned, self.to_world.mT)
 
     def _sensed(self, field: Float[Tensor, "N 3"], theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
         """What the sensor makes of a field in its axes, less its offset."""

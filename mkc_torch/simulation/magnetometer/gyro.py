@@ -14,7 +14,7 @@ from mkc_torch.simulation.magnetometer.matrix import SYMMETRIC
 from mkc_torch.simulation.magnetometer.norm import NormView
 from mkc_torch.simulation.magnetometer.view import AXES, GYRO, INDEPENDENT, VECTOR, View
 from mkc_torch.simulation.protocol import Changes, Port
-from mkc_torch.simulation.rotation import rotation_since
+from mkc_torch.simulation.rotation import rotated, rotation_since
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -69,7 +69,7 @@ class GyroView(View):
         Raises:
             NotIdentifiableError: ``error``, where the turns do not determine the offset either.
         """
-        seen = torch.einsum("kij,kj->ki", self.turned, self.measured)
+        seen = rotated(self.measured, self.turned)
         weight = seen.new_ones(len(seen), 1)
         offset = seen.new_zeros(3)
         for _ in range(_REWEIGHTED):
@@ -98,11 +98,11 @@ class GyroView(View):
         strength, added = self._strength(theta), self._field_change(changes)
         ambient = (strength if added is None else strength + added) * direction[self.window]
         frame = _frame(direction.detach())[self.window]
-        return torch.einsum("kij,kj->ki", frame, along - ambient)
+        return rotated(along - ambient, frame)
 
     def _steadied(self, theta: Tensor, field: Tensor) -> Tensor:
         """The calibrated field in the axes of its window's first sample."""
-        along = torch.einsum("kij,kj->ki", self.turned, field)
+        along = rotated(field, self.turned)
         # a bias b, small, turns what has been summed up since the window's first sample by the integral of turned · b
         return along - torch.linalg.cross(self.summed @ theta[9:12], along)
 
@@ -110,7 +110,7 @@ class GyroView(View):
         along = self._steadied(theta, self.corrected(theta, {}))
         middle = self._window_mean(along, self._weights(along.detach()))
         direction = middle / torch.linalg.vector_norm(middle, dim=-1, keepdim=True)
-        field = torch.einsum("kij,ki->kj", self.turned, self._strength(theta) * direction[self.window])
+        field = rotated(self._strength(theta) * direction[self.window], self.turned.mT)
         return torch.linalg.solve(self.matrix(theta), field.mT).mT
 
     def _window_mean(self, values: Tensor, weight: Tensor) -> Tensor:
