@@ -24,6 +24,7 @@ from mkc_torch.diagnosis.innovations import innovation_gain
 from mkc_torch.diagnosis.locate import Located, locate
 from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.noise_summary import noise_summary
+from mkc_torch.diagnosis.onsets import onset_interval
 from mkc_torch.diagnosis.preference import ALIKE_COLUMNS, UNKNOWN, alike
 from mkc_torch.diagnosis.refit import FittedModel, fitted
 from mkc_torch.diagnosis.remaining import remaining, remaining_warning
@@ -294,6 +295,7 @@ def _assembled(
             finding_of(s, final, k, *_held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, generator)),
             extrapolation=extrapolated(fits[k], s.fit, asked.seed),
             driver_shift=shifted(fits[k].model, s),
+            onset_interval=onset_interval(fits[k].model, s),
         )
         for k, s in enumerate(found)
     ]

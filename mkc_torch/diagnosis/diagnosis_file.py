@@ -148,6 +148,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         ],
         "plausible": f.plausible,
         "plausibility": f.plausibility,
+        **({} if f.onset_interval is None else {"onset_interval": f.onset_interval}),
         **({} if f.driver_shift is None else {"driver_shift": asdict(f.driver_shift)}),
         **({} if f.region is None else {"region": asdict(f.region)}),
         **({"experiments": f.experiments} if f.experiments else {}),

@@ -135,7 +135,7 @@ class Finding:
     ``extrapolation`` and ``map`` are for the report; None where they were not asked for or cannot be told, as is
     ``driver_shift`` of an effect without a recorded driver. ``region``
     is None where the gain arises all over the states, or where the simulation has none; ``experiments`` has each run's
-    share of the gain, and is empty for a single run.
+    share of the gain, and is empty for a single run. ``onset_interval`` holds the onset with 95 % confidence.
     """
 
     effect: str
@@ -158,6 +158,7 @@ class Finding:
     region: Region | None = None
     experiments: tuple[float, ...] = ()
     map: StateMap | None = None
+    onset_interval: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

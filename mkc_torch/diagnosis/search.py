@@ -348,12 +348,11 @@ class LinearSearch:
             found = self._log_likelihood(_beside(power, score.square().sum(-2)))
             for (family, rotated, cross), (left, log_det) in zip(in_family, lefts, strict=True):
                 shadow = own.mT @ cross[index]  # (C, q, k)
-                live = torch.diag_embed((own != 0).any(-2).double())
                 several = max(1, _CELLS // max(score.numel(), 1))
                 for share, rest, price in zip(
                     family.shares.split(several), left.split(several), log_det.split(several), strict=True
                 ):
-                    explained = _explained(score, shadow, live, share, rotated)
+                    explained = _explained(score, shadow, share, rotated)
                     value = self._log_likelihood(_beside(rest.unsqueeze(1), explained)) - 0.5 * price.unsqueeze(-1)
                     found = torch.maximum(found, value.amax(0))
             best[member] = torch.where(dof.unsqueeze(-1) > 0, found, -torch.inf)
@@ -408,7 +407,6 @@ def _beside(power: Tensor, explained: Tensor) -> Tensor:
 def _explained(
     score: Float[Tensor, "C q B"],
     shadow: Float[Tensor, "C q k"],
-    live: Float[Tensor, "C q q"],
     share: Float[Tensor, "S k"],
     rotated: Float[Tensor, "k B"],
 ) -> Float[Tensor, "S C B"]:
@@ -417,7 +415,6 @@ def _explained(
     Args:
         score: inner products of the candidates' directions with the series.
         shadow: those with the wander's axes.
-        live: the directions' own; the unit matrix, but for dropped ones.
         share: what the wander takes of each of its axes.
         rotated: inner products of its axes with the series.
     """
@@ -425,7 +422,7 @@ def _explained(
     taken = shadow.flatten(0, 1) @ (share.mT.unsqueeze(-1) * rotated.unsqueeze(1)).flatten(1)
     score = score - taken.unflatten(0, (C, q)).unflatten(-1, (len(share), B)).movedim(-2, 0)
     pairs = (shadow.unsqueeze(2) * shadow.unsqueeze(1)).flatten(0, 2)  # (C q q, k)
-    gram = live - (share @ pairs.mT).unflatten(-1, (C, q, q))
+    gram = torch.eye(q, dtype=shadow.dtype) - (share @ pairs.mT).unflatten(-1, (C, q, q))
     solved = score / gram if q == 1 else torch.linalg.solve(gram, score)
     return (score * solved).sum(-2)
 

@@ -253,6 +253,8 @@ def _mark(ax: Any, findings: Sequence[Finding]) -> None:
             ax.axvspan(start, end, color=_SHADE, lw=0, zorder=0)
         if finding.onset is not None:
             ax.axvline(finding.onset, color=ORANGE, lw=1.2, zorder=3)
+        if finding.onset_interval is not None:
+            ax.axvspan(*finding.onset_interval, color=ORANGE, alpha=0.3, lw=0, zorder=2)
 
 
 def _number(ax: Any, findings: Sequence[Finding]) -> None:

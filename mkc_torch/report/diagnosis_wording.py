@@ -215,10 +215,14 @@ def where(finding: Finding, clock: Clock) -> str:
         >>> clock = Clock(1, has_time=True)
         >>> where(finding, clock), where(replace(finding, onset=41.32), clock)
         ('throughout the recording', 'from 41.3 s on')
+        >>> where(replace(finding, onset=41.32, onset_interval=(41.24, 41.5)), clock)
+        'from 41.3 s on (95 %: 41.2 to 41.5 s)'
         >>> where(replace(finding, intervals=((1.0, 2.0), (7.0, 9.5))), clock)
         'mainly from 1.0 to 2.0 s and from 7.0 to 9.5 s'
     """
     begins = "" if finding.onset is None else f"from {clock.moment(finding.onset)} on"
+    if finding.onset_interval is not None:
+        begins += f" (95 %: {clock.interval(*finding.onset_interval)})"
     each = [f"from {clock.interval(start, end)}" for start, end in finding.intervals]
     if len(each) > 3:
         spans = [end - start for start, end in finding.intervals]
