@@ -77,6 +77,7 @@ class Score:
     separable: Share
     candidates: float
     onset_errors: tuple[float, ...]
+    onset_covered: Share
     coverage: Share
     coverage_by_effect: Mapping[str, Share]
     parameters_missing: int
@@ -154,6 +155,7 @@ def score(
         "separable": _share_of(told, lambda case: not case.said.findings[0].others),
         "candidates": _mean([1.0 + len(case.said.findings[0].others) for case in told]),
         "onset_errors": onset_errors(strong),
+        "onset_covered": onset_covered(singles),
         "coverage": share(sum(s.count for s in by_effect.values()), sum(s.total for s in by_effect.values())),
         "coverage_by_effect": by_effect,
         "parameters_missing": missing,
@@ -192,6 +194,19 @@ def onset_errors(cases: Sequence[_Single]) -> tuple[float, ...]:
             onset = findings[0].onset
             errors.append(math.inf if onset is None or truth.onset is None else abs(onset - truth.onset))
     return tuple(errors)
+
+
+def onset_covered(cases: Sequence[_Single]) -> Share:
+    """Of the steps that were named, those whose onset lies in the interval that was told with it."""
+    told = [
+        (case.truth.onset, case.said.findings[0].onset_interval)
+        for case in cases
+        if case.named and case.said.findings[0].named.effect == case.truth.effect and case.truth.onset is not None
+    ]
+    inside = [
+        onset is not None and interval is not None and interval[0] <= onset <= interval[1] for onset, interval in told
+    ]
+    return share(sum(inside), len(inside))
 
 
 def coverage(cases: Sequence[_Single]) -> tuple[dict[str, Share], int]:

@@ -36,6 +36,7 @@ class Finding:
     named: Candidate
     others: tuple[Candidate, ...]
     onset: float | None
+    onset_interval: tuple[float, float] | None
     parameters: tuple[Mapping[str, Any], ...]
 
 
@@ -75,6 +76,7 @@ def _finding(numbers: Mapping[str, Any]) -> Finding:
         _candidate(numbers),
         tuple(_candidate(other) for other in others),
         numbers.get("onset"),
+        None if numbers.get("onset_interval") is None else (numbers["onset_interval"][0], numbers["onset_interval"][1]),
         tuple(numbers.get("parameters") or ()),
     )
 

@@ -109,6 +109,18 @@ def test_onset_errors():
     assert measured(result, "step_within").value == 0.5
 
 
+def test_onsets_lie_in_their_intervals_or_not():
+    keys = [key(name, onset=10.0) for name in "abcd"]
+    answers = {
+        "a": says(finding("hard_iron_step", onset=10.4) | {"onset_interval": [9.9, 10.6]}),
+        "b": says(finding("hard_iron_step", onset=10.4) | {"onset_interval": [10.1, 10.6]}),
+        "c": says(finding("hard_iron_step", onset=10.4)),
+        "d": says(finding("offset_drift")),
+    }
+    result = score(keys, answers)
+    assert (result.onset_covered.count, result.onset_covered.total) == (1, 3)
+
+
 def test_intervals_of_ninety_per_cent():
     truth = (KeyParameter("offset_change", [1.0, 2.0, 3.0], "µT", True),)
     stated = {"name": "step", "value": [1.0, 2.16, 3.17], "standard_error": [0.1, 0.1, 0.1], "unit": "µT"}
