@@ -78,7 +78,7 @@ def _spread(place: int, count: int) -> list[int]:
 
     Example:
         >>> _spread(3, 9)
-        [1, 2, 3, 4, 5, 6, 8]
+        [1, 2, 3, 4, 6, 8]
     """
     away, step = [0], 1.0
     while away[-1] < count:
