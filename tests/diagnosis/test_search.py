@@ -118,6 +118,13 @@ def test_with_wander_gains_are_those_of_the_dense_covariance(search, family, siz
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
 
 
+def test_sizes_of_wander_can_be_tried_a_few_at_a_time(search, monkeypatch):
+    series = torch.stack([wandering(3.0, 0, seed=20), wandering(0.5, 1, seed=30)], -1)
+    together = search.gains(series).ratio
+    monkeypatch.setattr("mkc_torch.diagnosis.search._CELLS", 1)
+    torch.testing.assert_close(search.gains(series).ratio, together, rtol=1e-9, atol=1e-9)
+
+
 def test_sizes_of_wander_reach_from_none_to_all_there_is(search):
     gram = WANDER - NUISANCE @ torch.linalg.lstsq(NUISANCE, WANDER).solution
     for scale, known in zip(SCALES, search._families, strict=True):
