@@ -20,6 +20,7 @@ from mkc_torch.diagnosis.estimate import Estimate, estimate
 from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
 from mkc_torch.diagnosis.extrapolation import extrapolated, extrapolation_warning
 from mkc_torch.diagnosis.findings import finding_of
+from mkc_torch.diagnosis.first_look import p_value_beside
 from mkc_torch.diagnosis.innovations import innovation_gain
 from mkc_torch.diagnosis.locate import Located, locate
 from mkc_torch.diagnosis.model import JointModel, Term
@@ -56,6 +57,9 @@ _WIDER, _NEAR = 3.0, 0.05
 _BEYOND_DOUBT, _FURTHER = 8.0, 20.0
 """Nats beyond all draws of noise from which unseen blocks are not asked to confirm a first finding, and from which they
 need only to lean the way of a further one."""
+
+_QUIET = 0.5
+"""A p-value at a first look beside a finding above which nothing further is searched."""
 
 _REST = 0.5
 """A larger share of samples in which nothing moves is a sensor at rest, and is warned of."""
@@ -230,7 +234,9 @@ def _begun(base: FittedModel, terms: tuple[Term, ...], asked: _Asked, generator:
 
 
 def _continued(search: _Search, asked: _Asked, generator: torch.Generator) -> _Search:
-    """The next search, beside what was found."""
+    """The next search, beside what was found; none where a first look shows nothing."""
+    if _quiet(search, asked):
+        return replace(search, left=())
     fit = search.found[-1].fit
     try:
         located = locate(
@@ -239,6 +245,14 @@ def _continued(search: _Search, asked: _Asked, generator: torch.Generator) -> _S
         return _taken_up(search, located, asked)
     except ValueError as error:
         return replace(search, left=(), given_up=str(error))  # what was found before is not to be lost
+
+
+def _quiet(search: _Search, asked: _Asked) -> bool:
+    """Whether what is beside the last finding is far from anything that could count."""
+    last, near = search.found[-1], _near(search.found[-1].fit)
+    others = [all(not _same(term, one.term, near) for one in search.found) for term in last.terms]
+    generator = torch.Generator().manual_seed(asked.seed)
+    return p_value_beside(last, others, asked.surrogates, generator) > max(_QUIET, asked.level)
 
 
 def _taken_up(search: _Search, located: Located, asked: _Asked) -> _Search:
@@ -256,11 +270,16 @@ def _taken_up(search: _Search, located: Located, asked: _Asked) -> _Search:
         return replace(over, unconfirmed=located)
     fit, after = simplified(located.fit, after, search.blocks, holds)
     found = (*search.found, replace(located, fit=fit))
-    time = located.fit.model.prepared.time
-    near = _NEAR * float(time[-1] - time[0])
+    near = _near(located.fit)
     left = tuple(t for t in search.left if not _same(t, located.term, near))
     evidence = (*search.evidence, after)
     return replace(search, found=found, evidence=evidence, left=left if len(found) < asked.max_findings else ())
+
+
+def _near(fit: FittedModel) -> float:
+    """Seconds within which a step is the same one."""
+    time = fit.model.prepared.time
+    return _NEAR * float(time[-1] - time[0])
 
 
 def _same(term: Term, found: Term, near: float) -> bool:

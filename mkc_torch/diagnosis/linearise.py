@@ -239,6 +239,10 @@ class Linearised:
         """The same with other candidates after its own."""
         return replace(self, search=self.search.with_more(self._columns(tangents, counts)))
 
+    def without(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> Linearised:
+        """The same with these tangents taken out of everything too."""
+        return replace(self, search=self.search.without(torch.cat(self._columns(tangents, counts), -1)))
+
     def _columns(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> list[Tensor]:
         rows = len(self.series) - self.colour.root.numel()
         columns = [self._whitened(counts.unsqueeze(-1) * t) for t in tangents]

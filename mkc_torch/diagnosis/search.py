@@ -121,6 +121,17 @@ class LinearSearch:
         """The same with these candidates after its own."""
         return self.with_candidates([*self._flat.split(self._widths, -1), *candidates])
 
+    def without(self, columns: Float[Tensor, "M q"]) -> LinearSearch:
+        """The same candidates and noise, with these tangents taken out of everything too."""
+        scales = [family.scale for family in self._families]
+        none = self._wander.new_zeros(0, self._wander.shape[1])
+        return LinearSearch(
+            torch.cat([self._basis, columns], -1),
+            self._flat.split(self._widths, -1),
+            self._wander,
+            torch.stack(scales) if scales else none,
+        )
+
     def _grouped(self, columns: Tensor, on_basis: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
         """For each width: numbers of the candidates, their columns, whitening (C, q, q) and degrees of freedom."""
         starts = torch.tensor([0, *self._widths]).cumsum(0)
