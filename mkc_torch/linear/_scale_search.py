@@ -22,11 +22,13 @@ if TYPE_CHECKING:
 
 
 class ScaleRule(Protocol):
-    """A robust scale of residuals (B, S, N, m) and the weights in [0, 1] of a step that lowers it."""
+    """A robust scale of residuals (B, S, N, m)."""
 
     def scale(self, problem: LinearProblem, residual: Tensor) -> Float[Tensor, "B S m"]: ...
 
-    def weight(self, problem: LinearProblem, residual: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]: ...
+    def weighed(self, problem: LinearProblem, residual: Tensor) -> tuple[Float[Tensor, "B S m"], Tensor]:
+        """The scale, and the weights in [0, 1] of a step that lowers it, (B, S, N, m)."""
+        ...
 
 
 _CHUNK = 1 << 19
@@ -81,8 +83,7 @@ def relative_precision(scale: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batc
 def _step(problem: LinearProblem, beta: Tensor, rule: ScaleRule) -> tuple[Tensor, Tensor]:
     """Coefficients after one concentration step, and the objective before it."""
     residual = problem.residual(beta)
-    scale = rule.scale(problem, residual)
-    weight = rule.weight(problem, residual, scale)
+    scale, weight = rule.weighed(problem, residual)
     objective = _log_product(scale)
     share = weight if problem.sample_weight is None else weight * problem.sample_weight.unsqueeze(1)
     spread = (share * residual.square()).sum(-2).sqrt()  # the gradient of log(scale) has its square below
@@ -165,8 +166,7 @@ def _minimise(
         if not moving.any():
             break
     residual = problem.residual(beta)
-    scale = final.scale(problem, residual)
-    weight = final.weight(problem, residual, scale)
+    scale, weight = final.weighed(problem, residual)
     best = _log_product(scale).argmin(1)
     batch = torch.arange(beta.shape[0], device=beta.device)
     return ScaleMinimum(beta[batch, best], scale[batch, best], weight[batch, best], n_iter, ~moving[batch, best])

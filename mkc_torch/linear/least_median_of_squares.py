@@ -106,7 +106,7 @@ class LeastMedianOfSquares(LinearEstimator):
         rule = QuantileScale(h / N)
         residual = problem.residual(beta).unsqueeze(1)
         scale = rule.scale(problem, residual)
-        self._set_common(problem, beta, rule.weight(problem, residual, scale).squeeze(1))
+        self._set_common(problem, beta, rule.weight(residual, scale).squeeze(1))
         self.objective_ = problem.restore(scale.squeeze(1))
         total = problem.total_weight()
         factor = (1.0 + 5.0 / (total - p).clamp(min=1.0)) / _expected_quantile(h / N, total)
@@ -203,7 +203,7 @@ def _refine(problem: LinearProblem, rule: QuantileScale, beta: Float[Tensor, "B 
         largest = scale.amax(-1, keepdim=True)
         eps = torch.finfo(scale.dtype).eps
         unit = torch.where(largest > 0, scale / largest, 1.0).clamp(min=eps)
-        counts = rule.weight(problem, residual, scale) > 0
+        counts = rule.weight(residual, scale) > 0
         if problem.sample_weight is not None:
             counts = counts & (problem.sample_weight > 0).unsqueeze(1)
         used, share = counts.flatten(-2), (1.0 / unit).unsqueeze(-2).expand_as(residual).flatten(-2)

@@ -39,22 +39,20 @@ class TrimmedScale:
         return max(1, round(self.fraction * problem.num_samples))
 
     def scale(self, problem: LinearProblem, residual: Tensor) -> Float[Tensor, "B S m"]:
+        return self.weighed(problem, residual)[0]
+
+    def weighed(self, problem: LinearProblem, residual: Tensor) -> tuple[Float[Tensor, "B S m"], Tensor]:
         square = residual.square()
         h = self._count(problem)
-        weight = problem.sample_weight
-        if weight is None:
-            return torch.sqrt(square.topk(h, dim=-2, largest=False, sorted=False).values.mean(-2))
-        threshold = order_statistic(square, stacked(weight), h)
-        w = torch.where(square <= threshold.unsqueeze(-2), weight.unsqueeze(1), 0.0)
-        total = h / problem.num_samples * problem.total_weight().unsqueeze(1)
+        weight = stacked(problem.sample_weight)
+        threshold = order_statistic(square, weight, h)
+        counts = (square <= threshold.unsqueeze(-2)).to(square.dtype)
+        total, w = square.new_tensor(float(h)), counts
+        if weight is not None:
+            total, w = h / problem.num_samples * problem.total_weight().unsqueeze(1), weight * counts
         # ties beyond h enter once
         trimmed = (w * square).sum(-2) - (w.sum(-2) - total) * threshold
-        return torch.sqrt(trimmed.clamp(min=0.0) / total)
-
-    def weight(self, problem: LinearProblem, residual: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:  # noqa: ARG002
-        size = residual.abs()
-        threshold = order_statistic(size, stacked(problem.sample_weight), self._count(problem))
-        return (size <= threshold.unsqueeze(-2)).to(size.dtype)
+        return torch.sqrt(trimmed.clamp(min=0.0) / total), counts
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,12 @@ class QuantileScale:
         h = max(1, round(self.fraction * problem.num_samples))
         return order_statistic(residual.abs(), stacked(problem.sample_weight), h)
 
-    def weight(self, problem: LinearProblem, residual: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:  # noqa: ARG002
+    def weighed(self, problem: LinearProblem, residual: Tensor) -> tuple[Float[Tensor, "B S m"], Tensor]:
+        scale = self.scale(problem, residual)
+        return scale, self.weight(residual, scale)
+
+    def weight(self, residual: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:
+        """1 for what lies within the quantile."""
         return (residual.abs() <= scale.unsqueeze(-2)).to(residual.dtype)
 
 
@@ -152,8 +155,8 @@ class LeastTrimmedSquares(LinearEstimator):
         with torch.no_grad():
             beta, n_iter, converged = self._minimise(problem, rule, h)
             residual = problem.residual(beta).unsqueeze(1)
-            trimmed = rule.scale(problem, residual)
-            weight = rule.weight(problem, residual, trimmed).squeeze(1)
+            trimmed, weight = rule.weighed(problem, residual)
+            weight = weight.squeeze(1)
         if problem.basis.requires_grad or problem.Y.requires_grad:
             # which values count is a constant
             beta = problem.weighted_fit(weight * relative_precision(trimmed.squeeze(1)).unsqueeze(-2))

@@ -53,9 +53,10 @@ class MScale:
                 break
         return scale
 
-    def weight(self, problem: LinearProblem, residual: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:  # noqa: ARG002
+    def weighed(self, problem: LinearProblem, residual: Tensor) -> tuple[Float[Tensor, "B S m"], Tensor]:
+        scale = self.scale(problem, residual)
         tiny = torch.finfo(residual.dtype).tiny
-        return bisquare_weight(residual / (self.c * scale.clamp(min=tiny)).unsqueeze(-2))
+        return scale, bisquare_weight(residual / (self.c * scale.clamp(min=tiny)).unsqueeze(-2))
 
 
 def minimise_m_scale(
