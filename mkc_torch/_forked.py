@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any, BinaryIO, TypeVar
 
 import torch
@@ -51,30 +52,34 @@ def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) -> li
     """
     if min(_copies, len(works) - 1) < 1:
         return [work() for work in works]
-    done: dict[int, T] = {}
     with _todo(len(works)) as todo, _crew(works, todo, known) as crew:
-        for number in _taken(todo):
-            # also a core that has become free since
-            crew.fill(len(works) - len(done) - 1)
-            done[number] = works[number]()
-        for copy in crew.copies:
-            done |= copy.done()
-    return [done[number] if number in done else work() for number, work in enumerate(works)]
+        return _together(works, todo, crew)
 
 
 @contextmanager
-def meanwhile(work: Callable[[], T], known: Iterable[object] = ()) -> Iterator[Callable[[], T | None] | None]:
-    """What a copy works at while this process goes on; ``known`` as of :func:`shared`.
+def meanwhile(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) -> Iterator[Callable[[], list[T]]]:
+    """What a copy begins with while this process goes on, the last one first; ``known`` as of :func:`shared`.
 
-    Gives a function that waits for the result, which is None if the copy could not do or send it; None where there is
-    no core to spare. Once the copy is done its core is free for others.
+    Gives a function for all results, which takes part in what nobody has begun, and waits for the rest; where there is
+    no core to spare it does all of it. Once the copy is done its core is free for others.
     """
-    if _to_spare() < 1:
-        yield None
+    if _to_spare() < 1 or not works:
+        yield lambda: [work() for work in works]
         return
-    with _todo(1) as todo, _crew([work], todo, known) as crew:
-        crew.fill(1)
-        yield (lambda: crew.copies[0].done().get(0)) if crew.copies else None
+    with _todo(len(works) - 1) as todo, _crew(works, todo, known) as crew:
+        crew.fill(1, [len(works) - 1])
+        yield lambda: _together(works, todo, crew)
+
+
+def _together(works: Sequence[Callable[[], T]], todo: int, crew: _Crew) -> list[T]:
+    done: dict[int, T] = {}
+    for number in _taken(todo):
+        # also a core that has become free since
+        crew.fill(len(works) - len(done) - 1)
+        done[number] = works[number]()
+    for copy in crew.copies:
+        done |= copy.done()
+    return [done[number] if number in done else work() for number, work in enumerate(works)]
 
 
 def _to_spare() -> int:
@@ -164,11 +169,11 @@ class _Crew:
     known: dict[int, object]
     copies: list[_Copy]
 
-    def fill(self, most: int) -> None:
-        """Start copies where there are cores to spare."""
+    def fill(self, most: int, first: Sequence[int] = ()) -> None:
+        """Start copies where there are cores to spare, each with these works before what is to be done."""
         with suppress(OSError):  # no memory for another process: those that there are do it
             while len(self.copies) < most and _to_spare() > 0:
-                self.copies.append(_copy(self.works, self.todo, self.known))
+                self.copies.append(_copy(self.works, self.todo, self.known, first))
                 _working.append(self.copies[-1])
 
 
@@ -184,7 +189,7 @@ def _crew(works: Sequence[Callable[[], object]], todo: int, known: Iterable[obje
             copy.end()
 
 
-def _copy(works: Sequence[Callable[[], object]], todo: int, known: dict[int, object]) -> _Copy:
+def _copy(works: Sequence[Callable[[], object]], todo: int, known: dict[int, object], first: Sequence[int]) -> _Copy:
     # a file, for a copy that waits until it is read would keep its core
     answer = os.fdopen(os.memfd_create("answer"), "w+b")
     parent = os.getpid()
@@ -205,7 +210,7 @@ def _copy(works: Sequence[Callable[[], object]], todo: int, known: dict[int, obj
         _working.clear()
         gc.disable()
         done = {}
-        for number in _taken(todo):
+        for number in chain(first, _taken(todo)):
             if os.getppid() != parent:
                 break
             with suppress(Exception):

@@ -55,8 +55,8 @@ def test_results_come_in_order_and_copies_take_part():
 def test_without_permission_all_is_done_here():
     allow_copies(0)
     assert shared([os.getpid, os.getpid]) == [HERE, HERE]
-    with meanwhile(os.getpid) as answer:
-        assert answer is None
+    with meanwhile([os.getpid]) as answer:
+        assert answer() == [HERE]
 
 
 def test_a_copy_shares_nothing_further():
@@ -89,8 +89,8 @@ def test_without_memory_for_a_copy_all_is_done_here(monkeypatch):
 
     monkeypatch.setattr(os, "fork", fails)
     assert shared([os.getpid] * 3) == [HERE] * 3
-    with meanwhile(os.getpid) as answer:
-        assert answer is None
+    with meanwhile([os.getpid]) as answer:
+        assert answer() == [HERE]
 
 
 def test_an_error_is_raised_here():
@@ -117,8 +117,8 @@ def test_what_is_known_comes_back_as_itself_and_tensors_without_what_they_are_vi
 
 
 def test_a_copy_works_meanwhile():
-    with meanwhile(lambda: (os.getpid(), known), [known := object()]) as answer:
-        process, same = answer()
+    with meanwhile([lambda: (os.getpid(), known)], [known := object()]) as answer:
+        [(process, same)] = answer()
     assert process != HERE
     assert same is known
     assert _forked._copies == 2
@@ -129,43 +129,52 @@ def test_within_a_copy_all_is_done_there():
 
     def work():
         time.sleep(0.05)
-        with meanwhile(os.getpid) as answer:
-            return {os.getpid(), *shared([os.getpid, os.getpid]), *([] if answer is None else [answer()])}
+        with meanwhile([os.getpid]) as answer:
+            return {os.getpid(), *shared([os.getpid, os.getpid]), *answer()}
 
     assert all(len(processes) == 1 for processes in shared([work] * 6) if HERE not in processes)
-    with meanwhile(signal.pause), meanwhile(work) as answer:
-        assert len(answer()) == 1
+    with meanwhile([signal.pause]), meanwhile([work]) as answer:
+        assert len(answer()[0]) == 1
 
 
 def test_the_core_of_a_copy_at_work_is_not_there():
     allow_copies(1)
-    with meanwhile(signal.pause):
+    with meanwhile([signal.pause]):
         assert {process for _, process in shared([elsewhere(k) for k in range(4)])} == {HERE}
-        with meanwhile(os.getpid) as another:
-            assert another is None
+        with meanwhile([os.getpid]) as another:
+            assert another() == [HERE]
 
 
 def test_the_core_of_a_copy_that_is_done_is_free(copies):
     allow_copies(1)
-    with meanwhile(elsewhere(bytes(1_000_000))) as answer:
+    with meanwhile([elsewhere(bytes(1_000_000))]) as answer:
         # it is done while these are worked at, and what it has to say is not waited for
         results = shared([elsewhere(k) for k in range(9)])
         assert [value for value, _ in results] == list(range(9))
         assert len({process for _, process in results}) == 2
         while copies[0].at_work:
             time.sleep(0.01)
-        with meanwhile(os.getpid) as another:
-            assert another() != HERE
-        assert answer()[1] != HERE
+        with meanwhile([os.getpid]) as another:
+            assert another() != [HERE]
+        assert answer()[0][1] != HERE
 
 
-def test_meanwhile_nothing_comes_of_a_work_that_fails():
-    with meanwhile(lambda: 1 / 0) as answer:
-        assert answer() is None
+def test_what_nobody_has_begun_is_done_by_who_asks():
+    """The copy begins with the last one."""
+    with meanwhile([elsewhere(k) for k in range(3)] + [lambda: (time.sleep(0.5), os.getpid())]) as answer:
+        *others, (_, process) = answer()
+    assert [value for value, _ in others] == [0, 1, 2]
+    assert HERE in {by for _, by in others}
+    assert process != HERE
+
+
+def test_meanwhile_a_work_that_fails_fails_here():
+    with meanwhile([lambda: 1 / 0]) as answer, pytest.raises(ZeroDivisionError):
+        answer()
 
 
 def test_a_copy_that_is_not_waited_for_is_ended(copies):
-    with meanwhile(lambda: signal.pause()):
+    with meanwhile([signal.pause]):
         pass
     assert len(copies) == 1  # the fixture looks for what is left of it
 

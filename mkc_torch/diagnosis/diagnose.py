@@ -3,35 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from mkc_torch._forked import meanwhile
+from mkc_torch._forked import meanwhile, shared
 from mkc_torch.diagnosis.candidates import candidate_terms, described
-from mkc_torch.diagnosis.ceiling import ceiling
 from mkc_torch.diagnosis.density_check import density_warnings
 from mkc_torch.diagnosis.diagnosed_model import model_of
 from mkc_torch.diagnosis.drivers import Drivers, find_drivers
-from mkc_torch.diagnosis.estimate import Estimate, estimate
+from mkc_torch.diagnosis.ending import Ending, ending_parts, nameless
+from mkc_torch.diagnosis.estimate import Estimate
 from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
-from mkc_torch.diagnosis.extrapolation import extrapolated, extrapolation_warning
+from mkc_torch.diagnosis.extrapolation import extrapolation_warning
 from mkc_torch.diagnosis.findings import finding_of
 from mkc_torch.diagnosis.first_look import p_value_beside
 from mkc_torch.diagnosis.innovations import innovation_gain
 from mkc_torch.diagnosis.locate import Located, locate
 from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.noise_summary import noise_summary
-from mkc_torch.diagnosis.onsets import onset_interval
 from mkc_torch.diagnosis.preference import ALIKE_COLUMNS, UNKNOWN, alike
 from mkc_torch.diagnosis.refit import FittedModel, fitted
-from mkc_torch.diagnosis.remaining import remaining, remaining_warning
+from mkc_torch.diagnosis.remaining import remaining_warning
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Finding, HeldOut, Separability, Spread, Traces, Verdict
 from mkc_torch.diagnosis.separability import separability
-from mkc_torch.diagnosis.shifts import shift_warning, shifted
+from mkc_torch.diagnosis.shifts import shift_warning
 from mkc_torch.diagnosis.side_by_side import known_of, learn, with_memory
 from mkc_torch.diagnosis.simplified import simplified
 from mkc_torch.diagnosis.units import unit_warnings
@@ -58,8 +57,8 @@ _BEYOND_DOUBT, _FURTHER = 8.0, 20.0
 """Nats beyond all draws of noise from which unseen blocks are not asked to confirm a first finding, and from which they
 need only to lean the way of a further one."""
 
-_QUIET = 0.5
-"""A p-value at a first look beside a finding above which nothing further is searched."""
+_QUIET, _GLANCE = 0.5, 99
+"""A p-value at a first look beside a finding above which nothing further is searched, and the draws that it takes."""
 
 _REST = 0.5
 """A larger share of samples in which nothing moves is a sensor at rest, and is warned of."""
@@ -123,11 +122,8 @@ def diagnose(
     base = _base(prepared)
     search = _begun(base, terms, asked, generator)
 
-    def finished() -> Diagnosis:
-        fit = search.found[-1].fit if search.found else base
-        fit.model.residual(fit.parameters)  # to be the newest that a simulation remembers
-        final = estimate(fit).at_least(search.evidence[-1].jackknife)
-        return _assembled(simulation, prepared, drivers, len(terms), base, search, final, asked)
+    def told(search: _Search, parts: Sequence[Any]) -> Diagnosis:
+        return _assembled(simulation, prepared, drivers, len(terms), base, search, Ending(*parts), asked)
 
     def following() -> _Search:
         after = _continued(search, asked, generator)
@@ -135,17 +131,20 @@ def diagnose(
         fit.model.residual(fit.parameters)
         return after
 
+    known = [simulation, base, base.model, *known_of(prepared, terms)]
+
+    def ending(search: _Search) -> list[Callable[[], Any]]:
+        return ending_parts(base, search.found, search.evidence, search.blocks, drivers.drivers, seed)
+
     while search.left:
         # most often there is nothing more
-        work = with_memory(prepared, finished)
-        with meanwhile(work, [simulation, *search.parts, *known_of(prepared, terms)]) as answer:
+        with meanwhile(ending(search), [*known, *search.parts]) as ended:
             after, newest = with_memory(prepared, following)()
             if after.found == search.found:
-                sent = None if answer is None else answer()
-                return _with_rest(finished() if sent is None else sent[0], after)
+                return _with_rest(told(search, ended()), after)
         learn(prepared, newest)
         search = after
-    return _with_rest(finished(), search)
+    return _with_rest(told(search, shared(ending(search), [*known, *search.parts])), search)
 
 
 @dataclass(frozen=True)
@@ -220,7 +219,8 @@ class _Search:
     @property
     def parts(self) -> tuple[object, ...]:
         """What the next search goes on with."""
-        return self.first, *self.found, self.blocks, *self.evidence
+        fits = [located.fit for located in self.found]
+        return self.first, *self.found, *fits, *(fit.model for fit in fits), self.blocks, *self.evidence
 
 
 def _begun(base: FittedModel, terms: tuple[Term, ...], asked: _Asked, generator: torch.Generator) -> _Search:
@@ -252,7 +252,7 @@ def _quiet(search: _Search, asked: _Asked) -> bool:
     last, near = search.found[-1], _near(search.found[-1].fit)
     others = [all(not _same(term, one.term, near) for one in search.found) for term in last.terms]
     generator = torch.Generator().manual_seed(asked.seed)
-    return p_value_beside(last, others, asked.surrogates, generator) > max(_QUIET, asked.level)
+    return p_value_beside(last, others, _GLANCE, generator) > max(_QUIET, asked.level)
 
 
 def _taken_up(search: _Search, located: Located, asked: _Asked) -> _Search:
@@ -302,26 +302,23 @@ def _assembled(
     tried: int,
     base: FittedModel,
     search: _Search,
-    final: Estimate,
+    ending: Ending,
     asked: _Asked,
 ) -> Diagnosis:
     generator = torch.Generator().manual_seed(asked.seed)
     found, blocks, evidence, first = search.found, search.blocks, search.evidence, search.first
+    final = ending.final
     inliers = (evidence[-1].residual.abs() <= 3.0 * evidence[-1].d) & (final.fit.weights > _REST)
-    fits = [base, *(s.fit for s in found)]
     findings = [
         replace(
             finding_of(s, final, k, *_held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, generator)),
-            extrapolation=extrapolated(fits[k], s.fit, asked.seed),
-            driver_shift=shifted(fits[k].model, s),
-            onset_interval=onset_interval(fits[k].model, s),
+            extrapolation=more.extrapolation,
+            driver_shift=more.driver_shift,
+            onset_interval=more.onset_interval,
         )
-        for k, s in enumerate(found)
+        for k, (s, more) in enumerate(zip(found, ending.beyond, strict=True))
     ]
-    nameless = any(f.effect == UNKNOWN for f in findings)
-    verdict: Verdict = "adequate" if not findings else "unexplained" if nameless else "explained"
-    any_fit = ceiling(base.model, _answerable(base, final.fit), drivers.drivers, blocks)
-    left = () if nameless else remaining(any_fit, evidence[-1], final.fit, drivers.drivers, blocks, asked.seed)
+    verdict: Verdict = "adequate" if not findings else "unexplained" if nameless(final.fit) else "explained"
     return Diagnosis(
         recording=prepared.recording.name,
         simulation=prepared.name,
@@ -336,7 +333,7 @@ def _assembled(
         findings=tuple(findings),
         baseline=_spread(evidence[0], inliers),
         corrected=_spread(evidence[-1], inliers),
-        ceiling=_spread(any_fit.evidence, inliers),
+        ceiling=_spread(ending.reach.evidence, inliers),
         advice=_advice(findings),
         warnings=(
             *prepared.recording.warnings,
@@ -344,7 +341,7 @@ def _assembled(
             *prepared.warnings,
             *drivers.warnings,
             *_time_warnings(prepared),
-            *remaining_warning(left),
+            *remaining_warning(ending.left),
             *(sentence for finding in findings for sentence in shift_warning(finding)),
             *(sentence for finding in findings for sentence in extrapolation_warning(finding)),
             *density_warnings(final.fit.residual, final.fit.sigma, final.fit.d, final.fit.bound, prepared.channels),
@@ -362,12 +359,6 @@ def _with_rest(diagnosis: Diagnosis, search: _Search) -> Diagnosis:
     if search.given_up:
         more.append(f"The search beside what was found was given up. {search.given_up}")
     return replace(diagnosis, warnings=(*diagnosis.warnings, *more))
-
-
-def _answerable(base: FittedModel, final: FittedModel) -> FittedModel:
-    """The final fit; that of the simulation alone, if it has no answer at the other's parameters."""
-    alone = base.model.residual(final.parameters[: base.model.size])
-    return final if bool(alone.isfinite().all()) else base
 
 
 def _held(

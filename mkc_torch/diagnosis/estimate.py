@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.candidates import reach_of
-from mkc_torch.diagnosis.linearise import Linearised, Tangents, linearise, tangents_of
+from mkc_torch.diagnosis.linearise import Tangents, linearise, tangents_of
 from mkc_torch.diagnosis.local import Local, beside_wander
 from mkc_torch.diagnosis.model import Term
+from mkc_torch.diagnosis.noise import Colour
 from mkc_torch.diagnosis.refit import FittedModel
 from mkc_torch.diagnosis.search import NoiseFit
 from mkc_torch.diagnosis.shape_fit import ShapedModel
@@ -34,13 +35,17 @@ _UNKNOWN = 0.5
 class Estimate:
     """A fit with its final parameters, their covariance (p, p), and the noise that is left.
 
-    ``shape_errors`` are standard errors of the numbers of each effect's shape that were fitted and are known.
+    Attributes:
+        fit, covariance: what was found.
+        noise, colour: that are left; ``wander_spread`` is that of the wander over the recording, in its port's unit.
+        shape_errors: standard errors of the numbers of each effect's shape that were fitted and are known.
     """
 
     fit: FittedModel
     covariance: Float[Tensor, "p p"]
     noise: NoiseFit
-    linearised: Linearised
+    colour: Colour
+    wander_spread: float
     shape_errors: tuple[Mapping[str, float], ...]
 
     @property
@@ -83,7 +88,9 @@ def estimate(fit: FittedModel) -> Estimate:
         # there may be no trajectory a step away
         if bool(residual.isfinite().all()):
             fit = replace(fit, parameters=parameters, residual=residual)
-    plain = Estimate(fit, covariance, found.search.noise_fit(found.series), found, tuple({} for _ in fit.model.terms))
+    noise = found.search.noise_fit(found.series)
+    spread = found.search.wander_spread(noise) if noise.size > 0 else 0.0
+    plain = Estimate(fit, covariance, noise, found.colour, spread, tuple({} for _ in fit.model.terms))
     return _shapes_free(plain, tangents, local)
 
 

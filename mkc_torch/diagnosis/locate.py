@@ -97,7 +97,7 @@ def locate(
         prepared, partial(_named, best, base, terms, tangents, pseudo, counts, left.noise.colour, prefer, level)
     )
     # a copy names it already, while this process asks whether there is anything to be named
-    with meanwhile(naming, [base, best, *terms, *tangents.parts, *known_of(prepared, terms)]) as answer:
+    with meanwhile([naming], [base, best, *terms, *tangents.parts, *known_of(prepared, terms)]) as answer:
         linearised = linearise(base.model, parameters, pseudo, counts, tangents)
         noise = linearised.search.noise_fit(linearised.series)
         found = linearised.search.gains(linearised.series.unsqueeze(-1))
@@ -105,7 +105,7 @@ def locate(
         p_value, beyond = judged(linearised, noise, found, possible[:tried], surrogates, generator)
         ranking = ranked(terms, found, prefer, possible)
         if p_value <= level:
-            named, newest = (None if answer is None else answer()) or naming()
+            [(named, newest)] = answer()
             learn(prepared, newest)
             best, ranking, linearised = named.fit, named.ranking, named.linearised
             terms, tangents = named.terms, named.tangents

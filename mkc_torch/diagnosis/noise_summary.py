@@ -19,14 +19,13 @@ _COLOURED = 0.05
 
 def noise_summary(final: Estimate) -> Noise:
     """White, autoregressive, or wandering like a random walk, with its numbers."""
-    fit, linearised, wander = final.fit, final.linearised, final.noise
-    orders = linearised.colour.coefficients
+    fit, wander = final.fit, final.noise
+    orders = final.colour.coefficients
     coloured = any(float(phi.square().sum()) > _COLOURED for phi in orders)
     parameters: dict[str, Number] = {}
     clear = wander.size > 0 and wander.gain > _CLEAR
     if clear:
-        spread = linearised.search.wander_spread(wander)
-        parameters["wander"] = spread
+        parameters["wander"] = final.wander_spread
         if wander.family > 0:
             length = float(fit.model.prepared.time[-1] - fit.model.prepared.time[0])
             parameters["wander_period"] = 2.0 * length / CORNERS[wander.family - 1]

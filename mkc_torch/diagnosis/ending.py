@@ -1,0 +1,112 @@
+"""What is told of findings once they are known, in parts that need nothing of one another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from mkc_torch.diagnosis.ceiling import Ceiling, ceiling
+from mkc_torch.diagnosis.drivers import Driver
+from mkc_torch.diagnosis.estimate import Estimate, estimate
+from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks
+from mkc_torch.diagnosis.extrapolation import extrapolated
+from mkc_torch.diagnosis.locate import Located
+from mkc_torch.diagnosis.onsets import onset_interval
+from mkc_torch.diagnosis.preference import UNKNOWN
+from mkc_torch.diagnosis.refit import FittedModel
+from mkc_torch.diagnosis.remaining import remaining
+from mkc_torch.diagnosis.result import DriverShift, Extrapolation
+from mkc_torch.diagnosis.shifts import shifted
+from mkc_torch.diagnosis.side_by_side import memory_kept
+
+__all__ = ["Beyond", "Ending", "ending_parts", "nameless"]
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """What a finding is worth where its driver is high, and when it is moved; and how sure its onset is."""
+
+    extrapolation: Extrapolation | None
+    driver_shift: DriverShift | None
+    onset_interval: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class Ending:
+    """The parts, in the order of :func:`ending_parts`.
+
+    Attributes:
+        beyond: of each finding.
+        within_reach: the ceiling of any fit, and the columns along which something smooth remains.
+        final: the final parameters.
+    """
+
+    beyond: tuple[Beyond, ...]
+    within_reach: tuple[Ceiling, tuple[str, ...]]
+    final: Estimate
+
+    @property
+    def reach(self) -> Ceiling:
+        return self.within_reach[0]
+
+    @property
+    def left(self) -> tuple[str, ...]:
+        return self.within_reach[1]
+
+
+def ending_parts(
+    base: FittedModel,
+    found: Sequence[Located],
+    evidence: Sequence[Evidence],
+    blocks: HeldOutBlocks,
+    drivers: Sequence[Driver],
+    seed: int,
+) -> list[Callable[[], Any]]:
+    """Works that give the parts of an :class:`Ending`; the last one takes longest.
+
+    Args:
+        base: the simulation alone.
+        found: what was found.
+        evidence: of the simulation alone, and with one finding more each.
+        blocks: of the evidence.
+        drivers: the columns.
+        seed: of the bootstraps.
+    """
+    fits = [base, *(one.fit for one in found)]
+    fit = fits[-1]
+
+    def beyond() -> tuple[Beyond, ...]:
+        return tuple(_beyond(without, one, seed) for without, one in zip(fits[:-1], found, strict=True))
+
+    def within_reach() -> tuple[Ceiling, tuple[str, ...]]:
+        reach = ceiling(base.model, _answerable(base, fit), drivers, blocks)
+        left = () if nameless(fit) else remaining(reach, evidence[-1], fit, drivers, blocks, seed)
+        return reach, left
+
+    def final() -> Estimate:
+        return estimate(fit).at_least(evidence[-1].jackknife)
+
+    def begun(work: Callable[[], Any]) -> Any:
+        with memory_kept(base.model.prepared):
+            fit.model.residual(fit.parameters)  # to be the newest that a simulation remembers
+            return work()
+
+    return [partial(begun, work) for work in (beyond, within_reach, final)]
+
+
+def _beyond(without: FittedModel, found: Located, seed: int) -> Beyond:
+    model = without.model
+    return Beyond(extrapolated(without, found.fit, seed), shifted(model, found), onset_interval(model, found))
+
+
+def nameless(fit: FittedModel) -> bool:
+    """Whether an effect is a curve over a driver that no physics of the catalogue accounts for."""
+    return any(term.effect.id == UNKNOWN for term in fit.model.terms)
+
+
+def _answerable(base: FittedModel, final: FittedModel) -> FittedModel:
+    """The final fit; that of the simulation alone, if it has no answer at the other's parameters."""
+    alone = base.model.residual(final.parameters[: base.model.size])
+    return final if bool(alone.isfinite().all()) else base
