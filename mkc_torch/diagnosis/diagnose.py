@@ -57,7 +57,7 @@ _BEYOND_DOUBT, _FURTHER = 8.0, 20.0
 """Nats beyond all draws of noise from which unseen blocks are not asked to confirm a first finding, and from which they
 need only to lean the way of a further one."""
 
-_QUIET, _GLANCE = 0.5, 99
+_QUIET, _GLANCE = 0.2, 49
 """A p-value at a first look beside a finding above which nothing further is searched, and the draws that it takes."""
 
 _REST = 0.5
