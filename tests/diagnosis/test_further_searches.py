@@ -11,6 +11,7 @@ from mkc_torch.recording import Recording
 from mkc_torch.simulation import Dynamics
 
 diagnosis_of = importlib.import_module("mkc_torch.diagnosis.diagnose")
+ending_of = importlib.import_module("mkc_torch.diagnosis.ending")
 
 
 EFFECTS = [effect for effect in CATALOGUE if effect.id in ("cubic_stiffness", "quadratic_drag")]
@@ -46,7 +47,7 @@ def diagnosed(recording, monkeypatch):
 
     def run(beside):
         searches, begun, first = [], [], []
-        locate, estimate = diagnosis_of.locate, diagnosis_of.estimate
+        locate, estimate = diagnosis_of.locate, ending_of.estimate
 
         def search(base, terms, **options):
             searches.append(base)
@@ -57,7 +58,7 @@ def diagnosed(recording, monkeypatch):
 
         monkeypatch.setattr(diagnosis_of, "locate", search)
         monkeypatch.setattr(
-            diagnosis_of, "estimate", lambda fit: begun.append(fit.model.prepared.newest[1]) or estimate(fit)
+            ending_of, "estimate", lambda fit: begun.append(fit.model.prepared.newest[1]) or estimate(fit)
         )
         return diagnosis_of.diagnose(Sled(), recording, effects=EFFECTS), searches, begun
 
