@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from mkc_torch._commands.console import FAILURES, Look, folder_removed_on_failure, sentence_of, with_unit
 from mkc_torch._commands.diagnosis_summary import show
 from mkc_torch._files import claim_folder, write_atomically
+from mkc_torch._load_early import load_early
 from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
 from mkc_torch.diagnosis.python_source import SourceError
@@ -79,6 +80,8 @@ def diagnose_file(path: Path, folder: Path, request: Request, look: Look) -> lis
         claim_folder(folder, overwrite=request.force)
     except Exception as error:
         return [_failed(path, "", error)]
+    if request.report:
+        load_early("matplotlib.figure")
     with folder_removed_on_failure(folder):
         outcomes = [
             _outcome(path, label, simulation, part, place, request, look)

@@ -223,11 +223,14 @@ def filtered(values: Float[Tensor, " N"], coefficients: Tensor) -> Float[Tensor,
 
 def autoregressive(coefficients: Tensor, N: int, count: int, generator: torch.Generator) -> Float[Tensor, "N count"]:
     """Stationary draws of an autoregression whose innovations have variance one."""
-    # a circle three times as long, of which a third is used, hides that it closes
-    length = 3 * N
+    # a circle three times as long, of which a third is used, hides that it closes; its length is even
+    length = 3 * (N + N % 2)
     frequency = torch.arange(length // 2 + 1, dtype=torch.float64) * (2 * math.pi / length)
-    white = torch.fft.rfft(torch.randn(length, count, generator=generator, dtype=torch.float64), dim=0)
-    return torch.fft.irfft(white * _root(coefficients, frequency).unsqueeze(-1), n=length, dim=0)[:N]
+    # drawn where white noise is white too; the two ends of its spectrum are real
+    drawn = torch.randn(count, len(frequency), generator=generator, dtype=torch.complex128)
+    drawn[:, [0, -1]] *= math.sqrt(2.0)
+    drawn *= math.sqrt(length) * _root(coefficients, frequency)
+    return torch.fft.irfft(drawn, n=length)[:, :N].mT
 
 
 def colour_of(power: Float[Tensor, "K m"]) -> Colour:

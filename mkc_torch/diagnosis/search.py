@@ -188,7 +188,7 @@ class LinearSearch:
         on_basis = self._basis.mT @ series
         power = (series.square().sum(0) - on_basis.square().sum(0)).double()
         inner = (self._flat.mT @ series - (self._flat.mT @ self._basis) @ on_basis).double()
-        slow = (self._wander.mT @ series - (self._wander.mT @ self._basis) @ on_basis).double()
+        slow = (self._wander.mT @ series - self._wander_basis.mT @ on_basis).double()
         null, best = self._profile(power, inner, slow)
         ratio = (2.0 * (best - null)).clamp(min=0.0)
         dof = self.dof
@@ -229,7 +229,7 @@ class LinearSearch:
         series = series.to(self._flat.dtype).unsqueeze(-1)
         on_basis = self._basis.mT @ series
         power = (series.square().sum(0) - on_basis.square().sum(0)).double()
-        slow = (self._wander.mT @ series - (self._wander.mT @ self._basis) @ on_basis).double()
+        slow = (self._wander.mT @ series - self._wander_basis.mT @ on_basis).double()
         none = float(-0.5 * self._dof * power.log())
         best = NoiseFit(0, 0.0, float(power / self._dof), none, 0.0)
         for number, family in enumerate(self._families):
@@ -336,8 +336,8 @@ class LinearSearch:
         taken = self._basis.square().sum(-1)
         if fit.size > 0:
             family = self._families[fit.family]
-            courses = self._wander @ (family.scale.unsqueeze(-1) * family.axes)
-            courses = courses - self._basis @ (self._basis.mT @ courses)
+            axes = family.scale.unsqueeze(-1) * family.axes
+            courses = self._wander @ axes - self._basis @ (self._wander_basis @ axes)
             share = fit.size / (1.0 + fit.size * family.strength)
             left = left - courses @ (share * (courses.mT @ left))
             taken = taken + courses.square() @ share

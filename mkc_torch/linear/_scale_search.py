@@ -156,15 +156,17 @@ def _minimise(
 
     tolerance = 1e2 * torch.finfo(beta.dtype).eps
     objective = beta.new_full(beta.shape[:2], math.inf)
+    moving = torch.ones_like(objective, dtype=torch.bool)
     n_iter = 0
-    while n_iter < max_iter:
+    while n_iter < max_iter and moving.any():
         n_iter += 1
-        proposal, before = _step(problem, beta, final)
-        moving = objective - before > tolerance
-        objective = torch.minimum(objective, before)
-        beta = torch.where(moving.unsqueeze(-1), proposal, beta)
-        if not moving.any():
-            break
+        going = torch.nonzero(moving.any(0)).flatten()
+        here = beta[:, going]
+        proposal, before = _step(problem, here, final)
+        falls = objective[:, going] - before > tolerance
+        objective[:, going] = torch.minimum(objective[:, going], before)
+        beta[:, going] = torch.where(falls.unsqueeze(-1), proposal, here)
+        moving[:, going] = falls
     residual = problem.residual(beta)
     scale, weight = final.weighed(problem, residual)
     best = _log_product(scale).argmin(1)
