@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -24,6 +25,7 @@ from mkc_torch.diagnosis.first_look import p_value_beside
 from mkc_torch.diagnosis.innovations import innovation_gain
 from mkc_torch.diagnosis.locate import Located, locate
 from mkc_torch.diagnosis.model import JointModel, Term
+from mkc_torch.diagnosis.noise import autoregression
 from mkc_torch.diagnosis.noise_summary import noise_summary
 from mkc_torch.diagnosis.preference import ALIKE_COLUMNS, UNKNOWN, alike
 from mkc_torch.diagnosis.refit import FittedModel, fitted
@@ -57,7 +59,7 @@ _BEYOND_DOUBT, _FURTHER = 8.0, 20.0
 """Nats beyond all draws of noise from which unseen blocks are not asked to confirm a first finding, and from which they
 need only to lean the way of a further one."""
 
-_QUIET, _GLANCE = 0.2, 49
+_QUIET, _GLANCE = 0.1, 49
 """A p-value at a first look beside a finding above which nothing further is searched, and the draws that it takes."""
 
 _REST = 0.5
@@ -225,12 +227,25 @@ class _Search:
 
 def _begun(base: FittedModel, terms: tuple[Term, ...], asked: _Asked, generator: torch.Generator) -> _Search:
     """The first search, and its finding, if unseen blocks confirm it."""
-    first: Located | None = None
-    if terms:
-        first = locate(base, terms, level=asked.level, surrogates=asked.surrogates, generator=generator)
-    blocks = blocks_of(len(base.residual), 1 if first is None else 1 + first.linearised.colour.order)
-    search = _Search(first, (), None, blocks, (held_out(base, blocks),), terms)
-    return search if first is None else _taken_up(search, first, asked)
+    prepared = base.model.prepared
+    correlation = 1 + max(len(autoregression(one)) for one in base.pseudo[0].unbind(1))
+    blocks = blocks_of(len(base.residual), correlation)
+    alone = with_memory(prepared, partial(held_out, base, blocks))
+
+    def searched() -> Located:
+        located = locate(base, terms, level=asked.level, surrogates=asked.surrogates, generator=generator)
+        located.fit.model.residual(located.fit.parameters)  # to be the newest that a simulation remembers
+        return located
+
+    with meanwhile([alone], known_of(prepared, ())) as judged:
+        first, newest = with_memory(prepared, searched)() if terms else (None, None)
+        [(evidence, newest_alone)] = judged()
+    learn(prepared, newest_alone)
+    begun = _Search(first, (), None, blocks, (evidence,), terms)
+    if first is None:
+        return begun
+    learn(prepared, newest)
+    return _taken_up(begun, first, asked)
 
 
 def _continued(search: _Search, asked: _Asked, generator: torch.Generator) -> _Search:

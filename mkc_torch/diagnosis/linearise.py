@@ -245,7 +245,7 @@ class Linearised:
 
     def _columns(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> list[Tensor]:
         rows = len(self.series) - self.colour.root.numel()
-        columns = [self._whitened(counts.unsqueeze(-1) * t) for t in tangents]
+        columns = _each(lambda joined: self._whitened(counts.unsqueeze(-1) * joined), tangents)
         return [torch.cat([c, c.new_zeros(rows, c.shape[1])]) for c in columns]
 
     def _whitened(self, values: Float[Tensor, "N m c"]) -> Float[Tensor, "Km c"]:

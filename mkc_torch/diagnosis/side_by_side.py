@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any, TypeVar
 
 from mkc_torch._forked import shared
@@ -12,7 +11,7 @@ from mkc_torch.diagnosis.model import Term
 from mkc_torch.diagnosis.refit import FittedModel
 from mkc_torch.simulation.protocol import PreparedSimulation, Remembering
 
-__all__ = ["each", "fitted_each", "known_of", "learn", "memory_kept", "with_memory"]
+__all__ = ["each", "ending_at_fit", "fitted_each", "known_of", "learn", "memory_kept", "with_memory"]
 
 T = TypeVar("T")
 
@@ -22,12 +21,18 @@ def fitted_each(
 ) -> list[FittedModel]:
     """:func:`each` for fits with one of these effects more, or one that differs in its shape alone."""
 
-    def found(work: Callable[[], FittedModel]) -> FittedModel:
+    return each(around, [ending_at_fit(work) for work in works], terms)
+
+
+def ending_at_fit(work: Callable[[], FittedModel]) -> Callable[[], FittedModel]:
+    """The same work; in its end the fit is the newest that a simulation remembers."""
+
+    def found() -> FittedModel:
         fit = work()
-        fit.model.residual(fit.parameters)  # to be the newest that a simulation remembers
+        fit.model.residual(fit.parameters)
         return fit
 
-    return each(around, [partial(found, work) for work in works], terms)
+    return found
 
 
 def each(around: FittedModel, works: Sequence[Callable[[], T]], terms: Sequence[Term] = ()) -> list[T]:

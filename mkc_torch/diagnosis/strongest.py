@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from itertools import chain
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,12 +16,14 @@ from mkc_torch.diagnosis.linearise import Linearised, Tangents, linearise, tange
 from mkc_torch.diagnosis.model import Key, Term, one_sided
 from mkc_torch.diagnosis.preference import Preference
 from mkc_torch.diagnosis.refit import FittedModel, clipped_residual, fitted_beside, repeats
-from mkc_torch.diagnosis.side_by_side import fitted_each
+from mkc_torch.diagnosis.side_by_side import each, ending_at_fit, fitted_each
 from mkc_torch.order_statistic import robust_scale
 from mkc_torch.simulation.protocol import Beginning
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
+
+T = TypeVar("T")
 
 __all__ = ["refitted", "strongest"]
 
@@ -36,8 +40,8 @@ _SHAPES = 5
 Start = tuple[Tensor, tuple[Tensor, Tensor]]
 """Parameters to linearise around, and the pseudo-residual there with what counts of it."""
 
-Listed = tuple[Term, Tensor, Tensor]
-"""A candidate worth a joint refit, with the parameters and the γ to start from."""
+Listed = tuple[Term, Tensor]
+"""A candidate worth a joint refit, with the parameters to start from, its γ the last ones."""
 
 
 def strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *, parts: bool) -> list[FittedModel]:
@@ -47,28 +51,29 @@ def strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *,
     the fit rejects; and, where one model over all of the recording runs away, around fits to parts of it, and around
     where its fit began.
     """
-    around, likeliest = base.parameters, base.parameters.new_zeros(len(terms))
+    around = base.parameters
     tangents = tangents_of(base.model, around, terms)
-    listed = _short_list(base, terms, (around, base.pseudo), tangents, _SHORT_LIST, likeliest)
-    listed += _short_list(base, terms, (around, clipped_residual(base.residual)), tangents, 2, likeliest)
+    looks = [((around, base.pseudo), _SHORT_LIST), ((around, clipped_residual(base.residual)), 2)]
+    lists = each(base, [partial(_short_list, base, terms, start, tangents, most) for start, most in looks], terms)
     fits: dict[Key, FittedModel] = {}
-    _refit_all(fits, base, listed, prefer)
+    fitted_parts = _part_fits(base) if parts else []
+    listed: dict[Key, Listed] = {}
+    for one in chain(*(chosen for chosen, _ in lists)):
+        listed.setdefault(one[0].key, one)
+    starts = _refit_all(fits, base, list(listed.values()), prefer, fitted_parts)
     if parts:
         least = torch.stack([fit.d for fit in fits.values()]).amin(0)
-        listed = []
-        for start in (*_part_starts(base, least), *_first_start(base)):
-            listed += _short_list(base, terms, start, tangents_of(base.model, start[0], terms), 2, likeliest)
-        _refit_all(fits, base, listed, prefer)
-    leading = sorted(fits.values(), key=lambda fit: prefer.score(fit, base), reverse=True)[: _LEADING + 1]
-    close = max(_THIRD * prefer.score(leading[0], base), _MUCH)
-    leading = [fit for place, fit in enumerate(leading) if place < _LEADING or prefer.score(fit, base) > close]
+        started = [one.start for one in starts if one is not None and bool((one.scale < _BETTER * least).any())]
+        more = [
+            _short_list(base, terms, start, tangents_of(base.model, start[0], terms), 2)
+            for start in (*started, *_first_start(base))
+        ]
+        _refit_all(fits, base, [*chain(*(chosen for chosen, _ in more))], prefer)
+        lists += more
+    likeliest = torch.stack([log_p for _, log_p in lists]).amin(0)
     order = [terms[number] for number in likeliest.argsort().tolist()]
-
-    def shaped_best(fit: FittedModel) -> FittedModel:
-        fit.model.residual(fit.parameters)  # what other shapes of it begin with, where a simulation remembers
-        return refined(_best_shape(fit, base, order, prefer), base)
-
-    shaped = fitted_each(base, [partial(shaped_best, fit) for fit in leading], terms)
+    leading = _at_best_shapes(_leading(list(fits.values()), base, prefer), base, order, prefer)
+    shaped = fitted_each(base, [partial(refined, fit, base) for fit in leading], terms)
     shaped = [fit for fit in shaped if repeats(fit)] or [fit for fit in fits.values() if repeats(fit)]
     if not shaped:
         raise ValueError(
@@ -81,18 +86,12 @@ def strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *,
 
 
 def _short_list(
-    base: FittedModel,
-    terms: tuple[Term, ...],
-    start: Start,
-    tangents: Tangents,
-    most: int,
-    likeliest: Float[Tensor, " C"],
-) -> list[Listed]:
-    """The strongest candidates, noise taken for white; ``likeliest`` takes the log of each one's p."""
+    base: FittedModel, terms: tuple[Term, ...], start: Start, tangents: Tangents, most: int
+) -> tuple[list[Listed], Float[Tensor, " C"]]:
+    """The strongest candidates, noise taken for white, and the log of each one's p."""
     parameters, (pseudo, counts) = start
     plain = linearise(base.model, parameters, pseudo, counts, tangents, white=True, wander=False)
     log_p = plain.search.gains(plain.series.unsqueeze(-1)).log_p[:, 0]
-    torch.minimum(likeliest, log_p, out=likeliest)
     chosen: dict[Key, Listed] = {}
     for number in log_p.argsort().tolist():
         term = terms[number]
@@ -102,36 +101,39 @@ def _short_list(
                 gamma = gamma.clamp(max=0.0)
                 if not bool(gamma.any()):
                     continue
-            chosen[term.key] = term, parameters, -gamma
+            chosen[term.key] = term, torch.cat([parameters, -gamma])
         if len(chosen) >= most:
             break
     if not chosen:
         # none has a size of a sign that its physics allows; one of them is still to be told to be nothing
-        chosen[terms[0].key] = terms[0], parameters, parameters.new_zeros(_size(terms[0], base))
-    return list(chosen.values())
+        size = base.model.with_term(terms[0]).sizes[-1]
+        chosen[terms[0].key] = terms[0], torch.cat([parameters, parameters.new_zeros(size)])
+    return list(chosen.values()), log_p
 
 
-def _size(term: Term, base: FittedModel) -> int:
-    return base.model.with_term(term).sizes[-1]
+@dataclass(frozen=True)
+class _Part:
+    """A fit to a part of the recording, as a start, and the robust scale of its residuals there."""
+
+    start: Start
+    scale: Float[Tensor, " m"]
 
 
-def _part_starts(base: FittedModel, d: Float[Tensor, " m"]) -> list[Start]:
-    """Around fits to parts of the recording; those only that fit their part clearly better than d allows for."""
-    prepared = base.model.prepared
-    N = len(prepared.time)
-    starts = []
-    for part in range(_PARTS):
-        rows = torch.zeros(N, dtype=torch.bool)
-        rows[part * N // _PARTS : (part + 1) * N // _PARTS] = True
+def _part_fits(base: FittedModel) -> list[Callable[[], _Part | None]]:
+    """Works that fit parts of the recording; None where one cannot be fitted alone."""
+    N = len(base.model.prepared.time)
+
+    def fit_to(rows: Bool[Tensor, " N"]) -> _Part | None:
         try:
-            theta = prepared.start(rows)
+            theta = base.model.prepared.start(rows)
         except ValueError:
-            continue
+            return None
         parameters = torch.cat([theta, base.parameters[base.model.base :]])
         residual = base.model.residual(parameters)
-        if bool((robust_scale(residual[rows]) < _BETTER * d).any()):
-            starts.append((parameters, clipped_residual(residual)))
-    return starts
+        return _Part((parameters, clipped_residual(residual)), robust_scale(residual[rows]))
+
+    part = torch.arange(N) * _PARTS // N
+    return [partial(fit_to, part == number) for number in range(_PARTS)]
 
 
 def _first_start(base: FittedModel) -> list[Start]:
@@ -148,35 +150,50 @@ def _first_start(base: FittedModel) -> list[Start]:
     return [(parameters, clipped_residual(residual))] if bool(residual.isfinite().all()) else []
 
 
-def _refit_all(fits: dict[Key, FittedModel], base: FittedModel, listed: Sequence[Listed], prefer: Preference) -> None:
-    """Put the joint refit of each into ``fits``, where it is the better one of its physics."""
-    first: dict[tuple[Key, int], Listed] = {}
-    for one in listed:
-        first.setdefault((one[0].key, id(one[1])), one)
-    works = [
-        partial(fitted_beside, base, base.model.with_term(term), torch.cat([parameters, gamma]))
-        for term, parameters, gamma in first.values()
-    ]
-    found = fitted_each(base, works, [term for term, _, _ in first.values()])
-    for (key, _), fit in zip(first, found, strict=True):
-        if key not in fits or prefer.score(fit, base) > prefer.score(fits[key], base):
-            fits[key] = fit
+def _refit_all(
+    fits: dict[Key, FittedModel],
+    base: FittedModel,
+    listed: Sequence[Listed],
+    prefer: Preference,
+    beside: Sequence[Callable[[], T]] = (),
+) -> list[T]:
+    """Put the joint refit of each into ``fits``, where it is the better one of its physics; others go on beside."""
+    works = [ending_at_fit(partial(fitted_beside, base, base.model.with_term(term), start)) for term, start in listed]
+    done: list[Any] = each(base, [*works, *beside], [term for term, _ in listed])
+    for (term, _), fit in zip(listed, done, strict=False):
+        if term.key not in fits or prefer.score(fit, base) > prefer.score(fits[term.key], base):
+            fits[term.key] = fit
+    return done[len(works) :]
 
 
-def _best_shape(fit: FittedModel, base: FittedModel, terms: Sequence[Term], prefer: Preference) -> FittedModel:
-    """The fit, or a better one with another shape of the same effect, the likeliest of ``terms`` first.
+def _leading(fits: Sequence[FittedModel], base: FittedModel, prefer: Preference) -> list[FittedModel]:
+    """The first ones, and another that is close behind."""
+    first = sorted(fits, key=lambda fit: prefer.score(fit, base), reverse=True)[: _LEADING + 1]
+    close = max(_THIRD * prefer.score(first[0], base), _MUCH)
+    return [fit for place, fit in enumerate(first) if place < _LEADING or prefer.score(fit, base) > close]
+
+
+def _at_best_shapes(
+    fits: Sequence[FittedModel], base: FittedModel, terms: Sequence[Term], prefer: Preference
+) -> list[FittedModel]:
+    """Each fit, or a better one with another shape of the same effect, the likeliest of ``terms`` first.
 
     Onsets are many, and closed in on later.
     """
-    own = fit.model.terms[-1]
-    others = [t for t in terms if t.key == own.key and t.shape != own.shape]
-    if "onset" in own.shape or not others:
-        return fit
-    refits = [_reshaped(fit, base, other) for other in others[:_SHAPES]]
-    return max([fit, *refits], key=lambda f: prefer.score(f, base))
+    tried = []
+    for place, fit in enumerate(fits):
+        own = fit.model.terms[-1]
+        others = [t for t in terms if t.key == own.key and t.shape != own.shape]
+        tried += [(place, other) for other in others[:_SHAPES] if "onset" not in own.shape]
+    refits = fitted_each(base, [partial(_reshaped, fits[k], base, other) for k, other in tried], terms)
+    best = list(fits)
+    for (place, _), refit in zip(tried, refits, strict=True):
+        best[place] = max(best[place], refit, key=lambda fit: prefer.score(fit, base))
+    return best
 
 
 def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
+    fit.model.residual(fit.parameters)  # what other shapes of it begin with, where a simulation remembers
     model = base.model.with_term(term)
     kept = fit.parameters[: model.size]
     more = kept.new_zeros(model.size - len(kept))

@@ -94,5 +94,5 @@ def test_a_search_beside_a_finding_is_made_where_a_first_look_shows_something(mo
     monkeypatch.setattr(diagnosis_of, "p_value_beside", looked)
     diagnosis = diagnosis_of.diagnose(Magnetometer("attitude"), recording(*effects))
     assert [finding.effect for finding in diagnosis.findings] == names
-    assert len(begun) == searches + (seen[-1] <= 0.2)
+    assert len(begun) == searches + (seen[-1] <= 0.1)
     assert len(seen) == searches
