@@ -2,6 +2,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 
 import pytest
 import torch
@@ -56,6 +57,12 @@ def calibrated(tmp_path_factory):
     result = mkc("demo", "--output", folder)
     assert result.exit_code == 0, result.output
     return folder, result
+
+
+def test_the_version_is_that_of_the_package():
+    result = mkc("--version")
+    assert result.exit_code == 0
+    assert result.output == f"mkc {version('mkc-torch')}\n"
 
 
 def test_calibrate_writes_both_files_and_a_summary(good, tmp_path):

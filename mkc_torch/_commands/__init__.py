@@ -3,8 +3,11 @@
 What takes long to import, and not every command needs, is imported where it is used.
 """
 
+from typing import Annotated
+
 import typer
 
+from mkc_torch import __version__
 from mkc_torch._commands.apply import apply
 from mkc_torch._commands.calibrate import calibrate
 from mkc_torch._commands.challenge import challenge
@@ -20,6 +23,23 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+
+
+def _say_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"mkc {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _all_commands(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say which version this is.")
+    ] = False,
+) -> None:
+    """Options of no command in particular."""
+
+
 app.command()(diagnose)
 app.command()(calibrate)
 app.command()(apply)
