@@ -42,6 +42,9 @@ _MOST, _MARGIN, _FEWEST = 0.9, 3.0, 1000
 _AT_ONCE = 8
 """Candidates whose tangents are moved about together: they stay in a core's own memory."""
 
+_ALTERNATIONS, _SETTLED = 8, 1.0
+"""Steps at most between the colour and a wander beside it, and the nats that a step has to bring."""
+
 _REFILLED = 2
 """Times that the colour is read again, with what it says of rejected samples."""
 
@@ -226,6 +229,19 @@ class Linearised:
         return colour_of(power * self.colour.root.square())
 
     @property
+    def wanders(self) -> bool:
+        """Whether a wander makes the noise likelier."""
+        return self.search.noise_fit(self.series).gain > _SETTLED
+
+    def colour_ahead(self) -> Colour:
+        """Twice as far from the present colour as :meth:`colour_beside`: that goes slowly where a wander is strong.
+
+        Salakhutdinov & Roweis, "Adaptive overrelaxed bound optimization methods", ICML (2003).
+        """
+        step = self.colour_beside()
+        return replace(step, root=step.root.square() / self.colour.root)
+
+    @property
     def evidence(self) -> float:
         """Log-likelihood of the residuals by their own noise, up to a constant that all noise of a recording shares."""
         log_det = float(self.colour.root.log().sum()) + 0.5 * self.filling.log_det
@@ -388,7 +404,17 @@ def _coloured(
     # from the side of no wander and from that of no colour: either could pass for the other
     beside = _searching(plain, pull, seen, slow, gaps).colour_beside() if near is None else near
     tried.append(_searching(beside, pull, seen, slow, gaps))
-    return max(tried, key=lambda found: found.evidence)
+    found = max(tried, key=lambda found: found.evidence)
+    for _ in range(_ALTERNATIONS if found.wanders else 0):
+        # a step that goes too far is taken back to the one that cannot
+        for colour in (found.colour_ahead, found.colour_beside):
+            step = _searching(colour(), pull, seen, slow, gaps)
+            if step.evidence > found.evidence + _SETTLED:
+                break
+        else:
+            break
+        found = step
+    return found
 
 
 def _level(pseudo: Tensor) -> Tensor:
