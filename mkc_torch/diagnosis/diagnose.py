@@ -42,7 +42,7 @@ from mkc_torch.recording import Recording
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool
+    from jaxtyping import Bool, Float
 
 __all__ = ["diagnose"]
 
@@ -357,6 +357,7 @@ def _assembled(
             *drivers.warnings,
             *_time_warnings(prepared),
             *remaining_warning(ending.left),
+            *_in_one_stretch(first, prepared.time),
             *(sentence for finding in findings for sentence in shift_warning(finding)),
             *(sentence for finding in findings for sentence in extrapolation_warning(finding)),
             *density_warnings(final.fit.residual, final.fit.sigma, final.fit.d, final.fit.bound, prepared.channels),
@@ -450,11 +451,26 @@ def _nothing_to_separate() -> Separability:
 
 
 def _not_confirmed(located: Located) -> str:
-    name = " of ".join([located.term.effect.id, *([", ".join(located.term.columns)] if located.term.columns else [])])
     return (
-        f"{name} ({described(located.term.shape) or 'no onset'}): p = {located.p_value:.2g} after the whole search, "
-        "but it does not predict blocks better that the fit has not seen, so it does not count as a finding."
+        f"{_called(located.term)} ({described(located.term.shape) or 'no onset'}): p = {located.p_value:.2g} after the "
+        "whole search, but it does not predict blocks better that the fit has not seen, so it does not count as a "
+        "finding."
     )
+
+
+def _in_one_stretch(located: Located | None, time: Float[Tensor, " N"]) -> tuple[str, ...]:
+    if located is None or located.stretch is None:
+        return ()
+    begin, end = (float(time[n]) for n in (located.stretch[0], located.stretch[1] - 1))
+    return (
+        f"From {begin:.1f} to {end:.1f} s the recording is off as {_called(located.term)} would have it, but hardly "
+        "elsewhere. Other stretches are off too and no effect explains them, so this one counts as another burst of "
+        "outliers. Record again, for longer.",
+    )
+
+
+def _called(term: Term) -> str:
+    return " of ".join([term.effect.id, *([", ".join(term.columns)] if term.columns else [])])
 
 
 def _time_warnings(prepared: PreparedSimulation) -> tuple[str, ...]:

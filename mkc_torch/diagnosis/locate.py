@@ -17,6 +17,7 @@ from mkc_torch.diagnosis.linearise import Linearised, Tangents, candidate_tangen
 from mkc_torch.diagnosis.local import beside_wander
 from mkc_torch.diagnosis.model import Term
 from mkc_torch.diagnosis.noise import Colour
+from mkc_torch.diagnosis.one_stretch import telling_stretch
 from mkc_torch.diagnosis.preference import Preference
 from mkc_torch.diagnosis.ranking import SEPARABLE, Ranked, own_p, possible_of, ranked
 from mkc_torch.diagnosis.refit import FittedModel, fitted_beside, repeats
@@ -45,6 +46,7 @@ class Located:
         noise: the wander of the noise without the candidate.
         values, counts: (N, m), the pseudo-residual without the candidate, and what counts of it.
         linearised: the search that the p-value is from; ``tangents`` and ``terms`` are its candidates.
+        stretch: samples without which there is nothing, first and the one after the last, if they are few.
     """
 
     term: Term
@@ -58,6 +60,7 @@ class Located:
     linearised: Linearised
     tangents: Tangents
     terms: tuple[Term, ...]
+    stretch: tuple[int, int] | None = None
 
 
 def locate(
@@ -103,6 +106,17 @@ def locate(
         found = linearised.search.gains(linearised.series.unsqueeze(-1))
         possible = possible_of(terms, linearised)
         p_value, beyond = judged(linearised, noise, found, possible[:tried], surrogates, generator)
+        stretch = None
+        if p_value <= level:
+            own = int(torch.where(possible, found.log_p[:, 0], 0.0).argmin())
+            trace = counts * (tangents.candidates[own] @ linearised.search.estimate(own, linearised.series)[0])
+            stretch = telling_stretch(pseudo, counts, trace, tangents.nuisance)
+        if stretch is not None:
+            rest = counts.clone()
+            rest[slice(*stretch)] = 0.0
+            beside = linearise(base.model, parameters, rest * pseudo, rest, tangents)
+            without = _judged(beside, terms, tried, surrogates, generator)
+            p_value, beyond = max(p_value, without[0]), min(beyond, without[1])
         ranking = ranked(terms, found, prefer, possible)
         if p_value <= level:
             [(named, newest)] = answer()
@@ -118,8 +132,29 @@ def locate(
         shaped = shape_fitted(best)
         best = shaped if repeats(shaped) else best
     return Located(
-        best.model.terms[-1], best, p_value, beyond, ranking, noise, pseudo, counts, linearised, tangents, terms
+        best.model.terms[-1],
+        best,
+        p_value,
+        beyond,
+        ranking,
+        noise,
+        pseudo,
+        counts,
+        linearised,
+        tangents,
+        terms,
+        stretch if p_value > level else None,
     )
+
+
+def _judged(
+    linearised: Linearised, terms: tuple[Term, ...], tried: int, surrogates: int, generator: torch.Generator
+) -> tuple[float, float]:
+    """As :func:`judged` says, of the strongest of the first candidates in a search."""
+    noise = linearised.search.noise_fit(linearised.series)
+    found = linearised.search.gains(linearised.series.unsqueeze(-1))
+    possible = possible_of(terms, linearised)[:tried]
+    return judged(linearised, noise, found, possible, surrogates, generator)
 
 
 @dataclass(frozen=True)
