@@ -112,11 +112,10 @@ def locate(
             trace = counts * (tangents.candidates[own] @ linearised.search.estimate(own, linearised.series)[0])
             stretch = telling_stretch(pseudo, counts, trace, tangents.nuisance)
         if stretch is not None:
-            rest = counts.clone()
-            rest[slice(*stretch)] = 0.0
+            rest = _without(counts, stretch)
             beside = linearise(base.model, parameters, rest * pseudo, rest, tangents)
-            without = _judged(beside, terms, tried, surrogates, generator)
-            p_value, beyond = max(p_value, without[0]), min(beyond, without[1])
+            others = _judged(beside, terms, tried, surrogates, generator)
+            p_value, beyond = max(p_value, others[0]), min(beyond, others[1])
         ranking = ranked(terms, found, prefer, possible)
         if p_value <= level:
             [(named, newest)] = answer()
@@ -145,6 +144,13 @@ def locate(
         terms,
         stretch if p_value > level else None,
     )
+
+
+def _without(counts: Float[Tensor, "N m"], stretch: tuple[int, int]) -> Float[Tensor, "N m"]:
+    """With nothing that counts in a stretch."""
+    rest = counts.clone()
+    rest[slice(*stretch)] = 0.0
+    return rest
 
 
 def _judged(

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from mkc_torch.diagnosis.local import crowded, explained
+from mkc_torch.diagnosis.bursts import crowded
+from mkc_torch.diagnosis.local import explained
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -37,6 +38,7 @@ def telling_stretch(
         nuisance: tangents of the simulation's own parameters.
 
     Example:
+        >>> import torch
         >>> trace = torch.zeros(1000, 1, dtype=torch.float64)
         >>> trace[400:420] = 1.0
         >>> counts = torch.ones_like(trace)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from mkc_torch.diagnosis.bursts import of_all, out_of_bursts, together
 from mkc_torch.diagnosis.linearise import linearise, tangents_of
-from mkc_torch.diagnosis.local import _of_all, _out_of_bursts, _together, beside_wander
+from mkc_torch.diagnosis.local import beside_wander
 from mkc_torch.diagnosis.model import JointModel
 from mkc_torch.diagnosis.refit import fitted
 from mkc_torch.simulation import Magnetometer
@@ -98,16 +99,16 @@ def test_neighbours_to_one_side_together_do_not_count():
     for n in range(1, 3000):
         slow[n] += 0.98 * slow[n - 1]
     every = torch.ones_like(draws)
-    assert float(_together(draws, every).mean()) == 1.0
-    assert float(_together(slow, every).mean()) > 0.99
+    assert float(together(draws, every).mean()) == 1.0
+    assert float(together(slow, every).mean()) > 0.99
     draws[1000:1030, 1] += 1.5
     draws[2000:2600, 0] *= 1.5
-    found = _together(draws, every)
+    found = together(draws, every)
     assert float(found[1002:1028, 1].sum()) == 0.0
     assert float(found[:, 0].min()) == 1.0 == float(found[:970, 1].min()) == float(found[1060:, 1].min())
     rejected = every.clone()
     rejected[1000:1030, 1] = 0.0
-    assert float(_together(draws, rejected)[:, 1].min()) == 1.0
+    assert float(together(draws, rejected)[:, 1].min()) == 1.0
 
 
 def test_what_is_in_the_midst_of_outliers_is_one():
@@ -115,7 +116,7 @@ def test_what_is_in_the_midst_of_outliers_is_one():
     near[40:60, 0] = 0.0
     near[45::4, 0] = 1.0  # a course that follows the burst lets some of it through
     near[10::7, 1] = 0.0  # single outliers, however many, take nothing with them
-    found = _out_of_bursts(near)
+    found = out_of_bursts(near)
     assert float(found[43:57, 0].sum()) == 0.0
     assert float(found[:35, 0].min()) == float(found[66:, 0].min()) == 1.0
     assert torch.equal(found[:, 1], near[:, 1])
@@ -124,13 +125,13 @@ def test_what_is_in_the_midst_of_outliers_is_one():
 def test_outliers_that_come_together_count_in_no_channel():
     draws = torch.from_numpy(np.random.default_rng(4).random((2000, 3)))
     apart = (draws > 0.15).double()
-    assert torch.equal(_of_all(apart), apart)
+    assert torch.equal(of_all(apart), apart)
     together = apart.clone()
     together[:, 1] *= apart[:, 0]
     together[:, 2] *= (draws[:, 0] > 0.1).double()
-    assert torch.equal(_of_all(together), together.amin(1, keepdim=True).expand(-1, 3))
-    assert torch.equal(_of_all(apart[:, :1]), apart[:, :1])
-    assert torch.equal(_of_all(torch.ones_like(apart)), torch.ones_like(apart))
+    assert torch.equal(of_all(together), together.amin(1, keepdim=True).expand(-1, 3))
+    assert torch.equal(of_all(apart[:, :1]), apart[:, :1])
+    assert torch.equal(of_all(torch.ones_like(apart)), torch.ones_like(apart))
 
 
 def slow_in_the_world(seed, keep=0.998, size=0.4):
