@@ -42,8 +42,12 @@ _MOST, _MARGIN, _FEWEST = 0.9, 3.0, 1000
 _AT_ONCE = 8
 """Candidates whose tangents are moved about together: they stay in a core's own memory."""
 
-_ALTERNATIONS, _SETTLED = 8, 1.0
-"""Steps at most between the colour and a wander beside it, and the nats that a step has to bring."""
+_ALTERNATIONS, _SETTLED = 8, 10.0
+"""Steps at most between the colour and a wander beside it, and the nats that a step has to bring: as many as a colour,
+which is some twenty numbers, gains by chance."""
+
+_FARTHEST = 10.0
+"""Times that a step may go beyond, of the root of a spectrum."""
 
 _REFILLED = 2
 """Times that the colour is read again, with what it says of rejected samples."""
@@ -231,7 +235,7 @@ class Linearised:
     @property
     def wanders(self) -> bool:
         """Whether a wander makes the noise likelier."""
-        return self.search.noise_fit(self.series).gain > _SETTLED
+        return self.search.noise_fit(self.series).gain > 0
 
     def colour_ahead(self) -> Colour:
         """Twice as far from the present colour as :meth:`colour_beside`: that goes slowly where a wander is strong.
@@ -239,7 +243,8 @@ class Linearised:
         Salakhutdinov & Roweis, "Adaptive overrelaxed bound optimization methods", ICML (2003).
         """
         step = self.colour_beside()
-        return replace(step, root=step.root.square() / self.colour.root)
+        beyond = (step.root / self.colour.root).clamp(1.0 / _FARTHEST, _FARTHEST)
+        return replace(step, root=step.root * beyond)
 
     @property
     def evidence(self) -> float:
@@ -374,7 +379,13 @@ def _searching(
     colour: Colour, pull: _Pull, seen: _Seen, slow: Slow | None, gaps: Gaps, *, joint: bool = False
 ) -> Linearised:
     filling = gaps.filling(colour)
-    seen = seen.filled(filling)
+    return _filled(colour, pull, seen.filled(filling), slow, filling, joint=joint)
+
+
+def _filled(
+    colour: Colour, pull: _Pull, seen: _Seen, slow: Slow | None, filling: Filling, *, joint: bool = False
+) -> Linearised:
+    """A search of what has its rejected samples filled."""
     flat = colour.scaled(seen.pseudo)
     parameters = pull.under(colour.scaled(seen.nuisance), flat)
     candidates = [pull.below(colour.scaled(one)) for one in seen.candidates]
@@ -404,15 +415,25 @@ def _coloured(
     # from the side of no wander and from that of no colour: either could pass for the other
     beside = _searching(plain, pull, seen, slow, gaps).colour_beside() if near is None else near
     tried.append(_searching(beside, pull, seen, slow, gaps))
-    found = max(tried, key=lambda found: found.evidence)
-    for _ in range(_ALTERNATIONS if found.wanders else 0):
+    return _settled(max(tried, key=lambda found: found.evidence), pull, seen, slow)
+
+
+def _settled(found: Linearised, pull: _Pull, seen: _Seen, slow: Slow) -> Linearised:
+    """With the colour that alternating between it and the wander comes to.
+
+    What stands in for rejected samples stays: it follows any colour, and would lead it on.
+    """
+    if not found.wanders:
+        return found
+    filled = seen.filled(found.filling)
+    for _ in range(_ALTERNATIONS):
         # a step that goes too far is taken back to the one that cannot
         for colour in (found.colour_ahead, found.colour_beside):
-            step = _searching(colour(), pull, seen, slow, gaps)
+            step = _filled(colour(), pull, filled, slow, found.filling)
             if step.evidence > found.evidence + _SETTLED:
                 break
         else:
-            break
+            return found
         found = step
     return found
 

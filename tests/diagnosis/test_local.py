@@ -134,8 +134,8 @@ def test_outliers_that_come_together_count_in_no_channel():
     assert torch.equal(of_all(torch.ones_like(apart)), torch.ones_like(apart))
 
 
-def slow_in_the_world(seed, keep=0.998, size=0.4):
-    """What an attitude that drifts by a few tenths of a degree adds to the body's axes, in µT."""
+def slow_in_the_world(seed, keep=0.998, size=0.8):
+    """What an attitude that drifts by a degree adds to the body's axes, in µT."""
     drift = np.random.default_rng(seed).standard_normal((N, 3)) * size * np.sqrt(1.0 - keep**2)
     for n in range(1, N):
         drift[n] += keep * drift[n - 1]
@@ -149,9 +149,9 @@ def test_the_colour_beside_a_wander_is_the_likeliest(seed):
     found = local.noise
     beside = replace(tangents.bare, slow=local.slow)
     step = linearise(fit.model, fit.parameters, local.values, local.counts, beside, colour=found.colour_beside())
-    assert step.evidence < found.evidence + 2.0
+    assert step.evidence < found.evidence + 10.0
     slow = found.colour.root.square()
-    assert float((slow[2:6, 1:].mean(0) / slow[-200:, 1:].mean(0)).min()) > 3.0
+    assert float((slow[2:6, 1:].mean(0) / slow[-200:, 1:].mean(0)).min()) > 30.0
 
 
 def test_what_counts_keeps_its_wander():
