@@ -29,6 +29,9 @@ the likeliest density is so wide that most of them would, and in bursts of one s
 _ALIKE = 1e-10
 """Smallest eigenvalue, over the largest, of tangents on scales of their own that still tells them apart."""
 
+_EXCEPTION = 1.0 / 3.0
+"""Largest share of the residuals that can be bursts: what is off more often is physics that is not in the model yet."""
+
 _SETTLED = 5e-3
 """Share of the residuals that may still come to count or cease to."""
 
@@ -77,8 +80,10 @@ def beside_wander(fit: FittedModel, model: JointModel, parameters: Float[Tensor,
         density = fit_density(quick, bound=fit.bound)
         before = counts
         values, counts = pseudo_residual(quick, density.sigma, density.d)
-        near = out_of_bursts((quick.abs() <= _FAR * robust_scale(quick)).to(quick.dtype))
-        near = of_all(near * together(quick, counts * near))
+        alone = out_of_bursts((quick.abs() <= _FAR * robust_scale(quick)).to(quick.dtype))
+        near = of_all(alone * together(quick, counts * alone))
+        if float(near.mean()) < 1.0 - _EXCEPTION:
+            near = alone
         values, counts = values * near, counts * near
         values = values + counts * course
         if number > 0 and float((counts != before).double().mean()) < _SETTLED:
