@@ -74,7 +74,7 @@ def beside_wander(fit: FittedModel, model: JointModel, parameters: Float[Tensor,
     family = noise.search.noise_fit(noise.series).family
     for number in range(_ROUNDS):
         course = slow.course(noise.search.courses(noise.series))
-        # beside a wander they are not where a fit without one has them
+        # beside a wander the simulation's own parameters are not where a fit without one has them
         course = course + explained(fit.residual - course, counts, tangents.nuisance)
         quick = fit.residual - course
         density = fit_density(quick, bound=fit.bound)
