@@ -21,6 +21,7 @@ from mkc_torch.effects.protocol import (
     Shape,
     ShapedEffect,
 )
+from mkc_torch.effects.unrecorded import COURSE
 from mkc_torch.simulation.protocol import Port, PreparedSimulation
 
 if TYPE_CHECKING:
@@ -125,4 +126,5 @@ def described(shape: Shape) -> str:
         'onset 12.35 s, lag 0.5 s'
     """
     units: Mapping[str, str] = {"onset": " s", "lag": " s", "time_constant": " s", "delay": " s"}
-    return ", ".join(f"{name.replace('_', ' ')} {value:.4g}{units.get(name, '')}" for name, value in shape.items())
+    told = {name: value for name, value in shape.items() if not name.startswith(COURSE)}
+    return ", ".join(f"{name.replace('_', ' ')} {value:.4g}{units.get(name, '')}" for name, value in told.items())

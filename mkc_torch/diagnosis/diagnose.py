@@ -36,6 +36,7 @@ from mkc_torch.diagnosis.shifts import shift_warning
 from mkc_torch.diagnosis.side_by_side import known_of, learn, with_memory
 from mkc_torch.diagnosis.simplified import simplified
 from mkc_torch.diagnosis.units import unit_warnings
+from mkc_torch.diagnosis.unrecorded import course_without, located_cause
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.protocol import Effect
 from mkc_torch.recording import Recording
@@ -245,7 +246,15 @@ def _begun(base: FittedModel, terms: tuple[Term, ...], asked: _Asked, generator:
     if first is None:
         return begun
     learn(prepared, newest)
-    return _taken_up(begun, first, asked)
+    taken = _taken_up(begun, first, asked)
+    if taken.found:
+        return taken
+    cause = located_cause(base, first, asked.level, asked.surrogates)
+    if cause is None:
+        return taken
+    after = held_out(cause.fit, blocks, partial(course_without, base, cause))
+    # beside a course that may be any, little is left to be told
+    return replace(_taken_up(replace(taken, first=cause), cause, asked, after), left=())
 
 
 def _continued(search: _Search, asked: _Asked, generator: torch.Generator) -> _Search:
@@ -270,12 +279,14 @@ def _quiet(search: _Search, asked: _Asked) -> bool:
     return p_value_beside(last, others, _GLANCE, generator) > max(_QUIET, asked.level)
 
 
-def _taken_up(search: _Search, located: Located, asked: _Asked) -> _Search:
-    """With what was located, if it counts."""
+def _taken_up(search: _Search, located: Located, asked: _Asked, after: Evidence | None = None) -> _Search:
+    """With what was located, if it counts; ``after`` is its evidence, where that is not the fit's own."""
     over = replace(search, left=())
     if located.p_value > asked.level or asked.max_findings == 0:
         return over
-    before, after = search.evidence[-1], held_out(located.fit, search.blocks)
+    before = search.evidence[-1]
+    if after is None:
+        after = held_out(located.fit, search.blocks)
 
     def holds(fit: FittedModel, evidence: Evidence) -> bool:
         one = replace(located, fit=fit)

@@ -17,6 +17,7 @@ from mkc_torch.diagnosis.model import Term, context_at, summed
 from mkc_torch.diagnosis.python_source import python_source
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.protocol import AnchoredEffect, Context, Effect, LastingEffect, RelativeEffect, ShapedEffect
+from mkc_torch.effects.unrecorded import COURSE, Unrecorded
 from mkc_torch.recording import MissingColumnError, Recording
 from mkc_torch.simulation.protocol import Change, Correction, Simulation
 from mkc_torch.simulation.registry import correction_of
@@ -239,6 +240,8 @@ def _read(content: Mapping[str, Any], known: Sequence[Effect], simulation: Simul
 
 def _effect(entry: Mapping[str, Any], known: Sequence[Effect]) -> Effect:
     """The one of that id; of several curves without a name, that with these numbers in its shape."""
+    if entry["effect"] == Unrecorded.id and any(name.startswith(COURSE) for name in entry["shape"]):
+        return Unrecorded()
     same = [effect for effect in reversed(known) if effect.id == entry["effect"]]
     if not same:
         names = ", ".join(dict.fromkeys(effect.id for effect in known))

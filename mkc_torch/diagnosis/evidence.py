@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.diagnosis.model import JointModel
 from mkc_torch.diagnosis.refit import FittedModel, fitted
 from mkc_torch.diagnosis.side_by_side import each
 from mkc_torch.functional import mkc_nll
@@ -78,16 +80,28 @@ def blocks_of(N: int, correlation: int) -> HeldOutBlocks:
     return HeldOutBlocks(block, fold, tuple(train))
 
 
-def held_out(fit: FittedModel, blocks: HeldOutBlocks) -> Evidence:
-    """Refit on all folds but one, judge on that one, for each fold; the shapes of effects stay as they are."""
+def held_out(
+    fit: FittedModel,
+    blocks: HeldOutBlocks,
+    reread: Callable[[Bool[Tensor, " N"]], tuple[JointModel, Float[Tensor, " p"]]] | None = None,
+) -> Evidence:
+    """Refit on all folds but one, judge on that one, for each fold.
+
+    Args:
+        fit: on all folds.
+        blocks: of which a fold is made.
+        reread: the model to fit to these samples, and where to begin; default the fit's own, shapes of effects as they
+            are.
+    """
     N = len(fit.residual)
     log_likelihood = fit.residual.new_zeros(N)
     residual = torch.zeros_like(fit.residual)
 
     def without(train: Bool[Tensor, " N"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         rows = train.to(fit.residual.dtype)
-        found = fitted(fit.model, fit.parameters, fit.bound, rows=rows, graduate=False)
-        return fit.model.residual(found.parameters).detach(), found.sigma, found.d, found.bound, found.parameters
+        model, start = (fit.model, fit.parameters) if reread is None else reread(train)
+        found = fitted(model, start, fit.bound, rows=rows, graduate=False)
+        return model.residual(found.parameters).detach(), found.sigma, found.d, found.bound, found.parameters
 
     folds = each(fit, [partial(without, train) for train in blocks.train])
     for number, (out, *density, _) in enumerate(folds):

@@ -21,6 +21,7 @@ from mkc_torch.diagnosis.regions import attributed, map_of, region_of, shares_of
 from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter
 from mkc_torch.effects.protocol import Context, PartEffect, RelativeEffect
 from mkc_torch.effects.units import tidy
+from mkc_torch.effects.unrecorded import COURSE
 from mkc_torch.nonlinear import beside
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
     where = attributed(final.fit, number)
     curve = _curve(term, gamma, covariance, context)
     shape = _shape_parameters(term, context, final.shape_errors[number])
-    told_as = formulas(curve) if term.effect.id == UNKNOWN and curve is not None else ()
+    told_as = formulas(curve) if term.effect.id == UNKNOWN and term.columns and curve is not None else ()
     return Finding(
         effect=term.effect.id,
         drivers=term.columns,
@@ -117,7 +118,7 @@ def _shape_parameters(term: Term, context: Context, errors: Mapping[str, float])
     return tuple(
         Parameter(name, value, errors.get(name), _unit_of_shape(term, name, context))
         for name, value in term.shape.items()
-        if name != "onset"
+        if name != "onset" and not name.startswith(COURSE)
     )
 
 

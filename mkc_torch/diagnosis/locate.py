@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mkc_torch._forked import meanwhile
 from mkc_torch.diagnosis.closing_in import closer, coloured, refined
+from mkc_torch.diagnosis.common_cause import CommonCause, common_cause
 from mkc_torch.diagnosis.judge import judged
 from mkc_torch.diagnosis.linearise import Linearised, Tangents, candidate_tangents, linearise, tangents_of
 from mkc_torch.diagnosis.local import beside_wander
@@ -47,6 +48,7 @@ class Located:
         values, counts: (N, m), the pseudo-residual without the candidate, and what counts of it.
         linearised: the search that the p-value is from; ``tangents`` and ``terms`` are its candidates.
         stretch: samples without which there is nothing, first and the one after the last, if they are few.
+        cause: what the channels of the wander have in common.
     """
 
     term: Term
@@ -61,6 +63,7 @@ class Located:
     tangents: Tangents
     terms: tuple[Term, ...]
     stretch: tuple[int, int] | None = None
+    cause: CommonCause | None = None
 
 
 def locate(
@@ -106,6 +109,7 @@ def locate(
         found = linearised.search.gains(linearised.series.unsqueeze(-1))
         possible = possible_of(terms, linearised)
         p_value, beyond = judged(linearised, noise, found, possible[:tried], surrogates, generator)
+        cause = common_cause(linearised, tangents.slow)
         stretch = None
         if p_value <= level:
             own = int(torch.where(possible, found.log_p[:, 0], 0.0).argmin())
@@ -116,6 +120,7 @@ def locate(
             beside = linearise(base.model, parameters, rest * pseudo, rest, tangents)
             others = _judged(beside, terms, tried, surrogates, generator)
             p_value, beyond = max(p_value, others[0]), min(beyond, others[1])
+            cause = common_cause(beside, tangents.slow)
         ranking = ranked(terms, found, prefer, possible)
         if p_value <= level:
             [(named, newest)] = answer()
@@ -143,6 +148,7 @@ def locate(
         tangents,
         terms,
         stretch if p_value > level else None,
+        cause,
     )
 
 

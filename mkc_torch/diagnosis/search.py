@@ -21,7 +21,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Gains", "LinearSearch", "log_survival"]
+__all__ = ["Gains", "LinearSearch", "SlowPart", "log_survival"]
 
 _LEFT = 1e-4
 """A direction of a candidate of which the simulation's own parameters leave a smaller share than this is dropped."""
@@ -60,6 +60,25 @@ def log_survival(ratio: Tensor, dof: Tensor) -> Tensor:
     safe = x.clamp(min=1.0)
     far = -safe + (half - 1.0) * safe.log() - torch.lgamma(half) - torch.log1p(-((half - 1.0) / safe).clamp(max=0.5))
     return torch.where(x > 300.0, far, direct)
+
+
+@dataclass(frozen=True)
+class SlowPart:
+    """All that a series says of its wander, in courses on the scales of one family.
+
+    Attributes:
+        power: of the series beside the simulation's own parameters; ``dof`` are its degrees of freedom.
+        inner, gram: inner products of the courses with the series, (k,), and with one another, (k, k).
+        scale: standard deviations of the courses up to one size, (k,).
+        size: squared, the likeliest one of equal channels.
+    """
+
+    power: float
+    dof: int
+    inner: Float[Tensor, " k"]
+    gram: Float[Tensor, "k k"]
+    scale: Float[Tensor, " k"]
+    size: float
 
 
 @dataclass(frozen=True)
@@ -304,6 +323,15 @@ class LinearSearch:
         left = series - self._basis @ (self._basis.mT @ series)
         rotated = family.axes.mT @ (family.scale * (self._wander.mT @ left))
         return family.scale * (family.axes @ (fit.size / (1.0 + fit.size * family.strength) * rotated))
+
+    def slow_part(self, series: Float[Tensor, " M"]) -> SlowPart:
+        """What a series says of the likeliest wander."""
+        fit = self.noise_fit(series)
+        family = self._families[fit.family]
+        left = series - self._basis @ (self._basis.mT @ series)
+        inner = family.scale * (self._wander.mT @ left)
+        gram = (family.axes * family.strength) @ family.axes.mT
+        return SlowPart(float(left.square().sum()), self._dof, inner, gram, family.scale, fit.size)
 
     def shares(self, series: Float[Tensor, " M"], channels: int) -> Float[Tensor, " c"]:
         """Variance of the wander of each channel over that of the scales given, where the series says so; mean one.

@@ -126,7 +126,11 @@ def with_drivers(effect: str, drivers: Sequence[str], at: str = "") -> str:
         ('current field (battery_A)', 'offset drift')
         >>> with_drivers("linear_drag", [], "rate of speed")
         'linear drag on the rate of speed'
+        >>> with_drivers("unknown", [])
+        'a cause that no column recorded'
     """
+    if effect == "unknown" and not drivers:
+        return "a cause that no column recorded"
     place = f" on the {plain(at.removeprefix('loaded '))}" if at else ""
     return effect_name(effect) + (f" ({several(drivers, 3)})" if drivers else "") + place
 
@@ -138,6 +142,8 @@ def label_name(label: str) -> str:
         >>> label_name("current_field (battery_A)")
         'current field (battery_A)'
     """
+    if label == "unknown":
+        return with_drivers(label, ())
     effect, space, rest = label.partition(" ")
     return effect_name(plain(effect)) + space + plain(rest)
 
@@ -404,6 +410,8 @@ def headline(diagnosis: Diagnosis) -> str:
         return f"Left out of the simulation: {left_out}."
     if not diagnosis.findings:
         return "Structure remains that no effect in the catalogue accounts for."
+    if any(f.effect == "unknown" and not f.drivers for f in diagnosis.findings):
+        return f"Left out of the simulation: {left_out}. Its course over time is all that is known of it."
     return (
         f"Left out of the simulation: {left_out}. Yet structure remains that no effect in the catalogue accounts for."
     )

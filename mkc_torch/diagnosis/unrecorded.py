@@ -1,0 +1,89 @@
+"""What is located where no candidate is: a cause that was not recorded, told by what a wander's channels share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.common_cause import CommonCause, common_cause
+from mkc_torch.diagnosis.linearise import candidate_tangents, linearise
+from mkc_torch.diagnosis.locate import Located
+from mkc_torch.diagnosis.model import JointModel, Term
+from mkc_torch.diagnosis.ranking import Ranked
+from mkc_torch.diagnosis.refit import FittedModel, fitted_beside
+from mkc_torch.effects.unrecorded import Unrecorded
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["course_without", "located_cause"]
+
+_SHARE = 0.2
+"""Of the level: the question is asked last, of recordings in which the search found nothing."""
+
+
+def located_cause(base: FittedModel, located: Located, level: float, surrogates: int) -> Located | None:
+    """A search that found nothing, with the cause that moves the channels of the wander together; None without one.
+
+    Args:
+        base: the simulation alone.
+        located: what the search has, though it does not count.
+        level: of false alarms.
+        surrogates: draws of noise that other p-values are from, than which none can be smaller.
+    """
+    cause, slow = located.cause, located.tangents.slow
+    if cause is None or slow is None or slow.port != Unrecorded.port or cause.p_value > _SHARE * level:
+        return None
+    model, start = _with_cause(base, cause)
+    term = model.terms[-1]
+    fit = fitted_beside(base, model, start, graduate=False)
+    tangents = candidate_tangents(base.model, base.parameters, [term], located.tangents.pointwise)
+    others = [replace(one, gap=max(cause.gain - one.gain, 0.0)) for one in located.ranking]
+    return replace(
+        located,
+        term=term,
+        fit=fit,
+        p_value=max(cause.p_value / _SHARE, 1.0 / (1 + surrogates)),
+        beyond=0.0,
+        stretch=None,
+        ranking=(Ranked(len(located.terms), cause.gain, 0.0), *others),
+        linearised=located.linearised.with_more(tangents, located.counts),
+        tangents=replace(located.tangents, candidates=(*located.tangents.candidates, *tangents)),
+        terms=(*located.terms, term),
+    )
+
+
+def course_without(
+    base: FittedModel, located: Located, train: Bool[Tensor, " N"]
+) -> tuple[JointModel, Float[Tensor, " p"]]:
+    """The model with the course as these samples alone tell it, and where to begin.
+
+    Args:
+        base: the simulation alone.
+        located: what :func:`located_cause` found.
+        train: the samples.
+    """
+    cause, slow = located.cause, located.tangents.slow
+    assert cause is not None
+    assert slow is not None
+    counts = located.counts * train.unsqueeze(-1)
+    known = linearise(
+        base.model,
+        base.parameters,
+        counts * located.values,
+        counts,
+        located.tangents.bare,
+        colour=located.linearised.colour,
+    )
+    found = common_cause(known, slow)
+    if found is None:
+        return _with_cause(base, replace(cause, direction=torch.zeros_like(cause.direction)))
+    return _with_cause(base, found.towards(cause.direction))
+
+
+def _with_cause(base: FittedModel, cause: CommonCause) -> tuple[JointModel, Float[Tensor, " p"]]:
+    model = base.model.with_term(Term(Unrecorded(), None, cause.shape))
+    return model, torch.cat([base.parameters, -cause.direction])
