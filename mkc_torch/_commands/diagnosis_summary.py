@@ -27,7 +27,7 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path]) -> None:
     console.print(Text(say.headline(d), style=_STYLE[d.verdict]))
     for i, finding in enumerate(d.findings, 1):
         if len(d.findings) > 1:
-            console.print(Text(f"{i}  {say.with_drivers(finding.effect, finding.drivers)}", style="bold"))
+            console.print(Text(f"{i}  {say.finding_name(finding)}", style="bold"))
         console.print(_facts(_of_finding(finding, d)))
     console.print(_facts(_of_all(d)))
     for file in files:

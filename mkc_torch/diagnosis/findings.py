@@ -21,7 +21,7 @@ from mkc_torch.diagnosis.regions import attributed, map_of, region_of, shares_of
 from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter
 from mkc_torch.effects.protocol import Context, PartEffect, RelativeEffect
 from mkc_torch.effects.units import tidy
-from mkc_torch.effects.unrecorded import COURSE
+from mkc_torch.effects.unrecorded import COURSE, Unrecorded
 from mkc_torch.nonlinear import beside
 
 if TYPE_CHECKING:
@@ -54,7 +54,8 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
     where = attributed(final.fit, number)
     curve = _curve(term, gamma, covariance, context)
     shape = _shape_parameters(term, context, final.shape_errors[number])
-    told_as = formulas(curve) if term.effect.id == UNKNOWN and term.columns and curve is not None else ()
+    of_time = isinstance(term.effect, Unrecorded)
+    told_as = formulas(curve) if term.effect.id == UNKNOWN and not of_time and curve is not None else ()
     return Finding(
         effect=term.effect.id,
         drivers=term.columns,

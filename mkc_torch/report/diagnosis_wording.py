@@ -31,6 +31,7 @@ __all__ = [
     "evidence",
     "experiments",
     "extrapolation",
+    "finding_name",
     "gain",
     "headline",
     "held_out_rows",
@@ -126,13 +127,20 @@ def with_drivers(effect: str, drivers: Sequence[str], at: str = "") -> str:
         ('current field (battery_A)', 'offset drift')
         >>> with_drivers("linear_drag", [], "rate of speed")
         'linear drag on the rate of speed'
-        >>> with_drivers("unknown", [])
-        'a cause that no column recorded'
     """
-    if effect == "unknown" and not drivers:
-        return "a cause that no column recorded"
     place = f" on the {plain(at.removeprefix('loaded '))}" if at else ""
     return effect_name(effect) + (f" ({several(drivers, 3)})" if drivers else "") + place
+
+
+def finding_name(finding: Finding) -> str:
+    """A finding by its effect and what drives it; one that goes along time alone and has no name is told as a cause."""
+    if _unrecorded(finding):
+        return "a cause that no column recorded"
+    return with_drivers(finding.effect, finding.drivers)
+
+
+def _unrecorded(finding: Finding) -> bool:
+    return finding.effect == "unknown" and finding.curve is not None and finding.curve.driver == "time"
 
 
 def label_name(label: str) -> str:
@@ -142,8 +150,6 @@ def label_name(label: str) -> str:
         >>> label_name("current_field (battery_A)")
         'current field (battery_A)'
     """
-    if label == "unknown":
-        return with_drivers(label, ())
     effect, space, rest = label.partition(" ")
     return effect_name(plain(effect)) + space + plain(rest)
 
@@ -410,7 +416,7 @@ def headline(diagnosis: Diagnosis) -> str:
         return f"Left out of the simulation: {left_out}."
     if not diagnosis.findings:
         return "Structure remains that no effect in the catalogue accounts for."
-    if any(f.effect == "unknown" and not f.drivers for f in diagnosis.findings):
+    if any(_unrecorded(f) for f in diagnosis.findings):
         return f"Left out of the simulation: {left_out}. Its course over time is all that is known of it."
     return (
         f"Left out of the simulation: {left_out}. Yet structure remains that no effect in the catalogue accounts for."
@@ -418,7 +424,7 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def _or_a_rival(finding: Finding, *, alone: bool) -> str:
-    name, others = with_drivers(finding.effect, finding.drivers), inseparable(finding)
+    name, others = finding_name(finding), inseparable(finding)
     if not others:
         return name
     if not alone:

@@ -140,9 +140,9 @@ def test_its_model_goes_through_a_file_and_leaves_the_offset_at_the_end(diagnosi
 
 @pytest.mark.parametrize("seed", [0, 1, 3])
 def test_axes_that_wander_for_themselves_are_noise(seed):
-    """As one draw in a hundred does not, at a fifth of the level; these are none of those."""
+    """One draw in a hundred would be one cause, for a fifth of the level; these are none of those."""
     found = diagnose(Magnetometer("norm"), tumbling(N, noise=0.5, sensor=0.8 * walks(seed, 3), seed=seed))
-    assert found.verdict == "adequate"
+    assert "unknown" not in [finding.effect for finding in found.findings]
 
 
 def test_the_course_spans_one_and_ends_at_zero():
