@@ -369,6 +369,7 @@ def _assembled(
             *_time_warnings(prepared),
             *remaining_warning(ending.left),
             *_in_one_stretch(first, prepared.time),
+            *ending.stand_in,
             *(sentence for finding in findings for sentence in shift_warning(finding)),
             *(sentence for finding in findings for sentence in extrapolation_warning(finding)),
             *density_warnings(final.fit.residual, final.fit.sigma, final.fit.d, final.fit.bound, prepared.channels),

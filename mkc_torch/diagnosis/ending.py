@@ -20,6 +20,7 @@ from mkc_torch.diagnosis.remaining import remaining
 from mkc_torch.diagnosis.result import DriverShift, Extrapolation
 from mkc_torch.diagnosis.shifts import shifted
 from mkc_torch.diagnosis.side_by_side import memory_kept
+from mkc_torch.diagnosis.stand_in import stand_in_warning
 
 __all__ = ["Beyond", "Ending", "ending_parts", "nameless"]
 
@@ -38,11 +39,13 @@ class Ending:
     """The parts, in the order of :func:`ending_parts`.
 
     Attributes:
+        stand_in: a warning of a column that only goes much as the cause does.
         beyond: of each finding.
         within_reach: the ceiling of any fit, and the columns along which something smooth remains.
         final: the final parameters.
     """
 
+    stand_in: tuple[str, ...]
     beyond: tuple[Beyond, ...]
     within_reach: tuple[Ceiling, tuple[str, ...]]
     final: Estimate
@@ -93,7 +96,7 @@ def ending_parts(
             fit.model.residual(fit.parameters)  # to be the newest that a simulation remembers
             return work()
 
-    return [partial(begun, work) for work in (beyond, within_reach, final)]
+    return [partial(begun, work) for work in (partial(stand_in_warning, fit), beyond, within_reach, final)]
 
 
 def _beyond(without: FittedModel, found: Located, seed: int) -> Beyond:

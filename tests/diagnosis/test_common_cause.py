@@ -138,6 +138,18 @@ def test_its_model_goes_through_a_file_and_leaves_the_offset_at_the_end(diagnosi
     validate(json.loads(diagnosis_to_json(found)))
 
 
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_column_that_goes_as_the_cause_in_part_is_told_to_stand_in(whole):
+    """One that is the cause is not, and neither needs a name that says what it measures."""
+    column = course() if whole else np.sin(2 * np.pi * TIME / 23.0 + 4)
+    recording = tumbling(N, noise=0.5, sensor=1.2 * course()[:, None] * DIRECTION, aux=column)
+    found = diagnose(Magnetometer("norm"), recording)
+    assert (found.findings[0].effect, found.findings[0].drivers) == ("driver_offset", ("aux",))
+    told = [warning for warning in found.warnings if "stand in" in warning]
+    assert len(told) == (0 if whole else 1)
+    assert all(warning.startswith("What aux leaves of the offset goes on") for warning in told)
+
+
 @pytest.mark.parametrize("seed", [0, 1, 3])
 def test_axes_that_wander_for_themselves_are_noise(seed):
     """One draw in a hundred would be one cause, for a fifth of the level; these are none of those."""
