@@ -12,7 +12,6 @@ from torch import Tensor
 
 from mkc_torch._forked import meanwhile
 from mkc_torch.diagnosis.closing_in import closer, coloured, refined
-from mkc_torch.diagnosis.common_cause import CommonCause, common_cause
 from mkc_torch.diagnosis.judge import judged
 from mkc_torch.diagnosis.linearise import Linearised, Tangents, candidate_tangents, linearise, tangents_of
 from mkc_torch.diagnosis.local import beside_wander
@@ -46,9 +45,9 @@ class Located:
         ranking: for each candidate physics its best shape, gain in nats, and nats behind the first; best first.
         noise: the wander of the noise without the candidate.
         values, counts: (N, m), the pseudo-residual without the candidate, and what counts of it.
-        linearised: the search that the p-value is from; ``tangents`` and ``terms`` are its candidates.
+        linearised: the search that told candidates apart; ``tangents`` and ``terms`` are its candidates.
         stretch: samples without which there is nothing, first and the one after the last, if they are few.
-        cause: what the channels of the wander have in common.
+        beside_nothing: the search that the p-value is from; ``linearised`` is another one where an effect was named.
     """
 
     term: Term
@@ -62,8 +61,8 @@ class Located:
     linearised: Linearised
     tangents: Tangents
     terms: tuple[Term, ...]
+    beside_nothing: Linearised
     stretch: tuple[int, int] | None = None
-    cause: CommonCause | None = None
 
 
 def locate(
@@ -109,7 +108,7 @@ def locate(
         found = linearised.search.gains(linearised.series.unsqueeze(-1))
         possible = possible_of(terms, linearised)
         p_value, beyond = judged(linearised, noise, found, possible[:tried], surrogates, generator)
-        cause = common_cause(linearised, tangents.slow)
+        beside_nothing = linearised
         stretch = None
         if p_value <= level:
             own = int(torch.where(possible, found.log_p[:, 0], 0.0).argmin())
@@ -120,7 +119,7 @@ def locate(
             beside = linearise(base.model, parameters, rest * pseudo, rest, tangents)
             others = _judged(beside, terms, tried, surrogates, generator)
             p_value, beyond = max(p_value, others[0]), min(beyond, others[1])
-            cause = common_cause(beside, tangents.slow)
+            beside_nothing = beside
         ranking = ranked(terms, found, prefer, possible)
         if p_value <= level:
             [(named, newest)] = answer()
@@ -147,8 +146,8 @@ def locate(
         linearised,
         tangents,
         terms,
+        beside_nothing,
         stretch if p_value > level else None,
-        cause,
     )
 
 

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.common_cause import CommonCause, common_cause
+from mkc_torch.diagnosis.common_cause import common_cause
 from mkc_torch.diagnosis.linearise import candidate_tangents, linearise
 from mkc_torch.diagnosis.locate import Located
 from mkc_torch.diagnosis.model import JointModel, Term
 from mkc_torch.diagnosis.ranking import Ranked
 from mkc_torch.diagnosis.refit import FittedModel, fitted_beside
+from mkc_torch.effects.protocol import Shape
 from mkc_torch.effects.unrecorded import Unrecorded
 
 if TYPE_CHECKING:
@@ -34,10 +35,11 @@ def located_cause(base: FittedModel, located: Located, level: float, surrogates:
         level: of false alarms.
         surrogates: draws of noise that other p-values are from, than which none can be smaller.
     """
-    cause, slow = located.cause, located.tangents.slow
+    slow = located.tangents.slow
+    cause = common_cause(located.beside_nothing, slow)
     if cause is None or slow is None or slow.port != Unrecorded.port or cause.p_value > _SHARE * level:
         return None
-    model, start = _with_cause(base, cause)
+    model, start = _with_cause(base, cause.direction, cause.shape)
     term = model.terms[-1]
     fit = fitted_beside(base, model, start, graduate=False)
     tangents = candidate_tangents(base.model, base.parameters, [term], located.tangents.pointwise)
@@ -66,9 +68,6 @@ def course_without(
         located: what :func:`located_cause` found.
         train: the samples.
     """
-    cause, slow = located.cause, located.tangents.slow
-    assert cause is not None
-    assert slow is not None
     counts = located.counts * train.unsqueeze(-1)
     known = linearise(
         base.model,
@@ -78,12 +77,16 @@ def course_without(
         located.tangents.bare,
         colour=located.linearised.colour,
     )
-    found = common_cause(known, slow)
-    if found is None:
-        return _with_cause(base, replace(cause, direction=torch.zeros_like(cause.direction)))
-    return _with_cause(base, found.towards(cause.direction))
+    direction = -located.fit.model.gammas(located.fit.parameters)[-1]
+    cause = common_cause(known, located.tangents.slow)
+    if cause is None:
+        return _with_cause(base, torch.zeros_like(direction), located.term.shape)
+    cause = cause.towards(direction)
+    return _with_cause(base, cause.direction, cause.shape)
 
 
-def _with_cause(base: FittedModel, cause: CommonCause) -> tuple[JointModel, Float[Tensor, " p"]]:
-    model = base.model.with_term(Term(Unrecorded(), None, cause.shape))
-    return model, torch.cat([base.parameters, -cause.direction])
+def _with_cause(
+    base: FittedModel, direction: Float[Tensor, " c"], shape: Shape
+) -> tuple[JointModel, Float[Tensor, " p"]]:
+    # the residual is what was recorded less the prediction
+    return base.model.with_term(Term(Unrecorded(), None, shape)), torch.cat([base.parameters, -direction])
