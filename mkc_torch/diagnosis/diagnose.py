@@ -39,6 +39,7 @@ from mkc_torch.diagnosis.units import unit_warnings
 from mkc_torch.diagnosis.unrecorded import course_without, located_cause
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.protocol import Effect
+from mkc_torch.effects.unrecorded import Unrecorded
 from mkc_torch.recording import Recording
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
@@ -463,8 +464,11 @@ def _nothing_to_separate() -> Separability:
 
 
 def _not_confirmed(located: Located) -> str:
+    what = f"{_called(located.term)} ({described(located.term.shape) or 'no onset'})"
+    if isinstance(located.term.effect, Unrecorded):
+        what = "A cause that no column recorded"
     return (
-        f"{_called(located.term)} ({described(located.term.shape) or 'no onset'}): p = {located.p_value:.2g} after the "
+        f"{what}: p = {located.p_value:.2g} after the "
         "whole search, but it does not predict blocks better that the fit has not seen, so it does not count as a "
         "finding."
     )
