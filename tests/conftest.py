@@ -1,5 +1,7 @@
 """One thread a worker: results do not depend on it, and workers do not fight over the cores."""
 
-import torch
+import numpy  # noqa: F401 - its linear algebra can only be limited once it is there
 
-torch.set_num_threads(1)
+from mkc_torch._processes import one_thread
+
+one_thread()
