@@ -25,6 +25,9 @@ _ROUNDS, _SETTLED = 40, 1e-2
 _LEAST = 1e-6
 """Smallest variance of a direction, over that of all channels together."""
 
+_ROUNDED = 1e-12
+"""Share of the largest eigenvalue below which one is lost in rounding."""
+
 _TOLD = 1e-2
 """Courses whose amplitude is a smaller share of the largest one are not told."""
 
@@ -96,7 +99,7 @@ def _likeliest(
     covariance, (value, courses, seen, expected) = start, _at(part, start)
     for _ in range(_ROUNDS):
         moved = step(covariance, seen, expected)
-        moved = moved + _LEAST * moved.trace() * torch.eye(len(moved), dtype=moved.dtype)
+        moved = 0.5 * (moved + moved.mT) + _LEAST * moved.trace() * torch.eye(len(moved), dtype=moved.dtype)
         found = _at(part, moved)
         gained = found[0] - value
         if gained > 0.0:
@@ -130,10 +133,10 @@ def _diagonal(covariance: Tensor, seen: Tensor, expected: Tensor) -> Tensor:
 
 
 def _free(covariance: Tensor, seen: Tensor, expected: Tensor) -> Tensor:
-    root = torch.linalg.cholesky(expected)
-    inner = root.mT @ covariance @ seen @ covariance @ root
+    # what is expected of a direction that hardly moves is a difference of large numbers, and may round below zero
+    values, vectors = torch.linalg.eigh(0.5 * (expected + expected.mT))
+    values = values.clamp(min=_ROUNDED * float(values.abs().max()))
+    root, inverse = (vectors * values.sqrt()) @ vectors.mT, (vectors * values.rsqrt()) @ vectors.mT
+    inner = root @ covariance @ seen @ covariance @ root
     values, vectors = torch.linalg.eigh(0.5 * (inner + inner.mT))
-    middle = (vectors * values.clamp(min=0.0).sqrt()) @ vectors.mT
-    half = torch.linalg.solve_triangular(root.mT, middle, upper=True)
-    found = torch.linalg.solve_triangular(root.mT, half.mT, upper=True)
-    return 0.5 * (found + found.mT)
+    return inverse @ (vectors * values.clamp(min=0.0).sqrt()) @ vectors.mT @ inverse

@@ -82,7 +82,9 @@ def diagnose(
 
     The simulation's own parameters are fitted together with every candidate: effect × driver × shape. The strongest
     one is judged by the same search on draws of the fitted noise, and by whether it predicts blocks that the fit has
-    not seen; what passes is kept, refitted jointly, and the search goes on beside it.
+    not seen; what passes is kept, refitted jointly, and the search goes on beside it. Where nothing passes, whatever
+    the catalogue, a wander that moves a sensor's axes along one direction is told as "unknown": a cause that no column
+    recorded.
 
     Args:
         simulation: of the recording, such as :class:`mkc_torch.simulation.Magnetometer`.
@@ -468,9 +470,8 @@ def _not_confirmed(located: Located) -> str:
     if isinstance(located.term.effect, Unrecorded):
         what = "A cause that no column recorded"
     return (
-        f"{what}: p = {located.p_value:.2g} after the "
-        "whole search, but it does not predict blocks better that the fit has not seen, so it does not count as a "
-        "finding."
+        f"{what}: p = {located.p_value:.2g} after the whole search, but it does not predict blocks better that the fit "
+        "has not seen, so it does not count as a finding."
     )
 
 

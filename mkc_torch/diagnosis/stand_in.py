@@ -9,6 +9,7 @@ from mkc_torch.diagnosis.drivers import ANY
 from mkc_torch.diagnosis.linearise import tangents_of
 from mkc_torch.diagnosis.local import beside_wander
 from mkc_torch.diagnosis.refit import FittedModel
+from mkc_torch.effects.unrecorded import Unrecorded
 
 __all__ = ["stand_in_warning"]
 
@@ -25,8 +26,8 @@ def stand_in_warning(fit: FittedModel) -> tuple[str, ...]:
     Args:
         fit: the final one.
     """
-    driver = fit.model.terms[-1].driver if fit.model.terms else None
-    if driver is None or driver.role != ANY:
+    last = fit.model.terms[-1] if fit.model.terms else None
+    if last is None or last.driver is None or last.driver.role != ANY or last.port != Unrecorded.port:
         return ()
     tangents = tangents_of(fit.model, fit.parameters)
     left = beside_wander(fit, fit.model, fit.parameters, tangents)
@@ -37,7 +38,7 @@ def stand_in_warning(fit: FittedModel) -> tuple[str, ...]:
     cosine = torch.nn.functional.cosine_similarity(gamma, cause.direction, dim=0)
     if float(cosine.abs()) < _SAME_WAY:
         return ()
-    name = ", ".join(driver.columns)
+    name = ", ".join(last.columns)
     return (
         f"What {name} leaves of the offset goes on along the same direction: {name} follows the cause in part, and may "
         "only stand in for one that was not recorded. Look for it, and record it.",
