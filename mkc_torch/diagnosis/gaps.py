@@ -31,6 +31,9 @@ _MOST, _CELLS = 1000, 20_000_000
 """Frequencies at most that are not taken for white, those that are the farthest from it; fewer where their products
 with all others would be more numbers than these."""
 
+_HANDY = 0.5
+"""Rejected samples are solved for, where they are fewer than this share of the frequencies."""
+
 
 class Gaps:
     """The rejected samples of each channel.
@@ -59,13 +62,14 @@ class Gaps:
             self._bases[channel] = basis
         return self._bases[channel]
 
-    def overlap(self, channel: int, rows: Tensor) -> Float[Tensor, "K J"]:
-        """Inner products of the basis with its functions of these numbers, over the rejected samples of a channel."""
-        k = torch.arange(self._kept).unsqueeze(-1)
-        sums = self._sums[:, channel]
-        product = (sums[(k - rows).abs()] + sums[k + rows]) / self._N
-        product[0] *= math.sqrt(0.5)
-        product[:, rows == 0] *= math.sqrt(0.5)
+    def overlap(self, channel: int, rows: Tensor) -> Float[Tensor, "J K"]:
+        """Inner products of the basis' functions of these numbers with all of it, over a channel's rejected samples."""
+        K = self._kept
+        # the sums at every difference of two numbers, and at every sum of two
+        sums = torch.cat([self._sums[1:K, channel].flip(0), self._sums[: 2 * K - 1, channel]]) / self._N
+        product = sums[: 2 * K - 1].unfold(0, K, 1)[K - 1 - rows] + sums[K - 1 :].unfold(0, K, 1)[rows]
+        product[:, 0] *= math.sqrt(0.5)
+        product[rows == 0] *= math.sqrt(0.5)
         return product
 
     def filling(self, colour: Colour) -> Filling:
@@ -88,38 +92,78 @@ class Gaps:
                 rows = rows[far[rows].topk(most).indices].sort().values
             own = excess[rows, channel]
             # the same by either identity; what is solved is as large as the rejected samples, or as the frequencies
-            part = self._by_sample(channel, rows, own) if lost < len(rows) else self._by_frequency(channel, rows, own)
+            few = lost < _HANDY * len(rows)
+            part = self._by_sample(channel, rows, own) if few else self._by_frequency(channel, rows, own)
             log_det += part.log_det
             parts.append(part)
         return Filling(tuple(parts), log_det)
 
     def _by_sample(self, channel: int, rows: Tensor, excess: Tensor) -> _Part:
         basis = self.basis(channel)
-        near = basis[rows]
+        weighed = (excess.unsqueeze(-1) * basis[rows]).mT
         eye = torch.eye(basis.shape[1], dtype=basis.dtype)
-        root = torch.linalg.cholesky(eye + near.mT @ (excess.unsqueeze(-1) * near))
-        pulling = torch.cholesky_solve(near.mT * excess, root)
-        return _Part(rows, basis, pulling, 2.0 * float(root.diagonal().log().sum()))
+        root = torch.linalg.cholesky(eye + weighed @ basis[rows])
+        return _Part(rows, basis, _BySample(weighed, root), 2.0 * float(root.diagonal().log().sum()))
 
     def _by_frequency(self, channel: int, rows: Tensor, excess: Tensor) -> _Part:
         overlap = self.overlap(channel, rows)
         eye = torch.eye(len(rows), dtype=overlap.dtype)
-        factors, pivots = torch.linalg.lu_factor(eye + excess.unsqueeze(-1) * overlap[rows])
-        pulling = torch.linalg.lu_solve(factors, pivots, torch.diag(excess))
-        return _Part(rows, overlap, pulling, float(factors.diagonal().abs().log().sum()))
+        if bool((excess < 0.0).all()):
+            half = excess.neg().sqrt()
+            root, failed = torch.linalg.cholesky_ex(eye - half.unsqueeze(-1) * overlap[:, rows] * half)
+            if not failed:
+                log_det = 2.0 * float(root.diagonal().log().sum())
+                return _Part(rows, overlap.mT, _Louder(half.unsqueeze(-1), root), log_det)
+        factors, pivots = torch.linalg.lu_factor(eye + excess.unsqueeze(-1) * overlap[:, rows])
+        pulling = _ByFrequency(excess.unsqueeze(-1), factors, pivots)
+        return _Part(rows, overlap.mT, pulling, float(factors.diagonal().abs().log().sum()))
+
+
+@dataclass(frozen=True)
+class _BySample:
+    """``(1 + Bᵀ E B)⁻¹ Bᵀ E`` with B the basis at the rejected samples, E the excess."""
+
+    weighed: Tensor  # (n, J), Bᵀ E
+    root: Tensor  # (n, n)
+
+    def __call__(self, values: Float[Tensor, "J c"]) -> Float[Tensor, "n c"]:
+        return torch.cholesky_solve(self.weighed @ values, self.root)
+
+
+@dataclass(frozen=True)
+class _ByFrequency:
+    """``(1 + E O)⁻¹ E`` with O the overlap, E the excess."""
+
+    excess: Tensor  # (J, 1)
+    factors: Tensor  # (J, J)
+    pivots: Tensor  # (J,)
+
+    def __call__(self, values: Float[Tensor, "J c"]) -> Float[Tensor, "J c"]:
+        return torch.linalg.lu_solve(self.factors, self.pivots, self.excess * values)
+
+
+@dataclass(frozen=True)
+class _Louder:
+    """The same where all excess is negative: the noise is nowhere below the level of its spectrum's end."""
+
+    half: Tensor  # (J, 1), root of -E
+    root: Tensor  # (J, J) of 1 - half O half
+
+    def __call__(self, values: Float[Tensor, "J c"]) -> Float[Tensor, "J c"]:
+        return -self.half * torch.cholesky_solve(self.half * values, self.root)
 
 
 @dataclass(frozen=True)
 class _Part:
-    """What the rejected samples of a channel take: ``spread @ pulling`` times the coefficients of these rows."""
+    """What the rejected samples of a channel take: ``spread @ pulling(·)`` of the coefficients of these rows."""
 
     rows: Tensor  # (J,)
     spread: Tensor  # (K, n)
-    pulling: Tensor  # (n, J)
+    pulling: _BySample | _ByFrequency | _Louder
     log_det: float
 
     def __call__(self, values: Float[Tensor, "K c"]) -> Float[Tensor, "K c"]:
-        return values - self.spread @ (self.pulling @ values[self.rows])
+        return torch.addmm(values, self.spread, self.pulling(values[self.rows]), alpha=-1.0)
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 import torch
 from torch import Tensor
 
+from mkc_torch._forked import shared
 from mkc_torch.diagnosis.gaps import Filling, Gaps
 from mkc_torch.diagnosis.model import JointModel, Term, directions, follows_signal, port_jacobian, through_port
 from mkc_torch.diagnosis.noise import (
@@ -39,8 +41,9 @@ CORNERS = (25.0,)
 
 _MOST, _MARGIN, _FEWEST = 0.9, 3.0, 1000
 
-_AT_ONCE = 8
-"""Candidates whose tangents are moved about together: they stay in a core's own memory."""
+_AT_ONCE, _FILLED_AT_ONCE = 8, 64
+"""Candidates whose tangents are moved about together: they stay in a core's own memory. To fill them, a large matrix
+passes by each time."""
 
 _ALTERNATIONS, _SETTLED = 8, 10.0
 """Steps at most between the colour and a wander beside it, and the nats that a step has to bring: as many as a colour,
@@ -183,9 +186,9 @@ def candidate_tangents(
     return tuple(t for t in found if t is not None)
 
 
-def _blocks(items: Sequence[T]) -> list[Sequence[T]]:
+def _blocks(items: Sequence[T], at_once: int = _AT_ONCE) -> list[Sequence[T]]:
     """A few at a time."""
-    return [items[first : first + _AT_ONCE] for first in range(0, len(items), _AT_ONCE)]
+    return [items[first : first + at_once] for first in range(0, len(items), at_once)]
 
 
 def _slow_courses(model: JointModel, parameters: Tensor, pointwise: dict[str, Tensor | None]) -> Slow | None:
@@ -245,6 +248,15 @@ class Linearised:
         step = self.colour_beside()
         beyond = (step.root / self.colour.root).clamp(1.0 / _FARTHEST, _FARTHEST)
         return replace(step, root=step.root * beyond)
+
+    def recoloured(self, colour: Colour) -> Linearised:
+        """The same beside noise of another colour, with what stands in for rejected samples as it is."""
+        factor = (self.colour.root / colour.root).flatten()
+        own, rows = self.series[: len(factor)], len(self.series) - len(factor)
+        # what the prior pulls at is on the scale of the residuals
+        scale = (factor * own).std() / own.std()
+        factor = torch.cat([factor, scale.expand(rows)])
+        return replace(self, search=self.search.scaled(factor), series=factor * self.series, colour=colour)
 
     @property
     def evidence(self) -> float:
@@ -329,7 +341,9 @@ def linearise(
         found = _coloured(plain, near, pull, bare, slow, gaps)
     else:
         found = _searching(colour, pull, bare, slow, gaps)
-    candidates = [pull.below(found.colour.scaled(one)) for one in _each(found.filling, seen.candidates)]
+    candidates = [
+        pull.below(found.colour.scaled(one)) for one in _each(found.filling, seen.candidates, _FILLED_AT_ONCE)
+    ]
     found = replace(found, search=found.search.with_candidates(candidates))
     pointwise = None if slow is None else tangents.pointwise[slow.port]
     if slow is None or pointwise is None or not tangents.candidates:
@@ -362,15 +376,17 @@ class _Seen:
 
     def filled(self, filling: Filling) -> _Seen:
         """The same with what noise is expected at rejected samples, in all of it alike."""
-        pseudo, nuisance, *candidates = _each(filling, [self.pseudo.unsqueeze(-1), self.nuisance, *self.candidates])
+        pseudo, nuisance, *candidates = _each(
+            filling, [self.pseudo.unsqueeze(-1), self.nuisance, *self.candidates], _FILLED_AT_ONCE
+        )
         return _Seen(pseudo.squeeze(-1), nuisance, tuple(candidates), filling(self.slow))
 
 
-def _each(function: Callable[[Tensor], Tensor], columns: Sequence[Tensor]) -> list[Tensor]:
+def _each(function: Callable[[Tensor], Tensor], columns: Sequence[Tensor], at_once: int = _AT_ONCE) -> list[Tensor]:
     """A function of columns, of each of these matrices."""
     return [
         done
-        for block in _blocks(columns)
+        for block in _blocks(columns, at_once)
         for done in function(torch.cat([*block], -1)).split([c.shape[-1] for c in block], -1)
     ]
 
@@ -378,14 +394,9 @@ def _each(function: Callable[[Tensor], Tensor], columns: Sequence[Tensor]) -> li
 def _searching(
     colour: Colour, pull: _Pull, seen: _Seen, slow: Slow | None, gaps: Gaps, *, joint: bool = False
 ) -> Linearised:
-    filling = gaps.filling(colour)
-    return _filled(colour, pull, seen.filled(filling), slow, filling, joint=joint)
-
-
-def _filled(
-    colour: Colour, pull: _Pull, seen: _Seen, slow: Slow | None, filling: Filling, *, joint: bool = False
-) -> Linearised:
     """A search of what has its rejected samples filled."""
+    filling = gaps.filling(colour)
+    seen = seen.filled(filling)
     flat = colour.scaled(seen.pseudo)
     parameters = pull.under(colour.scaled(seen.nuisance), flat)
     candidates = [pull.below(colour.scaled(one)) for one in seen.candidates]
@@ -403,36 +414,43 @@ def _coloured(
 ) -> Linearised:
     """With the likeliest colour of the noise beside a wander at the port, by alternating between the two."""
     alone = replace(seen, slow=seen.slow[..., :0])
-    best = _searching(plain, pull, alone, None, gaps).colour_beside()
-    for _ in range(_REFILLED):
-        found = _searching(best, pull, alone, None, gaps)
-        if found.filling.nothing:
-            break
-        best = found.colour_beside()
-    tried = [_searching(best, pull, seen, slow, gaps)]
+
+    def beside_nothing() -> Colour:
+        best = _searching(plain, pull, alone, None, gaps).colour_beside()
+        for _ in range(_REFILLED):
+            found = _searching(best, pull, alone, None, gaps)
+            if found.filling.nothing:
+                break
+            best = found.colour_beside()
+        return best
+
     if slow is None:
-        return tried[0]
+        return _searching(beside_nothing(), pull, seen, None, gaps)
+
+    def beside_wander() -> Colour:
+        return _searching(plain, pull, seen, slow, gaps).colour_beside() if near is None else near
+
+    def tried(colour: Callable[[], Colour]) -> Linearised:
+        return _searching(colour(), pull, seen, slow, gaps)
+
     # from the side of no wander and from that of no colour: either could pass for the other
-    beside = _searching(plain, pull, seen, slow, gaps).colour_beside() if near is None else near
-    tried.append(_searching(beside, pull, seen, slow, gaps))
-    return _settled(max(tried, key=lambda found: found.evidence), pull, seen, slow)
+    starts = shared([partial(tried, beside_nothing), partial(tried, beside_wander)], [slow, slow.tangents, slow.scales])
+    return _settled(max(starts, key=lambda found: found.evidence))
 
 
-def _settled(found: Linearised, pull: _Pull, seen: _Seen, slow: Slow) -> Linearised:
+def _settled(found: Linearised) -> Linearised:
     """With the colour that alternating between it and the wander comes to.
 
     What stands in for rejected samples stays: it follows any colour, and would lead it on.
     """
     if not found.wanders:
         return found
-    filled = seen.filled(found.filling)
     for _ in range(_ALTERNATIONS):
-        # a step that goes too far is taken back to the one that cannot
-        for colour in (found.colour_ahead, found.colour_beside):
-            step = _filled(colour(), pull, filled, slow, found.filling)
-            if step.evidence > found.evidence + _SETTLED:
-                break
-        else:
+        step = found.recoloured(found.colour_ahead())
+        if step.evidence < found.evidence:
+            # a step that goes too far is taken back to the one that cannot
+            step = found.recoloured(found.colour_beside())
+        if step.evidence <= found.evidence + _SETTLED:
             return found
         found = step
     return found

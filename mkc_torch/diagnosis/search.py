@@ -142,14 +142,19 @@ class LinearSearch:
 
     def without(self, columns: Float[Tensor, "M q"]) -> LinearSearch:
         """The same candidates and noise, with these tangents taken out of everything too."""
+        nuisance = torch.cat([self._basis, columns], -1)
+        return LinearSearch(nuisance, self._flat.split(self._widths, -1), self._wander, self._scales)
+
+    def scaled(self, factor: Float[Tensor, " M"]) -> LinearSearch:
+        """The same with each row times a factor."""
+        nuisance, columns, wander = (factor.unsqueeze(-1) * known for known in (self._basis, self._flat, self._wander))
+        return LinearSearch(nuisance, columns.split(self._widths, -1), wander, self._scales)
+
+    @property
+    def _scales(self) -> Float[Tensor, "F k"]:
+        """Of each family of wander."""
         scales = [family.scale for family in self._families]
-        none = self._wander.new_zeros(0, self._wander.shape[1])
-        return LinearSearch(
-            torch.cat([self._basis, columns], -1),
-            self._flat.split(self._widths, -1),
-            self._wander,
-            torch.stack(scales) if scales else none,
-        )
+        return torch.stack(scales) if scales else self._wander.new_zeros(0, self._wander.shape[1])
 
     def _grouped(self, columns: Tensor, on_basis: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
         """For each width: numbers of the candidates, their columns, whitening (C, q, q) and degrees of freedom."""

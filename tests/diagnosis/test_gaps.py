@@ -64,11 +64,13 @@ def test_it_is_the_conditional_expectation(seed, share):
     assert filling.log_det == pytest.approx(total, abs=1e-8)
 
 
+@pytest.mark.parametrize("level", [1.0, 9.0])  # of 1, the noise is nowhere below it
 @pytest.mark.parametrize("share", [0.1, 0.7])
-def test_solving_for_samples_or_for_frequencies_is_the_same(share):
+def test_solving_for_samples_or_for_frequencies_is_the_same(share, level):
     counts = mask(11, share=share)
     known, rows = Gaps(counts, N), torch.arange(0, N, 2)
-    excess = (falling(N)[-1] / falling(N) - 1.0)[rows]
+    excess = (level / falling(N) - 1.0)[rows]
+    assert bool((excess < 0).all()) == (level == 1.0)
     one, other = known._by_sample(0, rows, excess), known._by_frequency(0, rows, excess)
     values = torch.randn(N, 3, generator=torch.Generator().manual_seed(12), dtype=torch.float64)
     assert float((one(values) - values).abs().max()) > 0.01

@@ -180,6 +180,21 @@ def test_the_noise_is_that_of_what_is_left():
     torch.testing.assert_close(again.series, local.noise.series)
 
 
+def test_another_colour_is_the_search_that_begins_with_it():
+    """Beside what stands in for rejected samples, which is that of the colour before."""
+    prepared = Magnetometer("attitude").prepare(tumbling(N, noise=0.3, sensor=walk([0.05] * 3), attitude=True))
+    model = JointModel(prepared)
+    fit = fitted(model, prepared.start())
+    tangents, values, counts = tangents_of(model, fit.parameters), fit.residual, torch.ones_like(fit.residual)
+    found = linearise(model, fit.parameters, values, counts, tangents, white=True)
+    colour = found.colour_beside()
+    built = linearise(model, fit.parameters, values, counts, tangents, colour=colour)
+    told = found.recoloured(colour)
+    torch.testing.assert_close(told.series, built.series)
+    assert told.evidence == pytest.approx(built.evidence)
+    assert told.evidence > found.evidence + 10.0
+
+
 def test_white_noise_is_left_as_it_is():
     fit, _, local = local_of(np.zeros((N, 3)), "attitude")
     values, counts = fit.pseudo

@@ -294,6 +294,13 @@ def test_a_search_takes_other_candidates(search):
     torch.testing.assert_close(search.gains(y).ratio[2:], other.gains(y).ratio)
 
 
+def test_rows_times_a_factor_are_a_search_of_such_tangents(search):
+    factor = 0.5 + torch.linspace(0.0, 2.0, M, dtype=torch.float64).unsqueeze(-1)
+    built = LinearSearch(factor * NUISANCE, [factor * c for c in CANDIDATES], factor * WANDER, SCALES)
+    series = factor * wandering(10.0, 0, seed=70).unsqueeze(-1)
+    torch.testing.assert_close(search.scaled(factor.squeeze(-1)).gains(series).ratio, built.gains(series).ratio)
+
+
 def test_the_share_of_a_channel_is_its_variance():
     """Courses of two channels take turns; those of the first are three times the size of the others."""
     courses = torch.cat([smooth(30) * randn(M, 1, seed=6), smooth(30) * randn(M, 1, seed=7)], -1)
