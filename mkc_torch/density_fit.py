@@ -1,11 +1,13 @@
 """Fit σ and d of the MKC density to residuals by maximum likelihood: the E-step of MKC-EM (Algorithm 2 of the paper).
 
 The mean negative log-likelihood of each channel is a function of two numbers. It is minimised by a safeguarded Newton
-method with analytic derivatives in log(κ + 0.02) and log d, κ = 1/σ², which reaches σ = ∞ at a finite coordinate.
+method with analytic derivatives in κ = 1/σ², of which σ = ∞ is a finite value, and log d. A step in log κ would go too
+far: where the tail is already more than there are outliers, the likelihood falls exponentially.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -20,6 +22,10 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 _KAPPA_OFFSET = 0.02
+"""Steps in κ are measured in shares of κ and this: a thousandth matters near a Gaussian, and nowhere else."""
+
+_LONGEST, _FURTHEST_DOWN = 2.0, math.exp(-2.0)
+"""Of a step, in log d and in shares of κ; and the share of κ that a step leaves at least."""
 
 
 class Derivatives(NamedTuple):
@@ -169,13 +175,13 @@ def initial_state(
 
 
 def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> DensityState:
-    """One damped Newton step in (log(κ + 0.02), log d) within κ in [0, 400] and d in [d_min, bound]; never uphill."""
+    """One damped Newton step in (κ, log d) within κ in [0, 400] and d in [d_min, bound]; never uphill."""
     fit = _energy_derivatives(error, weight, state.kappa, state.log_d)
     norm = _normaliser_derivatives(state.kappa, state.log_d, state.log_bound)
     total = Derivatives(*(a + b for a, b in zip(fit, norm, strict=True)))
     chain = state.kappa + _KAPPA_OFFSET
     g_s, g_l = total.kappa * chain, total.log_d
-    h_ss = total.kappa_kappa * chain.square() + g_s
+    h_ss = total.kappa_kappa * chain.square()
     h_sl, h_ll = total.kappa_log_d * chain, total.log_d_log_d
     held_s = ((state.kappa <= 0) & (g_s > 0)) | ((state.kappa >= KAPPA_MAX) & (g_s < 0))
     held_l = ((state.log_d <= state.log_d_min) & (g_l > 0)) | ((state.log_d >= state.log_bound) & (g_l < 0))
@@ -194,8 +200,9 @@ def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> De
     determinant = a * c - b * b
     step_s, step_l = (b * g_l - c * g_s) / determinant, (b * g_s - a * g_l) / determinant
     longest = torch.maximum(step_s.abs(), step_l.abs())
-    shorten = (2.0 / longest.clamp(min=2.0)).nan_to_num(0.0)
-    kappa = (chain * torch.exp(shorten * step_s.nan_to_num(0.0)) - _KAPPA_OFFSET).clamp(0.0, KAPPA_MAX)
+    shorten = (_LONGEST / longest.clamp(min=_LONGEST)).nan_to_num(0.0)
+    grown = (1.0 + shorten * step_s.nan_to_num(0.0)).clamp(min=_FURTHEST_DOWN)
+    kappa = (chain * grown - _KAPPA_OFFSET).clamp(0.0, KAPPA_MAX)
     log_d = torch.minimum(
         torch.maximum(state.log_d + shorten * step_l.nan_to_num(0.0), state.log_d_min), state.log_bound
     )
