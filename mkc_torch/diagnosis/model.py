@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import torch
@@ -16,6 +17,8 @@ from mkc_torch.effects.protocol import (
     GainEffect,
     LinearEffect,
     Shape,
+    combined,
+    gained,
 )
 from mkc_torch.nonlinear import GaussianPrior, beside
 from mkc_torch.simulation.protocol import Change, Changes, FreeChange, Port, PreparedSimulation
@@ -153,8 +156,9 @@ class JointModel:
     def changes(self, parameters: Float[Tensor, " p"]) -> dict[str, Change]:
         """What the effects add at each port."""
         total: dict[str, Change] = {}
-        for term, gamma, follows in zip(self.terms, self.gammas(parameters), self._follow, strict=True):
-            change = self._change(term, gamma)
+        known = zip(self.terms, self.gammas(parameters), self._follow, self._courses, strict=True)
+        for term, gamma, follows, courses in known:
+            change = self._change(term, gamma) if courses is None else _constant(courses(gamma))
             total[term.port] = summed(total.get(term.port), change if follows else FreeChange(change))
         return total
 
@@ -163,6 +167,14 @@ class JointModel:
             return term.effect.change(gamma, term.shape, term.context(self.prepared, signal))
 
         return change
+
+    @cached_property
+    def _courses(self) -> tuple[Callable[[Tensor], Tensor] | None, ...]:
+        """What each effect adds as a function of γ alone; None where it is more than a sum of known courses."""
+        return tuple(
+            None if follows else courses_of(term, term.context(self.prepared, None))
+            for term, follows in zip(self.terms, self._follow, strict=True)
+        )
 
     def signals(self, parameters: Float[Tensor, " p"]) -> Mapping[str, Tensor]:
         """What passes through each port, with the effects in it."""
@@ -198,6 +210,19 @@ def port_jacobian(model: JointModel, parameters: Float[Tensor, " p"], port: str)
     return torch.stack(columns, -1)
 
 
+def courses_of(term: Term, context: Context) -> Callable[[Tensor], Tensor] | None:
+    """A function of γ that is an effect's change, for one that adds courses of its own; None of any other."""
+    if isinstance(term.effect, LinearEffect):
+        return partial(combined, term.effect.basis(term.shape, context))
+    if isinstance(term.effect, GainEffect) and type(term.effect).change is GainEffect.change:
+        return partial(gained, term.effect.course(term.shape, context))
+    return None
+
+
+def _constant(added: Float[Tensor, "N c"]) -> Change:
+    return lambda _: added
+
+
 def summed(one: Change | None, other: Change) -> Change:
     """Two changes at one port."""
     if one is None:
@@ -222,7 +247,7 @@ def _widened(added: Float[Tensor, "N c"], width: int) -> Float[Tensor, "N w"]:
 
 def with_constant(changes: Changes, port: str, change: Float[Tensor, "N c"]) -> Changes:
     """The same with a change at a port that does not depend on its signal."""
-    return {**changes, port: summed(changes.get(port), FreeChange(lambda _: change))}
+    return {**changes, port: summed(changes.get(port), FreeChange(_constant(change)))}
 
 
 def limits(effect: Effect) -> tuple[float, float]:

@@ -352,7 +352,12 @@ class GainEffect:
         return (Quantity(self.gain, len(context.channels), self.unit(context)),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        return self.course(shape, context).unsqueeze(-1) @ gamma.unsqueeze(0)
+        return gained(self.course(shape, context), gamma)
+
+
+def gained(course: Float[Tensor, " N"], gain: Float[Tensor, " c"]) -> Float[Tensor, "N c"]:
+    """A course times a gain for each channel."""
+    return course.unsqueeze(-1) @ gain.unsqueeze(0)
 
 
 def per(unit: str, other: str) -> str:
