@@ -85,14 +85,15 @@ def in_processes(work: Callable[[T], R], items: Sequence[T]) -> Iterator[Iterato
     before = set(multiprocessing.active_children())
     # spawned, for torch's threads do not survive a fork
     context = multiprocessing.get_context("spawn")
-    stop = context.Event()
+    # without a lock: an interrupt can come between its taking and its giving back, and all would wait for it for ever
+    stop = context.RawValue(ctypes.c_bool, False)
     with ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(stop,)) as pool:
         try:
             with _not_interrupted():  # processes that start inherit it, and say nothing when they are interrupted
                 futures: list[Future[R]] = [pool.submit(_interruptible, work, item) for item in items]
             yield (future.result for future in futures)
         except BaseException:
-            stop.set()  # an item that a process has taken already cannot be cancelled
+            stop.value = True  # an item that a process has taken already cannot be cancelled
             for child in set(multiprocessing.active_children()) - before:
                 with suppress(ProcessLookupError, TypeError):
                     os.kill(child.pid, signal.SIGINT)  # type: ignore[arg-type]
@@ -103,7 +104,7 @@ def in_processes(work: Callable[[T], R], items: Sequence[T]) -> Iterator[Iterato
 class _Stop(Protocol):
     """Whether to stop, as all processes know it."""
 
-    def is_set(self) -> bool: ...
+    value: bool
 
 
 _stop: _Stop | None = None
@@ -118,11 +119,15 @@ def _start(stop: _Stop) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
+def _stopped() -> bool:
+    return _stop is not None and _stop.value
+
+
 def _interruptible(work: Callable[[T], R], item: T) -> R:
     """Work that an interrupt ends as it would here: what is half-written is cleared away."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        if _stop is not None and _stop.is_set():
+        if _stopped():
             raise KeyboardInterrupt
         return work(item)
     finally:

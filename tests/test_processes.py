@@ -1,11 +1,13 @@
 """Processes of the command line's own: they keep their memory, and end without looking at every module again."""
 
+import os
 import subprocess
 import sys
 
+import pytest
 import torch
 
-from mkc_torch._processes import keep_memory
+from mkc_torch._processes import cores, keep_memory
 
 
 def test_what_was_imported_is_out_of_the_collectors_sight_to_the_end():
@@ -34,3 +36,50 @@ def test_linear_algebra_computes_in_one_thread():
     )
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert told == "1 True {1}\n"
+
+
+INTERRUPTED = """
+import os, signal, time
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from threading import Thread
+
+from mkc_torch import _processes
+
+
+def interrupt_and_end():
+    time.sleep(0.5)
+    for _ in range(400):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(1e-4)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def ask(depth):
+    while True:
+        with suppress(KeyboardInterrupt):  # one can come between two of these too
+            ask(depth - 1) if depth else _processes._stopped()
+
+
+def asked_again_and_again(item):
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # as beside work
+    Thread(target=interrupt_and_end).start()
+    ask(20)
+
+
+if __name__ == "__main__":
+    try:
+        with _processes.in_processes(asked_again_and_again, range(2)) as results:
+            for result in results:
+                result()
+    except (BrokenProcessPool, KeyboardInterrupt):
+        print("told")
+"""
+
+
+@pytest.mark.skipif(cores() < 2 or os.name == "nt", reason="one core, or no such signal")
+def test_an_interrupt_where_it_is_asked_whether_to_stop_keeps_nobody_waiting(tmp_path):
+    script = tmp_path / "interrupted.py"
+    script.write_text(INTERRUPTED)
+    told = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=True)
+    assert told.stdout == "told\n"
