@@ -192,13 +192,16 @@ def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> De
     g_s, g_l = torch.where(held_s, 0.0, g_s), torch.where(held_l, 0.0, g_l)
     h_sl = torch.where(held_s | held_l, 0.0, h_sl)
     h_ss, h_ll = torch.where(held_s, 1.0, h_ss), torch.where(held_l, 1.0, h_ll)
+    # on scales of their own: near a Gaussian the curvature by κ is a thousandth of that by log d
+    r_s, r_l = (h.abs().clamp(min=1e-8 * (h_ss.abs() + h_ll.abs())).rsqrt() for h in (h_ss, h_ll))
+    a, b, c = h_ss * r_s * r_s, h_sl * r_s * r_l, h_ll * r_l * r_l
     # Levenberg's shift also lifts the smaller eigenvalue above 0
-    middle, spread = 0.5 * (h_ss + h_ll), torch.hypot(0.5 * (h_ss - h_ll), h_sl)
-    size = middle.abs() + spread
-    shift = (spread - middle + 1e-3 * size).clamp(min=0.0) + state.damping * size
-    a, b, c = h_ss + shift, h_sl, h_ll + shift
+    middle, spread = 0.5 * (a + c), torch.hypot(0.5 * (a - c), b)
+    shift = (spread - middle + 1e-3).clamp(min=0.0) + state.damping
+    a, c = a + shift, c + shift
     determinant = a * c - b * b
-    step_s, step_l = (b * g_l - c * g_s) / determinant, (b * g_s - a * g_l) / determinant
+    g_s, g_l = g_s * r_s, g_l * r_l
+    step_s, step_l = r_s * (b * g_l - c * g_s) / determinant, r_l * (b * g_s - a * g_l) / determinant
     longest = torch.maximum(step_s.abs(), step_l.abs())
     shorten = (_LONGEST / longest.clamp(min=_LONGEST)).nan_to_num(0.0)
     grown = (1.0 + shorten * step_s.nan_to_num(0.0)).clamp(min=_FURTHEST_DOWN)
