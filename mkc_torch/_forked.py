@@ -27,6 +27,9 @@ _copies = 0
 _working: list[_Copy] = []
 _BYTES = 4
 
+_BEHIND = 5
+"""Niceness of a copy that works meanwhile: against what is waited for it has a quarter of a core."""
+
 
 def allow_copies(most: int | None = None) -> None:
     """Have work be shared by all cores from now on, or by so many copies beside this process.
@@ -53,7 +56,7 @@ def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) -> li
     if min(_copies, len(works) - 1) < 1:
         return [work() for work in works]
     with _todo(len(works)) as todo, _crew(works, todo, known) as crew:
-        return _together(works, todo, crew)
+        return _together(works, todo, crew, _foremost)
 
 
 @contextmanager
@@ -61,39 +64,48 @@ def meanwhile(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) ->
     """What a copy begins with while this process goes on, the last one first; ``known`` as of :func:`shared`.
 
     Gives a function for all results, which takes part in what nobody has begun, and waits for the rest; where there is
-    no core to spare it does all of it. Once the copy is done its core is free for others.
+    no core to spare it does all of it. What is shared goes before: the copy takes what is left of the cores.
     """
-    if _to_spare() < 1 or not works:
+    if _copies <= _at_work() or not works:
         yield lambda: [work() for work in works]
         return
     with _todo(len(works) - 1) as todo, _crew(works, todo, known) as crew:
-        crew.fill(1, [len(works) - 1])
-        yield lambda: _together(works, todo, crew)
+        crew.fill(1, _at_work, [len(works) - 1])
+        yield lambda: _together(works, todo, crew, _at_work)
 
 
-def _together(works: Sequence[Callable[[], T]], todo: int, crew: _Crew) -> list[T]:
+def _together(works: Sequence[Callable[[], T]], todo: int, crew: _Crew, busy: Callable[[], int]) -> list[T]:
     done: dict[int, T] = {}
     for number in _taken(todo):
         # also a core that has become free since
-        crew.fill(len(works) - len(done) - 1)
+        crew.fill(len(works) - len(done) - 1, busy)
         done[number] = works[number]()
     for copy in crew.copies:
         done |= copy.done()
     return [done[number] if number in done else work() for number, work in enumerate(works)]
 
 
-def _to_spare() -> int:
-    """Copies that may still be started."""
-    return _copies - sum(copy.at_work for copy in _working)
+def _at_work() -> int:
+    """Copies that have a core."""
+    return sum(copy.at_work for copy in _working)
+
+
+def _foremost() -> int:
+    """Those of them that leave it to nobody."""
+    return sum(copy.at_work for copy in _working if not copy.behind)
 
 
 @dataclass(frozen=True)
 class _Copy:
-    """A copy of this process, and where it writes what it has done in the end."""
+    """A copy of this process, and where it writes what it has done in the end.
+
+    One that is ``behind`` leaves its core to others.
+    """
 
     process: int
     answer: BinaryIO
     known: dict[int, object]
+    behind: bool
 
     @property
     def at_work(self) -> bool:
@@ -169,10 +181,10 @@ class _Crew:
     known: dict[int, object]
     copies: list[_Copy]
 
-    def fill(self, most: int, first: Sequence[int] = ()) -> None:
-        """Start copies where there are cores to spare, each with these works before what is to be done."""
+    def fill(self, most: int, busy: Callable[[], int], first: Sequence[int] = ()) -> None:
+        """Start copies on all cores but the busy ones; with works of their own to begin with, behind others."""
         with suppress(OSError):  # no memory for another process: those that there are do it
-            while len(self.copies) < most and _to_spare() > 0:
+            while len(self.copies) < most and busy() < _copies:
                 self.copies.append(_copy(self.works, self.todo, self.known, first))
                 _working.append(self.copies[-1])
 
@@ -201,9 +213,12 @@ def _copy(works: Sequence[Callable[[], object]], todo: int, known: dict[int, obj
         except OSError:
             answer.close()
             raise
+    behind = len(first) > 0
     if process:
-        return _Copy(process, answer, known)
+        return _Copy(process, answer, known, behind)
     try:
+        if behind:
+            os.nice(_BEHIND)
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         warnings.simplefilter("ignore")  # another thread may have held the lock of where they are written
         allow_copies(0)

@@ -46,6 +46,11 @@ def elsewhere(value):
     return work
 
 
+def with_niceness(value):
+    """The same with how far that one stands back."""
+    return lambda: (*elsewhere(value)(), os.nice(0))
+
+
 def test_results_come_in_order_and_copies_take_part():
     results = shared([elsewhere(k) for k in range(9)])
     assert [value for value, _ in results] == list(range(9))
@@ -137,12 +142,25 @@ def test_within_a_copy_all_is_done_there():
         assert len(answer()[0]) == 1
 
 
-def test_the_core_of_a_copy_at_work_is_not_there():
+def test_a_copy_that_works_meanwhile_leaves_its_core_to_what_is_shared_and_to_nothing_else():
     allow_copies(1)
     with meanwhile([signal.pause]):
-        assert {process for _, process in shared([elsewhere(k) for k in range(4)])} == {HERE}
+        _, processes, niceness = zip(*shared([with_niceness(k) for k in range(4)]), strict=True)
+        assert len(set(processes)) == 2
+        assert len(set(niceness)) == 1
         with meanwhile([os.getpid]) as another:
             assert another() == [HERE]
+    with meanwhile([with_niceness(0)]) as answer:
+        [(_, process, niceness)] = answer()
+    assert process != HERE
+    assert niceness > os.nice(0)
+
+
+def test_who_waits_for_a_copy_starts_no_other_on_its_core(copies):
+    allow_copies(1)
+    with meanwhile([elsewhere(k) for k in range(5)]) as answer:
+        assert [value for value, _ in answer()] == list(range(5))
+    assert len(copies) == 1
 
 
 def test_the_core_of_a_copy_that_is_done_is_free(copies):
@@ -181,13 +199,15 @@ def test_a_copy_that_is_not_waited_for_is_ended(copies):
 
 CODE = """
     import os, sys, torch
-    torch.set_num_threads(1)
     from mkc_torch import Recording, diagnose
     from mkc_torch._forked import allow_copies
+    from mkc_torch._processes import one_thread
     from mkc_torch.demo import simulated_recording
     from mkc_torch.diagnosis.diagnosis_file import diagnosis_to_json
     from mkc_torch.simulation import Dynamics, Magnetometer
     from mkc_torch.diagnosis import side_by_side
+
+    one_thread()
 
     class Cart(Dynamics):
         states = ("place", "speed")
