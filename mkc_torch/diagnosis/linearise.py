@@ -32,8 +32,8 @@ T = TypeVar("T")
 
 __all__ = ["Linearised", "Slow", "Tangents", "candidate_tangents", "linearise", "tangents_of"]
 
-SLOW_COURSES = 150
-"""Cosine courses of each wandering channel: on 90 s they reach 0.8 Hz."""
+SLOW_COURSES = 100
+"""Cosine courses of each wandering channel: on 90 s they reach 0.55 Hz."""
 
 CORNERS = (25.0,)
 """Numbers of the courses beyond which the wander falls off; beside them, a random walk."""
@@ -443,17 +443,19 @@ def _settled(found: Linearised) -> Linearised:
 
     What stands in for rejected samples stays: it follows any colour, and would lead it on.
     """
-    if not found.wanders:
+    wander = found.search.noise_fit(found.series)
+    if wander.gain <= 0:
         return found
+    found = replace(found, search=found.search.of_family(wander.family))
     for _ in range(_ALTERNATIONS):
         step = found.recoloured(found.colour_ahead())
         if step.evidence < found.evidence:
             # a step that goes too far is taken back to the one that cannot
             step = found.recoloured(found.colour_beside())
         if step.evidence <= found.evidence + _SETTLED:
-            return found
+            break
         found = step
-    return found
+    return replace(found, search=found.search.of_family(None))
 
 
 def _level(pseudo: Tensor) -> Tensor:

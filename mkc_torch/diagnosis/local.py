@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mkc_torch.density_fit import fit_density
 from mkc_torch.diagnosis.bursts import near_median, of_all, out_of_bursts, together
-from mkc_torch.diagnosis.linearise import SLOW_COURSES, Linearised, Slow, Tangents, linearise
+from mkc_torch.diagnosis.linearise import Linearised, Slow, Tangents, linearise
 from mkc_torch.diagnosis.model import JointModel
 from mkc_torch.diagnosis.noise import pseudo_residual
 from mkc_torch.diagnosis.refit import FittedModel
@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 __all__ = ["Local", "beside_wander", "explained"]
 
 _ROUNDS = 4
+
+_MEDIANS = 75
+"""Windows of a running median that make up a recording."""
+
 _FAR = 2.6
 """Robust scales beyond which what is left beside the wander does not count. Where outliers five scales away are many,
 the likeliest density is so wide that most of them would, and in bursts of one sign they pass for a wander."""
@@ -68,7 +72,7 @@ def beside_wander(fit: FittedModel, model: JointModel, parameters: Float[Tensor,
         values, counts = fit.pseudo
         return Local(values, counts, linearise(model, parameters, values, counts, tangents.bare), None)
     # a burst must not pull the first course its way
-    counts = near_median(fit.residual, 2 * len(fit.residual) // SLOW_COURSES)
+    counts = near_median(fit.residual, len(fit.residual) // _MEDIANS)
     values = counts * fit.residual
     noise = linearise(model, parameters, values, counts, tangents.bare, white=True)
     family = noise.search.noise_fit(noise.series).family

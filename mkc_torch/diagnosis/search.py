@@ -83,12 +83,31 @@ class SlowPart:
 
 @dataclass(frozen=True)
 class _Wander:
-    """One family of wander in its own axes: singular values, rotation, and the sizes that are tried."""
+    """One family of wander; its own axes are found once they are asked for."""
 
     scale: Tensor  # (k,) standard deviations of the courses at size 1
-    axes: Tensor  # (k, k)
-    strength: Tensor  # (k,)
-    sizes: Tensor  # (1 + S,) squared sizes, the first one 0
+    gram: Tensor  # (k, k) inner products of the courses, not yet on this scale
+
+    @cached_property
+    def _decomposed(self) -> tuple[Tensor, Tensor]:
+        values, vectors = np.linalg.eigh((self.scale.unsqueeze(-1) * self.gram.double() * self.scale).numpy())
+        return torch.from_numpy(values).clamp(min=0.0), torch.from_numpy(vectors)
+
+    @property
+    def strength(self) -> Float[Tensor, " k"]:
+        """Eigenvalues of the inner products on this scale, ascending."""
+        return self._decomposed[0]
+
+    @property
+    def axes(self) -> Float[Tensor, "k k"]:
+        """Their eigenvectors, one a column."""
+        return self._decomposed[1]
+
+    @cached_property
+    def sizes(self) -> Float[Tensor, " sizes"]:
+        """Squared sizes that are tried; the first one is 0."""
+        tried = torch.logspace(-0.5, 5.0, _SIZES, dtype=torch.float64) / self.strength[-1]
+        return torch.cat([tried.new_zeros(1), tried])
 
     @cached_property
     def shares(self) -> Float[Tensor, "S k"]:
@@ -119,7 +138,8 @@ class LinearSearch:
         self._wander = wander
         self._wander_basis = self._basis.mT @ wander
         gram = _gram(wander) - _gram(self._wander_basis)
-        self._families = [_family(gram, scale) for scale in scales] if wander.shape[1] else []
+        self._families = [_Wander(scale, gram) for scale in scales] if wander.shape[1] else []
+        self._possible = range(len(self._families))
         self._try(candidates)
 
     def _try(self, candidates: Sequence[Float[Tensor, "M q"]]) -> None:
@@ -148,13 +168,26 @@ class LinearSearch:
     def scaled(self, factor: Float[Tensor, " M"]) -> LinearSearch:
         """The same with each row times a factor."""
         nuisance, columns, wander = (factor.unsqueeze(-1) * known for known in (self._basis, self._flat, self._wander))
-        return LinearSearch(nuisance, columns.split(self._widths, -1), wander, self._scales)
+        other = LinearSearch(nuisance, columns.split(self._widths, -1), wander, self._scales)
+        other._possible = self._possible
+        return other
+
+    def of_family(self, number: int | None) -> LinearSearch:
+        """The same, with a noise that wanders in this way if it does; None for any of all families."""
+        other = copy(self)
+        other._possible = range(len(self._families)) if number is None else range(number, number + 1)
+        return other
 
     @property
     def _scales(self) -> Float[Tensor, "F k"]:
         """Of each family of wander."""
         scales = [family.scale for family in self._families]
         return torch.stack(scales) if scales else self._wander.new_zeros(0, self._wander.shape[1])
+
+    @property
+    def _allowed(self) -> list[_Wander]:
+        """The families of wander that the noise may be of."""
+        return [self._families[number] for number in self._possible]
 
     def _grouped(self, columns: Tensor, on_basis: Tensor) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
         """For each width: numbers of the candidates, their columns, whitening (C, q, q) and degrees of freedom."""
@@ -256,7 +289,8 @@ class LinearSearch:
         slow = (self._wander.mT @ series - self._wander_basis.mT @ on_basis).double()
         none = float(-0.5 * self._dof * power.log())
         best = NoiseFit(0, 0.0, float(power / self._dof), none, 0.0)
-        for number, family in enumerate(self._families):
+        for number in self._possible:
+            family = self._families[number]
             left, log_det = _without_wander(power, family.axes.mT @ (family.scale.unsqueeze(-1) * slow), family)
             values = (-0.5 * log_det - 0.5 * self._dof * left.log()).squeeze(-1)
             place = int(values.argmax())
@@ -283,7 +317,7 @@ class LinearSearch:
         grams, inners = [gram.flatten().unsqueeze(0)], [inner.unsqueeze(0)]
         powers, log_dets = [power.reshape(1)], [power.new_zeros(1)]
         slow = self._wander.mT @ left
-        for family in self._families:
+        for family in self._allowed:
             cross = family.axes.mT @ (family.scale.unsqueeze(-1) * self._cross[:, index])
             rotated = family.axes.mT @ (family.scale * slow)
             share, sizes = family.shares, family.sizes[1:].unsqueeze(-1)
@@ -370,10 +404,11 @@ class LinearSearch:
         if fit.size > 0:
             family = self._families[fit.family]
             axes = family.scale.unsqueeze(-1) * family.axes
-            courses = self._wander @ axes - self._basis @ (self._wander_basis @ axes)
+            courses = self._wander - self._basis @ self._wander_basis
             share = fit.size / (1.0 + fit.size * family.strength)
-            left = left - courses @ (share * (courses.mT @ left))
-            taken = taken + courses.square() @ share
+            left = left - courses @ (axes @ (share * (axes.mT @ (courses.mT @ left))))
+            # a variance, and half of the time: single precision does
+            taken = taken + ((courses.float() @ axes.float()).square() @ share.float()).double()
         return left.square() + fit.variance * taken
 
     def _profile(self, power: Tensor, inner: Tensor, slow: Tensor) -> tuple[Tensor, Tensor]:
@@ -382,7 +417,7 @@ class LinearSearch:
         best = torch.full((len(self._widths), len(power)), -torch.inf, dtype=torch.float64)
         in_family = [
             (family, family.axes.mT @ (family.scale.unsqueeze(-1) * slow), self._cross_in(family))
-            for family in self._families
+            for family in self._allowed
         ]
         lefts = [_without_wander(power, rotated, family) for family, rotated, _ in in_family]
         for left, log_det in lefts:
@@ -434,13 +469,6 @@ def _gram(columns: Float[Tensor, "M k"]) -> Float[Tensor, "k k"]:
     """Inner products; NumPy sees that it is one matrix, and makes half of them."""
     known = columns.numpy()
     return torch.from_numpy(known.T @ known)
-
-
-def _family(gram: Tensor, scale: Tensor) -> _Wander:
-    values, vectors = np.linalg.eigh((scale.unsqueeze(-1) * gram.double() * scale).numpy())
-    strength, axes = torch.from_numpy(values).clamp(min=0.0), torch.from_numpy(vectors)
-    sizes = torch.cat([strength.new_zeros(1), torch.logspace(-0.5, 5.0, _SIZES, dtype=torch.float64) / strength[-1]])
-    return _Wander(scale, axes, strength, sizes)
 
 
 def _beside(power: Tensor, explained: Tensor) -> Tensor:
