@@ -10,14 +10,12 @@ from torch import Tensor
 from mkc_torch.calibration_file import Calibration, Matrix, Spread, Vector
 from mkc_torch.coverage import Coverage
 from mkc_torch.disturbance import disturbed_intervals
-from mkc_torch.ellipsoid import (
-    MIN_POINTS,
-    EllipsoidFit,
-    ellipsoid_from_coefficients,
-)
+from mkc_torch.ellipsoid import MIN_POINTS, EllipsoidFit, ellipsoid_from_coefficients
+from mkc_torch.functional import mkc_weight
 from mkc_torch.linear import MKCRegression
 from mkc_torch.linear.covariance import CovarianceKind
 from mkc_torch.recording import Recording, RecordingError
+from mkc_torch.rest import thin_at_rest
 
 __all__ = ["Calibration", "Matrix", "Spread", "Vector", "calibrate", "prepared"]
 
@@ -97,13 +95,16 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
     usable = prepared(recording)
     points = usable.magnetometer()
     kind: CovarianceKind = "sandwich" if usable.time is None else "hac"
-    fit = EllipsoidFit(MKCRegression(covariance=kind, seed=seed)).fit(points)
+    taken = None if usable.time is None else thin_at_rest(points).to(points)
+    fit = EllipsoidFit(MKCRegression(covariance=kind, seed=seed)).fit(points, taken)
     radius = float(fit.radius_)
     strength = radius if field_strength is None else field_strength
     scale = strength / radius
     matrix_se = fit.calibration_matrix_se_ if field_strength is None else strength * fit.root_se_
     density = _density(fit)
-    rejected = fit.weights_ < REJECTED_BELOW
+    length = torch.linalg.vector_norm(fit.calibrate(points), dim=-1)
+    # of all samples, those that were left out while the sensor rested among them
+    rejected = mkc_weight((length / radius).square() - 1.0, density[0], density[1]) < REJECTED_BELOW
     found = fit.coverage_
     assert isinstance(found, Coverage)
     norm = torch.linalg.vector_norm(points, dim=-1)
@@ -125,7 +126,7 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
         d=density[1],
         bound=density[2],
         before=_spread(norm - norm.median()),
-        after=_spread(fit.residual_),
+        after=_spread(length - radius),
         rejected=int(rejected.sum()),
         disturbed=() if usable.time is None else disturbed_intervals(usable.time, rejected),
         coverage=found,

@@ -37,11 +37,15 @@ def tumbling(
     attitude=False,
     rate=RATE,
     seed=0,
+    moments=None,
     **columns,
 ):
-    """A recording; ``sensor`` (N, 3) in µT is added to the measurement, ``columns`` go into the table as they are."""
+    """A recording; ``sensor`` (N, 3) in µT is added to the measurement, ``columns`` go into the table as they are.
+
+    ``moments`` (N,) in s are those of the motion, where they are not those of the samples.
+    """
     time = np.arange(N) / rate
-    rotation = turns(time, size)
+    rotation = turns(time if moments is None else moments, size)
     ambient = rotation.inv().apply(field)
     measured = ambient @ RESPONSE.T + OFFSET
     measured = measured + noise * np.random.default_rng(seed).standard_normal((N, 3))
@@ -55,6 +59,13 @@ def tumbling(
         table |= {"q_w": w, "q_x": x, "q_y": y, "q_z": z}
     table |= columns
     return Recording({name: torch.as_tensor(np.array(values)) for name, values in table.items()}, name="tumbling")
+
+
+def resting(N, first, last, rate=RATE):
+    """Moments of a motion that rests from one sample to another."""
+    steps = np.ones(N)
+    steps[first:last] = 0.0
+    return np.cumsum(steps) / rate
 
 
 def changed(recording, **columns):

@@ -75,7 +75,7 @@ class AttitudeView(View):
         self._to_frame = self._frame @ self.to_world @ self._unbent
         self._from_world = self.to_world.movedim(1, 0).flatten(1).contiguous()
         self._full = torch.cat([offset, response.flatten(), offset.new_zeros(2)])
-        self.warnings = (*_turned_too_little(self.corrected(self._full, {})), *_told(jumps, self.time))
+        self.warnings = (*self.warnings, *_turned_too_little(self.corrected(self._full, {})), *_told(jumps, self.time))
 
     def ambient(self, theta: Float[Tensor, " p"]) -> Float[Tensor, " 3"]:
         """The world's field."""
@@ -94,7 +94,8 @@ class AttitudeView(View):
 
     def _offset_and_field(self) -> tuple[Tensor, Tensor]:
         """Offset and world field by least trimmed squares, the matrix taken for the identity."""
-        to_world, measured = thinned(self.to_world), thinned(self.measured)
+        chosen = thinned(self.thin)
+        to_world, measured = self.to_world[chosen], self.measured[chosen]
         eye = torch.eye(3, dtype=to_world.dtype).expand(len(to_world), 3, 3)
         try:
             coefficients = LeastTrimmedSquares().fit(torch.cat([eye, to_world.mT], -1), measured).coef_

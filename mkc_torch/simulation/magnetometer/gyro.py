@@ -55,7 +55,10 @@ class GyroView(View):
             offset = self._offset_by_turns(error)
             self.strength = float(torch.linalg.vector_norm(self.measured - offset, dim=-1).median())
             self._full = torch.cat([offset, offset.new_tensor([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]), offset.new_zeros(3)])
-            self.warnings = (f"The gyroscope stands in for turns that are missing: {error}",)
+            self.warnings = (
+                *self.warnings,
+                f"The gyroscope stands in for turns that are missing: {error}",
+            )
         else:
             self.strength = float(fit.radius_)
             self._full = self._theta(fit)

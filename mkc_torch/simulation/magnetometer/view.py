@@ -13,11 +13,12 @@ from mkc_torch.ellipsoid import EllipsoidFit, NotIdentifiableError
 from mkc_torch.linear import LeastTrimmedSquares
 from mkc_torch.nonlinear import beside
 from mkc_torch.recording import Recording
+from mkc_torch.rest import thin_at_rest, turning
 from mkc_torch.simulation.magnetometer.matrix import MATRIX_OF_VIEW
 from mkc_torch.simulation.protocol import Changes, FreeChange, Port
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float, Int
 
 __all__ = ["ACCEL", "AXES", "GYRO", "INDEPENDENT", "QUATERNION", "VECTOR", "View", "length_of", "thinned"]
 
@@ -32,7 +33,7 @@ VECTOR = ("along", "across_1", "across_2")
 INDEPENDENT = (True, False, False)
 """The error of a rotation is across the field, in residual and signal alike."""
 
-_AT_REST = 0.1
+_AT_REST, _TURNS, _MOSTLY = 0.1, 0.1, 0.5
 _ENOUGH = 1500
 
 
@@ -48,10 +49,12 @@ class View:
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
         self.measured = recording.magnetometer()
-        _refuse_at_rest(self.measured)
+        turns = turning(self.measured)
+        _refuse_at_rest(self.measured, turns)
+        self.thin = thin_at_rest(self.measured)
         self.unit = recording.units["mag_x"]
         self.state = {"view": self.view}
-        self.warnings: tuple[str, ...] = ()
+        self.warnings = _rests(turns)
 
     @cached_property
     def time(self) -> Float[Tensor, " N"]:
@@ -93,21 +96,22 @@ class View:
         """Length of the field."""
         return beside(self.measured.new_tensor(self.strength), theta[0])
 
-    def _ellipsoid(self, rows: Tensor | None) -> EllipsoidFit:
-        points = self.measured if rows is None else self.measured[rows]
-        return EllipsoidFit(LeastTrimmedSquares(), finish=None).fit(thinned(points))
+    def _ellipsoid(self, rows: Bool[Tensor, " N"] | None) -> EllipsoidFit:
+        chosen = thinned(self.thin if rows is None else self.thin & rows)
+        return EllipsoidFit(LeastTrimmedSquares(), finish=None).fit(self.measured[chosen])
 
 
 def length_of(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
     return vectors.square().sum(0).sqrt()
 
 
-def thinned(values: Float[Tensor, N * rest]) -> Float[Tensor, n * rest]:
-    """Evenly, to as many samples as a place to start a fit from needs."""
-    return values[:: max(1, len(values) // _ENOUGH)]
+def thinned(taken: Bool[Tensor, " N"]) -> Int[Tensor, " n"]:
+    """Numbers of the samples taken; evenly, as many of them as a place to start a fit from needs."""
+    numbers = torch.nonzero(taken).flatten()
+    return numbers[:: max(1, len(numbers) // _ENOUGH)]
 
 
-def _refuse_at_rest(measured: Tensor) -> None:
+def _refuse_at_rest(measured: Tensor, turns: Tensor | None) -> None:
     """Refuse a sensor that does not turn: a ball of noise would pass for a small ellipsoid.
 
     Raises:
@@ -116,8 +120,20 @@ def _refuse_at_rest(measured: Tensor) -> None:
     middle = measured.median(0).values
     spread = (measured - middle).square().sum(-1).median()
     apart = measured.diff(dim=0).square().sum(-1).median()
-    if bool(spread < (_AT_REST * torch.linalg.vector_norm(middle)).square()) and bool(apart > 0.5 * spread):
+    close = bool(spread < (_AT_REST * torch.linalg.vector_norm(middle)).square()) and bool(apart > 0.5 * spread)
+    if close and (turns is None or float(turns.double().mean()) < _TURNS):
         raise NotIdentifiableError(
             f"Not identifiable: the sensor is at rest, its measurements stay within {float(spread.sqrt()):.3g} of one "
             "another. Turn the sensor through all directions while recording."
         )
+
+
+def _rests(turns: Tensor | None) -> tuple[str, ...]:
+    """A sentence about a sensor that rests most of the time."""
+    rest = 0.0 if turns is None else 1.0 - float(turns.double().mean())
+    if rest <= _MOSTLY:
+        return ()
+    return (
+        f"The sensor rests for {100.0 * rest:.0f} % of the recording. While it rests, a change of its offset shows in "
+        "one direction alone, or not at all; keep it turning.",
+    )
