@@ -81,6 +81,7 @@ def closer(
 def coloured(
     best: FittedModel,
     base: FittedModel,
+    around: FittedModel,
     tangents: Tangents,
     counts: Float[Tensor, "N m"],
     linearised: Linearised,
@@ -88,7 +89,7 @@ def coloured(
     """The fit with the shape that the noise of the search makes of its own: a joint fit takes the noise for white.
 
     That is another one where it is clearly better, else the middle one of those that are not told apart, as all onsets
-    within a burst of rejected samples are.
+    within a burst of rejected samples are. ``around`` is the fit that the search is linear around.
     """
     own = best.model.terms[-1]
     names = continuous(own)
@@ -96,10 +97,10 @@ def coloured(
         return best
 
     def gains(terms: Sequence[Term]) -> list[float]:
-        beside = candidate_tangents(best.model, best.parameters, terms, tangents.pointwise)
+        beside = candidate_tangents(around.model, around.parameters, terms, tangents.pointwise)
         return linearised.gains_of(beside, counts).ratio[:, 0].tolist()
 
-    others = closer([own], best.model, best.parameters, tangents, counts, linearised)
+    others = closer([own], around.model, around.parameters, tangents, counts, linearised)
     here, *there = gains([own, *others])
     if there and there[0] > here + _CLEAR:
         moved = others[0]

@@ -64,8 +64,8 @@ need only to lean the way of a further one."""
 _QUIET, _GLANCE = 0.1, 49
 """A p-value at a first look beside a finding above which nothing further is searched, and the draws that it takes."""
 
-_REST = 0.5
-"""A larger share of samples in which nothing moves is a sensor at rest, and is warned of."""
+_IN_USE = 0.5
+"""Weight from which a sample is one that the fit believes."""
 
 
 def diagnose(
@@ -337,7 +337,7 @@ def _assembled(
     generator = torch.Generator().manual_seed(asked.seed)
     found, blocks, evidence, first = search.found, search.blocks, search.evidence, search.first
     final = ending.final
-    inliers = (evidence[-1].residual.abs() <= 3.0 * evidence[-1].d) & (final.fit.weights > _REST)
+    inliers = (evidence[-1].residual.abs() <= 3.0 * evidence[-1].d) & (final.fit.weights > _IN_USE)
     findings = [
         replace(
             finding_of(s, final, k, *_held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, generator)),

@@ -16,7 +16,7 @@ from mkc_torch.diagnosis.judge import judged
 from mkc_torch.diagnosis.linearise import Linearised, Tangents, candidate_tangents, linearise, tangents_of
 from mkc_torch.diagnosis.local import beside_wander
 from mkc_torch.diagnosis.model import Term
-from mkc_torch.diagnosis.noise import Colour
+from mkc_torch.diagnosis.noise import REJECTED_BELOW, Colour
 from mkc_torch.diagnosis.one_stretch import telling_stretch
 from mkc_torch.diagnosis.preference import Preference
 from mkc_torch.diagnosis.ranking import SEPARABLE, Ranked, own_p, possible_of, ranked
@@ -31,6 +31,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = ["Located", "locate"]
+
+_HIDDEN, _SMALLER = 0.01, 0.8
+"""Share of the residuals that a fit without an effect may reject and one with it takes, and the scale with it over that
+without, from which the former hides nothing of the effect."""
 
 
 @dataclass(frozen=True)
@@ -87,19 +91,29 @@ def locate(
     terms = tuple(terms)
     prefer = Preference(terms, base.model.prepared)
     tried = len(terms)
-    fits = strongest(base, terms, prefer, parts=parts)
-    best, terms, tangents = _with_tangents(fits, terms)
-    parameters = best.parameters[: base.model.size]
+    fits, tangents = strongest(base, terms, prefer, parts=parts)
+    if _shows(base, fits[0]):
+        around, best = base, fits[0]
+        last = best.model.terms[-1]
+        if last not in terms:
+            terms, tangents = (*terms, last), _with_own(tangents, base, last)
+    else:
+        best, terms, tangents = _with_tangents(fits, terms)
+        around = best
+    parameters = around.parameters[: base.model.size]
     tangents = replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
-    number = terms.index(best.model.terms[-1])
-    gamma = best.parameters[base.model.size :]
     # without the effect, as what is left beside it weighs the samples
     left = beside_wander(best, base.model, parameters, tangents)
     counts, tangents = left.counts, replace(tangents, slow=left.slow)
-    pseudo = left.values - counts * torch.einsum("nmq,q->nm", tangents.candidates[number], gamma)
+    if around is base:
+        added = best.residual - base.residual
+    else:
+        number, gamma = terms.index(best.model.terms[-1]), best.parameters[base.model.size :]
+        added = torch.einsum("nmq,q->nm", tangents.candidates[number], gamma)
+    pseudo = left.values - counts * added
     prepared = base.model.prepared
     naming = with_memory(
-        prepared, partial(_named, best, base, terms, tangents, pseudo, counts, left.noise.colour, prefer, level)
+        prepared, partial(_named, best, base, around, terms, tangents, pseudo, counts, left.noise.colour, prefer, level)
     )
     # a copy names it already, while this process asks whether there is anything to be named
     with meanwhile([naming], [base, best, *terms, *tangents.parts, *known_of(prepared, terms)]) as answer:
@@ -131,7 +145,7 @@ def locate(
     if p_value <= level:
         best, ranking = by_joint_fits(best, base, ranking, terms, linearised, tangents, prefer, fits)
         best = _settled(refined(best, base, again=True), base)
-        best = coloured(best, base, tangents, counts, linearised)
+        best = coloured(best, base, around, tangents, counts, linearised)
         shaped = shape_fitted(best)
         best = shaped if repeats(shaped) else best
     return Located(
@@ -149,6 +163,25 @@ def locate(
         beside_nothing,
         stretch if p_value > level else None,
     )
+
+
+def _shows(base: FittedModel, fit: FittedModel) -> bool:
+    """Whether a fit without an effect shows what there is of it: it rejects no more, and its scale is no larger.
+
+    Then tangents there are the ones to judge it by. At a fit with it, an effect that is nearly not to be seen may have
+    any size, as a step has while the sensor rests, and what is linear about that size says nothing about none. Where an
+    effect bends a trajectory, tangents at the fit with it are the ones.
+    """
+    if fit.model.prepared.ports[fit.model.terms[-1].port].clock is not None:
+        return False
+    rejected = (base.weights < REJECTED_BELOW) & (fit.weights >= REJECTED_BELOW)
+    return float(rejected.double().mean()) < _HIDDEN and bool((fit.d > _SMALLER * base.d).all())
+
+
+def _with_own(tangents: Tangents, base: FittedModel, own: Term) -> Tangents:
+    """The same with those of one candidate more."""
+    more = candidate_tangents(base.model, base.parameters, [own], tangents.pointwise)
+    return replace(tangents, candidates=(*tangents.candidates, *more))
 
 
 def _without(counts: Float[Tensor, "N m"], stretch: tuple[int, int]) -> Float[Tensor, "N m"]:
@@ -186,6 +219,7 @@ class _Named:
 def _named(
     best: FittedModel,
     base: FittedModel,
+    around: FittedModel,
     terms: tuple[Term, ...],
     tangents: Tangents,
     pseudo: Float[Tensor, "N m"],
@@ -195,13 +229,13 @@ def _named(
     level: float,
 ) -> _Named:
     """Whether there is an effect is asked of the noise that has it in; which one it is, of the noise beside it."""
-    linearised = linearise(base.model, best.parameters[: base.model.size], pseudo, counts, tangents, colour=colour)
+    linearised = linearise(base.model, around.parameters[: base.model.size], pseudo, counts, tangents, colour=colour)
     found = linearised.search.gains(linearised.series.unsqueeze(-1))
     close = ranked(terms, found, prefer, possible_of(terms, linearised))
     near = [terms[one.number] for one in close if one.gap < 2.0 * SEPARABLE]
-    more = closer(near, best.model, best.parameters, tangents, counts, linearised)
+    more = closer(near, around.model, around.parameters, tangents, counts, linearised)
     terms = (*terms, *more)
-    beside = candidate_tangents(best.model, best.parameters, more, tangents.pointwise)
+    beside = candidate_tangents(around.model, around.parameters, more, tangents.pointwise)
     tangents = replace(tangents, candidates=(*tangents.candidates, *beside))
     linearised = linearised.with_more(beside, counts)
     found = linearised.search.gains(linearised.series.unsqueeze(-1))

@@ -44,8 +44,12 @@ Listed = tuple[Term, Tensor]
 """A candidate worth a joint refit, with the parameters to start from, its γ the last ones."""
 
 
-def strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *, parts: bool) -> list[FittedModel]:
+def strongest(
+    base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *, parts: bool
+) -> tuple[list[FittedModel], Tangents]:
     """The joint refits, the likeliest first; the leading ones each at its best shape, and behind them the others.
+
+    Beside them the tangents at the fit that they are beside.
 
     Candidates are ranked by the likelihood's own score and by a clipped one, which still sees a stretch of samples that
     the fit rejects; and, where one model over all of the recording runs away, around fits to parts of it, and around
@@ -82,7 +86,8 @@ def strongest(base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *,
         )
     keys = {fit.model.terms[-1].key for fit in shaped}
     parted = shaped, [fit for key, fit in fits.items() if key not in keys]
-    return [fit for part in parted for fit in sorted(part, key=lambda fit: prefer.score(fit, base), reverse=True)]
+    fitted = [fit for part in parted for fit in sorted(part, key=lambda fit: prefer.score(fit, base), reverse=True)]
+    return fitted, tangents
 
 
 def _short_list(
