@@ -32,8 +32,8 @@ T = TypeVar("T")
 
 __all__ = ["Linearised", "Slow", "Tangents", "candidate_tangents", "linearise", "tangents_of"]
 
-SLOW_COURSES = 100
-"""Cosine courses of each wandering channel: on 90 s they reach 0.55 Hz."""
+SLOW_COURSES = 120
+"""Cosine courses of each wandering channel: on 90 s they reach 0.67 Hz."""
 
 CORNERS = (25.0,)
 """Numbers of the courses beyond which the wander falls off; beside them, a random walk."""
@@ -441,21 +441,27 @@ def _coloured(
 def _settled(found: Linearised) -> Linearised:
     """With the colour that alternating between it and the wander comes to.
 
-    What stands in for rejected samples stays: it follows any colour, and would lead it on.
+    What stands in for rejected samples stays: it follows any colour, and would lead it on. The family of the wander
+    stays too until the colour has settled, and is asked for again then: each is decomposed anew for every colour.
     """
-    wander = found.search.noise_fit(found.series)
-    if wander.gain <= 0:
-        return found
-    found = replace(found, search=found.search.of_family(wander.family))
+    tried: set[int] = set()
+    while (wander := found.search.noise_fit(found.series)).gain > 0 and wander.family not in tried:
+        tried.add(wander.family)
+        found = _settled_in(replace(found, search=found.search.of_family(wander.family)))
+        found = replace(found, search=found.search.of_family(None))
+    return found
+
+
+def _settled_in(found: Linearised) -> Linearised:
     for _ in range(_ALTERNATIONS):
         step = found.recoloured(found.colour_ahead())
-        if step.evidence < found.evidence:
-            # a step that goes too far is taken back to the one that cannot
-            step = found.recoloured(found.colour_beside())
+        if step.evidence <= found.evidence + _SETTLED:
+            # it may have gone too far, as the one that cannot has not
+            step = max(step, found.recoloured(found.colour_beside()), key=lambda one: one.evidence)
         if step.evidence <= found.evidence + _SETTLED:
             break
         found = step
-    return replace(found, search=found.search.of_family(None))
+    return found
 
 
 def _level(pseudo: Tensor) -> Tensor:

@@ -97,7 +97,8 @@ def test_a_joint_fit_at_another_moment_gives_way_to_that_of_the_search(monkeypat
 
     def strongest(base, terms, prefer, *, parts):  # noqa: ARG001
         model = base.model.with_term(late)
-        return [fitted(model, torch.cat([base.parameters, torch.zeros(3)]), base.bound)]
+        fit = fitted(model, torch.cat([base.parameters, torch.zeros(3)]), base.bound)
+        return [fit], tangents_of(base.model, base.parameters, terms)
 
     monkeypatch.setattr("mkc_torch.diagnosis.locate.strongest", strongest)
     located = locate(base, terms, level=0.05, surrogates=19, generator=torch.Generator().manual_seed(0))
