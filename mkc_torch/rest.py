@@ -57,9 +57,12 @@ def turning(points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"] | None:
     if bool(noise > _ORDERED * order_statistic(away, None, math.ceil(0.9 * N))):
         return None
     half = _half(N)
-    padded = torch.nn.functional.pad(points.mT, (2 * half, 2 * half), mode="reflect")
+    padded = torch.nn.functional.pad(points.mT, (half, half), mode="reflect")
     middle = padded.unfold(-1, 2 * half + 1, 1).median(-1).values.mT
-    way = torch.linalg.vector_norm(middle[2 * half :] - middle[: -2 * half], dim=-1)
+    number = torch.arange(N)
+    before, after = (number - half).clamp(min=0), (number + half).clamp(max=N - 1)
+    # at the ends of the recording there is half of the way to be seen
+    way = torch.linalg.vector_norm(middle[after] - middle[before], dim=-1) * (2 * half / (after - before))
     return way > _FAR * noise / math.sqrt(2 * half + 1)
 
 
@@ -77,7 +80,7 @@ def thin_at_rest(points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
         (True, True)
     """
     found = turning(points)
-    if found is None:
+    if found is None or not bool(found.any()):
         return torch.ones_like(points[:, 0], dtype=torch.bool)
     _, run, length = torch.unique_consecutive(found, return_inverse=True, return_counts=True)
     place = torch.arange(len(points)) - (length.cumsum(0) - length)[run]

@@ -8,9 +8,12 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
-__all__ = ["from_quaternion", "rotated", "rotation_since", "turns"]
+__all__ = ["from_quaternion", "gaps", "rotated", "rotation_since", "turns"]
+
+_GAP = 5.0
+"""Median intervals beyond which nobody knows how a gyroscope turned in between."""
 
 
 def from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
@@ -51,6 +54,17 @@ def _steps(time: Float[Tensor, " N"], rate: Float[Tensor, "N 3"]) -> Float[Tenso
     turn = 0.5 * (rate[1:] + rate[:-1]) * time.diff().unsqueeze(-1)
     angle = torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
     return torch.cat([torch.cos(0.5 * angle), 0.5 * torch.sinc(0.5 * angle / torch.pi) * turn], -1)
+
+
+def gaps(time: Float[Tensor, " N"]) -> Bool[Tensor, " n"]:
+    """Whether each interval between samples is too long for the rates at its ends to tell the turn in it.
+
+    Example:
+        >>> gaps(torch.tensor([0.0, 0.1, 0.2, 0.3, 1.3, 1.4]))
+        tensor([False, False, False,  True, False])
+    """
+    step = time.diff()
+    return step > _GAP * step.median()
 
 
 def turns(time: Float[Tensor, " N"], rate: Float[Tensor, "N 3"]) -> Float[Tensor, "n 3 3"]:

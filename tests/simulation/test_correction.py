@@ -10,7 +10,7 @@ from mkc_torch.recording import MissingColumnError, RecordingError
 from mkc_torch.simulation import Magnetometer
 from mkc_torch.simulation.magnetometer import MagnetometerCorrection
 from mkc_torch.simulation.registry import correction_of
-from tests.simulation.tumbling import FIELD, OFFSET, changed, full_truth, symmetric_truth, tumbling, turns
+from tests.simulation.tumbling import FIELD, OFFSET, changed, full_truth, symmetric_truth, true_matrix, tumbling, turns
 
 STRENGTH = float(np.linalg.norm(FIELD))
 
@@ -24,12 +24,19 @@ def test_the_corrected_field_is_the_ambient_one(view):
     if view == "attitude":
         theta = full_truth(STRENGTH, 0.0, 0.0)
     else:
-        theta = symmetric_truth(STRENGTH, further=3 if view == "gyro" else 0)
+        theta = symmetric_truth(STRENGTH)
+    if view == "gyro":
+        theta = torch.cat([theta[:3], torch.from_numpy(true_matrix(STRENGTH)).flatten(), theta.new_zeros(3)])
     recording = tumbling(50)
     columns = MagnetometerCorrection({"view": view}, recording).corrected(theta, {})
     assert list(columns) == ["time", "field_x", "field_y", "field_z"]
     assert torch.equal(columns["time"], recording["time"])
     np.testing.assert_allclose(stacked(columns), turns(recording["time"].numpy()).inv().apply(FIELD), atol=1e-10)
+
+
+def test_parameters_of_another_view_are_refused():
+    with pytest.raises(ValueError, match="has 9 parameters of its sensor and not 15"):
+        MagnetometerCorrection({"view": "gyro"}, tumbling(50)).corrected(symmetric_truth(STRENGTH), {})
 
 
 def test_changes_are_taken_off_the_measurement():

@@ -26,12 +26,18 @@ def recorded(N, jumps, **kwargs):
     return changed(recording, q_w=w, q_x=x, q_y=y, q_z=z)
 
 
+def field_at(time):
+    """What a magnetometer measures without noise."""
+    return torch.from_numpy(turns(time).inv().apply(FIELD))
+
+
 def jumps_of(N, jumps, rate=None):
     time = np.arange(N) / RATE
     off = sum(((np.arange(N) >= first) * size for first, size in jumps.items()), np.zeros(N))
     turned = Rotation.from_rotvec(off[:, None] * [0.0, 0.0, 1.0], degrees=True) * turns(time)
     rate = body_rate(time) if rate is None else rate
-    return heading_jumps(torch.from_numpy(time), torch.from_numpy(turned.as_matrix()), torch.from_numpy(rate))
+    attitude = torch.from_numpy(turned.as_matrix())
+    return heading_jumps(torch.from_numpy(time), attitude, torch.from_numpy(rate), field_at(time))
 
 
 @settings(deadline=None, max_examples=40)
@@ -66,9 +72,13 @@ def test_in_a_gap_in_which_the_sensor_turns_more_there_is_none():
     time = np.concatenate([np.arange(100), np.arange(170, 350)]) / RATE
     attitude = torch.from_numpy(turns(time).as_matrix())
     rate = torch.from_numpy(body_rate(time))
-    assert heading_jumps(torch.from_numpy(time), attitude, rate) == ()
+    measured = field_at(time)
+    assert heading_jumps(torch.from_numpy(time), attitude, rate, measured) == ()
+    # at rest before and after, and turned in between, as the magnetometer shows
     still = torch.where((torch.arange(280) - 100).abs()[:, None] < 3, 0.0, rate)
-    assert [jump.after for jump in heading_jumps(torch.from_numpy(time), attitude, still)] == [99]
+    assert heading_jumps(torch.from_numpy(time), attitude, still, measured) == ()
+    measured[100:110] = measured[95:100].repeat(2, 1)
+    assert [jump.after for jump in heading_jumps(torch.from_numpy(time), attitude, still, measured)] == [99]
 
 
 @pytest.mark.parametrize("length", [1, 10, 40])
@@ -85,7 +95,7 @@ def test_of_many_jumps_the_largest_are_told_in_their_order():
 
 
 def test_too_few_samples_have_none():
-    assert heading_jumps(torch.zeros(1), torch.eye(3)[None], torch.zeros(1, 3)) == ()
+    assert heading_jumps(torch.zeros(1), torch.eye(3)[None], torch.zeros(1, 3), torch.zeros(1, 3)) == ()
 
 
 def test_the_port_is_there_where_the_heading_jumps_and_takes_the_error_back():

@@ -15,6 +15,7 @@ from mkc_torch.linear._problem import RankDeficientError
 from mkc_torch.nonlinear import GaussianPrior, beside
 from mkc_torch.recording import Recording
 from mkc_torch.simulation.heading import HeadingJump, heading_jumps
+from mkc_torch.simulation.magnetometer.matrix import SOFT_IRON
 from mkc_torch.simulation.magnetometer.view import AXES, GYRO, INDEPENDENT, QUATERNION, VECTOR, View, thinned
 from mkc_torch.simulation.protocol import Changes, Port
 from mkc_torch.simulation.rotation import from_quaternion, rotated
@@ -23,10 +24,6 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 __all__ = ["AttitudeView", "with_attitude"]
-
-SOFT_IRON = 0.1
-"""Standard deviation, before the data speak, of what soft iron, gains and misalignment add to the unit matrix. Weak
-against a sensor that is turned through all directions; it decides for the identity where a vehicle never tilts."""
 
 _MIN_ROWS = 50
 _REWEIGHTED, _RIDGE = 10, 1e-4
@@ -177,7 +174,7 @@ def _jumps(recording: Recording, to_world: Tensor) -> tuple[HeadingJump, ...]:
     """Of the heading, as far as the recording has a gyroscope that knows."""
     if recording.time is None or not all(name in recording for name in GYRO):
         return ()
-    return heading_jumps(recording.time, to_world, recording.stack(*GYRO))
+    return heading_jumps(recording.time, to_world, recording.stack(*GYRO), recording.magnetometer())
 
 
 def _told(jumps: tuple[HeadingJump, ...], time: Tensor) -> tuple[str, ...]:

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 __all__ = ["MagnetometerCorrection"]
 
+_PARAMETERS = {"norm": 9, "gyro": 15, "attitude": 14}
+"""Numbers of each view's parameters."""
+
 
 class MagnetometerCorrection:
     """``matrix @ (measured - change - offset)`` on any recording of the sensor.
@@ -30,7 +33,7 @@ class MagnetometerCorrection:
     def __init__(self, state: Mapping[str, Any], recording: Recording) -> None:
         if state.get("view") not in MATRIX_OF_VIEW:
             raise ValueError(f"The model's view is {state.get('view')!r} and not one of {', '.join(MATRIX_OF_VIEW)}.")
-        self._matrix = MATRIX_OF_VIEW[state["view"]]
+        self._matrix, self._count = MATRIX_OF_VIEW[state["view"]], _PARAMETERS[state["view"]]
         self.measured = recording.magnetometer()
         self.recording = recording
         known = recording.time
@@ -38,6 +41,11 @@ class MagnetometerCorrection:
         self.ports = {"sensor": Port(AXES, recording.units["mag_x"])}
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
+        if len(theta) != self._count:
+            raise ValueError(
+                f"The model has {len(theta)} parameters of its sensor and not {self._count}; it may be of another "
+                "version: diagnose the recording again."
+            )
         away = self.measured - theta[:3]
         if "sensor" in changes:
             away = away - changes["sensor"](away)

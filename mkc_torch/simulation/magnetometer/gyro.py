@@ -10,11 +10,10 @@ from torch import Tensor
 from mkc_torch.ellipsoid import EllipsoidFit, NotIdentifiableError
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.recording import Recording
-from mkc_torch.simulation.magnetometer.matrix import SYMMETRIC
-from mkc_torch.simulation.magnetometer.norm import NormView
+from mkc_torch.simulation.magnetometer.matrix import SOFT_IRON
 from mkc_torch.simulation.magnetometer.view import AXES, GYRO, INDEPENDENT, VECTOR, View
 from mkc_torch.simulation.protocol import Changes, Port
-from mkc_torch.simulation.rotation import rotated, rotation_since
+from mkc_torch.simulation.rotation import gaps, rotated, rotation_since
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -31,12 +30,19 @@ _REWEIGHTED, _TURNED = 10, 1e-3
 
 
 class GyroView(View):
-    """The vector, turned by the gyroscope to the first sample of its window: along that window's field, and across."""
+    """The vector, turned by the gyroscope to the first sample of its window: along that window's field, and across.
+
+    The matrix is any: it also turns the magnetometer's axes into those of the gyroscope, which no length shows.
+    """
 
     view = "gyro"
     channels = VECTOR
     independent = INDEPENDENT
-    parameter_names = (*NormView.parameter_names, *(f"gyro_bias_{a}" for a in AXES))
+    parameter_names = (
+        *(f"offset_{a}" for a in AXES),
+        *(f"matrix_{a}{b}" for a in AXES for b in AXES),
+        *(f"gyro_bias_{a}" for a in AXES),
+    )
 
     def __init__(self, recording: Recording) -> None:
         super().__init__(recording)
@@ -44,7 +50,7 @@ class GyroView(View):
             "sensor": Port(AXES, self.unit, wanders=True, pointwise=False),
             "field": Port(("strength",), self.unit, pointwise=False),
         }
-        self.prior = _bias_prior()
+        self.prior = _prior()
         self.window, first = _windows(self.time)
         self.turned = rotation_since(self.time, recording.stack(*GYRO), first)
         self.summed = _summed(self.turned, self.time, first)
@@ -54,7 +60,7 @@ class GyroView(View):
         except NotIdentifiableError as error:
             offset = self._offset_by_turns(error)
             self.strength = float(torch.linalg.vector_norm(self.measured - offset, dim=-1).median())
-            self._full = torch.cat([offset, offset.new_tensor([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]), offset.new_zeros(3)])
+            self._full = torch.cat([offset, torch.eye(3).to(offset).flatten(), offset.new_zeros(3)])
             self.warnings = (
                 *self.warnings,
                 f"The gyroscope stands in for turns that are missing: {error}",
@@ -62,6 +68,7 @@ class GyroView(View):
         else:
             self.strength = float(fit.radius_)
             self._full = self._theta(fit)
+        self._unbent = self.matrix(self._full)
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Tensor:
         return self._full.clone() if rows is None else self._theta(self._ellipsoid(rows))
@@ -92,7 +99,7 @@ class GyroView(View):
 
     def _theta(self, fit: EllipsoidFit) -> Tensor:
         matrix = fit.calibration_matrix_ * (self.strength / float(fit.radius_))
-        return torch.cat([fit.center_, torch.stack([matrix[i, j] for i, j in SYMMETRIC]), fit.center_.new_zeros(3)])
+        return torch.cat([fit.center_, matrix.flatten(), fit.center_.new_zeros(3)])
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
         along = self._steadied(theta, self.corrected(theta, changes))
@@ -101,13 +108,16 @@ class GyroView(View):
         strength, added = self._strength(theta), self._field_change(changes)
         ambient = (strength if added is None else strength + added) * direction[self.window]
         frame = _frame(direction.detach())[self.window]
-        return rotated(along - ambient, frame)
+        # as the sensor has it: the matrix would shrink the noise of what it is fitted to. A fixed one takes it back
+        left = rotated(along - ambient, self.turned.mT)
+        left = torch.linalg.solve(self.matrix(theta), left.mT).mT @ self._unbent.mT
+        return rotated(rotated(left, self.turned), frame)
 
     def _steadied(self, theta: Tensor, field: Tensor) -> Tensor:
         """The calibrated field in the axes of its window's first sample."""
         along = rotated(field, self.turned)
         # a bias b, small, turns what has been summed up since the window's first sample by the integral of turned · b
-        return along - torch.linalg.cross(self.summed @ theta[9:12], along)
+        return along - torch.linalg.cross(self.summed @ theta[12:15], along)
 
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
         along = self._steadied(theta, self.corrected(theta, {}))
@@ -141,17 +151,20 @@ def _frame(direction: Float[Tensor, "W 3"]) -> Float[Tensor, "W 3 3"]:
 
 
 def _windows(time: Tensor) -> tuple[Tensor, Tensor]:
-    """The window of each sample, and the first sample of that window; a gap of more than a window starts a new one."""
+    """The window of each sample, and the first sample of that window; a gap starts a new one."""
     number = torch.floor((time - time[0]) / WINDOW).long()
+    number[1:] += gaps(time).cumsum(0)
     _, window, counts = torch.unique_consecutive(number, return_inverse=True, return_counts=True)
     start = torch.cat([counts.new_zeros(1), counts.cumsum(0)[:-1]])
     return window, start[window]
 
 
-def _bias_prior() -> GaussianPrior:
-    mean = torch.zeros(12, dtype=torch.float64)
-    precision = torch.zeros(12, dtype=torch.float64)
-    precision[9:] = GYRO_BIAS**-2
+def _prior() -> GaussianPrior:
+    """Of the matrix, as where an attitude is recorded, and of the gyroscope's bias."""
+    mean = torch.zeros(15, dtype=torch.float64)
+    precision = torch.zeros(15, dtype=torch.float64)
+    mean[3:12] = torch.eye(3, dtype=torch.float64).flatten()
+    precision[3:12], precision[12:] = SOFT_IRON**-2, GYRO_BIAS**-2
     return GaussianPrior(mean, precision)
 
 

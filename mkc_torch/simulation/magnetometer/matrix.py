@@ -5,7 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["MATRIX_OF_VIEW", "SYMMETRIC"]
+__all__ = ["MATRIX_OF_VIEW", "SOFT_IRON", "SYMMETRIC"]
+
+SOFT_IRON = 0.1
+"""Standard deviation, before the data speak, of what soft iron, gains and misalignment add to the unit matrix. Weak
+against a sensor that is turned through all directions; it decides for the identity where a vehicle never tilts."""
 
 SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Entries of a symmetric matrix, in the order of its parameters."""
@@ -16,8 +20,12 @@ def _symmetric(theta: Tensor) -> Tensor:
     return torch.stack([torch.stack([xx, xy, xz]), torch.stack([xy, yy, yz]), torch.stack([xz, yz, zz])])
 
 
+def _any(theta: Tensor) -> Tensor:
+    return theta[3:12].unflatten(0, (3, 3))
+
+
 def _inverse(theta: Tensor) -> Tensor:
-    return torch.linalg.inv(theta[3:12].unflatten(0, (3, 3)))
+    return torch.linalg.inv(_any(theta))
 
 
-MATRIX_OF_VIEW = {"norm": _symmetric, "gyro": _symmetric, "attitude": _inverse}
+MATRIX_OF_VIEW = {"norm": _symmetric, "gyro": _any, "attitude": _inverse}
