@@ -21,10 +21,7 @@ def stacked(columns):
 
 @pytest.mark.parametrize("view", ["norm", "gyro", "attitude"])
 def test_the_corrected_field_is_the_ambient_one(view):
-    if view == "attitude":
-        theta = full_truth(STRENGTH, 0.0, 0.0)
-    else:
-        theta = symmetric_truth(STRENGTH)
+    theta = full_truth(STRENGTH, 0.0, 0.0) if view == "attitude" else symmetric_truth(STRENGTH)
     if view == "gyro":
         theta = torch.cat([theta[:3], torch.from_numpy(true_matrix(STRENGTH)).flatten(), theta.new_zeros(3)])
     recording = tumbling(50)
