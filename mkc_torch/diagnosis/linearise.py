@@ -17,6 +17,7 @@ from mkc_torch.diagnosis.noise import (
     Colour,
     autoregressive,
     colour_of,
+    colour_of_fast,
     cosines,
     dct,
     dct_of_courses,
@@ -48,6 +49,12 @@ passes by each time."""
 _ALTERNATIONS, _SETTLED = 8, 10.0
 """Steps at most between the colour and a wander beside it, and the nats that a step has to bring: as many as a colour,
 which is some twenty numbers, gains by chance."""
+
+_REACHED = 0.98
+"""Share of a random walk's power that lies at the frequencies that it reaches."""
+
+_PLAUSIBLE = 12.0
+"""Nats that a colour may be less likely than another one: as many as one of more numbers gains by chance."""
 
 _FARTHEST = 10.0
 """Times that a step may go beyond, of the root of a spectrum."""
@@ -221,6 +228,7 @@ class Linearised:
         entrance: where wandering noise enters, coloured noise may too: the port's pointwise tangents, and the
             autoregression of noise that gives such residuals; None where there is no such port.
         filling: what stands in for rejected samples.
+        others: noise from where the alternation between colour and wander was not begun.
     """
 
     search: LinearSearch
@@ -228,6 +236,15 @@ class Linearised:
     colour: Colour
     entrance: tuple[Tensor, Tensor] | None
     filling: Filling
+    others: tuple[Linearised, ...] = ()
+
+    def plausible(self) -> list[Colour]:
+        """Other colours that the noise may have: nearly as likely ones, to which the alternation comes from elsewhere.
+
+        A spectrum of twenty numbers that a wander hides in part has several.
+        """
+        settled = [_settled(one) for one in self.others]
+        return [one.colour for one in settled if one.evidence > self.evidence - _PLAUSIBLE]
 
     def colour_beside(self) -> Colour:
         """The colour of what is left beside the wander."""
@@ -433,9 +450,15 @@ def _coloured(
     def tried(colour: Callable[[], Colour]) -> Linearised:
         return _searching(colour(), pull, seen, slow, gaps)
 
-    # from the side of no wander and from that of no colour: either could pass for the other
-    starts = shared([partial(tried, beside_nothing), partial(tried, beside_wander)], [slow, slow.tangents, slow.scales])
-    return _settled(max(starts, key=lambda found: found.evidence))
+    def beyond_wander() -> Colour:
+        spread = (seen.slow.square() * slow.scales[0].square()).sum(-1)
+        return colour_of_fast(seen.pseudo.square(), ((spread.cumsum(0) / spread.sum(0)) < _REACHED).sum(0))
+
+    # from the side of no wander, from that of no colour, and from where there is no wander: each could pass for another
+    colours = (beside_nothing, beside_wander, beyond_wander)
+    starts = shared([partial(tried, colour) for colour in colours], [slow, slow.tangents, slow.scales])
+    best = max(starts, key=lambda found: found.evidence)
+    return replace(_settled(best), others=tuple(one for one in starts if one is not best))
 
 
 def _settled(found: Linearised) -> Linearised:
