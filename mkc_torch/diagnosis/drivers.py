@@ -12,7 +12,7 @@ from torch import Tensor
 from mkc_torch.recording import Recording
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 __all__ = ["ANY", "Driver", "Drivers", "find_drivers"]
 
@@ -21,6 +21,12 @@ FEWEST_FINITE = 0.5
 
 COPY = 1e-9
 """Two columns whose correlation is nearer to ±1 than this are one driver."""
+
+_REPEATS = 0.995
+"""Correlation with a measured column from which one repeats it."""
+
+_WILD, _FEW, _ALONE = 50.0, 5e-3, 3
+"""Times the range of all others that a value is off, the share of the samples that may be, and how many in a row."""
 
 ANY = "any"
 """The role of a column whose role is not known."""
@@ -59,16 +65,22 @@ class Drivers:
     warnings: tuple[str, ...]
 
 
-def find_drivers(recording: Recording, taken: frozenset[str], roles: frozenset[str] = frozenset()) -> Drivers:
+def find_drivers(
+    recording: Recording,
+    taken: frozenset[str],
+    roles: frozenset[str] = frozenset(),
+    measured: frozenset[str] = frozenset(),
+) -> Drivers:
     """The drivers among a recording's columns.
 
     A column's role comes from its name (``temperature``, ``temp_imu``, ``current_2`` …) or its unit. Missing values
-    are filled from their neighbours in time.
+    are filled from their neighbours in time; a few that are far from all others count as missing.
 
     Args:
         recording: the samples in use.
         taken: columns that the simulation uses itself.
         roles: further roles, of a user's own effects: a column has one if its name is that or begins with it.
+        measured: columns that are compared with the simulation; what repeats one of them drives nothing.
 
     Example:
         >>> ramp = torch.linspace(20.0, 30.0, 50)
@@ -83,6 +95,9 @@ def find_drivers(recording: Recording, taken: frozenset[str], roles: frozenset[s
         if name in taken or name == "experiment":
             continue
         values, complaint = _usable(name, recording[name])
+        repeated = None if values is None else _repeated(values, recording, measured)
+        if repeated is not None:
+            values, complaint = None, [f"Column `{name}` repeats `{repeated}` and is left out: it drives nothing."]
         warnings += complaint
         if values is not None:
             usable[name] = values
@@ -128,10 +143,49 @@ def _usable(name: str, values: Tensor) -> tuple[Tensor | None, list[str]]:
     if share < 1.0:
         warnings.append(f"Column `{name}` lacks {int((~finite).sum())} values, filled from their neighbours in time.")
         values = _filled(values, finite)
+    wild = _wild(values)
+    if bool(wild.any()):
+        first, last = (f"{float(end):.6g}" for end in torch.aminmax(values[wild]))
+        told = first if first == last else f"between {first} and {last}"
+        warnings.append(
+            f"Column `{name}` has {int(wild.sum())} value{'s' if int(wild.sum()) > 1 else ''} ({told}) far from all "
+            "others; they count as missing, and are filled from their neighbours in time."
+        )
+        values = _filled(values, ~wild)
     spread = float(values.amax() - values.amin())
     if spread <= 1e-12 * float(values.abs().amax()):
         return None, [*warnings, f"Column `{name}` is constant and can drive nothing."]
     return values, warnings
+
+
+def _wild(values: Float[Tensor, " N"]) -> Bool[Tensor, " N"]:
+    """A few values that are far from all others and come alone, or are all the same: glitches, and codes for none."""
+    few = max(int(_FEW * len(values)), 1)
+    ordered = values.sort().values
+    span = ordered[-1 - few] - ordered[few]
+    far = (values - ordered[len(values) // 2]).abs() > _WILD * span
+    if not bool(span > 0) or not 0 < int(far.sum()) <= few:
+        return torch.zeros_like(far)
+    _, length = torch.unique_consecutive(far, return_counts=True)
+    runs = length[int(not bool(far[0])) :: 2]
+    same = bool((values[far] == values[far][0]).all())
+    return far if same or int(runs.max()) <= _ALONE else torch.zeros_like(far)
+
+
+def _repeated(values: Float[Tensor, " N"], recording: Recording, measured: frozenset[str]) -> str | None:
+    """The measured column that these values are but for offset, gain and rounding."""
+    unit = _centred(values)
+    for name in sorted(measured):
+        if name in recording and bool(recording[name].isfinite().all()):
+            other = _centred(recording[name])
+            if abs(float(unit @ other)) > _REPEATS:
+                return name
+    return None
+
+
+def _centred(values: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    away = values - values.mean()
+    return away / torch.linalg.vector_norm(away).clamp(min=1e-300)
 
 
 def _filled(values: Tensor, finite: Tensor) -> Tensor:

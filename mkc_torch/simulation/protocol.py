@@ -223,6 +223,9 @@ class Simulation(Protocol):
         columns: names of the columns that the simulation uses itself, which are no drivers of effects.
         joins_experiments: whether one fit takes all runs of a recording together, told apart by its column
             ``experiment``; where it does not, each run is diagnosed by itself.
+
+    It may also have ``measured``, the names of the columns that it is compared with: a column that repeats one of these
+    drives no effect.
     """
 
     @property

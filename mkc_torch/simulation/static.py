@@ -94,6 +94,10 @@ class Static:
     def columns(self) -> frozenset[str]:
         return frozenset({"time", "experiment", *self.inputs, *self.outputs})
 
+    @property
+    def measured(self) -> frozenset[str]:
+        return frozenset(self.outputs)
+
     def output(self, time: Tensor, u: Any, p: Any) -> Mapping[str, Tensor]:
         """What is measured, by the columns' names.
 

@@ -166,3 +166,46 @@ def test_a_part_of_the_position_is_no_position():
     recording = Recording({"time": RAMP, "position_x": WAVES[0], "position_y": WAVES[1], "position_z": 0.0 * RAMP})
     drivers = find_drivers(recording, frozenset({"time"}), frozenset({"position", "any"})).drivers
     assert [(d.columns, d.role) for d in drivers] == [(("position_x",), "any"), (("position_y",), "any")]
+
+
+@pytest.mark.parametrize("glitch", [65535.0, -999.0, 1e30])
+@pytest.mark.parametrize("places", [[700], [100, 101, 650], list(range(300, 305))])
+def test_a_few_values_far_from_all_others_count_as_missing(glitch, places):
+    time = torch.linspace(0.0, 20.0, 1000, dtype=torch.float64)
+    clean = 3.0 + torch.sin(time)
+    values = clean.clone()
+    values[places] = glitch
+    result = find_drivers(Recording({"time": time, "current": values}), frozenset({"time"}))
+    (driver,) = result.drivers
+    torch.testing.assert_close(driver.values[:, 0] + driver.reference, clean, atol=0.02, rtol=0.0)
+    (sentence,) = result.warnings
+    assert f"`current` has {len(places)} value" in sentence
+    assert f"({glitch:.6g})" in sentence
+    assert "far from all others" in sentence
+
+
+def test_pulses_of_a_driver_are_no_glitches():
+    """A motor that runs for a tenth of a second; and a switch that is rarely on."""
+    time = torch.linspace(0.0, 20.0, 1000, dtype=torch.float64)
+    noise = torch.randn(1000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    on = (time - 5.0).abs() < 0.05
+    assert int(on.sum()) == 5
+    pulses = 0.01 * noise + 5.0 * on * (1.0 + 0.1 * noise)
+    switch = on.double()
+    result = find_drivers(Recording({"time": time, "current": pulses, "switch": switch}), frozenset({"time"}))
+    assert result.warnings == ()
+    assert [float(driver.values.max()) > 0.9 for driver in result.drivers] == [True, True]
+
+
+def test_a_column_that_repeats_what_is_measured_drives_nothing():
+    time = torch.linspace(0.0, 20.0, 1000, dtype=torch.float64)
+    measured = 40.0 * torch.sin(time)
+    columns = {"time": time, "mag_x": measured, "raw_x": (6.842 * measured).round() + 17.0, "load": torch.cos(time)}
+    result = find_drivers(Recording(columns), frozenset({"time", "mag_x"}), measured=frozenset({"mag_x"}))
+    assert [driver.columns for driver in result.drivers] == [("load",)]
+    assert result.warnings == ("Column `raw_x` repeats `mag_x` and is left out: it drives nothing.",)
+
+
+def test_time_itself_is_nothing_that_is_repeated():
+    result = found({"temperature": 20.0 + 3.0 * RAMP})
+    assert [driver.columns for driver in result.drivers] == [("temperature",)]

@@ -44,7 +44,11 @@ class Magnetometer:
 
     @property
     def columns(self) -> frozenset[str]:
-        return frozenset({"time", *(f"mag_{a}" for a in AXES), *GYRO, *ACCEL, *QUATERNION})
+        return frozenset({"time", *self.measured, *GYRO, *ACCEL, *QUATERNION})
+
+    @property
+    def measured(self) -> frozenset[str]:
+        return frozenset(f"mag_{a}" for a in AXES)
 
     def prepare(self, recording: Recording) -> NormView | AttitudeView | GyroView:
         """The magnetometer of a recording.
