@@ -7,6 +7,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from mkc_torch import NotIdentifiableError
+from mkc_torch.recording import RecordingError
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import FIELD, OFFSET, changed, full_truth, true_matrix, tumbling, turns
 
@@ -152,3 +153,27 @@ def test_a_vehicle_that_hardly_tilts_is_warned_of():
     assert warning.startswith("The ellipsoid alone is not identifiable")
     assert "Directions not covered: +z" in warning
     assert Magnetometer().prepare(tumbling(500, noise=0.3, attitude=True)).warnings == ()
+
+
+def inverse(recording):
+    return changed(recording, **{name: -recording[name] for name in ("q_x", "q_y", "q_z")})
+
+
+def test_an_inverse_attitude_is_refused_with_what_to_do():
+    with pytest.raises(RecordingError, match=r"inverse of what is expected.*give the conjugate"):
+        Magnetometer().prepare(inverse(tumbling(500, noise=0.3, attitude=True)))
+
+
+def test_an_attitude_of_something_else_is_told_of():
+    other = tumbling(500, attitude=True, moments=50.0 + 1.7 * np.arange(500) / 50.0)
+    recording = changed(
+        tumbling(500, noise=0.3, attitude=True), **{name: other[name] for name in ("q_w", "q_x", "q_y", "q_z")}
+    )
+    view = Magnetometer().prepare(recording)
+    assert any("hardly explains the field" in warning for warning in view.warnings)
+
+
+def test_a_large_effect_is_no_misfit_of_the_attitude():
+    current = 0.5 + 0.5 * np.sin(2.0 * np.arange(500) / 50.0)
+    recording = tumbling(500, noise=0.3, attitude=True, sensor=current[:, None] * [15.0, -10.0, 20.0])
+    assert not any("hardly explains" in warning for warning in Magnetometer().prepare(recording).warnings)

@@ -13,7 +13,7 @@ from mkc_torch.ellipsoid import MIN_INFORMATION, NotIdentifiableError
 from mkc_torch.linear import LeastTrimmedSquares
 from mkc_torch.linear._problem import RankDeficientError
 from mkc_torch.nonlinear import GaussianPrior, beside
-from mkc_torch.recording import Recording
+from mkc_torch.recording import Recording, RecordingError
 from mkc_torch.simulation.heading import HeadingJump, heading_jumps
 from mkc_torch.simulation.magnetometer.matrix import SOFT_IRON
 from mkc_torch.simulation.magnetometer.view import AXES, GYRO, INDEPENDENT, QUATERNION, VECTOR, View, thinned
@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 __all__ = ["AttitudeView", "with_attitude"]
+
+_MISFIT, _FAR_BETTER = 0.3, 0.5
+"""Share of the field by which half of the samples are off, from which the attitude is looked into; and how much closer
+they are with its inverse, where that is what was recorded."""
 
 _MIN_ROWS = 50
 _REWEIGHTED, _RIDGE = 10, 1e-4
@@ -61,7 +65,8 @@ class AttitudeView(View):
             self.ports["heading"] = Port(("heading",), "°", carries=carries)
         self.prior = _matrix_prior(len(self.parameter_names))
         self.strength, self._ahead = 1.0, self.measured.new_zeros(3)
-        offset, ahead = self._offset_and_field()
+        offset, ahead = self._offset_and_field(self.to_world)
+        self._refuse_inverse(offset, ahead)
         self.strength = float(torch.linalg.vector_norm(ahead))
         self._ahead = ahead / self.strength
         self._across = torch.linalg.svd(self._ahead.unsqueeze(0)).Vh[1:]
@@ -89,16 +94,44 @@ class AttitudeView(View):
         offset, response = _response(self.measured[rows], turned, offset)
         return torch.cat([offset, response.flatten(), offset.new_zeros(2)])
 
-    def _offset_and_field(self) -> tuple[Tensor, Tensor]:
+    def _offset_and_field(self, attitude: Float[Tensor, "N 3 3"]) -> tuple[Tensor, Tensor]:
         """Offset and world field by least trimmed squares, the matrix taken for the identity."""
         chosen = thinned(self.thin)
-        to_world, measured = self.to_world[chosen], self.measured[chosen]
+        to_world, measured = attitude[chosen], self.measured[chosen]
         eye = torch.eye(3, dtype=to_world.dtype).expand(len(to_world), 3, 3)
         try:
             coefficients = LeastTrimmedSquares().fit(torch.cat([eye, to_world.mT], -1), measured).coef_
         except RankDeficientError:
             raise _one_axis(self.to_world) from None
         return coefficients[:3], coefficients[3:]
+
+    def _refuse_inverse(self, offset: Tensor, ahead: Tensor) -> None:
+        """Refuse quaternions that turn the world into the sensor's axes; warn of those that do neither.
+
+        Raises:
+            RecordingError: the inverse of the attitude fits far better.
+        """
+        left, strength = self._left(self.to_world, offset, ahead), float(torch.linalg.vector_norm(ahead))
+        if left <= _MISFIT * strength:
+            return
+        inverse = self._left(self.to_world.mT, *self._offset_and_field(self.to_world.mT))
+        told = f"with the attitude as recorded half of the samples are off by {left:.3g} {self.unit} or more"
+        if inverse < _FAR_BETTER * left:
+            raise RecordingError(
+                f"The quaternions are the inverse of what is expected: {told}, with its inverse by {inverse:.3g} "
+                f"{self.unit}. They are to turn the sensor's axes into the world's; give the conjugate, with q_x, q_y "
+                "and q_z of the other sign."
+            )
+        self.warnings = (
+            *self.warnings,
+            f"The attitude hardly explains the field: {told}. See that it is of the same axes and times as the "
+            "magnetometer, in the order w, x, y, z.",
+        )
+
+    def _left(self, attitude: Float[Tensor, "N 3 3"], offset: Tensor, ahead: Tensor) -> float:
+        """The median distance of the measurements from an offset and a field that turns."""
+        turned = torch.einsum("kij,i->kj", attitude, ahead)
+        return float(torch.linalg.vector_norm(self.measured - offset - turned, dim=-1).median())
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
         # the simulated vector, not the measured one, goes through the matrix: the noise of what a matrix is fitted to
