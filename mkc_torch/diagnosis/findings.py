@@ -20,7 +20,7 @@ from mkc_torch.diagnosis.ranking import SEPARABLE
 from mkc_torch.diagnosis.regions import attributed, map_of, region_of, shares_of_runs
 from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter
 from mkc_torch.effects.protocol import Context, PartEffect, RelativeEffect
-from mkc_torch.effects.units import tidy
+from mkc_torch.effects.units import ratio, tidy
 from mkc_torch.effects.unrecorded import COURSE, Unrecorded
 from mkc_torch.nonlinear import beside
 
@@ -142,9 +142,12 @@ def _plausibility(term: Term, gamma: Tensor, context: Context) -> tuple[bool, st
     largest = float(gamma[: first.size].abs().max())
     if not math.isfinite(limit):
         return True, "No plausible size is known for this effect; judge it by its equation."
-    if first.unit and first.unit != "°" and "µT" not in first.unit:
-        return True, f"Its size is in {first.unit}; plausible sizes are known for µT alone."
-    unit = f" {first.unit}" if first.unit else ""
+    known = getattr(term.effect, "plausible_unit", "") or first.unit
+    times = ratio(known, first.unit)
+    if times is None:
+        return True, f"Its size is in {first.unit or 'no unit'}; what is plausible is known in {known} alone."
+    limit *= times
+    unit = f" {tidy(first.unit)}" if first.unit else ""
     told = f"Its largest value, {largest:.3g}{unit}, is"
     if largest <= limit:
         return True, f"{told} within the {limit:g}{unit} that is plausible ({term.effect.source})."

@@ -41,6 +41,7 @@ class CubicNonlinearity:
     explanation = "The sensor's response is not a straight line: it bends at large fields."
     advice = "Correct with the fitted coefficients; check the sensor's range setting."
     plausible = 4e-5
+    plausible_unit = "1/µT²"
     source = (
         "linearity of 0.1-1 % of full scale in data sheets of AMR, Hall and TMR sensors; 4e-5 /µT² are 10 % at 50 µT"
     )

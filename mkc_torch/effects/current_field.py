@@ -23,4 +23,5 @@ class CurrentField(DriverOffset):
     explanation = "The field of a current in the wiring adds to what the sensor measures."
     advice = "Move the sensor away from the power wires, twist them, or correct with the fitted gain."
     plausible = 20.0
+    plausible_unit = "µT/A"
     source = "Biot-Savart: 20 µT at 1 cm from a wire with 1 A; 0.1 µT/A is a good installation"

@@ -34,6 +34,7 @@ class FieldGradient:
     explanation = "The ambient field is not the same everywhere: iron nearby bends it."
     advice = "Record in the open, or turn the sensor on the spot."
     plausible = 200.0
+    plausible_unit = "µT/m"
     source = "indoor gradients of up to some µT/cm near steel; BROAD trial 21 (Laidig et al., Data 6(7):72, 2021)"
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002

@@ -38,6 +38,7 @@ class HardIronStep(GainEffect):
     explanation = "The sensor's offset jumped: something magnetic that moves with the sensor was attached or taken off."
     advice = "Look for what changed at that time; use the calibration from after the step."
     plausible = 200.0
+    plausible_unit = "µT"
     source = "sizes of 1-50 µT as seen when parts are mounted; BROAD trials 34-36 (Laidig et al., Data 6(7):72, 2021)"
 
     SPACING = 0.01

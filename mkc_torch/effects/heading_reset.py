@@ -41,6 +41,7 @@ class HeadingReset:
     explanation = "The recorded heading was set anew: the attitude turned about the vertical and the sensor did not."
     advice = "Use an attitude that this sensor does not steer, or the samples from between two of the jumps."
     plausible = 180.0
+    plausible_unit = "°"
     source = "filters align their heading by the compass again at arming and after take-off"
 
     # not one that follows the signal: what passes here is known and has no noise

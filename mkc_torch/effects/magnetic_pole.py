@@ -45,6 +45,7 @@ class MagneticPole:
     )
     advice = "Record in the open, or turn the sensor on the spot."
     plausible = 100.0
+    plausible_unit = "µT·m²"
     source = "a beam of 0.01 m² magnetised to 10⁵ A/m; Telford et al., Applied Geophysics (1990), 3.6"
     relative: Mapping[str, tuple[str, str]] = dict.fromkeys(
         ("place_x", "place_y", "place_z", "radius"), ("driver", "largest")

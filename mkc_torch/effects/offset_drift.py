@@ -43,6 +43,7 @@ class OffsetDrift(GainEffect):
     explanation = "The sensor's offset drifted slowly over the recording, as it does while electronics warm up."
     advice = "Let the sensor warm up before calibrating, or record its temperature beside it."
     plausible = 50.0
+    plausible_unit = "µT"
     source = "warm-up of first order; diffusion of heat into a half-space goes with the root of time"
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:

@@ -106,7 +106,8 @@ class Quantity(NamedTuple):
 class Effect(Protocol):
     """A piece of physics. At γ = 0 it changes nothing.
 
-    Some effects can do more: :class:`SignalEffect`, :class:`ContinuousEffect`, :class:`LinearEffect`,
+    An effect may have a ``plausible_unit``, the unit that ``plausible`` is in, where it is one of its own and not that
+    of the recording. Some effects can do more: :class:`SignalEffect`, :class:`ContinuousEffect`, :class:`LinearEffect`,
     :class:`LastingEffect`, :class:`ShapedEffect`, :class:`AnchoredEffect`.
 
     Attributes:
@@ -334,6 +335,7 @@ class GainEffect:
     explanation: str = ""
     advice: str = ""
     plausible: float = float("inf")
+    plausible_unit: str = ""
     source: str = ""
     gain: str = "gain"
 

@@ -32,6 +32,7 @@ class TemperatureOffset(DriverOffset):
     explanation = "The sensor's offset changes with temperature."
     advice = "Correct with the fitted coefficient, or calibrate at the temperature of use."
     plausible = 5.0
+    plausible_unit = "µT/K"
     source = "offset temperature coefficients of MEMS magnetometers, about 0.2 µT/K in data sheets"
     lags = (0.0, 1.0, 5.0)
     continuous: Mapping[str, tuple[float, float]] = {"lag": (0.0, 0.2)}

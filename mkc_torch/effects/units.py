@@ -5,11 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-__all__ = ["quotient", "tidy"]
+__all__ = ["quotient", "ratio", "tidy"]
 
 _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 _FACTOR = re.compile(r"(?P<name>[^\d⁻⁰¹²³⁴⁵⁶⁷⁸⁹^]+)\^?(?P<power>[-⁻]?[\d⁰¹²³⁴⁵⁶⁷⁸⁹]+)?$")
+
+
+_PREFIXES = {"": 1.0, "n": 1e-9, "µ": 1e-6, "u": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3}
+_BASE = {f"{prefix}{name}": (size, name) for name in "TAVmsK" for prefix, size in _PREFIXES.items()}
+_BASE |= {"°C": (1.0, "K"), "G": (1e-4, "T"), "mG": (1e-7, "T"), "gauss": (1e-4, "T"), "°": (1.0, "°")}
+"""Units with their sizes in base units."""
 
 
 def tidy(unit: str) -> str:
@@ -34,6 +40,40 @@ def quotient(unit: str, other: str, power: int = 1) -> str:
     if not unit or not other or above is None or below is None:
         return ""
     return _written({name: above.get(name, 0) - power * below.get(name, 0) for name in {**above, **below}})
+
+
+def ratio(unit: str, other: str) -> float | None:
+    """How many of the other one of a unit is; None where that is not known.
+
+    A degree is a kelvin: sizes are of differences.
+
+    Example:
+        >>> ratio("µT/A", "nT/mA"), ratio("µT/K", "µT/°C"), ratio("µT", "V"), ratio("furlong", "furlong")
+        (1.0, 1.0, None, 1.0)
+    """
+    if tidy(unit) == tidy(other):
+        return 1.0
+    sizes = [_in_base_units(one) for one in (unit, other)]
+    if sizes[0] is None or sizes[1] is None or sizes[0][1] != sizes[1][1]:
+        return None
+    # of two powers of ten, whose quotient is one too
+    return float(f"{sizes[0][0] / sizes[1][0]:.12g}")
+
+
+def _in_base_units(unit: str) -> tuple[float, dict[str, int]] | None:
+    """The size of a unit in base units, and their powers; None where one is not known."""
+    factors = _factors(unit)
+    if factors is None:
+        return None
+    size = 1.0
+    powers: dict[str, int] = {}
+    for name, power in factors.items():
+        base = _BASE.get(name)
+        if base is None:
+            return None
+        size *= base[0] ** power
+        powers[base[1]] = powers.get(base[1], 0) + power
+    return size, {name: power for name, power in powers.items() if power}
 
 
 def _factors(unit: str) -> dict[str, int] | None:
