@@ -25,7 +25,7 @@ from mkc_torch.diagnosis.first_look import p_value_beside
 from mkc_torch.diagnosis.innovations import innovation_gain
 from mkc_torch.diagnosis.locate import Located, locate
 from mkc_torch.diagnosis.model import JointModel, Term
-from mkc_torch.diagnosis.noise import autoregression
+from mkc_torch.diagnosis.noise import correlation_time
 from mkc_torch.diagnosis.noise_summary import noise_summary
 from mkc_torch.diagnosis.preference import ALIKE_COLUMNS, UNKNOWN, alike
 from mkc_torch.diagnosis.refit import FittedModel, fitted
@@ -58,8 +58,8 @@ FEWEST = 40
 _WIDER, _NEAR = 3.0, 0.05
 
 _BEYOND_DOUBT, _FURTHER = 8.0, 20.0
-"""Nats beyond all draws of noise from which unseen blocks are not asked to confirm a first finding, and from which they
-need only to lean the way of a further one."""
+"""Nats beyond all draws of noise from which unseen blocks need only not to be clearly worse with a first finding, and
+from which they need only to lean the way of a further one."""
 
 _QUIET, _GLANCE = 0.1, 49
 """A p-value at a first look beside a finding above which nothing further is searched, and the draws that it takes."""
@@ -121,7 +121,8 @@ def diagnose(
             f"{where}{len(prepared.time)} usable samples are too few for a diagnosis; it needs {FEWEST} at least."
         )
     roles = frozenset(role for effect in effects for role in effect.roles)
-    drivers = find_drivers(prepared.recording, simulation.columns, roles)
+    measured: frozenset[str] = getattr(simulation, "measured", frozenset())
+    drivers = find_drivers(prepared.recording, simulation.columns, roles, measured)
     terms = candidate_terms(prepared, drivers.drivers, effects)
     asked = _Asked(level, surrogates, max_findings, seed)
     generator = torch.Generator().manual_seed(seed)
@@ -169,22 +170,18 @@ def _holds(
     """Whether what was found counts.
 
     Blocks weigh samples as if their noise was white, and miss what is plain in coloured noise: of the first finding,
-    which the draws of noise have judged, they need only to lean its way, or to confirm it, by more than its number of
-    parameters is worth, once the noise is filtered white. What comes after a finding also has what that
-    one's form left over, and they have to confirm it, or to lean its way where it is plain beyond all draws.
+    which the draws of noise have judged, they need only to lean its way, or not clearly the other way where it is plain
+    beyond all draws; or to confirm it, by more than its number of parameters is worth, once the noise is filtered
+    white. What comes after a finding also has what that one's form left over, and they have to confirm it, or to lean
+    its way where it is plain beyond all draws.
     """
-    better = bool(after.log_likelihood.mean() > before.log_likelihood.mean())
-    if first:
-        plain = located.beyond > _BEYOND_DOUBT
-        price = 0.5 * located.fit.model.sizes[-1] * math.log(len(after.log_likelihood))
-        return better or plain or innovation_gain(before.residual, after.residual) > price
-    return (better and located.beyond > _FURTHER) or _confirmed(before, after, blocks, seed)
-
-
-def _confirmed(before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int) -> bool:
     difference = after.log_likelihood - before.log_likelihood
-    _, (low, _) = gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))
-    return low > 0.0
+    gain, (low, high) = gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))
+    if first:
+        plain = located.beyond > _BEYOND_DOUBT and high > 0.0
+        price = 0.5 * located.fit.model.sizes[-1] * math.log(len(after.log_likelihood))
+        return gain > 0.0 or plain or innovation_gain(before.residual, after.residual) > price
+    return low > 0.0 or (gain > 0.0 and located.beyond > _FURTHER)
 
 
 def _base(prepared: PreparedSimulation) -> FittedModel:
@@ -211,7 +208,8 @@ class _Search:
     """One search after the other: the first one, what was found, and what unseen blocks did not confirm.
 
     ``evidence`` is that of the simulation alone and with one finding more each; ``left`` are candidates that are still
-    to be searched beside what was found, none once the search is over; ``given_up`` says why there was no next one.
+    to be searched beside what was found, none once the search is over; ``given_up`` says why there was no next one, and
+    ``cut`` that there was something to search for when as much was found as was asked for.
     """
 
     first: Located | None
@@ -221,6 +219,7 @@ class _Search:
     evidence: tuple[Evidence, ...]
     left: tuple[Term, ...]
     given_up: str = ""
+    cut: bool = False
 
     @property
     def parts(self) -> tuple[object, ...]:
@@ -232,8 +231,8 @@ class _Search:
 def _begun(base: FittedModel, terms: tuple[Term, ...], asked: _Asked, generator: torch.Generator) -> _Search:
     """The first search, and its finding, if unseen blocks confirm it."""
     prepared = base.model.prepared
-    correlation = 1 + max(len(autoregression(one)) for one in base.pseudo[0].unbind(1))
-    blocks = blocks_of(len(base.residual), correlation)
+    correlation = max(correlation_time(one) for one in base.pseudo[0].unbind(1))
+    blocks = blocks_of(len(base.residual), math.ceil(correlation))
     alone = with_memory(prepared, partial(held_out, base, blocks))
 
     def searched() -> Located:
@@ -276,10 +275,14 @@ def _continued(search: _Search, asked: _Asked, generator: torch.Generator) -> _S
 
 def _quiet(search: _Search, asked: _Asked) -> bool:
     """Whether what is beside the last finding is far from anything that could count."""
+    return _beside(search, asked) > max(_QUIET, asked.level)
+
+
+def _beside(search: _Search, asked: _Asked) -> float:
+    """The p-value of a first look beside the last finding."""
     last, near = search.found[-1], _near(search.found[-1].fit)
     others = [all(not _same(term, one.term, near) for one in search.found) for term in last.terms]
-    generator = torch.Generator().manual_seed(asked.seed)
-    return p_value_beside(last, others, _GLANCE, generator) > max(_QUIET, asked.level)
+    return p_value_beside(last, others, _GLANCE, torch.Generator().manual_seed(asked.seed))
 
 
 def _taken_up(search: _Search, located: Located, asked: _Asked, after: Evidence | None = None) -> _Search:
@@ -301,8 +304,11 @@ def _taken_up(search: _Search, located: Located, asked: _Asked, after: Evidence 
     found = (*search.found, replace(located, fit=fit))
     near = _near(located.fit)
     left = tuple(t for t in search.left if not _same(t, located.term, near))
-    evidence = (*search.evidence, after)
-    return replace(search, found=found, evidence=evidence, left=left if len(found) < asked.max_findings else ())
+    taken = replace(search, found=found, evidence=(*search.evidence, after), left=left)
+    if len(found) < asked.max_findings:
+        return taken
+    # a p-value of 0 is that of a look that sees nothing
+    return replace(taken, left=(), cut=0.0 < _beside(taken, asked) <= asked.level)
 
 
 def _near(fit: FittedModel) -> float:
@@ -347,7 +353,6 @@ def _assembled(
         )
         for k, (s, more) in enumerate(zip(found, ending.beyond, strict=True))
     ]
-    verdict: Verdict = "adequate" if not findings else "unexplained" if nameless(final.fit) else "explained"
     return Diagnosis(
         recording=prepared.recording.name,
         simulation=prepared.name,
@@ -358,7 +363,7 @@ def _assembled(
         surrogates=asked.surrogates,
         seed=asked.seed,
         p_value=first.p_value if first else 1.0,
-        verdict=verdict,
+        verdict=_verdict(first, found, final.fit, ending.left, search.cut, asked),
         findings=tuple(findings),
         baseline=_spread(evidence[0], inliers),
         corrected=_spread(evidence[-1], inliers),
@@ -384,11 +389,31 @@ def _assembled(
     )
 
 
+def _verdict(
+    first: Located | None,
+    found: Sequence[Located],
+    final: FittedModel,
+    left: Sequence[str],
+    cut: bool,
+    asked: _Asked,
+) -> Verdict:
+    """Whether there is structure beyond the noise, and whether the findings account for it."""
+    if not found:
+        there = bool(left) or (first is not None and first.p_value <= asked.level)
+        return "unexplained" if there else "adequate"
+    return "unexplained" if nameless(final) or left or cut else "explained"
+
+
 def _with_rest(diagnosis: Diagnosis, search: _Search) -> Diagnosis:
     """With what the last search found that does not count, and why there was no other."""
     more = [_not_confirmed(search.unconfirmed)] if search.unconfirmed else []
     if search.given_up:
         more.append(f"The search beside what was found was given up. {search.given_up}")
+    if search.cut:
+        more.append(
+            f"There is more structure beside the {len(search.found)} findings, which are as many as were asked for; "
+            "ask for more with `max_findings`."
+        )
     return replace(diagnosis, warnings=(*diagnosis.warnings, *more))
 
 

@@ -15,7 +15,7 @@ from mkc_torch.diagnosis.extrapolation import extrapolated
 from mkc_torch.diagnosis.locate import Located
 from mkc_torch.diagnosis.onsets import onset_interval
 from mkc_torch.diagnosis.preference import UNKNOWN
-from mkc_torch.diagnosis.refit import FittedModel
+from mkc_torch.diagnosis.refit import FittedModel, without_term
 from mkc_torch.diagnosis.remaining import remaining
 from mkc_torch.diagnosis.result import DriverShift, Extrapolation
 from mkc_torch.diagnosis.shifts import shifted
@@ -81,7 +81,9 @@ def ending_parts(
     fit = fits[-1]
 
     def beyond() -> tuple[Beyond, ...]:
-        return tuple(_beyond(without, one, seed) for without, one in zip(fits[:-1], found, strict=True))
+        return tuple(
+            _beyond(without, fit, one, k, seed) for k, (without, one) in enumerate(zip(fits, found, strict=False))
+        )
 
     def within_reach() -> tuple[Ceiling, tuple[str, ...]]:
         reach = ceiling(base.model, _answerable(base, fit), drivers, blocks)
@@ -99,9 +101,12 @@ def ending_parts(
     return [partial(begun, work) for work in (partial(stand_in_warning, fit), beyond, within_reach, final)]
 
 
-def _beyond(without: FittedModel, found: Located, seed: int) -> Beyond:
-    model = without.model
-    return Beyond(extrapolated(without, found.fit, seed), shifted(model, found), onset_interval(model, found))
+def _beyond(without: FittedModel, final: FittedModel, found: Located, number: int, seed: int) -> Beyond:
+    model, term, fit = without.model, final.model.terms[number], found.fit
+    if number < len(final.model.terms) - 1 and model.prepared.ports[term.port].clock is None:
+        # what was found later belongs to both
+        without, fit = without_term(final, number), final
+    return Beyond(extrapolated(without, fit, term, seed), shifted(model, found), onset_interval(model, found))
 
 
 def nameless(fit: FittedModel) -> bool:

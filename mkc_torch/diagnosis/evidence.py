@@ -61,11 +61,13 @@ class Evidence:
 
 
 def blocks_of(N: int, correlation: int) -> HeldOutBlocks:
-    """Twenty-five blocks, five folds; between training and held-out samples lies at least a correlation time.
+    """Twenty-five blocks, five folds; between training and held-out samples lies a correlation time at least.
+
+    But no more than half a block, so that training blocks are left: noise that wanders for longer leans both ways.
 
     Args:
         N: number of samples.
-        correlation: in samples.
+        correlation: integrated correlation time in samples.
     """
     count = FOLDS * BLOCKS_PER_FOLD
     block = (torch.arange(N) * count).div(N, rounding_mode="floor")

@@ -20,8 +20,8 @@ _SPREAD = 0.25
 """Share of the driver's range that the lowest values must cover for a fit to them to say anything."""
 
 
-def extrapolated(without: FittedModel, fit: FittedModel, seed: int) -> Extrapolation | None:
-    """Fit with and without the last effect to the low values of its driver, and compare on the high ones.
+def extrapolated(without: FittedModel, fit: FittedModel, term: Term, seed: int) -> Extrapolation | None:
+    """Fit with and without an effect to the low values of its driver, and compare on the high ones.
 
     A driver of several columns is high where it is far from its mean. The shapes of effects stay as they are, and so
     does the bound.
@@ -29,13 +29,14 @@ def extrapolated(without: FittedModel, fit: FittedModel, seed: int) -> Extrapola
     Args:
         without: the model without the effect.
         fit: the same with it.
+        term: the effect.
         seed: of the bootstrap of blocks.
 
     Returns:
         None where the driver was not recorded, or where its low values hardly vary, as those of a switch, or the high
         ones are all in one place in time.
     """
-    reach = _reach(fit.model.terms[-1])
+    reach = _reach(term)
     if reach is None:
         return None
     low = reach <= torch.quantile(reach, SHARE)

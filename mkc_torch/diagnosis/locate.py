@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Located", "locate"]
 
+_DOUBTED = 25.0
+"""Nats beyond all draws of noise up to which draws of other noise that is nearly as likely are asked too."""
+
 _HIDDEN, _SMALLER = 0.01, 0.8
 """Share of the residuals that a fit without an effect may reject and one with it takes, and the scale with it over that
 without, from which the former hides nothing of the effect."""
@@ -123,6 +126,11 @@ def locate(
         possible = possible_of(terms, linearised)
         p_value, beyond = judged(linearised, noise, found, possible[:tried], surrogates, generator)
         beside_nothing = linearised
+        if p_value <= level and beyond < _DOUBTED:
+            for colour in linearised.plausible():
+                other = linearise(base.model, parameters, pseudo, counts, tangents, colour=colour)
+                p_other, beyond_other = _judged(other, terms, tried, surrogates, generator)
+                p_value, beyond = max(p_value, p_other), min(beyond, beyond_other)
         stretch = None
         if p_value <= level:
             own = int(torch.where(possible, found.log_p[:, 0], 0.0).argmin())

@@ -16,7 +16,7 @@ from mkc_torch.order_statistic import robust_scale
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_beside", "repeats"]
+__all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_beside", "repeats", "without_term"]
 
 _CLIP = 2.0
 _SHARES = (1.0, 0.3, 0.1, 0.01, 0.0)
@@ -102,6 +102,14 @@ def fitted_beside(
     except ValueError:
         none = base.parameters.new_zeros(model.size - base.model.size)
         return replace(base, model=model, parameters=torch.cat([base.parameters, none]))
+
+
+def without_term(fit: FittedModel, number: int) -> FittedModel:
+    """The simulation with all effects of a fit but one, as a start for fits: at its parameters, not fitted anew."""
+    model, place = fit.model, fit.model.base + sum(fit.model.sizes[:number])
+    left = JointModel(model.prepared, (*model.terms[:number], *model.terms[number + 1 :]))
+    parameters = torch.cat([fit.parameters[:place], fit.parameters[place + model.sizes[number] :]])
+    return replace(fit, model=left, parameters=parameters)
 
 
 def _usable(model: JointModel, start: Float[Tensor, " p"]) -> Float[Tensor, " p"]:

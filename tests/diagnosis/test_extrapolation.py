@@ -44,6 +44,11 @@ def both(trace, effect="driver_offset", **columns):
     return without, fitted(model, start, without.bound)
 
 
+def held_beyond(fits, seed=0):
+    without, fit = fits
+    return extrapolated(without, fit, fit.model.terms[-1], seed)
+
+
 def warning(found):
     (finding,) = make_diagnosis(1, samples=50).findings
     finding = dataclasses.replace(finding, effect="driver_offset", drivers=("load",), extrapolation=found)
@@ -51,7 +56,7 @@ def warning(found):
 
 
 def test_what_is_in_proportion_throughout_holds_where_the_driver_is_high():
-    found = extrapolated(*both(LOAD, load=LOAD), 0)
+    found = held_beyond(both(LOAD, load=LOAD))
     assert found.confidence_interval[0] > 0.2
     assert found.confidence_interval[0] < found.log_likelihood_gain < found.confidence_interval[1]
     assert warning(found) == ()
@@ -62,7 +67,7 @@ def test_what_turns_round_where_the_driver_is_high_does_not():
     trace = np.where(LOAD < EDGE, LOAD, 2.0 * EDGE - LOAD)
     without, fit = both(trace, load=LOAD)
     assert fit.log_likelihood > without.log_likelihood + 20.0
-    found = extrapolated(without, fit, 0)
+    found = held_beyond((without, fit))
     assert found.confidence_interval[1] < 0.0
     (sentence,) = warning(found)
     assert "driver_offset does not extrapolate" in sentence
@@ -70,7 +75,7 @@ def test_what_turns_round_where_the_driver_is_high_does_not():
 
 
 def test_what_is_not_there_is_neither():
-    found = extrapolated(*both(np.zeros(N), load=LOAD), 0)
+    found = held_beyond(both(np.zeros(N), load=LOAD))
     assert abs(found.log_likelihood_gain) < 0.02
     assert warning(found) == ()
 
@@ -79,19 +84,19 @@ def test_of_several_columns_what_is_far_from_the_middle_is_high():
     columns = {f"position_{axis}": np.sin(TIME * (0.7 + 0.4 * k)) for k, axis in enumerate("xyz")}
     stronger = 0.8 * columns["position_x"] - 0.5 * columns["position_z"]
     direction = turns(TIME).inv().apply(FIELD / np.linalg.norm(FIELD)) @ RESPONSE.T
-    found = extrapolated(*both(stronger[:, None] * direction, "field_gradient", **columns), 0)
+    found = held_beyond(both(stronger[:, None] * direction, "field_gradient", **columns))
     assert found.confidence_interval[0] > 0.0
 
 
 def test_a_switch_says_nothing():
     switch = np.where(np.quantile(LOAD, 0.8) < LOAD, 1.0, 0.0)
-    assert extrapolated(*both(switch, load=switch), 0) is None
+    assert held_beyond(both(switch, load=switch)) is None
 
 
 def test_high_values_all_in_one_place_say_nothing():
     high = np.where(abs(TIME - 11.0) < 1.0, 4.0, 2.5 * np.minimum(np.sin(TIME), 0.0))
     high += np.where(abs(TIME - 11.0) < 1.0, np.sin(9.0 * TIME), 0.0)
-    assert extrapolated(*both(high, load=high), 0) is None
+    assert held_beyond(both(high, load=high)) is None
 
 
 def test_an_effect_without_a_recorded_driver_has_none():
@@ -99,12 +104,12 @@ def test_an_effect_without_a_recorded_driver_has_none():
     effect = next(e for e in CATALOGUE if e.id == "hard_iron_step")
     model = without.model.with_term(Term(effect, None, {"onset": 10.0}))
     fit = fitted(model, torch.cat([without.parameters, torch.zeros(3, dtype=torch.float64)]), without.bound)
-    assert extrapolated(without, fit, 0) is None
+    assert held_beyond((without, fit)) is None
 
 
 def test_it_is_drawn_by_its_seed():
     fits = both(LOAD, load=LOAD)
-    assert extrapolated(*fits, 4) == extrapolated(*fits, 4)
+    assert held_beyond(fits, 4) == held_beyond(fits, 4)
 
 
 def test_only_a_clear_failure_is_warned_of():
@@ -124,3 +129,15 @@ def test_a_finding_of_a_diagnosis_has_it(diagnosis):
     assert finding.effect == "current_field"
     assert finding.extrapolation.confidence_interval[0] > 0.0
     assert not [w for w in diagnosis.warnings if "extrapolate" in w]
+
+
+def test_what_is_found_later_belongs_to_the_model_without_a_finding_too():
+    """A drift that is large where the driver is high would speak for it, or against it."""
+    drift = np.outer(np.maximum(TIME - 15.0, 0.0), [0.5, -0.3, 0.2])
+    ramp = LOAD + 0.1 * TIME
+    recording = tumbling(N, noise=0.3, sensor=GAIN * ramp[:, None] + drift, current=ramp + 2.0)
+    result = diagnose(Magnetometer(), recording, surrogates=19, max_findings=2)
+    assert {finding.effect for finding in result.findings} >= {"current_field"}
+    current = next(finding for finding in result.findings if finding.effect == "current_field")
+    assert len(result.findings) == 2
+    assert current.extrapolation.confidence_interval[0] > 0.0

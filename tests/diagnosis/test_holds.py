@@ -33,6 +33,7 @@ def located(beyond):
         (True, 0.01, 1.0, 0.0, True),  # leans its way
         (True, -0.01, 1.0, 0.0, False),
         (True, -0.01, 1.0, 100.0, True),  # plain beyond all draws
+        (True, -0.5, 1.0, 100.0, False),  # plain, and clearly worse on unseen blocks
         (False, 0.01, 1.0, 10.0, False),  # leans, and is not confirmed
         (False, 0.01, 1.0, 100.0, True),  # leans, and is plain
         (False, 0.5, 1.0, 0.0, True),

@@ -1,0 +1,74 @@
+"""The verdict follows from what is known of the whole recording, not from whether something was named."""
+
+import importlib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mkc_torch import Recording, diagnose
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.simulation import Magnetometer
+from tests.simulation.tumbling import tumbling
+
+module = importlib.import_module("mkc_torch.diagnosis.diagnose")
+ASKED = SimpleNamespace(level=0.05)
+FINAL = SimpleNamespace(model=SimpleNamespace(terms=(SimpleNamespace(effect=SimpleNamespace(id="current_field")),)))
+CURVE = SimpleNamespace(model=SimpleNamespace(terms=(SimpleNamespace(effect=SimpleNamespace(id="unknown")),)))
+
+
+def in_units(recording, **units):
+    return Recording(recording.columns, name=recording.name, units={**recording.units, **units})
+
+
+@pytest.mark.parametrize(
+    ("p_value", "found", "final", "left", "cut", "verdict"),
+    [
+        (0.2, 0, FINAL, (), False, "adequate"),
+        (None, 0, FINAL, (), False, "adequate"),
+        (0.05, 0, FINAL, (), False, "unexplained"),  # there is structure, and nothing that accounts for it
+        (0.2, 0, FINAL, ("temperature",), False, "unexplained"),
+        (0.01, 1, FINAL, (), False, "explained"),
+        (0.01, 1, CURVE, (), False, "unexplained"),
+        (0.01, 1, FINAL, ("temperature",), False, "unexplained"),
+        (0.01, 3, FINAL, (), True, "unexplained"),
+    ],
+)
+def test_a_verdict(p_value, found, final, left, cut, verdict):
+    first = None if p_value is None else SimpleNamespace(p_value=p_value)
+    assert module._verdict(first, (None,) * found, final, left, cut, ASKED) == verdict
+
+
+def test_more_than_was_asked_for_is_told_of():
+    N = 2000
+    time = np.arange(N) / 50.0
+    current = np.sin(2.0 * np.pi * time / 3.3)
+    temperature = 20.0 + 4.0 * np.sin(2.0 * np.pi * time / 17.0)
+    sensor = np.outer(current, [3.0, -2.0, 2.0]) + np.outer(temperature, [0.8, 0.5, -0.6])
+    recording = tumbling(N, noise=0.3, sensor=sensor, current=current, temperature=temperature)
+    one = diagnose(Magnetometer(), recording, surrogates=19, max_findings=1)
+    assert (len(one.findings), one.verdict) == (1, "unexplained")
+    assert any("more structure beside the 1 findings" in warning for warning in one.warnings)
+    two = diagnose(Magnetometer(), recording, surrogates=19, max_findings=2)
+    assert ({f.effect for f in two.findings}, two.verdict) == ({"current_field", "temperature_offset"}, "explained")
+
+
+def test_a_size_is_compared_in_the_unit_that_is_known():
+    current = np.sin(2.0 * np.arange(1500) / 50.0)
+    sensor = np.outer(current, [3.0, -2.0, 2.0])
+    effects = [effect for effect in CATALOGUE if effect.id == "current_field"]
+    for scale, unit, known in ((1.0, "A", "20 µT/A"), (1000.0, "mA", "0.02 µT/mA")):
+        recording = in_units(tumbling(1500, noise=0.3, sensor=sensor, current=scale * current), current=unit)
+        (finding,) = diagnose(Magnetometer(), recording, effects=effects, surrogates=19).findings
+        assert finding.plausible
+        assert f"within the {known} that is plausible" in finding.plausibility
+
+
+def test_a_size_in_a_unit_that_is_not_known_is_not_judged():
+    current = np.sin(2.0 * np.arange(1500) / 50.0)
+    recording = tumbling(1500, noise=0.3, sensor=np.outer(current, [3.0, -2.0, 2.0]), current=current)
+    recording = in_units(recording, mag_x="counts", mag_y="counts", mag_z="counts")
+    effects = [effect for effect in CATALOGUE if effect.id == "current_field"]
+    (finding,) = diagnose(Magnetometer(), recording, effects=effects, surrogates=19).findings
+    assert finding.plausible
+    assert "known in µT/A alone" in finding.plausibility
