@@ -61,20 +61,21 @@ def hard_iron_step(g: Generator, scene: Scene) -> Hidden:
 
 
 def offset_drift(g: Generator, scene: Scene) -> Hidden:
-    """The offset wanders off: two exponentials of their own directions, a square root of time, or a logistic curve."""
+    """The offset wanders off: two exponentials of their own directions, a stretched one, or a curve of Gompertz."""
     way, time = direction(g), scene.time
     first, length = float(time[0]), float(time[-1] - time[0])
-    form = choose(g, ("two exponentials", "square root", "logistic"))
+    form = choose(g, ("two exponentials", "stretched exponential", "Gompertz"))
     fast, slow = uniform(g, 0.05, 0.2) * length, uniform(g, 0.3, 1.2) * length
     second = torch.nn.functional.normalize(way + 0.5 * normal(g, 3), dim=0) * uniform(g, 0.5, 1.5)
-    middle, width = uniform(g, 0.3, 0.7) * length, uniform(g, 0.08, 0.25) * length
+    middle, width = uniform(g, 0.25, 0.6) * length, uniform(g, 0.08, 0.25) * length
+    stretch = uniform(g, 0.45, 0.8)
 
     def shape(x: Tensor) -> Tensor:
         if form == "two exponentials":
             return (1 - torch.exp(-x / fast))[:, None] * way + (1 - torch.exp(-x / slow))[:, None] * second
-        if form == "square root":
-            return (x / length).sqrt()[:, None] * way
-        return torch.sigmoid((x - middle) / width)[:, None] * way
+        if form == "stretched exponential":
+            return (1 - torch.exp(-(x / slow).pow(stretch)))[:, None] * way
+        return torch.exp(-torch.exp(-(x - middle) / width))[:, None] * way
 
     def trace(at: Scene) -> Tensor:
         x = torch.full_like(at.time, length) if at.settled else at.time - first
@@ -84,21 +85,26 @@ def offset_drift(g: Generator, scene: Scene) -> Hidden:
 
 
 def _bend(g: Generator) -> tuple[float, float, float]:
-    """Lag of the die in s, share of the quadratic part, temperature around which the offset was trimmed in °C."""
-    return uniform(g, 0.0, 0.5), choose(g, (-1.0, 1.0)) * uniform(g, 0.0, 0.05), 25.0
+    """Lag of the die in s, logarithm of how much steeper it ends, temperature around which it was trimmed in °C."""
+    return uniform(g, 0.0, 0.5), choose(g, (-1.0, 1.0)) * uniform(g, 0.01, 0.1), 25.0
+
+
+def _warmed(temperature: Tensor, step: float, lag: float) -> Tensor:
+    """Behind two thermal masses in a row, case and die, that lag by as much together."""
+    return lagged(lagged(temperature, step, 0.6 * lag), step, 0.4 * lag)
 
 
 def temperature_offset(g: Generator, scene: Scene) -> Hidden:
-    """k (T − T0) with a quadratic part of up to 5 % and a die that lags the thermometer by up to half a second."""
+    """Exponential in T − T0, at its end a tenth steeper at most, of a die that lags behind by half a second at most."""
     way = direction(g)
     lag, bend, center = _bend(g)
     span = float((scene.temperature - center).abs().max())
 
     def trace(at: Scene) -> Tensor:
-        x = lagged(at.temperature, at.step, lag) - center
-        return (x + bend * x.square() / span)[:, None] * way
+        x = _warmed(at.temperature, at.step, lag) - center
+        return (torch.expm1(bend * x / span) * span / bend)[:, None] * way
 
-    return Hidden("temperature_offset", "lagged, slightly quadratic", trace, 40.0, driver="temperature")
+    return Hidden("temperature_offset", "lagged, slightly exponential", trace, 40.0, driver="temperature")
 
 
 def temperature_gain(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
@@ -106,7 +112,7 @@ def temperature_gain(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - on
     lag, _, center = _bend(g)
 
     def trace(at: Scene) -> Tensor:
-        x = lagged(at.temperature, at.step, lag) - center
+        x = _warmed(at.temperature, at.step, lag) - center
         return x[:, None] * (at.field @ at.sensor.soft.mT) / 50.0
 
     return Hidden("temperature_gain", "lagged", trace, 10.0, driver="temperature")

@@ -9,10 +9,10 @@ import torch
 from torch import Generator, Tensor
 
 from mkc_torch.challenge import rotation
-from mkc_torch.challenge.draws import happens, normal, smooth, uniform
+from mkc_torch.challenge.draws import choose, happens, normal, smooth, uniform
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
 RATE = 50.0
 """Samples per second."""
@@ -25,6 +25,10 @@ WALKING_SHARE = 0.3
 
 STIFF_SHARE = 0.1
 """Share of the motions that turn little about one body axis, and so leave directions poorly covered."""
+
+REST_SHARE, LONGEST_REST = 0.15, 0.4
+"""Share of the motions in which the sensor lies still for a while, and the longest such while, as a share of the
+recording."""
 
 _GRAVITY = torch.tensor([0.0, 0.0, 9.81], dtype=torch.float64)
 
@@ -69,15 +73,28 @@ def tumble(g: Generator, *, duration: float = DURATION, rate: float = RATE, star
     size = torch.ones(3, dtype=torch.float64)
     if happens(g, STIFF_SHARE):
         size[int(uniform(g, 0.0, 3.0)) % 3] = 0.3
+    moves = _moves(g, count)
     gyro = uniform(g, 1.0, 3.0) * size / size.square().mean().sqrt() / 3.0**0.5 * smooth(g, count, 3, step, 2.0)
+    gyro = gyro * moves[:, None]
     turns = rotation.from_vector(gyro * step)
     first = torch.nn.functional.normalize(normal(g, 4), dim=0)
     attitude = rotation.running_product(torch.cat([first[None], turns[:-1]]))
     walks = happens(g, WALKING_SHARE)
     hand = 0.5 * torch.tanh(0.5 * smooth(g, count, 3, step, 3.0))
     body = smooth(g, count, 3, step, 25.0) * torch.tensor([2.0, 2.0, 0.05]) if walks else torch.zeros(count, 3)
-    position = hand + body
+    # where it lies it stays
+    position = (hand + body)[(moves.cumsum(0) - 1).clamp(min=0)]
     return Motion(time, attitude, position, gyro, walks)
+
+
+def _moves(g: Generator, count: int) -> Int[Tensor, " N"]:
+    """1 where a sensor moves, 0 where it lies still: at the beginning, say, before it is picked up."""
+    moves = torch.ones(count, dtype=torch.int64)
+    if happens(g, REST_SHARE):
+        length = int(uniform(g, 0.05, LONGEST_REST) * count)
+        first = choose(g, (0, count - length, int(uniform(g, 0.0, 1.0) * (count - length))))
+        moves[first : first + length] = 0
+    return moves
 
 
 def within(motion: Motion, other: Motion) -> Motion:

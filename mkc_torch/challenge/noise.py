@@ -15,8 +15,8 @@ from mkc_torch.challenge.process import Process, autoregressive, resonance
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-KINDS = ("white", "ar1", "ar2", "offset walk", "ambient ar", "ambient walk")
-KIND_SHARES = (0.40, 0.18, 0.12, 0.14, 0.08, 0.08)
+KINDS = ("white", "ar1", "ar2", "offset walk", "ar1 and offset walk", "ambient ar", "ambient walk")
+KIND_SHARES = (0.35, 0.16, 0.12, 0.12, 0.09, 0.08, 0.08)
 FAMILIES = ("gaussian", "laplace", "student")
 SIGMA = (0.2, 0.8)
 """Range of the standard deviation of an axis, in µT."""
@@ -31,8 +31,9 @@ MOST_OUTLIERS = 0.20
 class Noise:
     """Errors of a sensor; standard deviations in µT.
 
-    ``white`` (three axes) is independent from sample to sample, ``axes`` adds a process to each axis, ``ambient`` one
-    to the length of the field, and ``attitude`` (radians, one process on each world axis) turns the recorded attitude.
+    ``white`` (three axes) is independent from sample to sample, ``axes`` adds a process to each axis and ``walks`` a
+    random walk, ``ambient`` a process to the length of the field, and ``attitude`` (radians, one process on each world
+    axis) turns the recorded attitude.
     """
 
     kind: str
@@ -40,6 +41,7 @@ class Noise:
     sigma: float
     white: tuple[float, float, float]
     axes: tuple[Process, Process, Process] | None = None
+    walks: tuple[Process, Process, Process] | None = None
     ambient: Process | None = None
     attitude: Process | None = None
 
@@ -68,16 +70,17 @@ def draw_noise(g: Generator, samples: int, rate: float) -> Noise:
         (math.exp(-1.0 / (rate * log_uniform(g, 1.0, 20.0))),), math.radians(uniform(g, 0.2, 0.5)) / math.sqrt(3.0)
     )
     step = uniform(g, 0.5, 5.0) * sigma / math.sqrt(samples)
-    if kind in ("ar1", "ar2"):
+    steps = [step * uniform(g, 0.7, 1.4) for _ in range(3)]
+    walks = (Process((1.0,), steps[0]), Process((1.0,), steps[1]), Process((1.0,), steps[2]))
+    if kind == "offset walk":
+        return Noise(kind, family, sigma, white, walks=walks, attitude=attitude)
+    if kind in ("ar1", "ar2", "ar1 and offset walk"):
         mixed = happens(g, 0.5)
         part = math.sqrt(0.5) if mixed else 1.0
-        axes = [_coloured(g, kind, part * deviation, family) for deviation in deviations]
+        x, y, z = (_coloured(g, kind, part * deviation, family) for deviation in deviations)
         rest = (part * white[0], part * white[1], part * white[2]) if mixed else (0.0, 0.0, 0.0)
-        return Noise(kind, family, sigma, rest, axes=(axes[0], axes[1], axes[2]), attitude=attitude)
-    if kind == "offset walk":
-        steps = [step * uniform(g, 0.7, 1.4) for _ in range(3)]
-        walks = (Process((1.0,), steps[0]), Process((1.0,), steps[1]), Process((1.0,), steps[2]))
-        return Noise(kind, family, sigma, white, axes=walks, attitude=attitude)
+        also = walks if kind == "ar1 and offset walk" else None
+        return Noise(kind, family, sigma, rest, axes=(x, y, z), walks=also, attitude=attitude)
     if kind == "ambient walk":
         return Noise(kind, family, sigma, white, ambient=Process((1.0,), step), attitude=attitude)
     if kind == "ambient ar":
@@ -87,7 +90,7 @@ def draw_noise(g: Generator, samples: int, rate: float) -> Noise:
 
 
 def _coloured(g: Generator, kind: str, deviation: float, family: str) -> Process:
-    if kind == "ar1":
+    if kind != "ar2":
         return autoregressive((uniform(g, 0.3, 0.98),), deviation, family)
     return autoregressive(resonance(uniform(g, 0.6, 0.95), uniform(g, 0.01, 0.2)), deviation, family)
 
@@ -95,9 +98,10 @@ def _coloured(g: Generator, kind: str, deviation: float, family: str) -> Process
 def axis_errors(g: Generator, noise: Noise, samples: int) -> Float[Tensor, "N 3"]:
     """Errors of the three axes in µT; walks have their mean taken off, which the offset of the sensor holds."""
     errors = unit_variance(g, noise.family, samples, 3) * torch.tensor(noise.white, dtype=torch.float64)
-    if noise.axes is None:
-        return errors
-    return errors + torch.stack([_centred(process, process.sample(g, samples)) for process in noise.axes], -1)
+    for known in (noise.axes, noise.walks):
+        if known is not None:
+            errors = errors + torch.stack([_centred(process, process.sample(g, samples)) for process in known], -1)
+    return errors
 
 
 def ambient_errors(g: Generator, noise: Noise, samples: int) -> Float[Tensor, " N"]:

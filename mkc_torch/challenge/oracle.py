@@ -46,7 +46,4 @@ def second_residual(
 
 def _for_the_mean(metric: Metric) -> Metric:
     """Without walks of the offset: the best fit to those would seek the offset they began with, not their mean."""
-    axes = metric.noise.axes
-    if axes is None or not axes[0].walks:
-        return metric
-    return replace(metric, noise=replace(metric.noise, axes=None))
+    return replace(metric, noise=replace(metric.noise, walks=None))

@@ -105,9 +105,10 @@ class Metric:
         count = len(self.scene.time)
         gains = torch.zeros(count, 3, 0, dtype=torch.float64)
         processes: list[Process] = []
-        if self.noise.axes is not None:
-            gains = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
-            processes += self.noise.axes
+        for known in (self.noise.axes, self.noise.walks):
+            if known is not None:
+                gains = torch.cat([gains, torch.eye(3, dtype=torch.float64).expand(count, 3, 3)], -1)
+                processes += known
         if self.noise.ambient is not None:
             gains = torch.cat([gains, self.scene.along[:, :, None]], -1)
             processes.append(self.noise.ambient)

@@ -32,6 +32,19 @@ def test_covers_the_directions_most_of_the_time():
     assert sum(gaps) <= 6
 
 
+def test_some_lie_still_for_a_while_and_stay_where_they_are():
+    motions = [tumble(generator(6, k)) for k in range(60)]
+    rests = [(motion, motion.gyro.abs().amax(-1) == 0.0) for motion in motions]
+    resting = [(motion, still) for motion, still in rests if bool(still.any())]
+    assert 3 <= len(resting) <= 18
+    for motion, still in resting:
+        assert 0.04 < float(still.double().mean()) < 0.41
+        assert int((still[1:] & ~still[:-1]).sum()) <= 1
+        inside = torch.nonzero(still).flatten()[:-1]
+        assert float((motion.position[inside + 1] - motion.position[inside]).abs().max()) == 0.0
+        torch.testing.assert_close(motion.attitude[inside + 1], motion.attitude[inside])
+
+
 def test_walking_is_metres_and_standing_is_half_a_metre():
     motions = [tumble(generator(4, k)) for k in range(40)]
     assert 4 <= sum(motion.walks for motion in motions) <= 22

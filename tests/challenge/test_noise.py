@@ -39,13 +39,14 @@ def test_errors_have_the_stated_size(kind):
     noise = next(n for k in range(200) if (n := draw_noise(generator(2, k), 4500, 50.0)).kind == kind)
     errors = axis_errors(generator(3), noise, 4500)
     assert errors.shape == (4500, 3)
-    largest = 4.0 if kind == "offset walk" else 2.0
+    largest = 4.0 if noise.walks else 2.0
     assert bool((errors.std(0) < largest * noise.sigma).all() and (errors.std(0) > 0.3 * noise.sigma).all())
 
 
 def test_a_walk_goes_half_to_five_sigmas():
-    walks = [n for k in range(300) if (n := draw_noise(generator(4, k), 4500, 50.0)).kind == "offset walk"]
-    ends = [process.innovation * 4500**0.5 / n.sigma for n in walks for process in n.axes]
+    walks = [n for k in range(300) if "walk" in (n := draw_noise(generator(4, k), 4500, 50.0)).kind and n.walks]
+    assert {n.kind for n in walks} == {"offset walk", "ar1 and offset walk"}
+    ends = [process.innovation * 4500**0.5 / n.sigma for n in walks for process in n.walks]
     assert min(ends) > 0.3
     assert max(ends) < 7.5
 
