@@ -29,6 +29,7 @@ from mkc_torch.diagnosis.noise import correlation_time
 from mkc_torch.diagnosis.noise_summary import noise_summary
 from mkc_torch.diagnosis.preference import ALIKE_COLUMNS, UNKNOWN, alike
 from mkc_torch.diagnosis.refit import FittedModel, fitted
+from mkc_torch.diagnosis.rejected import rejected_warning
 from mkc_torch.diagnosis.remaining import remaining_warning
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Finding, HeldOut, Separability, Spread, Traces, Verdict
 from mkc_torch.diagnosis.separability import separability
@@ -377,6 +378,7 @@ def _assembled(
             *_time_warnings(prepared),
             *remaining_warning(ending.left),
             *_in_one_stretch(first, prepared.time),
+            *(() if prepared.recording.time is None else rejected_warning(prepared.time, final.fit.weights)),
             *ending.stand_in,
             *(sentence for finding in findings for sentence in shift_warning(finding)),
             *(sentence for finding in findings for sentence in extrapolation_warning(finding)),
