@@ -13,7 +13,7 @@ TIME = torch.arange(3000, dtype=torch.float64) / 50.0
 
 
 def weights(*stretches):
-    inside = sum(((TIME >= first) & (TIME < last)).double() for first, last in stretches)
+    inside = sum(((first <= TIME) & (last > TIME)).double() for first, last in stretches)
     return torch.stack([torch.ones_like(TIME), 1.0 - torch.as_tensor(inside).clamp(max=1.0)], -1)
 
 
