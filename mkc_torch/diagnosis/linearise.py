@@ -53,7 +53,7 @@ which is some twenty numbers, gains by chance."""
 _REACHED = 0.98
 """Share of a random walk's power that lies at the frequencies that it reaches."""
 
-_PLAUSIBLE = 12.0
+_PLAUSIBLE = 6.0
 """Nats that a colour may be less likely than another one: as many as one of more numbers gains by chance."""
 
 _FARTHEST = 10.0
