@@ -91,7 +91,7 @@ def estimate(fit: FittedModel) -> Estimate:
     noise = found.search.noise_fit(found.series)
     spread = found.search.wander_spread(noise) if noise.size > 0 else 0.0
     plain = Estimate(fit, covariance, noise, found.colour, spread, tuple({} for _ in fit.model.terms))
-    return _shapes_free(plain, tangents, local)
+    return _shapes_free(plain.at_least(found.search.doubted_error(0, found.series)), tangents, local)
 
 
 def _shapes_free(plain: Estimate, tangents: Tangents, local: Local) -> Estimate:

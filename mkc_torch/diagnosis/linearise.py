@@ -36,8 +36,9 @@ __all__ = ["Linearised", "Slow", "Tangents", "candidate_tangents", "linearise", 
 SLOW_COURSES = 120
 """Cosine courses of each wandering channel: on 90 s they reach 0.67 Hz."""
 
-CORNERS = (25.0,)
-"""Numbers of the courses beyond which the wander falls off; beside them, a random walk."""
+CORNERS, WALKS = (25.0, 25.0), (0.0, 5.0)
+"""Beside a random walk: numbers of the courses beyond which a wander falls off, and up to which a walk beside it is
+larger."""
 
 
 _MOST, _MARGIN, _FEWEST = 0.9, 3.0, 1000
@@ -207,7 +208,11 @@ def _slow_courses(model: JointModel, parameters: Tensor, pointwise: dict[str, Te
     name = wandering[0]
     c = len(model.prepared.ports[name].channels)
     k = torch.arange(1, count + 1, dtype=parameters.dtype).repeat_interleave(c)
-    scales = torch.stack([1.0 / k, *((1.0 + (k / corner).square()).rsqrt() for corner in CORNERS)])
+    others = (
+        (1.0 + (k / corner).square()).reciprocal() + (walk / k).square()
+        for corner, walk in zip(CORNERS, WALKS, strict=True)
+    )
+    scales = torch.stack([1.0 / k, *(square.sqrt() for square in others)])
     known = pointwise[name]
     if known is not None:
         return Slow(name, c, known, True, scales)

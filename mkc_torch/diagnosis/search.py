@@ -38,6 +38,13 @@ _CELLS = 3_000_000
 
 _EQUAL = 3.0
 
+_NEARLY = 12.0
+"""Nats that a family of wander may be less likely than another one and still be asked how sure a size is."""
+
+_PREFERRED = 5.0
+"""Nats by which the first family of wander, a random walk, goes before another one: beside a spectrum of any form that
+one can pass for a walk, and then knows too little of its slowest courses."""
+
 
 @dataclass(frozen=True)
 class Gains:
@@ -292,7 +299,7 @@ class LinearSearch:
         for number in self._possible:
             family = self._families[number]
             left, log_det = _without_wander(power, family.axes.mT @ (family.scale.unsqueeze(-1) * slow), family)
-            values = (-0.5 * log_det - 0.5 * self._dof * left.log()).squeeze(-1)
+            values = (-0.5 * log_det - 0.5 * self._dof * left.log()).squeeze(-1) - _price(number)
             place = int(values.argmax())
             value = float(values[place])
             if value > best.log_likelihood:
@@ -305,6 +312,26 @@ class LinearSearch:
 
         The sign is that of the series' own regression; directions that the nuisance takes over are 0.
         """
+        value, gamma, covariance = self._estimates(number, series)
+        best = int(value.argmax())
+        return gamma[best], covariance[best]
+
+    def doubted_error(self, number: int, series: Float[Tensor, " M"]) -> Float[Tensor, " q"]:
+        """Standard errors of γ: the largest of those by each family of wander that is nearly as likely.
+
+        What is slow in a recording says little of how a wander goes on towards what is slower, and the size of a slow
+        effect is as unsure as that.
+        """
+        value, _, covariance = self._estimates(number, series)
+        rows = [slice(0, 1)]
+        for family in self._allowed:
+            rows.append(slice(rows[-1].stop, rows[-1].stop + len(family.sizes) - 1))
+        best = [part.start + int(value[part].argmax()) for part in rows]
+        near = [row for row in best if float(value[row]) > float(value.max()) - _NEARLY]
+        return covariance[near].diagonal(dim1=-2, dim2=-1).amax(0).clamp(min=0.0).sqrt()
+
+    def _estimates(self, number: int, series: Float[Tensor, " M"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Log-likelihood (R,), γ (R, q) and its covariance (R, q, q) without a wander and at each of its sizes."""
         start = sum(self._widths[:number])
         index = torch.arange(start, start + self._widths[number])
         columns = self._flat[:, index]
@@ -317,14 +344,15 @@ class LinearSearch:
         grams, inners = [gram.flatten().unsqueeze(0)], [inner.unsqueeze(0)]
         powers, log_dets = [power.reshape(1)], [power.new_zeros(1)]
         slow = self._wander.mT @ left
-        for family in self._allowed:
+        for place in self._possible:
+            family = self._families[place]
             cross = family.axes.mT @ (family.scale.unsqueeze(-1) * self._cross[:, index])
             rotated = family.axes.mT @ (family.scale * slow)
             share, sizes = family.shares, family.sizes[1:].unsqueeze(-1)
             grams.append(gram.flatten() - share @ (cross.unsqueeze(-1) * cross.unsqueeze(-2)).flatten(1))
             inners.append(inner - share @ (cross * rotated.unsqueeze(-1)))
             powers.append(power - share @ rotated.square())
-            log_dets.append(torch.log1p(sizes * family.strength).sum(-1))
+            log_dets.append(torch.log1p(sizes * family.strength).sum(-1) + 2.0 * _price(place))
         scale = size_of.unsqueeze(-1) * size_of
         scaled = torch.cat(grams).unflatten(-1, (q, q)) * scale
         inverse = torch.linalg.pinv(scaled, hermitian=True, atol=_SINGULAR, rtol=0.0) * scale
@@ -332,8 +360,7 @@ class LinearSearch:
         gamma = (inverse @ inner.unsqueeze(-1)).squeeze(-1)
         rest = torch.cat(powers) - (inner * gamma).sum(-1)
         value = -0.5 * torch.cat(log_dets) - 0.5 * self._dof * rest.clamp(min=1e-300).log()
-        best = int(value.argmax())
-        return gamma[best], inverse[best] * rest[best] / self._dof
+        return value, gamma, inverse * (rest / self._dof)[:, None, None]
 
     def trace(self, number: int, series: Float[Tensor, " M"]) -> tuple[Tensor, Tensor, float]:
         """A candidate at its best γ, less what the nuisance takes over.
@@ -462,6 +489,11 @@ class NoiseFit:
     variance: float
     log_likelihood: float
     gain: float
+
+
+def _price(family: int) -> float:
+    """Nats by which a family of wander has to be likelier than the first one."""
+    return _PREFERRED if family > 0 else 0.0
 
 
 # For hundreds of courses NumPy's BLAS took half to three quarters of the time of torch's, on an AMD processor.

@@ -88,9 +88,13 @@ def test_the_mild_samples_of_bursts_do_not_count(step, size):
     for start, length in [(300, 25), (900, 30), (1500, 25)]:
         burst[start : start + length] = size
         hit[start : start + length] = True
-    _, _, local = local_of(walk([step] * 3) + burst, "norm")
-    assert float(local.counts[hit].mean()) < 0.25
-    assert float(local.counts[~hit].mean()) > 0.96
+    kept = []
+    for seed in range(3):
+        _, _, local = local_of(walk([step] * 3, seed) + burst, "norm")
+        kept.append((float(local.counts[hit].mean()), float(local.counts[~hit].mean())))
+    of_bursts, of_others = np.mean(kept, axis=0)
+    assert of_bursts < 0.2
+    assert of_others > 0.945
 
 
 def test_neighbours_to_one_side_together_do_not_count():

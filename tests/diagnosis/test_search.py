@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy import stats
 
-from mkc_torch.diagnosis.search import LinearSearch, log_survival
+from mkc_torch.diagnosis.search import _NEARLY, _PREFERRED, LinearSearch, log_survival
 
 M, P, K = 200, 4, 12
 
@@ -61,8 +61,11 @@ class Dense:
         courses = self.complement.T @ (WANDER * SCALES[family]).numpy()
         return np.eye(self.dof) + size * courses @ courses.T
 
-    def fits(self, y, columns=None):
-        """For each noise: log-likelihood with the white variance profiled out, γ and its covariance."""
+    def fits(self, y, columns=None, price=0.0):
+        """For each noise: log-likelihood with the white variance profiled out, γ and its covariance.
+
+        Other families than the first pay a price.
+        """
         z = self.complement.T @ np.asarray(y)
         for family, size in self.noises:
             factor = np.linalg.cholesky(self.covariance(family, size))
@@ -73,10 +76,11 @@ class Dense:
                 gamma = np.linalg.lstsq(X, white, rcond=None)[0]
                 white = white - X @ gamma
                 covariance = np.linalg.inv(X.T @ X) * (white @ white) / self.dof
-            yield -0.5 * log_det - 0.5 * self.dof * np.log(white @ white), gamma, covariance
+            value = -0.5 * log_det - 0.5 * self.dof * np.log(white @ white)
+            yield value - price * (family > 0), gamma, covariance
 
-    def best(self, y, columns=None):
-        return max(self.fits(y, columns), key=lambda fit: fit[0])
+    def best(self, y, columns=None, price=0.0):
+        return max(self.fits(y, columns, price), key=lambda fit: fit[0])
 
 
 def test_without_wander_gains_are_the_likelihood_ratios_of_least_squares(plain):
@@ -136,7 +140,7 @@ def test_sizes_of_wander_reach_from_none_to_all_there_is(search):
 
 def test_the_noise_of_a_series_is_the_likeliest_of_the_grid(search):
     dense, series = Dense(search), wandering(30.0, 0, seed=20)
-    values = [fit[0] for fit in dense.fits(series)]
+    values = [fit[0] for fit in dense.fits(series, price=_PREFERRED)]
     found = search.noise_fit(series)
     best = int(np.argmax(values))
     assert (found.family, found.size) == pytest.approx(dense.noises[best])
@@ -152,10 +156,27 @@ def test_the_noise_of_a_series_is_the_likeliest_of_the_grid(search):
 @pytest.mark.parametrize("size", [0.0, 100.0])
 def test_estimates_are_those_of_generalised_least_squares(search, number, size):
     series = wandering(size, 0, seed=30) + 0.4 * CANDIDATES[number].sum(-1)
-    _, expected, spread = Dense(search).best(series, CANDIDATES[number])
+    _, expected, spread = Dense(search).best(series, CANDIDATES[number], _PREFERRED)
     gamma, covariance = search.estimate(number, series)
     np.testing.assert_allclose(gamma, expected, rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(covariance, spread, rtol=1e-7, atol=1e-12)
+
+
+@pytest.mark.parametrize("family", [0, 1])
+def test_a_size_is_as_unsure_as_the_least_favourable_family_that_is_nearly_as_likely(search, family):
+    series = wandering(100.0, family, seed=30) + 0.4 * CANDIDATES[2].sum(-1)
+    fits = list(Dense(search).fits(series, CANDIDATES[2], _PREFERRED))
+    highest = max(fit[0] for fit in fits)
+    noises = Dense(search).noises
+    errors = []
+    for number in (None, 0, 1):
+        mine = [fit for fit, (f, size) in zip(fits, noises, strict=True) if (f if size else None) == number]
+        value, _, covariance = max(mine, key=lambda fit: fit[0])
+        if value > highest - _NEARLY:
+            errors.append(np.sqrt(np.diag(covariance)))
+    found = search.doubted_error(2, series)
+    np.testing.assert_allclose(found, np.max(errors, axis=0), rtol=1e-7)
+    assert float(found) >= float(search.estimate(2, series)[1].sqrt())
 
 
 def test_standard_errors_are_those_of_repeated_draws(search):
