@@ -348,12 +348,13 @@ def _assembled(
         for k, (s, more) in enumerate(zip(found, ending.beyond, strict=True))
     ]
     verdict: Verdict = "adequate" if not findings else "unexplained" if nameless(final.fit) else "explained"
+    noise = noise_summary(final)
     return Diagnosis(
         recording=prepared.recording.name,
         simulation=prepared.name,
         samples=len(prepared.time),
         level=asked.level,
-        noise=noise_summary(final),
+        noise=noise,
         candidates_tried=tried,
         surrogates=asked.surrogates,
         seed=asked.seed,
@@ -375,11 +376,12 @@ def _assembled(
             *ending.stand_in,
             *(sentence for finding in findings for sentence in shift_warning(finding)),
             *(sentence for finding in findings for sentence in extrapolation_warning(finding)),
-            *density_warnings(final.fit.residual, final.fit.sigma, final.fit.d, final.fit.bound, prepared.channels),
+            *density_warnings(noise.checks),
         ),
         candidates=_candidates(first),
         separability=separability(first) if first else _nothing_to_separate(),
         traces=_traces(prepared, drivers, base, final),
+        remaining=ending.left,
         model=model_of(final, simulation),
     )
 

@@ -18,8 +18,19 @@ from mkc_torch.diagnosis.model import Term, follows_signal
 from mkc_torch.diagnosis.preference import UNKNOWN
 from mkc_torch.diagnosis.ranking import SEPARABLE
 from mkc_torch.diagnosis.regions import attributed, map_of, region_of, shares_of_runs
-from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter
-from mkc_torch.effects.protocol import Context, PartEffect, RelativeEffect
+from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter, Reference
+from mkc_torch.effects.protocol import (
+    ComponentsEffect,
+    Context,
+    Effect,
+    FormedEffect,
+    MomentsEffect,
+    PartEffect,
+    PlacedEffect,
+    RelativeEffect,
+    ShapeUnitsEffect,
+    TellingEffect,
+)
 from mkc_torch.effects.units import tidy
 from mkc_torch.effects.unrecorded import COURSE, Unrecorded
 from mkc_torch.nonlinear import beside
@@ -56,14 +67,15 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
     shape = _shape_parameters(term, context, final.shape_errors[number])
     of_time = isinstance(term.effect, Unrecorded)
     told_as = formulas(curve) if term.effect.id == UNKNOWN and not of_time and curve is not None else ()
+    moments = term.effect.moments(context) if isinstance(term.effect, MomentsEffect) else ()
     return Finding(
         effect=term.effect.id,
         drivers=term.columns,
         channels=channels,
         intervals=intervals_of(final, number),
-        onset=term.shape.get("onset"),
-        equation="; ".join([term.effect.equation, *told_as]),
-        explanation=f"{term.effect.explanation} {term.effect.advice}".strip(),
+        onset=moments[0] if moments else term.shape.get("onset"),
+        equation="; ".join([_equation(term, context), *told_as]),
+        explanation=term.effect.explanation,
         parameters=(*parameters_of(term, gamma, covariance, context), *shape),
         p_value=located.p_value,
         held_out=held,
@@ -75,7 +87,29 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
         region=None if where is None else region_of(where),
         experiments=() if where is None else shares_of_runs(where),
         map=None if where is None else map_of(where),
+        moments=moments,
+        references=_references(term),
+        advice=term.effect.advice,
+        again=_again(term.effect),
+        placed=isinstance(term.effect, PlacedEffect) and term.effect.placed,
     )
+
+
+def _equation(term: Term, context: Context) -> str:
+    """In the form that the shape chose."""
+    effect = term.effect
+    return effect.equation_of(term.shape, context) if isinstance(effect, FormedEffect) else effect.equation
+
+
+def _references(term: Term) -> tuple[Reference, ...]:
+    if term.driver is None:
+        return ()
+    values = term.driver.reference.tolist()
+    return tuple(Reference(*one) for one in zip(term.columns, values, term.driver.units, strict=True))
+
+
+def _again(effect: Effect) -> str:
+    return effect.again if isinstance(effect, TellingEffect) else ""
 
 
 def places_of(term: Term, channels: Sequence[str]) -> tuple[str, ...]:
@@ -111,15 +145,25 @@ def parameters_of(
         start += quantity.size
         if readings is not None:
             value, spread = readings(quantity.name, value, covariance[mine, mine])
-        parameters.append(Parameter(quantity.name, _numbers(value), _numbers(spread), tidy(quantity.unit)))
+        components = _components(term, quantity.name, quantity.size, context)
+        parameters.append(Parameter(quantity.name, _numbers(value), _numbers(spread), tidy(quantity.unit), components))
     return tuple(parameters)
 
 
+def _components(term: Term, quantity: str, size: int, context: Context) -> tuple[str, ...]:
+    """What the numbers of a quantity are: as the effect says, or one for each channel."""
+    if size < 2:
+        return ()
+    own = term.effect.components(quantity, term.shape, context) if isinstance(term.effect, ComponentsEffect) else ()
+    return own or (tuple(context.channels) if size == len(context.channels) else ())
+
+
 def _shape_parameters(term: Term, context: Context, errors: Mapping[str, float]) -> tuple[Parameter, ...]:
+    chosen = term.effect.choices if isinstance(term.effect, FormedEffect) else ()
     return tuple(
         Parameter(name, value, errors.get(name), _unit_of_shape(term, name, context))
         for name, value in term.shape.items()
-        if name != "onset" and not name.startswith(COURSE)
+        if name != "onset" and not name.startswith(COURSE) and name not in chosen
     )
 
 
@@ -127,6 +171,8 @@ def _unit_of_shape(term: Term, name: str, context: Context) -> str:
     if isinstance(term.effect, RelativeEffect) and name in term.effect.relative:
         part = term.effect.relative[name][0]
         return context.units[0] if part == "driver" else context.unit_of(part)
+    if isinstance(term.effect, ShapeUnitsEffect) and (own := term.effect.unit_of_shape(name, context)):
+        return own
     return "s" if name in _SECONDS else ""
 
 
@@ -161,7 +207,8 @@ def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
         if rival.key == term.key or ranked.gap > _FARTHEST:
             continue
         gap = max(ranked.gap, 0.0)
-        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= SEPARABLE, rival.at))
+        again = _again(rival.effect)
+        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= SEPARABLE, rival.at, again))
     near = [a for a in found if not a.separable]
     return tuple(near + [a for a in found if a.separable][: max(0, _MOST_ALTERNATIVES - len(near))])
 
