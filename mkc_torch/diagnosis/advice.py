@@ -23,16 +23,16 @@ def advice_of(diagnosis: Diagnosis) -> tuple[str, ...]:
     if nothing_shows(d):
         return ("Use the simulation as it is, within what this recording covers.",)
     advice = [sentence for finding in d.findings for sentence in _of(finding, alone=len(d.findings) == 1)]
-    use = [_called(f) for f in d.findings if worth_correcting(f) and f.plausible and not f.placed]
-    if use:
-        advice.append(f"The model found here corrects for {', '.join(use)}: confirm it on a second recording.")
     if d.remaining:
-        advice.append(f"Find out what {', '.join(d.remaining)} does beside: something smooth remains along it.")
+        advice.append(f"Find out what else goes along with {', '.join(d.remaining)}: something smooth remains there.")
     elif not d.findings or d.verdict == "unexplained":
         advice.append(
             "Record again, for longer, with more columns that could drive what remains, such as temperature, current "
             "and motion."
         )
+    use = [_called(f) for f in d.findings if worth_correcting(f) and f.plausible and not f.placed]
+    if use:
+        advice.append(f"The model found here corrects for {', '.join(use)}: confirm it on a second recording.")
     return tuple(dict.fromkeys(advice))
 
 
@@ -81,6 +81,8 @@ def _how(finding: Finding, near: Sequence[Alternative]) -> str:
     every: tuple[Finding | Alternative, ...] = (finding, *near)
     columns = list(dict.fromkeys(column for one in every for column in one.drivers))
     if all(one.drivers for one in every):
+        if len(columns) == 1:
+            return f" with {columns[0]} over a wider range"
         return " while they go different ways: change one and hold the other"
     clauses = list(dict.fromkeys(one.again for one in every if one.again and not one.drivers))
     if columns:
