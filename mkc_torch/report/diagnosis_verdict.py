@@ -9,6 +9,7 @@ from mkc_torch.diagnosis.advice import nothing_shows
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.diagnosis.worth import confirmed, small, worth_correcting
 from mkc_torch.report.diagnosis_wording import (
+    acts_on,
     better,
     clock_of,
     evidence,
@@ -123,7 +124,7 @@ def lead(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     f = d.findings[0]
     told = [largest(p) for p in f.parameters[:2]]
     large = [("How large", "; ".join(told) + ".")] if told else []
-    acts = f"; acts on {several(f.channels)}" if f.channels else ""
+    acts = f"; {acts_on(f)}" if f.channels else ""
     confirms = f": {better(f.held_out)}, {gain(f.held_out)}." if f.held_out else f"; not measured: {f.held_out_note}."
     return [
         *large,
