@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from mkc_torch.diagnosis.result import Alternative, Diagnosis, Finding
-from mkc_torch.diagnosis.switched import comes_and_goes
-from mkc_torch.diagnosis.worth import change, confirmed, worth_correcting
+from mkc_torch.diagnosis.worth import carries_over, change, confirmed, worth_correcting
 
 __all__ = ["advice_of", "nothing_shows"]
 
@@ -30,7 +29,7 @@ def advice_of(diagnosis: Diagnosis) -> tuple[str, ...]:
             "Record again, for longer, with more columns that could drive what remains, such as temperature, current "
             "and motion."
         )
-    use = [_called(f) for f in d.findings if worth_correcting(f) and f.plausible and not f.placed]
+    use = [_called(f) for f in d.findings if carries_over(f)]
     if use:
         advice.append(f"The model found here corrects for {', '.join(use)}: confirm it on a second recording.")
     return tuple(dict.fromkeys(advice))
@@ -38,26 +37,31 @@ def advice_of(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 def _of(finding: Finding, *, alone: bool) -> Iterator[str]:
     f = finding
-    if worth_correcting(f):
-        what = _SWITCHED if comes_and_goes(f) else f.advice
-        if what:
-            yield what if alone else f"{_called(f)}: {what[:1].lower()}{what[1:]}"
-    elif confirmed(f) and f.held_out is not None:
-        yield (
-            f"Leave {_called(f)} alone, unless means over many samples matter: it makes the residual of a sample "
-            f"smaller by {max(100.0 * change(f.held_out), 0.0):.1f} % only."
-        )
-    else:
-        wider = f", with {', '.join(f.drivers)} over a wider range," if f.drivers else ","
-        yield (
-            f"Do not correct for {_called(f)} yet: blocks that the fit has not seen do not confirm it. Record again, "
-            f"for longer{wider} and see whether it comes back."
-        )
+    what = _SWITCHED if f.comes_and_goes else f.advice if worth_correcting(f) else ""
+    if what:
+        yield what if alone else f"{_called(f)}: {what[:1].lower()}{what[1:]}"
+    if not worth_correcting(f):
+        yield _hold_back(f)
     near = [a for a in f.alternatives if not a.separable]
     if near:
         yield _tell_apart(f, near)
     if not f.plausible:
         yield f"The size of {f.effect} is not plausible: look for another cause before correcting it."
+
+
+def _hold_back(finding: Finding) -> str:
+    """Why not to correct for it."""
+    f = finding
+    if confirmed(f) and f.held_out is not None:
+        return (
+            f"Leave {_called(f)} alone, unless means over many samples matter: it makes the residual of a sample "
+            f"smaller by {max(100.0 * change(f.held_out), 0.0):.1f} % only."
+        )
+    wider = f", with {', '.join(f.drivers)} over a wider range," if f.drivers else ","
+    return (
+        f"Do not correct for {_called(f)} yet: blocks that the fit has not seen do not confirm it. Record again, for "
+        f"longer{wider} and see whether it comes back."
+    )
 
 
 _SWITCHED = (

@@ -171,6 +171,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         **({"moments": f.moments} if f.moments else {}),
         **({"references": [asdict(one) for one in f.references]} if f.references else {}),
         **({"advice": f.advice} if f.advice else {}),
+        **({"comes_and_goes": True} if f.comes_and_goes else {}),
     }
 
 

@@ -19,6 +19,7 @@ from mkc_torch.diagnosis.preference import UNKNOWN
 from mkc_torch.diagnosis.ranking import SEPARABLE
 from mkc_torch.diagnosis.regions import attributed, map_of, region_of, shares_of_runs
 from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter, Reference
+from mkc_torch.diagnosis.switched import comes_and_goes, memory_of
 from mkc_torch.effects.protocol import (
     ComponentsEffect,
     Context,
@@ -38,7 +39,7 @@ from mkc_torch.nonlinear import beside
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["finding_of", "intervals_of", "labels", "parameters_of", "places_of"]
+__all__ = ["finding_of", "gain_of", "intervals_of", "labels", "parameters_of", "places_of"]
 
 _MOST_ALTERNATIVES = 5
 _FARTHEST = 30.0
@@ -68,12 +69,13 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
     of_time = isinstance(term.effect, Unrecorded)
     told_as = formulas(curve) if term.effect.id == UNKNOWN and not of_time and curve is not None else ()
     moments = term.effect.moments(context) if isinstance(term.effect, MomentsEffect) else ()
+    gain, time, onset = gain_of(final, number), final.fit.model.prepared.time, term.shape.get("onset")
     return Finding(
         effect=term.effect.id,
         drivers=term.columns,
         channels=channels,
-        intervals=intervals_of(final, number),
-        onset=moments[0] if moments else term.shape.get("onset"),
+        intervals=intervals_of(gain, time),
+        onset=moments[0] if moments else onset,
         equation="; ".join([_equation(term, context), *told_as]),
         explanation=term.effect.explanation,
         parameters=(*parameters_of(term, gamma, covariance, context), *shape),
@@ -92,6 +94,7 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
         advice=term.effect.advice,
         again=_again(term.effect),
         placed=isinstance(term.effect, PlacedEffect) and term.effect.placed,
+        comes_and_goes=onset is not None and comes_and_goes(gain, time, onset, memory_of(final.colour.coefficients)),
     )
 
 
@@ -213,18 +216,21 @@ def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
     return tuple(near + [a for a in found if a.separable][: max(0, _MOST_ALTERNATIVES - len(near))])
 
 
-def intervals_of(final: Estimate, number: int) -> tuple[tuple[float, float], ...]:
-    """Where the effect's gain is concentrated: the fewest of sixty blocks that hold nine tenths of it.
-
-    Empty where that is more than a third of the recording, and where runs share their times.
-    """
+def gain_of(final: Estimate, number: int) -> Float[Tensor, " N"]:
+    """What one effect gains at each sample, in nats, all else as it is."""
     fit = final.fit
     model, parameters = fit.model, fit.parameters.clone()
     start = model.base + sum(model.sizes[:number])
     with_it = scored(model.residual(parameters), fit.sigma, fit.d, fit.bound)
     parameters[start : start + model.sizes[number]] = 0.0
-    gain = (with_it - scored(model.residual(parameters), fit.sigma, fit.d, fit.bound)).detach()
-    time = model.prepared.time
+    return (with_it - scored(model.residual(parameters), fit.sigma, fit.d, fit.bound)).detach()
+
+
+def intervals_of(gain: Float[Tensor, " N"], time: Float[Tensor, " N"]) -> tuple[tuple[float, float], ...]:
+    """Where an effect's gain is concentrated: the fewest of sixty blocks that hold nine tenths of it.
+
+    Empty where that is more than a third of the recording, and where runs share their times.
+    """
     N = len(time)
     count = min(_BLOCKS, N // 10)
     if count < 10 or bool((time.diff() < 0).any()):

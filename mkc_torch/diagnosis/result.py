@@ -155,7 +155,8 @@ class Finding:
     share of the gain, and is empty for a single run. ``onset_interval`` holds the onset with 95 % confidence.
     ``moments`` are those at which an effect sets in that does so several times, the first of them its onset.
     ``references`` are what the equation counts its drivers from, ``advice`` what to do about it, ``again`` what becomes
-    of it in another recording; one that is ``placed`` belongs to the place or the attitude of this recording.
+    of it in another recording; one that is ``placed`` belongs to the place or the attitude of this recording. A step
+    ``comes_and_goes`` where it is as if something was switched on and off.
     """
 
     effect: str
@@ -184,6 +185,7 @@ class Finding:
     advice: str = ""
     again: str = ""
     placed: bool = False
+    comes_and_goes: bool = False
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Literal
 
 from mkc_torch.diagnosis.result import Finding, HeldOut
 
-__all__ = ["Confirmation", "change", "confirmation", "confirmed", "small", "worth_correcting"]
+__all__ = ["Confirmation", "carries_over", "change", "confirmation", "confirmed", "small", "worth_correcting"]
 
 Confirmation = Literal["surely", "probably", "not shown", "worse"]
 
@@ -62,3 +62,11 @@ def small(finding: Finding) -> bool:
 def worth_correcting(finding: Finding) -> bool:
     """Whether a simulation is clearly better with it."""
     return confirmed(finding) and not small(finding)
+
+
+def carries_over(finding: Finding) -> bool:
+    """Whether a model of it is of use on another recording.
+
+    What belongs to the place of this one, or comes and goes at times that nothing tells, is not.
+    """
+    return worth_correcting(finding) and finding.plausible and not (finding.placed or finding.comes_and_goes)

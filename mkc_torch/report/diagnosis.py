@@ -8,7 +8,6 @@ from typing import NamedTuple
 from markupsafe import Markup
 
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability
-from mkc_torch.diagnosis.switched import comes_and_goes
 from mkc_torch.report import diagnosis_pictures as pictures
 from mkc_torch.report import diagnosis_verdict, diagnosis_wording
 from mkc_torch.report.calibration import _render
@@ -57,7 +56,6 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
         top=diagnosis_verdict,
         typeset=typeset,
         marked=marked,
-        comes_and_goes=comes_and_goes,
         notes=diagnosis_wording.channel_notes(d.traces.channels),
         numbered=pictures.numbered(d),
         clock=diagnosis_wording.clock_of(d.traces),

@@ -7,7 +7,7 @@ from typing import Literal
 
 from mkc_torch.diagnosis.advice import nothing_shows
 from mkc_torch.diagnosis.result import Diagnosis, Finding
-from mkc_torch.diagnosis.worth import confirmed, small, worth_correcting
+from mkc_torch.diagnosis.worth import carries_over, confirmed, small, worth_correcting
 from mkc_torch.report.diagnosis_wording import (
     acts_on,
     better,
@@ -166,7 +166,7 @@ def _ids(diagnosis: Diagnosis) -> set[str]:
 def apply_command(diagnosis: Diagnosis) -> str:
     """The command that uses on another recording what was found; empty where nothing found is of use there."""
     d = diagnosis
-    if not any(worth_correcting(f) and f.plausible and not f.placed for f in d.findings):
+    if not any(carries_over(f) for f in d.findings):
         return ""
     own = {
         "magnetometer": " --output corrected.csv",

@@ -22,7 +22,6 @@ from mkc_torch.diagnosis.result import (
     Region,
     Traces,
 )
-from mkc_torch.diagnosis.switched import comes_and_goes
 from mkc_torch.diagnosis.worth import confirmation
 from mkc_torch.report.typesetting import plain, superscript, typeset
 from mkc_torch.report.wording import bandwidth, decimals, number, share, size
@@ -113,7 +112,8 @@ def clock_of(traces: Traces) -> Clock:
     """A clock that tells moments apart to about a thousandth of the recording."""
     known = traces.time[traces.time.isfinite()]
     span = float(known.max() - known.min()) if traces.has_time and len(known) else 0.0
-    return Clock(min(max(round(3.0 - math.log10(span)), 0), 6) if span > 0 else 1, traces.has_time)
+    digits = max(2 - math.floor(math.log10(span)), int(span < 1000.0)) if span > 0 else 1
+    return Clock(min(max(digits, 0), 6), traces.has_time)
 
 
 def effect_name(effect: str) -> str:
@@ -387,23 +387,23 @@ def where(finding: Finding, clock: Clock) -> str:
         'mainly from 1.0 to 2.0 s and from 7.0 to 9.5 s'
         >>> where(replace(finding, onset=61.1, moments=(61.1, 77.8)), clock)
         'anew at 61.1 s and 77.8 s'
-        >>> where(replace(finding, onset=6.2, intervals=((8.0, 9.0), (34.0, 37.3), (60.0, 62.0))), clock)
-        'first at 6.2 s, then it comes and goes: 3 separate intervals, the longest from 34.0 to 37.3 s'
+        >>> where(replace(finding, onset=6.2, intervals=((8.0, 9.0), (34.0, 37.3)), comes_and_goes=True), clock)
+        'first at 6.2 s, then it comes and goes, mainly from 8.0 to 9.0 s and from 34.0 to 37.3 s'
     """
-    switched = comes_and_goes(finding)
     begins = ""
     if finding.moments:
         begins = f"anew at {_and([clock.moment(moment) for moment in finding.moments])}"
     elif finding.onset is not None:
-        begins = f"first at {clock.moment(finding.onset)}" if switched else f"from {clock.moment(finding.onset)} on"
+        moment = clock.moment(finding.onset)
+        begins = f"first at {moment}" if finding.comes_and_goes else f"from {moment} on"
     if finding.onset_interval is not None:
         begins += f" (95 %: {clock.interval(*finding.onset_interval)})"
+    if finding.comes_and_goes:
+        begins += ", then it comes and goes"
     each = [f"from {clock.interval(start, end)}" for start, end in finding.intervals]
     spans = [end - start for start, end in finding.intervals]
-    if switched:
-        mainly = f"then it comes and goes: {_in_many(each, spans).replace(' intervals', ' separate intervals', 1)}"
-    elif len(each) > 3:
-        mainly = f"mainly in {_in_many(each, spans)}"
+    if len(each) > 3:
+        mainly = f"mainly in {len(each)} intervals, the longest {each[spans.index(max(spans))]}"
     else:
         mainly = f"mainly {_and(each)}" if each else ""
     return ", ".join(filter(None, [begins, mainly])) or "throughout the recording"
@@ -425,10 +425,6 @@ _AXES: dict[tuple[str, ...], str] = {
     ("x", "y", "z"): ", the sensor's axes",
     ("east", "north", "up"): ", the axes of the world that the attitude turns into, its x, y, z",
 }
-
-
-def _in_many(each: Sequence[str], spans: Sequence[float]) -> str:
-    return f"{len(each)} intervals, the longest {each[spans.index(max(spans))]}"
 
 
 def _and(each: Sequence[str]) -> str:

@@ -37,6 +37,13 @@ def test_what_belongs_to_the_place_is_not_for_other_recordings():
     assert "model found here" not in only
 
 
+def test_what_comes_and_goes_is_to_be_looked_for_and_not_corrected():
+    made = make_diagnosis(1, samples=50)
+    switched = dataclasses.replace(made.findings[0], comes_and_goes=True, alternatives=())
+    (only,) = advice_of(dataclasses.replace(made, findings=(switched,)))
+    assert only.startswith("Look for something that is switched on and off")
+
+
 def test_a_step_and_a_drift_are_told_apart_by_another_recording():
     drift = Alternative("offset_drift", (), 0.4, False, again=OffsetDrift.again)
     sentence = advised(1, alternatives=(drift,))[1]

@@ -89,13 +89,14 @@ def test_what_an_equation_needs_is_written():
     parameter = Parameter("gradient", (1.0, -2.0), (0.1, 0.2), "µT/m", ("∂B_x/∂y", "∂B_x/∂z"))
     changes = {
         "parameters": (parameter,), "moments": (61.1, 77.8), "advice": "Do it.",
-        "references": (Reference("current", 10.5, "A"),),
+        "references": (Reference("current", 10.5, "A"),), "comes_and_goes": True,
     }  # fmt: skip
     (finding,) = written(with_finding(make_diagnosis(1), **changes))["findings"]
     assert finding["parameters"][0]["components"] == ["∂B_x/∂y", "∂B_x/∂z"]
     assert finding["moments"] == [61.1, 77.8]
     assert finding["references"] == [{"column": "current", "value": 10.5, "unit": "A"}]
     assert finding["advice"] == "Do it."
+    assert finding["comes_and_goes"] is True
     bare = dict.fromkeys(("moments", "references"), ()) | {"advice": ""}
     assert not {"moments", "references", "advice"} & set(
         written(with_finding(make_diagnosis(1), **bare))["findings"][0]

@@ -12,6 +12,7 @@ from mkc_torch.effects.heading_reset import HeadingReset
 from mkc_torch.effects.offset_drift import OffsetDrift
 from mkc_torch.effects.protocol import ComponentsEffect, FormedEffect, MomentsEffect, PlacedEffect, TellingEffect
 from mkc_torch.effects.temperature_offset import TemperatureOffset
+from mkc_torch.effects.unrecorded import COURSE, Unrecorded
 from tests.effects.contexts import make_context
 from tests.effects.test_dynamics_catalogue import make_context as make_dynamic_context
 
@@ -34,6 +35,14 @@ def test_every_form_has_an_equation_that_names_no_choice(effect):
         for name in ("terms", "degree", "radius", "power", "order", "width =", "nan"):
             assert name not in equation
     assert set(effect.choices) <= {name for shape in shapes for name in shape}
+
+
+def test_a_course_says_where_its_numbers_are():
+    effect = Unrecorded()
+    assert isinstance(effect, FormedEffect)
+    told = effect.equation_of({f"{COURSE}{k}": 0.5 for k in (1, 3)}, make_context(effect))
+    assert told.startswith(effect.equation)
+    assert told.endswith("2 numbers c_k in model.json")
 
 
 def test_forms_differ_in_their_equations():
