@@ -326,6 +326,7 @@ def test_a_step_that_comes_and_goes_says_so():
     text = text_of(diagnosis_report(diagnosis))
     told = "irst at 6.2 s (95 %: 5.9 to 6.3 s), then it comes and goes, mainly in 4 intervals, the longest from 34.0"
     assert text.count(told) == 2
+    assert top.headline(diagnosis) == "Left out of the simulation: hard-iron step that comes and goes."
     assert "from 6.2 s on" not in text
     assert "switched on and off, and that no column recorded, would look like this" in text
     assert "Look for something that is switched" in text

@@ -137,10 +137,12 @@ def with_drivers(effect: str, drivers: Sequence[str], at: str = "") -> str:
         ('current field (battery_A)', 'offset drift')
         >>> with_drivers("linear_drag", [], "rate of speed")
         'linear drag on the rate of speed'
+        >>> with_drivers("clock_drift", [], "all outputs")
+        'clock drift on all outputs'
         >>> with_drivers("field_gradient", ["position_x", "position_y", "position_z"])
         'field gradient (position)'
     """
-    place = f" on the {plain(at.removeprefix('loaded '))}" if at else ""
+    place = f" on {'' if at.startswith('all ') else 'the '}{plain(at.removeprefix('loaded '))}" if at else ""
     return effect_name(effect) + (f" ({_together(drivers)})" if drivers else "") + place
 
 
@@ -154,7 +156,7 @@ def finding_name(finding: Finding) -> str:
     """A finding by its effect and what drives it; one that goes along time alone and has no name is told as a cause."""
     if unrecorded(finding):
         return "a cause that no column recorded"
-    return with_drivers(finding.effect, finding.drivers)
+    return with_drivers(finding.effect, finding.drivers) + (" that comes and goes" if finding.comes_and_goes else "")
 
 
 def unrecorded(finding: Finding) -> bool:
