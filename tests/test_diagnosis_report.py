@@ -401,12 +401,12 @@ def test_figures_above_are_told_of_only_where_they_are():
 
 def test_a_long_name_is_whole_where_there_is_room():
     made = make_diagnosis(1, samples=240)
-    curve = dataclasses.replace(made.findings[0].curve, driver="position along its main direction", unit="m")
+    curve = dataclasses.replace(made.findings[0].curve, driver="position along its longest direction", unit="m")
     names = ("position_x", "position_y")
     drivers = dict.fromkeys(names, made.traces.time)
     wide = first_changed(made, curve=curve, drivers=names)
     wide = dataclasses.replace(wide, traces=dataclasses.replace(wide.traces, drivers=drivers))
-    assert "position along its main direction (m)" in text_of(diagnosis_report(wide))
+    assert "position along its longest direction (m)" in text_of(diagnosis_report(wide))
 
 
 def test_whether_a_finding_extrapolates_is_said():

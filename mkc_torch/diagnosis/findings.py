@@ -286,7 +286,7 @@ def _along(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | N
             along = values @ direction
             x = torch.linspace(float(along.min()), float(along.max()), _POINTS, dtype=values.dtype)
             drivers, unit, shown = x.unsqueeze(-1) * direction, term.driver.units[0], x
-            name = f"{term.columns[0].rpartition('_')[0]} along its main direction"
+            name = f"{term.columns[0].rpartition('_')[0]}, main direction"
         time = torch.arange(_POINTS, dtype=values.dtype)
         return name, unit, shown, replace(context, time=time, drivers=drivers, signal=flat)
     if follows_signal(term.effect):
