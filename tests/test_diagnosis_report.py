@@ -8,7 +8,19 @@ import torch
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
-from mkc_torch.diagnosis.result import Candidate, DriverShift, Extrapolation, Region, Separability, StateMap
+from mkc_torch.diagnosis.advice import advice_of
+from mkc_torch.diagnosis.result import (
+    Candidate,
+    DensityCheck,
+    DriverShift,
+    Extrapolation,
+    HeldOut,
+    Parameter,
+    Region,
+    Separability,
+    StateMap,
+)
+from mkc_torch.report import diagnosis_verdict as top
 from mkc_torch.report import diagnosis_wording as say
 from mkc_torch.report.diagnosis import bars, diagnosis_report, heat_map
 from tests.diagnosis.factory import CHANNELS, make_candidates, make_diagnosis, make_separability
@@ -89,7 +101,7 @@ def test_explained_answers_what_where_how_sure_and_how_much_better():
     assert "From 41.3 s on; acts on mag_x, mag_y, mag_z." in text
     assert "p = 0.005, the smallest that 199 surrogates can show" in text
     assert "On data the fit had not seen, the residual is" in text
-    assert "Record at two more temperatures" in text
+    assert "What to do Look for what changed at that time; use the calibration from after the step." in text
     assert "+0.312 nats a sample (95 %: 0.281 to 0.350); residual 0.912 → 0.521 µT (43 % less)" in text
     assert "offset drift 41.2 yes" in text
 
@@ -99,20 +111,20 @@ def test_rivals_that_cannot_be_told_apart_stand_in_the_headline():
     assert "hard-iron step or current field (current), which this recording cannot tell apart." in text
     assert "current field (current) 1.30 no" in text
     assert "not to be told from finding 1" in text
-    assert "hard-iron step, or a rival; current field (current); an effect outside" in text_of(page_of(3))
+    assert "Left out of the simulation: hard-iron step, or a rival; current field (current)." in text_of(page_of(3))
 
 
 def test_unexplained_says_so():
     text = text_of(page_of(0, verdict="unexplained", p_value=0.005))
     assert "Structure remains that no effect in the catalogue accounts for." in text
-    assert "Record more columns" in text
+    assert "Record again, for longer, with more columns" in text
     both = text_of(page_of(2, verdict="unexplained"))
     assert "Yet structure remains that no effect in the catalogue accounts for." in both
 
 
 def test_findings_that_are_not_plausible_or_not_held_out_say_so(three):
     text = text_of(three)
-    assert "Not plausible: an effect outside the catalogue. A curve has no size to compare." in text
+    assert "Not plausible: an effect outside the catalogue (temperature). A curve has no size to compare." in text
     assert "not measured: The event has no second occurrence to be held out." in text
     assert "(4.02 ± 0.11) × 10⁻⁶ 1/µT²" in text
     assert "mainly from 12.1 to 18.4 s and from 60.0 to 71.5 s" in text_of(page_of(2, samples=4500))
@@ -185,20 +197,216 @@ def test_pages_without_candidates_curves_and_separability():
     text = text_of(page)
     assert "The candidates" not in text
     assert "What this recording can tell apart" not in text
-    assert "ceiling" not in text
+    assert "smooth correction" not in text
 
 
-def test_the_ceiling_stands_beside_the_models_compared():
-    for findings in (0, 2):
-        diagnosis = make_diagnosis(findings, samples=300, channels=2)
-        rows = dict(say.held_out_rows(diagnosis))
-        assert list(rows)[-1] == "with any smooth correction (the ceiling)"
-        assert rows["with any smooth correction (the ceiling)"] == [
-            f"{diagnosis.ceiling.rmse:.3f}", "−0.895", "1.40, 1.40", "0.300, 0.300",
-        ]  # fmt: skip
+SMOOTH = "with a smooth correction by all recorded columns"
+
+
+@pytest.mark.parametrize("findings", [0, 2])
+def test_a_smooth_correction_that_is_better_stands_beside_the_models_compared(findings):
+    diagnosis = make_diagnosis(findings, samples=300, channels=2)
+    rows = dict(say.held_out_rows(diagnosis))
+    assert list(rows)[-1] == SMOOTH
+    assert rows[SMOOTH] == [f"{diagnosis.ceiling.rmse:.3f}", "−0.895", "1.40, 1.40", "0.300, 0.300"]
+    text = text_of(diagnosis_report(diagnosis))
+    assert f"{SMOOTH} {diagnosis.ceiling.rmse:.3f} −0.895" in text
+    assert "It is no bound: a step or a sharp corner goes beyond it." in text
+    present = f"{'with the findings it is' if findings else 'the residual is'} {diagnosis.corrected.rmse:.3f} µT"
+    assert say.smooth_fit(diagnosis).endswith(f"reaches {diagnosis.ceiling.rmse:.3f} µT; {present}")
+
+
+def test_a_smooth_correction_that_findings_beat_is_not_told_of():
+    diagnosis = make_diagnosis(2, samples=300)
+    worse = dataclasses.replace(diagnosis.ceiling, rmse=1.2 * diagnosis.corrected.rmse)
+    beaten = dataclasses.replace(diagnosis, ceiling=worse)
+    assert say.smooth_fit(beaten) == ""
+    assert list(dict(say.held_out_rows(beaten))) == ["the simulation as it is", "with the findings"]
+    text = text_of(diagnosis_report(beaten))
+    assert "smooth correction" not in text
+    assert "no bound" not in text
+    # where nothing was found it is no judgement on anything
+    adequate = dataclasses.replace(make_diagnosis(0, samples=300), ceiling=worse)
+    assert "smooth correction" in text_of(diagnosis_report(adequate))
+
+
+def graded(gain, interval, before, after):
+    """A step whose held-out evidence this is, and what the page says first."""
+    held_out = HeldOut(gain, interval, before, after, "µT")
+    diagnosis = first_changed(make_diagnosis(1, samples=240), held_out=held_out, alternatives=())
+    diagnosis = dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
+    return top.headline(diagnosis), top.tone(diagnosis), " ".join(top.to_do(diagnosis)), diagnosis
+
+
+def test_a_finding_that_unseen_blocks_do_not_confirm_is_not_to_be_used():
+    headline, tone, doing, diagnosis = graded(0.134, (-0.019, 0.276), 1.74, 1.73)
+    assert headline == (
+        "Found, but not confirmed on unseen blocks and too small to be worth correcting: hard-iron step."
+    )
+    assert tone == "faint"
+    assert "Do not correct for hard-iron step yet" in doing
+    assert "use the calibration" not in doing
+    assert top.apply_command(diagnosis) == ""
+    text = text_of(diagnosis_report(diagnosis))
+    assert "probably better on unseen blocks, not surely" in text
+    assert "mkc apply" not in text
+    assert '<h1 class="faint">' in diagnosis_report(diagnosis)
+    larger, *_ = graded(0.16, (-0.01, 0.40), 0.269, 0.231)
+    assert larger == "Found, but not confirmed on unseen blocks: hard-iron step."
+
+
+def test_a_finding_that_hardly_changes_the_residual_is_small():
+    headline, tone, doing, diagnosis = graded(0.05, (0.03, 0.07), 1.74, 1.70)
+    assert headline == "Real, but small beside the noise: hard-iron step."
+    assert tone == "faint"
+    assert "Leave hard-iron step alone" in doing
+    assert "by 2.3 % only" in doing
+    assert top.apply_command(diagnosis) == ""
+
+
+def test_a_finding_that_is_clear_is_left_out_of_the_simulation():
+    headline, tone, doing, diagnosis = graded(0.31, (0.28, 0.35), 0.9, 0.5)
+    assert headline == "Left out of the simulation: hard-iron step."
+    assert tone == "found"
+    assert doing.startswith("Look for what changed at that time; use the calibration from after the step.")
+    assert "The model found here corrects for hard-iron step" in doing
+    assert "surely better on unseen blocks" in text_of(diagnosis_report(diagnosis))
+
+
+def test_structure_without_a_finding_is_not_called_nothing():
+    quiet = make_diagnosis(0, samples=240)
+    assert top.tone(quiet) == "good"
+    rare = make_diagnosis(0, samples=240, p_value=0.04)
+    assert top.headline(rare).startswith("Something is there that noise alone rarely makes, but no effect")
+    smooth = make_diagnosis(0, samples=240, remaining=("temperature",))
+    assert top.headline(smooth).startswith("Something smooth remains along temperature that no effect")
+    for diagnosis in (rare, smooth):
+        assert top.tone(diagnosis) == "open"
         text = text_of(diagnosis_report(diagnosis))
-        assert f"with any smooth correction (the ceiling) {diagnosis.ceiling.rmse:.3f} −0.895" in text
-        assert "The ceiling is how far curves of all columns and of time come" in text
+        assert "Nothing is missing" not in text
+        assert "Use the simulation as it is" not in text
+    beside = make_diagnosis(1, samples=240, remaining=("load",))
+    assert top.headline(beside).endswith(
+        "Yet something smooth remains along load that no effect in the catalogue accounts for."
+    )
+
+
+@pytest.mark.parametrize(
+    ("simulation", "command"),
+    [
+        ("magnetometer", "mkc apply model.json NEW.csv --output corrected.csv"),
+        ("simulated", "mkc apply model.json NEW.csv --simulated NEW_SIM.csv --output corrected.csv"),
+        ("Pendulum", "mkc apply model.json NEW.csv --simulation FILE.py:Pendulum --output simulated.csv"),
+    ],
+)
+def test_the_command_is_that_of_the_simulation(simulation, command):
+    assert top.apply_command(make_diagnosis(1, samples=50, simulation=simulation)) == command
+    placed = first_changed(make_diagnosis(1, samples=50, simulation=simulation), placed=True)
+    assert top.apply_command(placed) == ""
+
+
+def test_moments_and_what_each_number_is_are_told():
+    jumps = Parameter("heading_change", (11.2, 5.8, -1.2), (4.4, 3.9, 0.6), "°", ("jump at 61.1 s", "at 77.8 s", "c"))
+    changed = first_changed(
+        make_diagnosis(1, samples=4500), onset=61.1, moments=(61.1, 77.8), parameters=(jumps,), channels=("heading",)
+    )
+    page = diagnosis_report(changed)
+    text = text_of(page)
+    assert "Anew at 61.1 s and 77.8 s; acts on heading." in text
+    assert "jump at 61.1 s: 11.2 ± 4.4 ° at 77.8 s: 5.8 ± 3.9 ° c: −1.2 ± 0.6 °" in text
+
+
+def test_a_step_that_comes_and_goes_says_so():
+    intervals = ((8.0, 9.0), (20.0, 22.0), (34.0, 37.3), (50.0, 51.0))
+    diagnosis = first_changed(
+        make_diagnosis(1, samples=4500),
+        onset=6.2, onset_interval=(5.9, 6.3), intervals=intervals, alternatives=(), comes_and_goes=True,
+    )  # fmt: skip
+    diagnosis = dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
+    text = text_of(diagnosis_report(diagnosis))
+    told = "irst at 6.2 s (95 %: 5.9 to 6.3 s), then it comes and goes, mainly in 4 intervals, the longest from 34.0"
+    assert text.count(told) == 2
+    assert top.headline(diagnosis) == "Left out of the simulation: hard-iron step that comes and goes."
+    assert "from 6.2 s on" not in text
+    assert "switched on and off, and that no column recorded, would look like this" in text
+    assert "Look for something that is switched" in text
+    assert "use the calibration from after the step" not in text
+
+
+def test_what_an_equation_counts_from_stands_with_it():
+    assert "δB = k (I − Ī) Ī: the mean of current over this recording, 15.0 A." in text_of(page_of(2))
+
+
+def test_numbers_without_an_error_say_so():
+    lag = (Parameter("lag", 1.5, None, "s"),)
+    text = text_of(diagnosis_report(first_changed(make_diagnosis(1, samples=240), parameters=lag)))
+    assert "lag 1.50 s, standard error not estimated" in text
+
+
+def test_the_noise_has_units_and_its_density_is_compared():
+    made = make_diagnosis(1, samples=240, channels=2)
+    noise = dataclasses.replace(
+        made.noise,
+        parameters={"wander": 0.379, "wander_period": 7.21, "autoregression": ((0.26, 0.1), ())},
+        units={"wander": "µT", "wander_period": "s"},
+        unit="µT",
+        checks=(
+            DensityCheck("norm", 0.021, 0.034, 4.0, 0.05, False),
+            DensityCheck("turn_x", 0.2, 0.01, 2.0, 0.05, True),
+        ),
+    )
+    text = text_of(diagnosis_report(dataclasses.replace(made, noise=noise)))
+    assert "slow wander of the offset 0.379 µT, its standard deviation over the recording" in text
+    assert "the wander falls off below a period of 7.21 s" in text
+    assert "memory of norm 0.260, 0.100 times the samples before it" in text
+    assert "memory of turn_x" not in text
+    assert "d = 0.310 µT, within ±12.0 µT" in text
+    assert "norm 0.021 0.034 (4 degrees of freedom) 0.05 no more than chance" in text
+    assert "turn_x 0.2 0.01 (2 degrees of freedom) 0.05 a Student-t is closer" in text
+
+
+def test_warnings_name_effects_and_set_their_numbers():
+    warning = "hard_iron_step by load (onset -6.1 s): p = 4e-05 at (-0.2, +0.9)."
+    text = text_of(page_of(1, warnings=(warning,)))
+    assert "Hard-iron step by load (onset −6.1 s): p = 4 × 10⁻⁵ at (−0.2, +0.9)." in text
+
+
+def test_candidates_are_in_the_order_that_is_told():
+    weak = Candidate("current_field", ("current",), "", 253.0, 22.5, behind=0.0)
+    strong = Candidate("driver_offset", ("motor_1",), "", 294.0, 24.2, behind=31.5)
+    never = Candidate("cubic_nonlinearity", (), "", 1.0, 1.4, behind=math.inf)
+    text = text_of(diagnosis_report(dataclasses.replace(
+        make_diagnosis(1, samples=240), candidates=(weak, strong, never),
+    )))  # fmt: skip
+    assert "behind the first, nats" in text
+    assert "offset dependence (motor_1) 294 24.2 31.5" in text
+    assert "not possible" in text
+    assert "ordered by how far each is behind the first one" in text
+
+
+def test_channels_of_a_compared_vector_are_explained():
+    diagnosis = make_diagnosis(0, samples=240, channels=2)
+    traces = dataclasses.replace(diagnosis.traces, channels=("along", "across_1"))
+    text = text_of(diagnosis_report(dataclasses.replace(diagnosis, traces=traces)))
+    assert "along: the part of the residual along the ambient field" in text
+    assert "across_1 and across_2: the two parts at right angles" in text
+
+
+def test_figures_above_are_told_of_only_where_they_are():
+    assert "Figures above" in text_of(page_of(2, samples=4500))
+    bare = make_diagnosis(2, samples=240)
+    findings = tuple(dataclasses.replace(f, onset=None, intervals=()) for f in bare.findings)
+    assert "Figures above" not in text_of(diagnosis_report(dataclasses.replace(bare, findings=findings)))
+
+
+def test_a_long_name_is_whole_where_there_is_room():
+    made = make_diagnosis(1, samples=240)
+    curve = dataclasses.replace(made.findings[0].curve, driver="position along its longest direction", unit="m")
+    names = ("position_x", "position_y")
+    drivers = dict.fromkeys(names, made.traces.time)
+    wide = first_changed(made, curve=curve, drivers=names)
+    wide = dataclasses.replace(wide, traces=dataclasses.replace(wide.traces, drivers=drivers))
+    assert "position along its longest direction (m)" in text_of(diagnosis_report(wide))
 
 
 def test_whether_a_finding_extrapolates_is_said():

@@ -9,7 +9,7 @@ pytest.importorskip("rich")
 from rich.console import Console
 
 from mkc_torch._commands.diagnosis_summary import show
-from mkc_torch.diagnosis.result import Region
+from mkc_torch.diagnosis.result import Parameter, Region
 from tests.diagnosis.factory import make_diagnosis
 
 
@@ -26,7 +26,7 @@ def flat(text):
 
 def test_a_finding_in_a_dozen_lines():
     text = shown(make_diagnosis(1), ["out/flight_07/diagnosis.json"])
-    assert len(text.strip().splitlines()) <= 15
+    assert len(text.strip().splitlines()) <= 22
     for words in (
         "flight_07 against magnetometer",
         "Left out of the simulation: hard-iron step or current field (current)",
@@ -34,11 +34,15 @@ def test_a_finding_in_a_dozen_lines():
         "where from 41.3 s on; acts on mag_x, mag_y, mag_z",
         "driven by no recorded column",
         "how sure p = 0.005, the smallest that 199 surrogates can show",
-        "held out +0.312 nats a sample (95 %: 0.281 to 0.350), residual 0.912 → 0.521 µT (43 % less)",
+        "held out surely better on unseen blocks: residual 0.912 → 0.521 µT (43 % less), +0.312 nats a sample (95 %: "
+        "0.281 to 0.350); 0 is no better",
         "or current field (current): this recording cannot tell",
-        "ceiling a smooth correction by all columns and by time reaches",
+        "compare a smooth correction by all recorded columns and by time reaches",
         "noise autoregressive: noise with a memory",
-        "to do Record at two more temperatures",
+        "to do Look for what changed at that time; use the calibration from after the step.",
+        "To tell hard-iron step from current field (current), record again: a step does not come at the same moment",
+        "The model found here corrects for hard-iron step: confirm it on a second recording.",
+        "mkc apply model.json NEW.csv --output corrected.csv",
         "warning 3 samples",
         "written out/flight_07/diagnosis.json",
     ):
@@ -67,7 +71,8 @@ def test_several_findings_are_numbered():
         assert line in text.splitlines()
     assert "doubtful A curve has no size to compare." in flat(text)
     assert "together residual" in flat(text)
-    assert "less) Blocks of 4 s with gaps of 1 s." in flat(text)
+    assert "−0.0004 to 0.0046) Blocks of 4 s with gaps of 1 s." in flat(text)
+    assert text.count("0 is no better") == 1
 
 
 def test_structure_that_remains():
@@ -98,5 +103,21 @@ def test_every_width(width):
     assert "hard-iron step" in text
 
 
-def test_without_a_ceiling_there_is_no_line_of_it():
-    assert "ceiling" not in shown(make_diagnosis(1, ceiling=None))
+def test_without_a_smooth_correction_there_is_no_line_of_it():
+    assert "smooth correction" not in shown(make_diagnosis(1, ceiling=None))
+
+
+def test_a_rare_p_value_does_not_stand_beside_nothing_is_missing():
+    text = flat(shown(make_diagnosis(0, p_value=0.04)))
+    assert "Nothing is missing" not in text
+    assert "Something is there that noise alone rarely makes" in text
+    assert "how sure p = 0.04" in text
+
+
+def test_a_list_of_many_numbers_is_told_by_its_largest():
+    made = make_diagnosis(1)
+    slopes = Parameter("gradient", (0.1, -0.6, 3.0, 0.2, 0.3, 0.4, 0.5), (0.1,) * 7, "µT/m", tuple("abcdefg"))
+    text = flat(
+        shown(dataclasses.replace(made, findings=(dataclasses.replace(made.findings[0], parameters=(slopes,)),)))
+    )
+    assert "size gradient up to c: 3.00 ± 0.10 µT/m and more, see the report" in text

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.diagnosis.result import DensityCheck
 from mkc_torch.distribution import MKCDistribution
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["density_warnings", "effective_size", "kolmogorov", "student_cdf", "student_fit"]
+__all__ = ["density_checks", "density_warnings", "effective_size", "kolmogorov", "student_cdf", "student_fit"]
 
 _FREEDOM = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 """Degrees of freedom that are tried."""
@@ -29,19 +30,19 @@ _CLOSER = 0.5
 _ROUNDS, _NODES = 30, 2001
 
 
-def density_warnings(
+def density_checks(
     residual: Float[Tensor, "N m"],
     sigma: Float[Tensor, " m"],
     d: Float[Tensor, " m"],
     bound: Float[Tensor, " m"],
     channels: Sequence[str],
-) -> tuple[str, ...]:
-    """A sentence on the channels whose residuals, outliers among them, are clearly not of the density fitted to them.
+) -> tuple[DensityCheck, ...]:
+    """How far the residuals of each channel, outliers among them, are from their density, and from a Student-t.
 
     Their sizes go through the density's distribution function (probability-integral transform), which makes them
-    uniform if it is theirs. They are warned of if their Kolmogorov distance from that is beyond what so many samples
-    allow, as many as their autocorrelation leaves, while a Student-t around zero is likelier, much closer, and within
-    what they allow. Outliers that neither of the two describes are not told of.
+    uniform if it is theirs; the distance is Kolmogorov's from that. The other one is that of the likeliest Student-t
+    around zero. That one is the closer if the density's distance is beyond what so many samples allow, as many as their
+    autocorrelation leaves, while the Student-t is likelier, at half the distance, and within what they allow.
 
     Args:
         residual: of the final model.
@@ -52,8 +53,9 @@ def density_warnings(
         >>> order = torch.randperm(4000, generator=torch.Generator().manual_seed(0)).double()
         >>> cauchy = torch.tan(torch.pi * ((order + 0.5) / 4000 - 0.5)).unsqueeze(-1)
         >>> sigma, d, bound = (torch.tensor([v], dtype=torch.float64) for v in (3.0, 1.0, 2000.0))
-        >>> density_warnings(cauchy, sigma, d, bound, ["norm"])[0].partition(":")[0]
-        'The density does not describe the residuals of norm'
+        >>> (check,) = density_checks(cauchy, sigma, d, bound, ["norm"])
+        >>> check.degrees_of_freedom, check.closer
+        (1.0, True)
     """
     size = residual.abs()
     density = MKCDistribution(sigma, d, bound, validate_args=False)
@@ -64,19 +66,31 @@ def density_warnings(
     for k, channel in enumerate(channels):
         distance = kolmogorov(uniform[:, k])
         allowed = _BEYOND / math.sqrt(effective_size(uniform[:, k]))
-        if distance <= allowed:
-            continue
         freedom, scale, other = student_fit(residual[:, k])
-        closer = kolmogorov(student_cdf(size[:, k] / scale, freedom))
-        if other > float(likelihood[k]) and closer < min(_CLOSER * distance, allowed):
-            found.append((distance, closer, freedom, channel))
-    if not found:
+        near = kolmogorov(student_cdf(size[:, k] / scale, freedom))
+        closer = distance > allowed and other > float(likelihood[k]) and near < min(_CLOSER * distance, allowed)
+        found.append(DensityCheck(channel, distance, near, freedom, allowed, closer))
+    return tuple(found)
+
+
+def density_warnings(checks: Sequence[DensityCheck]) -> tuple[str, ...]:
+    """A sentence on the channels whose residuals are clearly not of the density fitted to them, and of a Student-t.
+
+    Outliers that neither of the two describes are not told of.
+
+    Example:
+        >>> density_warnings([DensityCheck("norm", 0.12, 0.01, 2.0, 0.05, True)])[0].partition(":")[0]
+        'The density does not describe the residuals of norm'
+    """
+    misfit = [check for check in checks if check.closer]
+    if not misfit:
         return ()
-    distance, closer, freedom, _ = max(found)
+    worst = max(misfit, key=lambda check: check.distance)
     return (
-        f"The density does not describe the residuals of {', '.join(channel for *_, channel in found)}: its "
-        f"distribution function is off by up to {distance:.2g}, that of a Student-t with {freedom:g} degrees of "
-        f"freedom by {closer:.2g}. A misfit of the tail must not be read as physics.",
+        f"The density does not describe the residuals of {', '.join(check.channel for check in misfit)}: its "
+        f"distribution function is off by up to {worst.distance:.2g}, that of a Student-t with "
+        f"{worst.degrees_of_freedom:g} degrees of freedom by {worst.student_distance:.2g}. A misfit of the tail must "
+        "not be read as physics.",
     )
 
 
@@ -125,10 +139,11 @@ def student_fit(error: Float[Tensor, " N"]) -> tuple[float, float, float]:
     """
     freedom = error.new_tensor(_FREEDOM).unsqueeze(-1)
     square = error.square()
-    variance = square.median().clamp(min=torch.finfo(error.dtype).tiny).expand(len(freedom), 1)
+    least = torch.finfo(error.dtype).tiny  # of residuals that are all zero
+    variance = square.median().clamp(min=least).expand(len(freedom), 1)
     for _ in range(_ROUNDS):
         weight = (freedom + 1.0) / (freedom + square / variance)
-        variance = (weight * square).mean(-1, keepdim=True)
+        variance = (weight * square).mean(-1, keepdim=True).clamp(min=least)
     likelihood = (
         torch.lgamma(0.5 * (freedom + 1.0))
         - torch.lgamma(0.5 * freedom)

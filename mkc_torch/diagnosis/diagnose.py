@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._forked import meanwhile, shared
+from mkc_torch.diagnosis.advice import advice_of
 from mkc_torch.diagnosis.candidates import candidate_terms, described
 from mkc_torch.diagnosis.density_check import density_warnings
 from mkc_torch.diagnosis.diagnosed_model import model_of
@@ -31,7 +32,7 @@ from mkc_torch.diagnosis.preference import ALIKE_COLUMNS, UNKNOWN, alike
 from mkc_torch.diagnosis.refit import FittedModel, fitted
 from mkc_torch.diagnosis.rejected import rejected_warning
 from mkc_torch.diagnosis.remaining import remaining_warning
-from mkc_torch.diagnosis.result import Candidate, Diagnosis, Finding, HeldOut, Separability, Spread, Traces, Verdict
+from mkc_torch.diagnosis.result import Candidate, Diagnosis, HeldOut, Separability, Spread, Traces, Verdict
 from mkc_torch.diagnosis.separability import separability
 from mkc_torch.diagnosis.shifts import shift_warning
 from mkc_torch.diagnosis.side_by_side import known_of, learn, with_memory
@@ -39,7 +40,7 @@ from mkc_torch.diagnosis.simplified import simplified
 from mkc_torch.diagnosis.units import unit_warnings
 from mkc_torch.diagnosis.unrecorded import course_without, located_cause
 from mkc_torch.effects import CATALOGUE
-from mkc_torch.effects.protocol import Effect
+from mkc_torch.effects.protocol import Effect, FormedEffect
 from mkc_torch.effects.unrecorded import Unrecorded
 from mkc_torch.recording import Recording
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
@@ -354,12 +355,13 @@ def _assembled(
         )
         for k, (s, more) in enumerate(zip(found, ending.beyond, strict=True))
     ]
-    return Diagnosis(
+    noise = noise_summary(final)
+    diagnosis = Diagnosis(
         recording=prepared.recording.name,
         simulation=prepared.name,
         samples=len(prepared.time),
         level=asked.level,
-        noise=noise_summary(final),
+        noise=noise,
         candidates_tried=tried,
         surrogates=asked.surrogates,
         seed=asked.seed,
@@ -369,7 +371,7 @@ def _assembled(
         baseline=_spread(evidence[0], inliers),
         corrected=_spread(evidence[-1], inliers),
         ceiling=_spread(ending.reach.evidence, inliers),
-        advice=_advice(findings),
+        advice=(),
         warnings=(
             *prepared.recording.warnings,
             *unit_warnings(prepared.recording),
@@ -382,13 +384,15 @@ def _assembled(
             *ending.stand_in,
             *(sentence for finding in findings for sentence in shift_warning(finding)),
             *(sentence for finding in findings for sentence in extrapolation_warning(finding)),
-            *density_warnings(final.fit.residual, final.fit.sigma, final.fit.d, final.fit.bound, prepared.channels),
+            *density_warnings(noise.checks),
         ),
         candidates=_candidates(first),
         separability=separability(first) if first else _nothing_to_separate(),
         traces=_traces(prepared, drivers, base, final),
+        remaining=ending.left,
         model=model_of(final, simulation),
     )
+    return replace(diagnosis, advice=advice_of(diagnosis))
 
 
 def _verdict(
@@ -452,26 +456,6 @@ def _spread(evidence: Evidence, inliers: Bool[Tensor, "N m"]) -> Spread:
     )
 
 
-def _advice(findings: Sequence[Finding]) -> tuple[str, ...]:
-    advice = []
-    for finding in findings:
-        near = [a for a in finding.alternatives if not a.separable]
-        if near:
-            told = ", ".join(
-                dict.fromkeys(f"{a.effect} ({', '.join(a.drivers)})" if a.drivers else a.effect for a in near)
-            )
-            driven = finding.drivers or any(a.drivers for a in near)
-            how = (
-                "change one and hold the other" if driven or not near[0].at else "at other speeds, loads and amplitudes"
-            )
-            advice.append(f"To tell {finding.effect} from {told}, record again while they go different ways: {how}.")
-        if not finding.plausible:
-            advice.append(
-                f"The size of {finding.effect} is not plausible: look for another cause before correcting it."
-            )
-    return tuple(dict.fromkeys(advice))
-
-
 def _candidates(first: Located | None) -> tuple[Candidate, ...]:
     if first is None:
         return ()
@@ -479,13 +463,20 @@ def _candidates(first: Located | None) -> tuple[Candidate, ...]:
         Candidate(
             first.terms[r.number].effect.id,
             first.terms[r.number].columns,
-            described(first.terms[r.number].shape),
+            _shape(first.terms[r.number]),
             r.gain,
             math.sqrt(2.0 * max(r.gain, 0.0)),
             first.terms[r.number].at,
+            r.gap,
         )
         for r in first.ranking
     )
+
+
+def _shape(term: Term) -> str:
+    """What of an effect's shape is told: not what chooses its form."""
+    chosen = term.effect.choices if isinstance(term.effect, FormedEffect) else ()
+    return described({name: value for name, value in term.shape.items() if name not in chosen})
 
 
 def _nothing_to_separate() -> Separability:
@@ -493,9 +484,8 @@ def _nothing_to_separate() -> Separability:
 
 
 def _not_confirmed(located: Located) -> str:
-    what = f"{_called(located.term)} ({described(located.term.shape) or 'no onset'})"
-    if isinstance(located.term.effect, Unrecorded):
-        what = "A cause that no column recorded"
+    shape = _shape(located.term)
+    what = f"{_called(located.term)} ({shape})" if shape else _called(located.term)
     return (
         f"{what}: p = {located.p_value:.2g} after the whole search, but it does not predict blocks better that the fit "
         "has not seen, so it does not count as a finding."
@@ -514,7 +504,12 @@ def _in_one_stretch(located: Located | None, time: Float[Tensor, " N"]) -> tuple
 
 
 def _called(term: Term) -> str:
-    return " of ".join([term.effect.id, *([", ".join(term.columns)] if term.columns else [])])
+    if isinstance(term.effect, Unrecorded):
+        return "a cause that no column recorded"
+    along = "a curve along" if term.effect.id == UNKNOWN else f"{term.effect.id} by"
+    if term.columns:
+        return f"{along} {', '.join(term.columns)}"
+    return "a curve without a name" if term.effect.id == UNKNOWN else term.effect.id
 
 
 def _time_warnings(prepared: PreparedSimulation) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from mkc_torch.diagnosis.result import Diagnosis, Finding, HeldOut, Noise, Number, Parameter, Spread
+from mkc_torch.diagnosis.result import DensityCheck, Diagnosis, Finding, HeldOut, Noise, Number, Parameter, Spread
 
 __all__ = ["SCHEMA", "DiagnosisFileError", "diagnosis_to_json", "json_schema", "validate"]
 
@@ -83,6 +83,9 @@ def validate(content: Mapping[str, Any]) -> None:
             if not _alike(parameter["value"], parameter["standard_error"]):
                 place = _where(("findings", i, "parameters", k, "standard_error"))
                 raise DiagnosisFileError(f"this is no diagnosis: {place} has not the shape of the value.")
+            if "components" in parameter and len(parameter["components"]) != _count(parameter["value"]):
+                place = _where(("findings", i, "parameters", k, "components"))
+                raise DiagnosisFileError(f"this is no diagnosis: {place} are not as many as the numbers of the value.")
         for k, (start, end) in enumerate(finding["intervals"]):
             if end < start:
                 place = _where(("findings", i, "intervals", k))
@@ -110,6 +113,19 @@ def _noise(noise: Noise) -> dict[str, Any]:
         "d": noise.d,
         "bound": noise.bound,
         "description": noise.description,
+        **({"units": dict(noise.units)} if noise.units else {}),
+        **({"unit": noise.unit} if noise.unit else {}),
+        **({"density_check": [_density_check(check) for check in noise.checks]} if noise.checks else {}),
+    }
+
+
+def _density_check(check: DensityCheck) -> dict[str, Any]:
+    return {
+        "channel": check.channel,
+        "distance": check.distance,
+        "student_t_distance": check.student_distance,
+        "degrees_of_freedom": check.degrees_of_freedom,
+        "allowed": check.allowed,
     }
 
 
@@ -152,12 +168,17 @@ def _finding(finding: Finding) -> dict[str, Any]:
         **({} if f.driver_shift is None else {"driver_shift": asdict(f.driver_shift)}),
         **({} if f.region is None else {"region": asdict(f.region)}),
         **({"experiments": f.experiments} if f.experiments else {}),
+        **({"moments": f.moments} if f.moments else {}),
+        **({"references": [asdict(one) for one in f.references]} if f.references else {}),
+        **({"advice": f.advice} if f.advice else {}),
+        **({"comes_and_goes": True} if f.comes_and_goes else {}),
     }
 
 
 def _parameter(parameter: Parameter) -> dict[str, Any]:
     p = parameter
-    return {"name": p.name, "value": p.value, "standard_error": _known(p.standard_error), "unit": p.unit}
+    told = {"name": p.name, "value": p.value, "standard_error": _known(p.standard_error), "unit": p.unit}
+    return {**told, **({"components": p.components} if p.components else {})}
 
 
 def _held_out(held_out: HeldOut) -> dict[str, Any]:
@@ -186,6 +207,10 @@ def _alike(value: Any, error: Any) -> bool:
     if isinstance(value, list) and isinstance(error, list):
         return len(value) == len(error) and all(_alike(v, e) for v, e in zip(value, error, strict=True))
     return error is None or not (isinstance(value, list) or isinstance(error, list))
+
+
+def _count(value: Any) -> int:
+    return len(value) if isinstance(value, list) else 1
 
 
 def _refuse_not_finite(content: Mapping[str, Any]) -> None:

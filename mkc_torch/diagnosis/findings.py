@@ -18,8 +18,20 @@ from mkc_torch.diagnosis.model import Term, follows_signal
 from mkc_torch.diagnosis.preference import UNKNOWN
 from mkc_torch.diagnosis.ranking import SEPARABLE
 from mkc_torch.diagnosis.regions import attributed, map_of, region_of, shares_of_runs
-from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter
-from mkc_torch.effects.protocol import Context, PartEffect, RelativeEffect
+from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter, Reference
+from mkc_torch.diagnosis.switched import comes_and_goes, memory_of
+from mkc_torch.effects.protocol import (
+    ComponentsEffect,
+    Context,
+    Effect,
+    FormedEffect,
+    MomentsEffect,
+    PartEffect,
+    PlacedEffect,
+    RelativeEffect,
+    ShapeUnitsEffect,
+    TellingEffect,
+)
 from mkc_torch.effects.units import ratio, tidy
 from mkc_torch.effects.unrecorded import COURSE, Unrecorded
 from mkc_torch.nonlinear import beside
@@ -27,7 +39,7 @@ from mkc_torch.nonlinear import beside
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["finding_of", "intervals_of", "labels", "parameters_of", "places_of"]
+__all__ = ["finding_of", "gain_of", "intervals_of", "labels", "parameters_of", "places_of"]
 
 _MOST_ALTERNATIVES = 5
 _FARTHEST = 30.0
@@ -56,14 +68,16 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
     shape = _shape_parameters(term, context, final.shape_errors[number])
     of_time = isinstance(term.effect, Unrecorded)
     told_as = formulas(curve) if term.effect.id == UNKNOWN and not of_time and curve is not None else ()
+    moments = term.effect.moments(context) if isinstance(term.effect, MomentsEffect) else ()
+    gain, time, onset = gain_of(final, number), final.fit.model.prepared.time, term.shape.get("onset")
     return Finding(
         effect=term.effect.id,
         drivers=term.columns,
         channels=channels,
-        intervals=intervals_of(final, number),
-        onset=term.shape.get("onset"),
-        equation="; ".join([term.effect.equation, *told_as]),
-        explanation=f"{term.effect.explanation} {term.effect.advice}".strip(),
+        intervals=intervals_of(gain, time),
+        onset=moments[0] if moments else onset,
+        equation="; ".join([_equation(term, context), *told_as]),
+        explanation=term.effect.explanation,
         parameters=(*parameters_of(term, gamma, covariance, context), *shape),
         p_value=located.p_value,
         held_out=held,
@@ -75,7 +89,30 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
         region=None if where is None else region_of(where),
         experiments=() if where is None else shares_of_runs(where),
         map=None if where is None else map_of(where),
+        moments=moments,
+        references=_references(term),
+        advice=term.effect.advice,
+        again=_again(term.effect),
+        placed=isinstance(term.effect, PlacedEffect) and term.effect.placed,
+        comes_and_goes=onset is not None and comes_and_goes(gain, time, onset, memory_of(final.colour.coefficients)),
     )
+
+
+def _equation(term: Term, context: Context) -> str:
+    """In the form that the shape chose."""
+    effect = term.effect
+    return effect.equation_of(term.shape, context) if isinstance(effect, FormedEffect) else effect.equation
+
+
+def _references(term: Term) -> tuple[Reference, ...]:
+    if term.driver is None:
+        return ()
+    values = term.driver.reference.tolist()
+    return tuple(Reference(*one) for one in zip(term.columns, values, term.driver.units, strict=True))
+
+
+def _again(effect: Effect) -> str:
+    return effect.again if isinstance(effect, TellingEffect) else ""
 
 
 def places_of(term: Term, channels: Sequence[str]) -> tuple[str, ...]:
@@ -111,15 +148,25 @@ def parameters_of(
         start += quantity.size
         if readings is not None:
             value, spread = readings(quantity.name, value, covariance[mine, mine])
-        parameters.append(Parameter(quantity.name, _numbers(value), _numbers(spread), tidy(quantity.unit)))
+        components = _components(term, quantity.name, quantity.size, context)
+        parameters.append(Parameter(quantity.name, _numbers(value), _numbers(spread), tidy(quantity.unit), components))
     return tuple(parameters)
 
 
+def _components(term: Term, quantity: str, size: int, context: Context) -> tuple[str, ...]:
+    """What the numbers of a quantity are: as the effect says, or one for each channel."""
+    if size < 2:
+        return ()
+    own = term.effect.components(quantity, term.shape, context) if isinstance(term.effect, ComponentsEffect) else ()
+    return own or (tuple(context.channels) if size == len(context.channels) else ())
+
+
 def _shape_parameters(term: Term, context: Context, errors: Mapping[str, float]) -> tuple[Parameter, ...]:
+    chosen = term.effect.choices if isinstance(term.effect, FormedEffect) else ()
     return tuple(
         Parameter(name, value, errors.get(name), _unit_of_shape(term, name, context))
         for name, value in term.shape.items()
-        if name != "onset" and not name.startswith(COURSE)
+        if name != "onset" and not name.startswith(COURSE) and name not in chosen
     )
 
 
@@ -127,6 +174,8 @@ def _unit_of_shape(term: Term, name: str, context: Context) -> str:
     if isinstance(term.effect, RelativeEffect) and name in term.effect.relative:
         part = term.effect.relative[name][0]
         return context.units[0] if part == "driver" else context.unit_of(part)
+    if isinstance(term.effect, ShapeUnitsEffect) and (own := term.effect.unit_of_shape(name, context)):
+        return own
     return "s" if name in _SECONDS else ""
 
 
@@ -164,23 +213,27 @@ def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
         if rival.key == term.key or ranked.gap > _FARTHEST:
             continue
         gap = max(ranked.gap, 0.0)
-        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= SEPARABLE, rival.at))
+        again = _again(rival.effect)
+        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= SEPARABLE, rival.at, again))
     near = [a for a in found if not a.separable]
     return tuple(near + [a for a in found if a.separable][: max(0, _MOST_ALTERNATIVES - len(near))])
 
 
-def intervals_of(final: Estimate, number: int) -> tuple[tuple[float, float], ...]:
-    """Where the effect's gain is concentrated: the fewest of sixty blocks that hold nine tenths of it.
-
-    Empty where that is more than a third of the recording, and where runs share their times.
-    """
+def gain_of(final: Estimate, number: int) -> Float[Tensor, " N"]:
+    """What one effect gains at each sample, in nats, all else as it is."""
     fit = final.fit
     model, parameters = fit.model, fit.parameters.clone()
     start = model.base + sum(model.sizes[:number])
     with_it = scored(model.residual(parameters), fit.sigma, fit.d, fit.bound)
     parameters[start : start + model.sizes[number]] = 0.0
-    gain = (with_it - scored(model.residual(parameters), fit.sigma, fit.d, fit.bound)).detach()
-    time = model.prepared.time
+    return (with_it - scored(model.residual(parameters), fit.sigma, fit.d, fit.bound)).detach()
+
+
+def intervals_of(gain: Float[Tensor, " N"], time: Float[Tensor, " N"]) -> tuple[tuple[float, float], ...]:
+    """Where an effect's gain is concentrated: the fewest of sixty blocks that hold nine tenths of it.
+
+    Empty where that is more than a third of the recording, and where runs share their times.
+    """
     N = len(time)
     count = min(_BLOCKS, N // 10)
     if count < 10 or bool((time.diff() < 0).any()):
@@ -236,7 +289,7 @@ def _along(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | N
             along = values @ direction
             x = torch.linspace(float(along.min()), float(along.max()), _POINTS, dtype=values.dtype)
             drivers, unit, shown = x.unsqueeze(-1) * direction, term.driver.units[0], x
-            name = f"{term.columns[0].rpartition('_')[0]} along its main direction"
+            name = f"{term.columns[0].rpartition('_')[0]}, main direction"
         time = torch.arange(_POINTS, dtype=values.dtype)
         return name, unit, shown, replace(context, time=time, drivers=drivers, signal=flat)
     if follows_signal(term.effect):

@@ -17,6 +17,7 @@ __all__ = [
     "Alternative",
     "Candidate",
     "Curve",
+    "DensityCheck",
     "Diagnosis",
     "DriverShift",
     "Extrapolation",
@@ -24,6 +25,7 @@ __all__ = [
     "HeldOut",
     "Noise",
     "Parameter",
+    "Reference",
     "Region",
     "Separability",
     "Spread",
@@ -37,11 +39,24 @@ Number = float | tuple["Number", ...]
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of an effect; ``standard_error`` has the shape of ``value`` and None where it is not known."""
+    """A parameter of an effect; ``standard_error`` has the shape of ``value`` and None where it is not known.
+
+    ``components`` says what each number of a list is, in their order; empty for a single number.
+    """
 
     name: str
     value: Number
     standard_error: Number | None
+    unit: str
+    components: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The value of a driver's column, its mean over the recording, that an equation counts from: T̄, Ī, x̄."""
+
+    column: str
+    value: float
     unit: str
 
 
@@ -77,7 +92,8 @@ class DriverShift:
 class Alternative:
     """Another candidate for a finding: how much less likely it is, in nats, and whether the data tell them apart.
 
-    ``at`` is where it acts, of several places that a simulation has for it.
+    ``at`` is where it acts, of several places that a simulation has for it; ``again`` what becomes of it in another
+    recording.
     """
 
     effect: str
@@ -85,6 +101,7 @@ class Alternative:
     log_likelihood_gap: float
     separable: bool
     at: str = ""
+    again: str = ""
 
 
 @dataclass(frozen=True)
@@ -136,6 +153,10 @@ class Finding:
     ``driver_shift`` of an effect without a recorded driver. ``region``
     is None where the gain arises all over the states, or where the simulation has none; ``experiments`` has each run's
     share of the gain, and is empty for a single run. ``onset_interval`` holds the onset with 95 % confidence.
+    ``moments`` are those at which an effect sets in that does so several times, the first of them its onset.
+    ``references`` are what the equation counts its drivers from, ``advice`` what to do about it, ``again`` what becomes
+    of it in another recording; one that is ``placed`` belongs to the place or the attitude of this recording. A step
+    ``comes_and_goes`` where it is as if something was switched on and off.
     """
 
     effect: str
@@ -159,14 +180,37 @@ class Finding:
     experiments: tuple[float, ...] = ()
     map: StateMap | None = None
     onset_interval: tuple[float, float] | None = None
+    moments: tuple[float, ...] = ()
+    references: tuple[Reference, ...] = ()
+    advice: str = ""
+    again: str = ""
+    placed: bool = False
+    comes_and_goes: bool = False
+
+
+@dataclass(frozen=True)
+class DensityCheck:
+    """How far the density of a channel's residuals is from their distribution, and how far a Student-t is.
+
+    The distances are Kolmogorov's, between distribution functions; ``allowed`` is what one set in a thousand exceeds of
+    as many independent samples as the channel tells of. ``closer`` says that a Student-t is clearly the better one.
+    """
+
+    channel: str
+    distance: float
+    student_distance: float
+    degrees_of_freedom: float
+    allowed: float
+    closer: bool
 
 
 @dataclass(frozen=True)
 class Noise:
     """The noise that structure was tested against.
 
-    ``model`` is one of "white", "ar" and "random_walk"; ``parameters`` names its numbers; ``bound`` is the half-width
-    of the density's domain, one for all models compared.
+    ``model`` is one of "white", "ar" and "random_walk"; ``parameters`` names its numbers, ``units`` those that have
+    a unit; ``bound`` is the half-width of the density's domain, one for all models compared. ``unit`` is that of d and
+    the bound, ``checks`` say how well the density describes each channel.
     """
 
     model: Literal["white", "ar", "random_walk"]
@@ -175,6 +219,9 @@ class Noise:
     d: tuple[float, ...]
     bound: tuple[float, ...]
     description: str
+    units: Mapping[str, str] = field(default_factory=dict)
+    unit: str = ""
+    checks: tuple[DensityCheck, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -192,7 +239,8 @@ class Candidate:
     """One candidate of the search at its best shape, for the first finding.
 
     ``log_likelihood_gain`` is that of the linearised model in nats; ``z`` the root of twice that, roughly the number
-    of standard errors. ``at`` is where it acts, of several places that a simulation has for it.
+    of standard errors. ``at`` is where it acts, of several places that a simulation has for it; ``behind`` how many
+    nats it is behind the first one, once its numbers and its handicap are paid for.
     """
 
     effect: str
@@ -201,6 +249,7 @@ class Candidate:
     log_likelihood_gain: float
     z: float
     at: str = ""
+    behind: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -247,12 +296,13 @@ class Diagnosis:
         findings: strongest first.
         baseline, corrected: the simulation without and with the findings, on held-out blocks.
         ceiling: the simulation with a smooth correction by all columns and by time instead of the findings, on the
-            same held-out blocks: how far any fit could come. None where it was not asked for.
-        advice: what to record next or to do, in sentences.
-        warnings: what was noticed.
+            same held-out blocks, for comparison; a step, say, goes beyond it. None where it was not asked for.
+        advice: what to do or to record next, in sentences, effects by their ids.
+        warnings: what was noticed, likewise.
         candidates: the candidates of the search, best first.
         separability: of the leading candidates.
         traces: the residuals.
+        remaining: columns along which something smooth remains beside the findings.
         model: the simulation's sensor or system with the findings in it; None where there is none to apply.
     """
 
@@ -275,4 +325,5 @@ class Diagnosis:
     candidates: tuple[Candidate, ...]
     separability: Separability
     traces: Traces
+    remaining: tuple[str, ...] = ()
     model: DiagnosedModel | None = field(default=None, repr=False, compare=False)

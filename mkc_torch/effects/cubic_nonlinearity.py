@@ -40,6 +40,8 @@ class CubicNonlinearity:
     equation = "δB_i = α_i B_i³ (+ β_i B_i²)"
     explanation = "The sensor's response is not a straight line: it bends at large fields."
     advice = "Correct with the fitted coefficients; check the sensor's range setting."
+    again = "a response that bends is there at all times, wherever the field along an axis is large"
+    choices = ("terms",)
     plausible = 4e-5
     plausible_unit = "1/µT²"
     source = (
@@ -48,6 +50,9 @@ class CubicNonlinearity:
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
         return ({}, {"terms": 2.0})
+
+    def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
+        return "δB_i = α_i B_i³" + (" + β_i B_i²" if "terms" in shape else "") + ",  for each axis i"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
         cubic = Quantity("coefficient", len(context.channels), f"1/{context.signal_unit}²")

@@ -33,6 +33,9 @@ class FieldGradient:
     equation = "B(p) = B₀ + G p + …,  ∇·B = 0, ∇×B = 0"
     explanation = "The ambient field is not the same everywhere: iron nearby bends it."
     advice = "Record in the open, or turn the sensor on the spot."
+    again = "what belongs to a place comes again at that place, and is gone in the open"
+    choices = ("degree",)
+    placed = True
     plausible = 200.0
     plausible_unit = "µT/m"
     source = "indoor gradients of up to some µT/cm near steel; BROAD trial 21 (Laidig et al., Data 6(7):72, 2021)"
@@ -47,12 +50,44 @@ class FieldGradient:
         gradient, curvature = Quantity("gradient", sizes[0], first), Quantity("curvature", sizes[1], second)
         return (gradient,) if shape["degree"] < 2 else (gradient, curvature)
 
+    def equation_of(self, shape: Shape, context: Context) -> str:
+        alone = len(context.channels) == 1
+        bent, second = ("", "") if shape["degree"] < 2 else (" + ½ (p − p̄)ᵀ H (p − p̄)", ", H = ∂²B/∂p²")
+        if alone:
+            return f"B(p) = B₀ + g·(p − p̄){bent},  B the strength,  g = ∂B/∂p{second} at p̄"
+        return f"B(p) = B₀ + G (p − p̄){bent},  ∇·B = 0, ∇×B = 0,  G = ∂B/∂p{second} at p̄"
+
+    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:  # noqa: ARG002
+        alone = len(context.channels) == 1
+        if quantity == "gradient":
+            return _SLOPES if alone else _GRADIENT
+        return _BENDS if alone else _CURVATURE
+
     def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]:
         terms = _polynomials if len(context.channels) == 1 else _harmonic_gradients
         return terms(context.drivers, int(shape["degree"])).mT
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
         return combined(self.basis(shape, context), gamma)
+
+
+_SLOPES = ("∂B/∂x", "∂B/∂y", "∂B/∂z")
+_BENDS = ("½ ∂²B/∂x²", "½ ∂²B/∂y²", "½ ∂²B/∂z²", "∂²B/∂x∂y", "∂²B/∂x∂z", "∂²B/∂y∂z")
+"""What the coefficients of :func:`_polynomials` are of the field's strength."""
+
+_GRADIENT = (
+    "∂B_x/∂y = ∂B_y/∂x", "∂B_x/∂z = ∂B_z/∂x", "∂B_y/∂z = ∂B_z/∂y", "(∂B_x/∂x − ∂B_y/∂y) / 2", "∂B_z/∂z / 2",
+)  # fmt: skip
+_CURVATURE = (
+    "∂²B_x/∂y∂z",
+    "(∂²B_x/∂x² − 3 ∂²B_x/∂y²) / 24",
+    "(3 ∂²B_y/∂x² − ∂²B_y/∂y²) / 24",
+    "(∂²B_z/∂x² − ∂²B_z/∂y²) / 4",
+    "∂²B_x/∂z² / 8",
+    "∂²B_y/∂z² / 8",
+    "∂²B_z/∂z² / 12",
+)
+"""What the coefficients of :func:`_harmonic_gradients` are of the field, in the axes of the position."""
 
 
 def _polynomials(p: Float[Tensor, "N 3"], degree: int) -> Float[Tensor, "N f 1"]:

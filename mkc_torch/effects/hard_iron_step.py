@@ -37,6 +37,7 @@ class HardIronStep(GainEffect):
     equation = "δB = Δb · 1[t ≥ t₀]"
     explanation = "The sensor's offset jumped: something magnetic that moves with the sensor was attached or taken off."
     advice = "Look for what changed at that time; use the calibration from after the step."
+    again = "a step does not come at the same moment again"
     plausible = 200.0
     plausible_unit = "µT"
     source = "sizes of 1-50 µT as seen when parts are mounted; BROAD trials 34-36 (Laidig et al., Data 6(7):72, 2021)"

@@ -40,6 +40,8 @@ class HeadingReset:
     equation = "B = R_z(Σ φ_k · 1[t > t_k]) B₀"
     explanation = "The recorded heading was set anew: the attitude turned about the vertical and the sensor did not."
     advice = "Use an attitude that this sensor does not steer, or the samples from between two of the jumps."
+    again = "an attitude that this sensor does not steer is not set anew"
+    placed = True
     plausible = 180.0
     plausible_unit = "°"
     source = "filters align their heading by the compass again at arming and after take-off"
@@ -48,6 +50,14 @@ class HeadingReset:
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
         return ({},)
+
+    def moments(self, context: Context) -> tuple[float, ...]:
+        # the last sample before each jump, as the simulation tells them
+        before = (context.signal <= 0.0).sum(0) - 1
+        return tuple(context.time[before].tolist())
+
+    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:  # noqa: ARG002
+        return tuple(f"jump at {moment:.1f} s" for moment in self.moments(context))
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity("heading_change", len(context.carries), context.signal_unit),)

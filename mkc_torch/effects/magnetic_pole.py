@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.effects.protocol import Context, Quantity, Shape, combined
+from mkc_torch.effects.units import sized
 from mkc_torch.nonlinear import beside
 
 if TYPE_CHECKING:
@@ -44,6 +45,9 @@ class MagneticPole:
         "from the middle of the path."
     )
     advice = "Record in the open, or turn the sensor on the spot."
+    again = "what belongs to a place comes again at that place, and is gone in the open"
+    choices = ("radius",)
+    placed = True
     plausible = 100.0
     plausible_unit = "µT·m²"
     source = "a beam of 0.01 m² magnetised to 10⁵ A/m; Telford et al., Applied Geophysics (1990), 3.6"
@@ -60,6 +64,15 @@ class MagneticPole:
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         unit = f"{context.signal_unit}·{context.units[0]}²" if context.units[0] else context.signal_unit
         return (Quantity("pole", 3 if len(context.channels) == 1 else 1, unit),)
+
+    def equation_of(self, shape: Shape, context: Context) -> str:
+        alone = len(context.channels) == 1
+        pole = "q·r / (r² + s²)^(3/2),  B the strength" if alone else "q r / (r² + s²)^(3/2)"
+        size = sized(float(shape["radius"]), context.units[0])
+        return f"B(p) = B₀ + {pole},  r = p − p̄ − c,  s = {size}, chosen, for no pole is a point"
+
+    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:  # noqa: ARG002
+        return ("q_x", "q_y", "q_z") if len(context.channels) == 1 else ()
 
     def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]:
         p = context.drivers

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.effects.protocol import Context, GainEffect, Shape
+from mkc_torch.effects.units import sized
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -42,6 +43,8 @@ class OffsetDrift(GainEffect):
     equation = "δB = Δb s(t),  s from 0 to 1 over the recording"
     explanation = "The sensor's offset drifted slowly over the recording, as it does while electronics warm up."
     advice = "Let the sensor warm up before calibrating, or record its temperature beside it."
+    again = "a warm-up comes again after a cold start"
+    choices = ("power",)
     plausible = 50.0
     plausible_unit = "µT"
     source = "warm-up of first order; diffusion of heat into a half-space goes with the root of time"
@@ -51,6 +54,17 @@ class OffsetDrift(GainEffect):
         exponential = [{"time_constant": length * share} for share in SHARES]
         logistic = [{"middle": length * m, "width": length * w} for m in MIDDLES for w in WIDTHS]
         return ({}, *exponential, {"power": 0.5}, *logistic)
+
+    def equation_of(self, shape: Shape, context: Context) -> str:
+        course = "t / T"
+        if "time_constant" in shape:
+            course = "(1 − exp(−t/τ)) / (1 − exp(−T/τ))"
+        elif "middle" in shape:
+            course = "(l(t) − l(0)) / (l(T) − l(0)),  l(t) = 1 / (1 + exp(−(t − middle) / width))"
+        elif "power" in shape:
+            course = "√(t / T)"
+        length = sized(float(context.time[-1] - context.time[0]), "s")
+        return f"δB = Δb s(t),  s(t) = {course},  t from the recording's start,  T = {length}"
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         elapsed = context.time - context.time[0]

@@ -19,20 +19,26 @@ __all__ = [
     "BoundedEffect",
     "ChoosyEffect",
     "CodedEffect",
+    "ComponentsEffect",
     "Context",
     "ContinuousEffect",
     "Effect",
+    "FormedEffect",
     "GainEffect",
     "LastingEffect",
     "LinearEffect",
+    "MomentsEffect",
     "NestedEffect",
     "OptionalDriverEffect",
     "PartEffect",
+    "PlacedEffect",
     "Quantity",
     "RelativeEffect",
     "Shape",
+    "ShapeUnitsEffect",
     "ShapedEffect",
     "SignalEffect",
+    "TellingEffect",
 ]
 
 _LEAST = 1e-12
@@ -306,6 +312,73 @@ class CodedEffect(Effect, Protocol):
                 temperature "own" absolute.
         """
         ...
+
+
+@runtime_checkable
+class FormedEffect(Effect, Protocol):
+    """An effect whose shape says which of several forms its equation has.
+
+    Attributes:
+        choices: the numbers of its shape that are chosen and not measured; the equation tells them, and no parameter.
+    """
+
+    @property
+    def choices(self) -> tuple[str, ...]: ...
+
+    def equation_of(self, shape: Shape, context: Context) -> str:
+        """The equation in this form."""
+        ...
+
+
+@runtime_checkable
+class ShapeUnitsEffect(Effect, Protocol):
+    """An effect with numbers in its shape whose units are its own."""
+
+    def unit_of_shape(self, name: str, context: Context) -> str:
+        """The unit of a number of its shape; empty where it is no such one."""
+        ...
+
+
+@runtime_checkable
+class ComponentsEffect(Effect, Protocol):
+    """An effect with quantities of several numbers that are not one for each channel."""
+
+    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:
+        """What each number of a quantity is, in their order; empty where they are one for each channel."""
+        ...
+
+
+@runtime_checkable
+class MomentsEffect(Effect, Protocol):
+    """An effect that sets in at several moments, which are known beforehand."""
+
+    def moments(self, context: Context) -> tuple[float, ...]:
+        """In s, ascending."""
+        ...
+
+
+@runtime_checkable
+class PlacedEffect(Effect, Protocol):
+    """An effect of the place or the attitude of its recording, which another recording does not have.
+
+    Attributes:
+        placed: whether it is one.
+    """
+
+    @property
+    def placed(self) -> bool: ...
+
+
+@runtime_checkable
+class TellingEffect(Effect, Protocol):
+    """An effect that says how another recording tells it from a rival.
+
+    Attributes:
+        again: what becomes of it in another recording, a clause such as "a warm-up comes again after a cold start".
+    """
+
+    @property
+    def again(self) -> str: ...
 
 
 class GainEffect:

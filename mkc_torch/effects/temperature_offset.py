@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from mkc_torch.effects.driver_offset import DriverOffset
-from mkc_torch.effects.protocol import Context, Shape
+from mkc_torch.effects.protocol import Context, Shape, per
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -34,11 +34,22 @@ class TemperatureOffset(DriverOffset):
     plausible = 5.0
     plausible_unit = "µT/K"
     source = "offset temperature coefficients of MEMS magnetometers, about 0.2 µT/K in data sheets"
+    choices: tuple[str, ...] = ()
     lags = (0.0, 1.0, 5.0)
     continuous: Mapping[str, tuple[float, float]] = {"lag": (0.0, 0.2)}
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         return (*super().shapes(time), {"curvature": 0.02}, {"curvature": -0.02})
+
+    def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
+        if "curvature" in shape:
+            return self.equation
+        if shape.get("lag", 0.0) > 0.0:
+            return "δB = k (T_τ − T̄),  τ dT_τ/dt = T − T_τ,  τ the lag"
+        return "δB = k (T − T̄)"
+
+    def unit_of_shape(self, name: str, context: Context) -> str:
+        return per("1", context.units[0]) if name == "curvature" else ""
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         follows = super().course(shape, context)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 
-__all__ = ["quotient", "ratio", "tidy"]
+__all__ = ["quotient", "ratio", "sized", "tidy"]
 
 _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -16,6 +17,24 @@ _PREFIXES = {"": 1.0, "n": 1e-9, "µ": 1e-6, "u": 1e-6, "m": 1e-3, "c": 1e-2, "k
 _BASE = {f"{prefix}{name}": (size, name) for name in "TAVmsK" for prefix, size in _PREFIXES.items()}
 _BASE |= {"°C": (1.0, "K"), "G": (1e-4, "T"), "mG": (1e-7, "T"), "gauss": (1e-4, "T"), "°": (1.0, "°")}
 """Units with their sizes in base units."""
+
+_PLAIN = -3, 6
+"""Powers of ten between which a number is written out."""
+
+
+def sized(value: float, unit: str = "") -> str:
+    """A number to four digits with its unit, as it stands in an equation.
+
+    Example:
+        >>> sized(-0.12345, "m"), sized(2.5e-7), sized(3.0)
+        ('−0.1235 m', '2.5 × 10⁻⁷', '3')
+    """
+    power = math.floor(math.log10(abs(value))) if value and math.isfinite(value) else 0
+    if _PLAIN[0] <= power < _PLAIN[1]:
+        told = f"{value:.4g}"
+    else:
+        told = f"{value / 10.0**power:.4g} × 10{str(power).replace('-', '⁻').translate(_POWERS)}"
+    return f"{told} {unit}".rstrip().replace("-", "−", 1) if value < 0 else f"{told} {unit}".rstrip()
 
 
 def tidy(unit: str) -> str:

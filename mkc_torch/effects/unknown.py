@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.effects.protocol import Context, Quantity, Shape
+from mkc_torch.effects.units import sized
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -34,11 +35,20 @@ class Unknown:
     equation = "δB = f(x), a smooth curve"
     explanation = "The offset follows this column along a curve that no effect of the catalogue describes."
     advice = "Look at the curve; find out what the column does to the sensor."
+    choices: tuple[str, ...] = ()
     plausible = float("inf")
     source = "none: a curve, not physics"
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
         return ({},)
+
+    def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
+        x, unit = context.drivers[:, 0], context.units[0]
+        low, high = sized(float(x.min()), unit), sized(float(x.max()), unit)
+        return (
+            f"{self.equation},  f(x) = Σ γ_j P_j(u),  P_j Legendre's polynomials,  u from −1 to 1 where x − x̄ goes "
+            f"from {low} to {high}, constant beyond"
+        )
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return tuple(

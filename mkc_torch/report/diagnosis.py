@@ -9,8 +9,10 @@ from markupsafe import Markup
 
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability
 from mkc_torch.report import diagnosis_pictures as pictures
-from mkc_torch.report import diagnosis_wording
+from mkc_torch.report import diagnosis_verdict, diagnosis_wording
 from mkc_torch.report.calibration import _render
+from mkc_torch.report.markup import marked, unbroken
+from mkc_torch.report.typesetting import typeset
 
 __all__ = ["Bar", "Cell", "bars", "diagnosis_report", "heat_map"]
 
@@ -46,11 +48,16 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
     d = diagnosis
     figures = [pictures.of_finding(d, i) for i in range(len(d.findings))]
     maps = [pictures.over_states(d, i) for i in range(len(d.findings))]
-    return _render(
+    page = _render(
         "diagnosis.html.j2",
         d=d,
         note=note,
         say=diagnosis_wording,
+        top=diagnosis_verdict,
+        typeset=typeset,
+        marked=marked,
+        notes=diagnosis_wording.channel_notes(d.traces.channels),
+        numbered=pictures.numbered(d),
         clock=diagnosis_wording.clock_of(d.traces),
         time_figure=Markup(pictures.over_time(d)) if len(d.traces.time) else None,
         figures=[None if svg is None else Markup(svg) for svg in figures],
@@ -61,6 +68,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
         heat=heat_map(d.separability),
         most=_MOST_SHOWN,
     )
+    return unbroken(page)
 
 
 def bars(candidates: tuple[Candidate, ...]) -> list[Bar]:

@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from mkc_torch.diagnosis.result import Curve, Diagnosis, Finding, Traces
-from mkc_torch.report.diagnosis_wording import plain
 from mkc_torch.report.pictures import _SHADE, _STYLE, BLUE, GREY, INK, ORANGE, _svg
+from mkc_torch.report.typesetting import plain
 
-__all__ = ["CURVE_COLORS", "Panel", "driver_panels", "of_finding", "over_states", "over_time"]
+__all__ = ["CURVE_COLORS", "Panel", "driver_panels", "numbered", "of_finding", "over_states", "over_time"]
 
 CURVE_COLORS = (BLUE, ORANGE, "#009E73", "#A8558A", "#B58900", INK)
 _USED, _REJECTED, _DARK = "#7FB8DA", "#F2C7AA", "#9A4300"
@@ -62,8 +62,8 @@ def over_time(diagnosis: Diagnosis) -> str:
     """
     t, findings = diagnosis.traces, diagnosis.findings
     rows, columns = min(len(t.channels), _MOST_ROWS), 2 if findings else 1
-    numbered = len(findings) > 1 and any(f.onset is not None or f.intervals for f in findings)
-    grid = _Grid(rows, columns, top=0.55 if numbered else 0.35, below=0.42)
+    above = numbered(diagnosis)
+    grid = _Grid(rows, columns, top=0.55 if above else 0.35, below=0.42)
     with _style():
         figure = grid.figure()
         for row in range(rows):
@@ -71,16 +71,22 @@ def over_time(diagnosis: Diagnosis) -> str:
             for ax in axes:
                 _mark(ax, findings)
             _residual(axes, t, _array(t.time), row)
-            if numbered and row == 0:
+            if above and row == 0:
                 for ax in axes:
                     _number(ax, findings)
             for ax, moment in zip(axes, ("Before", "After") if findings else ("Residual",), strict=True):
-                _title(ax, f"{moment}, {_short(t.channels[row])}", above=numbered and row == 0)
+                _title(ax, f"{moment}, {_short(t.channels[row])}", above=above and row == 0)
                 if row == rows - 1:
                     ax.set_xlabel("time (s)" if t.has_time else "sample")
                 else:
                     ax.tick_params(labelbottom=False)
         return _svg(figure, "time", "Residual over time before and after the findings were added to the simulation")
+
+
+def numbered(diagnosis: Diagnosis) -> bool:
+    """Whether the findings' numbers stand above the residual over time: of several, if one has a place there."""
+    findings = diagnosis.findings
+    return len(findings) > 1 and any(f.onset is not None or f.intervals for f in findings)
 
 
 def of_finding(diagnosis: Diagnosis, index: int) -> str | None:
@@ -102,7 +108,7 @@ def of_finding(diagnosis: Diagnosis, index: int) -> str | None:
                 ax.set_xlabel(_with_unit(panel.driver, t.driver_units.get(panel.driver, "")))
         if curve is not None:
             ax = grid.axes(figure, 0, 2) if beside else grid.axes(figure, 0, 0, wide=True)
-            _draw_curve(ax, curve, t.has_time)
+            _draw_curve(ax, curve, t.has_time, most=_MOST_LETTERS if beside else 3 * _MOST_LETTERS)
         return _svg(figure, f"finding{index + 1}", f"What finding {index + 1} is, and the residual over its drivers")
 
 
@@ -251,8 +257,8 @@ def _mark(ax: Any, findings: Sequence[Finding]) -> None:
     for finding in findings:
         for start, end in finding.intervals:
             ax.axvspan(start, end, color=_SHADE, lw=0, zorder=0)
-        if finding.onset is not None:
-            ax.axvline(finding.onset, color=ORANGE, lw=1.2, zorder=3)
+        for moment in _onsets(finding):
+            ax.axvline(moment, color=ORANGE, lw=1.2, zorder=3)
         if finding.onset_interval is not None:
             ax.axvspan(*finding.onset_interval, color=ORANGE, alpha=0.3, lw=0, zorder=2)
 
@@ -277,16 +283,21 @@ def _number(ax: Any, findings: Sequence[Finding]) -> None:
 def _places(findings: Sequence[Finding]) -> Iterator[tuple[float, str]]:
     for i, finding in enumerate(findings, 1):
         if finding.onset is not None:
-            yield finding.onset, str(i)
+            yield from ((moment, str(i)) for moment in _onsets(finding))
         else:
             yield from ((0.5 * (start + end), str(i)) for start, end in finding.intervals)
+
+
+def _onsets(finding: Finding) -> tuple[float, ...]:
+    """The moments at which it sets in."""
+    return finding.moments or (() if finding.onset is None else (finding.onset,))
 
 
 def _title(ax: Any, text: str, *, above: bool = False) -> None:
     ax.set_title(text, pad=18.0 if above else None)
 
 
-def _draw_curve(ax: Any, curve: Curve, has_time: bool) -> None:
+def _draw_curve(ax: Any, curve: Curve, has_time: bool, most: int) -> None:
     x, value, band = _array(curve.x), _array(curve.value), _array(curve.band)
     ax.axhline(0.0, color=GREY, lw=0.7, zorder=1)
     for i in range(value.shape[1]):
@@ -295,7 +306,7 @@ def _draw_curve(ax: Any, curve: Curve, has_time: bool) -> None:
         ax.plot(x, value[:, i], color=color, lw=1.6)
     ax.margins(x=0.01)
     sampled = curve.driver == "time" and not has_time
-    ax.set_xlabel("sample" if sampled else _with_unit(curve.driver, curve.unit))
+    ax.set_xlabel("sample" if sampled else _with_unit(curve.driver, curve.unit, most))
     ax.set_ylabel(_with_unit("effect", curve.value_unit))
     _title(ax, "What was found, 95 % band")
     ax.locator_params(axis="x", nbins=6)
@@ -306,10 +317,10 @@ def _array(values: Tensor) -> np.ndarray:
     return values.detach().cpu().numpy()
 
 
-def _with_unit(name: str, unit: str) -> str:
-    return f"{_short(name)} ({_short(unit)})" if unit else _short(name)
+def _with_unit(name: str, unit: str, most: int = _MOST_LETTERS) -> str:
+    return f"{_short(name, most)} ({_short(unit)})" if unit else _short(name, most)
 
 
-def _short(text: str) -> str:
+def _short(text: str, most: int = _MOST_LETTERS) -> str:
     told = plain(text)
-    return told if len(told) <= _MOST_LETTERS else told[: _MOST_LETTERS - 1] + "…"
+    return told if len(told) <= most else told[: most - 1] + "…"

@@ -1,31 +1,40 @@
-"""A diagnosis in words and figures, the same in the terminal and on a page."""
+"""The findings of a diagnosis in words and figures, the same in the terminal and on a page."""
 
 from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 from mkc_torch.diagnosis.result import (
     Alternative,
     Candidate,
+    DensityCheck,
     Diagnosis,
     Extrapolation,
     Finding,
     HeldOut,
     Noise,
     Number,
+    Parameter,
     Region,
     Traces,
 )
+from mkc_torch.diagnosis.worth import confirmation
+from mkc_torch.report.typesetting import plain, superscript, typeset
 from mkc_torch.report.wording import bandwidth, decimals, number, share, size
 
 __all__ = [
     "Clock",
-    "ceiling_reached",
-    "chance",
+    "acts_on",
+    "behind",
+    "better",
+    "channel_notes",
     "clock_of",
+    "counted_from",
+    "density_check",
     "driven_by",
     "effect_name",
     "evidence",
@@ -33,32 +42,42 @@ __all__ = [
     "extrapolation",
     "finding_name",
     "gain",
-    "headline",
     "held_out_rows",
     "improvement",
     "inseparable",
     "label_name",
-    "lead",
+    "largest",
     "measured",
+    "named_lines",
     "noise_model",
     "noise_parameters",
-    "plain",
+    "parameter_lines",
+    "parameter_name",
     "probability",
     "region",
     "residual_sizes",
     "rivals",
     "role",
     "several",
-    "to_do",
+    "smooth_fit",
+    "unrecorded",
     "where",
     "with_drivers",
+    "with_names",
 ]
 
 _FEWEST_LARGE, _MOST_SMALL = 1e6, 1e-3  # beyond these a number is written with a power of ten
 _MOST_NUMBERS = 12
+_CLEARLY = 0.99  # of a residual, below which another one is smaller
+_LONG = 4  # numbers from which a list is told by its largest
 _MOST_EXPERIMENTS = 6
 _NAMES = {"coulomb": "Coulomb", "stribeck": "Stribeck", "bouc": "Bouc", "wen": "Wen", "magnus": "Magnus"}
-_POWER = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_WORDS = {
+    "driver_linear": "linear dependence",
+    "driver_quadratic": "quadratic dependence",
+    "driver_offset": "offset dependence",
+    "unknown": "an effect outside the catalogue",
+}
 
 
 @dataclass(frozen=True)
@@ -93,17 +112,8 @@ def clock_of(traces: Traces) -> Clock:
     """A clock that tells moments apart to about a thousandth of the recording."""
     known = traces.time[traces.time.isfinite()]
     span = float(known.max() - known.min()) if traces.has_time and len(known) else 0.0
-    return Clock(min(max(2 - math.floor(math.log10(span)), 0), 6) if span > 0 else 1, traces.has_time)
-
-
-def plain(text: str) -> str:
-    """A text from a file on one line, without characters that steer a terminal.
-
-    Example:
-        >>> plain("coil \\x1b[31m\\n temperature")
-        'coil �[31m temperature'
-    """
-    return "".join(c if c.isprintable() else "�" for c in " ".join(text.split()))
+    digits = max(2 - math.floor(math.log10(span)), int(span < 1000.0)) if span > 0 else 1
+    return Clock(min(max(digits, 0), 6), traces.has_time)
 
 
 def effect_name(effect: str) -> str:
@@ -113,8 +123,8 @@ def effect_name(effect: str) -> str:
         >>> effect_name("hard_iron_step"), effect_name("coulomb_friction"), effect_name("unknown")
         ('hard-iron step', 'Coulomb friction', 'an effect outside the catalogue')
     """
-    if effect == "unknown":
-        return "an effect outside the catalogue"
+    if effect in _WORDS:
+        return _WORDS[effect]
     words = effect.replace("_", " ").replace("hard iron", "hard-iron").replace("soft iron", "soft-iron")
     return " ".join(_NAMES.get(word, word) for word in words.split(" "))
 
@@ -127,19 +137,29 @@ def with_drivers(effect: str, drivers: Sequence[str], at: str = "") -> str:
         ('current field (battery_A)', 'offset drift')
         >>> with_drivers("linear_drag", [], "rate of speed")
         'linear drag on the rate of speed'
+        >>> with_drivers("clock_drift", [], "all outputs")
+        'clock drift on all outputs'
+        >>> with_drivers("field_gradient", ["position_x", "position_y", "position_z"])
+        'field gradient (position)'
     """
-    place = f" on the {plain(at.removeprefix('loaded '))}" if at else ""
-    return effect_name(effect) + (f" ({several(drivers, 3)})" if drivers else "") + place
+    place = f" on {'' if at.startswith('all ') else 'the '}{plain(at.removeprefix('loaded '))}" if at else ""
+    return effect_name(effect) + (f" ({_together(drivers)})" if drivers else "") + place
+
+
+def _together(names: Sequence[str]) -> str:
+    """Names one after the other; the three of a vector by what they have in common."""
+    whole = names[0].removesuffix("_x")
+    return plain(whole) if list(names) == [f"{whole}_{axis}" for axis in "xyz"] else several(names, 3)
 
 
 def finding_name(finding: Finding) -> str:
     """A finding by its effect and what drives it; one that goes along time alone and has no name is told as a cause."""
-    if _unrecorded(finding):
+    if unrecorded(finding):
         return "a cause that no column recorded"
-    return with_drivers(finding.effect, finding.drivers)
+    return with_drivers(finding.effect, finding.drivers) + (" that comes and goes" if finding.comes_and_goes else "")
 
 
-def _unrecorded(finding: Finding) -> bool:
+def unrecorded(finding: Finding) -> bool:
     return finding.effect == "unknown" and finding.curve is not None and finding.curve.driver == "time"
 
 
@@ -176,29 +196,44 @@ def measured(value: Number, error: Number | None, unit: str) -> list[str]:
     """
     rows = list(_rows(value))
     errors = list(_rows(error)) if error is not None else []
-    values = [v for row in rows for v in row if math.isfinite(v)]
-    known = [e for row in errors for e in row if math.isfinite(e) and e > 0]
-    largest = max((abs(v) for v in [*values, *known]), default=0.0)
-    power = 0 if largest == 0 or _MOST_SMALL <= largest < _FEWEST_LARGE else math.floor(math.log10(largest))
-    scale = 10.0**power
-    places = decimals(max(known) / scale) if known else _three_digits(largest / scale)
-    factor = f" × 10{str(power).translate(_POWER)}" if power else ""
+    digits = _Digits.of(rows, errors)
     lines = []
     for i, row in enumerate(rows[:_MOST_NUMBERS]):
         beside = errors[i] if i < len(errors) and len(errors[i]) == len(row) else [math.nan] * len(row)
-        cells = [_cell(v / scale, e / scale, places) for v, e in zip(row, beside, strict=True)]
+        cells = [digits.cell(v, e) for v, e in zip(row, beside, strict=True)]
         rest = len(cells) - _MOST_NUMBERS
         text = ", ".join(cells[:_MOST_NUMBERS]) + (f", … {rest} more" if rest > 0 else "")
-        bare = isinstance(value, (int, float)) and not (factor and "±" in text)
-        lines.append((text if bare else f"({text})") + factor + (f" {plain(unit)}" if unit else ""))
+        bare = isinstance(value, (int, float)) and not (digits.power and "±" in text)
+        lines.append((text if bare else f"({text})") + digits.factor + (f" {plain(unit)}" if unit else ""))
     return [*lines, f"… {len(rows) - _MOST_NUMBERS} more rows"] if len(rows) > _MOST_NUMBERS else lines
 
 
-def _cell(value: float, error: float, places: int) -> str:
-    if not math.isfinite(value):
-        return "not known"
-    told = number(value, places)
-    return f"{told} ± {error:.{places}f}" if math.isfinite(error) and error > 0 else told
+@dataclass(frozen=True)
+class _Digits:
+    """How numbers of one list are written: the power of ten that they share, and the decimals that errors leave."""
+
+    power: int
+    places: int
+
+    @classmethod
+    def of(cls, rows: Sequence[Sequence[float]], errors: Sequence[Sequence[float]]) -> _Digits:
+        values = [v for row in rows for v in row if math.isfinite(v)]
+        known = [e for row in errors for e in row if math.isfinite(e) and e > 0]
+        largest = max((abs(v) for v in [*values, *known]), default=0.0)
+        power = 0 if largest == 0 or _MOST_SMALL <= largest < _FEWEST_LARGE else math.floor(math.log10(largest))
+        scale = 10.0**power
+        return cls(power, decimals(max(known) / scale) if known else _three_digits(largest / scale))
+
+    @property
+    def factor(self) -> str:
+        return f" × 10{superscript(self.power)}" if self.power else ""
+
+    def cell(self, value: float, error: float) -> str:
+        """A number with its error, without the power of ten."""
+        if not math.isfinite(value):
+            return "not known"
+        told, scale = number(value / 10.0**self.power, self.places), 10.0**self.power
+        return f"{told} ± {error / scale:.{self.places}f}" if math.isfinite(error) and error > 0 else told
 
 
 def _three_digits(value: float) -> int:
@@ -218,6 +253,127 @@ def _rows(value: Number | None) -> Iterator[list[float]]:
         yield [cell for v in value for row in _rows(v) for cell in row]
 
 
+def parameter_name(parameter: Parameter) -> str:
+    """A parameter's name in words.
+
+    Example:
+        >>> parameter_name(Parameter("field_per_ampere", 1.0, None, "µT/A"))
+        'field per ampere'
+    """
+    name = plain(parameter.name)
+    curve = re.fullmatch(r"legendre_(\d+)", name)
+    return f"amplitude of P{_lowered(curve[1])}" if curve else name.replace("_", " ")
+
+
+def _lowered(digits: str) -> str:
+    return digits.translate(str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉"))
+
+
+def parameter_lines(parameter: Parameter, channels: Sequence[str]) -> list[str]:
+    """A parameter as :func:`measured` has it; of one whose numbers are not one for each channel, one line a number.
+
+    Example:
+        >>> parameter_lines(Parameter("k", (1.0, 2.0), (0.1, 0.1), "µT", ("x", "y")), ("x", "y"))
+        ['(1.00 ± 0.10, 2.00 ± 0.10) µT']
+        >>> parameter_lines(
+        ...     Parameter("jumps", (11.2, -1.2), (4.4, 0.6), "°", ("at 61.1 s", "at 103.2 s")), ("heading",)
+        ... )
+        ['at 61.1 s: 11.2 ± 4.4 °', 'at 103.2 s: −1.2 ± 0.6 °']
+        >>> parameter_lines(Parameter("lag", 1.5, None, "s"), ("x",))
+        ['1.50 s, standard error not estimated']
+    """
+    p = parameter
+    if not p.components or tuple(p.components) == tuple(channels):
+        lines = measured(p.value, p.standard_error, p.unit)
+        return lines if _known(p.standard_error) else [*lines[:-1], f"{lines[-1]}, {_NOT_ESTIMATED}"]
+    each = _listed(p)
+    return each if _known(p.standard_error) else [*each, _NOT_ESTIMATED]
+
+
+_NOT_ESTIMATED = "standard error not estimated"
+
+
+def _listed(parameter: Parameter) -> list[str]:
+    """What each number of a list is, and the number, with the digits and the power of ten of all."""
+    p = parameter
+    (values,) = _rows(p.value)
+    errors = next(_rows(p.standard_error)) if isinstance(p.standard_error, Sequence) else [math.nan] * len(values)
+    digits = _Digits.of([values], [errors])
+    cells = [digits.cell(v, e) for v, e in zip(values, errors, strict=True)]
+    tail = digits.factor + (f" {plain(p.unit)}" if p.unit else "")
+    told = [f"({cell}){tail}" if digits.power and "±" in cell else f"{cell}{tail}" for cell in cells]
+    return [f"{plain(one)}: {cell}" for one, cell in zip(p.components, told, strict=True)]
+
+
+def _known(error: Number | None) -> bool:
+    """Whether any of it is."""
+    return any(math.isfinite(e) for row in _rows(error) for e in row)
+
+
+def named_lines(parameter: Parameter, channels: Sequence[str]) -> list[str]:
+    """The same with the parameter's name before the first."""
+    first, *rest = parameter_lines(parameter, channels)
+    own = parameter.components and tuple(parameter.components) != tuple(channels)
+    return [f"{parameter_name(parameter)}{',' if own else ''} {first}", *rest]
+
+
+def largest(parameter: Parameter) -> str:
+    """How large a parameter is, in short: of a long list its largest number.
+
+    Example:
+        >>> names = ("∂B_x/∂x", "∂B_x/∂y", "∂B_x/∂z", "∂B_z/∂z")
+        >>> largest(Parameter("gradient", (0.1, 0.2, 0.3, -1.06), (0.6, 0.3, 0.3, 0.25), "µT/m", names))
+        'gradient up to ∂B_z/∂z: −1.06 ± 0.25 µT/m'
+    """
+    p = parameter
+    if len(p.components) < _LONG:
+        return f"{parameter_name(p)} {' '.join(measured(p.value, p.standard_error, p.unit))}"
+    (sizes,) = ([abs(v) for v in row] for row in _rows(p.value))
+    return f"{parameter_name(p)} up to {_listed(p)[sizes.index(max(sizes))]}"
+
+
+def counted_from(finding: Finding) -> str:
+    """What the equation counts its drivers from; empty where there is none.
+
+    Example:
+        >>> from mkc_torch.diagnosis.result import Reference
+        >>> finding = Finding(
+        ...     "current_field",
+        ...     ("current",),
+        ...     (),
+        ...     (),
+        ...     None,
+        ...     "δB = k (I − Ī)",
+        ...     "",
+        ...     (),
+        ...     0.01,
+        ...     None,
+        ...     "",
+        ...     (),
+        ...     True,
+        ...     "",
+        ...     references=(Reference("current", 10.934, "A"),),
+        ... )
+        >>> counted_from(finding)
+        'Ī: the mean of current over this recording, 10.9 A.'
+    """
+    if not finding.references:
+        return ""
+    marked = re.search("[A-Za-z]\u0304", unicodedata.normalize("NFD", finding.equation))
+    symbol = unicodedata.normalize("NFC", marked[0]) if marked else "Counted from"
+    names = several([one.column for one in finding.references])
+    values = ", ".join(f"{size(one.value)} {plain(one.unit)}".rstrip() for one in finding.references)
+    means = "the means" if len(finding.references) > 1 else "the mean"
+    return f"{symbol}: {means} of {names} over this recording, {values}."
+
+
+def _cell(value: float, error: float, places: int) -> str:
+    if not math.isfinite(value):
+        return "not known"
+    told = number(value, places)
+    return f"{told} ± {error:.{places}f}" if math.isfinite(error) and error > 0 else told
+
+
 def where(finding: Finding, clock: Clock) -> str:
     """When the finding acts.
 
@@ -231,17 +387,50 @@ def where(finding: Finding, clock: Clock) -> str:
         'from 41.3 s on (95 %: 41.2 to 41.5 s)'
         >>> where(replace(finding, intervals=((1.0, 2.0), (7.0, 9.5))), clock)
         'mainly from 1.0 to 2.0 s and from 7.0 to 9.5 s'
+        >>> where(replace(finding, onset=61.1, moments=(61.1, 77.8)), clock)
+        'anew at 61.1 s and 77.8 s'
+        >>> where(replace(finding, onset=6.2, intervals=((8.0, 9.0), (34.0, 37.3)), comes_and_goes=True), clock)
+        'first at 6.2 s, then it comes and goes, mainly from 8.0 to 9.0 s and from 34.0 to 37.3 s'
     """
-    begins = "" if finding.onset is None else f"from {clock.moment(finding.onset)} on"
+    begins = ""
+    if finding.moments:
+        begins = f"anew at {_and([clock.moment(moment) for moment in finding.moments])}"
+    elif finding.onset is not None:
+        moment = clock.moment(finding.onset)
+        begins = f"first at {moment}" if finding.comes_and_goes else f"from {moment} on"
     if finding.onset_interval is not None:
         begins += f" (95 %: {clock.interval(*finding.onset_interval)})"
+    if finding.comes_and_goes:
+        begins += ", then it comes and goes"
     each = [f"from {clock.interval(start, end)}" for start, end in finding.intervals]
+    spans = [end - start for start, end in finding.intervals]
     if len(each) > 3:
-        spans = [end - start for start, end in finding.intervals]
         mainly = f"mainly in {len(each)} intervals, the longest {each[spans.index(max(spans))]}"
     else:
-        mainly = "mainly " + " and ".join(filter(None, [", ".join(each[:-1]), *each[-1:]])) if each else ""
+        mainly = f"mainly {_and(each)}" if each else ""
     return ", ".join(filter(None, [begins, mainly])) or "throughout the recording"
+
+
+def acts_on(finding: Finding) -> str:
+    """The channels that a finding acts on, and whose axes they are; empty where it has none.
+
+    Example:
+        >>> finding = Finding("offset_drift", (), ("x", "y", "z"), (), None, "", "", (), 0.01, None, "", (), True, "")
+        >>> acts_on(finding)
+        "acts on x, y, z, the sensor's axes"
+    """
+    whose = _AXES.get(finding.channels, "")
+    return f"acts on {several(finding.channels)}{whose}" if finding.channels else ""
+
+
+_AXES: dict[tuple[str, ...], str] = {
+    ("x", "y", "z"): ", the sensor's axes",
+    ("east", "north", "up"): ", the axes of the world that the attitude turns into, its x, y, z",
+}
+
+
+def _and(each: Sequence[str]) -> str:
+    return " and ".join(filter(None, [", ".join(each[:-1]), *each[-1:]]))
 
 
 def region(found: Region) -> str:
@@ -327,6 +516,24 @@ def gain_told(value: float, interval: tuple[float, float], *, short: bool = Fals
     return f"{signed} nats a sample (95 %: {number(low, places)} to {number(high, places)})"
 
 
+def better(held_out: HeldOut) -> str:
+    """Whether unseen blocks show that the finding makes it better.
+
+    Example:
+        >>> better(HeldOut(0.3, (0.2, 0.4), 1.0, 0.8, "µT")), better(HeldOut(0.13, (-0.02, 0.28), 1.0, 0.9, "µT"))
+        ('surely better on unseen blocks', 'probably better on unseen blocks, not surely')
+    """
+    return _BETTER[confirmation(held_out.log_likelihood_gain, held_out.confidence_interval)]
+
+
+_BETTER = {
+    "surely": "surely better on unseen blocks",
+    "probably": "probably better on unseen blocks, not surely",
+    "not shown": "not shown to be better on unseen blocks",
+    "worse": "worse on unseen blocks",
+}
+
+
 def improvement(before: float, after: float, unit: str) -> str:
     """A residual before and after.
 
@@ -348,8 +555,8 @@ def held_out_rows(diagnosis: Diagnosis) -> list[tuple[str, list[str]]]:
     rows = [("the simulation as it is", diagnosis.baseline)]
     if diagnosis.findings:
         rows.append(("with the findings", diagnosis.corrected))
-    if diagnosis.ceiling is not None:
-        rows.append(("with any smooth correction (the ceiling)", diagnosis.ceiling))
+    if diagnosis.ceiling is not None and _shown(diagnosis):
+        rows.append(("with a smooth correction by all recorded columns", diagnosis.ceiling))
     return [
         (
             name,
@@ -406,78 +613,15 @@ def role(candidate: Candidate, findings: Sequence[Finding]) -> str:
     return ""
 
 
-def headline(diagnosis: Diagnosis) -> str:
-    """The verdict in a sentence."""
-    if diagnosis.verdict == "adequate":
-        return "Nothing is missing that this recording could show."
-    alone = len(diagnosis.findings) == 1
-    left_out = "; ".join(_or_a_rival(f, alone=alone) for f in diagnosis.findings)
-    if diagnosis.verdict == "explained":
-        return f"Left out of the simulation: {left_out}."
-    if not diagnosis.findings:
-        return "Structure remains that no effect in the catalogue accounts for."
-    if any(_unrecorded(f) for f in diagnosis.findings):
-        return f"Left out of the simulation: {left_out}. Its course over time is all that is known of it."
-    return (
-        f"Left out of the simulation: {left_out}. Yet structure remains that no effect in the catalogue accounts for."
-    )
+def with_names(sentence: str, ids: Collection[str]) -> str:
+    """A sentence with effects by their names instead of their ids, its numbers as they are printed.
 
-
-def _or_a_rival(finding: Finding, *, alone: bool) -> str:
-    name, others = finding_name(finding), inseparable(finding)
-    if not others:
-        return name
-    if not alone:
-        return f"{name}, or a rival"
-    if len(others) == 1:
-        return f"{name} or {rivals(finding)}, which this recording cannot tell apart"
-    return f"{name} or one of {len(others)} others that this recording cannot tell from it"
-
-
-def lead(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """How large, where, how sure, how much better: questions with their answers."""
-    d = diagnosis
-    sure = ("How sure", chance(d.findings[0].p_value if d.findings else d.p_value, d))
-    if not d.findings:
-        unit = f" {plain(d.traces.unit)}" if d.traces.unit else ""
-        left = f"{size(d.baseline.rmse)}{unit}, root mean square on data the fit had not seen."
-        return [sure, ("Residual", left), ("Noise", f"{_capital(noise_model(d.noise))}.")]
-    better = ("How much better", f"On data the fit had not seen, the residual is {residual_sizes(d)}.")
-    if len(d.findings) > 1:
-        return [sure, better]
-    f = d.findings[0]
-    told = [f"{plain(p.name)} {' '.join(measured(p.value, p.standard_error, p.unit))}" for p in f.parameters[:2]]
-    large = [("How large", "; ".join(told) + ".")] if told else []
-    acts = f"; acts on {several(f.channels)}" if f.channels else ""
-    return [*large, ("Where", f"{_capital(where(f, clock_of(d.traces)))}{acts}."), sure, better]
-
-
-def chance(p_value: float, diagnosis: Diagnosis) -> str:
-    """What a p-value means, in a sentence."""
-    d = diagnosis
-    most = "at most " if _least(p_value, d.surrogates) else ""
-    return (
-        f"If nothing were missing, a search like this, of {d.candidates_tried:,} candidates, would find as much in "
-        f"{most}{share(p_value)} of recordings ({evidence(p_value, d.surrogates)}; the level asked for is {d.level:g})."
-    )
-
-
-def to_do(diagnosis: Diagnosis) -> list[str]:
-    """What to do next: what the diagnosis advises, or else what its verdict asks for."""
-    if diagnosis.advice:
-        ids = {f.effect for f in diagnosis.findings} | {a.effect for f in diagnosis.findings for a in f.alternatives}
-        ids = {one for one in ids if "_" in one}
-        return [_with_names(plain(sentence), ids) for sentence in diagnosis.advice]
-    return {
-        "adequate": ["Use the simulation as it is, within what this recording covers."],
-        "explained": ["Use the model found here in place of the simulation, and confirm it on a second recording."],
-        "unexplained": ["Record more columns that could drive what remains, such as temperature, current and motion."],
-    }[diagnosis.verdict].copy()
-
-
-def _with_names(sentence: str, ids: Collection[str]) -> str:
-    """A sentence with effects by their names."""
-    return re.sub(r"[a-z]\w*", lambda word: effect_name(word[0]) if word[0] in ids else word[0], sentence)
+    Example:
+        >>> with_names("hard_iron_step: p = 4e-05, by -6.1 µT.", {"hard_iron_step"})
+        'hard-iron step: p = 4 × 10⁻⁵, by −6.1 µT.'
+    """
+    named = re.sub(r"[a-z]\w*", lambda word: effect_name(word[0]) if word[0] in ids else word[0], sentence)
+    return typeset(named)
 
 
 def noise_model(noise: Noise) -> str:
@@ -487,21 +631,91 @@ def noise_model(noise: Noise) -> str:
 
 
 def noise_parameters(noise: Noise, channels: Sequence[str]) -> list[tuple[str, str]]:
-    """The numbers of the noise model by name, those of the density once a channel."""
-    rows = [(plain(name), " ".join(measured(value, None, ""))) for name, value in noise.parameters.items()]
+    """The numbers of the noise model in words, those of the density once a channel."""
+    rows: list[tuple[str, str]] = []
+    for name, value in noise.parameters.items():
+        unit = noise.units.get(name, "")
+        if name == "autoregression":
+            rows += _memory(value, channels)
+        elif name in _NOISE:
+            rows.append((_NOISE[name][0], _NOISE[name][1].format(" ".join(measured(value, None, unit)))))
+        else:
+            rows.append((plain(name), " ".join(measured(value, None, unit))))
+    unit = f" {plain(noise.unit)}" if noise.unit else ""
     density = zip(noise.sigma, noise.d, noise.bound, strict=True)
     for i, (sigma, d, bound) in enumerate(density):
         named = f" of {plain(channels[i])}" if len(noise.sigma) > 1 and i < len(channels) else ""
-        rows.append((f"density{named}", f"σ = {bandwidth(sigma)}, d = {size(d)}, on ±{size(bound)}"))
+        rows.append((f"density{named}", f"σ = {bandwidth(sigma)}, d = {size(d)}{unit}, within ±{size(bound)}{unit}"))
     return rows
 
 
-def ceiling_reached(diagnosis: Diagnosis) -> str:
-    """How far a smooth correction by all columns comes; empty where it was not asked for."""
-    if diagnosis.ceiling is None:
+_NOISE = {
+    "wander": ("slow wander of the offset", "{}, its standard deviation over the recording"),
+    "wander_period": ("the wander falls off", "below a period of {}"),
+}
+
+
+def _memory(value: Number, channels: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Autoregression coefficients, a row a channel that has some."""
+    each = list(value) if isinstance(value, Sequence) else [value]
+    for i, one in enumerate(each):
+        if not isinstance(one, Sequence) or one:
+            named = f" of {plain(channels[i])}" if len(each) > 1 and i < len(channels) else ""
+            told = measured(one, None, "")[0].removeprefix("(").removesuffix(")")
+            yield f"memory{named}", f"{told} times the samples before it"
+
+
+def density_check(check: DensityCheck) -> tuple[str, str, str]:
+    """How far a channel's density is off, how far a Student-t is, and what that says.
+
+    Example:
+        >>> density_check(DensityCheck("norm", 0.021, 0.034, 4.0, 0.05, False))
+        ('0.021', '0.034 (4 degrees of freedom)', 'no more than chance')
+    """
+    said = "a Student-t is closer" if check.closer else "no more than chance"
+    if not check.closer and check.distance > check.allowed:
+        said = "the density is off, and a Student-t clearly no better"
+    freedom = f"{check.degrees_of_freedom:g} degree{'' if check.degrees_of_freedom == 1 else 's'} of freedom"
+    return f"{check.distance:.2g}", f"{check.student_distance:.2g} ({freedom})", said
+
+
+def channel_notes(channels: Sequence[str]) -> str:
+    """What a magnetometer's channels are called; empty for others."""
+    return "; ".join(note for name, note in _CHANNELS.items() if name in channels)
+
+
+_CHANNELS = {
+    "norm": "norm: the length of the field, less what the simulation has for it",
+    "along": "along: the part of the residual along the ambient field, which its length shows too",
+    "across_1": "across_1 and across_2: the two parts at right angles to it, which errors of the attitude enter",
+}
+
+
+def smooth_fit(diagnosis: Diagnosis) -> str:
+    """How far a smooth correction by all columns comes, beside the residual; empty where what was found is better."""
+    d = diagnosis
+    if d.ceiling is None or not _shown(d):
         return ""
-    unit = plain(diagnosis.traces.unit)
-    return f"a smooth correction by all columns and by time reaches {size(diagnosis.ceiling.rmse)} {unit}".rstrip()
+    unit = plain(d.traces.unit)
+    reached = f"a smooth correction by all recorded columns and by time reaches {size(d.ceiling.rmse)} {unit}".rstrip()
+    with_it = "with the findings it is" if d.findings else "the residual is"
+    return f"{reached}; {with_it} {size(d.corrected.rmse)} {unit}".rstrip()
+
+
+def _shown(diagnosis: Diagnosis) -> bool:
+    """Whether the smooth correction says something that the findings do not."""
+    d = diagnosis
+    return d.ceiling is not None and (not d.findings or d.ceiling.rmse < _CLEARLY * d.corrected.rmse)
+
+
+def behind(candidate: Candidate) -> str:
+    """How far a candidate is behind the first one, in nats.
+
+    Example:
+        >>> behind(Candidate("hard_iron_step", (), "", 72.3, 12.0, behind=30.25))
+        '30.2'
+    """
+    return size(candidate.behind) if math.isfinite(candidate.behind) else "not possible"
 
 
 def driven_by(finding: Finding) -> str:
@@ -529,7 +743,3 @@ def extrapolation(found: Extrapolation) -> str:
     told = "predicts" if low > 0.0 else "misleads" if high < 0.0 else "says nothing"
     told_gain = gain_told(found.log_likelihood_gain, found.confidence_interval)
     return f"fitted where its driver is low, it {told} where that is high: {told_gain}"
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

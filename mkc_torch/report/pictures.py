@@ -100,7 +100,7 @@ def residual(calibration: Calibration, points: Tensor, time: Tensor | None) -> s
         if limit > 0:
             close.set_ylim(-limit, limit)
         top.set_title("Length of the corrected field less its nominal length: all samples")
-        close.set_title("Close up: five robust sizes")
+        close.set_title(f"Close up: within ±{limit:.3g} {c.unit}, five times its robust scatter")
         close.set_xlabel("sample" if time is None else "time (s)")
         close.margins(x=0.01)
         _legend_above(top)

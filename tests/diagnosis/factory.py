@@ -1,9 +1,11 @@
 """Diagnoses made by hand, with residuals that show what the findings say."""
 
+import dataclasses
 import math
 
 import torch
 
+from mkc_torch.diagnosis.advice import advice_of
 from mkc_torch.diagnosis.result import (
     Alternative,
     Candidate,
@@ -13,6 +15,7 @@ from mkc_torch.diagnosis.result import (
     HeldOut,
     Noise,
     Parameter,
+    Reference,
     Separability,
     Spread,
     Traces,
@@ -26,7 +29,7 @@ CATALOGUE = (
 
 
 def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candidates=12, **changes):
-    """A diagnosis of a simulated magnetometer; any field can be replaced by name."""
+    """A diagnosis of a simulated magnetometer; any field can be replaced by name, and advice follows from the rest."""
     found = (_step, _current, _unknown)[:findings]
     names = CHANNELS[:channels]
     traces = make_traces(findings, names, samples, has_time)
@@ -54,13 +57,14 @@ def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candi
         "baseline": Spread(-1.2345, before, (1.1,) * channels, (0.52,) * channels),
         "corrected": Spread(-0.9012, after, (math.inf,) * channels, (0.31,) * channels),
         "ceiling": Spread(-0.8951, 0.97 * after, (1.4,) * channels, (0.3,) * channels),
-        "advice": ("Record at two more temperatures, at least 10 °C apart.",) if findings else (),
+        "advice": (),
         "warnings": ("3 samples without a finite value were left out.",),
         "candidates": make_candidates(candidates),
         "separability": make_separability(min(candidates, 8)),
         "traces": traces,
     }
-    return Diagnosis(**content | changes)
+    diagnosis = Diagnosis(**content | changes)
+    return diagnosis if "advice" in changes else dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
 
 
 def make_traces(findings, channels, samples, has_time):
@@ -141,6 +145,8 @@ def _step(channels, has_time):
         plausible=True,
         plausibility="3.4 µT; steps of 1 to 50 µT occur.",
         curve=_curve("time", "s" if has_time else "", channels, lambda x: (x > 0.45).double()),
+        advice="Look for what changed at that time; use the calibration from after the step.",
+        again="a step does not come at the same moment again",
     )
 
 
@@ -151,7 +157,7 @@ def _current(channels, has_time):
         channels=("mag_x", "mag_y", "mag_z"),
         intervals=((12.1, 18.4), (60.0, 71.5)) if has_time else ((600.0, 900.0),),
         onset=None,
-        equation="δB = k I",
+        equation="δB = k (I − Ī)",
         explanation="A current near the sensor adds a field in proportion to it.",
         parameters=(
             Parameter("k", (-0.1702, 0.3311, 0.0298), (0.0123, 0.0119, 0.0131), "µT/A"),
@@ -164,6 +170,8 @@ def _current(channels, has_time):
         plausible=True,
         plausibility="0.37 µT/A; up to 1 µT/A occurs.",
         curve=_curve("current", "A", channels, lambda x: x - 0.5),
+        references=(Reference("current", 15.0, "A"),),
+        advice="Move the sensor away from the power wires.",
     )
 
 

@@ -15,7 +15,7 @@ from mkc_torch.diagnosis.linearise import Slow
 from mkc_torch.diagnosis.noise import cosines
 from mkc_torch.diagnosis.search import LinearSearch
 from mkc_torch.effects.unrecorded import COURSE, Unrecorded
-from mkc_torch.report.diagnosis_wording import headline
+from mkc_torch.report.diagnosis_verdict import headline
 from mkc_torch.simulation import Magnetometer
 from tests.effects.contexts import make_context
 from tests.simulation.tumbling import RATE, tumbling

@@ -8,6 +8,7 @@ from scipy import stats
 from mkc_torch import MKCDistribution
 from mkc_torch.density_fit import fit_density
 from mkc_torch.diagnosis.density_check import (
+    density_checks,
     density_warnings,
     effective_size,
     kolmogorov,
@@ -18,11 +19,15 @@ from mkc_torch.diagnosis.density_check import (
 N = 4500
 
 
-def warned(*channels):
+def checked(*channels):
     """Of residuals, each channel with the density that is fitted to it."""
     residual = torch.stack([torch.as_tensor(channel) for channel in channels], -1)
     fit = fit_density(residual)
-    return density_warnings(residual, fit.sigma, fit.d, fit.bound, [f"channel_{k}" for k in range(len(channels))])
+    return density_checks(residual, fit.sigma, fit.d, fit.bound, [f"channel_{k}" for k in range(len(channels))])
+
+
+def warned(*channels):
+    return density_warnings(checked(*channels))
 
 
 def mkc(seed):
@@ -60,6 +65,22 @@ def test_a_student_t_is_warned_of_with_its_freedom(freedom, seed):
     assert "does not describe the residuals of channel_0" in sentence
     assert f"a Student-t with {freedom:g} degrees of freedom" in sentence
     assert sentence.endswith("A misfit of the tail must not be read as physics.")
+
+
+def test_distances_are_told_whether_or_not_there_is_a_warning():
+    right, wrong = checked(gaussian(0), student(1))
+    assert right.distance < right.allowed
+    assert right.student_distance < right.allowed
+    assert not right.closer
+    assert wrong.distance > wrong.allowed > wrong.student_distance
+    assert wrong.closer
+
+
+def test_residuals_that_are_all_zero_have_distances():
+    one = torch.ones(1, dtype=torch.float64)
+    (check,) = density_checks(torch.zeros(50, 1, dtype=torch.float64), one, one, 10.0 * one, ["norm"])
+    assert check.distance == pytest.approx(1.0)
+    assert check.student_distance == pytest.approx(1.0)
 
 
 def test_only_the_channels_that_are_misfit_are_named():

@@ -8,7 +8,15 @@ import pytest
 pytest.importorskip("jsonschema")
 
 from mkc_torch.diagnosis.diagnosis_file import DiagnosisFileError, diagnosis_to_json, json_schema, validate
-from mkc_torch.diagnosis.result import DriverShift, Extrapolation, HeldOut, Parameter, Region
+from mkc_torch.diagnosis.result import (
+    DensityCheck,
+    DriverShift,
+    Extrapolation,
+    HeldOut,
+    Parameter,
+    Reference,
+    Region,
+)
 from tests.diagnosis.factory import make_diagnosis
 
 
@@ -43,7 +51,7 @@ def test_keys_are_those_of_the_format(content):
     assert set(content["search"]) == {"candidates", "surrogates", "seed"}
     assert set(content["findings"][0]) == {
         "effect", "drivers", "channels", "intervals", "onset", "equation", "explanation", "parameters", "p_value",
-        "held_out", "held_out_note", "alternatives", "plausible", "plausibility",
+        "held_out", "held_out_note", "alternatives", "plausible", "plausibility", "advice",
     }  # fmt: skip
     assert set(content["baseline"]) == {"log_likelihood", "rmse", "sigma", "d"}
 
@@ -75,6 +83,44 @@ def test_what_shifted_copies_of_a_driver_gain_is_written():
     (finding,) = written(with_finding(make_diagnosis(1), driver_shift=DriverShift(38, 2, 22.5)))["findings"]
     assert finding["driver_shift"] == {"copies": 38, "as_good": 2, "reach": 22.5}
     assert "driver_shift" not in written(make_diagnosis(1))["findings"][0]
+
+
+def test_what_an_equation_needs_is_written():
+    parameter = Parameter("gradient", (1.0, -2.0), (0.1, 0.2), "µT/m", ("∂B_x/∂y", "∂B_x/∂z"))
+    changes = {
+        "parameters": (parameter,), "moments": (61.1, 77.8), "advice": "Do it.",
+        "references": (Reference("current", 10.5, "A"),), "comes_and_goes": True,
+    }  # fmt: skip
+    (finding,) = written(with_finding(make_diagnosis(1), **changes))["findings"]
+    assert finding["parameters"][0]["components"] == ["∂B_x/∂y", "∂B_x/∂z"]
+    assert finding["moments"] == [61.1, 77.8]
+    assert finding["references"] == [{"column": "current", "value": 10.5, "unit": "A"}]
+    assert finding["advice"] == "Do it."
+    assert finding["comes_and_goes"] is True
+    bare = dict.fromkeys(("moments", "references"), ()) | {"advice": ""}
+    assert not {"moments", "references", "advice"} & set(
+        written(with_finding(make_diagnosis(1), **bare))["findings"][0]
+    )
+
+
+def test_the_noise_s_units_and_its_density_s_distances_are_written():
+    made = make_diagnosis(1)
+    check = DensityCheck("norm", 0.02, 0.03, 4.0, 0.05, False)
+    noise = dataclasses.replace(made.noise, units={"wander": "µT"}, unit="µT", checks=(check,))
+    told = written(dataclasses.replace(made, noise=noise))["noise"]
+    assert (told["unit"], told["units"]) == ("µT", {"wander": "µT"})
+    assert told["density_check"] == [
+        {
+            "channel": "norm", "distance": 0.02, "student_t_distance": 0.03, "degrees_of_freedom": 4.0,
+            "allowed": 0.05,
+        }
+    ]  # fmt: skip
+
+
+def test_components_are_as_many_as_the_numbers():
+    parameter = Parameter("gradient", (1.0, -2.0, 3.0), None, "µT/m", ("a", "b"))
+    with pytest.raises(DiagnosisFileError, match=r"parameters\.0\.components` are not as many as the numbers"):
+        diagnosis_to_json(with_finding(make_diagnosis(1), parameters=(parameter,)))
 
 
 def test_a_region_of_another_kind_is_refused(content):

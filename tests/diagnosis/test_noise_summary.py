@@ -30,6 +30,7 @@ def test_an_offset_that_wanders_is_told_with_its_unit():
     size = f"{noise.parameters['wander']:.2g} µT in all"
     assert noise.description.endswith(f"noise around an offset that wanders like a random walk, by {size}")
     assert 1.0 < noise.parameters["wander"] < 8.0  # 0.08 √2000 is 3.6
+    assert noise.units["wander"] == noise.unit == "µT"
 
 
 def test_noise_with_a_memory_is_coloured_and_without_one_white():
@@ -37,3 +38,11 @@ def test_noise_with_a_memory_is_coloured_and_without_one_white():
     assert (coloured.model, white.model) == ("ar", "white")
     assert "coloured noise" in coloured.description
     assert white.description.endswith("white noise")
+
+
+def test_how_well_the_density_fits_is_always_told():
+    (check,) = told(0.0, 0.0).checks
+    assert check.channel == "norm"
+    assert 0.0 < check.distance < check.allowed
+    assert 0.0 < check.student_distance < 0.1
+    assert not check.closer

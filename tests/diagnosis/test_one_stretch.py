@@ -52,7 +52,7 @@ def test_one_burst_among_others_is_no_effect():
     assert diagnosis.findings == ()
     (warning,) = told(diagnosis)
     assert warning.startswith("From 6.8 to 8.8 s")
-    assert "field_gradient of position_x, position_y, position_z" in warning
+    assert "field_gradient by position_x, position_y, position_z" in warning
 
 
 def test_what_is_passed_more_than_once_is_an_effect():

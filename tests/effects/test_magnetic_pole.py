@@ -90,6 +90,13 @@ def test_a_pole_beside_the_path_is_found_where_it_is():
         assert place.unit == "m"
         assert place.value == pytest.approx(there - mean, abs=0.25)
         assert 0.0 < place.standard_error < 0.25
+    assert known["pole"].components == ("q_x", "q_y", "q_z")
+    # a number that is chosen is told with the equation and is no parameter
+    assert "radius" not in known
+    assert f"s = {diagnosis.model.terms[0].shape['radius']:.4g} m, chosen" in finding.equation
+    assert [(one.column, one.unit) for one in finding.references] == [(name, "m") for name in finding.drivers]
+    assert [one.value for one in finding.references] == pytest.approx(middle.tolist())
+    assert finding.placed
     size = math.hypot(*known["pole"].value)
     assert size == pytest.approx(4.0, rel=0.3)
     # the file knows which of the two forms it is

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mkc_torch.effects.dynamics.rate import RateEffect
 from mkc_torch.effects.protocol import Context, Shape
+from mkc_torch.effects.units import sized
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -37,7 +38,12 @@ class CoulombFriction(RateEffect):
     equation = "δv̇ = −γ tanh(v / w)"
     explanation = "Dry friction holds against the motion with a force that does not depend on its speed."
     advice = "Add dry friction of this size."
+    choices = ("width",)
     source = "Coulomb's law of friction; Andersson et al., Tribology International 40 (2007), for the smoothing"
+
+    def equation_of(self, shape: Shape, context: Context) -> str:
+        width = sized(float(shape["width"]), context.unit_of("own"))
+        return f"{self.equation},  w = {width}, chosen, for the jump at standstill is smoothed"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return tuple({"width": width} for width in WIDTHS)

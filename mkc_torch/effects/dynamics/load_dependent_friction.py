@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mkc_torch.effects.dynamics.rate import RateEffect
 from mkc_torch.effects.protocol import Context, Quantity, Shape
+from mkc_torch.effects.units import sized
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -39,7 +40,12 @@ class LoadDependentFriction(RateEffect):
     equation = "δv̇ = −(γ₁ + γ₂ |a − h|) tanh(v / w)"
     explanation = "Dry friction holds against the motion, the more the harder the drive works against its load."
     advice = "Add dry friction with a part in proportion to the load."
+    choices = ("width",)
     source = "Duclusaud et al., Extended Friction Models for the Physics Simulation of Servo Actuators, ICRA 2025"
+
+    def equation_of(self, shape: Shape, context: Context) -> str:
+        width = sized(float(shape["width"]), context.unit_of("own"))
+        return f"{self.equation},  w = {width}, chosen, for the jump at standstill is smoothed"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return tuple({"width": width} for width in WIDTHS)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mkc_torch.effects.dynamics.rate import RateEffect
 from mkc_torch.effects.protocol import Context, Quantity, Shape
+from mkc_torch.effects.units import sized
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -38,7 +39,14 @@ class PositionPeriodicForce(RateEffect):
     equation = "δv̇ = γ₁ sin(k x) + γ₂ cos(k x)"
     explanation = "A force repeats with the position, as the cogging of a motor or an eccentric weight does."
     advice = "Add a force with this period."
+    choices = ("order",)
     source = "Hanselman, Brushless Permanent Magnet Motor Design (2003)"
+
+    def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
+        return f"{self.equation},  k = {sized(shape['order'])}, periods in a turn"
+
+    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:  # noqa: ARG002
+        return "sin(k x)", "cos(k x)"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return tuple({"order": float(order)} for order in ORDERS)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mkc_torch.effects.dynamics.rate import RateEffect
 from mkc_torch.effects.protocol import Context, Quantity, Shape
+from mkc_torch.effects.units import sized
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -37,7 +38,12 @@ class StribeckFriction(RateEffect):
     equation = "δv̇ = −(γ₁ + γ₂ exp(−(v/v_s)²)) tanh(v / w)"
     explanation = "Dry friction holds against the motion, more of it at small speeds than at large ones."
     advice = "Add dry friction with a rise towards standstill."
+    choices = ("width",)
     source = "Stribeck (1902); Armstrong-Hélouvry, Control of Machines with Friction (1991)"
+
+    def equation_of(self, shape: Shape, context: Context) -> str:
+        width = sized(float(shape["width"]), context.unit_of("own"))
+        return f"{self.equation},  w = {width}, chosen, for the jump at standstill is smoothed"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return tuple({"width": width, "stribeck_speed": speed} for width in (0.1, 0.03) for speed in SPEEDS)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mkc_torch.effects.dynamics.rate import RateEffect
 from mkc_torch.effects.protocol import Context, Quantity, Shape
+from mkc_torch.effects.units import sized
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -45,7 +46,12 @@ class UnknownRate(RateEffect):
         self.of = of
         self.needs = ("own", of)
         self._reach = f"reach_of_{of}"
+        self.choices = (self._reach,)
         self.relative: Mapping[str, tuple[str, str]] = {self._reach: (of, "largest")}
+
+    def equation_of(self, shape: Shape, context: Context) -> str:
+        reach = sized(float(shape[self._reach]), context.unit_of(self.of))
+        return f"{self.equation},  f(x) = Σ γ_j P_j(x / {reach}),  P_j Legendre's polynomials, constant beyond ±1"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return ({self._reach: 1.0},)

@@ -33,6 +33,7 @@ class ClockDrift:
     equation = "δy = y(t + γ (t − t₀)) − y(t)"
     explanation = "The recording's clock and the simulator's run at different rates."
     advice = "Take both times from one clock, or rescale one of them."
+    again = "clocks that drift apart do so the farther, the longer a recording is"
     source = "Mills, RFC 5905 (2010)"
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002

@@ -33,6 +33,7 @@ class Gain(GainEffect):
     equation = "δy = γ y"
     explanation = "What is measured is a constant share larger, or smaller, than what is simulated."
     advice = "Check the sensor's scale and units, and what the simulator takes for its own."
+    again = "an error of scale grows with the signal"
     source = "Doebelin, Measurement Systems (2003), 3.2"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002

@@ -30,6 +30,7 @@ class Offset(GainEffect):
     equation = "δy = γ"
     explanation = "What is measured lies beside what is simulated by a constant."
     advice = "Check the sensor's zero, and where the simulator has its own."
+    again = "an offset is there without a signal too"
     source = "Doebelin, Measurement Systems (2003), 3.2"
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002

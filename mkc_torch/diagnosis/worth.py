@@ -1,0 +1,72 @@
+"""What a finding is worth: whether unseen blocks confirm it, and how large it is beside the noise."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from mkc_torch.diagnosis.result import Finding, HeldOut
+
+__all__ = ["Confirmation", "carries_over", "change", "confirmation", "confirmed", "small", "worth_correcting"]
+
+Confirmation = Literal["surely", "probably", "not shown", "worse"]
+
+SMALL = 0.05
+"""Share by which a finding has to make the residual smaller to be more than small beside the noise."""
+
+_NORMAL_95 = 1.96
+
+
+def confirmation(gain: float, interval: tuple[float, float]) -> Confirmation:
+    """Whether a gain on unseen blocks shows that a model is better, by its 95 % interval.
+
+    "probably" is a gain of more than one standard error whose interval reaches to 0.
+
+    Example:
+        >>> confirmation(0.3, (0.2, 0.4)), confirmation(0.13, (-0.02, 0.28)), confirmation(0.01, (-0.1, 0.1))
+        ('surely', 'probably', 'not shown')
+        >>> confirmation(-0.3, (-0.4, -0.2)), confirmation(0.3, (float("nan"), float("nan")))
+        ('worse', 'not shown')
+    """
+    low, high = interval
+    if low > 0.0:
+        return "surely"
+    if high < 0.0:
+        return "worse"
+    error = (high - low) / (2.0 * _NORMAL_95)
+    return "probably" if math.isfinite(error) and gain > error else "not shown"
+
+
+def confirmed(finding: Finding) -> bool:
+    """Whether unseen blocks surely confirm it; of an event that cannot be held out the search alone has to."""
+    held = finding.held_out
+    return held is None or confirmation(held.log_likelihood_gain, held.confidence_interval) == "surely"
+
+
+def change(held_out: HeldOut) -> float:
+    """Share by which a finding makes the residual smaller; 0 where that is not known.
+
+    Example:
+        >>> round(change(HeldOut(0.3, (0.2, 0.4), 2.0, 1.5, "µT")), 3)
+        0.25
+    """
+    before, after = held_out.rmse_before, held_out.rmse_after
+    return 1.0 - after / before if before > 0.0 and math.isfinite(after / before) else 0.0
+
+
+def small(finding: Finding) -> bool:
+    """Whether it hardly makes the residual smaller: a mean over many samples shows it, a single sample does not."""
+    return finding.held_out is not None and change(finding.held_out) < SMALL
+
+
+def worth_correcting(finding: Finding) -> bool:
+    """Whether a simulation is clearly better with it."""
+    return confirmed(finding) and not small(finding)
+
+
+def carries_over(finding: Finding) -> bool:
+    """Whether a model of it is of use on another recording.
+
+    What belongs to the place of this one, or comes and goes at times that nothing tells, is not.
+    """
+    return worth_correcting(finding) and finding.plausible and not (finding.placed or finding.comes_and_goes)

@@ -1,0 +1,146 @@
+"""What effects say of themselves: the form of their equation, what their numbers are, and when they set in."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mkc_torch.effects import CATALOGUE, SENSOR, Context
+from mkc_torch.effects.cubic_nonlinearity import CubicNonlinearity
+from mkc_torch.effects.field_gradient import FieldGradient
+from mkc_torch.effects.heading_reset import HeadingReset
+from mkc_torch.effects.offset_drift import OffsetDrift
+from mkc_torch.effects.protocol import ComponentsEffect, FormedEffect, MomentsEffect, PlacedEffect, TellingEffect
+from mkc_torch.effects.temperature_offset import TemperatureOffset
+from mkc_torch.effects.unrecorded import COURSE, Unrecorded
+from tests.effects.contexts import make_context
+from tests.effects.test_dynamics_catalogue import make_context as make_dynamic_context
+
+FORMED = [effect for effect in CATALOGUE if isinstance(effect, FormedEffect)]
+GRADIENT = FieldGradient()
+VECTOR, STRENGTH = ("east", "north", "up"), ("strength",)
+
+
+def context_of(effect, **options):
+    return (make_context if effect in SENSOR else make_dynamic_context)(effect, **options)
+
+
+@pytest.mark.parametrize("effect", FORMED, ids=lambda e: e.id)
+def test_every_form_has_an_equation_that_names_no_choice(effect):
+    context = context_of(effect)
+    shapes = effect.shapes(context.time)
+    told = {effect.equation_of(shape, context) for shape in shapes}
+    for equation in told:
+        assert equation.startswith(effect.equation.partition("=")[0])
+        for name in ("terms", "degree", "radius", "power", "order", "width =", "nan"):
+            assert name not in equation
+    assert set(effect.choices) <= {name for shape in shapes for name in shape}
+
+
+def test_a_course_says_where_its_numbers_are():
+    effect = Unrecorded()
+    assert isinstance(effect, FormedEffect)
+    told = effect.equation_of({f"{COURSE}{k}": 0.5 for k in (1, 3)}, make_context(effect))
+    assert told.startswith(effect.equation)
+    assert told.endswith("2 numbers c_k in model.json")
+
+
+def test_forms_differ_in_their_equations():
+    context = make_context(OffsetDrift())
+    told = [OffsetDrift().equation_of(s, context).partition("s(t) = ")[2].partition(",  t from")[0] for s in (
+        {}, {"power": 0.5}, {"time_constant": 9.0},
+    )]  # fmt: skip
+    assert told == ["t / T", "√(t / T)", "(1 − exp(−t/τ)) / (1 − exp(−T/τ))"]
+    length = float(context.time[-1] - context.time[0])
+    assert f"T = {length:.4g} s" in OffsetDrift().equation_of({}, context)
+    cubic = make_context(CubicNonlinearity())
+    assert "β" not in CubicNonlinearity().equation_of({}, cubic)
+    assert "+ β_i B_i²" in CubicNonlinearity().equation_of({"terms": 2.0}, cubic)
+    warm = make_context(TemperatureOffset())
+    assert TemperatureOffset().equation_of({}, warm) == "δB = k (T − T̄)"
+    assert "T_τ" in TemperatureOffset().equation_of({"lag": 5.0}, warm)
+    assert TemperatureOffset().unit_of_shape("curvature", warm) == "1/K"
+    assert TemperatureOffset().unit_of_shape("lag", warm) == ""
+
+
+def slopes_and_bends(gamma, degree, context):
+    """First and second derivatives, by the position, of what is added at its mean."""
+    one = replace(context, time=context.time[:1], signal=context.signal[:1])
+
+    def field(point):
+        return GRADIENT.change(gamma, {"degree": degree}, replace(one, drivers=point.unsqueeze(0))).squeeze(0)
+
+    here = torch.zeros(3, dtype=torch.float64)
+    first = torch.func.jacfwd(field)
+    return first(here), torch.func.jacfwd(first)(here)
+
+
+def evaluated(label, first, second):
+    """A component's label as a formula in derivatives of the field."""
+    axes = {axis: k for k, axis in enumerate("xyz")}
+
+    def derivative(of, by):
+        row = axes[of[2:]] if of.startswith("B_") else 0
+        order = [axes[axis] for axis in by]
+        return float(first[row, order[0]] if len(order) == 1 else second[row, order[0], order[1]])
+
+    values = []
+    for side in label.split(" = "):
+        code = side.replace("−", "-").replace("½ ", "0.5 * ").replace("3 ", "3 * ")
+        for of in ("B_x", "B_y", "B_z") if len(first) == 3 else ("B",):
+            for by in ("x", "y", "z"):
+                code = code.replace(f"∂²{of}/∂{by}²", repr(derivative(of, by * 2)))
+                for other in ("x", "y", "z"):
+                    code = code.replace(f"∂²{of}/∂{by}∂{other}", repr(derivative(of, by + other)))
+                code = code.replace(f"∂{of}/∂{by}", repr(derivative(of, by)))
+        assert "∂" not in code
+        values.append(eval(code))
+    return values
+
+
+@pytest.mark.parametrize("channels", [VECTOR, STRENGTH], ids=len)
+@pytest.mark.parametrize("degree", [1.0, 2.0])
+def test_components_of_a_gradient_are_the_derivatives_that_they_are_called(channels, degree):
+    shape, context = {"degree": degree}, make_context(GRADIENT, channels=channels)
+    quantities = GRADIENT.quantities(shape, context)
+    generator = torch.Generator().manual_seed(5)
+    gamma = torch.randn(sum(q.size for q in quantities), generator=generator, dtype=torch.float64)
+    first, second = slopes_and_bends(gamma, degree, context)
+    labels = [label for q in quantities for label in GRADIENT.components(q.name, shape, context)]
+    assert len(labels) == len(gamma)
+    for label, value in zip(labels, gamma.tolist(), strict=True):
+        assert evaluated(label, first, second) == pytest.approx([value] * len(label.split(" = ")), abs=1e-12)
+
+
+def test_a_heading_that_is_set_anew_tells_when():
+    time = torch.arange(6.0, dtype=torch.float64)
+    since = torch.stack([time >= 2.0, time >= 5.0], -1).double()
+    none = torch.zeros(6, 0, dtype=torch.float64)
+    context = Context(time, none, (), since, "°", ("heading",), ("since_1", "since_2"))
+    effect = HeadingReset()
+    assert isinstance(effect, MomentsEffect)
+    assert effect.moments(context) == (1.0, 4.0)
+    assert effect.components("heading_change", {}, context) == ("jump at 1.0 s", "jump at 4.0 s")
+
+
+@pytest.mark.parametrize("effect", [e for e in CATALOGUE if isinstance(e, ComponentsEffect)], ids=lambda e: e.id)
+def test_there_are_as_many_components_as_numbers(effect):
+    if isinstance(effect, HeadingReset):
+        return
+    for channels in (VECTOR, STRENGTH):
+        context = context_of(effect, channels=channels) if effect in SENSOR else context_of(effect)
+        for shape in effect.shapes(context.time):
+            for quantity in effect.quantities(shape, context):
+                assert len(effect.components(quantity.name, shape, context)) in (0, quantity.size)
+
+
+def test_what_belongs_to_a_place_or_an_attitude_says_so():
+    placed = {effect.id for effect in CATALOGUE if isinstance(effect, PlacedEffect) and effect.placed}
+    assert placed == {"field_gradient", "heading_reset"}
+    assert {effect.port for effect in CATALOGUE if effect.id in placed} == {"field", "heading"}
+
+
+@pytest.mark.parametrize("effect", [e for e in CATALOGUE if isinstance(e, TellingEffect)], ids=lambda e: e.id)
+def test_what_another_recording_shows_is_a_clause(effect):
+    assert effect.again[0].islower()
+    assert not effect.again.endswith(".")
