@@ -78,7 +78,8 @@ def _called(finding: Finding) -> str:
 
 def _tell_apart(finding: Finding, near: Sequence[Alternative]) -> str:
     told = ", ".join(dict.fromkeys(f"{a.effect} ({', '.join(a.drivers)})" if a.drivers else a.effect for a in near))
-    return f"To tell {finding.effect} from {told}, record again{_how(finding, near)}."
+    asked = f"To tell {finding.effect} from {told}, record again{_how(finding, near)}."
+    return f"{asked} {near[0].told_by}".rstrip()
 
 
 def _how(finding: Finding, near: Sequence[Alternative]) -> str:

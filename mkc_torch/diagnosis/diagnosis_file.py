@@ -159,6 +159,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
                 "log_likelihood_gap": _known(a.log_likelihood_gap),
                 "separable": a.separable,
                 **({"at": a.at} if a.at else {}),
+                **({"told_by": a.told_by} if a.told_by else {}),
             }
             for a in f.alternatives
         ],

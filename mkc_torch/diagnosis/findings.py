@@ -20,6 +20,7 @@ from mkc_torch.diagnosis.ranking import SEPARABLE
 from mkc_torch.diagnosis.regions import attributed, map_of, region_of, shares_of_runs
 from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter, Reference
 from mkc_torch.diagnosis.switched import comes_and_goes, memory_of
+from mkc_torch.diagnosis.telling import SAME, told_by
 from mkc_torch.effects.protocol import (
     ComponentsEffect,
     Context,
@@ -207,14 +208,19 @@ def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
     """Rivals of the search, nearest first: all that the data do not tell apart, and the next few."""
     found = []
     if term.driver is not None:
-        found += [Alternative(term.effect.id, (copy,), 0.0, False, term.at) for copy in term.driver.copies]
+        found += [
+            Alternative(term.effect.id, (copy,), 0.0, False, term.at, told_by=SAME) for copy in term.driver.copies
+        ]
+    own = [ranked.number for ranked in located.ranking if located.terms[ranked.number].key == term.key]
     for ranked in located.ranking:
         rival = located.terms[ranked.number]
         if rival.key == term.key or ranked.gap > _FARTHEST:
             continue
         gap = max(ranked.gap, 0.0)
-        again = _again(rival.effect)
-        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= SEPARABLE, rival.at, again))
+        again, told = _again(rival.effect), ""
+        if own and gap < SEPARABLE:
+            told = told_by(located, own[0], ranked.number)
+        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= SEPARABLE, rival.at, again, told))
     near = [a for a in found if not a.separable]
     return tuple(near + [a for a in found if a.separable][: max(0, _MOST_ALTERNATIVES - len(near))])
 

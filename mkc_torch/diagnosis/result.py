@@ -93,7 +93,7 @@ class Alternative:
     """Another candidate for a finding: how much less likely it is, in nats, and whether the data tell them apart.
 
     ``at`` is where it acts, of several places that a simulation has for it; ``again`` what becomes of it in another
-    recording.
+    recording; ``told_by`` what to record to tell it from the finding, where the data do not.
     """
 
     effect: str
@@ -102,6 +102,7 @@ class Alternative:
     separable: bool
     at: str = ""
     again: str = ""
+    told_by: str = ""
 
 
 @dataclass(frozen=True)
