@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from mkc_torch._arguments import as_numbers, first_of, refuse_no_tensor
 from mkc_torch.functional import (
     as_computed,
     energy,
@@ -40,10 +41,14 @@ class MKCDistribution(Distribution):
         d: scale > 0, in the unit of the values.
         bound: half-width of the domain > 0, in the unit of the values.
         loc: centre.
-        validate_args: as in every torch distribution.
+        validate_args: as in every torch distribution; False leaves the values of all arguments unseen.
 
     The parameters broadcast. ``rsample`` and ``icdf`` are differentiable once in all four by implicit differentiation
     of the distribution function.
+
+    Raises:
+        TypeError: a parameter that is no number and no tensor, or a value that is no tensor.
+        ValueError: a parameter out of range, or a value outside the domain.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (17), Theorem 2, Corollary 1.
@@ -73,6 +78,8 @@ class MKCDistribution(Distribution):
         loc: Float[Tensor, "*batch"] | float = 0.0,
         validate_args: bool | None = None,
     ) -> None:
+        for name, value in (("sigma", sigma), ("d", d), ("bound", bound), ("loc", loc)):
+            as_numbers(name, value)
         self.sigma, self.d, self.bound, self.loc = torch.broadcast_tensors(*as_computed(sigma, d, bound, loc))
         super().__init__(self.sigma.shape, validate_args=validate_args)
 
@@ -106,6 +113,7 @@ class MKCDistribution(Distribution):
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density; ``-inf`` outside the domain, where validation is off."""
         if self._validate_args:
+            refuse_no_tensor("value", value, "a tensor")
             self._validate_sample(value)
         error = value - self.loc
         inside = (value >= self.loc - self.bound) & (value <= self.loc + self.bound)
@@ -115,6 +123,7 @@ class MKCDistribution(Distribution):
     def cdf(self, value: Tensor) -> Tensor:
         """Probability of a value at most ``value``."""
         if self._validate_args:
+            refuse_no_tensor("value", value, "a tensor")
             self._validate_sample(value)
         error = torch.minimum(torch.maximum(value - self.loc, -self.bound), self.bound)
         return _cumulative(error / self.d, self._kappa, self._length)
@@ -123,10 +132,16 @@ class MKCDistribution(Distribution):
         """Quantile of a probability in [0, 1].
 
         Raises:
+            TypeError: no tensor.
             ValueError: a probability outside [0, 1], where validation is on.
         """
-        if self._validate_args and not bool(((value >= 0) & (value <= 1)).all()):
-            raise ValueError("Expected argument `value` to be probabilities in [0, 1].")
+        refuse_no_tensor("value", value, "a tensor of probabilities")
+        wrong = ~((value >= 0) & (value <= 1))
+        if self._validate_args and bool(wrong.any()):
+            raise ValueError(
+                f"Expected argument `value` to be probabilities in [0, 1] but got {first_of(value, wrong)}; "
+                "divide per cents by 100."
+            )
         kappa, length = self._kappa, self._length
         value, kappa, length = torch.broadcast_tensors(value.to(kappa), kappa, length)
         u = _quantile(value, kappa, length)
