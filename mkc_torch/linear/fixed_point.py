@@ -8,6 +8,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import (
+    checked_number,
+    checked_whole,
+    refuse_complex,
+    refuse_no_tensor,
+    refuse_not_real,
+    refuse_out_of_range,
+)
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._mkc import (
     channel_parameter,
@@ -17,7 +25,7 @@ from mkc_torch.linear._mkc import (
     mean_energy,
 )
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.linear._robust_start import Start, robust_start
+from mkc_torch.linear._robust_start import Start, checked_start, robust_start
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 from mkc_torch.linear.implicit import Given, Rest, fit_layer, wanted
 
@@ -30,6 +38,8 @@ _GRADUATION = 10
 
 def whitened(X: Tensor, Y: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
     """X and Y multiplied by the inverse Cholesky factor of the channels' noise covariance (m, m)."""
+    refuse_not_real("X", X)
+    refuse_not_real("Y", Y)
     if X.dim() < 3 or Y.dim() < 2:
         raise ValueError(
             "Expected `X` (*, N, m, n) and `Y` (*, N, m) with `noise_covariance`; a single channel takes `d`."
@@ -113,6 +123,9 @@ class FixedPointLinear(LinearEstimator):
         n_iter_: steps made. converged_: (*,).
         differentiable_: after a fit as a layer, whether each problem's solution has a derivative, (*,).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (13)-(16), Algorithm 1.
 
@@ -146,17 +159,25 @@ class FixedPointLinear(LinearEstimator):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        if max_iter < 1:
-            raise ValueError(f"Expected argument `max_iter` to be at least 1 but got {max_iter}.")
+        refuse_out_of_range("sigma", sigma, ends="(]", advice="inf is least squares")
+        refuse_out_of_range("d", d, advice="it is the scale of the noise, in the unit of Y")
+        if noise_covariance is not None:
+            refuse_no_tensor("noise_covariance", noise_covariance, "a tensor")
+            refuse_complex("noise_covariance", noise_covariance)
+            if noise_covariance.dim() != 2 or noise_covariance.shape[0] != noise_covariance.shape[1]:
+                raise ValueError(
+                    f"Expected argument `noise_covariance` of shape (m, m) but got {tuple(noise_covariance.shape)}; "
+                    "variances alone are `d` squared."
+                )
         self.sigma = sigma
         self.d = d
         self.noise_covariance = noise_covariance
-        self.start = start
-        self.max_iter = max_iter
-        self.tol = tol
+        self.start = checked_start(start)
+        self.max_iter = checked_whole("max_iter", max_iter, 1, "500 is ample")
+        self.tol = checked_number("tol", tol, 0.0, 1.0, "[)", "1e-13 suits float64")
         self.covariance = checked_kind(covariance)
         self.bandwidth = checked_bandwidth(bandwidth)
-        self.seed = seed
+        self.seed = checked_whole("seed", seed)
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> FixedPointLinear:
         """Fit ``Y ~ X coef``.
