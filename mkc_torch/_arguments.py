@@ -30,6 +30,7 @@ __all__ = [
     "refuse_no_tensor",
     "refuse_not_finite",
     "refuse_not_real",
+    "refuse_other_type",
     "refuse_out_of_range",
     "refuse_text",
     "seems_finite",
@@ -44,6 +45,25 @@ DIVERGED = "The network has diverged, or what it was given holds NaN: lower the 
 def told(value: object) -> str:
     """What a value is, as an error tells it: classes by their names, long values shortened."""
     return f"the class {value.__name__}" if isinstance(value, type) else reprlib.repr(value)
+
+
+def refuse_other_type(name: str, value: object, kind: type, what: str, advice: str) -> None:
+    """Refuse what is no instance of a class; the class itself is told to be made one.
+
+    Args:
+        name: of the argument.
+        value: of the argument.
+        kind: the class.
+        what: is wanted, "a Recording" say.
+        advice: how to get one.
+
+    Raises:
+        TypeError: it is none.
+    """
+    if not isinstance(value, kind):
+        if isinstance(value, type) and issubclass(value, kind):
+            advice = f"make one, {value.__name__}(...)"
+        raise TypeError(f"Expected argument `{name}` to be {what} but got {told(value)}; {advice}.")
 
 
 def refuse_no_tensor(name: str, value: object, kind: str) -> None:

@@ -13,6 +13,7 @@ from mkc_torch._arguments import (
     refuse_bad_batch,
     refuse_bad_weight,
     refuse_not_real,
+    refuse_other_type,
     refuse_out_of_range,
     refuse_text,
     told,
@@ -104,6 +105,16 @@ def test_whole_numbers():
     for value in (0, 2.0, 1.5, True, "3", None):
         with pytest.raises(ValueError, match=r"`x` to be a whole number of at least 1 but got .*; 10 is ample\.$"):
             checked_whole("x", value, 1, "10 is ample")
+
+
+def test_what_is_no_instance_is_refused_and_a_class_is_told_to_be_made_one():
+    refuse_other_type("x", torch.nn.ReLU(), torch.nn.Module, "a module", "write one")
+    with pytest.raises(TypeError, match=r"`x` to be a module but got 'a'; write one\.$"):
+        refuse_other_type("x", "a", torch.nn.Module, "a module", "write one")
+    with pytest.raises(TypeError, match=r"`x` to be a module but got the class ReLU; make one, ReLU\(\.\.\.\)\.$"):
+        refuse_other_type("x", torch.nn.ReLU, torch.nn.Module, "a module", "write one")
+    with pytest.raises(TypeError, match=r"got the class int; write one\.$"):
+        refuse_other_type("x", int, torch.nn.Module, "a module", "write one")
 
 
 def test_text_is_no_sequence_of_names():
