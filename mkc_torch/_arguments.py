@@ -43,8 +43,12 @@ DIVERGED = "The network has diverged, or what it was given holds NaN: lower the 
 
 
 def told(value: object) -> str:
-    """What a value is, as an error tells it: classes by their names, long values shortened."""
-    return f"the class {value.__name__}" if isinstance(value, type) else reprlib.repr(value)
+    """What a value is, as an error tells it: classes and what has no text by their names, long values shortened."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    text = reprlib.repr(value)
+    kind = type(value).__name__
+    return f"a{'n' * (kind[0] in 'AEIOUaeiou')} {kind}" if text.startswith("<") else text
 
 
 def refuse_other_type(name: str, value: object, kind: type, what: str, advice: str) -> None:

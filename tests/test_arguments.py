@@ -155,4 +155,6 @@ def test_weights_may_be_counts_and_masks_but_no_lists_and_not_complex():
 def test_values_are_told_in_short():
     assert told(torch.nn.Linear) == "the class Linear"
     assert told("a") == "'a'"
+    assert told(told) == "a function"
+    assert told(object()) == "an object"
     assert len(told(list(range(1000)))) < 60
