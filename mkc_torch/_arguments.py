@@ -46,9 +46,10 @@ def told(value: object) -> str:
     """What a value is, as an error tells it: classes and what has no text by their names, long values shortened."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
-    text = reprlib.repr(value)
-    kind = type(value).__name__
-    return f"a{'n' * (kind[0] in 'AEIOUaeiou')} {kind}" if text.startswith("<") else text
+    text, kind = reprlib.repr(value), type(value).__name__
+    if not text.startswith("<"):
+        return text
+    return f"an {kind}" if kind[0] in "AEIOUaeiou" else f"a {kind}"
 
 
 def refuse_other_type(name: str, value: object, kind: type, what: str, advice: str) -> None:

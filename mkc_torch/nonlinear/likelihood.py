@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number, checked_whole
 from mkc_torch.density_fit import DensityState, domain_rule, initial_state, refuse_narrow_bound
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 from mkc_torch.nonlinear._alternate import alternated, gaussian_candidate, likelihood_of
@@ -41,6 +42,13 @@ class NonlinearFit:
         jacobian: of the residual at ``theta``, (*, N, m, p).
         n_iter: trial steps made.
         converged: (*,).
+
+    Example:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> y = 2.0 + 0.1 * torch.randn(200, generator=generator, dtype=torch.float64)
+        >>> found = fit(lambda theta: (y - theta).unsqueeze(-1), torch.tensor([0.0]).double())
+        >>> round(float(found.theta), 1), round(float(found.d), 1), round(float(found.standard_error()), 3)
+        (2.0, 0.1, 0.007)
     """
 
     theta: Float[Tensor, "*batch p"]
@@ -56,7 +64,11 @@ class NonlinearFit:
     converged: Bool[Tensor, " *batch"]
 
     def standard_error(self) -> Float[Tensor, "*batch p"]:
-        """Square root of the diagonal of ``covariance``, in the units of the parameters."""
+        """Square root of the diagonal of ``covariance``, in the units of the parameters.
+
+        Raises:
+            ValueError: the fit was made without a covariance.
+        """
         if self.covariance is None:
             raise ValueError("Expected a fit with a covariance but it was made with covariance=None; name a kind.")
         return self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
@@ -124,8 +136,8 @@ def fit(
         >>> [round(v, 1) for v in found.theta.tolist()], bool(found.standard_error().max() < 0.05)
         ([3.0, 0.7], True)
     """
-    if max_iter < 1:
-        raise ValueError(f"Expected argument `max_iter` to be at least 1 but got {max_iter}.")
+    checked_whole("max_iter", max_iter, 1, "200 is usual")
+    checked_number("tol", tol, ends="[)", advice="1e-10 suits float64")
     kind = None if covariance is None else checked_kind(covariance)
     checked_bandwidth(bandwidth)
     problem, point = prepared(
