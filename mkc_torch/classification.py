@@ -207,7 +207,10 @@ def graduated_sigma(progress: float, *, start: float = 1.2, end: float = 0.8, un
         σ.
 
     Raises:
-        ValueError: an argument out of range.
+        TypeError, ValueError: an argument that is no number, or out of range.
+
+    References:
+        Zhang and Sabuncu (2018) keep q; :class:`GeneralizedCrossEntropyLoss` has the source. The course is our own.
 
     Example:
         >>> [round(graduated_sigma(p), 2) for p in (0.0, 0.25, 0.5, 1.0)]

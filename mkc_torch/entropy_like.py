@@ -182,6 +182,12 @@ class LELoss(nn.Module):
             be the other dimensions: ``dim=0`` for (N, m).
         reduction: of what is left, "mean", "sum" or "none".
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
+    References:
+        G. Indiveri, Entropy 11 (2009), (40)-(45).
+
     Example:
         >>> loss = LELoss()
         >>> output = torch.zeros(50, requires_grad=True)

@@ -100,7 +100,12 @@ def _checked(least_sigma: float = _SIGMA_TINY, **given: object) -> tuple[Tensor,
 
 
 def inverse_square(sigma: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """``kappa = 1 / sigma^2``, with value and gradient 0 at ``sigma = inf``."""
+    """``kappa = 1 / sigma^2``, with value and gradient 0 at ``sigma = inf``.
+
+    Example:
+        >>> inverse_square(torch.tensor([0.5, math.inf]))
+        tensor([4., 0.])
+    """
     return sigma.pow(-2)
 
 
@@ -207,6 +212,9 @@ def energy(z: Float[Tensor, "*batch"], kappa: Float[Tensor, "*batch"]) -> Float[
     Raises:
         TypeError: an argument is no tensor.
 
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (9).
+
     Example:
         >>> energy(torch.tensor([1.0, 3.0]), torch.tensor(0.0))
         tensor([0.5000, 4.5000])
@@ -292,6 +300,9 @@ def log_partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"
 
     Raises:
         TypeError: an argument is no tensor.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
 
     Example:
         >>> log_partition(torch.tensor(1 / 9.0).double(), torch.tensor(10.0).double()).exp()

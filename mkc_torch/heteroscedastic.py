@@ -70,7 +70,7 @@ class HeteroscedasticMKCLoss(_WideBuffers):
         bound: buffer () or (m,), saved in the state_dict.
 
     Raises:
-        ValueError: an argument out of range.
+        TypeError, ValueError: an argument of another kind, or out of range.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
@@ -204,7 +204,11 @@ class MKCHead(_WideBuffers):
         scales: linear layer of what σ and d are made of.
 
     Raises:
-        ValueError: an argument out of range.
+        TypeError, ValueError: an argument of another kind, or out of range.
+
+    References:
+        Nix and Weigend, "Estimating the mean and variance of the target probability distribution", ICNN 1994: a scale
+        predicted beside the mean.
 
     Example:
         >>> head = MKCHead(5, 2, bound=50.0, d_min=1e-3, d_init=0.5)

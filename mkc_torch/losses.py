@@ -60,6 +60,7 @@ class MKCLoss(nn.Module):
         bound, d_min: buffers (m,), saved in the state_dict.
 
     Raises:
+        TypeError: an argument that is no number.
         ValueError: an argument out of range, or learning asked for with ``normalize=False``.
 
     Warns:

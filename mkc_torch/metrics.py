@@ -43,6 +43,9 @@ class MKCNegativeLogLikelihood(Metric):
     Raises:
         TypeError: ``loss`` is no MKCLoss.
 
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
+
     Example:
         >>> loss = MKCLoss(2, sigma=3.0, d=1.0, bound=50.0)
         >>> metric = MKCNegativeLogLikelihood(loss)

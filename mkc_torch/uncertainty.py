@@ -86,6 +86,9 @@ def outliers(
         TypeError: as in :func:`inlier_weight`.
         ValueError: as in :func:`inlier_weight`; a limit outside (0, 1); an error that is NaN.
 
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (15).
+
     Example:
         >>> loss = MKCLoss(1, sigma=2.0, d=1.0)
         >>> outliers(loss, torch.zeros(3, 1), torch.tensor([[0.0], [2.0], [50.0]])).flatten()
@@ -129,6 +132,9 @@ def beyond_bound(
         TypeError: as in :func:`inlier_weight`.
         ValueError: as the loss: shapes, channels, weights, an input or a target that counts and is not finite.
 
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
+
     Example:
         >>> loss = MKCLoss(2, bound=10.0)
         >>> target = torch.tensor([[0.0, 11.0], [-12.0, 1.0], [0.5, 0.0], [9.9, 0.0]])
@@ -169,6 +175,9 @@ def predictive_interval(loss: MKCLoss, input: Float[Tensor, "*shape"], level: fl
         TypeError: a loss of another kind; an integer or complex input, or what is no tensor.
         ValueError: a level outside (0, 1), an input that is empty or not finite, or another number of channels than the
             loss.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
 
     Example:
         >>> loss = MKCLoss(1, sigma=float("inf"), d=1.0, learn_sigma=False)

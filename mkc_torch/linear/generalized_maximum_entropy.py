@@ -43,6 +43,9 @@ class GeneralizedMaximumEntropy(LinearEstimator):
         n_iter_: steps of each problem, (*,).
         weights_: ones, (*, N, m).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         A. Golan, G. Judge, D. Miller, Maximum Entropy Econometrics (1996); G. Indiveri, Entropy 11 (2009), (30)-(39).
 

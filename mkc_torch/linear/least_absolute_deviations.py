@@ -36,6 +36,9 @@ class LeastAbsoluteDeviations(LinearEstimator):
         n_iter_: interior-point iterations (*,) of each problem, 0 where least squares already fits exactly.
         converged_: whether each problem (*,) reached ``tol``, or the rounding error of an objective near 0.
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     Example:
         >>> X = torch.tensor([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0], [1.0, 3.0]])
         >>> fit = LeastAbsoluteDeviations().fit(X, torch.tensor([1.0, 3.0, 50.0, 7.0]))

@@ -55,6 +55,9 @@ class LeastEntropyLike(LinearEstimator):
         weights_: 1 where the gradient (52) draws a residual towards zero, 0 where it pushes it away: where
             ``log q`` exceeds its mean under q.
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         G. Indiveri, "An Entropy-Like Estimator for Robust Parameter Identification", Entropy 11 (2009) 560-585.
 

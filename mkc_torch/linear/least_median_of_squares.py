@@ -55,6 +55,9 @@ class LeastMedianOfSquares(LinearEstimator):
         exact_: whether the optimum is certain: one channel, with h = N or all sets tried.
         n_iter_, converged_: refinements made, and whether they had come to rest, (*,).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         Rousseeuw, "Least median of squares regression", JASA 79 (1984) 871-880.
         Stromberg, "Computing the exact least median of squares estimate and stability diagnostics in multiple linear

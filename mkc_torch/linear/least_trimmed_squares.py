@@ -118,6 +118,9 @@ class LeastTrimmedSquares(LinearEstimator):
         exact_: whether the optimum is certain: every choice was tried, or h = N in one channel.
         n_iter_, converged_: steps made, and whether they had come to rest, (*,).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         Rousseeuw, "Least median of squares regression", JASA 79 (1984) 871-880.
         Rousseeuw & Van Driessen, "Computing LTS regression for large data sets", DMKD 12 (2006) 29-45.

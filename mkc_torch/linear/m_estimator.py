@@ -151,6 +151,9 @@ class MEstimator(LinearEstimator):
         weights_: ψ(z) / z, 1 at z = 0, (*, N, m).
         n_iter_, converged_: steps made, and whether they had come to rest, (*,).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         Indiveri, "An entropy-like estimator for robust parameter identification", Entropy 11 (2009), (11)-(21).
         Huber, "Robust estimation of a location parameter", Annals of Mathematical Statistics 35 (1964), proposal 2.

@@ -62,6 +62,9 @@ class MinimumEntropy(LinearEstimator):
         weights_: density of each residual over the greatest, (*, N, m).
         n_iter_, converged_: steps tried, and whether a local minimum was reached, (*,).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         E. Wolsztynski, E. Thierry, L. Pronzato, "Minimum-entropy estimation in semi-parametric models", Signal
         Processing 85 (2005) 937-949; B. W. Silverman, Density Estimation (1986), p. 45.

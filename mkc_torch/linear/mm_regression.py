@@ -38,6 +38,9 @@ class MMRegression(LinearEstimator):
         weights_: bisquare weights in [0, 1], (*, N, m).
         n_iter_, converged_: steps made after the S-estimate, and whether they had come to rest, (*,).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         Yohai, "High breakdown-point and high efficiency robust estimates for regression", Annals of Statistics 15
         (1987) 642-656.

@@ -52,6 +52,9 @@ class ReweightedLeastSquares(LinearEstimator):
         weights_: 1 for the values that count, 0 for those rejected, (*, N, m).
         start_: the robust fit.
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987), pp. 44-45 and 202 (the first scale).
         Indiveri, "An entropy-like estimator for robust parameter identification", Entropy 11 (2009), (26)-(29).

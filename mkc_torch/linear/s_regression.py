@@ -99,6 +99,9 @@ class SRegression(LinearEstimator):
         weights_: bisquare weights in [0, 1], (*, N, m).
         n_iter_, converged_: steps made, and whether they had come to rest, (*,).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         Rousseeuw & Yohai, "Robust regression by means of S-estimators" (1984).
         Salibian-Barrera & Yohai, "A fast algorithm for S-regression estimates", JCGS 15 (2006) 414-427.
