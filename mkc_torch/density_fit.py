@@ -389,14 +389,21 @@ def fit_density(
     half_width = parameter("bound", bound)
     if half_width is not None:
         refuse_narrow_bound(half_width, scale)
+    else:
+        half_width = domain_rule(error, scale, None if weight is None else weight > 0)
+    if floor is not None and bool((floor >= half_width).any()):
+        raise ValueError(
+            f"Expected argument `d_min` below the half-width of the domain, {half_width.tolist()}, but got {d_min}; it "
+            "is the precision of the residuals."
+        )
     fixed_sigma, fixed_d = parameter("sigma", sigma, SIGMA_LEAST, infinite=True), parameter("d", d)
-    if fixed_d is not None and half_width is not None and bool((fixed_d >= half_width).any()):
+    if fixed_d is not None and bound is not None and bool((fixed_d >= half_width).any()):
         raise ValueError(f"Expected argument `d` below `bound` but got {d} and {bound}; widen `bound`.")
     state = initial_state(
         error,
         normalised,
         scale,
-        domain_rule(error, scale, None if weight is None else weight > 0) if half_width is None else half_width,
+        half_width,
         0.1 * scale if floor is None else floor,
         kappa=None if fixed_sigma is None else fixed_sigma.pow(-2),
         d=fixed_d,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from mkc_torch._arguments import as_numbers, first_of, refuse_no_tensor
+from mkc_torch._arguments import as_numbers, first_of, refuse_no_tensor, told
 from mkc_torch.functional import (
     as_computed,
     energy,
@@ -154,6 +154,11 @@ class MKCDistribution(Distribution):
 
     def rsample(self, sample_shape: _Shape = torch.Size()) -> Tensor:  # noqa: B008
         """Samples, differentiable in sigma, d, bound and loc; drawn from torch's global generator."""
+        if not isinstance(sample_shape, (tuple, list)):
+            raise TypeError(
+                f"Expected argument `sample_shape` to be a shape but got {told(sample_shape)}; write (1000,) for a "
+                "thousand samples."
+            )
         shape = self._extended_shape(torch.Size(sample_shape))
         uniform = torch.rand(shape, dtype=self.d.dtype, device=self.d.device)
         return self.icdf(uniform.clamp(min=torch.finfo(uniform.dtype).eps / 4))  # a draw of 0 would be an edge

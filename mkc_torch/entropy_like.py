@@ -123,8 +123,17 @@ def _entropy(
     return entropy / math.log(count) if count > 1 else 0.0 * entropy
 
 
+def _refuse_no_dimension(dim: object) -> None:
+    dims = dim if isinstance(dim, (tuple, list)) else () if dim is None else (dim,)
+    if not all(isinstance(d, int) for d in dims):
+        raise TypeError(
+            f"Expected argument `dim` to be a dimension, several, or None but got {told(dim)}; 0 is that of samples."
+        )
+
+
 def _dimensions(residual: Tensor, dim: int | tuple[int, ...] | None) -> tuple[int, ...]:
     """The dimensions of one population."""
+    _refuse_no_dimension(dim)
     count = residual.dim()
     if dim is None:
         return tuple(range(count))
@@ -203,13 +212,7 @@ class LELoss(nn.Module):
     ) -> None:
         super().__init__()
         refuse_other_reduction(reduction)
-        if dim is not None and not isinstance(dim, int):
-            if not isinstance(dim, (tuple, list)) or not all(isinstance(d, int) for d in dim):
-                raise TypeError(
-                    f"Expected argument `dim` to be a dimension, several, or None but got {told(dim)}; 0 is that of "
-                    "the samples."
-                )
-            dim = tuple(dim)
+        _refuse_no_dimension(dim)
         self.dim = dim
         self.reduction = reduction
 

@@ -462,6 +462,7 @@ def test_arguments_that_lead_nowhere_are_refused():
     for options, message in (
         ({"sigma": 0.01}, r"`sigma` to be in \[0\.05, inf\] but got 0\.01"),
         ({"d": 30.0, "bound": 20.0}, "`d` below `bound` but got 30.0 and 20.0"),
+        ({"d_min": 1e9}, r"`d_min` below the half-width of the domain, \[.*\], but got 1000000000"),
         ({"max_iter": 0}, "`max_iter` to be a whole number of at least 1 but got 0"),
         ({"tol": -1.0}, "`tol` to be >= 0 and finite but got -1"),
         ({"tol": math.nan}, "`tol` to be >= 0 and finite but got nan"),

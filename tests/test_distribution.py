@@ -189,6 +189,13 @@ def test_a_number_is_no_tensor_of_values(name):
         getattr(MKCDistribution(2.0, 1.0, 10.0, validate_args=True), name)(0.5)
 
 
+@pytest.mark.parametrize("shape", [3, "a", None])
+def test_what_is_no_shape_of_samples_is_refused(shape):
+    for draw in (MKCDistribution(2.0, 1.0, 10.0).rsample, MKCDistribution(2.0, 1.0, 10.0).sample):
+        with pytest.raises(TypeError, match=r"`sample_shape` to be a shape but got .*; write \(1000,\)"):
+            draw(shape)
+
+
 @pytest.mark.parametrize("name", ["sigma", "d", "bound", "loc"])
 @pytest.mark.parametrize("value", ["2", None, torch.ones(1) + 0j])
 def test_parameters_that_are_no_numbers_are_refused_by_name(name, value):

@@ -245,6 +245,8 @@ def test_the_loss_refuses_what_it_cannot_answer():
     for dim in ("a", 1.5, (0, "a")):
         with pytest.raises(TypeError, match="`dim` to be a dimension, several, or None but got"):
             LELoss(dim=dim)
+        with pytest.raises(TypeError, match="`dim` to be a dimension, several, or None but got"):
+            entropy_like(x, dim)
     for dim in (7, (0, 0), (0, -1)):
         with pytest.raises(ValueError, match=r"`dim` to be dimensions of the residuals \(3,\), each once, but got"):
             LELoss(dim=dim)(x, 2 * x)

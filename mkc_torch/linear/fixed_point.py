@@ -15,6 +15,7 @@ from mkc_torch._arguments import (
     refuse_no_tensor,
     refuse_not_real,
     refuse_out_of_range,
+    told,
 )
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._mkc import (
@@ -45,16 +46,39 @@ def whitened(X: Tensor, Y: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
             "Expected `X` (*, N, m, n) and `Y` (*, N, m) with `noise_covariance`; a single channel takes `d`."
         )
     m = Y.shape[-1]
-    covariance = covariance.to(Y)
     if covariance.shape != (m, m):
-        raise ValueError(f"Expected argument `noise_covariance` of shape ({m}, {m}) but got {tuple(covariance.shape)}.")
-    factor, info = torch.linalg.cholesky_ex(covariance)
-    if int(info) != 0 or not torch.allclose(covariance, covariance.mT, rtol=1e-5, atol=0.0):
-        raise ValueError("Expected argument `noise_covariance` to be symmetric and positive definite.")
+        raise ValueError(
+            f"Expected argument `noise_covariance` of shape ({m}, {m}), a row for each channel of `Y`, but got "
+            f"{tuple(covariance.shape)}."
+        )
+    factor = _cholesky_factor(covariance.to(Y))
     return (
         torch.linalg.solve_triangular(factor, X, upper=False),
         torch.linalg.solve_triangular(factor, Y.unsqueeze(-1), upper=False).squeeze(-1),
     )
+
+
+def _cholesky_factor(covariance: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
+    factor, info = torch.linalg.cholesky_ex(covariance)
+    if int(info) != 0 or not torch.allclose(covariance, covariance.mT, rtol=1e-5, atol=0.0):
+        raise ValueError(
+            "Expected argument `noise_covariance` to be symmetric and positive definite but got "
+            f"{told(covariance.tolist())}; variances alone are `d` squared."
+        )
+    return factor
+
+
+def _refuse_no_covariance(covariance: Tensor) -> None:
+    """Refuse what its value alone says is no covariance, where that can be seen."""
+    refuse_no_tensor("noise_covariance", covariance, "a tensor")
+    refuse_complex("noise_covariance", covariance)
+    if covariance.dim() != 2 or covariance.shape[0] != covariance.shape[1]:
+        raise ValueError(
+            f"Expected argument `noise_covariance` of shape (m, m) but got {tuple(covariance.shape)}; variances alone "
+            "are `d` squared."
+        )
+    if covariance.device.type == "cpu" and not torch._C._are_functorch_transforms_active():
+        _cholesky_factor(covariance.detach().double())
 
 
 def descend(
@@ -162,13 +186,7 @@ class FixedPointLinear(LinearEstimator):
         refuse_out_of_range("sigma", sigma, ends="(]", advice="inf is least squares")
         refuse_out_of_range("d", d, advice="it is the scale of the noise, in the unit of Y")
         if noise_covariance is not None:
-            refuse_no_tensor("noise_covariance", noise_covariance, "a tensor")
-            refuse_complex("noise_covariance", noise_covariance)
-            if noise_covariance.dim() != 2 or noise_covariance.shape[0] != noise_covariance.shape[1]:
-                raise ValueError(
-                    f"Expected argument `noise_covariance` of shape (m, m) but got {tuple(noise_covariance.shape)}; "
-                    "variances alone are `d` squared."
-                )
+            _refuse_no_covariance(noise_covariance)
         self.sigma = sigma
         self.d = d
         self.noise_covariance = noise_covariance

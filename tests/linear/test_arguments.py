@@ -148,6 +148,11 @@ def test_a_coverage_of_nothing_is_refused(kind):
             ValueError,
             r"of shape \(m, m\) but got \(2, 3\)",
         ),
+        (
+            lambda: FixedPointLinear(noise_covariance=-torch.eye(2)),
+            ValueError,
+            "symmetric and positive definite but got",
+        ),
     ],
 )
 def test_other_arguments_are_refused_as_they_are_given(make, error, message):
