@@ -96,9 +96,7 @@ def refuse_complex(name: str, value: Tensor) -> None:
         TypeError: they are.
     """
     if value.is_complex():
-        raise TypeError(
-            f"Expected argument `{name}` to be real but got {value.dtype}; pass real and imaginary parts as channels."
-        )
+        raise TypeError(f"Expected argument `{name}` to be real but got {value.dtype}; pass its real part.")
 
 
 def refuse_not_real(name: str, value: object, kind: str = "a real floating-point tensor") -> None:
@@ -126,7 +124,7 @@ def as_numbers(
     if not isinstance(value, Tensor):
         try:
             return torch.as_tensor(value, dtype=dtype or torch.get_default_dtype(), device=device)
-        except (TypeError, ValueError, RuntimeError):
+        except (TypeError, ValueError, RuntimeError, OverflowError):
             raise TypeError(
                 f"Expected argument `{name}` to be a number, or a tensor of them, but got {told(value)}."
             ) from None
@@ -183,7 +181,10 @@ def checked_number(
         raise TypeError(
             f"Expected argument `{name}` to be a number {_range(low, high, ends)} but got {told(value)}{_then(advice)}."
         )
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        number = math.inf
     refuse_out_of_range(name, number, low, high, ends, advice)
     return number
 

@@ -85,6 +85,7 @@ class MKCDistribution(Distribution):
 
     def expand(self, batch_shape: _Shape, _instance: MKCDistribution | None = None) -> MKCDistribution:
         """The same distribution with its batch dimensions broadcast to ``batch_shape``."""
+        _refuse_no_shape("batch_shape", batch_shape)
         new = self._get_checked_instance(MKCDistribution, _instance)  # type: ignore[no-untyped-call]
         shape = torch.Size(batch_shape)
         for name in ("sigma", "d", "bound", "loc"):
@@ -154,11 +155,7 @@ class MKCDistribution(Distribution):
 
     def rsample(self, sample_shape: _Shape = torch.Size()) -> Tensor:  # noqa: B008
         """Samples, differentiable in sigma, d, bound and loc; drawn from torch's global generator."""
-        if not isinstance(sample_shape, (tuple, list)):
-            raise TypeError(
-                f"Expected argument `sample_shape` to be a shape but got {told(sample_shape)}; write (1000,) for a "
-                "thousand samples."
-            )
+        _refuse_no_shape("sample_shape", sample_shape)
         shape = self._extended_shape(torch.Size(sample_shape))
         uniform = torch.rand(shape, dtype=self.d.dtype, device=self.d.device)
         return self.icdf(uniform.clamp(min=torch.finfo(uniform.dtype).eps / 4))  # a draw of 0 would be an edge
@@ -192,6 +189,13 @@ class MKCDistribution(Distribution):
         on_tail = tail.unsqueeze(-1) * head(nodes, tail_energy.unsqueeze(-1))
         excess = (weights * (head(nodes, e) * torch.exp(-e) - on_tail)).sum(-1)
         return (2.0 * length * tail * tail_mean(length, tail_energy) + excess) / partition(kappa, length)
+
+
+def _refuse_no_shape(name: str, shape: object) -> None:
+    if not isinstance(shape, (tuple, list)) or not all(isinstance(size, (int, torch.SymInt)) for size in shape):
+        raise TypeError(
+            f"Expected argument `{name}` to be a shape but got {told(shape)}; write (1000,) for a thousand."
+        )
 
 
 def _cumulative(u: Tensor, kappa: Tensor, length: Tensor) -> Tensor:

@@ -46,7 +46,7 @@ def test_numbers_are_those_of_tensors_sequences_and_arrays():
     for value in ([1.0, 2.0], (1, 2), np.array([1.0, 2.0])):
         assert as_numbers("x", value, torch.float64).tolist() == [1.0, 2.0]
     assert as_numbers("x", 2).dtype == torch.get_default_dtype()
-    for value in ("a", None, 1j, [[1.0], [1.0, 2.0]], torch.nn.Linear):
+    for value in ("a", None, 1j, [[1.0], [1.0, 2.0]], torch.nn.Linear, 10**400):
         with pytest.raises(TypeError, match="`x` to be a number, or a tensor of them, but got "):
             as_numbers("x", value)
 
@@ -92,6 +92,8 @@ def test_values_under_vmap_and_in_empty_tensors_are_not_looked_at():
 def test_one_number_is_no_tensor_text_or_flag():
     assert checked_number("x", np.float32(0.5), 0.0, 1.0) == 0.5
     assert checked_number("x", 1, 0.0, 2.0) == 1
+    with pytest.raises(ValueError, match="`x` to be positive and finite but got inf"):
+        checked_number("x", 10**400)
     for value in ("0.5", None, True, torch.tensor(0.5), [0.5]):
         with pytest.raises(TypeError, match=r"`x` to be a number in \(0, 1\) but got .*; half is usual\.$"):
             checked_number("x", value, 0.0, 1.0, advice="half is usual")

@@ -189,11 +189,13 @@ def test_a_number_is_no_tensor_of_values(name):
         getattr(MKCDistribution(2.0, 1.0, 10.0, validate_args=True), name)(0.5)
 
 
-@pytest.mark.parametrize("shape", [3, "a", None])
+@pytest.mark.parametrize("shape", [3, "a", None, (2.5,)])
 def test_what_is_no_shape_of_samples_is_refused(shape):
     for draw in (MKCDistribution(2.0, 1.0, 10.0).rsample, MKCDistribution(2.0, 1.0, 10.0).sample):
         with pytest.raises(TypeError, match=r"`sample_shape` to be a shape but got .*; write \(1000,\)"):
             draw(shape)
+    with pytest.raises(TypeError, match=r"`batch_shape` to be a shape but got"):
+        MKCDistribution(2.0, 1.0, 10.0).expand(shape)
 
 
 @pytest.mark.parametrize("name", ["sigma", "d", "bound", "loc"])

@@ -634,6 +634,8 @@ def test_bad_starts_and_residuals_are_refused(function):
     [
         ({"residual": 3}, "`residual` to be a function of the parameters but got 3"),
         ({"equality": 3}, "`equality` to be a function of the parameters but got 3"),
+        ({"equality": lambda _: 3}, r"`equality` to be a function that returns a tensor \(k,\) but got 3"),
+        ({"start": START.half()}, r"`start` of dtype float32 or float64 but got torch\.float16; use \.float"),
         ({"residual": lambda _: "text"}, "`residual` to be a function that returns a tensor but got 'text'"),
         ({"start": [1.0, 1.0, 1.0]}, r"`start` .* got list; make a tensor of it, torch\.as_tensor\(start\)"),
         ({"sigma": "a"}, "`sigma` to be a number, or a tensor of them, but got 'a'"),
@@ -649,6 +651,12 @@ def test_arguments_of_another_kind_are_refused(function, arguments, message):
     given = {"residual": residual_to(noisy(0)), "start": START} | arguments
     with pytest.raises(TypeError, match=message):
         function(given.pop("residual"), given.pop("start"), **given)
+
+
+def test_a_bandwidth_below_that_of_the_normaliser_is_refused_where_there_is_one():
+    minimise(residual_to(noisy(0)), START, sigma=0.04)
+    with pytest.raises(ValueError, match=r"`sigma` to be in \[0\.05, inf\] but got 0\.04"):
+        fit(residual_to(noisy(0)), START, sigma=0.04)
 
 
 def test_a_narrow_bound_is_refused():

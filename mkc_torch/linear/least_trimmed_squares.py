@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import numbers
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -25,9 +26,9 @@ def stacked(weight: Tensor | None) -> Tensor | None:
     return None if weight is None else weight.unsqueeze(1)
 
 
-def checked_h(h: int | None) -> int | None:
+def checked_h(h: object) -> int | None:
     """``h``, or a clear error; what it has to exceed is not known before the fit."""
-    if h is not None and (isinstance(h, bool) or not isinstance(h, int)):
+    if h is not None and (isinstance(h, bool) or not isinstance(h, numbers.Integral)):
         raise TypeError(f"Expected argument `h` to be a whole number but got {h!r}; it counts values.")
     return None if h is None else checked_whole("h", h, 1, "it counts values; None takes the default")
 

@@ -40,6 +40,8 @@ def prepared(
                 "lambda theta: ..."
             )
     refuse_not_real("start", start)
+    if start.dtype in (torch.float16, torch.bfloat16):
+        raise TypeError(f"Expected argument `start` of dtype float32 or float64 but got {start.dtype}; use .float().")
     if start.dim() == 0 or start.shape[-1] == 0 or start.numel() == 0:
         raise ValueError(f"Expected argument `start` of shape (*, p >= 1) but got {tuple(start.shape)}.")
     if not bool(torch.isfinite(start).all()):
@@ -114,11 +116,15 @@ def prepared(
     return problem, point
 
 
-def per_channel(name: str, value: float | Tensor, like: Tensor, batch: torch.Size, *, infinite: bool) -> Tensor:
+def per_channel(
+    name: str, value: float | Tensor, like: Tensor, batch: torch.Size, *, infinite: bool, least: float = 0.0
+) -> Tensor:
     """A positive parameter of every channel, (B, m), from a number, (m,) or (*, m)."""
     t = as_numbers(name, value, like.dtype, like.device).to(like)
-    if not bool(((t > 0) & (torch.isfinite(t) | infinite)).all()):
+    if not bool(((t > 0) & (t >= least) & (torch.isfinite(t) | infinite)).all()):
         kind = "positive" if infinite else "positive and finite"
+        if least > 0.0:
+            kind = f"in [{least:.4g}, inf]"
         raise ValueError(f"Expected argument `{name}` to be {kind} but got {value}.")
     m = like.shape[-1]
     try:
@@ -203,6 +209,7 @@ def _checked_weight(weight: Tensor | None, first: Tensor, batch: torch.Size) -> 
 
 def _constraint_count(name: str, constraint: Constraint, theta: Tensor) -> int:
     value = constraint(theta)
+    refuse_other_type(name, value, Tensor, "a function that returns a tensor (k,)", "make one of its result")
     if value.dim() != 1 or not bool(torch.isfinite(value).all()):
         raise ValueError(
             f"Expected argument `{name}` to return finite values (k,) at `start` but got {value.tolist()}; "

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mkc_torch._arguments import checked_number, checked_whole
 from mkc_torch.density_fit import DensityState, domain_rule, initial_state, refuse_narrow_bound
+from mkc_torch.functional import SIGMA_LEAST
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 from mkc_torch.nonlinear._alternate import alternated, gaussian_candidate, likelihood_of
 from mkc_torch.nonlinear._arguments import per_channel, prepared
@@ -111,7 +112,7 @@ def fit(
         start: (*, p).
         bound: half-width of the domain in the unit of the residual, at least two robust scales: a number, (m,) or
             (*, m); None takes :func:`mkc_torch.density_fit.domain_rule` on a rough robust fit.
-        sigma: None learns σ; a value keeps it.
+        sigma: None learns σ; a value in [0.05, inf] keeps it.
         d: None learns d; a value keeps it.
         graduate: False begins at ``start`` as it is; only for starts near the answer.
         data, weight, prior, lower, upper, equality, inequality, jacobian: as in :func:`minimise`.
@@ -152,7 +153,9 @@ def fit(
         inequality=inequality,
         jacobian=jacobian,
     )
-    fixed_sigma = None if sigma is None else per_channel("sigma", sigma, point.residual, problem.batch, infinite=True)
+    fixed_sigma = None
+    if sigma is not None:
+        fixed_sigma = per_channel("sigma", sigma, point.residual, problem.batch, infinite=True, least=SIGMA_LEAST)
     fixed_d = None if d is None else per_channel("d", d, point.residual, problem.batch, infinite=False)
     fixed_bound = None if bound is None else per_channel("bound", bound, point.residual, problem.batch, infinite=False)
     steps = 0

@@ -51,7 +51,7 @@ class Paired:
     Raises:
         TypeError: what is no recording, or text in place of names of columns.
         MissingColumnError: there is no ``time``.
-        ValueError: a standard deviation that is not positive.
+        ValueError: a standard deviation that is not positive, or outputs without a column.
 
     Example:
         >>> time = torch.arange(0.0, 10.0, 0.1, dtype=torch.float64)
@@ -76,6 +76,8 @@ class Paired:
         refuse_no_recording("simulated", simulated)
         if outputs is not None:
             refuse_text("outputs", outputs, "a tuple of names of columns")
+            if not outputs:
+                raise ValueError("Expected argument `outputs` to name a column but got none; None takes all in common.")
         if offset is not None:
             checked_number("offset", offset, advice="it is in s, and None takes half an interval of the recording")
         checked_number("rate", rate, advice=f"{RATE:g} is that of quartz")

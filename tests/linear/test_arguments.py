@@ -112,6 +112,7 @@ def test_starts_that_are_none_are_refused(kind, value):
 
 @pytest.mark.parametrize("kind", [LeastMedianOfSquares, LeastTrimmedSquares])
 def test_a_coverage_of_nothing_is_refused(kind):
+    assert kind(h=np.int64(20)).h == 20
     for h in (-1, 0):
         with pytest.raises(ValueError, match=f"`h` to be a whole number of at least 1 but got {h}; it counts values"):
             kind(h=h)

@@ -154,5 +154,7 @@ def test_tables_that_do_not_meet():
         Paired(simulator()).prepare("REC.csv")
     with pytest.raises(TypeError, match=r"`outputs` to be a tuple of names of columns but got 'y'; write \('y',\)"):
         Paired(simulator(), outputs="y")
+    with pytest.raises(ValueError, match="`outputs` to name a column but got none; None takes all in common"):
+        Paired(simulator(), outputs=())
     with pytest.raises(SimulationError, match="run of one moment"):
         Paired(Recording({"time": torch.zeros(1), "y": torch.zeros(1)})).prepare(recorded(signal(times())))
