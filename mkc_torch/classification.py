@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import as_numbers, checked_number, checked_whole, refuse_no_tensor, refuse_not_real
 from mkc_torch.heteroscedastic import _WideBuffers
-from mkc_torch.losses import Reduction, _at_least_float32
+from mkc_torch.losses import Reduction, _at_least_float32, refuse_other_reduction
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -83,8 +84,8 @@ class GeneralizedCrossEntropyLoss(_WideBuffers):
         reduction: Reduction = "mean",
     ) -> None:
         super().__init__()
-        _refuse_other_reduction(reduction)
-        self.ignore_index = ignore_index
+        refuse_other_reduction(reduction)
+        self.ignore_index = checked_whole("ignore_index", ignore_index, advice="-100 is torch's")
         self.reduction = reduction
         self.register_buffer("kappa", _inverse_square(sigma))
         self.register_buffer("weight", None if weight is None else _class_weights(weight))
@@ -183,9 +184,9 @@ def generalized_cross_entropy(
         >>> generalized_cross_entropy(logits, label, sigma=1.0)  # 1 less the probability
         tensor(0.9100)
     """
-    _refuse_other_reduction(reduction)
+    refuse_other_reduction(reduction)
     weight = None if weight is None else _class_weights(weight)
-    _refuse_not_logits(input)
+    refuse_not_real("input", input, "floating-point logits")
     kappa = _inverse_square(sigma, _at_least_float32(input)).to(input.device)
     return _loss(input, target, kappa, weight, ignore_index, reduction)
 
@@ -206,21 +207,19 @@ def graduated_sigma(progress: float, *, start: float = 1.2, end: float = 0.8, un
         σ.
 
     Raises:
-        ValueError: an argument out of range.
+        TypeError, ValueError: an argument that is no number, or out of range.
+
+    References:
+        Zhang and Sabuncu (2018) keep q; :class:`GeneralizedCrossEntropyLoss` has the source. The course is our own.
 
     Example:
         >>> [round(graduated_sigma(p), 2) for p in (0.0, 0.25, 0.5, 1.0)]
         [1.2, 0.94, 0.8, 0.8]
     """
-    if not 0.0 <= progress <= 1.0:
-        raise ValueError(f"Expected argument `progress` in [0, 1] but got {progress}; pass epoch / epochs.")
-    if not 0.0 < until <= 1.0:
-        raise ValueError(f"Expected argument `until` in (0, 1] but got {until}; 0.5 is half of the training.")
+    checked_number("progress", progress, 0.0, 1.0, "[]", "pass epoch / epochs")
+    checked_number("until", until, 0.0, 1.0, "(]", "0.5 is half of the training")
     for name, sigma in (("start", start), ("end", end)):
-        if not sigma >= SIGMA_LEAST:
-            raise ValueError(
-                f"Expected argument `{name}` in [{SIGMA_LEAST:g}, inf] but got {sigma}; 1.2 to 0.8 is usual."
-            )
+        checked_number(name, sigma, SIGMA_LEAST, math.inf, "[]", "1.2 to 0.8 is usual")
     done = min(1.0, progress / until)
     kappa = (1.0 - done) * start**-2 + done * end**-2
     return kappa**-0.5 if kappa > 0.0 else math.inf
@@ -272,9 +271,8 @@ def _checked(
     input: Tensor, target: Tensor, weight: Tensor | None, ignore_index: int
 ) -> tuple[Tensor, Tensor | None, Tensor]:
     """Cross-entropy of each label, or of each class; the shares of the classes, if given; which labels count."""
-    _refuse_not_logits(input)
-    if not isinstance(target, Tensor):
-        raise TypeError(f"Expected argument `target` to be a tensor but got {type(target).__name__}.")
+    refuse_not_real("input", input, "floating-point logits")
+    refuse_no_tensor("target", target, "a tensor of integer labels or floating-point probabilities")
     if target.dtype == torch.bool or target.is_complex():
         raise TypeError(
             f"Expected argument `target` to be integer labels or floating-point probabilities but got {target.dtype}."
@@ -331,7 +329,7 @@ def _inverse_square(sigma: float | Tensor, dtype: torch.dtype | None = None) -> 
             "Expected argument `sigma` without a gradient but got a tensor that asks for one: the loss is smallest at "
             "the least sigma, whatever the data. Pass sigma.detach(), and see graduated_sigma for its course."
         )
-    t = torch.as_tensor(sigma, dtype=None if isinstance(sigma, Tensor) else dtype or torch.get_default_dtype())
+    t = as_numbers("sigma", sigma, dtype)
     t = t.to(_at_least_float32(t))
     if t.dim() != 0:
         raise ValueError(f"Expected argument `sigma` to be one number but got shape {tuple(t.shape)}.")
@@ -346,7 +344,7 @@ def _inverse_square(sigma: float | Tensor, dtype: torch.dtype | None = None) -> 
 
 
 def _class_weights(weight: Tensor) -> Tensor:
-    t = torch.as_tensor(weight).detach()
+    t = as_numbers("weight", weight).detach()
     t = t.to(_at_least_float32(t))
     if t.dim() != 1 or t.numel() == 0:
         raise ValueError(f"Expected argument `weight` of shape (C,), one for each class, but got {tuple(t.shape)}.")
@@ -357,18 +355,6 @@ def _class_weights(weight: Tensor) -> Tensor:
             "leave it out for equal weights."
         )
     return t.clone()
-
-
-def _refuse_not_logits(input: Tensor) -> None:
-    if not isinstance(input, Tensor):
-        raise TypeError(f"Expected argument `input` to be a tensor but got {type(input).__name__}.")
-    if not input.is_floating_point():
-        raise TypeError(f"Expected argument `input` to be floating-point logits but got {input.dtype}.")
-
-
-def _refuse_other_reduction(reduction: str) -> None:
-    if reduction not in ("none", "mean", "sum"):
-        raise ValueError(f"Expected argument `reduction` to be 'none', 'mean' or 'sum' but got {reduction!r}.")
 
 
 @torch.no_grad()

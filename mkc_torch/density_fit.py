@@ -15,7 +15,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from mkc_torch.functional import KAPPA_MAX, energy_value, head_rule, integrate, log_partition_value, tail_density
+from mkc_torch._arguments import as_numbers, checked_number, checked_whole, refuse_bad_weight, refuse_not_real
+from mkc_torch.functional import (
+    KAPPA_MAX,
+    SIGMA_LEAST,
+    energy_value,
+    head_rule,
+    integrate,
+    log_partition_value,
+    tail_density,
+)
 from mkc_torch.order_statistic import robust_scale
 
 if TYPE_CHECKING:
@@ -232,7 +241,24 @@ def conclusive(before: DensityState, after: DensityState) -> Tensor:
 
 @dataclass(frozen=True)
 class DensityFit:
-    """A fitted MKC density: σ and d (*, m), the mean log-likelihood in nats per residual (*, m), and its domain."""
+    """A fitted MKC density, as :func:`fit_density` gives it.
+
+    Attributes:
+        sigma, d, bound: bandwidth (``inf`` for a Gaussian channel), scale and half-width of the domain, (*, m).
+        log_likelihood: mean, in nats per residual, (*, m); compare only at equal ``bound``.
+        converged: (*, m).
+        n_iter: Newton steps made.
+
+    Example:
+        >>> from mkc_torch import MKCDistribution
+        >>> error = torch.linspace(-1.0, 1.0, 101, dtype=torch.float64).erfinv().clamp(-3.0, 3.0).unsqueeze(-1)
+        >>> fit = fit_density(error, bound=10.0)
+        >>> round(float(fit.bound)), bool(fit.converged)
+        (10, True)
+        >>> density = MKCDistribution(fit.sigma, fit.d, fit.bound)
+        >>> bool((density.log_prob(error).mean(0) - fit.log_likelihood).abs() < 1e-9)
+        True
+    """
 
     sigma: Float[Tensor, "*batch m"]
     d: Float[Tensor, "*batch m"]
@@ -293,11 +319,11 @@ def fit_density(
 
     Args:
         error: residuals (*, N, m), centred as the fit left them.
-        sigma: keeps σ at this value (``inf``: Gaussian) and fits d alone, Remark 7 of the paper.
+        sigma: keeps σ at this value in [0.05, inf] (``inf``: Gaussian) and fits d alone, Remark 7 of the paper.
         d: keeps d at this value and fits σ alone, Remark 6.
         bound: half-width of the domain, in the unit of ``error``, at least two robust scales of them; default by
             :func:`domain_rule`. A residual beyond it counts as one on the flat tail.
-        weight: non-negative weights of the residuals.
+        weight: non-negative weights of the residuals, (*, N, m) or (N, 1).
         d_min: floor under d; default a tenth of the robust scale, since the likelihood grows without limit as d → 0
             on residuals that a fit has interpolated.
         max_iter: Newton steps at most.
@@ -307,7 +333,11 @@ def fit_density(
         The fit, with the domain it was made on: likelihoods compare only on the same domain.
 
     Raises:
-        ValueError: fewer than two residuals, non-finite ones, or a parameter out of range.
+        TypeError: residuals or weights that are no real tensor, or a parameter that is no number.
+        ValueError: fewer than two residuals, non-finite ones, a parameter out of range, or shapes that do not fit.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (29)-(31), Algorithm 2, Remarks 6 and 7.
 
     Example:
         >>> generator = torch.Generator().manual_seed(0)
@@ -316,29 +346,41 @@ def fit_density(
         >>> bool(fit.sigma > 8), round(float(fit.d), 1)
         (True, 1.0)
     """
-    if error.dim() < 2 or error.shape[-2] < 2:
-        raise ValueError(f"Expected argument `error` of shape (*, N >= 2, m) but got {tuple(error.shape)}.")
+    refuse_not_real("error", error)
+    if error.dtype in (torch.float16, torch.bfloat16):
+        raise TypeError(f"Expected argument `error` of dtype float32 or float64 but got {error.dtype}; use .float().")
+    if error.dim() < 2 or error.shape[-2] < 2 or error.shape[-1] == 0:
+        mend = "; one channel is error.unsqueeze(-1)" if error.dim() == 1 and len(error) > 1 else ""
+        raise ValueError(
+            f"Expected argument `error` of shape (*, N >= 2, m) with a channel at least but got {tuple(error.shape)}"
+            f"{mend}."
+        )
     if not bool(torch.isfinite(error).all()):
         raise ValueError(
-            f"Expected argument `error` to be finite but got {int((~torch.isfinite(error)).sum())} values that are not."
+            f"Expected argument `error` to be finite but got {int((~torch.isfinite(error)).sum())} values that are "
+            "not; leave those residuals out."
         )
+    checked_whole("max_iter", max_iter, 1, "100 is ample")
+    checked_number("tol", tol, ends="[)", advice="1e-12 suits float64")
     shape = (*error.shape[:-2], error.shape[-1])
 
-    def parameter(name: str, value: float | Tensor | None, infinite: bool = False) -> Tensor | None:
+    def parameter(name: str, value: float | Tensor | None, least: float = 0.0, infinite: bool = False) -> Tensor | None:
         if value is None:
             return None
-        t = torch.as_tensor(value, dtype=error.dtype, device=error.device)
-        if not bool(((t > 0) & (torch.isfinite(t) | infinite)).all()):
+        t = as_numbers(name, value, error.dtype, error.device).to(error)
+        if not bool(((t > 0) & (t >= least) & (torch.isfinite(t) | infinite)).all()):
+            wanted = f"in [{least:.4g}, inf]" if infinite else "positive and finite"
+            raise ValueError(f"Expected argument `{name}` to be {wanted} but got {value}.")
+        try:
+            return t.expand(shape)
+        except RuntimeError:
             raise ValueError(
-                f"Expected argument `{name}` to be positive{' and finite' if not infinite else ''} but got {value}."
-            )
-        return t.expand(shape)
+                f"Expected argument `{name}` to be a number or of shape (m,) or {shape} but got {tuple(t.shape)}."
+            ) from None
 
     normalised = None
     if weight is not None:
-        weight = weight.to(error).expand_as(error)
-        if not bool(torch.isfinite(weight).all()) or bool((weight < 0).any()) or bool((weight.sum(-2) <= 0).any()):
-            raise ValueError("Expected argument `weight` to be finite, >= 0 and positive somewhere in every channel.")
+        weight = _full_weight(weight, error)
         normalised = weight / weight.sum(-2, keepdim=True)
     scale = robust_scale(error, weight)
     tiny = torch.finfo(error.dtype).tiny ** 0.5
@@ -347,15 +389,24 @@ def fit_density(
     half_width = parameter("bound", bound)
     if half_width is not None:
         refuse_narrow_bound(half_width, scale)
-    fixed_sigma = parameter("sigma", sigma, infinite=True)
+    else:
+        half_width = domain_rule(error, scale, None if weight is None else weight > 0)
+    if floor is not None and bool((floor >= half_width).any()):
+        raise ValueError(
+            f"Expected argument `d_min` below the half-width of the domain, {half_width.tolist()}, but got {d_min}; it "
+            "is the precision of the residuals."
+        )
+    fixed_sigma, fixed_d = parameter("sigma", sigma, SIGMA_LEAST, infinite=True), parameter("d", d)
+    if fixed_d is not None and bound is not None and bool((fixed_d >= half_width).any()):
+        raise ValueError(f"Expected argument `d` below `bound` but got {d} and {bound}; widen `bound`.")
     state = initial_state(
         error,
         normalised,
         scale,
-        domain_rule(error, scale, None if weight is None else weight > 0) if half_width is None else half_width,
+        half_width,
         0.1 * scale if floor is None else floor,
         kappa=None if fixed_sigma is None else fixed_sigma.pow(-2),
-        d=parameter("d", d),
+        d=fixed_d,
     )
     still = torch.zeros(shape, dtype=torch.int64, device=error.device)
     n_iter = 0
@@ -376,3 +427,25 @@ def fit_density(
         converged=still >= 2,
         n_iter=n_iter,
     )
+
+
+def _full_weight(weight: Tensor, error: Float[Tensor, "*batch N m"]) -> Float[Tensor, "*batch N m"]:
+    refuse_bad_weight(weight)
+    try:
+        # weights (N,) of as many channels as samples would be taken for those of channels
+        full = weight.to(error).expand_as(error) if weight.dim() > 1 else None
+    except RuntimeError:
+        full = None
+    if full is None:
+        mend = "; one weight a sample is weight.unsqueeze(-1)" if weight.dim() == 1 else ""
+        raise ValueError(
+            f"Expected argument `weight` of shape {tuple(error.shape)} or {(error.shape[-2], 1)} but got "
+            f"{tuple(weight.shape)}{mend}."
+        )
+    total = full.sum(-2)
+    if not bool((torch.isfinite(total) & (total > 0)).all()):
+        raise ValueError(
+            "Expected argument `weight` to be finite, >= 0 and positive somewhere in every channel but got channels "
+            f"of the sums {total.tolist()}."
+        )
+    return full

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
+from mkc_torch._arguments import as_numbers, first_of, refuse_no_tensor, told
 from mkc_torch.functional import (
     as_computed,
     energy,
@@ -40,10 +41,14 @@ class MKCDistribution(Distribution):
         d: scale > 0, in the unit of the values.
         bound: half-width of the domain > 0, in the unit of the values.
         loc: centre.
-        validate_args: as in every torch distribution.
+        validate_args: as in every torch distribution; False leaves the values of all arguments unseen.
 
     The parameters broadcast. ``rsample`` and ``icdf`` are differentiable once in all four by implicit differentiation
     of the distribution function.
+
+    Raises:
+        TypeError: a parameter that is no number and no tensor, or a value that is no tensor.
+        ValueError: a parameter out of range, or a value outside the domain.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (17), Theorem 2, Corollary 1.
@@ -73,11 +78,14 @@ class MKCDistribution(Distribution):
         loc: Float[Tensor, "*batch"] | float = 0.0,
         validate_args: bool | None = None,
     ) -> None:
+        for name, value in (("sigma", sigma), ("d", d), ("bound", bound), ("loc", loc)):
+            as_numbers(name, value)
         self.sigma, self.d, self.bound, self.loc = torch.broadcast_tensors(*as_computed(sigma, d, bound, loc))
         super().__init__(self.sigma.shape, validate_args=validate_args)
 
     def expand(self, batch_shape: _Shape, _instance: MKCDistribution | None = None) -> MKCDistribution:
         """The same distribution with its batch dimensions broadcast to ``batch_shape``."""
+        _refuse_no_shape("batch_shape", batch_shape)
         new = self._get_checked_instance(MKCDistribution, _instance)  # type: ignore[no-untyped-call]
         shape = torch.Size(batch_shape)
         for name in ("sigma", "d", "bound", "loc"):
@@ -106,6 +114,7 @@ class MKCDistribution(Distribution):
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density; ``-inf`` outside the domain, where validation is off."""
         if self._validate_args:
+            refuse_no_tensor("value", value, "a tensor")
             self._validate_sample(value)
         error = value - self.loc
         inside = (value >= self.loc - self.bound) & (value <= self.loc + self.bound)
@@ -115,6 +124,7 @@ class MKCDistribution(Distribution):
     def cdf(self, value: Tensor) -> Tensor:
         """Probability of a value at most ``value``."""
         if self._validate_args:
+            refuse_no_tensor("value", value, "a tensor")
             self._validate_sample(value)
         error = torch.minimum(torch.maximum(value - self.loc, -self.bound), self.bound)
         return _cumulative(error / self.d, self._kappa, self._length)
@@ -123,10 +133,16 @@ class MKCDistribution(Distribution):
         """Quantile of a probability in [0, 1].
 
         Raises:
+            TypeError: no tensor.
             ValueError: a probability outside [0, 1], where validation is on.
         """
-        if self._validate_args and not bool(((value >= 0) & (value <= 1)).all()):
-            raise ValueError("Expected argument `value` to be probabilities in [0, 1].")
+        refuse_no_tensor("value", value, "a tensor of probabilities")
+        wrong = ~((value >= 0) & (value <= 1))
+        if self._validate_args and bool(wrong.any()):
+            raise ValueError(
+                f"Expected argument `value` to be probabilities in [0, 1] but got {first_of(value, wrong)}; "
+                "divide per cents by 100."
+            )
         kappa, length = self._kappa, self._length
         value, kappa, length = torch.broadcast_tensors(value.to(kappa), kappa, length)
         u = _quantile(value, kappa, length)
@@ -139,6 +155,7 @@ class MKCDistribution(Distribution):
 
     def rsample(self, sample_shape: _Shape = torch.Size()) -> Tensor:  # noqa: B008
         """Samples, differentiable in sigma, d, bound and loc; drawn from torch's global generator."""
+        _refuse_no_shape("sample_shape", sample_shape)
         shape = self._extended_shape(torch.Size(sample_shape))
         uniform = torch.rand(shape, dtype=self.d.dtype, device=self.d.device)
         return self.icdf(uniform.clamp(min=torch.finfo(uniform.dtype).eps / 4))  # a draw of 0 would be an edge
@@ -172,6 +189,13 @@ class MKCDistribution(Distribution):
         on_tail = tail.unsqueeze(-1) * head(nodes, tail_energy.unsqueeze(-1))
         excess = (weights * (head(nodes, e) * torch.exp(-e) - on_tail)).sum(-1)
         return (2.0 * length * tail * tail_mean(length, tail_energy) + excess) / partition(kappa, length)
+
+
+def _refuse_no_shape(name: str, shape: object) -> None:
+    if not isinstance(shape, (tuple, list)) or not all(isinstance(size, (int, torch.SymInt)) for size in shape):
+        raise TypeError(
+            f"Expected argument `{name}` to be a shape but got {told(shape)}; write (1000,) for a thousand."
+        )
 
 
 def _cumulative(u: Tensor, kappa: Tensor, length: Tensor) -> Tensor:

@@ -16,9 +16,11 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import refuse_bad_weight, refuse_not_real, refuse_other_type
 from mkc_torch.coverage import Coverage, coverage
 from mkc_torch.linear import MKCRegression, RankDeficientError
 from mkc_torch.linear._estimator import Fitted, LinearEstimator
+from mkc_torch.linear._problem import common_batch
 from mkc_torch.nonlinear import NonlinearFit
 from mkc_torch.nonlinear import fit as nonlinear_fit
 from mkc_torch.order_statistic import order_statistic
@@ -177,6 +179,10 @@ class EllipsoidFit(Fitted):
         finish_: the :class:`mkc_torch.nonlinear.NonlinearFit` of the finish, or None: residual, d and bound are in the
             unit of the points, ``theta`` is about the median of the points in units of their median distance from it.
 
+    Raises:
+        TypeError: ``estimator`` is none of ``mkc_torch.linear``.
+        ValueError: ``finish`` is something else.
+
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), appendix A, (36)-(41).
 
@@ -189,11 +195,16 @@ class EllipsoidFit(Fitted):
         [1.0, 2.0, 3.0, 40.0, 50.0, 60.0]
     """
 
+    _fit_takes = "points"
+
     def __init__(
         self, estimator: LinearEstimator | None = None, *, finish: Literal["maximum_likelihood"] | None = None
     ) -> None:
         if finish not in (None, "maximum_likelihood"):
             raise ValueError(f"Expected argument `finish` to be None or 'maximum_likelihood' but got {finish!r}.")
+        if estimator is not None:
+            what = "an estimator of mkc_torch.linear"
+            refuse_other_type("estimator", estimator, LinearEstimator, what, "None takes MKCRegression()")
         self.estimator = MKCRegression() if estimator is None else estimator
         self.finish = finish
 
@@ -281,7 +292,16 @@ class EllipsoidFit(Fitted):
         )
 
     def calibrate(self, points: Float[Tensor, "*batch M 3"]) -> Float[Tensor, "*batch M 3"]:
-        """``calibration_matrix_ @ (p - center_)`` of each point: the field in the unit of the points."""
+        """``calibration_matrix_ @ (p - center_)`` of each point: the field in the unit of the points.
+
+        Raises:
+            NotFittedError: before ``fit``.
+            TypeError: not a floating tensor.
+            ValueError: another shape, or other batch dimensions than those of the fit.
+        """
+        matrix = self.calibration_matrix_
+        _refuse_no_points(points)
+        common_batch("points", points.shape[:-2], "calibration_matrix_", matrix.shape[:-2])
         return torch.einsum("...ij,...kj->...ki", self.calibration_matrix_, points - self.center_.unsqueeze(-2))
 
     def _refuse_unbounded(self, local: Ellipsoid, points: Tensor) -> None:
@@ -371,25 +391,34 @@ class EllipsoidFit(Fitted):
         return errors.detach().reshape(-1)
 
 
+def _refuse_no_points(points: Tensor) -> None:
+    refuse_not_real("points", points)
+    if points.dim() < 2 or points.shape[-1] != 3:
+        mend = "; a point is a row, so try points.mT" if points.dim() > 1 and points.shape[-2] == 3 else ""
+        if points.shape == (3,):
+            mend = "; one point is points.unsqueeze(0)"
+        raise ValueError(f"Expected argument `points` of shape (*, N, 3) but got {tuple(points.shape)}{mend}.")
+
+
 def _prepared(points: Tensor, sample_weight: Tensor | None) -> tuple[Tensor, Tensor | None]:
     """Checked points and weights; what a point of weight 0 holds is replaced, so that it can be anything."""
-    if not isinstance(points, Tensor) or not points.is_floating_point():
-        got = points.dtype if isinstance(points, Tensor) else type(points).__name__
-        raise TypeError(f"Expected argument `points` to be a real floating-point tensor but got {got}.")
-    if points.dim() < 2 or points.shape[-1] != 3:
-        raise ValueError(f"Expected argument `points` of shape (*, N, 3) but got {tuple(points.shape)}.")
+    _refuse_no_points(points)
+    if points.dtype in (torch.float16, torch.bfloat16):
+        raise TypeError(f"Expected argument `points` of dtype float32 or float64 but got {points.dtype}; use .float().")
     weight = None
     if sample_weight is not None:
+        refuse_bad_weight(sample_weight, "sample_weight")
         if sample_weight.shape != points.shape[:-1] and sample_weight.shape != points.shape[-2:-1]:
             raise ValueError(
                 f"Expected argument `sample_weight` of shape {tuple(points.shape[:-1])} "
-                f"but got {tuple(sample_weight.shape)}."
+                f"but got {tuple(sample_weight.shape)}; it has one weight for each point."
             )
         weight = sample_weight.to(points).expand(points.shape[:-1])
     count = points.shape[-2] if weight is None else int((weight > 0).sum(-1).min())
     if count < MIN_POINTS:
         raise ValueError(
-            f"Expected at least {MIN_POINTS} points, one for each coefficient of an ellipsoid, but got {count}."
+            f"Expected at least {MIN_POINTS} points, one for each coefficient of an ellipsoid, but got {count}; record "
+            "more, in all directions."
         )
     finite = torch.isfinite(points)
     if weight is not None:

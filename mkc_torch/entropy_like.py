@@ -19,8 +19,20 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor, nn
 
+from mkc_torch._arguments import (
+    checked_number,
+    checked_whole,
+    refuse_bad_batch,
+    refuse_bad_weight,
+    refuse_complex,
+    refuse_no_tensor,
+    refuse_not_finite,
+    refuse_not_real,
+    seems_finite,
+    told,
+)
 from mkc_torch.functional import as_computed
-from mkc_torch.losses import _refuse_not_finite
+from mkc_torch.losses import refuse_other_reduction, refuse_other_shapes
 from mkc_torch.trust_region import Quadratic, minimise
 
 if TYPE_CHECKING:
@@ -54,8 +66,11 @@ def entropy_like(
         H, in [0, 1] for weights that are counts, of the dimensions that are left.
 
     Raises:
-        ValueError: no residuals, or weights of several residuals that total at most 1, for which log N is not positive.
-            On an accelerator, under vmap and in compiled code the latter goes unseen: H is 0 there.
+        TypeError: complex residuals, or what is no tensor.
+        ValueError: no residuals, residuals that count and are not finite, a dimension that they have not, weights that
+            are negative or not finite or do not broadcast, or weights of several residuals that total at most 1, for
+            which log N is not positive. On an accelerator, under vmap and in compiled code values go unseen: there H is
+            0 for such weights, and NaN for NaN.
 
     References:
         G. Indiveri, Entropy 11 (2009), (40)-(45).
@@ -64,18 +79,32 @@ def entropy_like(
         >>> entropy_like(torch.tensor([1.0, -1.0, 1.0, 1.0])), entropy_like(torch.tensor([0.0, 0.0, 5.0, 0.0]))
         (tensor(1.), tensor(0.))
     """
+    refuse_no_tensor("residual", residual, "a real tensor")
+    refuse_complex("residual", residual)
     (residual,) = as_computed(residual)
+    if weight is not None:
+        _refuse_other_weight(weight, residual.shape)
+        residual = torch.where(_counts(weight), residual, 0.0)
+    if not seems_finite(residual):
+        refuse_not_finite("residual", residual, "Leave them out by a weight of 0")
+    return _entropy(residual, dim, weight)
+
+
+def _entropy(
+    residual: Float[Tensor, "*shape"],
+    dim: int | tuple[int, ...] | None,
+    weight: Float[Tensor, "*#shape"] | Bool[Tensor, "*#shape"] | None,
+) -> Tensor:
+    """H of residuals that are 0 where they do not count."""
     if residual.numel() == 0:
         raise ValueError(f"Expected at least one residual but got shape {tuple(residual.shape)}.")
-    dims = tuple(range(residual.dim())) if dim is None else (dim,) if isinstance(dim, int) else tuple(dim)
+    dims = _dimensions(residual, dim)
     count: Tensor | float
     if weight is None:
         count = float(math.prod(residual.shape[d] for d in dims))
     else:
         if not torch.compiler.is_compiling():
             _refuse_shares(weight, residual.shape, dims)
-        counts = weight if weight.dtype == torch.bool else weight != 0
-        residual = torch.where(counts, residual, 0.0)
         weight = weight.to(residual.dtype)
         count = weight.expand(residual.shape).sum(dims)
     tiny = torch.finfo(residual.dtype).tiny
@@ -92,6 +121,44 @@ def entropy_like(
         log_count = torch.log(count.clamp(min=1.0))
         return torch.where(log_count > 0, entropy / torch.where(log_count > 0, log_count, 1.0), 0.0)
     return entropy / math.log(count) if count > 1 else 0.0 * entropy
+
+
+def _refuse_no_dimension(dim: object) -> None:
+    dims = dim if isinstance(dim, (tuple, list)) else () if dim is None else (dim,)
+    if not all(isinstance(d, int) for d in dims):
+        raise TypeError(
+            f"Expected argument `dim` to be a dimension, several, or None but got {told(dim)}; 0 is that of samples."
+        )
+
+
+def _dimensions(residual: Tensor, dim: int | tuple[int, ...] | None) -> tuple[int, ...]:
+    """The dimensions of one population."""
+    _refuse_no_dimension(dim)
+    count = residual.dim()
+    if dim is None:
+        return tuple(range(count))
+    dims = (dim,) if isinstance(dim, int) else tuple(dim)
+    if not all(-count <= d < count for d in dims) or len({d % count for d in dims}) < len(dims):
+        raise ValueError(
+            f"Expected argument `dim` to be dimensions of the residuals {tuple(residual.shape)}, each once, "
+            f"but got {dim}."
+        )
+    return dims
+
+
+def _counts(weight: Tensor) -> Tensor:
+    return weight if weight.dtype == torch.bool else weight != 0
+
+
+def _refuse_other_weight(weight: Tensor, shape: torch.Size) -> None:
+    refuse_bad_weight(weight)
+    pairs = zip(reversed(weight.shape), reversed(shape), strict=False)
+    if weight.dim() > len(shape) or any(a not in (1, b) for a, b in pairs):
+        mend = "; give one weight a sample all dimensions, unsqueeze(-1)" if weight.dim() < len(shape) else ""
+        raise ValueError(
+            f"Expected argument `weight` to broadcast to the residuals {tuple(shape)} but got {tuple(weight.shape)}"
+            f"{mend}."
+        )
 
 
 def _refuse_shares(weight: Tensor, shape: torch.Size, dims: tuple[int, ...]) -> None:
@@ -124,6 +191,12 @@ class LELoss(nn.Module):
             be the other dimensions: ``dim=0`` for (N, m).
         reduction: of what is left, "mean", "sum" or "none".
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
+    References:
+        G. Indiveri, Entropy 11 (2009), (40)-(45).
+
     Example:
         >>> loss = LELoss()
         >>> output = torch.zeros(50, requires_grad=True)
@@ -138,8 +211,8 @@ class LELoss(nn.Module):
         self, dim: int | tuple[int, ...] | None = None, reduction: Literal["mean", "sum", "none"] = "mean"
     ) -> None:
         super().__init__()
-        if reduction not in ("mean", "sum", "none"):
-            raise ValueError(f"Expected argument `reduction` to be 'mean', 'sum' or 'none' but got {reduction!r}.")
+        refuse_other_reduction(reduction)
+        _refuse_no_dimension(dim)
         self.dim = dim
         self.reduction = reduction
 
@@ -160,21 +233,19 @@ class LELoss(nn.Module):
             A scalar, or for reduction "none" H of each population; float32 at least.
 
         Raises:
-            TypeError: integer or complex input or target.
-            ValueError: shapes differ or are empty, weights total at most 1, or a target that counts is not finite.
+            TypeError: integer or complex input or target, or what is no tensor.
+            ValueError: shapes differ or are empty, weights are negative or not finite or total at most 1, or an input
+                or a target that counts is not finite; :func:`entropy_like` says where values go unseen.
         """
-        for name, value in (("input", input), ("target", target)):
-            if not value.is_floating_point():
-                raise TypeError(f"Expected argument `{name}` to be a real floating-point tensor but got {value.dtype}.")
-        if input.shape != target.shape:
-            raise ValueError(
-                f"Expected `input` and `target` of one shape but got {tuple(input.shape)} and {tuple(target.shape)}."
-            )
-        if not torch.compiler.is_compiling():
-            counts = None if weight is None else (weight != 0).expand(target.shape)
-            _refuse_not_finite(target, counts)
+        refuse_other_shapes(input, target)
         input, target = as_computed(input, target)
-        entropy = entropy_like(input - target, self.dim, weight)
+        error, counts = input - target, None
+        if weight is not None:
+            _refuse_other_weight(weight, error.shape)
+            counts = _counts(weight).expand(error.shape)
+            error = torch.where(counts, error, 0.0)
+        refuse_bad_batch(input, target, counts, error)
+        entropy = _entropy(error, self.dim, weight)
         if self.reduction == "none":
             return entropy
         return entropy.mean() if self.reduction == "mean" else entropy.sum()
@@ -253,8 +324,9 @@ def least_entropy_like(
         max_iter: steps tried at most.
 
     Raises:
-        TypeError: ``starts`` is not a floating tensor of at least float32.
-        ValueError: ``starts`` has another shape or is not finite, or H is not finite at a start.
+        TypeError: ``starts`` is not a floating tensor of at least float32, or ``residual`` cannot be called.
+        ValueError: ``starts`` has another shape or is not finite, H is not finite at a start, or an argument is out of
+            range.
 
     References:
         G. Indiveri, Entropy 11 (2009), section 4.2.
@@ -267,9 +339,19 @@ def least_entropy_like(
         >>> found.best
         tensor([0.7000], dtype=torch.float64)
     """
-    if not isinstance(starts, Tensor) or starts.dtype not in (torch.float32, torch.float64):
-        got = starts.dtype if isinstance(starts, Tensor) else type(starts).__name__
-        raise TypeError(f"Expected argument `starts` to be a float32 or float64 tensor but got {got}.")
+    if not callable(residual):
+        raise TypeError(
+            f"Expected argument `residual` to be a function of the parameters but got {type(residual).__name__}; "
+            "write lambda theta: y - model(theta)."
+        )
+    refuse_not_real("starts", starts, "a float32 or float64 tensor")
+    if starts.dtype not in (torch.float32, torch.float64):
+        raise TypeError(
+            f"Expected argument `starts` to be a float32 or float64 tensor but got {starts.dtype}; use .float()."
+        )
+    if tol is not None:
+        checked_number("tol", tol, ends="[)")
+    checked_whole("max_iter", max_iter, 1)
     if starts.dim() not in (1, 2) or starts.numel() == 0:
         raise ValueError(f"Expected argument `starts` of shape (S, p) or (p,) but got {tuple(starts.shape)}.")
     if not bool(torch.isfinite(starts).all()):
@@ -293,6 +375,7 @@ def least_entropy_like(
         return Quadratic(value.to(theta.dtype), gradient, hessian)
 
     if weight is not None:
+        refuse_bad_weight(weight)
         _refuse_shares(weight, weight.shape, tuple(range(weight.dim())))
     first = torch.func.vmap(lambda theta: entropy(theta)[0])(points)
     if not bool(torch.isfinite(first).all()):

@@ -8,6 +8,11 @@ Li et al., "Multi-kernel Correntropy Regression" (2023)::
 Everything is computed in ``kappa = 1 / sigma^2`` and ``z = e / d``: ``energy = -expm1(-kappa z^2 / 2) / kappa`` is
 smooth at ``kappa = 0``, where it is exactly the Gaussian ``z^2 / 2``. All functions work under autograd (to any
 order), forward-mode differentiation, ``vmap`` and ``torch.compile``. Half and bfloat16 are computed in float32.
+
+:func:`mkc_energy`, :func:`mkc_weight`, :func:`log_normalizer` and :func:`mkc_nll` refuse a ``sigma``, ``d`` or
+``bound`` out of range: a number always, and a tensor on the CPU, in eager code and outside of ``vmap``, where looking
+at it waits for nothing. Elsewhere, and in :func:`energy`, :func:`log_partition` and :func:`inverse_square`, which they
+are made of, values go through the formulas as they are. A NaN among the errors comes out as NaN: it is one of many.
 """
 
 from __future__ import annotations
@@ -20,6 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import as_numbers, refuse_no_tensor, refuse_out_of_range
 from mkc_torch.partition_of_few import few, log_partition_and_slopes
 
 if TYPE_CHECKING:
@@ -39,6 +45,12 @@ __all__ = [
 KAPPA_MAX = 400.0
 """Largest ``1 / sigma^2`` for which the quadrature is specified; it is ``sigma = 0.05``."""
 
+SIGMA_LEAST = KAPPA_MAX**-0.5 * (1.0 - 1e-5)
+"""Of the normaliser; what was computed as the least ``sigma`` may round below it."""
+
+_SIGMA_TINY = 1e-18
+"""Of the energy: the ``kappa`` of a smaller one is infinite in float32."""
+
 _HEAD_TOLERANCE = 1e-13
 
 _FEW = 4096
@@ -56,7 +68,7 @@ def _head_quadrature(count: int) -> tuple[Tensor, Tensor]:
 _NODES, _WEIGHTS = _head_quadrature(32)
 
 
-def as_computed(*values: Tensor | float) -> tuple[Tensor, ...]:
+def as_computed(*values: object) -> tuple[Tensor, ...]:
     """Tensors of one floating dtype (float32 at least) and one device, from tensors and numbers."""
     tensors = [v for v in values if isinstance(v, Tensor)]
     dtype = torch.float32 if tensors else torch.get_default_dtype()
@@ -66,13 +78,34 @@ def as_computed(*values: Tensor | float) -> tuple[Tensor, ...]:
         if t.is_floating_point():
             dtype = torch.promote_types(dtype, t.dtype)
     device = next((t.device for t in tensors if t.dim() > 0), tensors[0].device if tensors else None)
-    return tuple(
-        v.to(dtype) if isinstance(v, Tensor) else torch.as_tensor(v, dtype=dtype, device=device) for v in values
-    )
+    return tuple(v.to(dtype) if isinstance(v, Tensor) else _as_tensor(v, dtype, device) for v in values)
+
+
+def _as_tensor(value: object, dtype: torch.dtype, device: torch.device | None) -> Tensor:
+    if isinstance(value, (int, float)):
+        return torch.as_tensor(value, dtype=dtype, device=device)
+    return as_numbers("value", value, dtype, device)
+
+
+def _checked(least_sigma: float = _SIGMA_TINY, **given: object) -> tuple[Tensor, ...]:
+    """Errors and parameters as :func:`as_computed` gives them, with the parameters in range."""
+    for name, value in given.items():
+        if name == "sigma":
+            refuse_out_of_range(name, value, least_sigma, math.inf, "[]", "inf is the Gaussian")
+        elif name != "error":
+            refuse_out_of_range(name, value, advice="it is in the unit of the errors")
+        elif not isinstance(value, (int, float)):
+            refuse_no_tensor(name, value, "a real tensor")
+    return as_computed(*given.values())
 
 
 def inverse_square(sigma: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """``kappa = 1 / sigma^2``, with value and gradient 0 at ``sigma = inf``."""
+    """``kappa = 1 / sigma^2``, with value and gradient 0 at ``sigma = inf``.
+
+    Example:
+        >>> inverse_square(torch.tensor([0.5, math.inf]))
+        tensor([4., 0.])
+    """
     return sigma.pow(-2)
 
 
@@ -176,10 +209,18 @@ def energy(z: Float[Tensor, "*batch"], kappa: Float[Tensor, "*batch"]) -> Float[
     Returns:
         The energy, of the broadcast shape; ``z^2 / 2`` exactly where ``kappa`` is 0.
 
+    Raises:
+        TypeError: an argument is no tensor.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (9).
+
     Example:
         >>> energy(torch.tensor([1.0, 3.0]), torch.tensor(0.0))
         tensor([0.5000, 4.5000])
     """
+    refuse_no_tensor("z", z, "a tensor")
+    refuse_no_tensor("kappa", kappa, "a tensor")
     function = _Energy if torch.compiler.is_compiling() else _EnergyWithTangent
     result: Tensor = function.apply(z, kappa)  # type: ignore[no-untyped-call]
     return result
@@ -257,10 +298,18 @@ def log_partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"
         kappa: ``1 / sigma^2`` in [0, 400].
         length: half-width of the domain in units of ``d``; broadcast against ``kappa``.
 
+    Raises:
+        TypeError: an argument is no tensor.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
+
     Example:
         >>> log_partition(torch.tensor(1 / 9.0).double(), torch.tensor(10.0).double()).exp()
         tensor(2.6348, dtype=torch.float64)
     """
+    refuse_no_tensor("kappa", kappa, "a tensor")
+    refuse_no_tensor("length", length, "a tensor")
     if kappa.shape != length.shape:
         kappa, length = torch.broadcast_tensors(kappa, length)
     if torch.compiler.is_compiling():
@@ -334,17 +383,22 @@ def mkc_energy(
 
     Args:
         error: errors ``e``, any shape, in the unit of ``d``.
-        sigma: bandwidth > 0, dimensionless, ``inf`` for the Gaussian ``e^2 / (2 d^2)``; broadcast (per sample too).
+        sigma: bandwidth in [1e-18, inf], dimensionless, ``inf`` for the Gaussian ``e^2 / (2 d^2)``; broadcast (per
+            sample too).
         d: scale > 0 in the unit of ``error``; broadcast.
 
     Returns:
         The energy, of the broadcast shape.
 
+    Raises:
+        TypeError: complex values, or an argument that is no number and no tensor.
+        ValueError: ``sigma`` or ``d`` out of range, where it can be seen; the module says where.
+
     Example:
         >>> mkc_energy(torch.tensor([0.0, 1.0, 100.0]), sigma=2.0, d=1.0)
         tensor([0.0000, 0.4700, 4.0000])
     """
-    error, sigma, d = as_computed(error, sigma, d)
+    error, sigma, d = _checked(error=error, sigma=sigma, d=d)
     return energy(error / d, inverse_square(sigma))
 
 
@@ -359,11 +413,14 @@ def mkc_weight(
     Returns:
         Weights in [0, 1]; 1 for every error at ``sigma = inf``.
 
+    Raises:
+        TypeError, ValueError: as :func:`mkc_energy`.
+
     Example:
         >>> mkc_weight(torch.tensor([0.0, 1.0, 100.0]), sigma=1.0, d=1.0)
         tensor([1.0000, 0.6065, 0.0000])
     """
-    error, sigma, d = as_computed(error, sigma, d)
+    error, sigma, d = _checked(error=error, sigma=sigma, d=d)
     z = error / d
     return torch.exp(-0.5 * inverse_square(sigma) * z * z)
 
@@ -385,11 +442,14 @@ def log_normalizer(
     Returns:
         The log-normaliser, of the broadcast shape, differentiable in all three arguments.
 
+    Raises:
+        TypeError, ValueError: as :func:`mkc_energy`, for ``bound`` too.
+
     Example:
         >>> log_normalizer(math.inf, 1.0, 100.0)  # log(sqrt(2 pi))
         tensor(0.9189)
     """
-    sigma, d, bound = as_computed(sigma, d, bound)
+    sigma, d, bound = _checked(SIGMA_LEAST, sigma=sigma, d=d, bound=bound)
     return torch.log(d) + log_partition(inverse_square(sigma), bound / d)
 
 
@@ -405,15 +465,22 @@ def mkc_nll(
     gradient. :meth:`mkc_torch.MKCDistribution.log_prob` is the strict one.
 
     Args:
-        error, sigma, d: as in :func:`mkc_energy`.
-        bound: half-width of the domain, as in :func:`log_normalizer`.
+        error, d: as in :func:`mkc_energy`.
+        sigma, bound: bandwidth and half-width of the domain, as in :func:`log_normalizer`.
 
     Returns:
         Nats, of the broadcast shape.
+
+    Raises:
+        TypeError, ValueError: as :func:`mkc_energy`, for ``bound`` too.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
 
     Example:
         >>> mkc_nll(torch.tensor([0.0, 1.0]), sigma=math.inf, d=1.0, bound=100.0)
         tensor([0.9189, 1.4189])
     """
-    error, sigma, d, bound = as_computed(error, sigma, d, bound)
-    return mkc_energy(error, sigma, d) + log_normalizer(sigma, d, bound)
+    error, sigma, d, bound = _checked(SIGMA_LEAST, error=error, sigma=sigma, d=d, bound=bound)
+    kappa = inverse_square(sigma)
+    return energy(error / d, kappa) + (torch.log(d) + log_partition(kappa, bound / d))

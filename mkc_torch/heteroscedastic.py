@@ -8,8 +8,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from mkc_torch._arguments import as_numbers, checked_whole, first_of, refuse_bad_batch, refuse_not_real
 from mkc_torch.functional import KAPPA_MAX, energy, inverse_square, log_partition
-from mkc_torch.losses import MKCLoss, Reduction, _at_least_float32, _refuse_not_finite
+from mkc_torch.losses import (
+    MKCLoss,
+    Reduction,
+    _at_least_float32,
+    checked_axis,
+    refuse_no_dimension,
+    refuse_other_reduction,
+    refuse_other_shapes,
+)
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -61,7 +70,7 @@ class HeteroscedasticMKCLoss(_WideBuffers):
         bound: buffer () or (m,), saved in the state_dict.
 
     Raises:
-        ValueError: an argument out of range.
+        TypeError, ValueError: an argument of another kind, or out of range.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
@@ -80,8 +89,8 @@ class HeteroscedasticMKCLoss(_WideBuffers):
         self, bound: float | Float[Tensor, " m"], *, channel_dim: int = -1, reduction: Reduction = "mean"
     ) -> None:
         super().__init__()
-        if reduction not in ("none", "mean", "sum"):
-            raise ValueError(f"Expected argument `reduction` to be 'none', 'mean' or 'sum' but got {reduction!r}.")
+        refuse_other_reduction(reduction)
+        refuse_no_dimension(channel_dim)
         self.channel_dim = channel_dim
         self.reduction = reduction
         self.register_buffer("bound", _positive("bound", bound))
@@ -110,17 +119,19 @@ class HeteroscedasticMKCLoss(_WideBuffers):
             the weighted mean over elements, and 0 if no element counts.
 
         Raises:
-            TypeError: integer or complex input, target, sigma or d.
-            ValueError: shapes differ, are empty, or do not fit the bound's; a target that counts is NaN or infinite; a
-                sigma or d that counts is out of range. On an accelerator the loss does not wait for the last two:
-                there a NaN comes out as NaN.
+            TypeError: integer or complex input, target, sigma or d, or what is no tensor.
+            ValueError: shapes differ, are empty, or do not fit the bound's; a weight is negative, NaN or infinite; an
+                input or a target that counts is NaN or infinite; a sigma or d that counts is out of range. For the last
+                three the loss does not wait for an accelerator, nor are they seen in compiled code or under vmap: there
+                a NaN comes out as NaN.
         """
         axis = self._checked_axis(input, target)
         dtype = torch.promote_types(_at_least_float32(input), target.dtype)
         for name, value in (("sigma", sigma), ("d", d)):
             _refuse_other_shape(name, value, input)
             dtype = torch.promote_types(dtype, value.dtype)
-        error = input.to(dtype) - target.to(dtype)
+        input, target = input.to(dtype), target.to(dtype)
+        error = input - target
         sigma, d, bound = sigma.to(dtype), d.to(dtype), self.bound.to(dtype)
         if weight is not None:
             weight, counts = MKCLoss._checked_weight(weight, error, axis)
@@ -131,8 +142,8 @@ class HeteroscedasticMKCLoss(_WideBuffers):
         if bound.dim():
             bound = bound.reshape([-1 if i == axis else 1 for i in range(error.dim())])
         length = bound / d
+        refuse_bad_batch(input, target, None if weight is None else counts, error)
         if not torch.compiler.is_compiling():
-            _refuse_not_finite(target, None if weight is None else counts)
             _refuse_out_of_range(sigma, d, length)
         kappa = inverse_square(sigma)
         values = energy(error / d, kappa) + (torch.log(d) + _log_partition(kappa, length))
@@ -149,23 +160,13 @@ class HeteroscedasticMKCLoss(_WideBuffers):
         return total / torch.where(elements > 0, elements, 1.0)
 
     def _checked_axis(self, input: Tensor, target: Tensor) -> int:
-        for name, value in (("input", input), ("target", target)):
-            _refuse_not_real(name, value)
-        if input.shape != target.shape:
-            raise ValueError(
-                f"Expected `input` and `target` of one shape but got {tuple(input.shape)} and {tuple(target.shape)}; "
-                "reshape one: torch would broadcast them."
-            )
-        if not -input.dim() <= self.channel_dim < input.dim():
-            raise ValueError(f"Expected a dimension {self.channel_dim} for the channels but got {tuple(input.shape)}.")
-        axis = self.channel_dim % input.dim()
+        refuse_other_shapes(input, target)
+        axis = checked_axis(input, self.channel_dim)
         if self.bound.dim() and input.shape[axis] != self.bound.shape[0]:
             raise ValueError(
                 f"Expected {self.bound.shape[0]} channels, as `bound` has, in dimension {self.channel_dim} "
                 f"but got {tuple(input.shape)}; pass one number as `bound` for any number of channels."
             )
-        if input.numel() == 0:
-            raise ValueError(f"Expected at least one element but got shape {tuple(input.shape)}; skip empty batches.")
         return axis
 
     def extra_repr(self) -> str:
@@ -203,7 +204,11 @@ class MKCHead(_WideBuffers):
         scales: linear layer of what σ and d are made of.
 
     Raises:
-        ValueError: an argument out of range.
+        TypeError, ValueError: an argument of another kind, or out of range.
+
+    References:
+        Nix and Weigend, "Estimating the mean and variance of the target probability distribution", ICNN 1994: a scale
+        predicted beside the mean.
 
     Example:
         >>> head = MKCHead(5, 2, bound=50.0, d_min=1e-3, d_init=0.5)
@@ -226,9 +231,8 @@ class MKCHead(_WideBuffers):
         d_init: float | Float[Tensor, " m"] = 1.0,
     ) -> None:
         super().__init__()
-        for name, count in (("in_features", in_features), ("num_channels", num_channels)):
-            if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-                raise ValueError(f"Expected argument `{name}` to be a positive integer but got {count!r}.")
+        in_features = checked_whole("in_features", in_features, 1)
+        num_channels = checked_whole("num_channels", num_channels, 1)
         given = {"bound": bound, "d_min": d_min, "sigma_init": sigma_init, "d_init": d_init}
         values = {name: _positive(name, value, num_channels) for name, value in given.items()}
         self.register_buffer("bound", values["bound"])
@@ -266,8 +270,10 @@ class MKCHead(_WideBuffers):
             ``(location, sigma, d)``, each (*, m); σ without unit, the others in the unit of the target.
 
         Raises:
+            TypeError: integer or complex features, or what is no tensor.
             ValueError: another number of features.
         """
+        refuse_not_real("features", features)
         if features.dim() == 0 or features.shape[-1] != self.in_features:
             raise ValueError(
                 f"Expected argument `features` of shape (*, {self.in_features}) but got {tuple(features.shape)}."
@@ -290,7 +296,7 @@ class MKCHead(_WideBuffers):
 
 def _positive(name: str, value: float | Tensor, num_channels: int | None = None) -> Tensor:
     """A number or one value a channel, (m,) where m is given."""
-    t = torch.as_tensor(value, dtype=torch.get_default_dtype() if not isinstance(value, Tensor) else None).detach()
+    t = as_numbers(name, value).detach()
     t = t.to(_at_least_float32(t))
     if t.dim() > 1 or (num_channels is not None and t.dim() == 1 and t.shape[0] not in (1, num_channels)):
         wanted = "(m,)" if num_channels is None else f"({num_channels},)"
@@ -310,15 +316,8 @@ def _log_partition(kappa: Tensor, length: Tensor) -> Tensor:
     return torch.cat([log_partition(*chunk) for chunk in chunks]).reshape(kappa.shape)
 
 
-def _refuse_not_real(name: str, value: Tensor) -> None:
-    if not isinstance(value, Tensor):
-        raise TypeError(f"Expected argument `{name}` to be a tensor but got {type(value).__name__}.")
-    if not value.is_floating_point():
-        raise TypeError(f"Expected argument `{name}` to be a real floating-point tensor but got {value.dtype}.")
-
-
 def _refuse_other_shape(name: str, value: Tensor, input: Tensor) -> None:
-    _refuse_not_real(name, value)
+    refuse_not_real(name, value)
     if value.dim() != input.dim() or any(a not in (1, b) for a, b in zip(value.shape, input.shape, strict=True)):
         raise ValueError(
             f"Expected argument `{name}` of the shape of `input`, {tuple(input.shape)}, or that with any dimensions 1, "
@@ -340,17 +339,12 @@ def _refuse_out_of_range(sigma: Tensor, d: Tensor, length: Tensor) -> None:
     if not least_sigma >= least * (1.0 - _ROUNDING):
         wrong = ~(sigma >= least * (1.0 - _ROUNDING))
         raise ValueError(
-            f"Expected argument `sigma` in [{least:g}, inf] but got {_first(sigma, wrong)}. Map the network's output "
+            f"Expected argument `sigma` in [{least:g}, inf] but got {first_of(sigma, wrong)}. Map the network's output "
             "into it, as MKCHead does: rsqrt(400 * sigmoid(raw))."
         )
     if not (shortest >= 1.0 - _ROUNDING and longest < float("inf")):
         wrong = ~((length >= 1.0 - _ROUNDING) & (length < float("inf")))
         raise ValueError(
-            f"Expected argument `d` in (0, bound] but got {_first(d.expand_as(length), wrong)}. Map the network's "
+            f"Expected argument `d` in (0, bound] but got {first_of(d.expand_as(length), wrong)}. Map the network's "
             "output into it, as MKCHead does: d_min + (bound - d_min) * sigmoid(raw)."
         )
-
-
-def _first(value: Tensor, wrong: Bool[Tensor, "*shape"]) -> str:
-    index = tuple(wrong.nonzero()[0].tolist())
-    return f"{value[index].item():.6g} at index {index}"

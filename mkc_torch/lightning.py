@@ -18,6 +18,7 @@ try:
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError("mkc_torch.lightning needs Lightning: pip install 'mkc-torch[lightning]'") from error
 
+from mkc_torch._arguments import checked_number, refuse_other_type, told
 from mkc_torch.expectation_step import damped, damped_kappa, expectation_step
 from mkc_torch.functional import KAPPA_MAX, mkc_nll
 from mkc_torch.losses import MKCLoss
@@ -111,7 +112,7 @@ class MKCExpectationMaximization(Callback):
     Raises:
         ValueError: an argument out of range. When the trainer runs: no loss, or several and no name; the loss's σ or d
             in an optimiser, or owned by another callback; a residual that is not finite, or a weight that is negative.
-        TypeError: ``residuals`` returned something else.
+        TypeError: an argument of another kind, or ``residuals`` returned something else.
 
     Warns:
         UserWarning: no residual came in: the loss was called by its ``forward``, or a compiler left out its hooks. Once
@@ -162,8 +163,14 @@ class MKCExpectationMaximization(Callback):
         ):
             if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < low):
                 raise ValueError(f"Expected argument `{name}` to be an integer >= {low} but got {value!r}.")
-        if not 0.0 <= damping < 1.0:
-            raise ValueError(f"Expected argument `damping` in [0, 1) but got {damping!r}.")
+        checked_number("damping", damping, 0.0, 1.0, "[)", "0 keeps nothing of the values before")
+        if loss is not None:
+            refuse_other_type("loss", loss, str, "the loss's name in the module, or None", "write 'criterion' say")
+        if residuals is not None and not callable(residuals):
+            raise TypeError(
+                f"Expected argument `residuals` to be a function (pl_module, batch) -> (input, target) but got "
+                f"{told(residuals)}; None takes those of the training steps."
+            )
         self.loss = loss
         self.every_n_steps = every_n_steps
         self.warmup_epochs = warmup_epochs

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor, nn
 
+from mkc_torch._arguments import as_numbers, refuse_bad_batch, refuse_bad_weight, refuse_not_real, told
 from mkc_torch.functional import KAPPA_MAX, as_computed, energy, inverse_square, log_partition
 from mkc_torch.fused import energy_sums
 
@@ -60,6 +60,7 @@ class MKCLoss(nn.Module):
         bound, d_min: buffers (m,), saved in the state_dict.
 
     Raises:
+        TypeError: an argument that is no number.
         ValueError: an argument out of range, or learning asked for with ``normalize=False``.
 
     Warns:
@@ -99,8 +100,8 @@ class MKCLoss(nn.Module):
         super().__init__()
         if isinstance(num_channels, bool) or not isinstance(num_channels, int) or num_channels < 1:
             raise ValueError(f"Expected argument `num_channels` to be a positive integer but got {num_channels!r}.")
-        if reduction not in ("none", "mean", "sum"):
-            raise ValueError(f"Expected argument `reduction` to be 'none', 'mean' or 'sum' but got {reduction!r}.")
+        refuse_other_reduction(reduction)
+        refuse_no_dimension(channel_dim)
         learned = learn_sigma or learn_d
         if normalize is None:
             normalize = learned
@@ -132,8 +133,7 @@ class MKCLoss(nn.Module):
         self._set_d(d)
 
     def _per_channel(self, name: str, value: float | Tensor, *, low: float) -> Tensor:
-        t = torch.as_tensor(value, dtype=torch.get_default_dtype() if not isinstance(value, Tensor) else None)
-        (t,) = as_computed(t.detach())
+        (t,) = as_computed(as_numbers(name, value).detach())
         if t.dim() > 1 or (t.dim() == 1 and t.shape[0] not in (1, self.num_channels)):
             raise ValueError(
                 f"Expected argument `{name}` to be a number or of shape ({self.num_channels},) but got {tuple(t.shape)}"
@@ -143,16 +143,12 @@ class MKCLoss(nn.Module):
         return t.expand(self.num_channels).clone()
 
     def _sigma_in_range(self, value: float | Tensor) -> Tensor:
-        t = torch.as_tensor(value, dtype=torch.get_default_dtype() if not isinstance(value, Tensor) else None)
-        (t,) = as_computed(t.detach())
+        (t,) = as_computed(as_numbers("sigma", value).detach())
         least = KAPPA_MAX**-0.5
         if not bool((t >= least).all()):
-            raise ValueError(f"Expected argument `sigma` in [{least:g}, inf] but got {value}.")
+            raise ValueError(f"Expected argument `sigma` in [{least:g}, inf] but got {value}; 3 is a usual start.")
         finite = self._per_channel("sigma", torch.where(torch.isinf(t), 1.0, t), low=0.0)
         return torch.where(torch.isinf(t).expand_as(finite), torch.inf, finite)
-
-    def _own_dtype(self, value: float | Tensor) -> Tensor:
-        return value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=self.bound.dtype)
 
     @property
     def kappa(self) -> Float[Tensor, " m"]:
@@ -182,7 +178,7 @@ class MKCLoss(nn.Module):
 
     @sigma.setter
     def sigma(self, value: float | Tensor) -> None:
-        self._set_kappa(inverse_square(self._sigma_in_range(self._own_dtype(value))))
+        self._set_kappa(inverse_square(self._sigma_in_range(as_numbers("sigma", value, self.bound.dtype))))
 
     @property
     def d(self) -> Float[Tensor, " m"]:
@@ -194,7 +190,7 @@ class MKCLoss(nn.Module):
 
     @d.setter
     def d(self, value: float | Tensor) -> None:
-        d = self._per_channel("d", self._own_dtype(value), low=0.0).to(self.bound)
+        d = self._per_channel("d", as_numbers("d", value, self.bound.dtype), low=0.0).to(self.bound)
         if self.raw_d is not None and not bool(((d > self.d_min) & (d < self.bound)).all()):
             raise ValueError(
                 f"Expected `d` between `d_min` {self.d_min.tolist()} and `bound` {self.bound.tolist()} but got {value}."
@@ -263,9 +259,10 @@ class MKCLoss(nn.Module):
             the weighted mean over elements, and 0 if no element counts.
 
         Raises:
-            TypeError: integer or complex input or target.
-            ValueError: shapes differ, are empty, or have another number of channels; a target that counts is NaN or
-                infinite. On an accelerator the loss does not wait for the last: there it comes out as NaN.
+            TypeError: integer or complex input or target, or what is no tensor.
+            ValueError: shapes differ, are empty, or have another number of channels; a weight is negative, NaN or
+                infinite; an input or a target that counts is NaN or infinite. For the last two the loss does not wait
+                for an accelerator, nor are they seen in compiled code or under vmap: there a NaN comes out as NaN.
         """
         axis = self._checked_axis(input, target)
         if not torch.compiler.is_compiling():
@@ -276,8 +273,7 @@ class MKCLoss(nn.Module):
         if weight is not None:
             weight, counts = self._checked_weight(weight, input, axis)
             error = torch.where(counts, input - wanted, 0.0)
-        if not torch.compiler.is_compiling():
-            _refuse_not_finite(target, None if weight is None else counts)
+        refuse_bad_batch(input, wanted, None if weight is None else counts, error)
         kappa, d = self.kappa, self.d
         norm = self._log_normalizer(kappa, d).to(dtype) if self.normalize else None
         kappa, d = (p.to(torch.promote_types(p.dtype, dtype)) for p in (kappa, d))
@@ -330,26 +326,19 @@ class MKCLoss(nn.Module):
             )
 
     def _checked_axis(self, input: Tensor, target: Tensor) -> int:
-        for name, value in (("input", input), ("target", target)):
-            if not value.is_floating_point():
-                raise TypeError(f"Expected argument `{name}` to be a real floating-point tensor but got {value.dtype}.")
-        if input.shape != target.shape:
-            raise ValueError(
-                f"Expected `input` and `target` of one shape but got {tuple(input.shape)} and {tuple(target.shape)}."
-            )
-        if not -input.dim() <= self.channel_dim < input.dim():
-            raise ValueError(f"Expected a dimension {self.channel_dim} for the channels but got {tuple(input.shape)}.")
-        axis = self.channel_dim % input.dim()
+        refuse_other_shapes(input, target)
+        axis = checked_axis(input, self.channel_dim)
         if input.shape[axis] != self.num_channels:
+            mend = "; give each sample a dimension for its channel, unsqueeze(-1)" if self.num_channels == 1 else ""
             raise ValueError(
-                f"Expected {self.num_channels} channels in dimension {self.channel_dim} but got {tuple(input.shape)}."
+                f"Expected {self.num_channels} channels in dimension {self.channel_dim} but got {tuple(input.shape)}"
+                f"{mend}."
             )
-        if input.numel() == 0:
-            raise ValueError(f"Expected at least one element but got shape {tuple(input.shape)}.")
         return axis
 
     @staticmethod
     def _checked_weight(weight: Tensor, input: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+        refuse_bad_weight(weight)
         samples = input.shape[:axis] + input.shape[axis + 1 :]
         if weight.shape == samples and weight.shape != input.shape:
             weight = weight.unsqueeze(axis)
@@ -370,26 +359,50 @@ class MKCLoss(nn.Module):
         )
 
 
-def _refuse_not_finite(target: Tensor, counts: Tensor | None) -> None:
-    """Refuse a target that counts and is NaN or infinite, where looking does not have to wait for an accelerator."""
-    if target.device.type != "cpu":
-        return
-    with torch.no_grad():
-        total = target.sum()
-    try:
-        fine = math.isfinite(total.item())
-    except RuntimeError:  # under vmap there is no one value
-        return
-    if fine:
-        return
-    bad = ~torch.isfinite(target.detach())
-    if counts is not None:
-        bad = bad & counts
-    if bool(bad.any()):
+def refuse_other_reduction(reduction: str) -> None:
+    if reduction not in ("none", "mean", "sum"):
+        raise ValueError(f"Expected argument `reduction` to be 'none', 'mean' or 'sum' but got {reduction!r}.")
+
+
+def refuse_no_dimension(channel_dim: int) -> None:
+    if isinstance(channel_dim, bool) or not isinstance(channel_dim, int):
         raise ValueError(
-            f"Expected argument `target` to be finite but got {int(bad.sum())} values that are not, the first at index "
-            f"{tuple(bad.nonzero()[0].tolist())}. Leave them out: loss(input, target, weight=torch.isfinite(target))."
+            f"Expected argument `channel_dim` to be a whole number but got {channel_dim!r}; -1 is the last dimension."
         )
+
+
+def refuse_other_shapes(input: Tensor, target: Tensor) -> None:
+    """Refuse what are no real tensors of one shape, with an element."""
+    for name, value in (("input", input), ("target", target)):
+        refuse_not_real(name, value)
+    if input.shape != target.shape:
+        short = "target" if input.dim() > target.dim() else "input"
+        mend = f"unsqueeze(-1) the {short}" if input.numel() == target.numel() else "reshape one"
+        raise ValueError(
+            f"Expected `input` and `target` of one shape but got {tuple(input.shape)} and {tuple(target.shape)}; "
+            f"{mend}: torch would broadcast them."
+        )
+    if input.numel() == 0:
+        raise ValueError(f"Expected at least one element but got shape {tuple(input.shape)}; skip empty batches.")
+
+
+def checked_axis(input: Tensor, channel_dim: int) -> int:
+    """The dimension of the channels, counted from the first."""
+    if not -input.dim() <= channel_dim < input.dim():
+        raise ValueError(f"Expected a dimension {channel_dim} for the channels but got {tuple(input.shape)}.")
+    return channel_dim % input.dim()
+
+
+def checked_loss(loss: nn.Module) -> MKCLoss:
+    """The MKCLoss itself, taken out of a compiled one."""
+    own = getattr(loss, "_orig_mod", loss)
+    if not isinstance(own, MKCLoss):
+        got = told(loss) if isinstance(loss, type) else type(loss).__name__
+        raise TypeError(
+            f"Expected argument `loss` to be an MKCLoss but got {got}; pass the loss that is trained with. "
+            "MKCDistribution and mkc_torch.functional take σ and d of each sample."
+        )
+    return own
 
 
 def _at_least_float32(value: Tensor) -> torch.dtype:

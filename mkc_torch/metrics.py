@@ -14,9 +14,10 @@ except ModuleNotFoundError as error:
         "mkc_torch.metrics needs torchmetrics, which comes with Lightning: pip install 'mkc-torch[lightning]'"
     ) from error
 
+from mkc_torch._arguments import refuse_bad_batch
 from mkc_torch.functional import log_partition
 from mkc_torch.fused import energy_sums
-from mkc_torch.losses import MKCLoss, _refuse_not_finite
+from mkc_torch.losses import MKCLoss, checked_loss
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -42,6 +43,9 @@ class MKCNegativeLogLikelihood(Metric):
     Raises:
         TypeError: ``loss`` is no MKCLoss.
 
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
+
     Example:
         >>> loss = MKCLoss(2, sigma=3.0, d=1.0, bound=50.0)
         >>> metric = MKCNegativeLogLikelihood(loss)
@@ -60,11 +64,7 @@ class MKCNegativeLogLikelihood(Metric):
 
     def __init__(self, loss: MKCLoss, *, per_channel: bool = False, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        if not isinstance(loss, MKCLoss):
-            raise TypeError(
-                f"Expected argument `loss` to be an MKCLoss but got {type(loss).__name__}; "
-                "pass the loss that is trained with."
-            )
+        loss = checked_loss(loss)
         self._loss = _Reference(loss)
         self.per_channel = per_channel
         for name in ("total", "weight"):
@@ -94,13 +94,14 @@ class MKCNegativeLogLikelihood(Metric):
         loss = self.loss
         axis = loss._checked_axis(input, target)
         with torch.no_grad():
-            error = input.double() - target.double()
+            input, target = input.double(), target.double()
+            error = input - target
             if weight is None:
                 weights, counts = torch.ones_like(error), None
             else:
                 weights, counts = loss._checked_weight(weight, error, axis)
                 error = torch.where(counts, error, 0.0)
-            _refuse_not_finite(target, counts)
+            refuse_bad_batch(input, target, counts, error)
             kappa, d, bound = (t.double() for t in (loss.kappa, loss.d, loss.bound))
             others = [i for i in range(error.dim()) if i != axis]
             elements = weights.sum(others) if others else weights

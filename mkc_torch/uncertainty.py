@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import DIVERGED, checked_number, refuse_bad_batch, refuse_not_finite, seems_finite
 from mkc_torch.distribution import SIGMA_MIN, MKCDistribution
 from mkc_torch.functional import mkc_weight
-from mkc_torch.losses import MKCLoss, _at_least_float32, _refuse_not_finite
+from mkc_torch.losses import MKCLoss, _at_least_float32, checked_loss
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -51,7 +52,7 @@ def inlier_weight(
         Weights in [0, 1] of the shape of ``input``, float32 at least, without a gradient.
 
     Raises:
-        TypeError: integer or complex input or target.
+        TypeError: a loss of another kind; integer or complex input or target, or what is no tensor.
         ValueError: shapes differ, are empty, or have another number of channels than the loss.
 
     References:
@@ -62,6 +63,7 @@ def inlier_weight(
         >>> inlier_weight(loss, torch.zeros(3, 1), torch.tensor([[0.0], [2.0], [50.0]])).flatten()
         tensor([1.0000, 0.6065, 0.0000])
     """
+    loss = checked_loss(loss)
     axis = loss._checked_axis(input, target)
     return mkc_weight(_error(input, target), _along(loss.sigma, input, axis), _along(loss.d, input, axis))
 
@@ -81,16 +83,18 @@ def outliers(
         Flags of the shape of ``input``, True for an outlier.
 
     Raises:
-        TypeError: integer or complex input or target.
+        TypeError: as in :func:`inlier_weight`.
         ValueError: as in :func:`inlier_weight`; a limit outside (0, 1); an error that is NaN.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (15).
 
     Example:
         >>> loss = MKCLoss(1, sigma=2.0, d=1.0)
         >>> outliers(loss, torch.zeros(3, 1), torch.tensor([[0.0], [2.0], [50.0]])).flatten()
         tensor([False, False,  True])
     """
-    if not 0.0 < weight_below < 1.0:
-        raise ValueError(f"Expected argument `weight_below` to be in (0, 1) but got {weight_below}; 0.1 is usual.")
+    checked_number("weight_below", weight_below, 0.0, 1.0, advice="0.1 is usual")
     weight = inlier_weight(loss, input, target)
     unknown = weight.isnan()
     if bool(unknown.any()):
@@ -125,8 +129,11 @@ def beyond_bound(
         which is NaN for a channel of which nothing counts.
 
     Raises:
-        TypeError: integer or complex input or target.
-        ValueError: as the loss: shapes, channels, a target that counts and is not finite.
+        TypeError: as in :func:`inlier_weight`.
+        ValueError: as the loss: shapes, channels, weights, an input or a target that counts and is not finite.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
 
     Example:
         >>> loss = MKCLoss(2, bound=10.0)
@@ -134,10 +141,11 @@ def beyond_bound(
         >>> beyond_bound(loss, torch.zeros(4, 2), target)
         BeyondBound(count=tensor([1, 1]), share=tensor([0.2500, 0.2500]))
     """
+    loss = checked_loss(loss)
     axis = loss._checked_axis(input, target)
     error = _error(input, target)
     weights, counts = loss._checked_weight(torch.ones_like(error) if weight is None else weight, error, axis)
-    _refuse_not_finite(target, counts)
+    refuse_bad_batch(input, target, counts, torch.where(counts, error, 0.0))
     beyond = counts & (error.abs() > _along(loss.bound, input, axis))
     others = [i for i in range(error.dim()) if i != axis]
     count, outside, total = (
@@ -164,17 +172,23 @@ def predictive_interval(loss: MKCLoss, input: Float[Tensor, "*shape"], level: fl
         more than ``1 - level``, the ends lie far out on the flat tail, within ``bound`` of the prediction.
 
     Raises:
-        TypeError: integer or complex input.
-        ValueError: a level outside (0, 1), an empty input, or another number of channels than the loss.
+        TypeError: a loss of another kind; an integer or complex input, or what is no tensor.
+        ValueError: a level outside (0, 1), an input that is empty or not finite, or another number of channels than the
+            loss.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
 
     Example:
         >>> loss = MKCLoss(1, sigma=float("inf"), d=1.0, learn_sigma=False)
         >>> predictive_interval(loss, torch.tensor([[10.0]]), level=0.95)
         Interval(low=tensor([[8.0400]]), high=tensor([[11.9600]]))
     """
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"Expected argument `level` to be in (0, 1) but got {level}; 0.9 leaves 5 % on either side.")
+    checked_number("level", level, 0.0, 1.0, advice="0.9 leaves 5 % on either side")
+    loss = checked_loss(loss)
     axis = loss._checked_axis(input, input)
+    if not seems_finite(input):
+        refuse_not_finite("input", input, DIVERGED)
     # on the processor, since not every accelerator has float64
     kappa, d, bound = (t.detach().cpu().double() for t in (loss.kappa, loss.d, loss.bound))
     density = MKCDistribution(kappa.rsqrt().clamp(min=SIGMA_MIN), d, bound)  # rounding may lead below the least σ

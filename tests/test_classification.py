@@ -350,7 +350,7 @@ def test_sigma_out_of_range_is_refused_wherever_it_is_given(sigma):
     with pytest.raises(ValueError, match=message):
         generalized_cross_entropy(logits, labels, sigma=sigma)
     for name in ("start", "end"):
-        with pytest.raises(ValueError, match=f"`{name}` in "):
+        with pytest.raises(ValueError, match=rf"`{name}` to be in \[0\.5, inf\] but got"):
             graduated_sigma(0.5, **{name: sigma})
     assert loss.sigma.item() == pytest.approx(1.2)
 
@@ -365,7 +365,7 @@ def test_a_sigma_to_be_learned_and_one_for_each_class_are_refused():
 
 @pytest.mark.parametrize(("progress", "until"), [(-0.1, 0.5), (1.1, 0.5), (NAN, 0.5), (0.5, 0.0), (0.5, 1.5)])
 def test_progress_beyond_the_training_is_refused(progress, until):
-    with pytest.raises(ValueError, match=r"Expected argument `(progress` in \[0|until` in \(0), 1\]"):
+    with pytest.raises(ValueError, match=r"Expected argument `(progress` to be in \[0|until` to be in \(0), 1\]"):
         graduated_sigma(progress, until=until)
 
 
@@ -453,5 +453,27 @@ def test_other_kinds_are_refused():
     logits, labels, _ = data(5, 4)
     refused(logits.long(), labels, "`input` to be floating-point logits but got torch.int64", TypeError)
     refused(logits, labels.bool(), "`target` to be integer labels or .* but got torch.bool", TypeError)
-    refused(logits, labels.tolist(), "`target` to be a tensor but got list", TypeError)
-    refused(logits.tolist(), labels, "`input` to be a tensor but got list", TypeError)
+    refused(
+        logits, labels.tolist(), r"`target` to be a tensor of .* but got list; .*torch\.as_tensor\(target\)", TypeError
+    )
+    refused(
+        logits.tolist(),
+        labels,
+        r"`input` to be floating-point logits but got list; .*torch\.as_tensor\(input\)",
+        TypeError,
+    )
+
+
+def test_arguments_that_are_no_numbers_are_refused_by_name():
+    logits, labels, _ = data(5, 4)
+    with pytest.raises(TypeError, match="`sigma` to be a number, or a tensor of them, but got 'a'"):
+        GeneralizedCrossEntropyLoss("a")
+    with pytest.raises(TypeError, match="`sigma` to be a number, or a tensor of them, but got 'a'"):
+        generalized_cross_entropy(logits, labels, sigma="a")
+    with pytest.raises(TypeError, match="`weight` to be a number, or a tensor of them, but got 'a'"):
+        GeneralizedCrossEntropyLoss(weight="a")
+    with pytest.raises(ValueError, match="`ignore_index` to be a whole number but got 'a'"):
+        GeneralizedCrossEntropyLoss(ignore_index="a")
+    for options in ({"progress": "a"}, {"progress": 0.5, "start": "a"}, {"progress": 0.5, "until": None}):
+        with pytest.raises(TypeError, match="to be a number in"):
+            graduated_sigma(**options)

@@ -415,6 +415,62 @@ def test_weights_that_are_negative_or_all_zero_are_refused(weight):
         fit_density(normal(0, 10, 1), weight=weight.double())
 
 
+def test_weights_of_another_shape_are_refused_with_how_to_reshape_them():
+    error = normal(0, 10, 10)
+    with pytest.raises(
+        ValueError, match=r"`weight` of shape \(10, 10\) or \(10, 1\) but got \(10,\); .*unsqueeze\(-1\)"
+    ):
+        fit_density(error, weight=torch.ones(10))
+    with pytest.raises(ValueError, match=r"`weight` of shape \(10, 10\) or \(10, 1\) but got \(3, 10\)\."):
+        fit_density(error, weight=torch.ones(3, 10))
+    with pytest.raises(ValueError, match=r"`weight` .* channels of the sums \[0\.0\]"):
+        fit_density(error[:, :1], weight=torch.zeros(10, 1))
+    once = fit_density(error, weight=torch.ones(10, 1))
+    torch.testing.assert_close(once.d, fit_density(error).d)
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (np.zeros((10, 1)), r"`error` .* got ndarray; make a tensor of it, torch\.as_tensor\(error\)"),
+        (torch.zeros(10, 1, dtype=torch.int64), r"`error` .* got torch\.int64; convert it, .*error\.double\(\)"),
+        (torch.zeros(10, 1).half(), r"`error` of dtype float32 or float64 but got torch\.float16; use \.float"),
+        (torch.zeros(10, 1) + 0j, r"`error` .* got torch\.complex64"),
+    ],
+)
+def test_residuals_of_another_kind_are_refused_with_how_to_convert_them(error, message):
+    with pytest.raises(TypeError, match=message):
+        fit_density(error)
+
+
+def test_a_channel_without_a_dimension_is_told_how_to_get_one():
+    with pytest.raises(ValueError, match=r"but got \(1000,\); one channel is error\.unsqueeze\(-1\)"):
+        fit_density(torch.zeros(1000))
+    with pytest.raises(ValueError, match=r"with a channel at least but got \(10, 0\)"):
+        fit_density(torch.zeros(10, 0))
+
+
+@pytest.mark.parametrize("name", ["sigma", "d", "bound", "d_min"])
+def test_parameters_that_are_no_numbers_or_of_another_shape_are_refused(name):
+    with pytest.raises(TypeError, match=f"`{name}` to be a number, or a tensor of them, but got 'a'"):
+        fit_density(normal(0, 10, 2), **{name: "a"})
+    with pytest.raises(ValueError, match=rf"`{name}` to be a number or of shape \(m,\) or \(2,\) but got \(3,\)"):
+        fit_density(normal(0, 10, 2), **{name: torch.full((3,), 9.0)})
+
+
+def test_arguments_that_lead_nowhere_are_refused():
+    for options, message in (
+        ({"sigma": 0.01}, r"`sigma` to be in \[0\.05, inf\] but got 0\.01"),
+        ({"d": 30.0, "bound": 20.0}, "`d` below `bound` but got 30.0 and 20.0"),
+        ({"d_min": 1e9}, r"`d_min` below the half-width of the domain, \[.*\], but got 1000000000"),
+        ({"max_iter": 0}, "`max_iter` to be a whole number of at least 1 but got 0"),
+        ({"tol": -1.0}, "`tol` to be >= 0 and finite but got -1"),
+        ({"tol": math.nan}, "`tol` to be >= 0 and finite but got nan"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fit_density(normal(0, 10, 1), **options)
+
+
 # Barron's line
 
 

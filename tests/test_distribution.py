@@ -177,8 +177,32 @@ def test_icdf_of_many_probabilities_equals_icdf_of_few():
 
 @pytest.mark.parametrize("probability", [-1e-3, 1.001, math.nan])
 def test_icdf_refuses_what_is_no_probability(probability):
-    with pytest.raises(ValueError, match=r"Expected argument `value` to be probabilities in \[0, 1\]"):
+    with pytest.raises(ValueError, match=r"`value` to be probabilities in \[0, 1\] but got .* at index \(1,\); divide"):
         MKCDistribution(2.0, 1.0, 10.0, validate_args=True).icdf(torch.tensor([0.5, probability]))
+
+
+@pytest.mark.parametrize("name", ["log_prob", "cdf", "icdf"])
+def test_a_number_is_no_tensor_of_values(name):
+    with pytest.raises(
+        TypeError, match=r"`value` to be a tensor.* but got float; make a tensor of it, torch\.as_tensor"
+    ):
+        getattr(MKCDistribution(2.0, 1.0, 10.0, validate_args=True), name)(0.5)
+
+
+@pytest.mark.parametrize("shape", [3, "a", None, (2.5,)])
+def test_what_is_no_shape_of_samples_is_refused(shape):
+    for draw in (MKCDistribution(2.0, 1.0, 10.0).rsample, MKCDistribution(2.0, 1.0, 10.0).sample):
+        with pytest.raises(TypeError, match=r"`sample_shape` to be a shape but got .*; write \(1000,\)"):
+            draw(shape)
+    with pytest.raises(TypeError, match=r"`batch_shape` to be a shape but got"):
+        MKCDistribution(2.0, 1.0, 10.0).expand(shape)
+
+
+@pytest.mark.parametrize("name", ["sigma", "d", "bound", "loc"])
+@pytest.mark.parametrize("value", ["2", None, torch.ones(1) + 0j])
+def test_parameters_that_are_no_numbers_are_refused_by_name(name, value):
+    with pytest.raises(TypeError, match=rf"Expected argument `{name}` to be (a number, or a tensor of them|real)"):
+        MKCDistribution(**{"sigma": 2.0, "d": 1.0, "bound": 10.0, name: value})
 
 
 # --- samples

@@ -605,6 +605,58 @@ def test_what_is_no_floating_tensor_is_refused(points):
         EllipsoidFit().fit(points)
 
 
+@pytest.mark.parametrize("estimator", ["lts", 3, MKCRegression, np.ones(3)])
+def test_what_is_no_estimator_is_refused_when_the_fit_is_made(estimator):
+    with pytest.raises(TypeError, match=r"`estimator` to be an estimator of mkc_torch\.linear but got") as refused:
+        EllipsoidFit(estimator)
+    assert ("the class MKCRegression; make one, MKCRegression(...)" in str(refused.value)) == (
+        estimator is MKCRegression
+    )
+
+
+def test_an_unfitted_ellipsoid_asks_for_points():
+    for asked in (lambda fit: fit.center_, lambda fit: fit.calibrate(surface(20))):
+        with pytest.raises(NotFittedError, match=r"EllipsoidFit has no `\w+_` yet; call fit\(points\) first"):
+            asked(EllipsoidFit())
+
+
+@pytest.mark.parametrize(
+    ("weight", "error", "message"),
+    [
+        (-torch.ones(20), ValueError, "`sample_weight` to be >= 0 and finite but got -1"),
+        (torch.full((20,), math.nan), ValueError, "`sample_weight` to be >= 0 and finite but got nan"),
+        ([1.0] * 20, TypeError, r"`sample_weight` .* got list; make a tensor of it, torch\.as_tensor\(sample_weight\)"),
+        (np.ones(20), TypeError, r"`sample_weight` .* got ndarray; make a tensor"),
+        (torch.ones(19), ValueError, r"`sample_weight` of shape \(20,\) but got \(19,\); it has one weight for each"),
+    ],
+)
+def test_weights_that_are_none_are_refused(weight, error, message):
+    with pytest.raises(error, match=message):
+        EllipsoidFit().fit(surface(20), weight)
+
+
+def test_points_to_calibrate_are_looked_at():
+    fit = EllipsoidFit().fit(surface(100))
+    for points, error, message in (
+        (surface(20).numpy(), TypeError, r"`points` .* got ndarray; make a tensor of it"),
+        (surface(20).mT, ValueError, r"\(\*, N, 3\) but got \(3, 20\); a point is a row, so try points\.mT"),
+        (surface(20)[0], ValueError, r"\(\*, N, 3\) but got \(3,\); one point is points\.unsqueeze\(0\)"),
+        (surface(20)[:, :2], ValueError, r"\(\*, N, 3\) but got \(20, 2\)\."),
+    ):
+        with pytest.raises(error, match=message):
+            fit.calibrate(points)
+    batch = EllipsoidFit().fit(surface(100).expand(2, 100, 3))
+    with pytest.raises(
+        ValueError, match=r"`points` and `calibration_matrix_` that broadcast but got \(3,\) and \(2,\)"
+    ):
+        batch.calibrate(surface(20).expand(3, 20, 3))
+
+
+def test_half_precision_is_told_to_be_converted():
+    with pytest.raises(TypeError, match=r"`points` of dtype float32 or float64 but got torch\.float16; use \.float"):
+        EllipsoidFit().fit(surface(20).half())
+
+
 @pytest.mark.parametrize("shape", [(20, 2), (20,), (3, 20)])
 def test_wrong_shapes_are_refused(shape):
     with pytest.raises(ValueError, match="shape"):

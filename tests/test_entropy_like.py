@@ -173,6 +173,18 @@ def test_weights_that_total_one_are_refused():
         entropy_like(sample(0, 4), weight=torch.full((4,), 0.25))
 
 
+def test_residuals_that_count_and_are_not_finite_are_refused():
+    for bad in (math.nan, math.inf):
+        with pytest.raises(
+            ValueError, match=r"`residual` to be finite but got 1 .* \(1,\)\. Leave them out by a weight"
+        ):
+            entropy_like(torch.tensor([1.0, bad, 2.0]))
+    for residual in ("a", [1.0, 2.0], np.ones(3)):
+        with pytest.raises(TypeError, match="`residual` to be a real tensor but got"):
+            entropy_like(residual)
+    assert float(entropy_like(torch.tensor([1, 1, 1]))) == pytest.approx(1.0)
+
+
 # the loss
 
 
@@ -214,11 +226,30 @@ def test_the_loss_refuses_what_it_cannot_answer():
         ((x, torch.tensor([1.0, math.nan, 2.0])), ValueError, "finite"),
         ((x.long(), x), TypeError, "floating"),
         ((torch.ones(0), torch.ones(0)), ValueError, "at least one"),
+        ((torch.tensor([1.0, math.nan, 2.0]), x), ValueError, "`input` to be finite but got 1"),
+        ((torch.tensor([1.0, math.inf, 2.0]), x), ValueError, "`input` to be finite but got 1"),
+        ((x.numpy(), x), TypeError, "`input` to be a real floating-point tensor but got ndarray"),
+        ((x, x, -torch.ones(3)), ValueError, "`weight` to be >= 0 and finite but got -1"),
+        ((x, x, torch.tensor([1.0, math.nan, 1.0])), ValueError, "`weight` to be >= 0 and finite but got nan"),
+        ((x, x, [1.0, 1.0, 1.0]), TypeError, "`weight` to be a tensor"),
+        (
+            (torch.ones(3, 2), torch.ones(3, 2), torch.ones(3)),
+            ValueError,
+            r"\(3, 2\) but got \(3,\); .*unsqueeze\(-1\)",
+        ),
     ):
         with pytest.raises(error, match=match):
             LELoss()(*given)
     with pytest.raises(ValueError, match="reduction"):
         LELoss(reduction="median")
+    for dim in ("a", 1.5, (0, "a")):
+        with pytest.raises(TypeError, match="`dim` to be a dimension, several, or None but got"):
+            LELoss(dim=dim)
+        with pytest.raises(TypeError, match="`dim` to be a dimension, several, or None but got"):
+            entropy_like(x, dim)
+    for dim in (7, (0, 0), (0, -1)):
+        with pytest.raises(ValueError, match=r"`dim` to be dimensions of the residuals \(3,\), each once, but got"):
+            LELoss(dim=dim)(x, 2 * x)
     masked = LELoss()(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.0, math.nan, 0.0]), torch.tensor([1.0, 0.0, 1.0]))
     assert bool(torch.isfinite(masked))
 
@@ -363,3 +394,22 @@ def test_starts_that_make_no_sense_are_refused():
     ):
         with pytest.raises(error, match=match):
             least_entropy_like(residual, starts)
+
+
+def test_arguments_that_make_no_sense_are_refused():
+    x = torch.arange(1.0, 5.0)
+    one = torch.ones(1, 1)
+
+    def residual(t: Tensor) -> Tensor:
+        return x - t[0]
+
+    for arguments, options, error, match in (
+        ((3, one), {}, TypeError, "`residual` to be a function of the parameters but got int; write lambda"),
+        ((residual, one), {"tol": "a"}, TypeError, "`tol` to be a number"),
+        ((residual, one), {"tol": -1.0}, ValueError, "`tol` to be >= 0"),
+        ((residual, one), {"max_iter": 0}, ValueError, "`max_iter` to be a whole number of at least 1 but got 0"),
+        ((residual, one), {"weight": -torch.ones(4)}, ValueError, "`weight` to be >= 0"),
+        ((residual, one), {"weight": [1.0] * 4}, TypeError, "`weight` to be a tensor"),
+    ):
+        with pytest.raises(error, match=match):
+            least_entropy_like(*arguments, **options)

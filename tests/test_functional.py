@@ -519,10 +519,86 @@ def test_an_empty_batch_gives_an_empty_result():
 def test_complex_values_are_refused(position):
     arguments = [torch.ones(2) for _ in range(4)]
     arguments[position] = arguments[position].to(torch.complex64)
-    with pytest.raises(TypeError, match=r"Expected real values but got a tensor of dtype torch\.complex64"):
+    with pytest.raises(TypeError, match=r"real .*got .*torch\.complex64"):
         mkc_nll(*arguments)
 
 
 def test_kappa_max_is_the_inverse_square_of_the_least_sigma():
     assert inverse_square(double(0.05)).item() == pytest.approx(KAPPA_MAX, rel=1e-14)
     assert inverse_square(double(INF)).item() == 0
+
+
+# --- what is refused, and where
+
+
+POINTWISE = [mkc_energy, mkc_weight]
+LIKELIHOOD = [lambda _, **p: log_normalizer(**p), mkc_nll]
+
+
+def called(function, **changed):
+    parameters = {"sigma": 2.0, "d": 1.0} | ({} if function in POINTWISE else {"bound": 5.0}) | changed
+    return function(torch.tensor([0.5, 1.0]), **parameters)
+
+
+@pytest.mark.parametrize("function", [*POINTWISE, *LIKELIHOOD])
+@pytest.mark.parametrize("name", ["sigma", "d", "bound"])
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, -INF])
+@pytest.mark.parametrize("kind", [float, torch.tensor, lambda v: torch.tensor([1.0, v], requires_grad=True)])
+def test_parameters_out_of_range_are_refused_by_name(function, name, bad, kind):
+    if name == "bound" and function in POINTWISE:
+        return
+    with pytest.raises(ValueError, match=rf"`{name}` to be (positive and finite|in \[.*inf\]) but got"):
+        called(function, **{name: kind(bad)})
+
+
+@pytest.mark.parametrize("function", [*POINTWISE, *LIKELIHOOD])
+def test_an_infinite_scale_or_domain_is_refused_and_an_infinite_bandwidth_is_the_gaussian(function):
+    assert bool(called(function, sigma=INF).isfinite().all())
+    for name in ("d", "bound"):
+        if name == "d" or function not in POINTWISE:
+            with pytest.raises(ValueError, match=f"`{name}` to be positive and finite but got inf"):
+                called(function, **{name: INF})
+
+
+def test_the_normaliser_takes_the_least_sigma_as_it_is_rounded():
+    for function in LIKELIHOOD:
+        called(function, sigma=torch.tensor(KAPPA_MAX).rsqrt() * (1 - 1e-6))
+        with pytest.raises(ValueError, match=r"`sigma` to be in \[0\.05, inf\] but got 0\.04"):
+            called(function, sigma=0.04)
+    assert called(mkc_energy, sigma=0.001).tolist() == pytest.approx([1e-6, 1e-6])
+
+
+@pytest.mark.parametrize("function", [*POINTWISE, *LIKELIHOOD])
+def test_under_vmap_parameters_go_through_as_they_are(function):
+    sigma = torch.tensor([[2.0, -2.0], [1.0, 3.0]])
+    found = vmap(lambda s: called(function, sigma=s))(sigma)
+    torch.testing.assert_close(found, torch.stack([called(function, sigma=s.abs()) for s in sigma]))
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
+def test_compiled_parameters_are_looked_at_where_they_are_numbers():
+    compiled = torch.compile(mkc_nll, fullgraph=True)
+    error = torch.linspace(-3.0, 3.0, 7)
+    torch.testing.assert_close(compiled(error, 2.0, 1.0, 5.0), mkc_nll(error, 2.0, 1.0, 5.0))
+    with pytest.raises(ValueError, match="`sigma` to be in"):
+        torch.compile(mkc_nll)(error, -2.0, 1.0, 5.0)
+    tensors = torch.tensor([2.0]), torch.tensor([1.0]), torch.tensor([5.0])
+    torch.testing.assert_close(compiled(error, *tensors), mkc_nll(error, *tensors))
+
+
+@pytest.mark.parametrize("function", [*POINTWISE, *LIKELIHOOD])
+def test_what_is_no_number_is_refused_by_name(function):
+    for value in ("2", None, 2j):
+        with pytest.raises(TypeError, match="`sigma` to be a number, or a tensor of them, but got"):
+            called(function, sigma=value)
+
+
+def test_errors_are_tensors_and_the_primitives_take_nothing_else():
+    for error in (np.ones(2), [1.0, 2.0]):
+        with pytest.raises(TypeError, match=r"`error` to be a real tensor but got .*torch\.as_tensor\(error\)"):
+            mkc_energy(error, 1.0, 1.0)
+    with pytest.raises(TypeError, match="`kappa` to be a tensor but got float"):
+        energy(torch.ones(2), 1.0)
+    with pytest.raises(TypeError, match="`length` to be a tensor but got float"):
+        log_partition(torch.ones(2), 1.0)
+    assert mkc_energy(torch.tensor([math.nan, 1.0]), 2.0, 1.0).isnan().tolist() == [True, False]

@@ -298,7 +298,7 @@ def test_integers_and_numbers_are_refused(name):
     loss = HeteroscedasticMKCLoss(30.0)
     with pytest.raises(TypeError, match=f"`{name}` to be a real floating-point tensor but got torch.int64"):
         loss(**{**given, name: torch.ones(4, 3, dtype=torch.int64)})
-    with pytest.raises(TypeError, match=f"`{name}` to be a tensor but got float"):
+    with pytest.raises(TypeError, match=f"`{name}` to be a real floating-point tensor but got float; make"):
         loss(**{**given, name: 1.0})
 
 
@@ -332,17 +332,25 @@ def test_what_the_loss_of_channels_refuses_is_refused():
         ((x[:0], x[:0]), "at least one element"),
         ((torch.zeros(()), torch.zeros(())), "for the channels"),
         ((x, bad), r"`target` to be finite but got 1 values that are not, the first at index \(1, 0\)"),
+        ((bad, x), r"`input` to be finite but got 1 values that are not, the first at index \(1, 0\)"),
     ):
         with pytest.raises(ValueError, match=message):
             loss(*arguments, one, one)
     with pytest.raises(ValueError, match="Expected argument `weight` of shape"):
         loss(x, x, one, one, torch.ones(3))
+    with pytest.raises(ValueError, match="`weight` to be >= 0 and finite but got -1 at index"):
+        loss(x, x, one, one, -torch.ones(4))
+    assert bool(loss(bad, x, one, one, bad.isfinite()).isfinite())
 
 
 @pytest.mark.parametrize("bound", [0.0, -1.0, INF, NAN, torch.ones(2, 2)])
 def test_bad_bounds_and_reductions_are_refused(bound):
     with pytest.raises(ValueError, match="`bound` to be"):
         HeteroscedasticMKCLoss(bound)
+    with pytest.raises(ValueError, match="`channel_dim` to be"):
+        HeteroscedasticMKCLoss(1.0, channel_dim="last")
+    with pytest.raises(TypeError, match="`bound` to be a number"):
+        HeteroscedasticMKCLoss("a")
     with pytest.raises(ValueError, match="`reduction` to be"):
         HeteroscedasticMKCLoss(1.0, reduction="average")
 
@@ -350,8 +358,8 @@ def test_bad_bounds_and_reductions_are_refused(bound):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"in_features": 0}, "`in_features` to be a positive integer but got 0"),
-        ({"num_channels": True}, "`num_channels` to be a positive integer but got True"),
+        ({"in_features": 0}, "`in_features` to be a whole number of at least 1 but got 0"),
+        ({"num_channels": True}, "`num_channels` to be a whole number of at least 1 but got True"),
         ({"bound": INF}, "`bound` to be positive and finite"),
         ({"bound": torch.ones(3)}, r"`bound` to be a number or of shape \(2,\) but got \(3,\)"),
         ({"d_min": 0.0}, "`d_min` to be positive and finite"),
@@ -370,3 +378,7 @@ def test_bad_heads_are_refused_with_a_reason(options, message):
 def test_another_number_of_features_is_refused():
     with pytest.raises(ValueError, match=r"`features` of shape \(\*, 5\) but got \(4, 3\)"):
         MKCHead(5, 2, bound=50.0, d_min=1e-3)(torch.zeros(4, 3))
+    with pytest.raises(TypeError, match="`features` to be a real floating-point tensor but got ndarray"):
+        MKCHead(5, 2, bound=50.0, d_min=1e-3)(torch.zeros(4, 5).numpy())
+    with pytest.raises(TypeError, match="`d_min` to be a number"):
+        MKCHead(5, 2, bound=50.0, d_min="small")

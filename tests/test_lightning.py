@@ -673,9 +673,12 @@ def _losses_of(module):
 
 
 @pytest.mark.parametrize("bad", [NAN, INF])
-def test_residuals_that_are_not_finite_name_step_channel_and_remedy(bad):
+def test_residuals_that_are_not_finite_name_step_channel_and_remedy(bad, monkeypatch):
     error = drawn(500, 2)
     error[320, 1] = bad
+    refused(Replay(), error=error, match=r"`input` to be finite but got 1 values .* \(20, 1\)")
+    # as on an accelerator, for which the loss does not wait
+    monkeypatch.setattr("mkc_torch.losses.refuse_bad_batch", lambda *_: None)
     refused(Replay(), error=error, match=r"step 3 of the loss `criterion`.*channel 1; .*torch.isfinite\(target\)")
 
 
@@ -761,12 +764,29 @@ def test_residuals_of_zero_end_at_the_floor_with_a_warning(kind):
         ({"warmup_epochs": -1}, "`warmup_epochs` to be an integer >= 0 but got -1"),
         ({"warmup_epochs": True}, "`warmup_epochs`"),
         ({"anneal_epochs": 0}, "`anneal_epochs` to be an integer >= 1"),
-        ({"damping": 1.0}, r"`damping` in \[0, 1\) but got 1.0"),
+        ({"damping": 1.0}, r"`damping` to be in \[0, 1\) but got 1.0"),
         ({"damping": NAN}, "`damping`"),
     ],
 )
 def test_arguments_out_of_range_are_refused(options, match):
     with pytest.raises(ValueError, match=match):
+        MKCExpectationMaximization(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"damping": "a"}, r"`damping` to be a number in \[0, 1\) but got 'a'"),
+        (
+            {"loss": MKCLoss(2)},
+            "`loss` to be the loss's name in the module, or None but got MKCLoss.*; write 'criterion'",
+        ),
+        ({"loss": 3}, "`loss` to be the loss's name in the module, or None but got 3"),
+        ({"residuals": 3}, r"`residuals` to be a function \(pl_module, batch\) -> .* but got 3; None takes those"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused(options, match):
+    with pytest.raises(TypeError, match=match):
         MKCExpectationMaximization(**options)
 
 

@@ -3,6 +3,7 @@ import io
 import math
 import pickle
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -753,3 +754,107 @@ def test_ordinary_noise_is_no_collapse():
         loss(torch.zeros(256, 1), target).backward()
         optimiser.step()
     assert 0.7 < float(loss.d.detach()) < 1.3
+
+
+# --- values that are refused, and where
+
+
+@each_reduction
+@pytest.mark.parametrize("bad", [-1.0, NAN, INF])
+@pytest.mark.parametrize("shape", [(4, 2), (4,)], ids=["element", "sample"])
+def test_weights_that_are_negative_or_not_finite_are_refused(reduction, bad, shape):
+    loss, x = MKCLoss(2, reduction=reduction), torch.zeros(4, 2)
+    weight = torch.ones(shape)
+    weight[1] = bad
+    with pytest.raises(ValueError, match=rf"`weight` to be >= 0 and finite but got {bad:g} at index \(1"):
+        loss(x, x, weight)
+
+
+def test_weights_that_are_no_tensor_or_complex_are_refused():
+    loss, x = MKCLoss(2), torch.zeros(4, 2)
+    for weight in ([1.0] * 4, np.ones(4), 1.0):
+        with pytest.raises(TypeError, match=r"`weight` to be a tensor of weights or a boolean mask but got"):
+            loss(x, x, weight)
+    with pytest.raises(TypeError, match=r"`weight` to be real"):
+        loss(x, x, torch.ones(4) + 0j)
+
+
+@each_reduction
+@pytest.mark.parametrize("bad", [NAN, INF, -INF])
+@pytest.mark.parametrize("learned", [True, False])
+def test_a_prediction_that_counts_and_is_not_finite_is_refused(reduction, bad, learned):
+    loss = MKCLoss(2, reduction=reduction, **({} if learned else FIXED))
+    x, y = torch.zeros(3, 2), torch.zeros(3, 2)
+    x[1, 0] = bad
+    message = r"`input` to be finite but got 1 values that are not, the first at index \(1, 0\)\. The network has"
+    with pytest.raises(ValueError, match=message):
+        loss(x, y)
+    with pytest.raises(ValueError, match=message), torch.no_grad():
+        loss(x, y, torch.ones(3))
+    assert bool(loss(x, y, x.isfinite()).isfinite().all())
+
+
+def test_a_prediction_and_a_target_that_are_infinite_alike_do_not_cancel():
+    x = torch.full((2, 1), INF)
+    with pytest.raises(ValueError, match="`target` to be finite but got 2 values"):
+        MKCLoss(1)(x, x)
+
+
+def test_what_is_refused_goes_through_under_vmap():
+    loss, x = made(reduction="sum"), data(4, 3)[0]
+    bad = x.clone()
+    bad[1] = NAN
+    found = vmap(loss)(bad, x)
+    assert found.isnan().tolist() == [False, True, False, False]
+    assert vmap(loss, in_dims=(None, 0))(bad[1], x).isnan().all()
+    weight = torch.tensor([1.0, -1.0, 2.0, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(vmap(loss)(x, x, weight.unsqueeze(-1).expand(4, 3)), weight * loss(x, x) / 4)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
+def test_what_is_refused_goes_through_a_compiled_loss():
+    loss = made(reduction="none", **FIXED)
+    compiled = torch.compile(loss, fullgraph=True)
+    x, y = data(5, 3)
+    weight = torch.tensor([1.0, 0.5, 0.0, 2.0, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(compiled(x, y, weight), loss(x, y, weight))
+    bad = x.clone()
+    bad[1, 2] = NAN
+    assert compiled(bad, y, weight).isnan().nonzero().tolist() == [[1, 2]]
+
+
+@pytest.mark.parametrize("name", ["input", "target"])
+@pytest.mark.parametrize("value", [np.zeros((4, 2)), [[0.0, 0.0]] * 4, None, 3.0])
+def test_data_that_are_no_tensors_are_refused_by_name(name, value):
+    arguments = {"input": torch.zeros(4, 2), "target": torch.zeros(4, 2), name: value}
+    with pytest.raises(
+        TypeError, match=f"`{name}` to be a real floating-point tensor but got {type(value).__name__}; "
+    ):
+        MKCLoss(2)(**arguments)
+
+
+def test_a_channel_that_has_no_dimension_is_told_how_to_get_one():
+    flat, column = torch.zeros(1000), torch.zeros(1000, 1)
+    with pytest.raises(ValueError, match=r"Expected 1 channels .* got \(1000,\); .* unsqueeze\(-1\)"):
+        MKCLoss(1)(flat, flat)
+    with pytest.raises(ValueError, match=r"\(1000, 1\) and \(1000,\); unsqueeze\(-1\) the target"):
+        MKCLoss(1)(column, flat)
+    with pytest.raises(ValueError, match=r"\(1000,\) and \(1000, 1\); unsqueeze\(-1\) the input"):
+        MKCLoss(1)(flat, column)
+
+
+@pytest.mark.parametrize("name", ["sigma", "d", "bound", "d_min"])
+def test_parameters_that_are_no_numbers_are_refused_by_name(name):
+    for value in ("a", [[1.0], [1.0, 2.0]], 1j):
+        with pytest.raises(TypeError, match=f"`{name}` to be a number, or a tensor of them, but got"):
+            MKCLoss(2, **{name: value})
+    loss = MKCLoss(2)
+    if name in ("sigma", "d"):
+        with pytest.raises(TypeError, match=f"`{name}` to be a number, or a tensor of them, but got 'a'"):
+            setattr(loss, name, "a")
+
+
+@pytest.mark.parametrize("value", ["last", 1.0, None, True])
+def test_a_channel_dim_that_is_no_whole_number_is_refused(value):
+    with pytest.raises(ValueError, match="`channel_dim` to be a whole number but got"):
+        MKCLoss(2, channel_dim=value)

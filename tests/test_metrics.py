@@ -169,6 +169,17 @@ def test_what_is_no_loss_and_what_the_loss_refuses_is_refused():
         metric.update(torch.zeros(4, 2), torch.zeros(4, 1))
     with pytest.raises(TypeError, match="`target` to be a real floating-point tensor"):
         metric.update(torch.zeros(4, 2), torch.zeros(4, 2, dtype=torch.int64))
+    x = torch.zeros(4, 2)
+    with pytest.raises(ValueError, match="`input` to be finite but got 8 values"):
+        metric.update(x * NAN, x)
+    with pytest.raises(ValueError, match="`weight` to be >= 0 and finite"):
+        metric.update(x, x, -torch.ones(4))
+    assert float(metric.weight.sum()) == 0.0
+
+
+def test_the_loss_may_be_compiled():
+    loss = made()
+    assert MKCNegativeLogLikelihood(torch.compile(loss)).loss is loss
 
 
 def test_without_torchmetrics_the_error_says_what_to_install(monkeypatch):

@@ -602,7 +602,8 @@ def test_more_parameters_than_residuals_are_refused():
         ({"prior": GaussianPrior(torch.zeros(3), -torch.ones(3))}, "positive semi-definite"),
         ({"equality": lambda t: t[0]}, "`equality` to return"),
         ({"jacobian": "sideways"}, "'forward' or 'reverse'"),
-        ({"max_iter": 0}, "`max_iter` to be at least 1"),
+        ({"max_iter": 0}, "`max_iter` to be a whole number of at least 1"),
+        ({"tol": -1.0}, "`tol` to be >= 0 and finite"),
         ({"data": torch.ones(3, 4)}, None),
     ],
 )
@@ -625,6 +626,37 @@ def test_bad_starts_and_residuals_are_refused(function):
         function(lambda t: residual_to(noisy(0))(t).squeeze(-1), START)
     with pytest.raises(TypeError, match=r"dtype of `start`, torch.float32, but got torch.float64"):
         function(residual_to(noisy(0)), START.float())
+
+
+@pytest.mark.parametrize("function", [minimise, fit])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"residual": 3}, "`residual` to be a function of the parameters but got 3"),
+        ({"equality": 3}, "`equality` to be a function of the parameters but got 3"),
+        ({"equality": lambda _: 3}, r"`equality` to be a function that returns a tensor \(k,\) but got 3"),
+        ({"start": START.half()}, r"`start` of dtype float32 or float64 but got torch\.float16; use \.float"),
+        ({"residual": lambda _: "text"}, "`residual` to be a function that returns a tensor but got 'text'"),
+        ({"start": [1.0, 1.0, 1.0]}, r"`start` .* got list; make a tensor of it, torch\.as_tensor\(start\)"),
+        ({"sigma": "a"}, "`sigma` to be a number, or a tensor of them, but got 'a'"),
+        ({"weight": "a"}, "`weight` to be a number, or a tensor of them"),
+        ({"lower": "a"}, "`lower` to be a number, or a tensor of them"),
+        ({"prior": 3}, r"`prior` to be a GaussianPrior but got 3; write GaussianPrior\(mean, precision\)"),
+        ({"prior": GaussianPrior("a", 3)}, r"`prior\.mean` to be a number, or a tensor of them, but got 'a'"),
+        ({"data": "a"}, "`data` to be tensors but got 'a'"),
+        ({"tol": "a"}, "`tol` to be a number"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused(function, arguments, message):
+    given = {"residual": residual_to(noisy(0)), "start": START} | arguments
+    with pytest.raises(TypeError, match=message):
+        function(given.pop("residual"), given.pop("start"), **given)
+
+
+def test_a_bandwidth_below_that_of_the_normaliser_is_refused_where_there_is_one():
+    minimise(residual_to(noisy(0)), START, sigma=0.04)
+    with pytest.raises(ValueError, match=r"`sigma` to be in \[0\.05, inf\] but got 0\.04"):
+        fit(residual_to(noisy(0)), START, sigma=0.04)
 
 
 def test_a_narrow_bound_is_refused():

@@ -2,8 +2,18 @@ import math
 
 import pytest
 import torch
+from torch import nn
 
-from mkc_torch import MKCDistribution, MKCLoss, beyond_bound, fit_density, inlier_weight, outliers, predictive_interval
+from mkc_torch import (
+    HeteroscedasticMKCLoss,
+    MKCDistribution,
+    MKCLoss,
+    beyond_bound,
+    fit_density,
+    inlier_weight,
+    outliers,
+    predictive_interval,
+)
 from mkc_torch.functional import mkc_weight
 
 INF, NAN = math.inf, math.nan
@@ -216,3 +226,49 @@ def test_what_the_loss_refuses_is_refused(function):
         function(loss, x, x.long())
     with pytest.raises(ValueError, match="at least one element"):
         function(loss, x[:0], x[:0])
+    with pytest.raises(TypeError, match="`input` to be a real floating-point tensor but got ndarray"):
+        function(loss, x.numpy(), x)
+
+
+def fields(function, loss, x):
+    found = function(loss, x, x)
+    return vars(found).values() if hasattr(found, "__dict__") and not isinstance(found, torch.Tensor) else found
+
+
+@pytest.mark.parametrize(
+    "function", [inlier_weight, outliers, beyond_bound, lambda loss, x, _: predictive_interval(loss, x)]
+)
+def test_what_is_no_mkc_loss_is_refused_and_a_compiled_one_is_taken(function):
+    x = torch.zeros(4, 3)
+    for other, got in (
+        (nn.MSELoss(), "MSELoss"),
+        (HeteroscedasticMKCLoss(9.0), "HeteroscedasticMKCLoss"),
+        (MKCLoss, "the class MKCLoss"),
+        ("mkc", "str"),
+    ):
+        with pytest.raises(
+            TypeError, match=f"`loss` to be an MKCLoss but got {got}; pass the loss that is trained with"
+        ):
+            function(other, x, x)
+    loss = made()
+    for found, expected in zip(fields(function, torch.compile(loss), x), fields(function, loss, x), strict=True):
+        assert torch.equal(found, expected)
+
+
+def test_predictions_that_are_not_finite_have_no_interval_and_are_not_within_the_bound():
+    loss, x = made(), torch.zeros(4, 3)
+    bad = x.clone()
+    bad[2, 1] = NAN
+    for call in (lambda: predictive_interval(loss, bad), lambda: beyond_bound(loss, bad, x)):
+        with pytest.raises(ValueError, match=r"`input` to be finite but got 1 values .* \(2, 1\)"):
+            call()
+    with pytest.raises(ValueError, match="`weight` to be >= 0 and finite but got -1"):
+        beyond_bound(loss, x, x, -torch.ones(4))
+
+
+def test_limits_that_are_no_numbers_are_refused():
+    x = torch.zeros(4, 3)
+    with pytest.raises(TypeError, match=r"`weight_below` to be a number in \(0, 1\) but got 'a'"):
+        outliers(made(), x, x, "a")
+    with pytest.raises(TypeError, match=r"`level` to be a number in \(0, 1\) but got None"):
+        predictive_interval(made(), x, None)

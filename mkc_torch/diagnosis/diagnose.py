@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number, checked_whole, told
 from mkc_torch._forked import meanwhile, shared
 from mkc_torch.diagnosis.advice import advice_of
 from mkc_torch.diagnosis.candidates import candidate_terms, described
@@ -43,7 +44,7 @@ from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.protocol import Effect, FormedEffect
 from mkc_torch.effects.unrecorded import Unrecorded
 from mkc_torch.recording import Recording
-from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
+from mkc_torch.simulation.protocol import PreparedSimulation, Simulation, refuse_no_recording
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -101,6 +102,7 @@ def diagnose(
         The diagnosis.
 
     Raises:
+        TypeError: an argument of another kind: the name of a simulation, of a file or of an effect, or a class.
         ValueError: an argument out of range, too few samples, or a recording that the simulation refuses.
         MissingColumnError: the recording lacks a column that the simulation needs.
 
@@ -111,7 +113,10 @@ def diagnose(
         >>> result.verdict in ("adequate", "explained", "unexplained")
         True
     """
-    _check(level, surrogates, max_findings)
+    _refuse_no_simulation(simulation)
+    refuse_no_recording("recording", recording)
+    effects = _checked_effects(effects)
+    _check(level, surrogates, max_findings, seed)
     where = f"{recording.name}: " if recording.name else ""
     if len(recording) < FEWEST:
         raise ValueError(
@@ -193,16 +198,58 @@ def _base(prepared: PreparedSimulation) -> FittedModel:
     return fitted(rough.model, rough.parameters, bound, graduate=False)
 
 
-def _check(level: float, surrogates: int, max_findings: int) -> None:
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"Expected argument `level` to be in (0, 1) but got {level}.")
+def _refuse_no_simulation(simulation: object) -> None:
+    if not isinstance(simulation, type) and all(hasattr(simulation, name) for name in ("columns", "prepare")):
+        return
+    mend = "pass one, such as Magnetometer()"
+    if isinstance(simulation, type):
+        mend = f"make one, {simulation.__name__}()"
+    elif isinstance(simulation, Recording):
+        mend = "it comes first, diagnose(simulation, recording)"
+    elif isinstance(simulation, str):
+        mend += f", or name it on the command line, mkc diagnose REC.csv --simulation {simulation} --output DIR"
+    raise TypeError(f"Expected argument `simulation` to be a Simulation but got {told(simulation)}; {mend}.")
+
+
+def _checked_effects(effects: object) -> tuple[Effect, ...]:
+    if isinstance(effects, str) or not isinstance(effects, Iterable):
+        raise TypeError(
+            f"Expected argument `effects` to be a sequence of Effects but got {told(effects)}; it is a tuple such as "
+            "mkc_torch.effects.CATALOGUE, which holds all, and () for none."
+        )
+    # an iterator would be empty when it is asked again
+    checked = tuple(effects)
+    for effect in checked:
+        _refuse_no_effect(effect)
+    return checked
+
+
+def _refuse_no_effect(effect: object) -> None:
+    lacking = [name for name in ("id", "port", "roles", "quantities", "shapes", "change") if not hasattr(effect, name)]
+    roles = getattr(effect, "roles", ())
+    if isinstance(effect, type):
+        mend = f"make one, {effect.__name__}()"
+    elif isinstance(effect, str):
+        mend = f"mkc_torch.effects.CATALOGUE holds them, [e for e in CATALOGUE if e.id == {effect!r}]"
+    elif lacking:
+        mend = f"it lacks {', '.join(lacking)}, which mkc_torch.effects.Effect explains"
+    elif isinstance(roles, str):
+        mend = f"its roles are names, ({roles!r},)"
+    else:
+        return
+    raise TypeError(f"Expected argument `effects` to hold Effects but got {told(effect)}; {mend}.")
+
+
+def _check(level: float, surrogates: int, max_findings: int, seed: int) -> None:
+    checked_number("level", level, 0.0, 1.0, advice="0.05 is usual")
+    checked_whole("surrogates", surrogates, 0, "99 is usual")
+    checked_whole("max_findings", max_findings, 0, "3 is usual")
+    checked_whole("seed", seed)
     if surrogates < math.ceil(1.0 / level - 1.0 - 1e-9):
         raise ValueError(
             f"Expected argument `surrogates` to be at least {math.ceil(1.0 / level - 1.0 - 1e-9)} at level {level}, "
             f"for no p-value can be smaller than 1 / (surrogates + 1), but got {surrogates}."
         )
-    if max_findings < 0:
-        raise ValueError(f"Expected argument `max_findings` to be at least 0 but got {max_findings}.")
 
 
 @dataclass(frozen=True)

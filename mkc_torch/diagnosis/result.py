@@ -305,6 +305,19 @@ class Diagnosis:
         traces: the residuals.
         remaining: columns along which something smooth remains beside the findings.
         model: the simulation's sensor or system with the findings in it; None where there is none to apply.
+
+    Example:
+        >>> import torch
+        >>> from mkc_torch import Recording, diagnose
+        >>> from mkc_torch.simulation import Static
+        >>> time = torch.arange(100) / 10.0
+        >>> noise = 0.01 * torch.randn(100, generator=torch.Generator().manual_seed(0))
+        >>> heat = torch.sin(time)
+        >>> recording = Recording({"time": time, "temperature": heat, "voltage": 0.5 + 2.0 * heat + noise})
+        >>> line = Static(torch.nn.Linear(1, 1), inputs=("temperature",), outputs=("voltage",))
+        >>> result = diagnose(line, recording, effects=(), surrogates=19)
+        >>> result.simulation, result.verdict, result.findings, round(result.baseline.rmse, 2)
+        ('Linear', 'adequate', (), 0.01)
     """
 
     recording: str

@@ -14,6 +14,16 @@ class CurrentField(DriverOffset):
     Plausible: up to 20 µT/A, 1 cm from the wire; 0.1 µT/A is a good installation, and bad ones reach 70 % of the
     Earth's field at half throttle.
     Source: Biot-Savart's law, µ₀ I / (2π r).
+
+    Example:
+        >>> import torch
+        >>> from mkc_torch.effects import Context
+        >>> current = torch.tensor([[-1.0], [0.0], [1.0]])  # in A, less its mean
+        >>> context = Context(torch.arange(3.0), current, ("A",), torch.zeros(3, 2), "µT", ("x", "y"))
+        >>> CurrentField().change(torch.tensor([0.5, -2.0]), {}, context)
+        tensor([[-0.5000,  2.0000],
+                [ 0.0000, -0.0000],
+                [ 0.5000, -2.0000]])
     """
 
     id = "current_field"

@@ -25,6 +25,16 @@ class DriverOffset(GainEffect):
     Attributes:
         gain: what a user reads k as.
         lags: time constants in s that are tried, behind which the sensor follows the column.
+
+    Example:
+        >>> import torch
+        >>> from mkc_torch.effects import Context
+        >>> column = torch.tensor([[-2.0], [0.0], [2.0]])  # less its mean
+        >>> context = Context(torch.arange(3.0), column, ("V",), torch.zeros(3, 1), "µT", ("x",))
+        >>> DriverOffset().change(torch.tensor([1.5]), {}, context).squeeze(-1)
+        tensor([-3.,  0.,  3.])
+        >>> DriverOffset().quantities({}, context)
+        (Quantity(name='offset_per_unit', size=1, unit='µT/V'),)
     """
 
     id = "driver_offset"

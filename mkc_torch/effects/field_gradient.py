@@ -25,6 +25,13 @@ class FieldGradient:
     Units: gradient in µT/m, curvature in µT/m².
     Plausible: up to 200 µT/m; some µT/cm occur near steel.
     Source: Maxwell's equations in a room without sources; BROAD trial 21 (Laidig et al., Data 6(7):72, 2021).
+
+    Example:
+        >>> from mkc_torch.effects import Context
+        >>> position = torch.tensor([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.5]])  # in m, less its mean
+        >>> context = Context(torch.arange(2.0), position, ("m",) * 3, torch.zeros(2, 1), "µT", ("strength",))
+        >>> FieldGradient().change(torch.tensor([3.0, 0.0, 2.0]), {"degree": 1.0}, context).squeeze(-1)
+        tensor([-3.,  4.])
     """
 
     id = "field_gradient"

@@ -34,6 +34,16 @@ class MagneticPole:
     Units: q in µT·m², the place in m from the middle of the path.
     Plausible: up to 100 µT·m², a beam of 0.01 m² magnetised to 10⁵ A/m.
     Source: Telford, Geldart & Sheriff, Applied Geophysics (1990), 3.6, the isolated pole.
+
+    Example:
+        >>> from mkc_torch.effects import Context
+        >>> position = torch.tensor([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])  # in m from the middle of the path
+        >>> axes = ("east", "north", "up")
+        >>> context = Context(torch.arange(2.0), position, ("m",) * 3, torch.zeros(2, 3), "µT", axes)
+        >>> shape = {"place_x": 0.0, "place_y": 0.0, "place_z": 0.0, "radius": 0.0}
+        >>> MagneticPole().change(torch.tensor([8.0]), shape, context)
+        tensor([[8., 0., 0.],
+                [2., 0., 0.]])
     """
 
     id = "field_gradient"

@@ -31,6 +31,13 @@ class OffsetDrift(GainEffect):
     Units: Δb in µT; the time constant, the middle and the width in s from the start of the recording.
     Plausible: up to 50 µT.
     Source: Newton's law of cooling; the diffusion of heat into a half-space, which goes with the root of time.
+
+    Example:
+        >>> from mkc_torch.effects import Context
+        >>> time = torch.arange(5.0)
+        >>> context = Context(time, torch.zeros(5, 0), (), torch.zeros(5, 1), "µT", ("x",))
+        >>> OffsetDrift().change(torch.tensor([4.0]), {"power": 0.5}, context).squeeze(-1)
+        tensor([0.0000, 2.0000, 2.8284, 3.4641, 4.0000])
     """
 
     id = "offset_drift"

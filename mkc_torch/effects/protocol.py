@@ -62,6 +62,14 @@ class Context:
         parts: what components of the signal are to each other, such as ``{"own": "speed", "position": "angle"}``.
         part_units: of the parts.
         run: number of each sample's run, where the simulation knows of runs.
+
+    Example:
+        >>> time = torch.tensor([0.0, 1.0, 2.0, 0.0, 1.0])
+        >>> context = Context(time, torch.zeros(5, 1), ("A",), torch.zeros(5, 2), "µT", ("x", "y"))
+        >>> context.runs  # one begins where time goes back
+        tensor([0, 0, 0, 1, 1])
+        >>> context.component("y").shape
+        torch.Size([5])
     """
 
     time: Float[Tensor, " N"]
@@ -89,7 +97,11 @@ class Context:
         return self.signal[:, known] if self.signal.shape[1] > known else None
 
     def part(self, name: str) -> Float[Tensor, " N"]:
-        """The component of the signal that is this part."""
+        """The component of the signal that is this part.
+
+        Raises:
+            KeyError: the port has no such part; :class:`ChoosyEffect` says which an effect needs.
+        """
         return self.component(self.parts[name])
 
     def component(self, name: str) -> Float[Tensor, " N"]:
@@ -102,7 +114,12 @@ class Context:
 
 
 class Quantity(NamedTuple):
-    """A parameter as a user reads it: it covers ``size`` numbers of γ, in ``unit``."""
+    """A parameter as a user reads it: it covers ``size`` numbers of γ, in ``unit``.
+
+    Example:
+        >>> Quantity("offset_change", 3, "µT")  # of three axes
+        Quantity(name='offset_change', size=3, unit='µT')
+    """
 
     name: str
     size: int

@@ -23,6 +23,16 @@ class TemperatureOffset(DriverOffset):
     Units: k in µT/K, the lag in s, the curvature c in 1/K.
     Plausible: up to 5 µT/K.
     Source: data sheets of MEMS magnetometers, about 0.2 µT/K.
+
+    Example:
+        >>> import torch
+        >>> from mkc_torch.effects import Context
+        >>> temperature = torch.tensor([[-10.0], [0.0], [10.0]])  # in °C, less its mean
+        >>> context = Context(torch.arange(3.0), temperature, ("°C",), torch.zeros(3, 1), "µT", ("x",))
+        >>> TemperatureOffset().change(torch.tensor([0.2]), {}, context).squeeze(-1)
+        tensor([-2.,  0.,  2.])
+        >>> TemperatureOffset().change(torch.tensor([0.2]), {"curvature": 0.02}, context).squeeze(-1)
+        tensor([-1.6000,  0.0000,  2.4000])
     """
 
     id = "temperature_offset"

@@ -27,6 +27,13 @@ class Unknown:
     Units: γ in µT.
     Plausible: any size.
     Source: none; it is a curve and no physics.
+
+    Example:
+        >>> from mkc_torch.effects import Context
+        >>> column = torch.tensor([[-3.0], [0.0], [3.0]])
+        >>> context = Context(torch.arange(3.0), column, ("V",), torch.zeros(3, 1), "µT", ("x",))
+        >>> Unknown().change(torch.tensor([2.0, 1.0, 0.0]), {}, context).squeeze(-1)  # a line and a parabola
+        tensor([-1.0000, -0.5000,  3.0000])
     """
 
     id = "unknown"

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import refuse_not_real
+from mkc_torch.linear._problem import common_batch
+
 if TYPE_CHECKING:
     from jaxtyping import Float
 
@@ -24,13 +27,15 @@ class NotFittedError(AttributeError):
 class Fitted:
     """Results have names that end in an underscore and exist after ``fit``; a repr shows the parameters."""
 
+    _fit_takes = "X, Y"
+
     def __repr__(self) -> str:
         names = [p for p in inspect.signature(type(self).__init__).parameters if p != "self"]
         return f"{type(self).__name__}({', '.join(f'{p}={getattr(self, p)!r}' for p in names)})"
 
     def __getattr__(self, name: str) -> Any:
         if name.endswith("_") and not name.startswith("_"):
-            raise NotFittedError(f"{type(self).__name__} has no `{name}` yet; call fit(X, Y) first.")
+            raise NotFittedError(f"{type(self).__name__} has no `{name}` yet; call fit({self._fit_takes}) first.")
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
 
@@ -53,12 +58,27 @@ class LinearEstimator(Fitted):
         raise NotImplementedError
 
     def predict(self, X: Float[Tensor, "*batch N m n"]) -> Float[Tensor, "*batch N m"]:
-        """``X coef_`` for X of the shape given to ``fit``: (*, N, m, n) or, for one channel, (*, N, n)."""
-        if X.shape[-1] != self.coef_.shape[-1]:
+        """``X coef_`` for X of the shape given to ``fit``: (*, N, m, n) or, for one channel, (*, N, n).
+
+        Raises:
+            NotFittedError: before ``fit``.
+            TypeError: X is no floating tensor, or of another dtype or device than the coefficients.
+            ValueError: X has another number of columns, or other batch dimensions.
+        """
+        n = self.coef_.shape[-1]
+        refuse_not_real("X", X)
+        if X.dtype != self.coef_.dtype or X.device != self.coef_.device:
+            raise TypeError(
+                f"Expected argument `X` of the dtype and device of the fit, {self.coef_.dtype} on {self.coef_.device}, "
+                f"but got {X.dtype} on {X.device}; convert it, X.to(fit.coef_)."
+            )
+        if X.dim() == 0 or X.shape[-1] != n:
+            got = X.shape[-1] if X.dim() else 0
             raise ValueError(
-                f"Expected argument `X` with {self.coef_.shape[-1]} columns in its last dimension but got {X.shape[-1]}"
+                f"Expected argument `X` with {n} columns in its last dimension but got {got}; give it those of the fit."
             )
         samples = 1 if self._single_channel else 2
+        common_batch("X", X.shape[: -1 - samples], "coef_", self.coef_.shape[:-1])
         coef = self.coef_.reshape(*self.coef_.shape[:-1], *(1 for _ in range(samples - 1)), -1, 1)
         return torch.matmul(X, coef).squeeze(-1)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import as_numbers
 from mkc_torch.functional import energy
 from mkc_torch.linear._scale_search import relative_precision
 from mkc_torch.linear.covariance import CovarianceKind, sandwich
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 def channel_parameter(name: str, value: float | Tensor, problem: LinearProblem, *, infinite: bool = False) -> Tensor:
     """A positive parameter of every channel as a tensor (B, m); accepts a number, (m,) or (*, m)."""
-    t = torch.as_tensor(value, dtype=problem.Y.dtype, device=problem.Y.device)
+    t = as_numbers(name, value, problem.Y.dtype, problem.Y.device).to(problem.Y)
     m = problem.num_channels
     if t.dim() > 0 and t.shape[-1] not in (1, m):
         raise ValueError(f"Expected argument `{name}` to be a number or of shape ({m},) but got {tuple(t.shape)}.")

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import refuse_complex, refuse_no_tensor, refuse_not_real
+
 if TYPE_CHECKING:
     from jaxtyping import Float
 
@@ -191,35 +193,44 @@ def laid_out(
         TypeError: X or Y is not a floating tensor, or their dtypes or devices differ.
         ValueError: shapes do not fit.
     """
-    for name, value in (("X", X), ("Y", Y)):
-        if not isinstance(value, Tensor) or not value.is_floating_point():
-            got = value.dtype if isinstance(value, Tensor) else type(value).__name__
-            raise TypeError(f"Expected argument `{name}` to be a real floating-point tensor but got {got}.")
+    refuse_not_real("X", X)
+    refuse_not_real("Y", Y)
     if X.dtype != Y.dtype or X.device != Y.device:
         raise TypeError(
             f"Expected `X` and `Y` to share dtype and device but got {X.dtype} on {X.device} "
-            f"and {Y.dtype} on {Y.device}."
+            f"and {Y.dtype} on {Y.device}; convert one, Y.to(X) say."
         )
     if X.dtype in (torch.float16, torch.bfloat16):
         raise TypeError(f"Expected `X` of dtype float32 or float64 but got {X.dtype}; use .float().")
     if X.dim() < 2 or Y.dim() < 1 or X.shape[-2] != Y.shape[-1]:
         raise ValueError(
             f"Expected `X` of shape (*, N, m, n) with `Y` (*, N, m), or (*, N, n) with (*, N), "
-            f"but got {tuple(X.shape)} and {tuple(Y.shape)}."
+            f"but got {tuple(X.shape)} and {tuple(Y.shape)}{_mend(X, Y)}."
         )
     single = _last_is_samples(X, Y)
     if single:
         X, Y = X.unsqueeze(-2), Y.unsqueeze(-1)
     if X.shape[-1] == 0 or Y.numel() == 0:
         raise ValueError(f"Expected at least one sample and one column but got `X` {tuple(X.shape)}.")
-    batch = _common_batch("X", X.shape[:-3], "Y", Y.shape[:-2])
+    batch = common_batch("X", X.shape[:-3], "Y", Y.shape[:-2])
     N, m = Y.shape[-2:]
     weight = None
     if sample_weight is not None:
         weight = _as_weight(sample_weight, N, m, single, Y)
-        batch = _common_batch("sample_weight", weight.shape[:-2], "Y", batch)
+        batch = common_batch("sample_weight", weight.shape[:-2], "Y", batch)
         weight = weight.expand(*batch, N, m)
     return CanonicalShapes(X, Y.expand(*batch, N, m), weight, batch, single)
+
+
+def _mend(X: Tensor, Y: Tensor) -> str:
+    """What to do about shapes that do not fit, where it is plain."""
+    if X.dim() == 1 and X.shape == Y.shape:
+        return "; one column is X.unsqueeze(-1)"
+    if X.dim() == Y.dim() > 1 and X.shape[:-1] == Y.shape[:-1] and Y.shape[-1] == 1:
+        return "; one channel is Y.squeeze(-1)"
+    if X.dim() > 1 and Y.dim() > 0 and X.shape[-1] == Y.shape[-1]:
+        return "; a sample is a row of X, so try X.mT"
+    return ""
 
 
 def canonical_shapes(
@@ -272,7 +283,7 @@ def linear_problem(
     return LinearProblem(basis, to_coef, v.Y.reshape(flat, N, m), weight, v.batch, v.single_channel)
 
 
-def _common_batch(name: str, shape: torch.Size, other: str, other_shape: torch.Size) -> torch.Size:
+def common_batch(name: str, shape: torch.Size, other: str, other_shape: torch.Size) -> torch.Size:
     try:
         # torch's own loads a system of computer algebra
         return torch.Size(np.broadcast_shapes(shape, other_shape))
@@ -292,14 +303,15 @@ def _last_is_samples(X: Tensor, Y: Tensor) -> bool:
 
 
 def _as_weight(sample_weight: Tensor, N: int, m: int, single_channel: bool, Y: Tensor) -> Tensor:
-    if not isinstance(sample_weight, Tensor):
-        raise TypeError(f"Expected argument `sample_weight` to be a tensor but got {type(sample_weight).__name__}.")
+    refuse_no_tensor("sample_weight", sample_weight, "a tensor")
+    refuse_complex("sample_weight", sample_weight)
     weight = sample_weight.to(Y)
     if weight.dim() >= 1 and weight.shape[-1] == N and (single_channel or weight.shape[-2:] != (N, m)):
         weight = weight.unsqueeze(-1)
     if weight.dim() < 2 or weight.shape[-2] != N or weight.shape[-1] not in (1, m):
         raise ValueError(
-            f"Expected argument `sample_weight` of shape (*, {N}) or (*, {N}, {m}) but got {tuple(weight.shape)}."
+            f"Expected argument `sample_weight` of shape (*, {N}) or (*, {N}, {m}) but got {tuple(weight.shape)}; "
+            "it has one weight for each sample."
         )
     return weight
 

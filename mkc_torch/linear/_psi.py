@@ -85,7 +85,7 @@ def checked_tuning(name: str, tuning: float | Tuning | None) -> tuple[PsiName, T
     Raises:
         ValueError: no such ψ, or constants that do not suit it.
     """
-    if name not in _WEIGHTS:
+    if not isinstance(name, str) or name not in _WEIGHTS:
         raise ValueError(f"Expected argument `psi` to be one of {', '.join(map(repr, _WEIGHTS))} but got {name!r}.")
     known: PsiName = name
     default = TUNING_95[known]

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import refuse_complex, seems_finite, told
 from mkc_torch.linear._problem import LinearProblem
 from mkc_torch.linear._scale_search import minimise_scale
 from mkc_torch.linear.least_trimmed_squares import QuantileScale, TrimmedScale, default_coverage
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 Start = Literal["lts", "s", "least_squares"]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,33 @@ class RobustStart:
     beta: Float[Tensor, "B n"]
     scale: Float[Tensor, "B m"]
     exact: Float[Tensor, " B"]
+
+
+def checked_start(start: T, names: tuple[str, ...] = get_args(Start), others: str = "") -> T:
+    """``start``, the name of one or coefficients.
+
+    Args:
+        start: as an estimator is given it.
+        names: of the starts that it knows.
+        others: what else it takes, as an error tells it.
+
+    Raises:
+        TypeError: complex coefficients.
+        ValueError: no such start, or coefficients that are none.
+    """
+    if isinstance(start, Tensor):
+        refuse_complex("start", start)
+        if start.dim() == 0 or not seems_finite(start):
+            raise ValueError(
+                f"Expected argument `start` to be finite coefficients, (n,) or (*, n), but got {told(start.tolist())}."
+            )
+    elif not isinstance(start, str) or start not in names:
+        array = isinstance(start, (list, tuple)) or hasattr(start, "__array__")
+        raise ValueError(
+            f"Expected argument `start` to be {', '.join(map(repr, names))} or coefficients{others} but got "
+            f"{told(start)}{'; make a tensor of it, torch.as_tensor(start)' if array else ''}."
+        )
+    return start
 
 
 def elemental_count(num_coefficients: int) -> int:
@@ -81,12 +110,9 @@ def robust_start(problem: LinearProblem, method: Start | Tensor = "lts", *, seed
         beta = _trimmed_start(problem, seed)
     elif method == "s":
         beta = minimise_m_scale(problem, starts=elemental_count(problem.num_coefficients), seed=seed).beta
-    elif method == "least_squares":
-        beta = problem.weighted_fit(torch.ones_like(problem.Y))
     else:
-        raise ValueError(
-            f"Expected argument `start` to be 'lts', 's', 'least_squares' or coefficients but got {method!r}."
-        )
+        checked_start(method)
+        beta = problem.weighted_fit(torch.ones_like(problem.Y))
     scale = residual_scale(problem, problem.residual(beta))
     magnitude = problem.Y.abs().amax(-2)
     floor = 1e3 * torch.finfo(scale.dtype).eps * torch.where(magnitude > 0, magnitude, 1.0)

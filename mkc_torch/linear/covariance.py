@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number
+
 if TYPE_CHECKING:
     from jaxtyping import Float
 
@@ -22,9 +24,9 @@ def checked_kind(kind: CovarianceKind) -> CovarianceKind:
 
 def checked_bandwidth(bandwidth: float | None) -> float | None:
     """``bandwidth``, or a clear error."""
-    if bandwidth is not None and not 0 <= bandwidth < float("inf"):
-        raise ValueError(f"Expected argument `bandwidth` to be a number of lags >= 0 but got {bandwidth}.")
-    return bandwidth
+    if bandwidth is None:
+        return None
+    return checked_number("bandwidth", bandwidth, ends="[)", advice="it counts lags; None takes Andrews' rule")
 
 
 def andrews_bandwidth(score: Float[Tensor, "*batch N n"]) -> Float[Tensor, " *batch"]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number, checked_whole, refuse_out_of_range
 from mkc_torch.density_fit import (
     DensityState,
     conclusive,
@@ -17,10 +19,11 @@ from mkc_torch.density_fit import (
     newton_step,
     refuse_narrow_bound,
 )
+from mkc_torch.functional import SIGMA_LEAST
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._mkc import channel_parameter, coefficient_covariance, fixed_point_step, kernel_weight
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.linear._robust_start import RobustStart, Start, robust_start
+from mkc_torch.linear._robust_start import RobustStart, Start, checked_start, robust_start
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 from mkc_torch.linear.implicit import Given, Rest, fit_layer, wanted
 
@@ -178,8 +181,8 @@ class MKCRegression(LinearEstimator):
     strict maximum: asking for one raises. The start, ``covariance_`` and ``history_`` are constants.
 
     Args:
-        sigma: None learns σ; a number, (m,) or (*, m) keeps it: ``inf`` is least squares with learned channel weights
-            (Remark 7).
+        sigma: None learns σ; a number in [0.05, inf], (m,) or (*, m) keeps it: ``inf`` is least squares with learned
+            channel weights (Remark 7).
         d: None learns d; a value keeps it (Remark 6).
         bound: half-width of the domain in the unit of Y, at least two robust scales of the residuals, a number, (m,) or
             (*, m); None takes the rule above. A residual beyond it counts as one on the flat tail.
@@ -200,6 +203,9 @@ class MKCRegression(LinearEstimator):
         exact_fit_: more than half of the values lie on the fit to rounding, (*,).
         n_iter_, converged_: alternations made, and whether each problem came to rest, as an exact fit has.
         differentiable_: after a fit as a layer, whether each problem's solution has a derivative, (*,).
+
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (17), (29)-(31), Algorithms 2 and 3, Remarks 6 and 7.
@@ -242,17 +248,20 @@ class MKCRegression(LinearEstimator):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        if max_iter < 1:
-            raise ValueError(f"Expected argument `max_iter` to be at least 1 but got {max_iter}.")
+        if sigma is not None:
+            refuse_out_of_range("sigma", sigma, SIGMA_LEAST, math.inf, "[]", "None learns it")
+        for name, value in (("d", d), ("bound", bound)):
+            if value is not None:
+                refuse_out_of_range(name, value, advice="it is in the unit of Y; None finds it")
         self.sigma = sigma
         self.d = d
         self.bound = bound
-        self.start = start
-        self.max_iter = max_iter
-        self.tol = tol
+        self.start = checked_start(start)
+        self.max_iter = checked_whole("max_iter", max_iter, 1, "200 is ample")
+        self.tol = checked_number("tol", tol, ends="[)", advice="1e-10 suits float64")
         self.covariance = checked_kind(covariance)
         self.bandwidth = checked_bandwidth(bandwidth)
-        self.seed = seed
+        self.seed = checked_whole("seed", seed)
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> MKCRegression:
         """Fit ``Y ~ X coef``.

@@ -8,6 +8,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import (
+    checked_number,
+    checked_whole,
+    refuse_complex,
+    refuse_no_tensor,
+    refuse_not_real,
+    refuse_out_of_range,
+    told,
+)
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._mkc import (
     channel_parameter,
@@ -17,7 +26,7 @@ from mkc_torch.linear._mkc import (
     mean_energy,
 )
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.linear._robust_start import Start, robust_start
+from mkc_torch.linear._robust_start import Start, checked_start, robust_start
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 from mkc_torch.linear.implicit import Given, Rest, fit_layer, wanted
 
@@ -30,21 +39,46 @@ _GRADUATION = 10
 
 def whitened(X: Tensor, Y: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
     """X and Y multiplied by the inverse Cholesky factor of the channels' noise covariance (m, m)."""
+    refuse_not_real("X", X)
+    refuse_not_real("Y", Y)
     if X.dim() < 3 or Y.dim() < 2:
         raise ValueError(
             "Expected `X` (*, N, m, n) and `Y` (*, N, m) with `noise_covariance`; a single channel takes `d`."
         )
     m = Y.shape[-1]
-    covariance = covariance.to(Y)
     if covariance.shape != (m, m):
-        raise ValueError(f"Expected argument `noise_covariance` of shape ({m}, {m}) but got {tuple(covariance.shape)}.")
-    factor, info = torch.linalg.cholesky_ex(covariance)
-    if int(info) != 0 or not torch.allclose(covariance, covariance.mT, rtol=1e-5, atol=0.0):
-        raise ValueError("Expected argument `noise_covariance` to be symmetric and positive definite.")
+        raise ValueError(
+            f"Expected argument `noise_covariance` of shape ({m}, {m}), a row for each channel of `Y`, but got "
+            f"{tuple(covariance.shape)}."
+        )
+    factor = _cholesky_factor(covariance.to(Y))
     return (
         torch.linalg.solve_triangular(factor, X, upper=False),
         torch.linalg.solve_triangular(factor, Y.unsqueeze(-1), upper=False).squeeze(-1),
     )
+
+
+def _cholesky_factor(covariance: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
+    factor, info = torch.linalg.cholesky_ex(covariance)
+    if int(info) != 0 or not torch.allclose(covariance, covariance.mT, rtol=1e-5, atol=0.0):
+        raise ValueError(
+            "Expected argument `noise_covariance` to be symmetric and positive definite but got "
+            f"{told(covariance.tolist())}; variances alone are `d` squared."
+        )
+    return factor
+
+
+def _refuse_no_covariance(covariance: Tensor) -> None:
+    """Refuse what its value alone says is no covariance, where that can be seen."""
+    refuse_no_tensor("noise_covariance", covariance, "a tensor")
+    refuse_complex("noise_covariance", covariance)
+    if covariance.dim() != 2 or covariance.shape[0] != covariance.shape[1]:
+        raise ValueError(
+            f"Expected argument `noise_covariance` of shape (m, m) but got {tuple(covariance.shape)}; variances alone "
+            "are `d` squared."
+        )
+    if covariance.device.type == "cpu" and not torch._C._are_functorch_transforms_active():
+        _cholesky_factor(covariance.detach().double())
 
 
 def descend(
@@ -113,6 +147,9 @@ class FixedPointLinear(LinearEstimator):
         n_iter_: steps made. converged_: (*,).
         differentiable_: after a fit as a layer, whether each problem's solution has a derivative, (*,).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (13)-(16), Algorithm 1.
 
@@ -146,17 +183,19 @@ class FixedPointLinear(LinearEstimator):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        if max_iter < 1:
-            raise ValueError(f"Expected argument `max_iter` to be at least 1 but got {max_iter}.")
+        refuse_out_of_range("sigma", sigma, ends="(]", advice="inf is least squares")
+        refuse_out_of_range("d", d, advice="it is the scale of the noise, in the unit of Y")
+        if noise_covariance is not None:
+            _refuse_no_covariance(noise_covariance)
         self.sigma = sigma
         self.d = d
         self.noise_covariance = noise_covariance
-        self.start = start
-        self.max_iter = max_iter
-        self.tol = tol
+        self.start = checked_start(start)
+        self.max_iter = checked_whole("max_iter", max_iter, 1, "500 is ample")
+        self.tol = checked_number("tol", tol, 0.0, 1.0, "[)", "1e-13 suits float64")
         self.covariance = checked_kind(covariance)
         self.bandwidth = checked_bandwidth(bandwidth)
-        self.seed = seed
+        self.seed = checked_whole("seed", seed)
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> FixedPointLinear:
         """Fit ``Y ~ X coef``.

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number, checked_whole, refuse_complex
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import CanonicalShapes, canonical_shapes
 
@@ -42,6 +43,9 @@ class GeneralizedMaximumEntropy(LinearEstimator):
         n_iter_: steps of each problem, (*,).
         weights_: ones, (*, N, m).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         A. Golan, G. Judge, D. Miller, Maximum Entropy Econometrics (1996); G. Indiveri, Entropy 11 (2009), (30)-(39).
 
@@ -67,14 +71,10 @@ class GeneralizedMaximumEntropy(LinearEstimator):
         max_iter: int = 200,
     ) -> None:
         super().__init__()
-        if not 0 < tol < 1:
-            raise ValueError(f"Expected argument `tol` to be in (0, 1) but got {tol}; 1e-10 suits float64.")
-        if max_iter < 1:
-            raise ValueError(f"Expected argument `max_iter` to be >= 1 but got {max_iter}; 200 is ample.")
         self.coef_support = _checked_support("coef_support", coef_support)
         self.error_support = None if error_support is None else _checked_support("error_support", error_support)
-        self.tol = tol
-        self.max_iter = max_iter
+        self.tol = checked_number("tol", tol, 0.0, 1.0, advice="1e-10 suits float64")
+        self.max_iter = checked_whole("max_iter", max_iter, 1, "200 is ample")
 
     @torch.no_grad()
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> GeneralizedMaximumEntropy:
@@ -157,9 +157,9 @@ _LARGEST = 1e8
 def _checked_support(name: str, support: float | Tensor) -> Tensor:
     """Support points along the last dimension."""
     if not isinstance(support, Tensor):
-        if not 0 < support < float("inf"):
-            raise ValueError(f"Expected argument `{name}` to be positive and finite but got {support}.")
-        return support * _POINTS
+        half = checked_number(name, support, advice=f"points are a tensor, torch.as_tensor({name})")
+        return half * _POINTS
+    refuse_complex(name, support)
     if support.dim() == 0 or support.shape[-1] < 2 or not bool(torch.isfinite(support).all()):
         raise ValueError(
             f"Expected argument `{name}` of finite values with at least 2 points in the last dimension "
@@ -225,11 +225,14 @@ class _Dual:
         for iteration in range(max_iter + 1):
             gap, change, change_pull = self.step(multiplier, pull)
             size = torch.where(used, gap.abs(), 0.0)
-            left = size.amax(-1) > tol
+            left = ~(size.amax(-1) <= tol)
             if not bool(left.any()):
                 return multiplier, pull, n_iter
-            # multipliers of ever larger size belong to errors at the end of their support
-            if iteration == max_iter or bool((multiplier.abs().amax(-1)[left] > _LARGEST).any()):
+            # multipliers of ever larger size belong to errors at the end of their support, and so do steps to nowhere
+            steps = torch.cat([change, change_pull], -1).isfinite().all(-1)
+            stuck = left & ~(steps & (multiplier.abs().amax(-1) <= _LARGEST))
+            if iteration == max_iter or bool(stuck.any()):
+                left = stuck if bool(stuck.any()) else left
                 break
             slope = (self.weight * gap * change).sum(-1)
             length = left.to(gap).unsqueeze(-1)
@@ -242,7 +245,7 @@ class _Dual:
                 length = torch.where(low.unsqueeze(-1), length, 0.5 * length)
             multiplier, pull, best = trial, trial_pull, value
             n_iter = n_iter + left
-        problem = int(size.amax(-1).argmax())
+        problem = int(torch.where(left, size.amax(-1), -1.0).argmax())
         sample, channel = divmod(int(size[problem].argmax()), shape[1])
         at = f"sample {sample}" + (f", channel {channel}" if shape[1] > 1 else "")
         raise ValueError(

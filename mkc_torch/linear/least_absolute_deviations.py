@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number, checked_whole
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import linear_problem, solve_gram
 
@@ -35,6 +36,9 @@ class LeastAbsoluteDeviations(LinearEstimator):
         n_iter_: interior-point iterations (*,) of each problem, 0 where least squares already fits exactly.
         converged_: whether each problem (*,) reached ``tol``, or the rounding error of an objective near 0.
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     Example:
         >>> X = torch.tensor([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0], [1.0, 3.0]])
         >>> fit = LeastAbsoluteDeviations().fit(X, torch.tensor([1.0, 3.0, 50.0, 7.0]))
@@ -51,12 +55,8 @@ class LeastAbsoluteDeviations(LinearEstimator):
     converged_: Tensor
 
     def __init__(self, tol: float = 1e-9, max_iter: int = 100) -> None:
-        if not 0 < tol < 1:
-            raise ValueError(f"Expected argument `tol` to be in (0, 1) but got {tol}; 1e-9 suits float64.")
-        if max_iter < 1:
-            raise ValueError(f"Expected argument `max_iter` to be >= 1 but got {max_iter}; 100 is ample.")
-        self.tol = tol
-        self.max_iter = max_iter
+        self.tol = checked_number("tol", tol, 0.0, 1.0, advice="1e-9 suits float64")
+        self.max_iter = checked_whole("max_iter", max_iter, 1, "100 is ample")
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> LeastAbsoluteDeviations:
         """Fit ``Y ~ X coef``.

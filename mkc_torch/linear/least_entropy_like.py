@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number, checked_whole, refuse_complex, refuse_no_tensor, seems_finite
 from mkc_torch.entropy_like import LEAST_TOTAL, orthogonal_starts
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._precision import in_double
@@ -54,6 +55,9 @@ class LeastEntropyLike(LinearEstimator):
         weights_: 1 where the gradient (52) draws a residual towards zero, 0 where it pushes it away: where
             ``log q`` exceeds its mean under q.
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         G. Indiveri, "An Entropy-Like Estimator for Robust Parameter Identification", Entropy 11 (2009) 560-585.
 
@@ -85,16 +89,20 @@ class LeastEntropyLike(LinearEstimator):
         super().__init__()
         if start is not None and starts is not None:
             raise ValueError("Expected one of the arguments `start` and `starts` but got both; drop one.")
-        if not 0 < tol < 1:
-            raise ValueError(
-                f"Expected argument `tol` to be in (0, 1) but got {tol}; 1e-12 leaves the coefficients nine digits."
-            )
-        if max_iter < 1:
-            raise ValueError(f"Expected argument `max_iter` to be >= 1 but got {max_iter}; 200 is ample.")
+        for name, value, least in (("start", start, 1), ("starts", starts, 2)):
+            if value is None:
+                continue
+            refuse_no_tensor(name, value, "a tensor")
+            refuse_complex(name, value)
+            if value.dim() < least or not seems_finite(value):
+                raise ValueError(
+                    f"Expected argument `{name}` of finite values of shape (*, {'S, ' * (least - 1)}n) but got "
+                    f"{'NaN or infinity' if value.dim() >= least else tuple(value.shape)}."
+                )
         self.start = start
         self.starts = starts
-        self.tol = tol
-        self.max_iter = max_iter
+        self.tol = checked_number("tol", tol, 0.0, 1.0, advice="1e-12 leaves the coefficients nine digits")
+        self.max_iter = checked_whole("max_iter", max_iter, 1, "200 is ample")
 
     @torch.no_grad()
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> LeastEntropyLike:

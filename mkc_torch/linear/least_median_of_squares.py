@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_whole
 from mkc_torch.linear._chebyshev import equal_heights, minimax
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._scale_search import elemental_starts
-from mkc_torch.linear.least_trimmed_squares import QuantileScale
-from mkc_torch.linear.s_regression import check_starts
+from mkc_torch.linear.least_trimmed_squares import QuantileScale, checked_h
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -55,6 +55,9 @@ class LeastMedianOfSquares(LinearEstimator):
         exact_: whether the optimum is certain: one channel, with h = N or all sets tried.
         n_iter_, converged_: refinements made, and whether they had come to rest, (*,).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         Rousseeuw, "Least median of squares regression", JASA 79 (1984) 871-880.
         Stromberg, "Computing the exact least median of squares estimate and stability diagnostics in multiple linear
@@ -77,12 +80,9 @@ class LeastMedianOfSquares(LinearEstimator):
 
     def __init__(self, h: int | None = None, *, starts: int = 3000, seed: int = 0) -> None:
         super().__init__()
-        if h is not None and (isinstance(h, bool) or not isinstance(h, int)):
-            raise TypeError(f"Expected argument `h` to be a whole number but got {h!r}.")
-        check_starts(starts)
-        self.h = h
-        self.starts = starts
-        self.seed = seed
+        self.h = checked_h(h)
+        self.starts = checked_whole("starts", starts, 1, "3000 is usual")
+        self.seed = checked_whole("seed", seed)
 
     @torch.no_grad()
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> LeastMedianOfSquares:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._mkc import coefficient_covariance
 from mkc_torch.linear._problem import canonical_shapes, linear_problem
@@ -19,6 +18,9 @@ class LeastSquares(LinearEstimator):
     Args:
         covariance: "sandwich" for independent samples, "hac" for a time series.
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
+
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
 
     Example:
         >>> X = torch.tensor([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]])
@@ -41,6 +43,12 @@ class LeastSquares(LinearEstimator):
 
         Returns:
             The estimator, with ``coef_`` (*, n), its ``covariance_`` (*, n, n) and ``weights_``, all ones.
+
+        Raises:
+            TypeError: X, Y or the weights are no real floating-point tensors, or their dtypes or devices differ.
+            ValueError: shapes do not fit, values are not finite or out of range, there are fewer values than
+                coefficients.
+            RankDeficientError: columns of X are linearly dependent.
         """
         problem = linear_problem(X, Y, sample_weight)
         ones = torch.ones_like(problem.Y)
@@ -59,6 +67,12 @@ class Ridge(LinearEstimator):
     Args:
         alpha: penalty >= 0, in units of ``X^2`` summed over samples (scikit-learn's convention).
 
+    Raises:
+        TypeError, ValueError: ``alpha`` is no number, or out of range.
+
+    References:
+        Hoerl & Kennard, "Ridge regression: biased estimation for nonorthogonal problems", Technometrics 12 (1970).
+
     Example:
         >>> X = torch.eye(2)
         >>> Ridge(alpha=1.0).fit(X, torch.tensor([1.0, 2.0])).coef_
@@ -66,9 +80,7 @@ class Ridge(LinearEstimator):
     """
 
     def __init__(self, alpha: float = 1.0) -> None:
-        if not 0 <= alpha < math.inf:
-            raise ValueError(f"Expected argument `alpha` to be >= 0 and finite but got {alpha}.")
-        self.alpha = alpha
+        self.alpha = checked_number("alpha", alpha, ends="[)", advice="0 is least squares")
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> Ridge:
         """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. Dependent columns are allowed for alpha > 0."""

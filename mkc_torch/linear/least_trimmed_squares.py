@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
+import numbers
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_whole
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._scale_search import minimise_scale, relative_precision
@@ -22,6 +24,13 @@ if TYPE_CHECKING:
 def stacked(weight: Tensor | None) -> Tensor | None:
     """Sample weights (B, N, m) beside a stack of candidates, (B, 1, N, m)."""
     return None if weight is None else weight.unsqueeze(1)
+
+
+def checked_h(h: object) -> int | None:
+    """``h``, or a clear error; what it has to exceed is not known before the fit."""
+    if h is not None and (isinstance(h, bool) or not isinstance(h, numbers.Integral)):
+        raise TypeError(f"Expected argument `h` to be a whole number but got {h!r}; it counts values.")
+    return None if h is None else checked_whole("h", h, 1, "it counts values; None takes the default")
 
 
 def default_coverage(problem: LinearProblem) -> int:
@@ -110,6 +119,9 @@ class LeastTrimmedSquares(LinearEstimator):
         exact_: whether the optimum is certain: every choice was tried, or h = N in one channel.
         n_iter_, converged_: steps made, and whether they had come to rest, (*,).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         Rousseeuw, "Least median of squares regression", JASA 79 (1984) 871-880.
         Rousseeuw & Van Driessen, "Computing LTS regression for large data sets", DMKD 12 (2006) 29-45.
@@ -132,13 +144,9 @@ class LeastTrimmedSquares(LinearEstimator):
 
     def __init__(self, h: int | None = None, *, starts: int = 500, seed: int = 0) -> None:
         super().__init__()
-        if h is not None and (isinstance(h, bool) or not isinstance(h, int)):
-            raise TypeError(f"Expected argument `h` to be a whole number but got {h!r}.")
-        if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
-            raise ValueError(f"Expected argument `starts` to be a whole number of at least 1 but got {starts!r}.")
-        self.h = h
-        self.starts = starts
-        self.seed = seed
+        self.h = checked_h(h)
+        self.starts = checked_whole("starts", starts, 1, "500 is usual")
+        self.seed = checked_whole("seed", seed)
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> LeastTrimmedSquares:
         """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. A weight of 2 is a sample that occurs twice.

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Literal, get_args
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number, checked_whole
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._psi import TUNING_95, PsiName, Tuning, checked_tuning, psi_weight
-from mkc_torch.linear._robust_start import robust_start
+from mkc_torch.linear._robust_start import checked_start, robust_start
 from mkc_torch.linear._scale_search import relative_precision
 from mkc_torch.linear.least_absolute_deviations import LeastAbsoluteDeviations
 from mkc_torch.order_statistic import order_statistic
@@ -120,10 +121,8 @@ def reweight(
 
 
 def check_iterations(max_iter: int, tol: float) -> None:
-    if max_iter < 1:
-        raise ValueError(f"Expected argument `max_iter` to be >= 1 but got {max_iter}; 500 is ample.")
-    if not 0 < tol < 1:
-        raise ValueError(f"Expected argument `tol` to be in (0, 1) but got {tol}; 1e-10 suits float64.")
+    checked_whole("max_iter", max_iter, 1, "500 is ample")
+    checked_number("tol", tol, 0.0, 1.0, advice="1e-10 suits float64")
 
 
 class MEstimator(LinearEstimator):
@@ -151,6 +150,9 @@ class MEstimator(LinearEstimator):
         scale_: (*, m), m being 1 for one channel; of an exact fit the rounding error of Y.
         weights_: ψ(z) / z, 1 at z = 0, (*, N, m).
         n_iter_, converged_: steps made, and whether they had come to rest, (*,).
+
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
 
     References:
         Indiveri, "An entropy-like estimator for robust parameter identification", Entropy 11 (2009), (11)-(21).
@@ -184,11 +186,8 @@ class MEstimator(LinearEstimator):
         checked_tuning(psi, tuning)
         if scale not in get_args(MScaleName):
             raise ValueError(f"Expected argument `scale` to be 'mad' or 'proposal2' but got {scale!r}.")
-        if not (start is None or isinstance(start, Tensor) or start in get_args(MStart)):
-            raise ValueError(
-                "Expected argument `start` to be 'lad', 'lts', 's', 'least_squares', coefficients or None "
-                f"but got {start!r}."
-            )
+        if start is not None:
+            checked_start(start, get_args(MStart), ", or None,")
         check_iterations(max_iter, tol)
         self.psi = psi
         self.tuning = tuning
@@ -196,7 +195,7 @@ class MEstimator(LinearEstimator):
         self.start = start
         self.max_iter = max_iter
         self.tol = tol
-        self.seed = seed
+        self.seed = checked_whole("seed", seed)
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> MEstimator:
         """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. A weight of 2 is a sample that occurs twice.

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import as_numbers, checked_whole, refuse_out_of_range
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._precision import in_double
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.linear._robust_start import Start, robust_start
+from mkc_torch.linear._robust_start import Start, checked_start, robust_start
 from mkc_torch.order_statistic import order_statistic
 from mkc_torch.trust_region import Quadratic, minimise
 
@@ -61,6 +62,9 @@ class MinimumEntropy(LinearEstimator):
         weights_: density of each residual over the greatest, (*, N, m).
         n_iter_, converged_: steps tried, and whether a local minimum was reached, (*,).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         E. Wolsztynski, E. Thierry, L. Pronzato, "Minimum-entropy estimation in semi-parametric models", Signal
         Processing 85 (2005) 937-949; B. W. Silverman, Density Estimation (1986), p. 45.
@@ -94,17 +98,13 @@ class MinimumEntropy(LinearEstimator):
         if location not in ("median", "symmetric"):
             raise ValueError(f"Expected argument `location` to be 'median' or 'symmetric' but got {location!r}.")
         if bandwidth is not None:
-            width = torch.as_tensor(bandwidth)
-            if not bool(((width > 0) & torch.isfinite(width)).all()):
-                raise ValueError(f"Expected argument `bandwidth` to be positive and finite but got {bandwidth}.")
-        if max_iter < 1:
-            raise ValueError(f"Expected argument `max_iter` to be >= 1 but got {max_iter}; 100 is ample.")
+            refuse_out_of_range("bandwidth", bandwidth, advice="it is in the unit of Y; None takes Silverman's rule")
         self.entropy = entropy
         self.bandwidth = bandwidth
         self.location = location
-        self.start = start
-        self.max_iter = max_iter
-        self.seed = seed
+        self.start = checked_start(start)
+        self.max_iter = checked_whole("max_iter", max_iter, 1, "100 is ample")
+        self.seed = checked_whole("seed", seed)
 
     @torch.no_grad()
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> MinimumEntropy:
@@ -130,7 +130,7 @@ class MinimumEntropy(LinearEstimator):
         if self.bandwidth is None:
             h = 1.06 * begin.scale.double() * total.pow(-0.2)
         else:
-            h = torch.as_tensor(self.bandwidth).to(problem.Y)
+            h = as_numbers("bandwidth", self.bandwidth, problem.Y.dtype, problem.Y.device).to(problem.Y)
             if h.dim() > 1 or h.numel() not in (1, problem.num_channels):
                 raise ValueError(
                     f"Expected argument `bandwidth` to be a number or of shape ({problem.num_channels},) "

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number, checked_whole
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear._psi import bisquare_for_efficiency, psi_weight
@@ -37,6 +38,9 @@ class MMRegression(LinearEstimator):
         weights_: bisquare weights in [0, 1], (*, N, m).
         n_iter_, converged_: steps made after the S-estimate, and whether they had come to rest, (*,).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         Yohai, "High breakdown-point and high efficiency robust estimates for regression", Annals of Statistics 15
         (1987) 642-656.
@@ -65,8 +69,7 @@ class MMRegression(LinearEstimator):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        if not 0.3 <= efficiency <= 0.99:
-            raise ValueError(f"Expected argument `efficiency` between 0.3 and 0.99 but got {efficiency}; try 0.95.")
+        checked_number("efficiency", efficiency, 0.3, 0.99, "[]", "0.95 is usual")
         check_breakdown(breakdown)
         check_starts(starts)
         check_iterations(max_iter, tol)
@@ -75,7 +78,7 @@ class MMRegression(LinearEstimator):
         self.starts = starts
         self.max_iter = max_iter
         self.tol = tol
-        self.seed = seed
+        self.seed = checked_whole("seed", seed)
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> MMRegression:
         """Fit ``Y ~ X coef``; shapes and errors as in :meth:`LeastSquares.fit`.

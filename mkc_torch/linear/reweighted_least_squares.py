@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number, checked_whole, told
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import residual_scale
@@ -51,6 +52,9 @@ class ReweightedLeastSquares(LinearEstimator):
         weights_: 1 for the values that count, 0 for those rejected, (*, N, m).
         start_: the robust fit.
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         Rousseeuw & Leroy, Robust Regression and Outlier Detection (1987), pp. 44-45 and 202 (the first scale).
         Indiveri, "An entropy-like estimator for robust parameter identification", Entropy 11 (2009), (26)-(29).
@@ -76,16 +80,18 @@ class ReweightedLeastSquares(LinearEstimator):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        if not (isinstance(start, LinearEstimator) or start in _STARTS):
-            raise ValueError(f"Expected argument `start` to be 'lts', 'lms', 's' or an estimator but got {start!r}.")
-        if not 1 <= threshold < math.inf:
-            raise ValueError(f"Expected argument `threshold` of at least 1 scale but got {threshold}; 2.5 is usual.")
+        if not (isinstance(start, LinearEstimator) or (isinstance(start, str) and start in _STARTS)):
+            mend = f"; make one, {start.__name__}()" if isinstance(start, type) else ""
+            raise ValueError(
+                f"Expected argument `start` to be 'lts', 'lms', 's' or an estimator but got {told(start)}{mend}."
+            )
+        checked_number("threshold", threshold, 1.0, math.inf, "[)", "it counts scales, and 2.5 is usual")
         if starts is not None:
             check_starts(starts)
         self.start = start
         self.threshold = threshold
         self.starts = starts
-        self.seed = seed
+        self.seed = checked_whole("seed", seed)
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> ReweightedLeastSquares:
         """Fit ``Y ~ X coef``; shapes and errors as in :meth:`LeastSquares.fit`.

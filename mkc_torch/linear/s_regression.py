@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number, checked_whole
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._psi import BISQUARE_50, bisquare_for_breakdown, bisquare_rho, bisquare_weight
@@ -69,13 +70,11 @@ def minimise_m_scale(
 
 
 def check_breakdown(breakdown: float) -> None:
-    if not 0.01 <= breakdown <= 0.5:
-        raise ValueError(f"Expected argument `breakdown` between 0.01 and 0.5 but got {breakdown}.")
+    checked_number("breakdown", breakdown, 0.01, 0.5, "[]", "0.5 withstands most")
 
 
 def check_starts(starts: int) -> None:
-    if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
-        raise ValueError(f"Expected argument `starts` to be a whole number of at least 1 but got {starts!r}.")
+    checked_whole("starts", starts, 1, "500 is usual")
 
 
 class SRegression(LinearEstimator):
@@ -100,6 +99,9 @@ class SRegression(LinearEstimator):
         weights_: bisquare weights in [0, 1], (*, N, m).
         n_iter_, converged_: steps made, and whether they had come to rest, (*,).
 
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
     References:
         Rousseeuw & Yohai, "Robust regression by means of S-estimators" (1984).
         Salibian-Barrera & Yohai, "A fast algorithm for S-regression estimates", JCGS 15 (2006) 414-427.
@@ -122,7 +124,7 @@ class SRegression(LinearEstimator):
         check_starts(starts)
         self.breakdown = breakdown
         self.starts = starts
-        self.seed = seed
+        self.seed = checked_whole("seed", seed)
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> SRegression:
         """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. A weight of 2 is a sample that occurs twice."""

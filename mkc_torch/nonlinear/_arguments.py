@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 
+from mkc_torch._arguments import as_numbers, refuse_not_real, refuse_other_type, told
 from mkc_torch.nonlinear._descent import within
 from mkc_torch.nonlinear._forward import Residual
 from mkc_torch.nonlinear._problem import Constraint, Point, Problem
 from mkc_torch.nonlinear.prior import GaussianPrior
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["per_channel", "prepared"]
 
@@ -35,14 +33,21 @@ def prepared(
     jacobian: str,
 ) -> tuple[Problem, Point]:
     """The checked problem and its start."""
-    if not isinstance(start, Tensor) or not start.is_floating_point():
-        got = start.dtype if isinstance(start, Tensor) else type(start).__name__
-        raise TypeError(f"Expected argument `start` to be a real floating-point tensor but got {got}.")
+    for name, function in (("residual", residual), ("equality", equality), ("inequality", inequality)):
+        if not callable(function) and (name == "residual" or function is not None):
+            raise TypeError(
+                f"Expected argument `{name}` to be a function of the parameters but got {told(function)}; write "
+                "lambda theta: ..."
+            )
+    refuse_not_real("start", start)
+    if start.dtype in (torch.float16, torch.bfloat16):
+        raise TypeError(f"Expected argument `start` of dtype float32 or float64 but got {start.dtype}; use .float().")
     if start.dim() == 0 or start.shape[-1] == 0 or start.numel() == 0:
         raise ValueError(f"Expected argument `start` of shape (*, p >= 1) but got {tuple(start.shape)}.")
     if not bool(torch.isfinite(start).all()):
         raise ValueError(
-            f"Expected argument `start` to be finite but got {int((~torch.isfinite(start)).sum())} values that are not."
+            f"Expected argument `start` to be finite but got {int((~torch.isfinite(start)).sum())} values that are "
+            "not; start elsewhere."
         )
     if jacobian not in ("forward", "reverse"):
         raise ValueError(f"Expected argument `jacobian` to be 'forward' or 'reverse' but got {jacobian!r}.")
@@ -51,6 +56,8 @@ def prepared(
     box = _checked_box(lower, upper, theta)
     theta = within(box, theta)
     for leaf in tree_leaves(data):
+        if data is not None:
+            refuse_other_type("data", leaf, Tensor, "tensors", "close over what is none, lambda theta, data: ...")
         if isinstance(leaf, Tensor) and leaf.shape[: len(batch)] != batch:
             raise ValueError(
                 f"Expected every tensor in argument `data` to begin with the batch dimensions {tuple(batch)} of "
@@ -73,7 +80,7 @@ def prepared(
     if first.dim() != 3 or first.shape[1] == 0 or first.shape[2] == 0:
         raise ValueError(
             f"Expected `residual` to return a tensor (N, m) but got shape {tuple(first.shape[1:])}; "
-            "one channel is (N, 1)."
+            "one channel is (N, 1), residual.unsqueeze(-1)."
         )
     if first.dtype != theta.dtype:
         raise TypeError(
@@ -109,11 +116,15 @@ def prepared(
     return problem, point
 
 
-def per_channel(name: str, value: float | Tensor, like: Tensor, batch: torch.Size, *, infinite: bool) -> Tensor:
+def per_channel(
+    name: str, value: float | Tensor, like: Tensor, batch: torch.Size, *, infinite: bool, least: float = 0.0
+) -> Tensor:
     """A positive parameter of every channel, (B, m), from a number, (m,) or (*, m)."""
-    t = torch.as_tensor(value, dtype=like.dtype, device=like.device)
-    if not bool(((t > 0) & (torch.isfinite(t) | infinite)).all()):
+    t = as_numbers(name, value, like.dtype, like.device).to(like)
+    if not bool(((t > 0) & (t >= least) & (torch.isfinite(t) | infinite)).all()):
         kind = "positive" if infinite else "positive and finite"
+        if least > 0.0:
+            kind = f"in [{least:.4g}, inf]"
         raise ValueError(f"Expected argument `{name}` to be {kind} but got {value}.")
     m = like.shape[-1]
     try:
@@ -130,7 +141,7 @@ def _checked_box(lower: Tensor | None, upper: Tensor | None, theta: Tensor) -> t
     p = theta.shape[-1]
     sides = []
     for name, side, default in (("lower", lower, -math.inf), ("upper", upper, math.inf)):
-        t = torch.as_tensor(default if side is None else side, dtype=theta.dtype, device=theta.device)
+        t = as_numbers(name, default if side is None else side, theta.dtype, theta.device).to(theta)
         if t.dim() > 1 or (t.dim() == 1 and t.shape[0] != p) or bool(torch.isnan(t).any()):
             raise ValueError(
                 f"Expected argument `{name}` to be {p} numbers, infinite for no bound, but got "
@@ -149,8 +160,12 @@ def _checked_box(lower: Tensor | None, upper: Tensor | None, theta: Tensor) -> t
 def _checked_prior(prior: GaussianPrior | None, theta: Tensor) -> tuple[Tensor | None, Tensor | None]:
     if prior is None:
         return None, None
+    refuse_other_type("prior", prior, GaussianPrior, "a GaussianPrior", "write GaussianPrior(mean, precision)")
     p = theta.shape[-1]
-    mean, precision = torch.as_tensor(prior.mean).to(theta), torch.as_tensor(prior.precision).to(theta)
+    mean, precision = (
+        as_numbers(f"prior.{name}", getattr(prior, name), theta.dtype, theta.device).to(theta)
+        for name in ("mean", "precision")
+    )
     if mean.shape != (p,) or precision.shape not in ((p,), (p, p)):
         raise ValueError(
             f"Expected argument `prior` with a mean ({p},) and a precision ({p},) or ({p}, {p}) but got "
@@ -177,7 +192,7 @@ def _checked_weight(weight: Tensor | None, first: Tensor, batch: torch.Size) -> 
     if weight is None:
         return None, None
     N, m = first.shape[1:]
-    w = torch.as_tensor(weight).to(first)
+    w = as_numbers("weight", weight, first.dtype, first.device).to(first)
     if w.shape == (N,):
         w = w.unsqueeze(-1)
     try:
@@ -194,6 +209,7 @@ def _checked_weight(weight: Tensor | None, first: Tensor, batch: torch.Size) -> 
 
 def _constraint_count(name: str, constraint: Constraint, theta: Tensor) -> int:
     value = constraint(theta)
+    refuse_other_type(name, value, Tensor, "a function that returns a tensor (k,)", "make one of its result")
     if value.dim() != 1 or not bool(torch.isfinite(value).all()):
         raise ValueError(
             f"Expected argument `{name}` to return finite values (k,) at `start` but got {value.tolist()}; "

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
+from mkc_torch._arguments import refuse_other_type
 from mkc_torch.nonlinear._forward import Residual, forward_tangents, reverse_tangents
 
 if TYPE_CHECKING:
@@ -40,7 +41,9 @@ class Problem:
     def _over_batch(self, function: Callable[..., Tensor], theta: Tensor) -> Tensor:
         arguments = (theta,) if self.data is None else (theta, self.data)
         if theta.shape[0] == 1:
-            return function(*tree_map(lambda t: t[0], arguments)).unsqueeze(0)
+            found = function(*tree_map(lambda t: t[0], arguments))
+            refuse_other_type("residual", found, Tensor, "a function that returns a tensor", "make one of its result")
+            return found.unsqueeze(0)
         return torch.func.vmap(function)(*arguments)
 
     def raw_residual(self, theta: Float[Tensor, "B p"]) -> Float[Tensor, "B N m"]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number, checked_whole
 from mkc_torch.nonlinear._arguments import per_channel, prepared
 from mkc_torch.nonlinear._constraints import constrained
 from mkc_torch.nonlinear._forward import Residual
@@ -35,6 +36,12 @@ class Solution:
         converged: (*,).
         jacobian: of the residual at ``theta``, (*, N, m, p).
         curvature: of the objective at ``theta``, ``Σ w (1 - z²/σ²) JᵀJ / d²`` and the prior's precision, (*, p, p).
+
+    Example:
+        >>> y = torch.tensor([1.0, 1.2, 0.8, 50.0], dtype=torch.float64)
+        >>> found = minimise(lambda theta: (y - theta).unsqueeze(-1), torch.tensor([0.5]).double(), sigma=1.0)
+        >>> found.theta, found.weights.squeeze(-1).round(decimals=2)  # the last one has no say
+        (tensor([1.0000], dtype=torch.float64), tensor([1.0000, 0.9800, 0.9800, 0.0000], dtype=torch.float64))
     """
 
     theta: Float[Tensor, "*batch p"]
@@ -95,7 +102,7 @@ def minimise(
         jacobian: "forward" is quick for few parameters, "reverse" for few residuals.
 
     Raises:
-        TypeError: ``start`` is no floating tensor, or the residual has another dtype.
+        TypeError: ``start`` is no floating tensor, the residual has another dtype, or an argument is of another kind.
         ValueError: wrong shapes, more parameters than residuals (without a prior), a residual or derivative that is
             not finite at ``start``, crossed bounds, or a parameter out of range.
 
@@ -113,8 +120,8 @@ def minimise(
         >>> minimise(decay, torch.tensor([2.0, 1.0]).double(), sigma=1.0, d=0.1).theta
         tensor([3.0000, 0.7000], dtype=torch.float64)
     """
-    if max_iter < 1:
-        raise ValueError(f"Expected argument `max_iter` to be at least 1 but got {max_iter}.")
+    checked_whole("max_iter", max_iter, 1, "50 is usual")
+    checked_number("tol", tol, ends="[)", advice="1e-10 suits float64")
     problem, point = prepared(
         residual,
         start,

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number, checked_whole
 from mkc_torch.density_fit import DensityState, domain_rule, initial_state, refuse_narrow_bound
+from mkc_torch.functional import SIGMA_LEAST
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 from mkc_torch.nonlinear._alternate import alternated, gaussian_candidate, likelihood_of
 from mkc_torch.nonlinear._arguments import per_channel, prepared
@@ -41,6 +43,13 @@ class NonlinearFit:
         jacobian: of the residual at ``theta``, (*, N, m, p).
         n_iter: trial steps made.
         converged: (*,).
+
+    Example:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> y = 2.0 + 0.1 * torch.randn(200, generator=generator, dtype=torch.float64)
+        >>> found = fit(lambda theta: (y - theta).unsqueeze(-1), torch.tensor([0.0]).double())
+        >>> round(float(found.theta), 1), round(float(found.d), 1), round(float(found.standard_error()), 3)
+        (2.0, 0.1, 0.007)
     """
 
     theta: Float[Tensor, "*batch p"]
@@ -56,7 +65,11 @@ class NonlinearFit:
     converged: Bool[Tensor, " *batch"]
 
     def standard_error(self) -> Float[Tensor, "*batch p"]:
-        """Square root of the diagonal of ``covariance``, in the units of the parameters."""
+        """Square root of the diagonal of ``covariance``, in the units of the parameters.
+
+        Raises:
+            ValueError: the fit was made without a covariance.
+        """
         if self.covariance is None:
             raise ValueError("Expected a fit with a covariance but it was made with covariance=None; name a kind.")
         return self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
@@ -99,7 +112,7 @@ def fit(
         start: (*, p).
         bound: half-width of the domain in the unit of the residual, at least two robust scales: a number, (m,) or
             (*, m); None takes :func:`mkc_torch.density_fit.domain_rule` on a rough robust fit.
-        sigma: None learns σ; a value keeps it.
+        sigma: None learns σ; a value in [0.05, inf] keeps it.
         d: None learns d; a value keeps it.
         graduate: False begins at ``start`` as it is; only for starts near the answer.
         data, weight, prior, lower, upper, equality, inequality, jacobian: as in :func:`minimise`.
@@ -124,8 +137,8 @@ def fit(
         >>> [round(v, 1) for v in found.theta.tolist()], bool(found.standard_error().max() < 0.05)
         ([3.0, 0.7], True)
     """
-    if max_iter < 1:
-        raise ValueError(f"Expected argument `max_iter` to be at least 1 but got {max_iter}.")
+    checked_whole("max_iter", max_iter, 1, "200 is usual")
+    checked_number("tol", tol, ends="[)", advice="1e-10 suits float64")
     kind = None if covariance is None else checked_kind(covariance)
     checked_bandwidth(bandwidth)
     problem, point = prepared(
@@ -140,7 +153,9 @@ def fit(
         inequality=inequality,
         jacobian=jacobian,
     )
-    fixed_sigma = None if sigma is None else per_channel("sigma", sigma, point.residual, problem.batch, infinite=True)
+    fixed_sigma = None
+    if sigma is not None:
+        fixed_sigma = per_channel("sigma", sigma, point.residual, problem.batch, infinite=True, least=SIGMA_LEAST)
     fixed_d = None if d is None else per_channel("d", d, point.residual, problem.batch, infinite=False)
     fixed_bound = None if bound is None else per_channel("bound", bound, point.residual, problem.batch, infinite=False)
     steps = 0

@@ -20,6 +20,16 @@ class GaussianPrior:
     Attributes:
         mean: (p,).
         precision: the diagonal of P (p,), or P (p, p), symmetric and positive semi-definite, in 1 / unit².
+
+    What they hold is looked at by :func:`minimise` and :func:`fit`.
+
+    Example:
+        >>> import torch
+        >>> from mkc_torch.nonlinear import minimise
+        >>> y = torch.full((3, 1), 4.0, dtype=torch.float64)
+        >>> known = GaussianPrior(torch.zeros(1), torch.tensor([1.0]))  # 0 with a standard deviation of 1
+        >>> minimise(lambda theta: y - theta, torch.zeros(1).double(), prior=known).theta
+        tensor([3.0000], dtype=torch.float64)
     """
 
     mean: Float[Tensor, " p"]

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import checked_number, refuse_text
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.recording import Recording
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
 from mkc_torch.simulation.parameter import SimulationError
-from mkc_torch.simulation.protocol import Changes
+from mkc_torch.simulation.protocol import Changes, refuse_no_recording
 from mkc_torch.simulation.runs import successive_runs
 
 if TYPE_CHECKING:
@@ -48,8 +49,9 @@ class Paired:
         joins_experiments: True: one fit takes all runs.
 
     Raises:
+        TypeError: what is no recording, or text in place of names of columns.
         MissingColumnError: there is no ``time``.
-        ValueError: a standard deviation that is not positive.
+        ValueError: a standard deviation that is not positive, or outputs without a column.
 
     Example:
         >>> time = torch.arange(0.0, 10.0, 0.1, dtype=torch.float64)
@@ -71,9 +73,14 @@ class Paired:
         offset: float | None = None,
         rate: float = RATE,
     ) -> None:
-        for what, value in (("offset", offset), ("rate", rate)):
-            if value is not None and not 0.0 < value < float("inf"):
-                raise ValueError(f"Expected argument `{what}` to be positive and finite but got {value}.")
+        refuse_no_recording("simulated", simulated)
+        if outputs is not None:
+            refuse_text("outputs", outputs, "a tuple of names of columns")
+            if not outputs:
+                raise ValueError("Expected argument `outputs` to name a column but got none; None takes all in common.")
+        if offset is not None:
+            checked_number("offset", offset, advice="it is in s, and None takes half an interval of the recording")
+        checked_number("rate", rate, advice=f"{RATE:g} is that of quartz")
         self.simulated = simulated.finite("time").sorted_by_time()
         self.outputs = None if outputs is None else tuple(outputs)
         self.offset, self.rate = offset, rate
@@ -87,9 +94,11 @@ class Paired:
         """The simulator's columns beside a recording's.
 
         Raises:
+            TypeError: what is no recording.
             MissingColumnError: the recording has no ``time``, or lacks a column of ``outputs``.
             SimulationError: no column, no run or no time in common.
         """
+        refuse_no_recording("recording", recording)
         shared = self._shared(recording)
         table = recording.finite("time", *shared).sorted_by_time()
         table, curve = _met(self.simulated.finite(*shared), table, shared)

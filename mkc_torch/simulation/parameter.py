@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 
-if TYPE_CHECKING:
-    pass
+from mkc_torch._arguments import checked_number, refuse_other_type, told
 
-__all__ = ["Parameter", "SimulationError"]
+__all__ = ["Parameter", "SimulationError", "known_parameters"]
 
 
 class SimulationError(ValueError):
@@ -19,15 +19,55 @@ class SimulationError(ValueError):
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a simulation.
+    """A parameter of a simulation, which is fitted.
 
     Attributes:
-        value: to start from.
+        value: to start from; where it is out of the bounds, from the nearer one.
         lower, upper: least and greatest value.
         unit: for reports.
+
+    Raises:
+        TypeError: a value or a bound is no number, or the unit no text.
+        ValueError: the value is not finite, or ``lower`` exceeds ``upper``.
+
+    Example:
+        >>> Parameter(0.1, lower=0.0, unit="1/s")
+        Parameter(value=0.1, lower=0.0, upper=inf, unit='1/s')
     """
 
     value: float
     lower: float = -torch.inf
     upper: float = torch.inf
     unit: str = ""
+
+    def __post_init__(self) -> None:
+        checked_number("value", self.value, -math.inf, math.inf, advice="it is what the fit starts from")
+        for name, bound in (("lower", self.lower), ("upper", self.upper)):
+            checked_number(name, bound, -math.inf, math.inf, "[]", "it is infinite for no bound")
+        if self.lower > self.upper:
+            raise ValueError(
+                f"Expected argument `lower` to be at most `upper` but got {self.lower} and {self.upper}; swap them."
+            )
+        refuse_other_type("unit", self.unit, str, "text", "write '1/s' say")
+
+
+def known_parameters(name: str, parameters: Mapping[str, float | Parameter]) -> dict[str, Parameter]:
+    """The parameters of the simulation of that name, numbers made into some.
+
+    Raises:
+        SimulationError: they are no mapping, or one is no number.
+    """
+    if not isinstance(parameters, Mapping):
+        raise SimulationError(
+            f"{name}: `parameters` should be names with their values, {{'gain': 1.0}}, but is {told(parameters)}."
+        )
+    return {key: one if isinstance(one, Parameter) else _made(name, key, one) for key, one in parameters.items()}
+
+
+def _made(name: str, key: str, value: float) -> Parameter:
+    try:
+        return Parameter(float(value))
+    except (TypeError, ValueError) as error:
+        raise SimulationError(
+            f"{name}: its parameter `{key}` should be a finite number or a Parameter but is {told(value)}."
+        ) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from mkc_torch._arguments import refuse_other_type
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.recording import Recording
 
@@ -26,6 +28,7 @@ __all__ = [
     "PreparedSimulation",
     "Remembering",
     "Simulation",
+    "refuse_no_recording",
 ]
 
 Change = Callable[[Tensor], Tensor]
@@ -85,6 +88,11 @@ class Port:
         clock: when; None for the recording's samples.
         run: number of each moment's run; None where the simulation knows of no runs.
         memory: name of the internal state that an effect here may bring; empty where none may.
+
+    Example:
+        >>> sensor = Port(("mag_x", "mag_y", "mag_z"), "µT", kind="sensor")
+        >>> sensor.at(torch.ones(5, 3)).shape  # at the recording's own samples
+        torch.Size([5, 3])
     """
 
     channels: tuple[str, ...]
@@ -216,7 +224,10 @@ class Correction(Protocol):
 
 
 class Simulation(Protocol):
-    """A simulation of a kind of recording.
+    """A simulation of a kind of recording: what :func:`mkc_torch.diagnose` takes.
+
+    :class:`mkc_torch.simulation.Magnetometer` and :class:`mkc_torch.simulation.Paired` are some as they are; a user's
+    own derives from :class:`mkc_torch.simulation.Static` or :class:`mkc_torch.simulation.Dynamics`.
 
     Attributes:
         name: as ``diagnosis.json`` gives it.
@@ -226,6 +237,17 @@ class Simulation(Protocol):
 
     It may also have ``measured``, the names of the columns that it is compared with: a column that repeats one of these
     drives no effect.
+
+    Example:
+        >>> from mkc_torch.simulation import Static
+        >>> class Thermistor(Static):
+        ...     inputs, outputs, parameters = ("temperature",), ("voltage",), {"slope": 0.01}
+        ...
+        ...     def output(self, time, u, p):
+        ...         return {"voltage": p.slope * u.temperature}
+        >>> simulation: Simulation = Thermistor()
+        >>> simulation.name, simulation.joins_experiments
+        ('Thermistor', False)
     """
 
     @property
@@ -243,3 +265,15 @@ class Simulation(Protocol):
             ValueError: it cannot be simulated; the message says why.
         """
         ...
+
+
+def refuse_no_recording(name: str, value: object) -> None:
+    """Refuse what is no recording, and say how to get one.
+
+    Raises:
+        TypeError: a file's name, columns, or something else.
+    """
+    advice = "make one, Recording({'time': ..., ...}), or read it, Recording.read('REC.csv')"
+    if isinstance(value, (str, os.PathLike)):
+        advice = f"read it, Recording.read({os.fspath(value)!r})"
+    refuse_other_type(name, value, Recording, "a Recording", advice)

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from mkc_torch._arguments import refuse_other_type, refuse_text
 from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
 from mkc_torch.recording import Recording
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
-from mkc_torch.simulation.parameter import Parameter, SimulationError
-from mkc_torch.simulation.protocol import Changes, Port
+from mkc_torch.simulation.parameter import Parameter, SimulationError, known_parameters
+from mkc_torch.simulation.protocol import Changes, Port, refuse_no_recording
 from mkc_torch.simulation.undetermined import undetermined
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ class Static:
         joins_experiments: False: each run of a recording is diagnosed by itself.
 
     Raises:
+        TypeError: what is no module, or text in place of names of columns.
         SimulationError: a module without parameters that are real numbers, or with more than 200 of them.
 
     Example:
@@ -79,8 +81,15 @@ class Static:
         outputs: Sequence[str] | None = None,
         name: str | None = None,
     ) -> None:
-        self.inputs = self.inputs if inputs is None else tuple(inputs)
-        self.outputs = self.outputs if outputs is None else tuple(outputs)
+        for what, names in (("inputs", inputs), ("outputs", outputs)):
+            chosen = getattr(self, what) if names is None else names
+            refuse_text(what, chosen, "a tuple of names of columns")
+            setattr(self, what, tuple(chosen))
+        if module is not None:
+            advice = "derive from Static, with an `output`, for a function"
+            refuse_other_type("module", module, nn.Module, "a torch.nn.Module", advice)
+        if name is not None:
+            refuse_other_type("name", name, str, "text", "write 'line' say")
         self.module = None if module is None else copy.deepcopy(module).double().eval()
         self._name = name or (type(self).__name__ if module is None else type(module).__name__)
         if self.module is not None:
@@ -123,7 +132,13 @@ class Static:
             known = dict(self.module.named_parameters())
             parts = theta.split([one.numel() for one in known.values()])
             values = {name: part.reshape(one.shape) for (name, one), part in zip(known.items(), parts, strict=True)}
-            found = torch.func.functional_call(self.module, values, (inputs,))
+            try:
+                found = torch.func.functional_call(self.module, values, (inputs,))
+            except RuntimeError as error:
+                raise SimulationError(
+                    f"{self.name}: the module fails on inputs of shape {tuple(inputs.shape)}, a column for each of "
+                    f"{', '.join(self.inputs) or 'no inputs'}: {error}"
+                ) from error
             return self._checked_module(found, len(time))
         u = SimpleNamespace(**dict(zip(self.inputs, inputs.unbind(-1), strict=True)))
         p = SimpleNamespace(**dict(zip(self.parameters, theta.unbind(), strict=True)))
@@ -161,9 +176,15 @@ class Static:
         """The simulation of a recording, which needs no ``time``.
 
         Raises:
+            TypeError: what is no recording.
             MissingColumnError: the recording lacks an input or an output.
-            SimulationError: no outputs are named, or ``output`` returns a wrong shape or what is not finite.
+            SimulationError: no outputs are named or one twice, a parameter is no number, a module takes another number
+                of inputs, or ``output`` returns a wrong shape or what is not finite.
         """
+        refuse_no_recording("recording", recording)
+        twice = sorted({one for names in (self.inputs, self.outputs) for one in names if names.count(one) > 1})
+        if twice:
+            raise SimulationError(f"{self.name} names the column `{twice[0]}` twice; name it once.")
         if not self.outputs:
             raise SimulationError(f"{self.name} has no `outputs`; name the columns that it predicts.")
         table = recording.finite(*self.inputs, *self.outputs)
@@ -184,10 +205,7 @@ class PreparedStatic:
         units = {name: system.units.get(name, recording.units[name]) for name in (*system.inputs, *system.outputs)}
         own = {units[name] for name in system.outputs}
         self.unit = own.pop() if len(own) == 1 else ""
-        self.known = {
-            name: one if isinstance(one, Parameter) else Parameter(float(one))
-            for name, one in system.parameters.items()
-        }
+        self.known = known_parameters(system.name, system.parameters)
         self.parameter_names = tuple(self.known)
         low = [one.lower for one in self.known.values()]
         high = [one.upper for one in self.known.values()]

@@ -10,6 +10,7 @@ from mkc_torch import diagnose
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.diagnosed_model import ModelFileError
 from mkc_torch.diagnosis.diagnosis_file import diagnosis_to_json
+from mkc_torch.effects.hard_iron_step import HardIronStep
 from mkc_torch.recording import MissingColumnError, Recording
 from mkc_torch.simulation import Magnetometer
 from tests.shared_data import shared_data
@@ -161,12 +162,70 @@ def test_a_text_that_is_no_model_is_refused(text, said):
     [
         ({"level": 0.0}, "`level`"),
         ({"surrogates": 5}, "`surrogates` to be at least 19"),
-        ({"max_findings": -1}, "`max_"),
+        ({"max_findings": -1}, "`max_findings` to be a whole number of at least 0 but got -1; 3 is usual"),
+        ({"max_findings": 1.5}, "`max_findings` to be a whole number of at least 0 but got 1.5"),
+        ({"surrogates": 19.5}, "`surrogates` to be a whole number"),
+        ({"seed": "a"}, "`seed` to be a whole number but got 'a'"),
     ],
 )
 def test_arguments_out_of_range_are_refused(options, said):
     with pytest.raises(ValueError, match=said):
         diagnose(Magnetometer(), recording_of(np.zeros((N, 3))), **options)
+
+
+class Lacking:
+    id = "lacking"
+
+
+class Letters(HardIronStep):
+    roles = "temperature"
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"simulation": "magnetometer"}, r"got 'magnetometer'; pass one, such as Magnetometer\(\), or name it on the"),
+        ({"simulation": Magnetometer}, r"got the class Magnetometer; make one, Magnetometer\(\)"),
+        ({"simulation": None}, r"`simulation` to be a Simulation but got None; pass one"),
+        ({"recording": "NEW.csv"}, r"`recording` to be a Recording but got 'NEW\.csv'; read it, Recording\.read\('NEW"),
+        ({"recording": {"time": torch.ones(3)}}, r"`recording` to be a Recording but got .*; make one, Recording\("),
+        (
+            {"effects": ("hard_iron_step",)},
+            r"`effects` to hold Effects but got 'hard_iron_step'; .*CATALOGUE holds them",
+        ),
+        (
+            {"effects": "hard_iron_step"},
+            r"`effects` to be a sequence of Effects but got 'hard_iron_step'; it is a tuple",
+        ),
+        ({"effects": HardIronStep()}, "`effects` to be a sequence of Effects but got a HardIronStep; it is a tuple"),
+        ({"effects": None}, r"`effects` to be a sequence of Effects but got None; .* and \(\) for none"),
+        ({"effects": (HardIronStep,)}, r"got the class HardIronStep; make one, HardIronStep\(\)"),
+        ({"effects": (Lacking(),)}, "it lacks port, roles, quantities, shapes, change, which .*Effect explains"),
+        ({"effects": (Letters(),)}, r"its roles are names, \('temperature',\)"),
+        ({"level": "a"}, r"`level` to be a number in \(0, 1\) but got 'a'"),
+    ],
+)
+def test_arguments_of_another_kind_are_told_what_to_pass(changed, said):
+    given = {"simulation": Magnetometer(), "recording": recording_of(np.zeros((N, 3)))} | changed
+    with pytest.raises(TypeError, match=said):
+        diagnose(**given)
+
+
+def test_arguments_that_were_swapped_are_told_their_order():
+    with pytest.raises(
+        TypeError, match=r"`simulation` .* got Recording.*; it comes first, diagnose\(simulation, recording\)"
+    ):
+        diagnose(recording_of(np.zeros((N, 3))), Magnetometer())
+
+
+def test_effects_may_come_from_an_iterator():
+    table = tumbling(600, noise=0.4)
+    options = {"surrogates": 19, "max_findings": 0}
+    once = diagnose(Magnetometer(), table, effects=iter((HardIronStep(),)), **options)
+    assert (
+        once.candidates_tried == diagnose(Magnetometer(), table, effects=(HardIronStep(),), **options).candidates_tried
+    )
+    assert once.candidates_tried > 0
 
 
 def test_two_rows_are_too_few():

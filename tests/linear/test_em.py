@@ -566,7 +566,7 @@ def test_what_a_batched_fit_returns_can_be_given_to_the_next():
 @pytest.mark.parametrize("start", [torch.full((2,), math.nan), torch.zeros(3), torch.tensor(1.0)])
 def test_a_start_that_is_no_set_of_coefficients_is_refused(start):
     X, y = torch.randn(20, 2).double(), torch.randn(20).double()
-    with pytest.raises(ValueError, match="`start` to be 2 finite coefficients"):
+    with pytest.raises(ValueError, match=r"`start` to be (2 )?finite coefficients"):
         MKCRegression(start=start).fit(X, y)
 
 

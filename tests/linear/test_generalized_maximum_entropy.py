@@ -162,6 +162,17 @@ def test_supports_that_cannot_hold_are_refused_by_the_sample():
         GeneralizedMaximumEntropy(2.0, 5.0).fit(X, y)
 
 
+@pytest.mark.parametrize("seed", [1, 7, 9, 12])
+def test_errors_that_have_to_be_at_the_end_of_their_support_are_refused(seed):
+    X = sample(seed, 10, 3)
+    supports = torch.linspace(-10, 10, 5).double(), torch.linspace(-3, 3, 5).double()
+    y = torch.full((10,), 3.0).double()
+    with pytest.raises(ValueError, match=r"sample \d+ .* is left over; widen `coef_support` or `error_support`"):
+        GeneralizedMaximumEntropy(*supports).fit(X, y)
+    wider = GeneralizedMaximumEntropy(supports[0], 2.0 * supports[1]).fit(X, y)
+    torch.testing.assert_close(X @ wider.coef_ + wider.error_.squeeze(-1), y, rtol=0, atol=1e-8)
+
+
 def test_arguments_and_input_without_an_answer_are_refused():
     X, y = sample(19, 10, 2), sample(20, 10)
     for support in (0.0, math.inf, torch.ones(1), torch.ones(5), torch.tensor([0.0, math.nan])):

@@ -287,7 +287,7 @@ def test_dependent_columns_raise():
         ({"tol": 0.0}, r"`tol` to be in \(0, 1\) but got 0.0"),
         ({"tol": 1.0}, r"`tol` to be in \(0, 1\) but got 1.0"),
         ({"tol": float("nan")}, "`tol` .* but got nan"),
-        ({"max_iter": 0}, "`max_iter` to be >= 1 but got 0"),
+        ({"max_iter": 0}, "`max_iter` to be a whole number of at least 1 but got 0"),
     ],
 )
 def test_parameters_out_of_range_raise(arguments, message):

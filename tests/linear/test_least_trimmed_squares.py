@@ -284,7 +284,7 @@ def test_a_channel_fitted_exactly_does_not_blind_the_others():
 # parameters
 
 
-@pytest.mark.parametrize("h", [0, 3, 41])
+@pytest.mark.parametrize("h", [1, 3, 41])
 def test_a_coverage_out_of_range_is_refused(h):
     with pytest.raises(ValueError, match=r"`h` between 4 and the 40 samples but got"):
         LeastTrimmedSquares(h=h).fit(*contaminated_line(0))

@@ -152,8 +152,11 @@ def test_a_median_of_fewer_than_twice_the_coefficients_is_refused():
     ("kwargs", "message"),
     [
         ({"scale": "iqr"}, "`scale` to be 'mad' or 'proposal2' but got 'iqr'"),
-        ({"start": "zero"}, "`start` to be 'lad', 'lts', 's', 'least_squares', coefficients or None but got 'zero'"),
-        ({"max_iter": 0}, "`max_iter` to be >= 1 but got 0"),
+        (
+            {"start": "zero"},
+            "`start` to be 'lad', 'lts', 's', 'least_squares' or coefficients, or None, but got 'zero'",
+        ),
+        ({"max_iter": 0}, "`max_iter` to be a whole number of at least 1 but got 0"),
         ({"tol": 0.0}, r"`tol` to be in \(0, 1\) but got 0.0"),
         ({"tuning": -1.0}, "`tuning` of 'huber' to be one positive number but got -1.0"),
     ],

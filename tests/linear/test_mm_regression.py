@@ -98,10 +98,10 @@ def test_an_exact_fit_is_found_beside_forty_per_cent_outliers():
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"efficiency": 1.0}, "`efficiency` between 0.3 and 0.99 but got 1.0"),
-        ({"breakdown": 0.6}, "`breakdown` between 0.01 and 0.5 but got 0.6"),
+        ({"efficiency": 1.0}, r"`efficiency` to be in \[0\.3, 0\.99\] but got 1\.0"),
+        ({"breakdown": 0.6}, r"`breakdown` to be in \[0\.01, 0\.5\] but got 0\.6"),
         ({"starts": 2.5}, "`starts` to be a whole number of at least 1 but got 2.5"),
-        ({"max_iter": 0}, "`max_iter` to be >= 1 but got 0"),
+        ({"max_iter": 0}, "`max_iter` to be a whole number of at least 1 but got 0"),
         ({"tol": 2.0}, r"`tol` to be in \(0, 1\) but got 2.0"),
     ],
 )

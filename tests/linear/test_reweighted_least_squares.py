@@ -92,7 +92,7 @@ def test_the_gradient_is_that_of_least_squares_on_what_counts():
     ("kwargs", "message"),
     [
         ({"start": "ols"}, "`start` to be 'lts', 'lms', 's' or an estimator but got 'ols'"),
-        ({"threshold": 0.5}, "`threshold` of at least 1 scale but got 0.5"),
+        ({"threshold": 0.5}, r"`threshold` to be in \[1, inf\) but got 0\.5"),
         ({"starts": 0}, "`starts` to be a whole number of at least 1 but got 0"),
     ],
 )

@@ -144,5 +144,17 @@ def test_tables_that_do_not_meet():
         Paired(Recording({"y": times()}))
     with pytest.raises(ValueError, match="`rate` to be positive and finite but got 0"):
         Paired(simulator(), rate=0.0)
+    with pytest.raises(ValueError, match="`offset` to be positive and finite but got -1"):
+        Paired(simulator(), offset=-1)
+    with pytest.raises(TypeError, match="`offset` to be a number positive and finite but got 'a'"):
+        Paired(simulator(), offset="a")
+    with pytest.raises(TypeError, match=r"`simulated` to be a Recording but got 'SIM\.csv'; read it, Recording\.read"):
+        Paired("SIM.csv")
+    with pytest.raises(TypeError, match=r"`recording` to be a Recording but got 'REC\.csv'; read it, Recording\.read"):
+        Paired(simulator()).prepare("REC.csv")
+    with pytest.raises(TypeError, match=r"`outputs` to be a tuple of names of columns but got 'y'; write \('y',\)"):
+        Paired(simulator(), outputs="y")
+    with pytest.raises(ValueError, match="`outputs` to name a column but got none; None takes all in common"):
+        Paired(simulator(), outputs=())
     with pytest.raises(SimulationError, match="run of one moment"):
         Paired(Recording({"time": torch.zeros(1), "y": torch.zeros(1)})).prepare(recorded(signal(times())))

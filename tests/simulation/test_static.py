@@ -1,4 +1,5 @@
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -130,3 +131,54 @@ def test_modules_that_cannot_be_used():
         Static(outputs=("voltage",)).prepare(recording())
     with pytest.raises(MissingColumnError, match="temperature"):
         Thermistor().prepare(Recording({"voltage": torch.ones(5)}))
+    with pytest.raises(
+        SimulationError, match=r"Linear: the module fails on inputs of shape \(300, 2\), a column for each"
+    ):
+        Static(torch.nn.Linear(1, 1), inputs=("temperature", "current"), outputs=("voltage",)).prepare(recording())
+    with pytest.raises(SimulationError, match="Linear names the column `temperature` twice"):
+        Static(torch.nn.Linear(2, 1), inputs=("temperature", "temperature"), outputs=("voltage",)).prepare(recording())
+
+
+@pytest.mark.parametrize(
+    ("module", "got"),
+    [
+        ("line", "'line'; derive from Static"),
+        (lambda x: x, "a function; derive from Static, with an `output`, for a function"),
+        (torch.nn.Linear, r"the class Linear; make one, Linear\(\.\.\.\)"),
+    ],
+)
+def test_what_is_no_module_is_refused(module, got):
+    with pytest.raises(TypeError, match=rf"`module` to be a torch\.nn\.Module but got {got}"):
+        Static(module, inputs=("temperature",), outputs=("voltage",))
+
+
+def test_a_text_in_place_of_names_is_refused_and_not_taken_by_its_letters():
+    line = torch.nn.Linear(1, 1)
+    with pytest.raises(TypeError, match=r"`inputs` to be a tuple of names of columns but got 'ab'; write \('ab',\)"):
+        Static(line, inputs="ab", outputs=("voltage",))
+    with pytest.raises(TypeError, match=r"`outputs` to be a tuple of names of columns but got 'voltage'; write"):
+        Static(line, inputs=("temperature",), outputs="voltage")
+    with pytest.raises(TypeError, match=r"`inputs` to be a tuple of names of columns but got \(3,\)"):
+        Static(line, inputs=(3,), outputs=("voltage",))
+
+    class Letters(Thermistor):
+        inputs = "temperature"
+
+    with pytest.raises(TypeError, match=r"but got 'temperature'; write \('temperature',\)"):
+        Letters()
+    with pytest.raises(TypeError, match="`name` to be text but got 3"):
+        Static(line, inputs=("temperature",), outputs=("voltage",), name=3)
+
+
+@pytest.mark.parametrize(
+    ("value", "mend"),
+    [
+        ("NEW.csv", r"read it, Recording\.read\('NEW\.csv'\)"),
+        (Path("NEW.csv"), r"read it, Recording\.read\('NEW\.csv'\)"),
+        ({"time": torch.ones(3)}, r"make one, Recording\(\{'time': \.\.\., \.\.\.\}\)"),
+        (Recording, r"make one, Recording\(\.\.\.\)"),
+    ],
+)
+def test_what_is_no_recording_is_told_how_to_become_one(value, mend):
+    with pytest.raises(TypeError, match=f"`recording` to be a Recording but got .*; {mend}"):
+        Thermistor().prepare(value)

@@ -1,0 +1,319 @@
+"""Arguments that are refused: what was expected, what came, and what to do about it.
+
+Types and shapes are always looked at. Values of tensors are looked at where that does not have to wait for an
+accelerator and where there is one value to look at: not in compiled code, nor under ``vmap``. There, what is out of
+range goes through the formulas, and a NaN comes out as NaN.
+"""
+
+from __future__ import annotations
+
+import math
+import numbers
+import reprlib
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = [
+    "DIVERGED",
+    "as_numbers",
+    "checked_number",
+    "checked_whole",
+    "first_of",
+    "refuse_bad_batch",
+    "refuse_bad_weight",
+    "refuse_complex",
+    "refuse_no_tensor",
+    "refuse_not_finite",
+    "refuse_not_real",
+    "refuse_other_type",
+    "refuse_out_of_range",
+    "refuse_text",
+    "seems_finite",
+    "told",
+]
+
+
+DIVERGED = "The network has diverged, or what it was given holds NaN: lower the learning rate, or look at its inputs"
+"""What to do about predictions that are not finite."""
+
+
+def told(value: object) -> str:
+    """What a value is, as an error tells it: classes and what has no text by their names, long values shortened."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    text, kind = reprlib.repr(value), type(value).__name__
+    if not text.startswith("<"):
+        return text
+    return f"an {kind}" if kind[0] in "AEIOUaeiou" else f"a {kind}"
+
+
+def refuse_other_type(name: str, value: object, kind: type, what: str, advice: str) -> None:
+    """Refuse what is no instance of a class; the class itself is told to be made one.
+
+    Args:
+        name: of the argument.
+        value: of the argument.
+        kind: the class.
+        what: is wanted, "a Recording" say.
+        advice: how to get one.
+
+    Raises:
+        TypeError: it is none.
+    """
+    if not isinstance(value, kind):
+        if isinstance(value, type) and issubclass(value, kind):
+            advice = f"make one, {value.__name__}(...)"
+        raise TypeError(f"Expected argument `{name}` to be {what} but got {told(value)}; {advice}.")
+
+
+def refuse_no_tensor(name: str, value: object, kind: str) -> None:
+    """Refuse data that are no tensor, and say how to make one.
+
+    Args:
+        name: of the argument.
+        value: of the argument.
+        kind: what is wanted, "a real tensor" say.
+
+    Raises:
+        TypeError: an array, a list, a number, or something else.
+    """
+    if isinstance(value, Tensor):
+        return
+    array = isinstance(value, (list, tuple, int, float)) or hasattr(value, "__array__")
+    advice = f"make a tensor of it, torch.as_tensor({name})" if array else "pass a tensor"
+    raise TypeError(f"Expected argument `{name}` to be {kind} but got {type(value).__name__}; {advice}.")
+
+
+def refuse_complex(name: str, value: Tensor) -> None:
+    """Refuse complex numbers.
+
+    Raises:
+        TypeError: they are.
+    """
+    if value.is_complex():
+        raise TypeError(f"Expected argument `{name}` to be real but got {value.dtype}; pass its real part.")
+
+
+def refuse_not_real(name: str, value: object, kind: str = "a real floating-point tensor") -> None:
+    """Refuse data that are no tensor of real floating-point numbers, and say how to make one.
+
+    Raises:
+        TypeError: integers, complex numbers, or no tensor.
+    """
+    refuse_no_tensor(name, value, kind)
+    if isinstance(value, Tensor) and not value.is_floating_point():
+        advice = "pass real and imaginary parts as channels"
+        if not value.is_complex():
+            advice = f"convert it, {name}.float() or {name}.double()"
+        raise TypeError(f"Expected argument `{name}` to be {kind} but got {value.dtype}; {advice}.")
+
+
+def as_numbers(
+    name: str, value: object, dtype: torch.dtype | None = None, device: torch.device | None = None
+) -> Tensor:
+    """A parameter as a tensor: one already, a number, or a sequence of numbers, which get ``dtype``.
+
+    Raises:
+        TypeError: it is none of these, or complex.
+    """
+    if not isinstance(value, Tensor):
+        try:
+            return torch.as_tensor(value, dtype=dtype or torch.get_default_dtype(), device=device)
+        except (TypeError, ValueError, RuntimeError, OverflowError):
+            raise TypeError(
+                f"Expected argument `{name}` to be a number, or a tensor of them, but got {told(value)}."
+            ) from None
+    refuse_complex(name, value)
+    return value
+
+
+def refuse_out_of_range(
+    name: str, value: object, low: float = 0.0, high: float = math.inf, ends: str = "()", advice: str = ""
+) -> None:
+    """Refuse a number, or a tensor or sequence of numbers, that is not all in a range.
+
+    Args:
+        name: of the argument.
+        value: numbers always; those of a tensor where they can be looked at.
+        low, high: ends of the range.
+        ends: "(" or "[" and ")" or "]": whether the ends themselves are in it.
+        advice: what to do.
+
+    Raises:
+        TypeError: it is no number.
+        ValueError: it is out of range, or NaN.
+    """
+    if isinstance(value, (int, float)):
+        least, most = value, value
+    else:
+        value = as_numbers(name, value)
+        seen = _extremes(value)
+        if seen is None:
+            return
+        least, most = seen
+    # written so that NaN fails
+    if (low <= least if ends[0] == "[" else low < least) and (most <= high if ends[1] == "]" else most < high):
+        return
+    got = f"{value}"
+    if isinstance(value, Tensor):
+        right = ((value >= low) if ends[0] == "[" else (value > low)) & (
+            (value <= high) if ends[1] == "]" else (value < high)
+        )
+        got = first_of(value.detach(), ~right)
+    raise ValueError(f"Expected argument `{name}` to be {_range(low, high, ends)} but got {got}{_then(advice)}.")
+
+
+def checked_number(
+    name: str, value: object, low: float = 0.0, high: float = math.inf, ends: str = "()", advice: str = ""
+) -> float:
+    """``value``, one number in a range as :func:`refuse_out_of_range` takes it.
+
+    Raises:
+        TypeError: it is no number.
+        ValueError: it is out of range, or NaN.
+    """
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        raise TypeError(
+            f"Expected argument `{name}` to be a number {_range(low, high, ends)} but got {told(value)}{_then(advice)}."
+        )
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number of hundreds of digits
+        number = math.inf
+    refuse_out_of_range(name, number, low, high, ends, advice)
+    return number
+
+
+def checked_whole(name: str, value: object, least: int | None = None, advice: str = "") -> int:
+    """``value``, a whole number of at least ``least``.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    number = None if isinstance(value, bool) or not isinstance(value, numbers.Integral) else int(value)
+    if number is None or (least is not None and number < least):
+        limit = "" if least is None else f" of at least {least}"
+        raise ValueError(
+            f"Expected argument `{name}` to be a whole number{limit} but got {told(value)}{_then(advice)}."
+        )
+    return number
+
+
+def refuse_text(name: str, value: object, what: str) -> None:
+    """Refuse text where a sequence of names is wanted, for its letters would be the names.
+
+    Raises:
+        TypeError: text, or what is no sequence of texts.
+    """
+    if isinstance(value, str):
+        raise TypeError(f"Expected argument `{name}` to be {what} but got {value!r}; write ({value!r},).")
+    if not isinstance(value, (tuple, list)) or not all(isinstance(one, str) for one in value):
+        raise TypeError(f"Expected argument `{name}` to be {what} but got {told(value)}.")
+
+
+def refuse_bad_weight(weight: object, name: str = "weight") -> None:
+    """Refuse weights that are no tensor of real numbers, negative, NaN or infinite; a boolean mask is welcome.
+
+    Raises:
+        TypeError: no tensor, or complex.
+        ValueError: a weight is negative or not finite.
+    """
+    refuse_no_tensor(name, weight, "a tensor of weights or a boolean mask")
+    assert isinstance(weight, Tensor)
+    refuse_complex(name, weight)
+    if weight.dtype == torch.bool:
+        return
+    seen = _extremes(weight)
+    if seen is None or (seen[0] >= 0.0 and seen[1] < math.inf):
+        return
+    weight = weight.detach()
+    wrong = ~((weight >= 0) & (weight < math.inf))
+    raise ValueError(
+        f"Expected argument `{name}` to be >= 0 and finite but got {first_of(weight, wrong)} ({int(wrong.sum())} such "
+        "values); what is not to count has the weight 0 or False."
+    )
+
+
+def seems_finite(*values: Tensor) -> bool:
+    """Whether no element is NaN or infinite; True where that cannot be seen, False where only a sum overflows."""
+    if torch.compiler.is_compiling() or any(value.device.type != "cpu" for value in values):
+        return True
+    try:
+        # a sum takes a fraction of the time that a look at each element takes
+        totals = [value.detach().sum().item() for value in values]
+    except RuntimeError:  # under vmap there is no one value
+        return True
+    return all(map(math.isfinite, totals))
+
+
+def refuse_not_finite(
+    name: str, value: Float[Tensor, "*shape"], advice: str, counts: Bool[Tensor, "*shape"] | None = None
+) -> None:
+    """Refuse a tensor with an element that counts and is NaN or infinite; by looking at each.
+
+    Raises:
+        ValueError: there is one.
+    """
+    wrong = ~torch.isfinite(value.detach())
+    if counts is not None:
+        wrong = wrong & counts
+    if bool(wrong.any()):
+        raise ValueError(
+            f"Expected argument `{name}` to be finite but got {int(wrong.sum())} values that are not, the first at "
+            f"index {tuple(wrong.nonzero()[0].tolist())}. {advice}."
+        )
+
+
+def refuse_bad_batch(
+    input: Float[Tensor, "*shape"],
+    target: Float[Tensor, "*shape"],
+    counts: Bool[Tensor, "*shape"] | None = None,
+    error: Float[Tensor, "*shape"] | None = None,
+) -> None:
+    """Refuse predictions and targets that count and are NaN or infinite, where that can be seen.
+
+    Args:
+        input, target: predictions and targets, in float32 at least.
+        counts: which elements count; None if all do.
+        error: their difference with 0 in place of what does not count, where it is laid out: one look does then.
+
+    Raises:
+        ValueError: a target or a prediction is not finite.
+    """
+    if seems_finite(*((input, target) if error is None else (error,))):
+        return
+    refuse_not_finite("target", target, "Leave them out: loss(input, target, weight=torch.isfinite(target))", counts)
+    refuse_not_finite("input", input, DIVERGED, counts)
+
+
+def _extremes(value: Tensor) -> tuple[float, float] | None:
+    """Least and greatest element, NaN if there is one; None where they cannot be looked at, or there is none."""
+    if torch.compiler.is_compiling() or value.device.type != "cpu" or value.numel() == 0:
+        return None
+    least, most = torch.aminmax(value.detach())
+    try:
+        return least.item(), most.item()
+    except RuntimeError:  # under vmap there is no one value
+        return None
+
+
+def first_of(value: Tensor, wrong: Tensor) -> str:
+    """The first element that is wrong, as an error tells it."""
+    index = tuple(wrong.nonzero()[0].tolist())
+    return f"{value[index].item():.6g}" + (f" at index {index}" if index else "")
+
+
+def _range(low: float, high: float, ends: str) -> str:
+    if low == 0.0 and high == math.inf:
+        sign = "positive" if ends[0] == "(" else ">= 0"
+        return sign if ends[1] == "]" else f"{sign} and finite"
+    return f"in {ends[0]}{low:.4g}, {high:.4g}{ends[1]}"
+
+
+def _then(advice: str) -> str:
+    return f"; {advice}" if advice else ""
