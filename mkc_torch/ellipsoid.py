@@ -21,7 +21,7 @@ from mkc_torch.linear import MKCRegression, RankDeficientError
 from mkc_torch.linear._estimator import Fitted, LinearEstimator
 from mkc_torch.nonlinear import NonlinearFit
 from mkc_torch.nonlinear import fit as nonlinear_fit
-from mkc_torch.order_statistic import order_statistic
+from mkc_torch.order_statistic import order_statistic, robust_scale
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -32,6 +32,10 @@ MIN_INFORMATION = 0.003
 
 MAX_STANDARD_ERROR = 0.05
 """Largest standard error of the centre or a semi-axis, as a share of the radius, that identifies an ellipsoid."""
+
+MAX_SCATTER = 0.2
+"""Largest scatter of the points about the surface, as a share of its shortest semi-axis: the square of it is the bias
+of the fit. A ball of noise scatters by half."""
 
 _EXACT = 1e4
 """Roundings by which a point may be off a surface that it is on."""
@@ -129,6 +133,11 @@ def sampson_distance(theta: Float[Tensor, " 9"], points: Float[Tensor, "N 3"]) -
     """
     root = theta[3:][list(_SYMMETRIC)].unflatten(-1, (3, 3))
     y = (points - theta[:3]) @ root
+    return _distance(y, root)
+
+
+def _distance(y: Float[Tensor, "*batch N 3"], root: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch N"]:
+    """The same from y and the symmetric L."""
     # keeps a point at the very centre finite
     tiny = torch.finfo(y.dtype).eps ** 2
     norm = (y.square().sum(-1) + tiny).sqrt()
@@ -209,8 +218,8 @@ class EllipsoidFit(Fitted):
         Raises:
             TypeError: not a floating tensor.
             ValueError: wrong shape, too few or non-finite points.
-            NotIdentifiableError: the points lie on a plane or cover too few directions; the message names those that
-                are missing.
+            NotIdentifiableError: the points lie on a plane, cover too few directions (the message names those that are
+                missing), or draw no surface: they scatter about it by more than a fifth of its shortest semi-axis.
         """
         self._forget()
         points, weight = _prepared(points, sample_weight)
@@ -260,6 +269,7 @@ class EllipsoidFit(Fitted):
         if covariance is not None:
             self._standard_errors(local, scale, parameters, covariance, ellipsoid_of)
         self._refuse_uncovered(self.calibrate(points), weight)
+        self._refuse_scattered(self.calibrate(points), weight)
 
     def _finished(self, local: Ellipsoid, points: Tensor, scale: Tensor, weight: Tensor | None) -> NonlinearFit:
         """The maximum of the likelihood of the distances that is nearest to an ellipsoid, all in local coordinates."""
@@ -355,13 +365,27 @@ class EllipsoidFit(Fitted):
                     directions[index],
                 )
             if largest is not None and MAX_STANDARD_ERROR < float(largest[index]) < math.inf:
-                radius = float(self.radius_.reshape(-1)[index])
                 raise _refusal(
                     f"{where}Not identifiable: the centre or a semi-axis has a standard error of "
-                    f"{float(largest[index]) * radius:.3g}, more than {MAX_STANDARD_ERROR:.0%} of the radius "
-                    f"{radius:.3g}.",
+                    f"{float(largest[index]):.0%} of the radius, more than {MAX_STANDARD_ERROR:.0%}.",
                     directions[index],
                 )
+
+    @torch.no_grad()
+    def _refuse_scattered(self, field: Tensor, weight: Tensor | None) -> None:
+        """Refuse a surface that the points do not draw: that of a ball of noise is as wide as the noise."""
+        radius = self.radius_[..., None, None]
+        distance = _distance(field / radius, self.calibration_matrix_ / radius).unsqueeze(-1)
+        used = None if weight is None else (weight > 0).to(field).unsqueeze(-1)
+        scatter = (robust_scale(distance, used) / self.semi_axes_[..., :1]).reshape(-1)
+        wide = (scatter > MAX_SCATTER).nonzero().flatten()
+        if len(wide) > 0:
+            where = f"Problem {int(wide[0])}: " if field.dim() > 2 else ""
+            raise NotIdentifiableError(
+                f"{where}Not identifiable: the points draw no surface. They scatter about the ellipsoid by "
+                f"{float(scatter[wide[0]]):.0%} of its shortest semi-axis, more than {MAX_SCATTER:.0%}, as the noise "
+                "of a sensor that hardly turns does. Turn the sensor through all directions."
+            )
 
     def _largest_standard_error(self) -> Tensor | None:
         """Of centre and semi-axes as a share of the radius, for each problem; infinite where it is unknown."""
