@@ -19,6 +19,7 @@ from mkc_torch.ellipsoid import (
     ellipsoid_from_coefficients,
 )
 from mkc_torch.functional import mkc_weight
+from mkc_torch.impossible import without_impossible
 from mkc_torch.linear import MKCRegression
 from mkc_torch.recording import Recording, RecordingError
 from mkc_torch.rest import refuse_at_rest, thin_at_rest, turning, way
@@ -40,7 +41,7 @@ _AXES = ("mag_x", "mag_y", "mag_z")
 
 
 def prepared(recording: Recording) -> Recording:
-    """The samples a calibration uses: those with a finite field, in the order of time where there is a time.
+    """The samples a calibration uses: those with a finite and possible field, in the order of time if there is a time.
 
     Raises:
         MissingColumnError: no ``mag_x``, ``mag_y`` or ``mag_z``.
@@ -63,6 +64,7 @@ def prepared(recording: Recording) -> Recording:
             f"{where}{found} too few, an ellipsoid needs at least {MIN_POINTS}; record while turning the sensor "
             f"through all directions.{' ' + reasons if reasons else ''}"
         )
+    usable = without_impossible(usable, *_AXES)
     largest = float(usable.magnetometer().abs().max())
     if largest > 1.0 / _LEAST or 0.0 < largest < _LEAST:
         where = f"{recording.name}: " if recording.name else ""
