@@ -302,7 +302,10 @@ class EllipsoidFit(Fitted):
             index = int((~bounded).nonzero()[0, 0])
             vectors = (points - _middle(points)).reshape(-1, *points.shape[-2:])[index]
             where = f"Problem {index}: " if points.dim() > 2 else ""
-            raise _refusal(f"{where}Not identifiable: the quadric that fits the points is no ellipsoid.", vectors)
+            seen = ", seen from the middle of the samples (the centre is not known, so the gaps may be wider)"
+            raise _refusal(
+                f"{where}Not identifiable: the quadric that fits the points is no ellipsoid.", vectors, seen=seen
+            )
 
     def _keep(self, points: Tensor, ellipsoid: Ellipsoid) -> None:
         self.center_ = ellipsoid.center
@@ -434,8 +437,8 @@ def _middle(points: Tensor) -> Tensor:
     return 0.5 * (points.amax(-2, keepdim=True) + points.amin(-2, keepdim=True))
 
 
-def _refusal(message: str, vectors: Tensor) -> NotIdentifiableError:
-    """The error, with the directions that are covered and advice on those that are not."""
+def _refusal(message: str, vectors: Tensor, *, seen: str = "") -> NotIdentifiableError:
+    """The error, with the directions that are covered and advice on those that are not, seen from where."""
     flat = vectors.detach().reshape(-1, 3)
     directions = flat[torch.linalg.vector_norm(flat, dim=-1) > 0]
     if len(directions) == 0:
@@ -445,7 +448,9 @@ def _refusal(message: str, vectors: Tensor) -> NotIdentifiableError:
         missing = "; ".join(str(g) for g in found.gaps)
         turn = "Turn the sensor so that the field points there too."
         message += (
-            f" Directions not covered: {missing}. {turn}" if missing else " Turn the sensor through all directions."
+            f" Directions not covered{seen}: {missing}. {turn}"
+            if missing
+            else " Turn the sensor through all directions."
         )
     return NotIdentifiableError(message, found, directions)
 

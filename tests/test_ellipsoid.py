@@ -686,6 +686,7 @@ def test_a_passing_magnet_does_not_move_the_fit():
 def test_a_flight_that_never_turns_over_is_refused_naming_what_is_missing(name):
     error = refused(recorded(name))
     assert "+z" in str(error)
+    assert ("seen from the middle of the samples" in str(error)) == ("no ellipsoid" in str(error))
     assert error.coverage is not None
 
 
