@@ -72,7 +72,17 @@ def test_calibrate_writes_both_files_and_a_summary(good, tmp_path):
     assert sorted(p.name for p in folder.iterdir()) == ["calibration.json", "report.html"]
     c = Calibration.from_json((folder / "calibration.json").read_text(encoding="utf-8"))
     assert c.center == pytest.approx((5.0, -9.0, 20.0), abs=0.3)
-    for words in ("offset", "semi-axes", "residual", "σ =", "d =", "rejected", "coverage", "report.html", "±"):
+    for words in (
+        "offset",
+        "semi-axes",
+        "residual",
+        "noise",
+        "µT along the field",
+        "rejected",
+        "coverage",
+        "report.html",
+        "±",
+    ):
         assert words in result.stdout
     assert result.stderr == ""
 
