@@ -302,7 +302,7 @@ class EllipsoidFit(Fitted):
             index = int((~bounded).nonzero()[0, 0])
             vectors = (points - _middle(points)).reshape(-1, *points.shape[-2:])[index]
             where = f"Problem {index}: " if points.dim() > 2 else ""
-            seen = ", seen from the middle of the samples (the centre is not known, so the gaps may be wider)"
+            seen = " They are seen from the middle of the samples, for the centre is not known; the gaps may be wider."
             raise _refusal(
                 f"{where}Not identifiable: the quadric that fits the points is no ellipsoid.", vectors, seen=seen
             )
@@ -438,7 +438,7 @@ def _middle(points: Tensor) -> Tensor:
 
 
 def _refusal(message: str, vectors: Tensor, *, seen: str = "") -> NotIdentifiableError:
-    """The error, with the directions that are covered and advice on those that are not, seen from where."""
+    """The error, with the directions that are covered and advice on those that are not; ``seen`` says from where."""
     flat = vectors.detach().reshape(-1, 3)
     directions = flat[torch.linalg.vector_norm(flat, dim=-1) > 0]
     if len(directions) == 0:
@@ -448,7 +448,7 @@ def _refusal(message: str, vectors: Tensor, *, seen: str = "") -> NotIdentifiabl
         missing = "; ".join(str(g) for g in found.gaps)
         turn = "Turn the sensor so that the field points there too."
         message += (
-            f" Directions not covered{seen}: {missing}. {turn}"
+            f" Directions not covered: {missing}.{seen} {turn}"
             if missing
             else " Turn the sensor through all directions."
         )
