@@ -54,7 +54,8 @@ def _console(
     terminal: bool, *, stderr: bool = False, width: int | None = None, file: io.StringIO | None = None
 ) -> Console:
     return Console(
-        file=file, stderr=stderr, highlight=False, soft_wrap=False,
+        file=file, stderr=stderr, soft_wrap=False,
+        highlight=False, markup=False, emoji=False,  # what a user wrote is printed as it is
         force_terminal=terminal, no_color=None if terminal else True,
         width=width if terminal else width or _WIDTH_IN_A_PIPE,
     )  # fmt: skip
@@ -65,7 +66,7 @@ def complain(subject: str | Path, error: BaseException) -> None:
     sentence = sentence_of(error)
     if not sentence.startswith(str(subject)):
         sentence = f"{subject}: {sentence}"
-    err().print(f"mkc: {sentence}", markup=False, soft_wrap=True)
+    err().print(f"mkc: {sentence}", soft_wrap=True)
 
 
 def sentence_of(error: BaseException) -> str:

@@ -45,9 +45,9 @@ def demo(
     show(console, calibration, files)
     console.print()
     console.print(_table(rows))
-    console.print(f"\nNext: open {files[-1]}, or", markup=False, soft_wrap=True)
+    console.print(f"\nNext: open {files[-1]}, or", soft_wrap=True)
     command = shlex.join(["mkc", "apply", str(files[1]), str(files[0]), "--output", "corrected.csv"])
-    console.print(f"  {command}", markup=False, soft_wrap=True)
+    console.print(f"  {command}", soft_wrap=True)
 
 
 def _demonstrate(folder: Path, *, force: bool) -> tuple[Calibration, list[Comparison], list[Path]]:

@@ -117,7 +117,7 @@ def _tell(outcomes: list[Outcome], step: Steps) -> None:
     with step.aside():
         for outcome in outcomes:
             if outcome.failed:
-                err().print(f"mkc: {outcome.text}", markup=False, soft_wrap=True)
+                err().print(f"mkc: {outcome.text}", soft_wrap=True)
             else:
                 typer.echo(outcome.text, nl=False)
 
