@@ -393,8 +393,16 @@ def write_table(
         name: np.array(known[name])[values.long().numpy()] if name in known else values.numpy()
         for name, values in table.columns.items()
     }
+    if _EXPERIMENT in told and _EXPERIMENT not in known:
+        told[_EXPERIMENT] = _whole(told[_EXPERIMENT])
     data = encoded(path, told)
     write_atomically(path, data, overwrite=overwrite)
+
+
+def _whole(numbers: np.ndarray) -> np.ndarray:
+    """Numbers of experiments, 1 and not 1.0, where all of them are whole."""
+    whole = np.isfinite(numbers) & (np.abs(numbers) < 2**53) & (numbers == np.round(numbers))
+    return numbers.astype(np.int64) if whole.all() else numbers
 
 
 def _check_columns(columns: Mapping[str, Tensor], name: str) -> None:

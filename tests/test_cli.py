@@ -286,6 +286,47 @@ def test_apply_does_not_overwrite_and_keeps_rows_without_values(calibrated, tmp_
     assert mkc(*command, "--force").exit_code == 0
 
 
+def test_apply_never_overwrites_what_it_reads(calibrated, tmp_path):
+    folder, _ = calibrated
+    recording, model = tmp_path / "mine.csv", tmp_path / "model.csv"
+    recording.write_bytes((folder / "recording.csv").read_bytes())
+    model.write_bytes((folder / "calibration.json").read_bytes())
+    (tmp_path / "soft.csv").symlink_to(recording)
+    (tmp_path / "hard.csv").hardlink_to(recording)
+    (tmp_path / "folder").mkdir()
+    before = recording.read_bytes(), model.read_bytes()
+    for name in ("mine.csv", "soft.csv", "hard.csv", "folder/../mine.csv", "model.csv"):
+        refused(mkc("apply", model, recording, "--output", tmp_path / name, "--force"), "never overwritten")
+    assert (recording.read_bytes(), model.read_bytes()) == before
+    assert (tmp_path / "soft.csv").is_symlink()
+
+
+def test_apply_warns_of_a_recording_in_another_unit(calibrated, tmp_path):
+    folder, _ = calibrated
+    mine = Recording.read(folder / "recording.csv")
+    other = table(tmp_path / "other.csv", 1e3 * mine.magnetometer())
+    result = mkc("apply", folder / "calibration.json", other, "--output", tmp_path / "o.csv")
+    assert result.exit_code == 0
+    assert "times the 48.2 µT of the recording that this was made from" in result.stdout
+    assert "another unit" in result.stdout
+    result = mkc("apply", folder / "calibration.json", folder / "recording.csv", "--output", tmp_path / "p.csv")
+    assert "warning" not in result.stdout
+    assert "median length 48.2" in result.stdout
+
+
+def test_what_a_user_wrote_is_printed_as_it_is(calibrated, tmp_path):
+    """Rich would make a cross of :X: and bold of [b]."""
+    odd = tmp_path / "no:X:[b]file.csv"
+    result = mkc("apply", calibrated[0] / "calibration.json", odd, "--output", tmp_path / "o.csv")
+    assert result.stderr == f"mkc: {odd}: there is no such file.\n"
+    path = table(odd, noisy_ellipsoid(300))
+    result = mkc("calibrate", path, "--output", tmp_path / "out", "--unit", ":X:[b]")
+    assert result.exit_code == 0
+    assert "no:X:[b]file\n" in result.stdout
+    assert "± SE, :X:[b] " in result.stdout
+    assert str(tmp_path / "out" / "no:X:[b]file" / "report.html") in result.stdout
+
+
 def test_apply_refuses_what_it_cannot_use(calibrated, tmp_path):
     folder, _ = calibrated
     c, rec, out = folder / "calibration.json", folder / "recording.csv", ("--output", tmp_path / "o.csv")

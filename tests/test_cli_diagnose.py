@@ -129,6 +129,22 @@ def test_the_model_corrects_a_second_recording(stepped, tmp_path):
     assert float(length.std() / length.mean()) < 0.01
     model = DiagnosedModel.from_json((folder / "model.json").read_text(encoding="utf-8"))
     assert torch.equal(corrected["field_x"], model(Recording.read(new))["field_x"])
+    assert f"median length {float(length.median()):.5g} µT: {output}" in result.stdout
+    assert "warning" not in result.stdout
+
+
+def test_the_model_knows_the_unit_and_the_length_of_its_field(stepped, tmp_path):
+    _, folder, _ = stepped
+    new = sensor(7, step=1.0, start=100.0)
+    other = table(tmp_path / "other.csv", {n: 1e3 * v if n.startswith("mag_") else v for n, v in new.items()})
+    result = mkc("apply", folder / "model.json", other, "--output", tmp_path / "corrected.csv")
+    assert " µT of the recording that this was made from: is this one in another unit" in result.stdout
+    content = json.loads((folder / "model.json").read_text(encoding="utf-8"))
+    del content["state"]["unit"], content["state"]["strength"]  # of an earlier version
+    (tmp_path / "old.json").write_text(json.dumps(content), encoding="utf-8")
+    result = mkc("apply", tmp_path / "old.json", other, "--output", tmp_path / "old.csv")
+    assert result.exit_code == 0
+    assert "warning" not in result.stdout
 
 
 def test_apply_tells_models_from_other_files(stepped, tmp_path):

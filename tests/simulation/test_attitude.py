@@ -129,7 +129,7 @@ def test_ports(view):
     assert view.ports["sensor"].channels == ("x", "y", "z")
     assert all(port.pointwise for port in view.ports.values())
     assert view.ports["sensor"].wanders
-    assert view.state == {"view": "attitude"}
+    assert view.state == {"view": "attitude", "unit": "µT", "strength": view.strength}
 
 
 def test_a_turn_about_one_axis_determines_no_offset_along_it():

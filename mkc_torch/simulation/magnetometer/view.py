@@ -53,8 +53,12 @@ class View:
         self.unit = recording.units["mag_x"]
         refuse_at_rest(self.measured, turns, self.unit)
         self.thin = thin_at_rest(self.measured)
-        self.state = {"view": self.view}
         self.warnings = _rests(turns)
+
+    @property
+    def state(self) -> dict[str, str | float]:
+        """What a model needs on another recording, and what the corrected field's length was here, in which unit."""
+        return {"view": self.view, "unit": self.unit, "strength": self.strength}
 
     @cached_property
     def time(self) -> Float[Tensor, " N"]:
