@@ -23,6 +23,7 @@ from mkc_torch.table_files import (
     counted,
     encoded,
     listed,
+    missing_warning,
     numbered,
     read_table,
     renamed,
@@ -105,9 +106,10 @@ class Recording:
     def read(cls, path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Recording:
         """Read a table from a file: CSV (``.csv``, ``.tsv``, ``.txt``) or Parquet (``.parquet``).
 
-        A CSV has a header line of column names, and values separated by comma, semicolon or tab. An empty cell,
-        ``nan`` or ``NA`` becomes NaN; integers become float64. Columns of text alone that nobody asked for are
-        left out, which ``warnings`` tells; in the column ``experiment`` text is numbered, and ``labels`` has it.
+        A CSV has a header line of column names, and values separated by comma, semicolon or tab. An empty cell and
+        ``nan`` become NaN; so do ``NA``, ``n/a`` and ``null``, of which ``warnings`` tells. Integers become float64.
+        Columns of text alone that nobody asked for are left out, which ``warnings`` tells; in the column ``experiment``
+        text is numbered, and ``labels`` has it.
 
         Args:
             path: the file.
@@ -140,6 +142,8 @@ class Recording:
                     continue
                 else:
                     raise text_error(path, table, name, series, int(bad.arg_max()))
+            elif told := missing_warning(table, name, series):
+                warnings.append(told)
             values[name] = torch.tensor(numbers.fill_null(math.nan).to_numpy())
         if not values:
             known = ", ".join(SEPARATORS.values())

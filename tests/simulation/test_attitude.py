@@ -7,6 +7,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from mkc_torch import NotIdentifiableError
+from mkc_torch.recording import RecordingError
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import FIELD, OFFSET, changed, full_truth, true_matrix, tumbling, turns
 
@@ -142,7 +143,13 @@ def test_quaternions_of_length_zero_are_left_out():
     waiting = (torch.arange(500) >= 20).double()
     view = Magnetometer().prepare(changed(recording, **{f"q_{a}": waiting * recording[f"q_{a}"] for a in "wxyz"}))
     assert len(view.time) == 480
-    assert any("20 of 500" in warning for warning in (*view.warnings, *view.recording.warnings))
+    assert any("20 of 500 samples whose quaternion is zero" in warning for warning in view.recording.warnings)
+
+
+def test_a_recording_of_nothing_but_zero_quaternions_is_refused_as_such():
+    recording = changed(tumbling(500, attitude=True), **{f"q_{a}": torch.zeros(500) for a in "wxyz"})
+    with pytest.raises(RecordingError, match="tumbling: all quaternions q_w, q_x, q_y, q_z are zero"):
+        Magnetometer().prepare(recording)
 
 
 def test_a_vehicle_that_hardly_tilts_is_warned_of():
