@@ -12,7 +12,7 @@ import torch
 import typer
 
 from mkc_torch import calibration_file
-from mkc_torch._commands.console import FAILURES, complain, out, parsed_columns
+from mkc_torch._commands.console import FAILURES, complain, interrupts_told, out, parsed_columns
 from mkc_torch._commands.diagnosis_files import SIMULATIONS, named_simulation, paired_simulation
 from mkc_torch.calibration import Calibration
 from mkc_torch.diagnosis import DiagnosedModel, diagnosed_model, diagnosis_file
@@ -72,11 +72,12 @@ def apply(
         known = read_correction(model, own)
         subject = output
         _refuse_input(output, recording, model, simulated)
-        subject = recording
-        table = Recording.read(recording, columns=names)
-        corrected = correct(known, table)
-        subject = output
-        write_table(output, corrected.columns, labels=table.labels, overwrite=force)
+        with interrupts_told(lambda: f"nothing was written to {output}."):
+            subject = recording
+            table = Recording.read(recording, columns=names)
+            corrected = correct(known, table)
+            subject = output
+            write_table(output, corrected.columns, labels=table.labels, overwrite=force)
     except Exception as error:
         told = raised_in(simulation, error) if simulation and simulation not in SIMULATIONS else None
         if told is None and not isinstance(error, FAILURES):

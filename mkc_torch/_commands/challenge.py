@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mkc_torch._commands.apply import correct, read_correction
-from mkc_torch._commands.console import FAILURES, Look, complain, out, progress
+from mkc_torch._commands.console import FAILURES, Look, complain, interrupts_told, out, progress
 from mkc_torch._commands.diagnosis_files import Request, diagnose_file, named_simulation
 from mkc_torch._forked import allow_copies
 from mkc_torch._processes import cores, keep_memory, one_thread
@@ -78,7 +78,7 @@ def challenge(
     keep_memory()
     allow_copies(0)  # the workers are as many processes as was asked for
     try:
-        with progress(cases + empty) as step:
+        with interrupts_told(lambda: f"what was done so far is in {output}."), progress(cases + empty) as step:
             score = run.run_challenge(
                 diagnose, correct_one, subject=subject, cases=cases, empty=empty, seed=seed, output=output,
                 overwrite=force, workers=min(workers or cores(), cases + empty), progress=step.count,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -179,6 +179,31 @@ def progress(total: int) -> Iterator[Steps]:
     parts = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*parts, console=console, transient=True, redirect_stdout=False, redirect_stderr=False) as bar:
         yield Steps(bar, total)
+
+
+@contextmanager
+def interrupts_told(left: Callable[[], str]) -> Iterator[None]:
+    """One line on standard error when the user interrupts, with what ``left`` says of what there is and is not."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        err().print(f"mkc: interrupted; {left()}", soft_wrap=True)
+        raise
+
+
+def not_written(recordings: Iterable[Path], output: Path) -> str:
+    """Which recordings were not begun or left nothing behind, and for which something is there.
+
+    Example:
+        >>> not_written([Path("a.csv"), Path("b.csv")], Path("results"))
+        'nothing was written for a.csv, b.csv.'
+    """
+    paths = list(recordings)
+    there = [path for path in paths if (output / path.stem).is_dir()]
+    absent = ", ".join(str(path) for path in paths if path not in there)
+    told = [f"nothing was written for {absent}"] if absent else []
+    told += [f"{', '.join(str(output / path.stem) for path in there)} may be incomplete"] if there else []
+    return f"{'; '.join(told)}." if told else "all was written."
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from mkc_torch._commands.console import FAILURES, complain, folder_removed_on_failure, out
+from mkc_torch._commands.console import FAILURES, complain, folder_removed_on_failure, interrupts_told, out
 from mkc_torch._commands.summary import show
 from mkc_torch._files import claim_folder, write_atomically
 from mkc_torch.calibration import Calibration, Vector, calibrate
@@ -35,7 +35,7 @@ def demo(
     """Calibrate an embedded SIMULATED sensor and compare the result with the truth; needs no file."""
     try:
         claim_folder(output, overwrite=force)
-        with folder_removed_on_failure(output):
+        with interrupts_told(lambda: _written(output)), folder_removed_on_failure(output):
             calibration, rows, files = _demonstrate(output, force=force)
     except FAILURES as error:
         complain(output, error)
@@ -48,6 +48,11 @@ def demo(
     console.print(f"\nNext: open {files[-1]}, or", soft_wrap=True)
     command = shlex.join(["mkc", "apply", str(files[1]), str(files[0]), "--output", "corrected.csv"])
     console.print(f"  {command}", soft_wrap=True)
+
+
+def _written(output: Path) -> str:
+    """What an interrupt left."""
+    return f"{output} may be incomplete." if output.is_dir() else f"nothing was written to {output}."
 
 
 def _demonstrate(folder: Path, *, force: bool) -> tuple[Calibration, list[Comparison], list[Path]]:

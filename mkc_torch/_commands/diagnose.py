@@ -17,6 +17,8 @@ from mkc_torch._commands.console import (
     Steps,
     complain,
     err,
+    interrupts_told,
+    not_written,
     out,
     parsed_columns,
     progress,
@@ -88,14 +90,19 @@ def diagnose(
     keep_memory()
     look = Look.of(out())
     work = partial(_diagnosed, output, request, look)
-    total = failed = 0
-    with progress(len(recordings)) as step, in_processes(work, recordings) as results:
+    total, failed, left = 0, 0, list(recordings)
+    with (
+        interrupts_told(lambda: not_written(left, output)),
+        progress(len(recordings)) as step,
+        in_processes(work, recordings) as results,
+    ):
         for path, result in zip(recordings, results, strict=True):
             step(path.name)
             outcomes = _waited_for(result, path)
             _tell(outcomes, step)
             total += len(outcomes)
             failed += sum(outcome.failed for outcome in outcomes)
+            left.remove(path)
             step(None)
     if total > 1 and failed:
         err().print(f"mkc: {failed} of {total} recordings were not diagnosed.", soft_wrap=True)
