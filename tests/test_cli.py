@@ -112,6 +112,14 @@ def test_existing_results_are_kept_without_force(good, tmp_path):
     assert (tmp_path / "good" / "calibration.json").read_bytes() != before
 
 
+@pytest.mark.parametrize("name", ["report.html", "calibration.json"])
+def test_force_replaces_no_file_of_the_users_own(good, tmp_path, name):
+    (tmp_path / "good").mkdir()
+    (tmp_path / "good" / name).write_text("mine")
+    refused(mkc("calibrate", good, "--output", tmp_path, "--force"), name, "not written by mkc")
+    assert (tmp_path / "good" / name).read_text() == "mine"
+
+
 def test_two_recordings_of_one_name_are_refused_before_any_work(good, tmp_path):
     (tmp_path / "more").mkdir()
     twin = table(tmp_path / "more" / "good.csv", noisy_ellipsoid(100))
@@ -242,7 +250,7 @@ def test_not_identifiable_writes_a_report_and_no_calibration(tmp_path):
     path = shared_data("magnetometer/quadrotor_compass1.csv")
     folder = tmp_path / "quadrotor_compass1"
     folder.mkdir()
-    (folder / "calibration.json").write_text("of an earlier run")
+    (folder / "calibration.json").write_text('{"schema": "mkc-calibration/1"}')
     result = mkc("calibrate", path, "--output", tmp_path, "--force")
     refused(result, "Not identifiable", "+z", "report.html")
     assert [p.name for p in folder.iterdir()] == ["report.html"]

@@ -178,6 +178,9 @@ def test_force_replaces_results_and_keeps_other_files(tmp_path):
     folder.mkdir()
     for name in (*WRITTEN, "notes.txt"):
         (folder / name).write_text("mine")
+    refused(diagnosed(path, "--output", tmp_path, "--force"), "not written by mkc")
+    for name in WRITTEN:
+        (folder / name).write_text('{"schema": "mkc-diagnosis/1"} Made by mkc_torch')
     assert diagnosed(path, "--output", tmp_path, "--force").exit_code == 0
     assert sorted(p.name for p in folder.iterdir()) == sorted((*WRITTEN, "notes.txt"))
     assert (folder / "notes.txt").read_text() == "mine"

@@ -80,8 +80,8 @@ def calibrate_into(
     """Write calibration.json and report.html of a recording; where it is refused, the report alone says why."""
     from mkc_torch.report import calibration_report, refusal_report
 
-    claim_folder(folder, overwrite=force)
     report, result = folder / "report.html", folder / "calibration.json"
+    claim_folder(folder, overwrite=force, files=(report.name, result.name))
     with folder_removed_on_failure(folder):
         try:
             calibration = fit(recording, field_strength=field_strength)

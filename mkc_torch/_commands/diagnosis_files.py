@@ -41,6 +41,7 @@ SIMULATIONS = (MAGNETOMETER,)
 """Simulations that are known by name."""
 
 _EXPERIMENT = "experiment"
+_FILES = ("diagnosis.json", "model.json", "corrected.py", "report.html")
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ def diagnose_file(path: Path, folder: Path, request: Request, look: Look) -> lis
         simulation = simulation_of(request)
         if request.simulated is None and request.simulation == MAGNETOMETER:
             recording = with_unit(recording, request.unit)
-        claim_folder(folder, overwrite=request.force)
+        claim_folder(folder, overwrite=request.force, files=_FILES)
     except Exception as error:
         return [_failed(path, "", error)]
     if request.report:
@@ -148,7 +149,8 @@ def _outcome(
     path: Path, label: str, simulation: Simulation, recording: Recording, folder: Path, request: Request, look: Look
 ) -> Outcome:
     try:
-        claim_folder(folder, overwrite=request.force or not label)  # the whole folder was claimed before
+        # the whole folder was claimed before
+        claim_folder(folder, overwrite=request.force or not label, files=_FILES)
         with folder_removed_on_failure(folder):
             diagnosis = diagnose(
                 simulation, recording, level=request.level, surrogates=request.surrogates, seed=request.seed
