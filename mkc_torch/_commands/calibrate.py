@@ -56,7 +56,7 @@ def calibrate(
     console, failed, left = out(), 0, list(recordings)
     with progress(len(recordings)) as step, interrupts_told(lambda: not_written(left, output)):
         for path in recordings:
-            step(path.name)
+            step(f"calibrating {path.name}")
             try:
                 recording = with_unit(Recording.read(path, columns=names), unit)
                 calibration, files = calibrate_into(output / path.stem, recording, field_strength, force=force)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import io
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event, RLock, Thread
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from mkc_torch.recording import Recording
 from mkc_torch.simulation.load import SimulationFileError
@@ -138,7 +140,7 @@ def refuse_same_names(recordings: Sequence[Path]) -> None:
 
 
 class Steps:
-    """A bar over several things to do; without one it does nothing."""
+    """What is being done, how much of it is, and for how long; without a bar it does nothing."""
 
     def __init__(self, bar: Progress | None, total: int) -> None:
         self._bar = bar
@@ -164,21 +166,57 @@ class Steps:
         if self._bar is None:
             yield
             return
-        self._bar.stop()
-        yield
-        self._bar.start()
+        with drawing:
+            self._bar.stop()
+            yield
+            self._bar.start()
+
+
+drawing = RLock()
+"""Held while something is drawn, and while this process is forked: a copy finds none of the locks of others taken."""
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=drawing.acquire, after_in_parent=drawing.release, after_in_child=drawing.release)
+
+_EVERY = 0.2  # s
 
 
 @contextmanager
 def progress(total: int) -> Iterator[Steps]:
-    """A bar over several things on a terminal; nothing for one thing or in a pipe."""
+    """What is being done and for how long, on a terminal, with a bar over several things; nothing in a pipe."""
     console = err()
-    if total < 2 or not console.is_terminal:
+    if not console.is_terminal:
         yield Steps(None, total)
         return
-    parts = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*parts, console=console, transient=True, redirect_stdout=False, redirect_stderr=False) as bar:
+    over = (BarColumn(), MofNCompleteColumn()) if total > 1 else ()
+    parts = (SpinnerColumn(), TextColumn("{task.description}", markup=False), *over, TimeElapsedColumn())
+    with (
+        Progress(
+            *parts, console=console, transient=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False
+        ) as bar,
+        _refreshed(bar),
+    ):
         yield Steps(bar, total)
+
+
+@contextmanager
+def _refreshed(bar: Progress) -> Iterator[None]:
+    """Draws the bar anew from time to time; a thread of its own does, for the work gives it no moment."""
+    done = Event()
+
+    def draw() -> None:
+        while not done.wait(_EVERY):
+            with drawing:
+                if bar.live.is_started:
+                    bar.refresh()
+
+    thread = Thread(target=draw, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
 
 
 @contextmanager

@@ -89,15 +89,17 @@ def diagnose(
     one_thread()
     keep_memory()
     look = Look.of(out())
-    work = partial(_diagnosed, output, request, look)
     total, failed, left = 0, 0, list(recordings)
     with (
         interrupts_told(lambda: not_written(left, output)),
         progress(len(recordings)) as step,
-        in_processes(work, recordings) as results,
+        # a single one is worked on in this process, and says which experiment it is at
+        in_processes(
+            partial(_diagnosed, output, request, look, step if len(recordings) == 1 else None), recordings
+        ) as results,
     ):
         for path, result in zip(recordings, results, strict=True):
-            step(path.name)
+            step(f"diagnosing {path.name}")
             outcomes = _waited_for(result, path)
             _tell(outcomes, step)
             total += len(outcomes)
@@ -109,8 +111,8 @@ def diagnose(
     raise typer.Exit(1 if failed else 0)
 
 
-def _diagnosed(output: Path, request: Request, look: Look, path: Path) -> list[Outcome]:
-    return diagnose_file(path, output / path.stem, request, look)
+def _diagnosed(output: Path, request: Request, look: Look, step: Steps | None, path: Path) -> list[Outcome]:
+    return diagnose_file(path, output / path.stem, request, look, step)
 
 
 def _waited_for(result: Callable[[], list[Outcome]], path: Path) -> list[Outcome]:

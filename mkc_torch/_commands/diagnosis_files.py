@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -67,11 +67,13 @@ class Outcome:
     failed: bool
 
 
-def diagnose_file(path: Path, folder: Path, request: Request, look: Look) -> list[Outcome]:
+def diagnose_file(
+    path: Path, folder: Path, request: Request, look: Look, step: Callable[[str], None] | None = None
+) -> list[Outcome]:
     """Diagnose a file into a folder.
 
     Each experiment of a table that holds several is diagnosed on its own, into a folder in it, but for a simulation
-    that takes several at once. One that fails does not keep the others from being done.
+    that takes several at once. One that fails does not keep the others from being done. ``step`` is told which it is.
     """
     try:
         recording = Recording.read(path, columns=request.columns)
@@ -84,10 +86,11 @@ def diagnose_file(path: Path, folder: Path, request: Request, look: Look) -> lis
     if request.report:
         load_early("matplotlib.figure")
     with folder_removed_on_failure(folder):
-        outcomes = [
-            _outcome(path, label, simulation, part, place, request, look)
-            for label, part, place in _parts(recording, simulation, folder)
-        ]
+        parts, outcomes = list(_parts(recording, simulation, folder)), []
+        for number, (label, part, place) in enumerate(parts, start=1):
+            if step is not None and len(parts) > 1:
+                step(f"diagnosing {path.name}, experiment {label} ({number} of {len(parts)})")
+            outcomes.append(_outcome(path, label, simulation, part, place, request, look))
         if all(outcome.failed for outcome in outcomes):
             _remove_if_empty(folder)
     return outcomes
