@@ -1,8 +1,10 @@
 import json
 import os
+import re
 import subprocess
 import sys
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,7 +17,7 @@ from typer.testing import CliRunner
 from mkc_torch import _files
 from mkc_torch._commands import app
 from mkc_torch.calibration import Calibration
-from mkc_torch.demo import simulated_recording
+from mkc_torch.demo import FIELD_PER_AMPERE, simulated_recording
 from mkc_torch.recording import Recording, write_table
 from tests.shared_data import shared_data
 from tests.test_calibration import noisy_ellipsoid
@@ -352,9 +354,12 @@ def test_apply_refuses_what_it_cannot_use(calibrated, tmp_path):
     assert not (tmp_path / "o.csv").exists()
 
 
+DEMO = ["calibration.json", "concealed", "concealed.csv", "corrected.csv", "recording.csv", "report.html", "second.csv"]
+
+
 def test_demo_says_that_it_is_simulated_and_shows_the_truth(calibrated):
     folder, result = calibrated
-    assert sorted(p.name for p in folder.iterdir()) == ["calibration.json", "recording.csv", "report.html"]
+    assert sorted(p.name for p in folder.iterdir()) == DEMO
     assert "SIMULATED" in result.stdout
     for row in ("truth", "least squares", "MKC-EM"):
         assert row in result.stdout
@@ -362,10 +367,37 @@ def test_demo_says_that_it_is_simulated_and_shows_the_truth(calibrated):
     assert torch.equal(Recording.read(folder / "recording.csv").magnetometer(), simulated_recording()[0].magnetometer())
 
 
-def test_demo_refuses_an_existing_folder(calibrated):
+def test_demo_finds_what_is_concealed_and_corrects_a_second_recording(calibrated):
+    folder, result = calibrated
+    place = folder / "concealed"
+    assert sorted(p.name for p in place.iterdir()) == ["diagnosis.json", "model.json", "report.html"]
+    found = json.loads((place / "diagnosis.json").read_text(encoding="utf-8"))
+    (finding,) = found["findings"]
+    assert (finding["effect"], finding["drivers"]) == ("current_field", ["current"])
+    (parameter,) = (p for p in finding["parameters"] if p["name"] == "field_per_ampere")
+    for value, error, true in zip(parameter["value"], parameter["standard_error"], FIELD_PER_AMPERE, strict=True):
+        assert abs(value - true) < 4.0 * error < 0.2
+    assert finding["held_out"]["rmse_after"] < 0.9 * finding["held_out"]["rmse_before"]
+    assert "SIMULATED: no sensor recorded this" in (place / "report.html").read_text(encoding="utf-8")
+    assert "Left out of the simulation: current field (current)." in result.stdout
+    alone, model = (float(x) for x in re.findall(r"(?:alone|found)   +(\d\.\d\d) µT", result.stdout))
+    assert model < 0.9 * alone
+    again = mkc("apply", place / "model.json", folder / "second.csv", "--output", folder.parent / "again.csv")
+    assert again.exit_code == 0
+    assert (folder.parent / "again.csv").read_bytes() == (folder / "corrected.csv").read_bytes()
+
+
+def test_demo_refuses_an_existing_folder_and_files_of_the_users_own(calibrated, tmp_path):
     folder, _ = calibrated
     refused(mkc("demo", "--output", folder), "not empty", "--force")
     assert mkc("demo", "--output", folder, "--force").exit_code == 0
+    (tmp_path / "concealed").mkdir()
+    for name in ("second.csv", "concealed/report.html"):
+        (tmp_path / name).write_text("mine")
+        refused(mkc("demo", "--output", tmp_path, "--force"), name, "not written by mkc")
+        assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == [Path(name).name]
+        assert (tmp_path / name).read_text() == "mine"
+        (tmp_path / name).unlink()
 
 
 def test_recording_of_the_demo_calibrates_to_the_same_numbers(calibrated, tmp_path):

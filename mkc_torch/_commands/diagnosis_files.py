@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = [
     "MAGNETOMETER",
     "SIMULATIONS",
+    "WRITTEN",
     "Outcome",
     "Request",
     "diagnose_file",
@@ -41,7 +42,7 @@ SIMULATIONS = (MAGNETOMETER,)
 """Simulations that are known by name."""
 
 _EXPERIMENT = "experiment"
-_FILES = ("diagnosis.json", "model.json", "corrected.py", "report.html")
+WRITTEN = ("diagnosis.json", "model.json", "corrected.py", "report.html")
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def diagnose_file(
         simulation = simulation_of(request)
         if request.simulated is None and request.simulation == MAGNETOMETER:
             recording = with_unit(recording, request.unit)
-        claim_folder(folder, overwrite=request.force, files=_FILES)
+        claim_folder(folder, overwrite=request.force, files=WRITTEN)
     except Exception as error:
         return [_failed(path, "", error)]
     if request.report:
@@ -96,10 +97,12 @@ def diagnose_file(
     return outcomes
 
 
-def write_diagnosis(diagnosis: Diagnosis, folder: Path, *, force: bool, report: bool = True) -> list[Path]:
+def write_diagnosis(
+    diagnosis: Diagnosis, folder: Path, *, force: bool, report: bool = True, note: str = ""
+) -> list[Path]:
     """Write diagnosis.json, model.json and report.html of a diagnosis into a folder.
 
-    Of differential equations also corrected.py, the simulation with what was found.
+    Of differential equations also corrected.py, the simulation with what was found. ``note`` is said in the report.
     """
     from mkc_torch.diagnosis.diagnosis_file import diagnosis_to_json
     from mkc_torch.report import diagnosis_report
@@ -112,7 +115,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path, *, force: bool, report: 
     for name in {"model.json", "corrected.py"} - set(texts):
         (folder / name).unlink(missing_ok=True)  # an old one would be taken for this diagnosis' own
     if report:
-        texts["report.html"] = diagnosis_report(diagnosis)
+        texts["report.html"] = diagnosis_report(diagnosis, note=note)
     for name, text in texts.items():
         write_atomically(folder / name, text, overwrite=force)
     return [folder / name for name in texts]
@@ -153,7 +156,7 @@ def _outcome(
 ) -> Outcome:
     try:
         # the whole folder was claimed before
-        claim_folder(folder, overwrite=request.force or not label, files=_FILES)
+        claim_folder(folder, overwrite=request.force or not label, files=WRITTEN)
         with folder_removed_on_failure(folder):
             diagnosis = diagnose(
                 simulation, recording, level=request.level, surrogates=request.surrogates, seed=request.seed
