@@ -134,6 +134,15 @@ def test_units_other_than_microtesla():
     assert "µT per counts" in text_of(calibration_report(both, counts))
 
 
+@pytest.mark.parametrize("factor", [1e-30, 1e-6, 1e6, 1e30])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_a_recording_of_any_size_has_a_page(factor, noise):
+    huge = recorded(factor * noisy_ellipsoid(noise=noise))
+    text = text_of(calibration_report(calibrate(huge), huge))
+    assert "recorded units" in text
+    assert "nan" not in text.casefold().split()
+
+
 @pytest.mark.parametrize("count", [12, 30, 400])
 def test_small_and_exact_recordings_have_a_page(count):
     exact = recorded(noisy_ellipsoid(count, noise=0.0))
