@@ -1,6 +1,7 @@
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -385,6 +386,11 @@ def test_challenge(tmp_path):
     for words in ("Blind proof: 2 recordings, something hidden in 1", "false alarms", "asked", "holds"):
         assert words in result.stdout
     assert str(folder / "challenge.html") in result.stdout
+    flat = " ".join(result.stdout.split())
+    assert re.search(r"at most 7 % false alarms \d+\.0 % (yes|no) ", flat)
+    assert "Empty recordings, at least 400 at level 0.05 1 too few" in flat
+    assert "Too few recordings to tell (1 of at least 400 and" in flat
+    assert " % |" in (folder / "summary.md").read_text(encoding="utf-8")
     assert "failed none" in " ".join(result.stdout.split())
     record = json.loads((folder / "score.json").read_text(encoding="utf-8"))
     assert (record["settings"]["hidden"], record["settings"]["empty"], record["settings"]["seed"]) == (1, 1, 4)
