@@ -10,20 +10,13 @@ from torch import Tensor
 from mkc_torch.calibration_file import Calibration, Matrix, Spread, Vector
 from mkc_torch.coverage import Coverage
 from mkc_torch.disturbance import disturbed_intervals
-from mkc_torch.ellipsoid import (
-    MAX_SCATTER,
-    MAX_STANDARD_ERROR,
-    MIN_POINTS,
-    EllipsoidFit,
-    NotIdentifiableError,
-    ellipsoid_from_coefficients,
-)
+from mkc_torch.ellipsoid import MIN_POINTS, EllipsoidFit, ellipsoid_from_coefficients
 from mkc_torch.functional import mkc_weight
 from mkc_torch.impossible import without_impossible
 from mkc_torch.linear import MKCRegression
 from mkc_torch.order_statistic import robust_scale
+from mkc_torch.recorded_ellipsoid import recorded_ellipsoid
 from mkc_torch.recording import Recording, RecordingError
-from mkc_torch.rest import refuse_at_rest, thin_at_rest, turning, way
 from mkc_torch.units import RECORDED, field_warning, time_warning
 
 __all__ = ["Calibration", "Matrix", "Spread", "Vector", "calibrate", "prepared"]
@@ -42,9 +35,6 @@ UNUSUAL_RATIO = 1.5
 
 ENOUGH_INFORMATION = 0.1
 """Information, as a share of even coverage, at which directions that are missing do no harm."""
-
-_ERRORS = 3.0
-"""Standard errors by which two fits to the same samples may differ."""
 
 _LEAST = 1e-60
 FEW_SAMPLES = 50
@@ -117,7 +107,7 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
         raise ValueError(f"Expected argument `field_strength` to be positive but got {field_strength}.")
     usable = prepared(recording)
     points = usable.magnetometer()
-    fit = _fitted(usable, seed)
+    fit = recorded_ellipsoid(usable, seed)
     radius = float(fit.radius_)
     strength = radius if field_strength is None else field_strength
     scale = strength / radius
@@ -160,75 +150,6 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
             *_warnings(fit, found, float(rejected.double().mean())),
         ),
     )
-
-
-def _fitted(usable: Recording, seed: int) -> EllipsoidFit:
-    """The fit of a recording in the order of time, where it has a time.
-
-    Raises:
-        NotIdentifiableError: it does not determine an ellipsoid, or only by samples that stand apart.
-    """
-    points = usable.magnetometer()
-    if usable.time is None:
-        fit = EllipsoidFit(MKCRegression(covariance="sandwich", seed=seed)).fit(points)
-        _refuse_coarse(fit, points)
-        return fit
-    estimator, taken = MKCRegression(covariance="hac", seed=seed), thin_at_rest(points).to(points)
-    try:
-        fit = EllipsoidFit(estimator).fit(points, taken)
-        _refuse_coarse(fit, points)
-    except NotIdentifiableError:
-        refuse_at_rest(points, turning(points), usable.units[_AXES[0]])  # says it better
-        raise
-    went = way(points)
-    if went is not None:
-        _refuse_other(fit, _along(EllipsoidFit(estimator), went, taken))
-    return fit
-
-
-def _refuse_coarse(fit: EllipsoidFit, points: Tensor) -> None:
-    """Refuse an ellipsoid no wider than a few steps of the digits: there is one through any few points of a lattice.
-
-    Raises:
-        NotIdentifiableError: the steps of a column are a large share of the shortest semi-axis.
-    """
-    if 2 * len(points.unique(dim=0)) > len(points):
-        return  # hardly two are equal, which says nothing about steps
-    steps = [column.unique().diff() for column in points.unbind(-1)]
-    share = max(float(step.min()) for step in steps if len(step) > 0) / float(fit.semi_axes_[0])
-    if share > MAX_SCATTER:
-        raise NotIdentifiableError(
-            f"Not identifiable: the measurements come in steps of {share:.0%} of the ellipsoid's shortest semi-axis, "
-            f"more than {MAX_SCATTER:.0%}, as those of a sensor that hardly turns do. Turn the sensor through all "
-            "directions."
-        )
-
-
-def _along(fit: EllipsoidFit, went: Tensor, taken: Tensor) -> EllipsoidFit:
-    """The fit to the sensor's way, which samples that stand apart do not move."""
-    try:
-        return fit.fit(went, taken)
-    except NotIdentifiableError as error:
-        told = f"{error} Single samples that stand apart from those before and after them do not count here."
-        raise NotIdentifiableError(told, error.coverage, error.directions) from None
-
-
-def _refuse_other(fit: EllipsoidFit, along: EllipsoidFit) -> None:
-    """Refuse a fit that the sensor's way does not confirm: outliers to one side can draw a surface of their own.
-
-    Raises:
-        NotIdentifiableError: centre or semi-axes are others, by more than errors explain.
-    """
-    apart = torch.cat([along.center_ - fit.center_, along.semi_axes_ - fit.semi_axes_]).abs() / fit.radius_
-    error = torch.cat([fit.center_se_, fit.semi_axes_se_]) / fit.radius_
-    worst = float((apart - _ERRORS * error).max())
-    if worst > MAX_STANDARD_ERROR:
-        raise NotIdentifiableError(
-            "Not identifiable: single samples decide on the ellipsoid. Without those that stand apart from the ones "
-            f"before and after them, its centre or a semi-axis is off by {float(apart.max()):.0%} of the radius. "
-            "Record again away from what disturbs the sensor, and turn it through all directions.",
-            along.coverage_ if isinstance(along.coverage_, Coverage) else None,
-        )
 
 
 def _density(fit: EllipsoidFit) -> tuple[float, float, float]:

@@ -370,7 +370,8 @@ class EllipsoidFit(Fitted):
             if largest is not None and MAX_STANDARD_ERROR < float(largest[index]) < math.inf:
                 raise _refusal(
                     f"{where}Not identifiable: the centre or a semi-axis has a standard error of "
-                    f"{float(largest[index]):.0%} of the radius, more than {MAX_STANDARD_ERROR:.0%}.",
+                    f"{100.0 * float(largest[index]):.0f} % of the radius, more than "
+                    f"{100.0 * MAX_STANDARD_ERROR:.0f} %.",
                     directions[index],
                 )
 
@@ -386,8 +387,9 @@ class EllipsoidFit(Fitted):
             where = f"Problem {int(wide[0])}: " if field.dim() > 2 else ""
             raise NotIdentifiableError(
                 f"{where}Not identifiable: the points draw no surface. They scatter about the ellipsoid by "
-                f"{float(scatter[wide[0]]):.0%} of its shortest semi-axis, more than {MAX_SCATTER:.0%}, as the noise "
-                "of a sensor that hardly turns does. Turn the sensor through all directions."
+                f"{100.0 * float(scatter[wide[0]]):.0f} % of its shortest semi-axis, more than "
+                f"{100.0 * MAX_SCATTER:.0f} %, as the noise of a sensor that hardly turns does. Turn the sensor "
+                "through all directions."
             )
 
     def _largest_standard_error(self) -> Tensor | None:
