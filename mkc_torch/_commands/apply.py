@@ -12,7 +12,7 @@ import torch
 import typer
 
 from mkc_torch import calibration_file
-from mkc_torch._commands.console import FAILURES, complain, interrupts_told, out, parsed_columns
+from mkc_torch._commands.console import FAILURES, complain, interrupts_told, out, parsed_columns, progress
 from mkc_torch._commands.diagnosis_files import SIMULATIONS, named_simulation, paired_simulation
 from mkc_torch.calibration import Calibration
 from mkc_torch.diagnosis import DiagnosedModel, diagnosed_model, diagnosis_file
@@ -64,15 +64,16 @@ def apply(
         raise typer.BadParameter("--simulation and --simulated exclude each other; give the one that was diagnosed.")
     subject: str | Path = model
     try:
-        own = None
-        if simulation is not None or simulated is not None:
-            subject = str(simulation or simulated)
-            own = named_simulation(simulation) if simulation else paired_simulation(Path(subject), names)
-        subject = model
-        known = read_correction(model, own)
-        subject = output
-        _refuse_input(output, recording, model, simulated)
-        with interrupts_told(lambda: f"nothing was written to {output}."):
+        with interrupts_told(lambda: f"nothing was written to {output}."), progress(1) as step:
+            step(f"correcting {recording.name}")
+            own = None
+            if simulation is not None or simulated is not None:
+                subject = str(simulation or simulated)
+                own = named_simulation(simulation) if simulation else paired_simulation(Path(subject), names)
+            subject = model
+            known = read_correction(model, own)
+            subject = output
+            _refuse_input(output, recording, model, simulated)
             subject = recording
             table = Recording.read(recording, columns=names)
             corrected = correct(known, table)

@@ -85,11 +85,12 @@ def diagnose(
         force=force,
     )
     refuse_same_names(recordings)
-    _refuse_unusable(request)
+    total, failed, left = 0, 0, list(recordings)
+    with interrupts_told(lambda: not_written(left, output)):
+        _refuse_unusable(request)
     one_thread()
     keep_memory()
     look = Look.of(out())
-    total, failed, left = 0, 0, list(recordings)
     with (
         interrupts_told(lambda: not_written(left, output)),
         progress(len(recordings)) as step,
