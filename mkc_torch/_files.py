@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 __all__ = ["claim_folder", "write_atomically"]
@@ -48,18 +49,24 @@ def write_atomically(path: str | os.PathLike[str], data: str | bytes, *, overwri
         temporary.unlink(missing_ok=True)
 
 
-def claim_folder(path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+_MARKS = {".html": b"Made by mkc_torch", ".json": b'"schema": "mkc-', ".py": b"`mkc diagnose`"}
+"""By which files of a kind are known as written here."""
+
+
+def claim_folder(path: str | os.PathLike[str], *, overwrite: bool = False, files: Iterable[str] = ()) -> Path:
     """Create an output folder, its parents too, or take an existing one that is empty.
 
     Args:
         path: the folder.
         overwrite: accept a folder with files in it. None of them is removed.
+        files: names of those that will be written: a file of the user's own under such a name is not to be lost.
 
     Returns:
         The folder.
 
     Raises:
-        FileExistsError: ``path`` is a file, or a folder with something in it and ``overwrite`` is False.
+        FileExistsError: ``path`` is a file, or a folder with something in it and ``overwrite`` is False, or it has a
+            file to be written that was not written here.
 
     Example:
         >>> import tempfile
@@ -75,5 +82,18 @@ def claim_folder(path: str | os.PathLike[str], *, overwrite: bool = False) -> Pa
             f"{path} exists and is not empty; use `--force` (in Python `overwrite=True`) to write into it, "
             "or choose another output folder."
         )
+    for name in _foreign(path, list(files)):
+        raise FileExistsError(
+            f"{path / name} exists and was not written by mkc, so it is not replaced; move it away, or choose another "
+            "output folder."
+        )
     path.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def _foreign(folder: Path, names: Sequence[str]) -> list[str]:
+    """Files that are there and were not written here; one of a kind without a mark goes with those that have one."""
+    there = [name for name in names if (folder / name).is_file()]
+    marked = {name: _MARKS[Path(name).suffix] for name in there if Path(name).suffix in _MARKS}
+    own = {name for name, mark in marked.items() if mark in (folder / name).read_bytes()}
+    return [name for name in there if name not in own and (name in marked or not own)]

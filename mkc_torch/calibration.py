@@ -12,10 +12,12 @@ from mkc_torch.coverage import Coverage
 from mkc_torch.disturbance import disturbed_intervals
 from mkc_torch.ellipsoid import MIN_POINTS, EllipsoidFit, ellipsoid_from_coefficients
 from mkc_torch.functional import mkc_weight
+from mkc_torch.impossible import without_impossible
 from mkc_torch.linear import MKCRegression
-from mkc_torch.linear.covariance import CovarianceKind
+from mkc_torch.order_statistic import robust_scale
+from mkc_torch.recorded_ellipsoid import recorded_ellipsoid
 from mkc_torch.recording import Recording, RecordingError
-from mkc_torch.rest import thin_at_rest
+from mkc_torch.units import RECORDED, field_warning, time_warning
 
 __all__ = ["Calibration", "Matrix", "Spread", "Vector", "calibrate", "prepared"]
 
@@ -25,13 +27,22 @@ REJECTED_BELOW = 0.5
 MAX_REJECTED = 0.2
 """Above this share of rejected samples one ellipsoid is a doubtful model, and a warning says so."""
 
+MUCH_SCATTER = 0.1
+"""Scatter of the calibrated field's length, as a share of the radius, above which a warning says so."""
+
+UNUSUAL_RATIO = 1.5
+"""Longest over shortest semi-axis above which a warning says so."""
+
+ENOUGH_INFORMATION = 0.1
+"""Information, as a share of even coverage, at which directions that are missing do no harm."""
+
 _LEAST = 1e-60
 FEW_SAMPLES = 50
 _AXES = ("mag_x", "mag_y", "mag_z")
 
 
 def prepared(recording: Recording) -> Recording:
-    """The samples a calibration uses: those with a finite field, in the order of time where there is a time.
+    """The samples a calibration uses: those with a finite and possible field, in the order of time if there is a time.
 
     Raises:
         MissingColumnError: no ``mag_x``, ``mag_y`` or ``mag_z``.
@@ -54,6 +65,7 @@ def prepared(recording: Recording) -> Recording:
             f"{where}{found} too few, an ellipsoid needs at least {MIN_POINTS}; record while turning the sensor "
             f"through all directions.{' ' + reasons if reasons else ''}"
         )
+    usable = without_impossible(usable, *_AXES)
     largest = float(usable.magnetometer().abs().max())
     if largest > 1.0 / _LEAST or 0.0 < largest < _LEAST:
         where = f"{recording.name}: " if recording.name else ""
@@ -67,8 +79,9 @@ def prepared(recording: Recording) -> Recording:
 def calibrate(recording: Recording, *, field_strength: float | None = None, seed: int = 0) -> Calibration:
     """Calibrate the magnetometer of a recording by MKC-EM on the linear ellipsoid fit.
 
-    Samples that are not finite are dropped and the rest is sorted by time, which the warnings tell. Standard errors
-    allow for autocorrelation where there is a time; without one, samples count as independent.
+    Samples that are not finite, or that no field explains, are left out and the rest is sorted by time, which the
+    warnings tell. Standard errors allow for autocorrelation where there is a time; without one, samples count as
+    independent. Where the radius does not fit the unit, it is called "recorded units", and a warning says why.
 
     Args:
         recording: with columns ``mag_x``, ``mag_y``, ``mag_z``, in any one unit, and ``time`` in s where it has one.
@@ -94,9 +107,7 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
         raise ValueError(f"Expected argument `field_strength` to be positive but got {field_strength}.")
     usable = prepared(recording)
     points = usable.magnetometer()
-    kind: CovarianceKind = "sandwich" if usable.time is None else "hac"
-    taken = None if usable.time is None else thin_at_rest(points).to(points)
-    fit = EllipsoidFit(MKCRegression(covariance=kind, seed=seed)).fit(points, taken)
+    fit = recorded_ellipsoid(usable, seed)
     radius = float(fit.radius_)
     strength = radius if field_strength is None else field_strength
     scale = strength / radius
@@ -107,11 +118,14 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
     rejected = mkc_weight((length / radius).square() - 1.0, density[0], density[1]) < REJECTED_BELOW
     found = fit.coverage_
     assert isinstance(found, Coverage)
+    unit = usable.units[_AXES[0]]
+    size = field_warning(radius, unit, "radius of the ellipsoid is", "all numbers")
+    unit = unit if size is None else RECORDED
     norm = torch.linalg.vector_norm(points, dim=-1)
     return Calibration(
         recording=usable.name,
         samples=len(points),
-        unit=usable.units[_AXES[0]],
+        unit=unit,
         center=_vector(fit.center_),
         center_se=_vector(fit.center_se_),
         semi_axes=_vector(fit.semi_axes_),
@@ -121,7 +135,7 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
         matrix_se=_matrix(matrix_se),
         radius=radius,
         field_strength=strength,
-        field_unit=usable.units[_AXES[0]] if field_strength is None else "µT",
+        field_unit=unit if field_strength is None else "µT",
         sigma=density[0],
         d=density[1],
         bound=density[2],
@@ -130,7 +144,11 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
         rejected=int(rejected.sum()),
         disturbed=() if usable.time is None else disturbed_intervals(usable.time, rejected),
         coverage=found,
-        warnings=(*usable.warnings, *_warnings(fit, found, float(rejected.double().mean()))),
+        warnings=(
+            *usable.warnings,
+            *(sentence for sentence in (size, time_warning(usable)) if sentence),
+            *_warnings(fit, found, float(rejected.double().mean())),
+        ),
     )
 
 
@@ -149,11 +167,24 @@ def _density(fit: EllipsoidFit) -> tuple[float, float, float]:
 def _warnings(fit: EllipsoidFit, found: Coverage, rejected_share: float) -> list[str]:
     warnings = []
     if rejected_share > MAX_REJECTED:
-        per_cent = f"{100.0 * rejected_share:.0f} %"
         warnings.append(
-            f"{per_cent} of the samples do not fit one ellipsoid: the sensor's offset may have changed "
-            "during the recording, or something magnetic was near for long. Record again away from it, or calibrate "
-            "the parts of the recording separately."
+            f"{100.0 * rejected_share:.0f} % of the samples do not fit one ellipsoid: the sensor's offset may have "
+            "changed during the recording, or something magnetic was near for long. `mkc diagnose` says what changed, "
+            "and when; or record again away from it, or calibrate the parts of the recording separately."
+        )
+    scatter = float(robust_scale(fit.residual_.unsqueeze(-1))) / float(fit.radius_)
+    if scatter > MUCH_SCATTER:
+        warnings.append(
+            f"The length of the calibrated field scatters by {100.0 * scatter:.0f} % of the radius; that of a sensor "
+            "which is calibrated in a steady field scatters by one to three. Offset and semi-axes may be off by more "
+            "than their standard errors say; `mkc diagnose` says what disturbs it."
+        )
+    ratio = float(fit.semi_axes_[2] / fit.semi_axes_[0])
+    if ratio > UNUSUAL_RATIO:
+        warnings.append(
+            f"The longest semi-axis is {ratio:.2g} times the shortest. The gains of one chip differ by some per cent, "
+            "and iron nearby seldom adds more than some ten: check that all three columns are in one unit, that none "
+            "is cut off at the end of its range, and the directions covered."
         )
     if len(fit.weights_) < FEW_SAMPLES:
         warnings.append(
@@ -161,11 +192,28 @@ def _warnings(fit: EllipsoidFit, found: Coverage, rejected_share: float) -> list
             f"standard errors say. Record {FEW_SAMPLES} at least."
         )
     if found.gaps:
-        missing = "; ".join(str(gap) for gap in found.gaps)
-        warnings.append(f"Directions not covered: {missing}. Turn the sensor so that the field points there too.")
+        warnings.append(_gaps(fit, found))
     if not bool(torch.as_tensor(getattr(fit.estimator_, "converged_", True)).all()):
         warnings.append("The fit stopped before it came to rest; its last digits are uncertain.")
     return warnings
+
+
+def _gaps(fit: EllipsoidFit, found: Coverage) -> str:
+    """Which directions are missing, and what that means for the result."""
+    missing = "; ".join(str(gap) for gap in found.gaps)
+    worst = 100.0 * float((torch.cat([fit.center_se_, fit.semi_axes_se_]) / fit.radius_).max())
+    known = f"to {worst:.1g} % of the radius" if worst < math.inf else "but how well is not known"
+    if found.information >= ENOUGH_INFORMATION:
+        means = f"The others determine offset and semi-axes {known}, so the calibration holds all the same"
+    else:
+        means = (
+            f"The others determine offset and semi-axes {known}, if nothing changed meanwhile: what is known worst is "
+            f"known {found.information**-0.5:.1g} times less well than from all directions, and a disturbance counts "
+            "as much more"
+        )
+    return (
+        f"Directions not covered: {missing}. {means}. To be sure, turn the sensor so that the field points there too."
+    )
 
 
 def _spread(residual: Tensor) -> Spread:

@@ -1,4 +1,4 @@
-"""A SIMULATED magnetometer for the demonstration: a sensor turned by hand while something magnetic passes by."""
+"""A SIMULATED magnetometer for the demonstration: turned by hand while something magnetic passes, or beside a cable."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mkc_torch.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Truth", "simulated_recording"]
+__all__ = ["FIELD_PER_AMPERE", "Truth", "concealed_recording", "simulated_recording"]
 
 RATE = 50.0  # Hz
 SECONDS = 90.0
@@ -29,6 +29,10 @@ MOMENT = (1.6, 1.6, -2.4)  # A·m², a large loudspeaker
 NEAREST = 0.17  # m
 SPEED = 0.24  # m/s
 MU0_OVER_4PI = 0.1  # µT·m³/(A·m²)
+
+FIELD_PER_AMPERE = (0.3, -0.2, 0.4)  # µT/A, of a cable beside the sensor
+_CABLE_RATE, _CABLE_SECONDS = 20.0, 60.0  # Hz, s
+_OUTLIERS, _OUTLIER = 0.05, 8.0  # share, µT
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,36 @@ def simulated_recording(seed: int = 0) -> tuple[Recording, Truth]:
     columns = {"time": time} | {f"mag_{axis}": RESOLUTION * counts[:, i] for i, axis in enumerate("xyz")}
     truth = Truth(OFFSET, (semi_axes[0], semi_axes[1], semi_axes[2]), (float(disturbed[0]), float(disturbed[-1])))
     return Recording(columns, name="simulated_sensor"), truth
+
+
+def concealed_recording(seed: int = 0) -> Recording:
+    """A minute of ``time``, ``mag_x`` to ``mag_z``, ``current`` and ``temperature`` at 20 Hz, with something hidden.
+
+    The same sensor beside a cable, whose current adds :data:`FIELD_PER_AMPERE`: less than the noise, and one sample in
+    twenty is an outlier. The temperature rises and does nothing.
+
+    Example:
+        >>> concealed_recording().names
+        ('time', 'mag_x', 'mag_y', 'mag_z', 'current', 'temperature')
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    time = torch.arange(round(_CABLE_RATE * _CABLE_SECONDS), dtype=torch.float64) / _CABLE_RATE
+    begin, *phase = (50.0 * torch.rand(4, generator=generator, dtype=torch.float64)).tolist()
+    waves = 1.2 * torch.sin(0.9 * time + phase[0]) + 0.8 * torch.sin(2.3 * time + phase[1])
+    current = 3.0 + waves + 0.6 * torch.sign(torch.sin(0.35 * time + phase[2]))
+    temperature = 24.0 + 2.5 * time / _CABLE_SECONDS + 0.05 * normal(len(time))
+    earth = FIELD * torch.tensor([math.cos(DIP), 0.0, -math.sin(DIP)], dtype=torch.float64)
+    response = torch.tensor(RESPONSE, dtype=torch.float64)
+    measured = _hand_rotation(begin + time) @ earth @ response.mT + torch.tensor(OFFSET, dtype=torch.float64)
+    measured = measured + current.unsqueeze(-1) * torch.tensor(FIELD_PER_AMPERE, dtype=torch.float64)
+    outlier = torch.rand(len(time), 1, generator=generator, dtype=torch.float64) < _OUTLIERS
+    measured = measured + NOISE * normal(*measured.shape) + outlier * _OUTLIER * normal(*measured.shape)
+    columns = {"time": time} | {f"mag_{axis}": measured[:, i] for i, axis in enumerate("xyz")}
+    return Recording(columns | {"current": current, "temperature": temperature}, name="concealed")
 
 
 def passing_dipole(time: Float[Tensor, " N"]) -> Float[Tensor, "N 3"]:

@@ -23,7 +23,7 @@ from mkc_torch.linear._estimator import Fitted, LinearEstimator
 from mkc_torch.linear._problem import common_batch
 from mkc_torch.nonlinear import NonlinearFit
 from mkc_torch.nonlinear import fit as nonlinear_fit
-from mkc_torch.order_statistic import order_statistic
+from mkc_torch.order_statistic import order_statistic, robust_scale
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -34,6 +34,10 @@ MIN_INFORMATION = 0.003
 
 MAX_STANDARD_ERROR = 0.05
 """Largest standard error of the centre or a semi-axis, as a share of the radius, that identifies an ellipsoid."""
+
+MAX_SCATTER = 0.2
+"""Largest scatter of the points about the surface, as a share of its shortest semi-axis: the square of it is the bias
+of the fit. A ball of noise scatters by half."""
 
 _EXACT = 1e4
 """Roundings by which a point may be off a surface that it is on."""
@@ -131,6 +135,11 @@ def sampson_distance(theta: Float[Tensor, " 9"], points: Float[Tensor, "N 3"]) -
     """
     root = theta[3:][list(_SYMMETRIC)].unflatten(-1, (3, 3))
     y = (points - theta[:3]) @ root
+    return _distance(y, root)
+
+
+def _distance(y: Float[Tensor, "*batch N 3"], root: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch N"]:
+    """The same from y and the symmetric L."""
     # keeps a point at the very centre finite
     tiny = torch.finfo(y.dtype).eps ** 2
     norm = (y.square().sum(-1) + tiny).sqrt()
@@ -220,8 +229,8 @@ class EllipsoidFit(Fitted):
         Raises:
             TypeError: not a floating tensor.
             ValueError: wrong shape, too few or non-finite points.
-            NotIdentifiableError: the points lie on a plane or cover too few directions; the message names those that
-                are missing.
+            NotIdentifiableError: the points lie on a plane, cover too few directions (the message names those that are
+                missing), or draw no surface: they scatter about it by more than a fifth of its shortest semi-axis.
         """
         self._forget()
         points, weight = _prepared(points, sample_weight)
@@ -271,6 +280,7 @@ class EllipsoidFit(Fitted):
         if covariance is not None:
             self._standard_errors(local, scale, parameters, covariance, ellipsoid_of)
         self._refuse_uncovered(self.calibrate(points), weight)
+        self._refuse_scattered(self.calibrate(points), weight)
 
     def _finished(self, local: Ellipsoid, points: Tensor, scale: Tensor, weight: Tensor | None) -> NonlinearFit:
         """The maximum of the likelihood of the distances that is nearest to an ellipsoid, all in local coordinates."""
@@ -312,7 +322,10 @@ class EllipsoidFit(Fitted):
             index = int((~bounded).nonzero()[0, 0])
             vectors = (points - _middle(points)).reshape(-1, *points.shape[-2:])[index]
             where = f"Problem {index}: " if points.dim() > 2 else ""
-            raise _refusal(f"{where}Not identifiable: the quadric that fits the points is no ellipsoid.", vectors)
+            seen = " They are seen from the middle of the samples, for the centre is not known; the gaps may be wider."
+            raise _refusal(
+                f"{where}Not identifiable: the quadric that fits the points is no ellipsoid.", vectors, seen=seen
+            )
 
     def _keep(self, points: Tensor, ellipsoid: Ellipsoid) -> None:
         self.center_ = ellipsoid.center
@@ -375,13 +388,29 @@ class EllipsoidFit(Fitted):
                     directions[index],
                 )
             if largest is not None and MAX_STANDARD_ERROR < float(largest[index]) < math.inf:
-                radius = float(self.radius_.reshape(-1)[index])
                 raise _refusal(
                     f"{where}Not identifiable: the centre or a semi-axis has a standard error of "
-                    f"{float(largest[index]) * radius:.3g}, more than {MAX_STANDARD_ERROR:.0%} of the radius "
-                    f"{radius:.3g}.",
+                    f"{100.0 * float(largest[index]):.0f} % of the radius, more than "
+                    f"{100.0 * MAX_STANDARD_ERROR:.0f} %.",
                     directions[index],
                 )
+
+    @torch.no_grad()
+    def _refuse_scattered(self, field: Tensor, weight: Tensor | None) -> None:
+        """Refuse a surface that the points do not draw: that of a ball of noise is as wide as the noise."""
+        radius = self.radius_[..., None, None]
+        distance = _distance(field / radius, self.calibration_matrix_ / radius).unsqueeze(-1)
+        used = None if weight is None else (weight > 0).to(field).unsqueeze(-1)
+        scatter = (robust_scale(distance, used) / self.semi_axes_[..., :1]).reshape(-1)
+        wide = (scatter > MAX_SCATTER).nonzero().flatten()
+        if len(wide) > 0:
+            where = f"Problem {int(wide[0])}: " if field.dim() > 2 else ""
+            raise NotIdentifiableError(
+                f"{where}Not identifiable: the points draw no surface. They scatter about the ellipsoid by "
+                f"{100.0 * float(scatter[wide[0]]):.0f} % of its shortest semi-axis, more than "
+                f"{100.0 * MAX_SCATTER:.0f} %, as the noise of a sensor that hardly turns does. Turn the sensor "
+                "through all directions."
+            )
 
     def _largest_standard_error(self) -> Tensor | None:
         """Of centre and semi-axes as a share of the radius, for each problem; infinite where it is unknown."""
@@ -439,8 +468,8 @@ def _middle(points: Tensor) -> Tensor:
     return 0.5 * (points.amax(-2, keepdim=True) + points.amin(-2, keepdim=True))
 
 
-def _refusal(message: str, vectors: Tensor) -> NotIdentifiableError:
-    """The error, with the directions that are covered and advice on those that are not."""
+def _refusal(message: str, vectors: Tensor, *, seen: str = "") -> NotIdentifiableError:
+    """The error, with the directions that are covered and advice on those that are not; ``seen`` says from where."""
     flat = vectors.detach().reshape(-1, 3)
     directions = flat[torch.linalg.vector_norm(flat, dim=-1) > 0]
     if len(directions) == 0:
@@ -450,7 +479,9 @@ def _refusal(message: str, vectors: Tensor) -> NotIdentifiableError:
         missing = "; ".join(str(g) for g in found.gaps)
         turn = "Turn the sensor so that the field points there too."
         message += (
-            f" Directions not covered: {missing}. {turn}" if missing else " Turn the sensor through all directions."
+            f" Directions not covered: {missing}.{seen} {turn}"
+            if missing
+            else " Turn the sensor through all directions."
         )
     return NotIdentifiableError(message, found, directions)
 

@@ -23,6 +23,7 @@ from mkc_torch.table_files import (
     counted,
     encoded,
     listed,
+    missing_warning,
     numbered,
     read_table,
     renamed,
@@ -105,9 +106,10 @@ class Recording:
     def read(cls, path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Recording:
         """Read a table from a file: CSV (``.csv``, ``.tsv``, ``.txt``) or Parquet (``.parquet``).
 
-        A CSV has a header line of column names, and values separated by comma, semicolon or tab. An empty cell,
-        ``nan`` or ``NA`` becomes NaN; integers become float64. Columns of text alone that nobody asked for are
-        left out, which ``warnings`` tells; in the column ``experiment`` text is numbered, and ``labels`` has it.
+        A CSV has a header line of column names, and values separated by comma, semicolon or tab. An empty cell and
+        ``nan`` become NaN; so do ``NA``, ``n/a`` and ``null``, of which ``warnings`` tells. Integers become float64.
+        Columns of text alone that nobody asked for are left out, which ``warnings`` tells; in the column ``experiment``
+        text is numbered, and ``labels`` has it.
 
         Args:
             path: the file.
@@ -140,6 +142,8 @@ class Recording:
                     continue
                 else:
                     raise text_error(path, table, name, series, int(bad.arg_max()))
+            elif told := missing_warning(table, name, series):
+                warnings.append(told)
             values[name] = torch.tensor(numbers.fill_null(math.nan).to_numpy())
         if not values:
             known = ", ".join(SEPARATORS.values())
@@ -238,7 +242,7 @@ class Recording:
                 "Leave out the columns that hold no values."
             )
         dropped = f"Dropped {int((~keep).sum())} of {len(self)} samples that are not finite: {'; '.join(counts)}."
-        return self._take(keep, dropped)
+        return self.rows(keep, dropped)
 
     def sorted_by_time(self) -> Recording:
         """The samples in the order of their times, each time once.
@@ -277,7 +281,25 @@ class Recording:
                 f"{differ} of them with other values."
             )
         found += timed._gaps(time[kept], group[kept])
-        return timed._take(torch.from_numpy(kept), *found)
+        return timed.rows(torch.from_numpy(kept), *found)
+
+    def rows(self, chosen: Tensor, *warnings: str) -> Recording:
+        """The chosen rows, and the sentences that say why beside those there are.
+
+        Args:
+            chosen: a boolean for each row, or the numbers of rows in the order that they are to have.
+
+        Example:
+            >>> Recording({"a": torch.tensor([1.0, 2.0, 3.0])}).rows(torch.tensor([2, 0]))["a"]
+            tensor([3., 1.], dtype=torch.float64)
+        """
+        return Recording(
+            {name: values[chosen] for name, values in self._columns.items()},
+            name=self._name,
+            units=self._units,
+            warnings=(*self._warnings, *warnings),
+            labels=self._labels,
+        )
 
     def experiments(self) -> dict[str, Recording]:
         """The parts of the table that the column ``experiment`` separates, by label, in the order of appearance.
@@ -294,7 +316,7 @@ class Recording:
         group = torch.from_numpy(self._experiment_numbers())
         parts = {}
         for number in range(int(group.max()) + 1):
-            part = self._take(group == number)
+            part = self.rows(group == number)
             label = self._experiment_label(part[_EXPERIMENT][0].item())
             parts[label] = Recording(
                 {key: values for key, values in part.columns.items() if key != _EXPERIMENT},
@@ -305,15 +327,6 @@ class Recording:
             )
         return parts
 
-    def _take(self, rows: Tensor, *warnings: str) -> Recording:
-        return Recording(
-            {name: values[rows] for name, values in self._columns.items()},
-            name=self._name,
-            units=self._units,
-            warnings=(*self._warnings, *warnings),
-            labels=self._labels,
-        )
-
     def _in(self) -> str:
         return f"{self._name}: " if self._name else ""
 
@@ -323,7 +336,7 @@ class Recording:
             return self
         if not keep.any():
             raise RecordingError(f"{self._in()}no sample has a finite time; the column `time` must hold seconds.")
-        return self._take(keep, f"Dropped {int((~keep).sum())} of {len(self)} samples without a finite time.")
+        return self.rows(keep, f"Dropped {int((~keep).sum())} of {len(self)} samples without a finite time.")
 
     def _experiment_numbers(self) -> np.ndarray:
         """For each sample 0, 1, … in the order in which the experiments first appear."""
@@ -384,8 +397,16 @@ def write_table(
         name: np.array(known[name])[values.long().numpy()] if name in known else values.numpy()
         for name, values in table.columns.items()
     }
+    if _EXPERIMENT in told and _EXPERIMENT not in known:
+        told[_EXPERIMENT] = _whole(told[_EXPERIMENT])
     data = encoded(path, told)
     write_atomically(path, data, overwrite=overwrite)
+
+
+def _whole(numbers: np.ndarray) -> np.ndarray:
+    """Numbers of experiments, 1 and not 1.0, where all of them are whole."""
+    whole = np.isfinite(numbers) & (np.abs(numbers) < 2**53) & (numbers == np.round(numbers))
+    return numbers.astype(np.int64) if whole.all() else numbers
 
 
 def _check_columns(columns: Mapping[str, Tensor], name: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import re
@@ -13,7 +14,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab"}
-_MISSING = ["", "na", "n/a", "nan", "-nan", "null"]  # in lower case; C's printf writes -nan
+_MISSING_WORDS = ["na", "n/a", "null"]
+_MISSING = ["", "nan", "-nan", *_MISSING_WORDS]  # in lower case; C's printf writes -nan
 
 
 class RecordingError(ValueError):
@@ -102,7 +104,9 @@ def _read_csv(path: Path) -> Table:
         with path.open(encoding="utf-8-sig") as file:
             rows = [(number, line.rstrip("\n")) for number, line in enumerate(file, start=1) if line.strip(" \r\n")]
     except UnicodeDecodeError as error:
-        raise RecordingError(f"{path}: the file is not UTF-8 text; export it as CSV in UTF-8.") from error
+        begin = path.read_bytes()[:2]
+        found = " but begins as UTF-16 does" if begin in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else ""
+        raise RecordingError(f"{path}: the file is not UTF-8 text{found}; export it as CSV in UTF-8.") from error
     if not rows:
         raise RecordingError(f"{path}: the file is empty; it must hold a header line and rows of numbers.")
     header = rows.pop(0)[1]
@@ -115,10 +119,14 @@ def _read_csv(path: Path) -> Table:
     for number, line in rows:
         count = len(_cells(line, separator)) if '"' in line else line.count(separator) + 1
         if count != len(names):
+            advice = (
+                "correct or remove that line"
+                if len(names) > 1
+                else "the first line must hold the column names: remove what stands above them"
+            )
             raise RecordingError(
                 f"{path}: line {number} has {counted(count, 'value')} but the header names "
-                f"{counted(len(names), 'column')} (the separator is the {SEPARATORS[separator]}); "
-                "correct or remove that line."
+                f"{counted(len(names), 'column')} (the separator is the {SEPARATORS[separator]}); {advice}."
             )
     body = "\n".join(line for _, line in rows).encode()
     try:
@@ -192,6 +200,23 @@ def as_numbers(series: Any) -> tuple[Any, Any]:
     return polars.repeat(None, len(series), dtype=polars.Float64, eager=True), series.is_not_null()
 
 
+def missing_warning(table: Table, name: str, series: Any) -> str | None:
+    """A sentence about words that stand for missing values, such as n/a; what is empty or nan speaks for itself."""
+    polars = _polars()
+    if series.dtype != polars.String:
+        return None
+    cells = series.str.strip_chars()
+    words = cells.str.to_lowercase().is_in(_MISSING_WORDS)
+    count = int(words.sum() or 0)
+    if not count:
+        return None
+    row = int(words.fill_null(False).arg_max())
+    return (
+        f'Column `{name}` holds "{cells[row]}" or the like {counted(count, "time")}, first at {table.line} '
+        f"{table.lines[row]}; it is read as no value."
+    )
+
+
 def numbered(series: Any) -> tuple[Any, list[str]]:
     """Labels as 0, 1, … in the order of appearance, and the labels."""
     polars = _polars()
@@ -202,6 +227,7 @@ def numbered(series: Any) -> tuple[Any, list[str]]:
 
 def text_error(path: Path, table: Table, name: str, series: Any, row: int) -> RecordingError:
     text = str(series[row]).strip()
+    kind = "text" if series.dtype == _polars().String else "no number"
     advice = "correct it, or write nan where there is no value"
     if _is_number(text.replace(",", ".")):
         advice = "write decimals with a point"
@@ -209,7 +235,7 @@ def text_error(path: Path, table: Table, name: str, series: Any, row: int) -> Re
         advice = "times are numbers, in seconds"
     shown = text if len(text) <= 40 else text[:39] + "…"
     return RecordingError(
-        f'{path}: column `{name}` holds text at {table.line} {table.lines[row]}, "{shown}"; {advice}.'
+        f'{path}: column `{name}` holds {kind} at {table.line} {table.lines[row]}, "{shown}"; {advice}.'
     )
 
 

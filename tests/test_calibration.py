@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import math
+import re
 
 import pytest
 import torch
@@ -196,7 +197,69 @@ def test_many_rejected_samples_are_warned_of():
     points[:120] += torch.tensor([0.0, 0.0, 60.0])
     c = calibrate(recorded(points))
     assert c.rejected >= 100
-    assert any("do not fit one ellipsoid" in w for w in c.warnings)
+    assert any("do not fit one ellipsoid" in w and "`mkc diagnose`" in w for w in c.warnings)
+
+
+@pytest.mark.parametrize(
+    ("factor", "guess"),
+    [
+        (1e3, "nanotesla"),
+        (1e-2, "gauss"),
+        (1e-3, "millitesla"),
+        (1e-6, "tesla"),
+        (10.0, "milligauss"),
+        (30.0, "raw counts"),
+    ],
+)
+def test_a_radius_that_is_no_field_of_the_earth_is_in_recorded_units(factor, guess):
+    c = calibrate(recorded(factor * noisy_ellipsoid()))
+    assert (c.unit, c.field_unit) == ("recorded units", "recorded units")
+    assert any(guess in w and "--unit" in w for w in c.warnings)
+    assert c.center == pytest.approx([factor * v for v in (5.0, -9.0, 20.0)], rel=0.05)
+    strong = calibrate(recorded(factor * noisy_ellipsoid()), field_strength=48.0)
+    assert (strong.unit, strong.field_unit) == ("recorded units", "µT")
+
+
+def test_the_radius_tells_the_unit_and_not_what_an_offset_adds():
+    c = calibrate(recorded(noisy_ellipsoid() + 500.0))
+    assert c.unit == "µT"
+    assert not c.warnings
+
+
+def test_a_unit_of_the_users_own_is_believed():
+    points = 1e3 * noisy_ellipsoid()
+    c = calibrate(Recording(dict(zip(AXES, points.unbind(-1), strict=True)), units=dict.fromkeys(AXES, "nT")))
+    assert c.unit == "nT"
+    assert not c.warnings
+
+
+def test_times_in_milliseconds_are_told_of():
+    c = calibrate(recorded(noisy_ellipsoid(), time=20.0 * torch.arange(400)))
+    assert any("looks like ms" in w for w in c.warnings)
+
+
+def test_much_scatter_is_warned_of():
+    (warning,) = calibrate(recorded(noisy_ellipsoid(2000, noise=5.5))).warnings
+    assert "scatters by 11 % of the radius" in warning
+    assert "mkc diagnose" in warning
+
+
+def test_semi_axes_of_unusual_lengths_are_warned_of():
+    points = noisy_ellipsoid()
+    points[:, 2] *= 2.0
+    (warning,) = calibrate(recorded(points)).warnings
+    assert "longest semi-axis is 2.4 times the shortest" in warning
+
+
+def test_a_warning_of_missing_directions_says_whether_the_result_holds():
+    points = noisy_ellipsoid(4000)
+    away = torch.nn.functional.normalize((points - torch.tensor([5.0, -9.0, 20.0])), dim=-1)
+    small, large = points[away[:, 2] < 0.7], points[away[:, 2] < 0.0]
+    (warning,) = calibrate(recorded(small)).warnings
+    assert re.search(r"semi-axes to 0\.0\d % of the radius, so the calibration holds all the same", warning)
+    (warning,) = calibrate(recorded(large)).warnings
+    assert "if nothing changed meanwhile" in warning
+    assert "holds all the same" not in warning
 
 
 def test_exact_points_are_no_trouble():

@@ -1,8 +1,10 @@
 import json
 import os
+import re
 import subprocess
 import sys
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,7 +17,7 @@ from typer.testing import CliRunner
 from mkc_torch import _files
 from mkc_torch._commands import app
 from mkc_torch.calibration import Calibration
-from mkc_torch.demo import simulated_recording
+from mkc_torch.demo import FIELD_PER_AMPERE, simulated_recording
 from mkc_torch.recording import Recording, write_table
 from tests.shared_data import shared_data
 from tests.test_calibration import noisy_ellipsoid
@@ -72,7 +74,17 @@ def test_calibrate_writes_both_files_and_a_summary(good, tmp_path):
     assert sorted(p.name for p in folder.iterdir()) == ["calibration.json", "report.html"]
     c = Calibration.from_json((folder / "calibration.json").read_text(encoding="utf-8"))
     assert c.center == pytest.approx((5.0, -9.0, 20.0), abs=0.3)
-    for words in ("offset", "semi-axes", "residual", "σ =", "d =", "rejected", "coverage", "report.html", "±"):
+    for words in (
+        "offset",
+        "semi-axes",
+        "residual",
+        "noise",
+        "µT along the field",
+        "rejected",
+        "coverage",
+        "report.html",
+        "±",
+    ):
         assert words in result.stdout
     assert result.stderr == ""
 
@@ -100,6 +112,14 @@ def test_existing_results_are_kept_without_force(good, tmp_path):
     forced = mkc("calibrate", good, "--output", tmp_path, "--field-strength", "50", "--force")
     assert forced.exit_code == 0
     assert (tmp_path / "good" / "calibration.json").read_bytes() != before
+
+
+@pytest.mark.parametrize("name", ["report.html", "calibration.json"])
+def test_force_replaces_no_file_of_the_users_own(good, tmp_path, name):
+    (tmp_path / "good").mkdir()
+    (tmp_path / "good" / name).write_text("mine")
+    refused(mkc("calibrate", good, "--output", tmp_path, "--force"), name, "not written by mkc")
+    assert (tmp_path / "good" / name).read_text() == "mine"
 
 
 def test_two_recordings_of_one_name_are_refused_before_any_work(good, tmp_path):
@@ -232,7 +252,7 @@ def test_not_identifiable_writes_a_report_and_no_calibration(tmp_path):
     path = shared_data("magnetometer/quadrotor_compass1.csv")
     folder = tmp_path / "quadrotor_compass1"
     folder.mkdir()
-    (folder / "calibration.json").write_text("of an earlier run")
+    (folder / "calibration.json").write_text('{"schema": "mkc-calibration/1"}')
     result = mkc("calibrate", path, "--output", tmp_path, "--force")
     refused(result, "Not identifiable", "+z", "report.html")
     assert [p.name for p in folder.iterdir()] == ["report.html"]
@@ -276,6 +296,47 @@ def test_apply_does_not_overwrite_and_keeps_rows_without_values(calibrated, tmp_
     assert mkc(*command, "--force").exit_code == 0
 
 
+def test_apply_never_overwrites_what_it_reads(calibrated, tmp_path):
+    folder, _ = calibrated
+    recording, model = tmp_path / "mine.csv", tmp_path / "model.csv"
+    recording.write_bytes((folder / "recording.csv").read_bytes())
+    model.write_bytes((folder / "calibration.json").read_bytes())
+    (tmp_path / "soft.csv").symlink_to(recording)
+    (tmp_path / "hard.csv").hardlink_to(recording)
+    (tmp_path / "folder").mkdir()
+    before = recording.read_bytes(), model.read_bytes()
+    for name in ("mine.csv", "soft.csv", "hard.csv", "folder/../mine.csv", "model.csv"):
+        refused(mkc("apply", model, recording, "--output", tmp_path / name, "--force"), "never overwritten")
+    assert (recording.read_bytes(), model.read_bytes()) == before
+    assert (tmp_path / "soft.csv").is_symlink()
+
+
+def test_apply_warns_of_a_recording_in_another_unit(calibrated, tmp_path):
+    folder, _ = calibrated
+    mine = Recording.read(folder / "recording.csv")
+    other = table(tmp_path / "other.csv", 1e3 * mine.magnetometer())
+    result = mkc("apply", folder / "calibration.json", other, "--output", tmp_path / "o.csv")
+    assert result.exit_code == 0
+    assert "times the 48.2 µT of the recording that this was made from" in result.stdout
+    assert "another unit" in result.stdout
+    result = mkc("apply", folder / "calibration.json", folder / "recording.csv", "--output", tmp_path / "p.csv")
+    assert "warning" not in result.stdout
+    assert "median length 48.2" in result.stdout
+
+
+def test_what_a_user_wrote_is_printed_as_it_is(calibrated, tmp_path):
+    """Rich would make a cross of :X: and bold of [b]."""
+    odd = tmp_path / "no:X:[b]file.csv"
+    result = mkc("apply", calibrated[0] / "calibration.json", odd, "--output", tmp_path / "o.csv")
+    assert result.stderr == f"mkc: {odd}: there is no such file.\n"
+    path = table(odd, noisy_ellipsoid(300))
+    result = mkc("calibrate", path, "--output", tmp_path / "out", "--unit", ":X:[b]")
+    assert result.exit_code == 0
+    assert "no:X:[b]file\n" in result.stdout
+    assert "± SE, :X:[b] " in result.stdout
+    assert str(tmp_path / "out" / "no:X:[b]file" / "report.html") in result.stdout
+
+
 def test_apply_refuses_what_it_cannot_use(calibrated, tmp_path):
     folder, _ = calibrated
     c, rec, out = folder / "calibration.json", folder / "recording.csv", ("--output", tmp_path / "o.csv")
@@ -293,9 +354,12 @@ def test_apply_refuses_what_it_cannot_use(calibrated, tmp_path):
     assert not (tmp_path / "o.csv").exists()
 
 
+DEMO = ["calibration.json", "concealed", "concealed.csv", "corrected.csv", "recording.csv", "report.html", "second.csv"]
+
+
 def test_demo_says_that_it_is_simulated_and_shows_the_truth(calibrated):
     folder, result = calibrated
-    assert sorted(p.name for p in folder.iterdir()) == ["calibration.json", "recording.csv", "report.html"]
+    assert sorted(p.name for p in folder.iterdir()) == DEMO
     assert "SIMULATED" in result.stdout
     for row in ("truth", "least squares", "MKC-EM"):
         assert row in result.stdout
@@ -303,10 +367,37 @@ def test_demo_says_that_it_is_simulated_and_shows_the_truth(calibrated):
     assert torch.equal(Recording.read(folder / "recording.csv").magnetometer(), simulated_recording()[0].magnetometer())
 
 
-def test_demo_refuses_an_existing_folder(calibrated):
+def test_demo_finds_what_is_concealed_and_corrects_a_second_recording(calibrated):
+    folder, result = calibrated
+    place = folder / "concealed"
+    assert sorted(p.name for p in place.iterdir()) == ["diagnosis.json", "model.json", "report.html"]
+    found = json.loads((place / "diagnosis.json").read_text(encoding="utf-8"))
+    (finding,) = found["findings"]
+    assert (finding["effect"], finding["drivers"]) == ("current_field", ["current"])
+    (parameter,) = (p for p in finding["parameters"] if p["name"] == "field_per_ampere")
+    for value, error, true in zip(parameter["value"], parameter["standard_error"], FIELD_PER_AMPERE, strict=True):
+        assert abs(value - true) < 4.0 * error < 0.2
+    assert finding["held_out"]["rmse_after"] < 0.9 * finding["held_out"]["rmse_before"]
+    assert "SIMULATED: no sensor recorded this" in (place / "report.html").read_text(encoding="utf-8")
+    assert "Left out of the simulation: current field (current)." in result.stdout
+    alone, model = (float(x) for x in re.findall(r"(?:alone|found)   +(\d\.\d\d) µT", result.stdout))
+    assert model < 0.9 * alone
+    again = mkc("apply", place / "model.json", folder / "second.csv", "--output", folder.parent / "again.csv")
+    assert again.exit_code == 0
+    assert (folder.parent / "again.csv").read_bytes() == (folder / "corrected.csv").read_bytes()
+
+
+def test_demo_refuses_an_existing_folder_and_files_of_the_users_own(calibrated, tmp_path):
     folder, _ = calibrated
     refused(mkc("demo", "--output", folder), "not empty", "--force")
     assert mkc("demo", "--output", folder, "--force").exit_code == 0
+    (tmp_path / "concealed").mkdir()
+    for name in ("second.csv", "concealed/report.html"):
+        (tmp_path / name).write_text("mine")
+        refused(mkc("demo", "--output", tmp_path, "--force"), name, "not written by mkc")
+        assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == [Path(name).name]
+        assert (tmp_path / name).read_text() == "mine"
+        (tmp_path / name).unlink()
 
 
 def test_recording_of_the_demo_calibrates_to_the_same_numbers(calibrated, tmp_path):

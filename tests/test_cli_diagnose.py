@@ -1,6 +1,7 @@
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -129,6 +130,22 @@ def test_the_model_corrects_a_second_recording(stepped, tmp_path):
     assert float(length.std() / length.mean()) < 0.01
     model = DiagnosedModel.from_json((folder / "model.json").read_text(encoding="utf-8"))
     assert torch.equal(corrected["field_x"], model(Recording.read(new))["field_x"])
+    assert f"median length {float(length.median()):.5g} µT: {output}" in result.stdout
+    assert "warning" not in result.stdout
+
+
+def test_the_model_knows_the_unit_and_the_length_of_its_field(stepped, tmp_path):
+    _, folder, _ = stepped
+    new = sensor(7, step=1.0, start=100.0)
+    other = table(tmp_path / "other.csv", {n: 1e3 * v if n.startswith("mag_") else v for n, v in new.items()})
+    result = mkc("apply", folder / "model.json", other, "--output", tmp_path / "corrected.csv")
+    assert " µT of the recording that this was made from: is this one in another unit" in result.stdout
+    content = json.loads((folder / "model.json").read_text(encoding="utf-8"))
+    del content["state"]["unit"], content["state"]["strength"]  # of an earlier version
+    (tmp_path / "old.json").write_text(json.dumps(content), encoding="utf-8")
+    result = mkc("apply", tmp_path / "old.json", other, "--output", tmp_path / "old.csv")
+    assert result.exit_code == 0
+    assert "warning" not in result.stdout
 
 
 def test_apply_tells_models_from_other_files(stepped, tmp_path):
@@ -162,6 +179,9 @@ def test_force_replaces_results_and_keeps_other_files(tmp_path):
     folder.mkdir()
     for name in (*WRITTEN, "notes.txt"):
         (folder / name).write_text("mine")
+    refused(diagnosed(path, "--output", tmp_path, "--force"), "not written by mkc")
+    for name in WRITTEN:
+        (folder / name).write_text('{"schema": "mkc-diagnosis/1"} Made by mkc_torch')
     assert diagnosed(path, "--output", tmp_path, "--force").exit_code == 0
     assert sorted(p.name for p in folder.iterdir()) == sorted((*WRITTEN, "notes.txt"))
     assert (folder / "notes.txt").read_text() == "mine"
@@ -366,6 +386,11 @@ def test_challenge(tmp_path):
     for words in ("Blind proof: 2 recordings, something hidden in 1", "false alarms", "asked", "holds"):
         assert words in result.stdout
     assert str(folder / "challenge.html") in result.stdout
+    flat = " ".join(result.stdout.split())
+    assert re.search(r"at most 7 % false alarms \d+\.0 % (yes|no) ", flat)
+    assert "Empty recordings, at least 400 at level 0.05 1 too few" in flat
+    assert "Too few recordings to tell (1 of at least 400 and" in flat
+    assert " % |" in (folder / "summary.md").read_text(encoding="utf-8")
     assert "failed none" in " ".join(result.stdout.split())
     record = json.loads((folder / "score.json").read_text(encoding="utf-8"))
     assert (record["settings"]["hidden"], record["settings"]["empty"], record["settings"]["seed"]) == (1, 1, 4)

@@ -142,6 +142,7 @@ def test_a_model_simulates_another_recording(tank, tmp_path):
     corrected = Recording.read(output)
     assert corrected.names == ("time", "experiment", "level")
     assert torch.equal(corrected["experiment"], Recording.read(new)["experiment"])
+    assert output.read_text().splitlines()[1].startswith("0.0,0,")
     assert float((corrected["level"] - Recording.read(new)["level"]).square().mean().sqrt()) < 0.008
 
 

@@ -580,6 +580,35 @@ def test_noise_without_an_ellipsoid_is_refused_or_honest():
     assert float(fit.semi_axes_se_.max()) <= 0.05 * float(fit.radius_)
 
 
+@pytest.mark.parametrize("estimator", [None, LeastSquares(), LeastTrimmedSquares()])
+@pytest.mark.parametrize("long", [0.0, 2.0])
+def test_a_cloud_of_noise_draws_no_surface(estimator, long):
+    """A sensor at rest, or one that is turned a little to and fro: the noise covers all directions evenly."""
+    turned = long * torch.linspace(0.0, 30.0, 2000, dtype=torch.float64).sin()
+    cloud = 0.25 * sample(0, 2000, 3) + torch.stack([turned, 0.0 * turned, 0.0 * turned], -1)
+    error = refused(CENTER + cloud @ rotation(3).mT, estimator)
+    assert "draw no surface" in str(error)
+
+
+@pytest.mark.parametrize("finish", [None, "maximum_likelihood"])
+def test_noise_of_a_tenth_of_the_shortest_semi_axis_leaves_the_surface(finish):
+    points = surface(400) + 3.5 * sample(0, 400, 3)
+    fit = EllipsoidFit(finish=finish).fit(points)
+    torch.testing.assert_close(fit.center_, CENTER, rtol=0, atol=2.0)
+    assert fit.coverage_.fraction == 1.0
+
+
+def test_in_a_batch_the_cloud_of_noise_is_named_and_its_points_of_weight_0_do_not_count():
+    points = torch.stack([surface(300), surface(300) + 30.0 * sample(1, 300, 3), surface(300)])
+    with pytest.raises(NotIdentifiableError, match="Problem 1: Not identifiable"):
+        EllipsoidFit(LeastSquares()).fit(points)
+    weight = torch.ones(3, 300).double()
+    points[1] = surface(300)
+    points[1, ::2] += 30.0 * sample(1, 150, 3)
+    weight[1, ::2] = 0.0
+    torch.testing.assert_close(EllipsoidFit(LeastSquares()).fit(points, weight).center_, CENTER.expand(3, 3))
+
+
 @pytest.mark.parametrize("count", [0, 1, 8])
 def test_fewer_than_nine_points_are_refused(count):
     with pytest.raises(ValueError, match=f"at least 9 points.* but got {count}"):
@@ -709,6 +738,7 @@ def test_a_passing_magnet_does_not_move_the_fit():
 def test_a_flight_that_never_turns_over_is_refused_naming_what_is_missing(name):
     error = refused(recorded(name))
     assert "+z" in str(error)
+    assert ("seen from the middle of the samples" in str(error)) == ("no ellipsoid" in str(error))
     assert error.coverage is not None
 
 

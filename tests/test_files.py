@@ -110,6 +110,33 @@ def test_claim_folder_on_demand_takes_a_folder_and_removes_nothing(tmp_path):
     assert contents(tmp_path) == {"a": b"old"}
 
 
+OWN = {
+    "report.html": "<footer>Made by mkc_torch: method</footer>",
+    "model.json": '{\n  "schema": "mkc-model/1",\n',
+    "corrected.py": '"""Tank, corrected by what `mkc diagnose` found"""',
+}
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_claim_folder_keeps_files_of_the_users_own(tmp_path, name):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(FileExistsError, match=f"{name} exists and was not written by mkc"):
+        claim_folder(tmp_path, overwrite=True, files=OWN)
+    assert contents(tmp_path) == {name: b"mine"}
+    assert claim_folder(tmp_path, overwrite=True, files=["other.html"]) == tmp_path
+    (tmp_path / name).write_text(OWN[name])
+    assert claim_folder(tmp_path, overwrite=True, files=OWN) == tmp_path
+
+
+def test_a_table_goes_with_the_files_beside_it(tmp_path):
+    names = ["recording.csv", "report.html"]
+    (tmp_path / "recording.csv").write_text("a\n1\n")
+    with pytest.raises(FileExistsError, match=r"recording\.csv exists and was not written by mkc"):
+        claim_folder(tmp_path, overwrite=True, files=names)
+    (tmp_path / "report.html").write_text(OWN["report.html"])
+    assert claim_folder(tmp_path, overwrite=True, files=names) == tmp_path
+
+
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_claim_folder_refuses_a_file(tmp_path, overwrite):
     (tmp_path / "a").write_text("old")

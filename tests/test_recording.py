@@ -670,3 +670,31 @@ def test_a_real_table_of_several_runs_is_separated_by_its_labels():
     assert sum(map(len, parts.values())) == len(table)
     assert "Baseball/1" in parts
     assert all((part.time.diff() > 0).all() for part in parts.values())
+
+
+@pytest.mark.parametrize("word", ["n/a", "NA", " null "])
+def test_words_for_a_missing_value_are_told_of(tmp_path, word):
+    recording = read(tmp_path, f"time,a\n0,1\n1,{word}\n2,\n3,nan\n4,{word}\n")
+    assert same(recording["a"], [1, NAN, NAN, NAN, NAN])
+    (warning,) = recording.warnings
+    assert warning == (
+        f'Column `a` holds "{word.strip()}" or the like 2 times, first at line 3; it is read as no value.'
+    )
+
+
+def test_lines_above_the_header_are_named(tmp_path):
+    with pytest.raises(RecordingError, match="the first line must hold the column names: remove what stands above"):
+        read(tmp_path, "# made by logger\n# fw 1.2\ntime,a\n0,1\n")
+
+
+@pytest.mark.parametrize("mark", ["utf-16-le", "utf-16-be"])
+def test_utf_16_is_refused_and_how_to_export_said(tmp_path, mark):
+    with pytest.raises(RecordingError, match="begins as UTF-16 does; export it as CSV in UTF-8"):
+        read(tmp_path, "\ufefftime,a\n0,1\n".encode(mark))
+
+
+def test_a_date_is_no_number(tmp_path):
+    path = tmp_path / "a.parquet"
+    pl.DataFrame({"time": [0, 1], "a": [1.0, 2.0]}).with_columns(pl.col("time").cast(pl.Datetime)).write_parquet(path)
+    with pytest.raises(RecordingError, match=r"column `time` holds no number at row 1.*times are numbers, in seconds"):
+        Recording.read(path)

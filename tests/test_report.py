@@ -134,6 +134,15 @@ def test_units_other_than_microtesla():
     assert "µT per counts" in text_of(calibration_report(both, counts))
 
 
+@pytest.mark.parametrize("factor", [1e-30, 1e-6, 1e6, 1e30])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_a_recording_of_any_size_has_a_page(factor, noise):
+    huge = recorded(factor * noisy_ellipsoid(noise=noise))
+    text = text_of(calibration_report(calibrate(huge), huge))
+    assert "recorded units" in text
+    assert "nan" not in text.casefold().split()
+
+
 @pytest.mark.parametrize("count", [12, 30, 400])
 def test_small_and_exact_recordings_have_a_page(count):
     exact = recorded(noisy_ellipsoid(count, noise=0.0))
@@ -176,6 +185,55 @@ def test_pages_leave_the_settings_of_matplotlib_alone(calibration, recording):
 
 def test_same_input_gives_the_same_page(calibration, recording):
     assert calibration_report(calibration, recording) == calibration_report(calibration, recording)
+
+
+def test_numbers_of_any_size_are_written_in_a_power_of_ten(recording):
+    columns = {name: 1e-6 * values for name, values in recording.columns.items() if name != "time"}
+    tiny = Recording(columns | {"time": recording["time"]}, units=dict.fromkeys(columns, "T"))
+    text = text_of(calibration_report(calibrate(tiny), tiny))
+    assert "± standard error, 10⁻⁶ T" in text
+    assert re.search(r"Offset \(11\.\d+, −7\.\d+, 2\d\.\d+\) × 10⁻⁶ T", text)
+    assert not re.search(r"± 0\.0+(?!\d)", text)
+    strong = calibrate(tiny, field_strength=50.0)
+    assert "Calibration matrix, 10⁶ µT per T" in text_of(calibration_report(strong, tiny))
+
+
+def test_the_noise_is_said_in_the_units_of_the_recording(calibration, page):
+    assert wording.noise(calibration).startswith("0.47")
+    assert f"The noise is {wording.noise(calibration)}." in text_of(page)
+
+
+def test_backticks_are_set_as_code(calibration, recording):
+    shown = dataclasses.replace(calibration, warnings=("run `mkc <x>` & so on", "one ` alone"))
+    html = calibration_report(shown, recording)
+    assert "run <code>mkc &lt;x&gt;</code> &amp; so on" in html
+    assert "one ` alone" in html
+
+
+def test_what_is_said_of_the_file_is_no_doubt_about_the_result(recording):
+    time = recording["time"].clone()
+    time[2000:] += 30.0
+    gap = Recording(dict(recording.columns) | {"time": time})
+    text = text_of(calibration_report(calibrate(gap), gap))
+    assert "Calibrated. Offset" in text
+    assert "The time has 1 gap" in text
+
+
+def test_many_rejected_samples_lead_to_the_diagnosis():
+    points = noisy_ellipsoid()
+    points[:120] += torch.tensor([0.0, 0.0, 60.0])
+    doubtful = recorded(points)
+    assert "mkc diagnose RECORDING.csv" in text_of(calibration_report(calibrate(doubtful), doubtful))
+
+
+def test_a_refusal_tells_what_was_left_out():
+    points = noisy_ellipsoid(600)
+    cap = points[points[:, 2] < -10.0]
+    cap[3, 0] = 1e9
+    refused_one = recorded(cap)
+    with pytest.raises(NotIdentifiableError) as refused:
+        calibrate(refused_one)
+    assert "mag_x is 1e+09" in text_of(refusal_report(refused_one, refused.value))
 
 
 def test_sizes_read_well():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,11 +12,12 @@ import torch
 import typer
 
 from mkc_torch import calibration_file
-from mkc_torch._commands.console import FAILURES, complain, out, parsed_columns
+from mkc_torch._commands.console import FAILURES, complain, interrupts_told, out, parsed_columns, progress
 from mkc_torch._commands.diagnosis_files import SIMULATIONS, named_simulation, paired_simulation
 from mkc_torch.calibration import Calibration
 from mkc_torch.diagnosis import DiagnosedModel, diagnosed_model, diagnosis_file
 from mkc_torch.recording import Recording, write_table
+from mkc_torch.report.wording import size
 from mkc_torch.simulation.load import raised_in
 from mkc_torch.simulation.registry import refuse_unknown
 
@@ -25,6 +27,9 @@ if TYPE_CHECKING:
     from mkc_torch.simulation import Simulation
 
 _NOT_MEASURED = ("time", "experiment")
+
+_OTHER_LENGTH = 1.5
+"""How many times longer or shorter a field is that is not the one a correction was made in."""
 
 
 def apply(
@@ -59,17 +64,21 @@ def apply(
         raise typer.BadParameter("--simulation and --simulated exclude each other; give the one that was diagnosed.")
     subject: str | Path = model
     try:
-        own = None
-        if simulation is not None or simulated is not None:
-            subject = str(simulation or simulated)
-            own = named_simulation(simulation) if simulation else paired_simulation(Path(subject), names)
-        subject = model
-        known = read_correction(model, own)
-        subject = recording
-        table = Recording.read(recording, columns=names)
-        corrected = correct(known, table)
-        subject = output
-        write_table(output, corrected.columns, labels=table.labels, overwrite=force)
+        with interrupts_told(lambda: f"nothing was written to {output}."), progress(1) as step:
+            step(f"correcting {recording.name}")
+            own = None
+            if simulation is not None or simulated is not None:
+                subject = str(simulation or simulated)
+                own = named_simulation(simulation) if simulation else paired_simulation(Path(subject), names)
+            subject = model
+            known = read_correction(model, own)
+            subject = output
+            _refuse_input(output, recording, model, simulated)
+            subject = recording
+            table = Recording.read(recording, columns=names)
+            corrected = correct(known, table)
+            subject = output
+            write_table(output, corrected.columns, labels=table.labels, overwrite=force)
     except Exception as error:
         told = raised_in(simulation, error) if simulation and simulation not in SIMULATIONS else None
         if told is None and not isinstance(error, FAILURES):
@@ -79,6 +88,17 @@ def apply(
     _show(table, corrected, output)
 
 
+def _refuse_input(output: Path, *inputs: Path | None) -> None:
+    """Refuses to write over what is read, under whatever name.
+
+    Raises:
+        ValueError: the output is one of the inputs.
+    """
+    for path in inputs:
+        if path is not None and output.exists() and path.exists() and output.samefile(path):
+            raise ValueError(f"this is {path} itself, which is read and never overwritten; choose another --output.")
+
+
 def _show(table: Recording, corrected: Corrected, output: Path) -> None:
     console = out()
     columns = {name: values for name, values in corrected.columns.items() if name not in _NOT_MEASURED}
@@ -86,28 +106,50 @@ def _show(table: Recording, corrected: Corrected, output: Path) -> None:
     missing = int((~values.isfinite().all(-1)).sum())
     is_field = set(columns) == {f"field_{axis}" for axis in "xyz"}
     for warning in table.warnings:
-        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
+        console.print(f"warning: {warning}", soft_wrap=True)
     for note in corrected.notes:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
+        console.print(f"note: {note}", soft_wrap=True)
     if missing:
         what = "field" if is_field else f"value of {', '.join(columns)}"
-        console.print(f"warning: {missing} of {len(values)} rows have no finite {what}.", markup=False, soft_wrap=True)
+        console.print(f"warning: {missing} of {len(values)} rows have no finite {what}.", soft_wrap=True)
     if not is_field:
         told = f"{len(values):,} rows of {', '.join(columns)} simulated with what was found"
     elif missing < len(values):
-        norm = torch.linalg.vector_norm(values, dim=-1)
-        told = f"{len(values):,} rows corrected, median length {float(norm.nanmedian()):.2f} {corrected.unit}".rstrip()
+        length = float(torch.linalg.vector_norm(values, dim=-1).nanmedian())
+        if sentence := _other(length, corrected):
+            console.print(f"warning: {sentence}", soft_wrap=True)
+        told = f"{len(values):,} rows corrected, median length {length:.5g} {corrected.unit}".rstrip()
     else:
         told = f"{len(values):,} rows corrected"
-    console.print(f"{told}: {output}", markup=False, soft_wrap=True)
+    console.print(f"{told}: {output}", soft_wrap=True)
+
+
+def _other(length: float, corrected: Corrected) -> str | None:
+    """A sentence about a field of quite another length than that of the recording which the correction is from."""
+    expected, unit = corrected.length, corrected.unit
+    if expected is None or not length > 0 or abs(math.log(length / expected)) < math.log(_OTHER_LENGTH):
+        return None
+    return (
+        f"the corrected field's median length is {size(length)}, {size(length / expected)} times the "
+        f"{size(expected)} {unit} of the recording that this was made from: is this one in another unit, or of another "
+        "sensor or place?"
+    ).replace("  ", " ")
 
 
 @dataclass(frozen=True)
 class Corrected:
-    """The corrected columns of a recording, their unit if it is known, and sentences about what was left out."""
+    """The corrected columns of a recording.
+
+    Attributes:
+        columns: name to values.
+        unit: of the corrected field, if it is known.
+        length: of the field where the correction was made, if it is known.
+        notes: sentences about what was left out.
+    """
 
     columns: dict[str, Tensor]
     unit: str
+    length: float | None
     notes: tuple[str, ...]
 
 
@@ -146,9 +188,10 @@ def read_correction(path: Path, simulation: Simulation | None = None) -> Calibra
 def correct(known: Calibration | DiagnosedModel, recording: Recording) -> Corrected:
     """The recording as the calibration or the model corrects it."""
     if isinstance(known, Calibration):
-        return Corrected(known.apply(recording), known.field_unit, ())
+        return Corrected(known.apply(recording), known.field_unit, known.field_strength, ())
     columns, notes = known.correct(recording)
-    return Corrected(columns, "", notes)
+    length = known.state.get("strength")
+    return Corrected(columns, str(known.state.get("unit", "")), length if isinstance(length, float) else None, notes)
 
 
 def _text(path: Path) -> str:

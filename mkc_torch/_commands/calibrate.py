@@ -13,6 +13,8 @@ from mkc_torch._commands.console import (
     complain,
     err,
     folder_removed_on_failure,
+    interrupts_told,
+    not_written,
     out,
     parsed_columns,
     progress,
@@ -51,10 +53,10 @@ def calibrate(
     if not unit.strip():
         raise typer.BadParameter("--unit is empty; name the unit, such as counts.")
     refuse_same_names(recordings)
-    console, failed = out(), 0
-    with progress(len(recordings)) as step:
+    console, failed, left = out(), 0, list(recordings)
+    with progress(len(recordings)) as step, interrupts_told(lambda: not_written(left, output)):
         for path in recordings:
-            step(path.name)
+            step(f"calibrating {path.name}")
             try:
                 recording = with_unit(Recording.read(path, columns=names), unit)
                 calibration, files = calibrate_into(output / path.stem, recording, field_strength, force=force)
@@ -65,6 +67,7 @@ def calibrate(
             else:
                 with step.aside():
                     show(console, calibration, files)
+            left.remove(path)
             step(None)
     if len(recordings) > 1 and failed:
         err().print(f"mkc: {failed} of {len(recordings)} recordings were not calibrated.", soft_wrap=True)
@@ -77,8 +80,8 @@ def calibrate_into(
     """Write calibration.json and report.html of a recording; where it is refused, the report alone says why."""
     from mkc_torch.report import calibration_report, refusal_report
 
-    claim_folder(folder, overwrite=force)
     report, result = folder / "report.html", folder / "calibration.json"
+    claim_folder(folder, overwrite=force, files=(report.name, result.name))
     with folder_removed_on_failure(folder):
         try:
             calibration = fit(recording, field_strength=field_strength)

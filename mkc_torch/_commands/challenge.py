@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mkc_torch._commands.apply import correct, read_correction
-from mkc_torch._commands.console import FAILURES, Look, complain, out, progress
+from mkc_torch._commands.console import FAILURES, Look, complain, interrupts_told, out, progress
 from mkc_torch._commands.diagnosis_files import Request, diagnose_file, named_simulation
 from mkc_torch._forked import allow_copies
 from mkc_torch._processes import cores, keep_memory, one_thread
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from mkc_torch.challenge import Score
+    from mkc_torch.challenge.score import Measured
     from mkc_torch.challenge.subject import Subject
 
 _QUIET = Look(terminal=False, width=100)
@@ -78,7 +79,7 @@ def challenge(
     keep_memory()
     allow_copies(0)  # the workers are as many processes as was asked for
     try:
-        with progress(cases + empty) as step:
+        with interrupts_told(lambda: f"what was done so far is in {output}."), progress(cases + empty) as step:
             score = run.run_challenge(
                 diagnose, correct_one, subject=subject, cases=cases, empty=empty, seed=seed, output=output,
                 overwrite=force, workers=min(workers or cores(), cases + empty), progress=step.count,
@@ -146,8 +147,17 @@ _JOBS = {
 }
 
 
+def _counts(measured: Measured) -> bool:
+    """Whether it is a number of recordings."""
+    return math.isinf(measured.threshold.high)
+
+
+def _not(measured: Measured) -> str:
+    return "too few" if _counts(measured) else "no"
+
+
 def _show(score: Score, cases: int, empty: int, output: Path) -> None:
-    from mkc_torch.challenge.page import number_text, share_text
+    from mkc_torch.challenge.page import measured_text, share_text
 
     console = out()
     console.print()
@@ -159,10 +169,16 @@ def _show(score: Score, cases: int, empty: int, output: Path) -> None:
     for m in score.measured:
         table.add_row(
             Text(m.threshold.sentence),
-            number_text(m.value),
-            Text("—") if math.isnan(m.value) else Text("yes") if m.holds else Text("no", style="bold yellow"),
+            measured_text(m),
+            Text("—") if math.isnan(m.value) else Text("yes") if m.holds else Text(_not(m), style="bold yellow"),
         )
     console.print(table)
+    if few := [m for m in score.measured if _counts(m) and not m.holds]:
+        found = " and ".join(f"{m.value:.0f} of at least {m.threshold.low:.0f}" for m in few)
+        console.print(
+            f"Too few recordings to tell ({found}): what holds here, and what does not, may be chance. Leave out "
+            "--cases and --empty for a run of full size."
+        )
     facts = Table.grid(padding=(0, 3, 0, 0))
     facts.add_column(no_wrap=True)
     facts.add_column(overflow="fold")

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import io
+import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event, RLock, Thread
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from mkc_torch.recording import Recording
 from mkc_torch.simulation.load import SimulationFileError
@@ -54,7 +56,8 @@ def _console(
     terminal: bool, *, stderr: bool = False, width: int | None = None, file: io.StringIO | None = None
 ) -> Console:
     return Console(
-        file=file, stderr=stderr, highlight=False, soft_wrap=False,
+        file=file, stderr=stderr, soft_wrap=False,
+        highlight=False, markup=False, emoji=False,  # what a user wrote is printed as it is
         force_terminal=terminal, no_color=None if terminal else True,
         width=width if terminal else width or _WIDTH_IN_A_PIPE,
     )  # fmt: skip
@@ -65,7 +68,7 @@ def complain(subject: str | Path, error: BaseException) -> None:
     sentence = sentence_of(error)
     if not sentence.startswith(str(subject)):
         sentence = f"{subject}: {sentence}"
-    err().print(f"mkc: {sentence}", markup=False, soft_wrap=True)
+    err().print(f"mkc: {sentence}", soft_wrap=True)
 
 
 def sentence_of(error: BaseException) -> str:
@@ -137,7 +140,7 @@ def refuse_same_names(recordings: Sequence[Path]) -> None:
 
 
 class Steps:
-    """A bar over several things to do; without one it does nothing."""
+    """What is being done, how much of it is, and for how long; without a bar it does nothing."""
 
     def __init__(self, bar: Progress | None, total: int) -> None:
         self._bar = bar
@@ -163,21 +166,82 @@ class Steps:
         if self._bar is None:
             yield
             return
-        self._bar.stop()
-        yield
-        self._bar.start()
+        with drawing:
+            self._bar.stop()
+            yield
+            self._bar.start()
+
+
+drawing = RLock()
+"""Held while something is drawn, and while this process is forked: a copy finds none of the locks of others taken."""
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=drawing.acquire, after_in_parent=drawing.release, after_in_child=drawing.release)
+
+_EVERY = 0.2  # s
 
 
 @contextmanager
 def progress(total: int) -> Iterator[Steps]:
-    """A bar over several things on a terminal; nothing for one thing or in a pipe."""
+    """What is being done and for how long, on a terminal, with a bar over several things; nothing in a pipe."""
     console = err()
-    if total < 2 or not console.is_terminal:
+    if not console.is_terminal:
         yield Steps(None, total)
         return
-    parts = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*parts, console=console, transient=True, redirect_stdout=False, redirect_stderr=False) as bar:
+    over = (BarColumn(), MofNCompleteColumn()) if total > 1 else ()
+    parts = (SpinnerColumn(), TextColumn("{task.description}", markup=False), *over, TimeElapsedColumn())
+    with (
+        Progress(
+            *parts, console=console, transient=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False
+        ) as bar,
+        _refreshed(bar),
+    ):
         yield Steps(bar, total)
+
+
+@contextmanager
+def _refreshed(bar: Progress) -> Iterator[None]:
+    """Draws the bar anew from time to time; a thread of its own does, for the work gives it no moment."""
+    done = Event()
+
+    def draw() -> None:
+        while not done.wait(_EVERY):
+            with drawing:
+                if bar.live.is_started:
+                    bar.refresh()
+
+    thread = Thread(target=draw, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+@contextmanager
+def interrupts_told(left: Callable[[], str]) -> Iterator[None]:
+    """One line on standard error when the user interrupts, with what ``left`` says of what there is and is not."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        err().print(f"mkc: interrupted; {left()}", soft_wrap=True)
+        raise
+
+
+def not_written(recordings: Iterable[Path], output: Path) -> str:
+    """Which recordings were not begun or left nothing behind, and for which something is there.
+
+    Example:
+        >>> not_written([Path("a.csv"), Path("b.csv")], Path("results"))
+        'nothing was written for a.csv, b.csv.'
+    """
+    paths = list(recordings)
+    there = [path for path in paths if (output / path.stem).is_dir()]
+    absent = ", ".join(str(path) for path in paths if path not in there)
+    told = [f"nothing was written for {absent}"] if absent else []
+    told += [f"{', '.join(str(output / path.stem) for path in there)} may be incomplete"] if there else []
+    return f"{'; '.join(told)}." if told else "all was written."
 
 
 @contextmanager

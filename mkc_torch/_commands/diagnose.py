@@ -17,6 +17,8 @@ from mkc_torch._commands.console import (
     Steps,
     complain,
     err,
+    interrupts_told,
+    not_written,
     out,
     parsed_columns,
     progress,
@@ -83,27 +85,35 @@ def diagnose(
         force=force,
     )
     refuse_same_names(recordings)
-    _refuse_unusable(request)
+    total, failed, left = 0, 0, list(recordings)
+    with interrupts_told(lambda: not_written(left, output)):
+        _refuse_unusable(request)
     one_thread()
     keep_memory()
     look = Look.of(out())
-    work = partial(_diagnosed, output, request, look)
-    total = failed = 0
-    with progress(len(recordings)) as step, in_processes(work, recordings) as results:
+    with (
+        interrupts_told(lambda: not_written(left, output)),
+        progress(len(recordings)) as step,
+        # a single one is worked on in this process, and says which experiment it is at
+        in_processes(
+            partial(_diagnosed, output, request, look, step if len(recordings) == 1 else None), recordings
+        ) as results,
+    ):
         for path, result in zip(recordings, results, strict=True):
-            step(path.name)
+            step(f"diagnosing {path.name}")
             outcomes = _waited_for(result, path)
             _tell(outcomes, step)
             total += len(outcomes)
             failed += sum(outcome.failed for outcome in outcomes)
+            left.remove(path)
             step(None)
     if total > 1 and failed:
         err().print(f"mkc: {failed} of {total} recordings were not diagnosed.", soft_wrap=True)
     raise typer.Exit(1 if failed else 0)
 
 
-def _diagnosed(output: Path, request: Request, look: Look, path: Path) -> list[Outcome]:
-    return diagnose_file(path, output / path.stem, request, look)
+def _diagnosed(output: Path, request: Request, look: Look, step: Steps | None, path: Path) -> list[Outcome]:
+    return diagnose_file(path, output / path.stem, request, look, step)
 
 
 def _waited_for(result: Callable[[], list[Outcome]], path: Path) -> list[Outcome]:
@@ -117,7 +127,7 @@ def _tell(outcomes: list[Outcome], step: Steps) -> None:
     with step.aside():
         for outcome in outcomes:
             if outcome.failed:
-                err().print(f"mkc: {outcome.text}", markup=False, soft_wrap=True)
+                err().print(f"mkc: {outcome.text}", soft_wrap=True)
             else:
                 typer.echo(outcome.text, nl=False)
 

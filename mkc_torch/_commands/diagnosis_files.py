@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = [
     "MAGNETOMETER",
     "SIMULATIONS",
+    "WRITTEN",
     "Outcome",
     "Request",
     "diagnose_file",
@@ -41,6 +42,7 @@ SIMULATIONS = (MAGNETOMETER,)
 """Simulations that are known by name."""
 
 _EXPERIMENT = "experiment"
+WRITTEN = ("diagnosis.json", "model.json", "corrected.py", "report.html")
 
 
 @dataclass(frozen=True)
@@ -66,36 +68,41 @@ class Outcome:
     failed: bool
 
 
-def diagnose_file(path: Path, folder: Path, request: Request, look: Look) -> list[Outcome]:
+def diagnose_file(
+    path: Path, folder: Path, request: Request, look: Look, step: Callable[[str], None] | None = None
+) -> list[Outcome]:
     """Diagnose a file into a folder.
 
     Each experiment of a table that holds several is diagnosed on its own, into a folder in it, but for a simulation
-    that takes several at once. One that fails does not keep the others from being done.
+    that takes several at once. One that fails does not keep the others from being done. ``step`` is told which it is.
     """
     try:
         recording = Recording.read(path, columns=request.columns)
         simulation = simulation_of(request)
         if request.simulated is None and request.simulation == MAGNETOMETER:
             recording = with_unit(recording, request.unit)
-        claim_folder(folder, overwrite=request.force)
+        claim_folder(folder, overwrite=request.force, files=WRITTEN)
     except Exception as error:
         return [_failed(path, "", error)]
     if request.report:
         load_early("matplotlib.figure")
     with folder_removed_on_failure(folder):
-        outcomes = [
-            _outcome(path, label, simulation, part, place, request, look)
-            for label, part, place in _parts(recording, simulation, folder)
-        ]
+        parts, outcomes = list(_parts(recording, simulation, folder)), []
+        for number, (label, part, place) in enumerate(parts, start=1):
+            if step is not None and len(parts) > 1:
+                step(f"diagnosing {path.name}, experiment {label} ({number} of {len(parts)})")
+            outcomes.append(_outcome(path, label, simulation, part, place, request, look))
         if all(outcome.failed for outcome in outcomes):
             _remove_if_empty(folder)
     return outcomes
 
 
-def write_diagnosis(diagnosis: Diagnosis, folder: Path, *, force: bool, report: bool = True) -> list[Path]:
+def write_diagnosis(
+    diagnosis: Diagnosis, folder: Path, *, force: bool, report: bool = True, note: str = ""
+) -> list[Path]:
     """Write diagnosis.json, model.json and report.html of a diagnosis into a folder.
 
-    Of differential equations also corrected.py, the simulation with what was found.
+    Of differential equations also corrected.py, the simulation with what was found. ``note`` is said in the report.
     """
     from mkc_torch.diagnosis.diagnosis_file import diagnosis_to_json
     from mkc_torch.report import diagnosis_report
@@ -108,7 +115,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Path, *, force: bool, report: 
     for name in {"model.json", "corrected.py"} - set(texts):
         (folder / name).unlink(missing_ok=True)  # an old one would be taken for this diagnosis' own
     if report:
-        texts["report.html"] = diagnosis_report(diagnosis)
+        texts["report.html"] = diagnosis_report(diagnosis, note=note)
     for name, text in texts.items():
         write_atomically(folder / name, text, overwrite=force)
     return [folder / name for name in texts]
@@ -148,7 +155,8 @@ def _outcome(
     path: Path, label: str, simulation: Simulation, recording: Recording, folder: Path, request: Request, look: Look
 ) -> Outcome:
     try:
-        claim_folder(folder, overwrite=request.force or not label)  # the whole folder was claimed before
+        # the whole folder was claimed before
+        claim_folder(folder, overwrite=request.force or not label, files=WRITTEN)
         with folder_removed_on_failure(folder):
             diagnosis = diagnose(
                 simulation, recording, level=request.level, surrogates=request.surrogates, seed=request.seed

@@ -20,8 +20,10 @@ def show(console: Console, c: Calibration, files: list[Path]) -> None:
     table.add_column(no_wrap=True)
     for _ in range(3):
         table.add_column(justify="right", no_wrap=True)
-    table.add_row(f"offset x, y, z ± SE, {c.unit}", *w.with_errors(c.center, c.center_se))
-    table.add_row(f"semi-axes ± SE, {c.unit}", *w.with_errors(c.semi_axes, c.semi_axes_se))
+    power = w.power(c.radius)
+    unit = w.in_power(power, c.unit)
+    table.add_row(Text(f"offset x, y, z ± SE, {unit}"), *w.with_errors(c.center, c.center_se, power))
+    table.add_row(Text(f"semi-axes ± SE, {unit}"), *w.with_errors(c.semi_axes, c.semi_axes_se, power))
     console.print(table)
     residual = f"{w.change(c.before, c.after, c.unit)} robust, {w.size(c.before.rms)} → {w.size(c.after.rms)} rms"
     facts = Table.grid(padding=(0, 3, 0, 0))
@@ -29,9 +31,9 @@ def show(console: Console, c: Calibration, files: list[Path]) -> None:
     facts.add_column(overflow="fold")
     for name, value in (
         ("residual", residual),
-        ("noise", f"σ = {w.bandwidth(c.sigma)}, d = {w.size(c.d)} of the algebraic residual"),
+        ("noise", w.noise(c)),
         ("rejected", w.rejection(c)),
-        ("coverage", f"{w.share(c.coverage.fraction)} of all directions"),
+        ("coverage", f"{w.share(c.coverage.fraction)} of all directions have a sample within 15°"),
     ):
         facts.add_row(name, Text(value))
     for warning in c.warnings:

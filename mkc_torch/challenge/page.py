@@ -9,7 +9,7 @@ from typing import Any
 
 from mkc_torch.challenge.binomial import Share
 from mkc_torch.challenge.key import Key
-from mkc_torch.challenge.score import Score
+from mkc_torch.challenge.score import Measured, Score
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _SHARED = Path(__file__).parents[1] / "report" / "templates"
@@ -38,7 +38,7 @@ def challenge_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(share=share_text, number=number_text)
+    environment.filters.update(share=share_text, number=number_text, measured=measured_text)
     return environment.get_template("challenge.html.j2").render(
         score=score,
         passed=sum(m.holds for m in score.measured),
@@ -59,8 +59,7 @@ def summary(score: Score, baselines: Mapping[str, Score], settings: Mapping[str,
     lines = ["# The blind proof", "", *(f"- {name}: {value}" for name, value in settings.items()), ""]
     lines += ["| asked | measured | holds |", "|---|---|---|"]
     lines += [
-        f"| {m.threshold.sentence} | {number_text(m.value)} | {'yes' if m.holds else '**no**'} |"
-        for m in score.measured
+        f"| {m.threshold.sentence} | {measured_text(m)} | {'yes' if m.holds else '**no**'} |" for m in score.measured
     ]
     names = ["diagnosis", *baselines]
     lines += ["", f"| | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
@@ -122,6 +121,19 @@ def share_text(share: Share) -> str:
 
 def number_text(value: float) -> str:
     return "not measured" if math.isnan(value) else f"{value:.4g}"
+
+
+def measured_text(measured: Measured) -> str:
+    """What was measured, in per cent where that was asked for.
+
+    Example:
+        >>> from mkc_torch.challenge.thresholds import THRESHOLDS
+        >>> measured_text(Measured(THRESHOLDS[1], 0.0625)), measured_text(Measured(THRESHOLDS[-1], 1.007))
+        ('6.2 %', '1.007')
+    """
+    value = measured.value
+    asked_in_per_cent = "%" in measured.threshold.sentence and math.isfinite(value)
+    return f"{100.0 * value:.1f} %" if asked_in_per_cent else number_text(value)
 
 
 def _median(values: Sequence[float]) -> float:

@@ -38,13 +38,13 @@ from mkc_torch.diagnosis.separability import separability
 from mkc_torch.diagnosis.shifts import shift_warning
 from mkc_torch.diagnosis.side_by_side import known_of, learn, with_memory
 from mkc_torch.diagnosis.simplified import simplified
-from mkc_torch.diagnosis.units import unit_warnings
 from mkc_torch.diagnosis.unrecorded import course_without, located_cause
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.protocol import Effect, FormedEffect
 from mkc_torch.effects.unrecorded import Unrecorded
 from mkc_torch.recording import Recording
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation, refuse_no_recording
+from mkc_torch.units import unit_warnings
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

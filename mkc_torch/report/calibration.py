@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
-from mkc_torch.calibration import MAX_REJECTED, Calibration, Vector, prepared
+from mkc_torch.calibration import ENOUGH_INFORMATION, MAX_REJECTED, Calibration, Vector, prepared
 from mkc_torch.coverage import nearest_axis
 from mkc_torch.ellipsoid import NotIdentifiableError
 from mkc_torch.recording import Recording
@@ -54,7 +54,10 @@ def calibration_report(
     return _render(
         "calibration.html.j2",
         c=calibration,
-        doubtful=calibration.rejected_share > MAX_REJECTED or bool(calibration.coverage.gaps),
+        # what is said of the file, such as a gap in time, is no doubt about the result
+        doubtful=len(calibration.warnings) > len(usable.warnings),
+        enough=ENOUGH_INFORMATION,
+        rejects_many=calibration.rejected_share > MAX_REJECTED,
         note=note,
         comparison=comparison,
         figures={
@@ -90,7 +93,7 @@ def refusal_report(recording: Recording, error: NotIdentifiableError) -> str:
         picture = Markup(pictures.coverage_map(error.coverage, error.directions))
     return _render(
         "not_identifiable.html.j2",
-        recording=recording,
+        recording=prepared(recording),
         reason=str(error).removeprefix("Not identifiable: "),
         coverage=error.coverage,
         picture=picture,
@@ -105,5 +108,14 @@ def _render(template: str, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["coded"] = _coded
     environment.globals.update(w=wording, nearest_axis=nearest_axis, zip=zip)
     return environment.get_template(template).render(**values)
+
+
+def _coded(text: str) -> Markup:
+    """A sentence in which what stands between backticks is set as code."""
+    parts = [escape(part) for part in text.split("`")]
+    if len(parts) % 2 == 0:
+        return escape(text)
+    return Markup("").join(Markup("<code>{}</code>").format(p) if i % 2 else p for i, p in enumerate(parts))

@@ -133,8 +133,8 @@ def density(calibration: Calibration, points: Tensor) -> str:
             ax.margins(x=0)
             if ax is right:
                 least = 1.0 / (len(e) * (edges[1] - edges[0]))
-                ax.set_yscale("log")
                 ax.set_ylim(0.3 * least, 3.0 * max(float(fitted.max()), float(value.max())))
+                ax.set_yscale("log")
         left.set_ylabel(f"density (1/{c.unit})" if c.unit else "density")
         left.set_title("Head, linear scale")
         right.set_title("Head and tail, logarithmic scale")

@@ -5,10 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from mkc_torch.calibration import Calibration, Matrix, Spread
+from mkc_torch.calibration import Calibration, Spread
 from mkc_torch.disturbance import Interval
 
-_MOST_DECIMALS = 6
+_MOST_DECIMALS = 9
+_LEAST, _MOST = 0.01, 1e6
+"""Sizes that are written without a power of ten."""
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def decimals(step: float) -> int:
@@ -34,50 +38,81 @@ def number(value: float, places: int) -> str:
     return text.replace("-", "−") if float(text) != 0 else text.lstrip("-")
 
 
-def with_errors(values: Sequence[float], errors: Sequence[float]) -> list[str]:
-    """Values with their standard errors, all to the digits that the largest error leaves.
+def power(largest: float) -> int:
+    """The power of ten, a multiple of three, that numbers of this size are written in; 0 for usual ones.
+
+    Example:
+        >>> power(46.2), power(4.6e-5), power(4.6e31)
+        (0, -6, 30)
+    """
+    if largest == 0 or _LEAST <= largest < _MOST or not math.isfinite(largest):
+        return 0
+    return 3 * math.floor(math.log10(largest) / 3.0)
+
+
+def in_power(exponent: int, unit: str) -> str:
+    """A unit of numbers that are written in a power of ten.
+
+    Example:
+        >>> in_power(-6, "T"), in_power(0, "µT")
+        ('10⁻⁶ T', 'µT')
+    """
+    return f"10{str(exponent).translate(_RAISED)} {unit}".rstrip() if exponent else unit
+
+
+def with_errors(values: Sequence[float], errors: Sequence[float], exponent: int = 0) -> list[str]:
+    """Values with their standard errors, all to the digits that the largest error leaves, in a power of ten.
 
     Example:
         >>> with_errors((-0.89431, 44.2), (0.085, 0.0925)), with_errors((1.5,), (math.nan,))
         (['−0.894 ± 0.085', '44.200 ± 0.092'], ['1.500'])
+        >>> with_errors((1.1984e-05,), (1.1e-08,), -6), with_errors((1.0,), (1e-15,))
+        (['11.984 ± 0.011'], ['1.000000000 ± 1.0e-15'])
     """
-    return _with_places(values, errors, decimals(max(errors)))
+    return matrix_with_errors([values], [errors], exponent)[0]
 
 
-def matrix_with_errors(matrix: Matrix, errors: Matrix) -> list[list[str]]:
-    """Rows of a matrix with their standard errors, all to the same digits."""
-    places = decimals(max(e for row in errors for e in row))
-    return [_with_places(row, error, places) for row, error in zip(matrix, errors, strict=True)]
-
-
-def _with_places(values: Sequence[float], errors: Sequence[float], places: int) -> list[str]:
+def matrix_with_errors(
+    matrix: Sequence[Sequence[float]], errors: Sequence[Sequence[float]], exponent: int = 0
+) -> list[list[str]]:
+    """Rows of a matrix with their standard errors, all to the same digits, in a power of ten."""
+    scale = 10.0**exponent
+    places = decimals(max(e for row in errors for e in row) / scale)
     return [
-        f"{number(v, places)} ± {e:.{places}f}" if math.isfinite(e) else number(v, places)
-        for v, e in zip(values, errors, strict=True)
+        [_with_error(v / scale, e / scale, places) for v, e in zip(row, error, strict=True)]
+        for row, error in zip(matrix, errors, strict=True)
     ]
+
+
+def _with_error(value: float, error: float, places: int) -> str:
+    if not math.isfinite(error):
+        return number(value, places)
+    told = f"{error:.{places}f}"
+    return f"{number(value, places)} ± {told if float(told) > 0 or error == 0 else f'{error:.1e}'}"
 
 
 def size(value: float) -> str:
     """A size to three digits.
 
     Example:
-        >>> size(28.62), size(0.2837), size(758.09), size(0.0)
-        ('28.6', '0.284', '758', '0')
+        >>> size(28.62), size(0.2837), size(758.09), size(0.0), size(4.6e31)
+        ('28.6', '0.284', '758', '0', '4.60e+31')
     """
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     places = max(2 - math.floor(math.log10(abs(value))), 0)
-    return number(value, places) if places <= 6 else f"{value:.2e}"
+    return number(value, places) if places <= 6 and abs(value) < 1e9 else f"{value:.2e}"
 
 
-def listed(values: Sequence[float], errors: Sequence[float]) -> str:
-    """Values side by side, to the digits their errors leave.
+def listed(values: Sequence[float], errors: Sequence[float], exponent: int = 0) -> str:
+    """Values side by side, to the digits their errors leave, in a power of ten.
 
     Example:
         >>> listed((1.234, -2.0, 0.5), (0.1, 0.1, 0.1))
         '1.23, −2.00, 0.50'
     """
-    return ", ".join(number(v, decimals(max(errors))) for v in values)
+    scale = 10.0**exponent
+    return ", ".join(number(v / scale, decimals(max(errors) / scale)) for v in values)
 
 
 def share(value: float) -> str:
@@ -102,6 +137,16 @@ def change(before: Spread, after: Spread, unit: str) -> str:
 def bandwidth(sigma: float) -> str:
     """σ, "∞" where the density is Gaussian."""
     return "∞" if math.isinf(sigma) else f"{sigma:.2f}"
+
+
+def noise(calibration: Calibration) -> str:
+    """The noise along the field in the recording's unit, and whether outliers stand beside it.
+
+    The algebraic residual is twice the relative error of the length, to first order.
+    """
+    c = calibration
+    kind = "Gaussian" if math.isinf(c.sigma) else f"heavy-tailed, σ = {bandwidth(c.sigma)}"
+    return f"{size(0.5 * c.radius * c.d)} {c.unit} along the field, {kind}"
 
 
 def when(intervals: Sequence[Interval]) -> str:
@@ -134,8 +179,11 @@ def rejection(calibration: Calibration) -> str:
 def headline(calibration: Calibration) -> list[str]:
     """The result in three sentences."""
     c = calibration
+    exponent = power(c.radius)
+    unit = f"× {in_power(exponent, c.unit)}" if exponent else c.unit
     return [
-        f"Offset ({listed(c.center, c.center_se)}) {c.unit}, semi-axes {listed(c.semi_axes, c.semi_axes_se)} {c.unit}.",
+        f"Offset ({listed(c.center, c.center_se, exponent)}) {unit}, "
+        f"semi-axes ({listed(c.semi_axes, c.semi_axes_se, exponent)}) {unit}.",
         f"The length of the field scatters by {size(c.after.robust)} {c.unit}; before, by {size(c.before.robust)} "
         f"{c.unit}.",
         rejection(c),

@@ -130,7 +130,7 @@ def test_ports(view):
     assert view.ports["sensor"].channels == ("x", "y", "z")
     assert all(port.pointwise for port in view.ports.values())
     assert view.ports["sensor"].wanders
-    assert view.state == {"view": "attitude"}
+    assert view.state == {"view": "attitude", "unit": "µT", "strength": view.strength}
 
 
 def test_a_turn_about_one_axis_determines_no_offset_along_it():
@@ -143,7 +143,13 @@ def test_quaternions_of_length_zero_are_left_out():
     waiting = (torch.arange(500) >= 20).double()
     view = Magnetometer().prepare(changed(recording, **{f"q_{a}": waiting * recording[f"q_{a}"] for a in "wxyz"}))
     assert len(view.time) == 480
-    assert any("20 of 500" in warning for warning in (*view.warnings, *view.recording.warnings))
+    assert any("20 of 500 samples whose quaternion is zero" in warning for warning in view.recording.warnings)
+
+
+def test_a_recording_of_nothing_but_zero_quaternions_is_refused_as_such():
+    recording = changed(tumbling(500, attitude=True), **{f"q_{a}": torch.zeros(500) for a in "wxyz"})
+    with pytest.raises(RecordingError, match="tumbling: all quaternions q_w, q_x, q_y, q_z are zero"):
+        Magnetometer().prepare(recording)
 
 
 def test_a_vehicle_that_hardly_tilts_is_warned_of():

@@ -145,7 +145,7 @@ def test_what_is_known_of_the_bias_beforehand(view):
 def test_ports(view):
     assert view.ports["field"].channels == ("strength",)
     assert not any(port.pointwise for port in view.ports.values())
-    assert view.state == {"view": "gyro"}
+    assert view.state == {"view": "gyro", "unit": "µT", "strength": view.strength}
 
 
 def test_a_hand_that_turns_too_little_for_the_length_is_followed_by_the_gyroscope():

@@ -103,7 +103,7 @@ def test_ports(view):
     assert all(port.unit == "µT" and port.pointwise for port in view.ports.values())
     assert view.ports["sensor"].wanders
     assert view.prior is None
-    assert view.state == {"view": "norm"}
+    assert view.state == {"view": "norm", "unit": "µT", "strength": view.strength}
 
 
 def test_without_times_the_samples_are_numbered():

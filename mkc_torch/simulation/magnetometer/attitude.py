@@ -166,16 +166,23 @@ class AttitudeView(View):
 
 
 def with_attitude(recording: Recording) -> Recording:
-    """The samples that have an attitude; a quaternion of length zero is none."""
-    length = torch.linalg.vector_norm(recording.stack(*QUATERNION), dim=-1)
-    columns = {
-        name: torch.where(length > 0.0, values, torch.nan) if name in QUATERNION else values
-        for name, values in recording.columns.items()
-    }
-    marked = Recording(
-        columns, name=recording.name, units=recording.units, warnings=recording.warnings, labels=recording.labels
-    )
-    return marked.finite(*QUATERNION)
+    """The samples that have an attitude; a quaternion of length zero is none.
+
+    Raises:
+        RecordingError: no sample has one.
+    """
+    known = recording.finite(*QUATERNION)
+    has = torch.linalg.vector_norm(known.stack(*QUATERNION), dim=-1) > 0.0
+    if bool(has.all()):
+        return known
+    if not bool(has.any()):
+        where = f"{recording.name}: " if recording.name else ""
+        raise RecordingError(
+            f"{where}all quaternions {', '.join(QUATERNION)} are zero, which is no attitude. Leave out these columns, "
+            "or record the attitude."
+        )
+    zero = int((~has).sum())
+    return known.rows(has, f"Left out {zero} of {len(known)} samples whose quaternion is zero, which is no attitude.")
 
 
 def _matrix_prior(count: int) -> GaussianPrior:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.ellipsoid import EllipsoidFit, NotIdentifiableError
+from mkc_torch.ellipsoid import EllipsoidFit
 from mkc_torch.linear import LeastTrimmedSquares
 from mkc_torch.nonlinear import beside
 from mkc_torch.recording import Recording
-from mkc_torch.rest import thin_at_rest, turning
+from mkc_torch.rest import refuse_at_rest, thin_at_rest, turning
 from mkc_torch.simulation.magnetometer.matrix import MATRIX_OF_VIEW
 from mkc_torch.simulation.protocol import Changes, FreeChange, Port
 
@@ -33,7 +33,7 @@ VECTOR = ("along", "across_1", "across_2")
 INDEPENDENT = (True, False, False)
 """The error of a rotation is across the field, in residual and signal alike."""
 
-_AT_REST, _TURNS, _MOSTLY = 0.1, 0.1, 0.5
+_MOSTLY = 0.5
 _ENOUGH = 1500
 
 
@@ -50,11 +50,15 @@ class View:
         self.recording = recording
         self.measured = recording.magnetometer()
         turns = turning(self.measured)
-        _refuse_at_rest(self.measured, turns)
-        self.thin = thin_at_rest(self.measured)
         self.unit = recording.units["mag_x"]
-        self.state = {"view": self.view}
+        refuse_at_rest(self.measured, turns, self.unit)
+        self.thin = thin_at_rest(self.measured)
         self.warnings = _rests(turns)
+
+    @property
+    def state(self) -> dict[str, str | float]:
+        """What a model needs on another recording, and what the corrected field's length was here, in which unit."""
+        return {"view": self.view, "unit": self.unit, "strength": self.strength}
 
     @cached_property
     def time(self) -> Float[Tensor, " N"]:
@@ -109,23 +113,6 @@ def thinned(taken: Bool[Tensor, " N"]) -> Int[Tensor, " n"]:
     """Numbers of the samples taken; evenly, as many of them as a place to start a fit from needs."""
     numbers = torch.nonzero(taken).flatten()
     return numbers[:: max(1, len(numbers) // _ENOUGH)]
-
-
-def _refuse_at_rest(measured: Tensor, turns: Tensor | None) -> None:
-    """Refuse a sensor that does not turn: a ball of noise would pass for a small ellipsoid.
-
-    Raises:
-        NotIdentifiableError: the measurements lie close together, and those that follow one another no closer.
-    """
-    middle = measured.median(0).values
-    spread = (measured - middle).square().sum(-1).median()
-    apart = measured.diff(dim=0).square().sum(-1).median()
-    close = bool(spread < (_AT_REST * torch.linalg.vector_norm(middle)).square()) and bool(apart > 0.5 * spread)
-    if close and (turns is None or float(turns.double().mean()) < _TURNS):
-        raise NotIdentifiableError(
-            f"Not identifiable: the sensor is at rest, its measurements stay within {float(spread.sqrt()):.3g} of one "
-            "another. Turn the sensor through all directions while recording."
-        )
 
 
 def _rests(turns: Tensor | None) -> tuple[str, ...]:

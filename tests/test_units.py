@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from mkc_torch.diagnosis.units import unit_warnings
 from mkc_torch.recording import Recording
+from mkc_torch.units import unit_warnings
 
 ANGLE = torch.linspace(0.0, 6.0, 50, dtype=torch.float64)
 
@@ -32,12 +32,18 @@ def test_fields_of_the_earth_and_some_more_are_accepted(size):
 
 @pytest.mark.parametrize(
     ("size", "unit"),
-    [(0.5, "gauss (1 gauss = 100 µT)"), (500.0, "milligauss (10 mG = 1 µT)"), (5e4, "nanotesla (1000 nT = 1 µT)")],
+    [
+        (5e-5, "tesla (1 T = 1000000 µT)"),
+        (0.05, "millitesla (1 mT = 1000 µT)"),
+        (0.5, "gauss (1 gauss = 100 µT)"),
+        (500.0, "milligauss (10 mG = 1 µT)"),
+        (5e4, "nanotesla (1000 nT = 1 µT)"),
+    ],
 )
 def test_fields_in_another_unit_are_named(size, unit):
     (sentence,) = warnings_of(vector("mag", size))
-    assert f"in {unit} that would be an ambient field" in sentence
-    assert f"{size:.3g} µT" in sentence
+    assert f"in {unit} it would be" in sentence
+    assert f"{size:g} µT" in sentence
     assert "Nothing was converted" in sentence
 
 
@@ -70,10 +76,15 @@ def test_accelerations_in_g_are_named():
     assert warnings_of(vector("accel", 1.0), units={f"accel_{a}": "g" for a in "xyz"}) == ()
 
 
-def test_times_in_milliseconds_are_named():
-    (sentence,) = warnings_of(vector("mag", 50.0), time=20.0 * torch.arange(50))
-    assert "20 s apart" in sentence
-    assert "ms or µs" in sentence
+@pytest.mark.parametrize(
+    ("interval", "shown", "unit"), [(20.0, "20", "ms"), (2e4, "20000", "µs"), (2e7, "20000000", "ns")]
+)
+@pytest.mark.parametrize("since", [0.0, 1.7e9])
+def test_times_in_other_units_are_named(interval, shown, unit, since):
+    time = (50.0 * since + torch.arange(50).double()) * interval
+    (sentence,) = warnings_of(vector("mag", 50.0), time=time)
+    assert f"lie {shown} s apart" in sentence
+    assert f"looks like {unit} (50 samples a second then)" in sentence
 
 
 def test_several_units_are_named_one_by_one():
