@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 from markupsafe import Markup
 
+from mkc_torch._forked import shared
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability
 from mkc_torch.report import diagnosis_pictures as pictures
 from mkc_torch.report import diagnosis_verdict, diagnosis_wording
@@ -46,8 +49,13 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
         HTML with its pictures in it.
     """
     d = diagnosis
-    figures = [pictures.of_finding(d, i) for i in range(len(d.findings))]
-    maps = [pictures.over_states(d, i) for i in range(len(d.findings))]
+    count = len(d.findings)
+    works: list[Callable[[], str | None]] = [
+        lambda: pictures.over_time(d) if len(d.traces.time) else None,
+        *(partial(pictures.of_finding, d, i) for i in range(count)),
+        *(partial(pictures.over_states, d, i) for i in range(count)),
+    ]
+    time_figure, *drawn = shared(works)
     page = _render(
         "diagnosis.html.j2",
         d=d,
@@ -59,9 +67,9 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
         notes=diagnosis_wording.channel_notes(d.traces.channels),
         numbered=pictures.numbered(d),
         clock=diagnosis_wording.clock_of(d.traces),
-        time_figure=Markup(pictures.over_time(d)) if len(d.traces.time) else None,
-        figures=[None if svg is None else Markup(svg) for svg in figures],
-        maps=[None if svg is None else Markup(svg) for svg in maps],
+        time_figure=_markup(time_figure),
+        figures=[_markup(svg) for svg in drawn[:count]],
+        maps=[_markup(svg) for svg in drawn[count:]],
         panels=[pictures.driver_panels(d, i) for i in range(len(d.findings))],
         curve_colors=pictures.CURVE_COLORS,
         bars=bars(d.candidates),
@@ -69,6 +77,10 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
         most=_MOST_SHOWN,
     )
     return unbroken(page)
+
+
+def _markup(svg: str | None) -> Markup | None:
+    return None if svg is None else Markup(svg)
 
 
 def bars(candidates: tuple[Candidate, ...]) -> list[Bar]:

@@ -1,0 +1,129 @@
+"""What real magnetometers' recordings hide: diagnosed, and set beside the step that the true attitude shows.
+
+Data:
+    broad: Laidig et al., "BROAD - A Benchmark for Robust Inertial Orientation Estimation", Data 6(7):72 (2021),
+        github.com/dlaidig/broad, CC BY 4.0.
+    full_sphere: github.com/sunsided/sensor-fusion, EUPL-1.2.
+    raw_counts: github.com/tomisuarez2/MagnetometerCalibration, MIT.
+    quadrotor: github.com/dronekit/dronekit-la-testdata, CC BY-SA 3.0.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from mkc_torch import Diagnosis, Recording, diagnose
+from mkc_torch.diagnosis.result import Finding
+from mkc_torch.simulation import Magnetometer
+
+DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data" / "magnetometer"
+"""Where the recordings lie by default: beside the project's folder."""
+
+FIELD = ("mag_x", "mag_y", "mag_z")
+QUATERNION = ("q_x", "q_y", "q_z", "q_w")  # in SciPy's order
+SHOWN = "broad_34_attached_magnet_3cm"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A recording, what is used of it, and, of a magnet that is taken off, between which moments the sensor is left."""
+
+    name: str
+    use: str = "norm"
+    every: int = 1
+    unit: str = "µT"
+    taken_off: tuple[float, float] | None = None
+
+    def recording(self, folder: Path) -> Recording:
+        whole = Recording.read(folder / f"{self.name}.csv")
+        # from the length of the field alone nothing else is to help
+        names = [name for name in whole.columns if self.use != "norm" or name in ("time", *FIELD)]
+        columns = {name: whole[name][:: self.every] for name in names}
+        return Recording(columns, name=self.name, units=dict.fromkeys(FIELD, self.unit))
+
+
+CASES = (
+    Case("broad_34_attached_magnet_3cm", every=4, taken_off=(48.0, 54.0)),
+    Case("broad_36_attached_magnet_5cm", every=4, taken_off=(51.0, 57.0)),
+    Case("broad_21_undisturbed_fast", every=4),
+    Case("broad_21_undisturbed_fast", "attitude", every=4),
+    Case("broad_02_undisturbed", every=4),
+    Case("full_sphere"),
+    Case("raw_counts", every=4, unit="counts"),
+    Case("quadrotor_compass1", "attitude"),
+    Case("quadrotor_compass3", "attitude"),
+)
+
+
+def step_by_attitude(folder: Path, case: Case) -> npt.NDArray[np.float64]:
+    """The offset after a magnet was taken off less that before, from the true attitude by least squares.
+
+    A constant field of the world, turned into the sensor, and one offset for each of the two parts; nothing of this
+    library but its reader.
+    """
+    assert case.taken_off is not None
+    whole = Recording.read(folder / f"{case.name}.csv")
+    moment, measured, attitude = whole["time"].numpy(), whole.stack(*FIELD).numpy(), whole.stack(*QUATERNION).numpy()
+    before, after = moment < case.taken_off[0], moment > case.taken_off[1]
+    taken = (before | after) & np.isfinite(np.concatenate([measured, attitude], -1)).all(-1)
+    to_sensor = Rotation.from_quat(attitude[taken]).inv().as_matrix()
+    offsets = np.stack([before, after], -1)[taken][:, None, :, None] * np.eye(3)[None, :, None, :]
+    design = np.concatenate([to_sensor, offsets.reshape(-1, 3, 6)], -1)
+    solution = np.linalg.lstsq(design.reshape(-1, 9), measured[taken].reshape(-1), rcond=None)[0]
+    return solution[6:] - solution[3:6]
+
+
+def told(finding: Finding) -> str:
+    """A finding in a line: what, when, of which size, and what it gains on blocks that the fit has not seen."""
+    moment = "" if finding.onset is None else f" at {finding.onset:.1f} s"
+    drivers = f" by {', '.join(finding.drivers)}" if finding.drivers else ""
+    size = finding.parameters[0]
+    value, error = (np.round(np.array(v, dtype=float), 3).tolist() for v in (size.value, size.standard_error))
+    held = finding.held_out
+    gain = "" if held is None else f"; residual {held.rmse_before:.3g} -> {held.rmse_after:.3g} {held.unit}"
+    return f"  {finding.effect}{drivers}{moment}: {size.name} {value} ± {error} {size.unit}{gain}"
+
+
+def picture(diagnosis: Diagnosis, path: Path) -> None:
+    """The residual over time before and after, with the onset."""
+    t = diagnosis.traces
+    figure, axes = plt.subplots(2, 1, figsize=(9, 5), sharex=True, sharey=True, layout="constrained")
+    for ax, residual, words in zip(axes, (t.before, t.after), ("one ellipsoid", "with what was found"), strict=True):
+        ax.plot(t.time, residual[:, 0], ".", color="tab:blue", markersize=2)
+        ax.set_title(words, loc="left")
+        ax.set_ylabel(f"residual, {t.unit}")
+        for finding in diagnosis.findings:
+            if finding.onset is not None:
+                ax.axvline(finding.onset, color="tab:red", linewidth=1)
+    axes[1].set_xlabel("time, s")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=DATA, help="folder with the magnetometers' recordings")
+    parser.add_argument("--output", type=Path, help=f"PNG file to write of {SHOWN}")
+    options = parser.parse_args()
+    for case in CASES:
+        start = time.perf_counter()
+        diagnosis = diagnose(Magnetometer(case.use), case.recording(options.data))
+        print(f"{case.name}, {case.use}: {diagnosis.verdict}, {time.perf_counter() - start:.0f} s")
+        for finding in diagnosis.findings:
+            print(told(finding))
+        if case.taken_off is not None:
+            print(f"  by the true attitude: {np.round(step_by_attitude(options.data, case), 2).tolist()} µT")
+        if options.output and case.name == SHOWN:
+            picture(diagnosis, options.output)
+
+
+if __name__ == "__main__":
+    main()
