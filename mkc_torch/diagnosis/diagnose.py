@@ -155,7 +155,7 @@ def diagnose(
         with meanwhile(ending(search), [*known, *search.parts]) as ended:
             after, newest = with_memory(prepared, following)()
             if after.found == search.found:
-                return _with_rest(told(search, ended()), after)
+                return _with_rest(told(replace(search, cut=after.cut), ended()), after)
         learn(prepared, newest)
         search = after
     return _with_rest(told(search, shared(ending(search), [*known, *search.parts])), search)
@@ -258,7 +258,7 @@ class _Search:
 
     ``evidence`` is that of the simulation alone and with one finding more each; ``left`` are candidates that are still
     to be searched beside what was found, none once the search is over; ``given_up`` says why there was no next one, and
-    ``cut`` that there was something to search for when as much was found as was asked for.
+    ``cut`` that there was a further finding when as much was found as was asked for.
     """
 
     first: Located | None
@@ -349,15 +349,16 @@ def _taken_up(search: _Search, located: Located, asked: _Asked, after: Evidence 
 
     if not holds(located.fit, after):
         return replace(over, unconfirmed=located)
+    if len(search.found) == asked.max_findings:
+        return replace(over, cut=True)
     fit, after = simplified(located.fit, after, search.blocks, holds)
     found = (*search.found, replace(located, fit=fit))
     near = _near(located.fit)
     left = tuple(t for t in search.left if not _same(t, located.term, near))
     taken = replace(search, found=found, evidence=(*search.evidence, after), left=left)
-    if len(found) < asked.max_findings:
-        return taken
     # a p-value of 0 is that of a look that sees nothing
-    return replace(taken, left=(), cut=0.0 < _beside(taken, asked) <= asked.level)
+    full = len(found) == asked.max_findings and not 0.0 < _beside(taken, asked) <= asked.level
+    return replace(taken, left=()) if full else taken
 
 
 def _near(fit: FittedModel) -> float:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 __all__ = ["comes_and_goes", "memory_of"]
 
 _FREQUENCIES = 4001
-_NATS, _SHARE = 12.0, 0.05
+_NATS, _SHARE = 7.0, 0.05
 """What a step has to lose in a stretch after its onset: nats, and the share of all that it gains."""
 
 

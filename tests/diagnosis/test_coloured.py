@@ -28,7 +28,7 @@ def burst():
     """A step of 2 µT in the middle of a second in which all samples are far off."""
     sensor = np.zeros((N, 3))
     sensor[(FIRST + LAST) // 2 :] = [2.0, -1.0, 1.0]
-    sensor[FIRST:LAST] += 4000.0 * np.random.default_rng(1).choice([-1.0, 1.0], (LAST - FIRST, 3))
+    sensor[FIRST:LAST] += 400.0 * np.random.default_rng(1).choice([-1.0, 1.0], (LAST - FIRST, 3))
     prepared = Magnetometer("attitude").prepare(tumbling(N, noise=0.3, sensor=sensor, attitude=True))
     return fitted(JointModel(prepared), prepared.start())
 
