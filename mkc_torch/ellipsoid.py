@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import refuse_bad_weight, refuse_not_real, refuse_other_type
+from mkc_torch._arguments import checked_number, refuse_bad_weight, refuse_not_real, refuse_other_type
 from mkc_torch.coverage import Coverage, coverage
 from mkc_torch.linear import MKCRegression, RankDeficientError
 from mkc_torch.linear._estimator import Fitted, LinearEstimator
@@ -168,6 +168,8 @@ class EllipsoidFit(Fitted):
             of the points. It is what the algebraic fit is an approximation of where the noise of the points is the
             same in all directions: the algebraic residual weighs a point by its distance to the centre and is biased
             by the square of the noise over the radius.
+        max_scatter: share of the shortest semi-axis by which the points may scatter about the surface, in (0, ∞]; inf
+            takes any, as a place to start from where something else moves the points.
 
     Attributes, after ``fit`` (``*`` batch dimensions, lengths in the unit of the points):
         center_: (*, 3), the offset.
@@ -189,8 +191,8 @@ class EllipsoidFit(Fitted):
             unit of the points, ``theta`` is about the median of the points in units of their median distance from it.
 
     Raises:
-        TypeError: ``estimator`` is none of ``mkc_torch.linear``.
-        ValueError: ``finish`` is something else.
+        TypeError: ``estimator`` is none of ``mkc_torch.linear``, or ``max_scatter`` is no number.
+        ValueError: ``finish`` is something else, or ``max_scatter`` is out of range.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), appendix A, (36)-(41).
@@ -207,7 +209,11 @@ class EllipsoidFit(Fitted):
     _fit_takes = "points"
 
     def __init__(
-        self, estimator: LinearEstimator | None = None, *, finish: Literal["maximum_likelihood"] | None = None
+        self,
+        estimator: LinearEstimator | None = None,
+        *,
+        finish: Literal["maximum_likelihood"] | None = None,
+        max_scatter: float = MAX_SCATTER,
     ) -> None:
         if finish not in (None, "maximum_likelihood"):
             raise ValueError(f"Expected argument `finish` to be None or 'maximum_likelihood' but got {finish!r}.")
@@ -216,6 +222,7 @@ class EllipsoidFit(Fitted):
             refuse_other_type("estimator", estimator, LinearEstimator, what, "None takes MKCRegression()")
         self.estimator = MKCRegression() if estimator is None else estimator
         self.finish = finish
+        self.max_scatter = checked_number("max_scatter", max_scatter, ends="(]", advice=f"{MAX_SCATTER:g} is usual")
 
     def fit(
         self, points: Float[Tensor, "*batch N 3"], sample_weight: Float[Tensor, "*batch N"] | None = None
@@ -230,7 +237,7 @@ class EllipsoidFit(Fitted):
             TypeError: not a floating tensor.
             ValueError: wrong shape, too few or non-finite points.
             NotIdentifiableError: the points lie on a plane, cover too few directions (the message names those that are
-                missing), or draw no surface: they scatter about it by more than a fifth of its shortest semi-axis.
+                missing), or draw no surface: they scatter about it by more than ``max_scatter``.
         """
         self._forget()
         points, weight = _prepared(points, sample_weight)
@@ -402,13 +409,13 @@ class EllipsoidFit(Fitted):
         distance = _distance(field / radius, self.calibration_matrix_ / radius).unsqueeze(-1)
         used = None if weight is None else (weight > 0).to(field).unsqueeze(-1)
         scatter = (robust_scale(distance, used) / self.semi_axes_[..., :1]).reshape(-1)
-        wide = (scatter > MAX_SCATTER).nonzero().flatten()
+        wide = (scatter > self.max_scatter).nonzero().flatten()
         if len(wide) > 0:
             where = f"Problem {int(wide[0])}: " if field.dim() > 2 else ""
             raise NotIdentifiableError(
                 f"{where}Not identifiable: the points draw no surface. They scatter about the ellipsoid by "
                 f"{100.0 * float(scatter[wide[0]]):.0f} % of its shortest semi-axis, more than "
-                f"{100.0 * MAX_SCATTER:.0f} %, as the noise of a sensor that hardly turns does. Turn the sensor "
+                f"{100.0 * self.max_scatter:.0f} %, as the noise of a sensor that hardly turns does. Turn the sensor "
                 "through all directions."
             )
 

@@ -35,7 +35,7 @@ def stepwise_bic(recording: Recording) -> dict[str, Any] | None:
     """What least squares with stepwise BIC would write into ``diagnosis.json``; None where no ellipsoid fits."""
     points = recording.magnetometer()
     try:
-        fit = EllipsoidFit(LeastSquares()).fit(points)
+        fit = EllipsoidFit(LeastSquares(), max_scatter=math.inf).fit(points)
     except (NotIdentifiableError, ValueError):
         return None
     corrected = (points - fit.center_) @ fit.calibration_matrix_.mT

@@ -208,5 +208,9 @@ def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
 def refitted(best: FittedModel, base: FittedModel, term: Term, linearised: Linearised, number: int) -> FittedModel:
     gamma, _ = linearised.search.estimate(number, linearised.series)
     gamma = gamma.clamp(max=0.0) if one_sided(term.effect) else gamma
-    start = torch.cat([best.parameters[: base.model.size], -gamma])
-    return fitted_beside(base, base.model.with_term(term), start)
+    model = base.model.with_term(term)
+    found = fitted_beside(base, model, torch.cat([best.parameters[: base.model.size], -gamma]))
+    if found.log_likelihood >= base.log_likelihood and repeats(found):
+        return found
+    # it went astray from there: from nothing it only climbs
+    return fitted_beside(base, model, torch.cat([base.parameters, torch.zeros_like(gamma)]), graduate=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -102,7 +103,8 @@ class View:
 
     def _ellipsoid(self, rows: Bool[Tensor, " N"] | None) -> EllipsoidFit:
         chosen = thinned(self.thin if rows is None else self.thin & rows)
-        return EllipsoidFit(LeastTrimmedSquares(), finish=None).fit(self.measured[chosen])
+        # what is sought may scatter the samples as widely as noise does
+        return EllipsoidFit(LeastTrimmedSquares(), max_scatter=math.inf).fit(self.measured[chosen])
 
 
 def length_of(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
