@@ -590,6 +590,17 @@ def test_a_cloud_of_noise_draws_no_surface(estimator, long):
     assert "draw no surface" in str(error)
 
 
+def test_a_cloud_of_noise_is_taken_as_a_start_where_that_is_asked_for():
+    fit = EllipsoidFit(LeastTrimmedSquares(), max_scatter=math.inf).fit(CENTER + 0.25 * sample(0, 2000, 3))
+    assert float((fit.center_ - CENTER).abs().max()) < 0.1
+
+
+@pytest.mark.parametrize(("value", "error"), [(0.0, ValueError), (math.nan, ValueError), ("wide", TypeError)])
+def test_a_scatter_that_is_no_share_is_refused(value, error):
+    with pytest.raises(error, match="`max_scatter`"):
+        EllipsoidFit(max_scatter=value)
+
+
 @pytest.mark.parametrize("finish", [None, "maximum_likelihood"])
 def test_noise_of_a_tenth_of_the_shortest_semi_axis_leaves_the_surface(finish):
     points = surface(400) + 3.5 * sample(0, 400, 3)

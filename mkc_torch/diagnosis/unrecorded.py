@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["course_without", "located_cause"]
 
-_SHARE = 0.2
+_SHARE = 0.1
 """Of the level: the question is asked last, of recordings in which the search found nothing."""
 
 

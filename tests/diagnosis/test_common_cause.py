@@ -152,7 +152,7 @@ def test_a_column_that_goes_as_the_cause_in_part_is_told_to_stand_in(whole):
 
 @pytest.mark.parametrize("seed", [0, 1, 3])
 def test_axes_that_wander_for_themselves_are_noise(seed):
-    """One draw in a hundred would be one cause, for a fifth of the level; these are none of those."""
+    """One draw in two hundred would be one cause, for a tenth of the level; these are none of those."""
     found = diagnose(Magnetometer("norm"), tumbling(N, noise=0.5, sensor=0.8 * walks(seed, 3), seed=seed))
     assert "unknown" not in [finding.effect for finding in found.findings]
 
