@@ -95,14 +95,6 @@ def test_a_step_is_found_to_the_sample_or_nearly():
     assert diagnose(Magnetometer(), recording_of(effect)).findings[0].onset == pytest.approx(23.4, abs=0.3)
 
 
-def test_an_effect_as_large_as_the_field_is_named():
-    """It moves the samples so far that they draw no surface."""
-    recording = recording_of(np.outer(TEMPERATURE - 25.0, [3.3, -5.8, -1.7]))
-    found = diagnose(Magnetometer("norm"), recording, surrogates=19, max_findings=1).findings[0]
-    assert (found.effect, found.drivers) == ("temperature_offset", ("temperature",))
-    assert np.allclose(found.parameters[0].value, [3.3, -5.8, -1.7], atol=0.3)
-
-
 def test_nothing_is_found_where_nothing_is():
     found = [diagnose(Magnetometer(), tumbling(N, noise=0.4, sensor=outliers(s), seed=s, **COLUMNS)) for s in range(4)]
     assert sum(d.verdict != "adequate" for d in found) <= 1

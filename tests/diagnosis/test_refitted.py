@@ -25,7 +25,7 @@ def base():
 def searched(*gamma):
     """A search that estimates these amplitudes."""
     estimate = torch.tensor(gamma, dtype=torch.float64)
-    return SimpleNamespace(search=SimpleNamespace(estimate=lambda number, series: (estimate, None)), series=None)
+    return SimpleNamespace(search=SimpleNamespace(estimate=lambda *_: (estimate, None)), series=None)
 
 
 @pytest.mark.parametrize("astray", [0.0, -0.3, 30.0, -1e4])

@@ -5,7 +5,8 @@ import pytest
 import torch
 from scipy.optimize import brentq
 
-from mkc_torch import NotIdentifiableError
+from mkc_torch import EllipsoidFit, NotIdentifiableError
+from mkc_torch.linear import LeastTrimmedSquares
 from mkc_torch.recording import MissingColumnError
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import FIELD, OFFSET, changed, symmetric_truth, true_matrix, tumbling
@@ -160,3 +161,12 @@ def test_columns_of_its_own_drive_nothing():
         "time", "mag_x", "mag_y", "mag_z", "gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z",
         "q_w", "q_x", "q_y", "q_z",
     }  # fmt: skip
+
+
+def test_samples_that_draw_no_surface_are_a_start_too():
+    """An effect that is sought may move them as widely as the noise does here."""
+    recording = tumbling(3000, noise=14.0)
+    with pytest.raises(NotIdentifiableError, match="draw no surface"):
+        EllipsoidFit(LeastTrimmedSquares()).fit(recording.magnetometer())
+    start = Magnetometer("norm").prepare(recording).start()
+    assert np.abs(start[:3].numpy() - OFFSET).max() < 5.0
