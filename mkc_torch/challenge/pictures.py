@@ -54,7 +54,8 @@ def power_curves(score: Score, baselines: Mapping[str, Score]) -> str:
             ax.set_xlabel(f"{title} (number of recordings)")
             ax.set_ylim(-0.03, 1.03)
         figure.axes[0].set_ylabel("share of recordings")
-        figure.axes[1].legend(loc="lower right", fontsize=9)
+        handles, labels = figure.axes[1].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper right", ncols=3, fontsize=9)
         return _svg(figure, "power", "Shares of the hidden effects that were found and named, over z and z_sep")
 
 

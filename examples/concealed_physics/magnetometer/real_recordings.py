@@ -34,25 +34,25 @@ SHOWN = "broad_34_attached_magnet_3cm"
 
 @dataclass(frozen=True)
 class Case:
-    """A recording, what is used of it, and, of a magnet that is taken off, between which moments the sensor is left."""
+    """A recording, what is used of it, and, where a magnet is taken off, the moments between which that happens."""
 
     name: str
     use: str = "norm"
     every: int = 1
     unit: str = "µT"
+    field_alone: bool = False
     taken_off: tuple[float, float] | None = None
 
     def recording(self, folder: Path) -> Recording:
         whole = Recording.read(folder / f"{self.name}.csv")
-        # from the length of the field alone nothing else is to help
-        names = [name for name in whole.columns if self.use != "norm" or name in ("time", *FIELD)]
+        names = [name for name in whole.columns if not self.field_alone or name in ("time", *FIELD)]
         columns = {name: whole[name][:: self.every] for name in names}
         return Recording(columns, name=self.name, units=dict.fromkeys(FIELD, self.unit))
 
 
 CASES = (
-    Case("broad_34_attached_magnet_3cm", every=4, taken_off=(48.0, 54.0)),
-    Case("broad_36_attached_magnet_5cm", every=4, taken_off=(51.0, 57.0)),
+    Case("broad_34_attached_magnet_3cm", every=4, field_alone=True, taken_off=(48.0, 54.0)),
+    Case("broad_36_attached_magnet_5cm", every=4, field_alone=True, taken_off=(51.0, 57.0)),
     Case("broad_21_undisturbed_fast", every=4),
     Case("broad_21_undisturbed_fast", "attitude", every=4),
     Case("broad_02_undisturbed", every=4),
@@ -86,10 +86,13 @@ def told(finding: Finding) -> str:
     moment = "" if finding.onset is None else f" at {finding.onset:.1f} s"
     drivers = f" by {', '.join(finding.drivers)}" if finding.drivers else ""
     size = finding.parameters[0]
-    value, error = (np.round(np.array(v, dtype=float), 3).tolist() for v in (size.value, size.standard_error))
+    value, error = (
+        ", ".join(f"{v:.3g}" for v in np.ravel(np.array(one, dtype=float)).tolist())
+        for one in (size.value, size.standard_error)
+    )
     held = finding.held_out
     gain = "" if held is None else f"; residual {held.rmse_before:.3g} -> {held.rmse_after:.3g} {held.unit}"
-    return f"  {finding.effect}{drivers}{moment}: {size.name} {value} ± {error} {size.unit}{gain}"
+    return f"  {finding.effect}{drivers}{moment}: {size.name} ({value}) ± ({error}) {size.unit}{gain}"
 
 
 def picture(diagnosis: Diagnosis, path: Path) -> None:
