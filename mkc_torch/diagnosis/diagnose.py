@@ -55,6 +55,8 @@ LEVEL = 0.05
 SURROGATES = 99
 MAX_FINDINGS = 3
 
+_BESIDE = "Judged beside the other findings: while those are left out, they hide it."
+
 FEWEST = 40
 """With fewer samples nothing can be said about structure."""
 
@@ -394,9 +396,16 @@ def _assembled(
     found, blocks, evidence, first = search.found, search.blocks, search.evidence, search.first
     final = ending.final
     inliers = (evidence[-1].residual.abs() <= 3.0 * evidence[-1].d) & (final.fit.weights > _IN_USE)
+
+    def judged(k: int, term: Term, without: Evidence | None) -> tuple[HeldOut | None, str]:
+        if without is None:
+            return _held(evidence[k], evidence[k + 1], blocks, inliers, term, prepared, generator)
+        held, note = _held(without, evidence[-1], blocks, inliers, term, prepared, generator)
+        return held, note if held is None else _BESIDE
+
     findings = [
         replace(
-            finding_of(s, final, k, *_held(evidence[k], evidence[k + 1], blocks, inliers, s.term, prepared, generator)),
+            finding_of(s, final, k, *judged(k, s.term, more.without)),
             extrapolation=more.extrapolation,
             driver_shift=more.driver_shift,
             onset_interval=more.onset_interval,

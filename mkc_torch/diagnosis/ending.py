@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import torch
+
 from mkc_torch.diagnosis.ceiling import Ceiling, ceiling
 from mkc_torch.diagnosis.drivers import Driver
 from mkc_torch.diagnosis.estimate import Estimate, estimate
-from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks
+from mkc_torch.diagnosis.evidence import Evidence, HeldOutBlocks, gain_interval, held_out
 from mkc_torch.diagnosis.extrapolation import extrapolated
 from mkc_torch.diagnosis.locate import Located
 from mkc_torch.diagnosis.onsets import onset_interval
@@ -27,11 +29,15 @@ __all__ = ["Beyond", "Ending", "ending_parts", "nameless"]
 
 @dataclass(frozen=True)
 class Beyond:
-    """What a finding is worth where its driver is high, and when it is moved; and how sure its onset is."""
+    """What a finding is worth where its driver is high, and when it is moved; and how sure its onset is.
+
+    ``without`` is the evidence of the final model without it, where what was found later may have hidden its gain.
+    """
 
     extrapolation: Extrapolation | None
     driver_shift: DriverShift | None
     onset_interval: tuple[float, float] | None
+    without: Evidence | None
 
 
 @dataclass(frozen=True)
@@ -82,7 +88,8 @@ def ending_parts(
 
     def beyond() -> tuple[Beyond, ...]:
         return tuple(
-            _beyond(without, fit, one, k, seed) for k, (without, one) in enumerate(zip(fits, found, strict=False))
+            _beyond(without, fit, one, k, evidence, blocks, seed)
+            for k, (without, one) in enumerate(zip(fits, found, strict=False))
         )
 
     def within_reach() -> tuple[Ceiling, tuple[str, ...]]:
@@ -101,12 +108,29 @@ def ending_parts(
     return [partial(begun, work) for work in (partial(stand_in_warning, fit), beyond, within_reach, final)]
 
 
-def _beyond(without: FittedModel, final: FittedModel, found: Located, number: int, seed: int) -> Beyond:
+def _beyond(
+    without: FittedModel,
+    final: FittedModel,
+    found: Located,
+    number: int,
+    evidence: Sequence[Evidence],
+    blocks: HeldOutBlocks,
+    seed: int,
+) -> Beyond:
     model, term, fit = without.model, final.model.terms[number], found.fit
+    beside = None
     if number < len(final.model.terms) - 1 and model.prepared.ports[term.port].clock is None:
         # what was found later belongs to both
         without, fit = without_term(final, number), final
-    return Beyond(extrapolated(without, fit, term, seed), shifted(model, found), onset_interval(model, found))
+        if not _confirmed(evidence[number], evidence[number + 1], blocks, seed):
+            beside = held_out(without, blocks)
+    return Beyond(extrapolated(without, fit, term, seed), shifted(model, found), onset_interval(model, found), beside)
+
+
+def _confirmed(before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int) -> bool:
+    """Whether unseen blocks are surely better."""
+    difference = after.log_likelihood - before.log_likelihood
+    return gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))[1][0] > 0.0
 
 
 def nameless(fit: FittedModel) -> bool:
