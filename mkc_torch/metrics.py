@@ -14,10 +14,10 @@ except ModuleNotFoundError as error:
         "mkc_torch.metrics needs torchmetrics, which comes with Lightning: pip install 'mkc-torch[lightning]'"
     ) from error
 
-from mkc_torch._arguments import refuse_bad_batch
-from mkc_torch.functional import log_partition
-from mkc_torch.fused import energy_sums
-from mkc_torch.losses import MKCLoss, checked_loss
+from mkc_torch._support.arguments import refuse_bad_batch
+from mkc_torch.density.normalizer import log_partition
+from mkc_torch.losses._energy_sums import energy_sums
+from mkc_torch.losses.mkc import MKCLoss, checked_loss
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

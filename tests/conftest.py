@@ -1,7 +1,19 @@
-"""One thread a worker: results do not depend on it, and workers do not fight over the cores."""
+"""One thread a worker, so that workers do not fight over the cores; forward mode loaded once."""
+
+import warnings
 
 import numpy  # noqa: F401 - its linear algebra can only be limited once it is there
+import pytest
+import torch
 
-from mkc_torch._processes import one_thread
+from mkc_torch._parallel.processes import one_thread
 
 one_thread()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _forward_mode():
+    # torch warns of a deprecation of its own at the first use
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.func.jvp(torch.sin, (torch.ones(1),), (torch.ones(1),))

@@ -10,16 +10,9 @@ from scipy import integrate, special
 from torch.autograd import forward_ad, gradcheck, gradgradcheck
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vmap
 
-from mkc_torch.functional import (
-    KAPPA_MAX,
-    energy,
-    inverse_square,
-    log_normalizer,
-    log_partition,
-    mkc_energy,
-    mkc_nll,
-    mkc_weight,
-)
+from mkc_torch.density.energy import KAPPA_MAX, energy, inverse_square
+from mkc_torch.density.normalizer import log_partition
+from mkc_torch.functional import log_normalizer, mkc_energy, mkc_nll, mkc_weight
 
 # torch's own forward mode scripts its decompositions when it is first entered
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")

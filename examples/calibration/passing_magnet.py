@@ -18,7 +18,7 @@ from scipy.stats import norm
 from torch import Tensor
 
 from mkc_torch import EllipsoidFit, Recording
-from mkc_torch.calibration import calibrate
+from mkc_torch.calibration.calibrate import calibrate
 from mkc_torch.functional import mkc_nll
 from mkc_torch.linear import LeastSquares, MKCRegression
 

@@ -22,7 +22,7 @@ from peers import MKC_EM, Regression, losses, mean_and_error, perceptron, quiet,
 from torch import Tensor, nn
 
 from mkc_torch import HeteroscedasticMKCLoss, MKCHead, MKCLoss, inlier_weight
-from mkc_torch.heteroscedastic import MKCHeadOutput
+from mkc_torch.losses.heteroscedastic import MKCHeadOutput
 
 WINDOW, AHEAD = 24, (1, 2, 4, 8)
 TRAINING, HELD_OUT, NOISE, EPOCHS = 3000, 2000, 0.05, 30

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, TensorDataset
 
 from mkc_torch import MKCLoss
-from mkc_torch.lightning import MKCExpectationMaximization
+from mkc_torch.lightning.callback import MKCExpectationMaximization
 
 MKC_EM, MKC_JOINT = "MKC, EM", "MKC, joint"
 

@@ -30,6 +30,7 @@ from rich.table import Table
 from sklearn.linear_model import LinearRegression, RANSACRegressor
 from torch import Tensor
 
+from mkc_torch.density.robustness import bandwidth_for_efficiency
 from mkc_torch.linear import (
     FixedPointLinear,
     GeneralizedMaximumEntropy,
@@ -47,7 +48,6 @@ from mkc_torch.linear import (
     SRegression,
 )
 from mkc_torch.linear._estimator import LinearEstimator
-from mkc_torch.robustness import bandwidth_for_efficiency
 
 SAMPLES, COEFFICIENTS = 200, 4
 SHARES = tuple(0.05 * k for k in range(11))

@@ -19,7 +19,8 @@ from scipy.special import erf, gammaln
 from scipy.stats import norm
 
 from mkc_torch import MKCLoss
-from mkc_torch.functional import energy, log_partition
+from mkc_torch.density.energy import energy
+from mkc_torch.density.normalizer import log_partition
 
 LENGTHS = np.concatenate([np.linspace(1, 12, 12), np.logspace(1.2, 7, 12)])
 KAPPAS = np.concatenate([[0.0], np.logspace(-3, math.log10(400), 40)])

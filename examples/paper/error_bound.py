@@ -21,14 +21,14 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from mkc_torch.linear import FixedPointLinear, LeastSquares
-from mkc_torch.robustness import (
+from mkc_torch.density.robustness import (
     error_bound,
     gaussian_efficiency,
     least_bandwidth,
     least_error_bound,
     optimal_bandwidth,
 )
+from mkc_torch.linear import FixedPointLinear, LeastSquares
 
 N, EPSILON = 100, 2.0
 LEVERAGE = 1e6

@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from mkc_torch.entropy_like import entropy_like
 from mkc_torch.linear import LeastEntropyLike, LeastSquares
+from mkc_torch.losses.entropy_like import entropy_like
 
 BLUE, RED, GREEN = "tab:blue", "tab:red", "tab:green"
 

@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from mkc_torch.entropy_like import entropy_like
 from mkc_torch.linear import LeastEntropyLike, LeastMedianOfSquares, LeastSquares
+from mkc_torch.losses.entropy_like import entropy_like
 
 DATA = """
 10.1 19.6 28.3 9.7; 9.5 20.5 28.9 10.1; 10.7 20.2 31 10.3; 9.9 21.5 31.7 9.5; 10.3 21.1 31.1 10; 10.8 20.4 29.2 10;

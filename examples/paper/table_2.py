@@ -20,9 +20,9 @@ from sklearn.linear_model import Lasso as SklearnLasso
 from torch import Tensor
 
 from mkc_torch import EllipsoidFit, Recording
-from mkc_torch.demo import simulated_recording
 from mkc_torch.linear import FixedPointLinear, LeastAbsoluteDeviations, LeastSquares, MKCRegression, Ridge
 from mkc_torch.linear._estimator import LinearEstimator
+from mkc_torch.recording.demonstration import simulated_recording
 
 
 class Lasso(LinearEstimator):

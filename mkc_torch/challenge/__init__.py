@@ -3,8 +3,8 @@
 The generator shares no code with the catalogue of effects and uses other functional forms of the same physics.
 """
 
-from mkc_torch.challenge.generator import Case, draw
 from mkc_torch.challenge.key import Key
+from mkc_torch.challenge.magnetometer.generator import Case, draw
 from mkc_torch.challenge.run import run_challenge
 from mkc_torch.challenge.score import Score, score
 

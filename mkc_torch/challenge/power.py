@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.challenge.families import Family
-from mkc_torch.challenge.noise import Noise
-from mkc_torch.challenge.process import Process
-from mkc_torch.challenge.scene import Scene
-from mkc_torch.challenge.state_space import whitened
+from mkc_torch.challenge.magnetometer.families import Family
+from mkc_torch.challenge.magnetometer.noise import Noise
+from mkc_torch.challenge.magnetometer.process import Process
+from mkc_torch.challenge.magnetometer.scene import Scene
+from mkc_torch.challenge.magnetometer.state_space import whitened
 
 if TYPE_CHECKING:
     from jaxtyping import Float

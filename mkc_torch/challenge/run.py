@@ -16,15 +16,15 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from mkc_torch._files import claim_folder, write_atomically
-from mkc_torch._processes import keep_memory, one_thread
+from mkc_torch._parallel.processes import keep_memory, one_thread
+from mkc_torch._support.files import claim_folder, write_atomically
 from mkc_torch.challenge.draws import generator
 from mkc_torch.challenge.key import Key, canonical, digest
-from mkc_torch.challenge.magnetometer import magnetometer
+from mkc_torch.challenge.magnetometer.subject import magnetometer
 from mkc_torch.challenge.page import challenge_page, summary
 from mkc_torch.challenge.score import Score, score
 from mkc_torch.challenge.subject import Subject
-from mkc_torch.recording import Recording, write_table
+from mkc_torch.recording.recording import Recording, write_table
 
 Diagnose = Callable[[list[Path], Path], object]
 """Writes ``<folder>/<stem>/diagnosis.json`` and ``model.json`` for each recording."""

@@ -9,10 +9,10 @@ from typing import Any
 
 from torch import Tensor
 
-from mkc_torch.challenge.generator import Case
 from mkc_torch.challenge.key import Key
+from mkc_torch.challenge.magnetometer.generator import Case
 from mkc_torch.challenge.thresholds import Threshold
-from mkc_torch.recording import Recording
+from mkc_torch.recording.recording import Recording
 
 Ratio = Callable[[Mapping[str, Tensor], Recording, Key], float]
 """From what a corrected model makes of a second recording, that recording and its key: residual over the oracle's."""

@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
-from mkc_torch.challenge.families import POSITION
 from mkc_torch.challenge.key import KeyEffect, KeyParameter
+from mkc_torch.challenge.magnetometer.families import POSITION
 from mkc_torch.challenge.thresholds import COVERAGE_FACTOR
 
 NOTHING, UNKNOWN, FAILED = "nothing", "unknown", "failed"

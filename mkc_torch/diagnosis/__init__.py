@@ -1,7 +1,7 @@
 """Diagnosis: where simulation and recording differ, what physics was left out, and how much better it fits with it."""
 
 from mkc_torch.diagnosis.diagnose import diagnose
-from mkc_torch.diagnosis.diagnosed_model import DiagnosedModel
+from mkc_torch.diagnosis.files.model import DiagnosedModel
 from mkc_torch.diagnosis.result import Diagnosis
 
 __all__ = ["DiagnosedModel", "Diagnosis", "diagnose"]

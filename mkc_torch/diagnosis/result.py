@@ -11,7 +11,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    from mkc_torch.diagnosis.diagnosed_model import DiagnosedModel
+    from mkc_torch.diagnosis.files.model import DiagnosedModel
 
 __all__ = [
     "Alternative",

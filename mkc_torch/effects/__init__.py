@@ -7,32 +7,26 @@ plausible, and where that is from.
 
 from __future__ import annotations
 
-from mkc_torch.effects.cubic_nonlinearity import CubicNonlinearity
-from mkc_torch.effects.current_field import CurrentField
-from mkc_torch.effects.driver_offset import DriverOffset
-from mkc_torch.effects.dynamics import DYNAMICS
-from mkc_torch.effects.field_gradient import FieldGradient
-from mkc_torch.effects.hard_iron_step import HardIronStep
-from mkc_torch.effects.heading_reset import HeadingReset
-from mkc_torch.effects.magnetic_pole import MagneticPole
-from mkc_torch.effects.offset_drift import OffsetDrift
-from mkc_torch.effects.paired import PAIRED
-from mkc_torch.effects.protocol import (
+from mkc_torch.effects.base import (
     AnchoredEffect,
-    Context,
     ContinuousEffect,
     Effect,
     GainEffect,
     LastingEffect,
     LinearEffect,
     NestedEffect,
-    Quantity,
-    Shape,
     ShapedEffect,
     SignalEffect,
 )
-from mkc_torch.effects.temperature_offset import TemperatureOffset
-from mkc_torch.effects.unknown import Unknown
+from mkc_torch.effects.context import Context, Quantity, Shape
+from mkc_torch.effects.courses import lagged
+from mkc_torch.effects.dynamics import DYNAMICS
+from mkc_torch.effects.dynamics.backlash import played
+from mkc_torch.effects.dynamics.rate import beyond
+from mkc_torch.effects.paired import PAIRED
+from mkc_torch.effects.paired.between import shifted
+from mkc_torch.effects.sensor import ATTITUDE, SENSOR
+from mkc_torch.effects.share import soft_clip
 
 __all__ = [
     "ATTITUDE",
@@ -52,23 +46,12 @@ __all__ = [
     "Shape",
     "ShapedEffect",
     "SignalEffect",
+    "beyond",
+    "lagged",
+    "played",
+    "shifted",
+    "soft_clip",
 ]
-
-SENSOR: tuple[Effect, ...] = (
-    HardIronStep(),
-    OffsetDrift(),
-    TemperatureOffset(),
-    CurrentField(),
-    FieldGradient(),
-    MagneticPole(),
-    CubicNonlinearity(),
-    DriverOffset(),
-    Unknown(),
-)
-"""The effects that a diagnosis of a sensor tries."""
-
-ATTITUDE: tuple[Effect, ...] = (HeadingReset(),)
-"""The effects of an attitude that is recorded beside a sensor."""
 
 CATALOGUE: tuple[Effect, ...] = (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED)
 """All effects; each is tried where a simulation has its port."""

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import refuse_not_real
+from mkc_torch._support.arguments import refuse_not_real
 from mkc_torch.linear._problem import common_batch
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+    from mkc_torch.linear._implicit.layer import Layer
     from mkc_torch.linear._problem import LinearProblem
-    from mkc_torch.linear.implicit import Layer
 
 Self = TypeVar("Self", bound="LinearEstimator")
 

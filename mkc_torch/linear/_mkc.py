@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import as_numbers
-from mkc_torch.functional import energy
+from mkc_torch._support.arguments import as_numbers
+from mkc_torch.density.energy import energy
 from mkc_torch.linear._scale_search import relative_precision
 from mkc_torch.linear.covariance import CovarianceKind, sandwich
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import refuse_complex, refuse_no_tensor, refuse_not_real
+from mkc_torch._support.arguments import refuse_complex, refuse_no_tensor, refuse_not_real
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import refuse_complex, seems_finite, told
+from mkc_torch._support.arguments import refuse_complex, seems_finite, told
+from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._problem import LinearProblem
 from mkc_torch.linear._scale_search import minimise_scale
 from mkc_torch.linear.least_trimmed_squares import QuantileScale, TrimmedScale, default_coverage
 from mkc_torch.linear.s_regression import minimise_m_scale
-from mkc_torch.order_statistic import order_statistic
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import checked_number
+from mkc_torch._support.arguments import checked_number
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import checked_number, checked_whole, refuse_out_of_range
-from mkc_torch.density_fit import (
+from mkc_torch._support.arguments import checked_number, checked_whole, refuse_out_of_range
+from mkc_torch.density.energy import SIGMA_LEAST
+from mkc_torch.density.fit import (
     DensityState,
     conclusive,
     domain_rule,
@@ -19,13 +20,13 @@ from mkc_torch.density_fit import (
     newton_step,
     refuse_narrow_bound,
 )
-from mkc_torch.functional import SIGMA_LEAST
 from mkc_torch.linear._estimator import LinearEstimator
+from mkc_torch.linear._implicit.at_rest import Rest
+from mkc_torch.linear._implicit.layer import Given, fit_layer, wanted
 from mkc_torch.linear._mkc import channel_parameter, coefficient_covariance, fixed_point_step, kernel_weight
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import RobustStart, Start, checked_start, robust_start
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
-from mkc_torch.linear.implicit import Given, Rest, fit_layer, wanted
 
 _FLOOR = 0.3
 """Least d in robust scales: a scale is at most doubled by outliers, and a fit that interpolates ends far below."""
@@ -169,7 +170,7 @@ class MKCRegression(LinearEstimator):
     where the Gaussian likelihood at least squares is higher than what it ends at, it goes on from there.
 
     The domain ``a`` of each channel is fixed before, from a rough fit: half the range of its residuals, and no less
-    than ten of its d (:func:`mkc_torch.density_fit.domain_rule` says why), or what ``bound`` says. d stays above 0.3
+    than ten of its d (:func:`mkc_torch.density.fit.domain_rule` says why), or what ``bound`` says. d stays above 0.3
     robust scales, since the likelihood of residuals that a fit interpolates grows without limit.
 
     The fit is a differentiable layer: where X, Y, ``sample_weight`` or a given σ, d or bound require a gradient, or

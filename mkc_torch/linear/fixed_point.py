@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import (
+from mkc_torch._support.arguments import (
     checked_number,
     checked_whole,
     refuse_complex,
@@ -18,6 +18,8 @@ from mkc_torch._arguments import (
     told,
 )
 from mkc_torch.linear._estimator import LinearEstimator
+from mkc_torch.linear._implicit.at_rest import Rest
+from mkc_torch.linear._implicit.layer import Given, fit_layer, wanted
 from mkc_torch.linear._mkc import (
     channel_parameter,
     coefficient_covariance,
@@ -28,7 +30,6 @@ from mkc_torch.linear._mkc import (
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import Start, checked_start, robust_start
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
-from mkc_torch.linear.implicit import Given, Rest, fit_layer, wanted
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import checked_number, checked_whole
+from mkc_torch._support.arguments import checked_number, checked_whole
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import linear_problem, solve_gram
 

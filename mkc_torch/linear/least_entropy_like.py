@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import checked_number, checked_whole, refuse_complex, refuse_no_tensor, seems_finite
-from mkc_torch.entropy_like import LEAST_TOTAL, orthogonal_starts
+from mkc_torch._support.arguments import checked_number, checked_whole, refuse_complex, refuse_no_tensor, seems_finite
+from mkc_torch._support.trust_region import Minima, Quadratic, minimise
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._precision import in_double
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.trust_region import Minima, Quadratic, minimise
+from mkc_torch.losses.entropy_like import LEAST_TOTAL, orthogonal_starts
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

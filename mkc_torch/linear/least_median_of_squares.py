@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import checked_whole
+from mkc_torch._support.arguments import checked_whole
 from mkc_torch.linear._chebyshev import equal_heights, minimax
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import checked_number
+from mkc_torch._support.arguments import checked_number
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._mkc import coefficient_covariance
 from mkc_torch.linear._problem import canonical_shapes, linear_problem

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import checked_whole
+from mkc_torch._support.arguments import checked_whole
+from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._scale_search import minimise_scale, relative_precision
-from mkc_torch.order_statistic import order_statistic
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Literal, get_args
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import checked_number, checked_whole
+from mkc_torch._support.arguments import checked_number, checked_whole
+from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._psi import TUNING_95, PsiName, Tuning, checked_tuning, psi_weight
 from mkc_torch.linear._robust_start import checked_start, robust_start
 from mkc_torch.linear._scale_search import relative_precision
 from mkc_torch.linear.least_absolute_deviations import LeastAbsoluteDeviations
-from mkc_torch.order_statistic import order_statistic
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import as_numbers, checked_whole, refuse_out_of_range
+from mkc_torch._support.arguments import as_numbers, checked_whole, refuse_out_of_range
+from mkc_torch._support.order_statistic import order_statistic
+from mkc_torch._support.trust_region import Quadratic, minimise
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._precision import in_double
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import Start, checked_start, robust_start
-from mkc_torch.order_statistic import order_statistic
-from mkc_torch.trust_region import Quadratic, minimise
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import checked_number, checked_whole, told
+from mkc_torch._support.arguments import checked_number, checked_whole, told
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import residual_scale

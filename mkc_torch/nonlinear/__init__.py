@@ -4,7 +4,7 @@
 of each channel too. Both take a prior, bounds, equalities and inequalities, and a batch of problems at once.
 """
 
-from mkc_torch.nonlinear._forward import beside, load_forward_mode
+from mkc_torch._support.forward_mode import beside, load_forward_mode
 from mkc_torch.nonlinear.energy import Solution, minimise
 from mkc_torch.nonlinear.likelihood import NonlinearFit, fit
 from mkc_torch.nonlinear.prior import GaussianPrior

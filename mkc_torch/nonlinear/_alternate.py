@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from mkc_torch.density_fit import DensityState, conclusive, initial_state, newton_step
+from mkc_torch.density.fit import DensityState, conclusive, initial_state, newton_step
 from mkc_torch.nonlinear._constraints import constrained
 from mkc_torch.nonlinear._descent import damped_step
 from mkc_torch.nonlinear._problem import Point, Problem
 from mkc_torch.nonlinear._quadratic import Penalty, positive, prior_value, quadratic_about
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["alternated", "gaussian_candidate", "likelihood_of"]
 

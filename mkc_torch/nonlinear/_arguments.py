@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 
-from mkc_torch._arguments import as_numbers, refuse_not_real, refuse_other_type, told
+from mkc_torch._support.arguments import as_numbers, refuse_not_real, refuse_other_type, told
+from mkc_torch._support.forward_mode import Residual
 from mkc_torch.nonlinear._descent import within
-from mkc_torch.nonlinear._forward import Residual
 from mkc_torch.nonlinear._problem import Constraint, Point, Problem
 from mkc_torch.nonlinear.prior import GaussianPrior
 

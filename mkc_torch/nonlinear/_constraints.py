@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -11,9 +10,6 @@ from torch import Tensor
 from mkc_torch.nonlinear._descent import Descent, descended
 from mkc_torch.nonlinear._problem import Point, Problem
 from mkc_torch.nonlinear._quadratic import Penalty, positive, quadratic_about
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["constrained"]
 

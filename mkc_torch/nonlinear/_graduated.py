@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.nonlinear._constraints import constrained
 from mkc_torch.nonlinear._problem import Point, Problem
-from mkc_torch.order_statistic import order_statistic
 
 if TYPE_CHECKING:
     from jaxtyping import Float

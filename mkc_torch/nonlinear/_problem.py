@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
-from mkc_torch._arguments import refuse_other_type
-from mkc_torch.nonlinear._forward import Residual, forward_tangents, reverse_tangents
+from mkc_torch._support.arguments import refuse_other_type
+from mkc_torch._support.forward_mode import Residual, forward_tangents, reverse_tangents
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.functional import energy_value
+from mkc_torch.density.energy import energy_value
 from mkc_torch.nonlinear._problem import Point, Problem
 
 if TYPE_CHECKING:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import checked_number, checked_whole
+from mkc_torch._support.arguments import checked_number, checked_whole
+from mkc_torch._support.forward_mode import Residual
 from mkc_torch.nonlinear._arguments import per_channel, prepared
 from mkc_torch.nonlinear._constraints import constrained
-from mkc_torch.nonlinear._forward import Residual
 from mkc_torch.nonlinear._problem import Constraint, kernel_weights, shaped_jacobian
 from mkc_torch.nonlinear._quadratic import quadratic_about
 from mkc_torch.nonlinear.prior import GaussianPrior

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import checked_number, checked_whole
-from mkc_torch.density_fit import DensityState, domain_rule, initial_state, refuse_narrow_bound
-from mkc_torch.functional import SIGMA_LEAST
+from mkc_torch._support.arguments import checked_number, checked_whole
+from mkc_torch._support.forward_mode import Residual
+from mkc_torch.density.energy import SIGMA_LEAST
+from mkc_torch.density.fit import DensityState, domain_rule, initial_state, refuse_narrow_bound
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 from mkc_torch.nonlinear._alternate import alternated, gaussian_candidate, likelihood_of
 from mkc_torch.nonlinear._arguments import per_channel, prepared
 from mkc_torch.nonlinear._covariance import parameter_covariance
-from mkc_torch.nonlinear._forward import Residual
 from mkc_torch.nonlinear._graduated import LEAST_SCALE, graduated, residual_scale
 from mkc_torch.nonlinear._problem import Constraint, Point, kernel_weights, shaped_jacobian
 from mkc_torch.nonlinear.prior import GaussianPrior
@@ -111,7 +111,7 @@ def fit(
         residual: as in :func:`minimise`.
         start: (*, p).
         bound: half-width of the domain in the unit of the residual, at least two robust scales: a number, (m,) or
-            (*, m); None takes :func:`mkc_torch.density_fit.domain_rule` on a rough robust fit.
+            (*, m); None takes :func:`mkc_torch.density.fit.domain_rule` on a rough robust fit.
         sigma: None learns σ; a value in [0.05, inf] keeps it.
         d: None learns d; a value keeps it.
         graduate: False begins at ``start`` as it is; only for starts near the answer.

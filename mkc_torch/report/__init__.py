@@ -6,16 +6,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mkc_torch.report.calibration import Comparison, calibration_report, refusal_report
-    from mkc_torch.report.diagnosis import diagnosis_report
+    from mkc_torch.report.calibration.page import Comparison, calibration_report, refusal_report
+    from mkc_torch.report.diagnosis.page import diagnosis_report
 
 __all__ = ["Comparison", "calibration_report", "diagnosis_report", "refusal_report"]
 
 _HOMES = {
-    "Comparison": "calibration",
-    "calibration_report": "calibration",
-    "diagnosis_report": "diagnosis",
-    "refusal_report": "calibration",
+    "Comparison": "calibration.page",
+    "calibration_report": "calibration.page",
+    "diagnosis_report": "diagnosis.page",
+    "refusal_report": "calibration.page",
 }
 
 if not TYPE_CHECKING:

@@ -1,6 +1,6 @@
 """Simulations: what predicts a recording, with ports through which an effect can act on it."""
 
-from mkc_torch.simulation.dynamics import Dynamics
+from mkc_torch.simulation.dynamics.definition import Dynamics
 from mkc_torch.simulation.load import SimulationFileError, load_simulation
 from mkc_torch.simulation.magnetometer import Magnetometer
 from mkc_torch.simulation.paired import Paired

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import checked_number, refuse_text
+from mkc_torch._support.arguments import checked_number, refuse_text
 from mkc_torch.nonlinear import GaussianPrior
-from mkc_torch.recording import Recording
+from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
 from mkc_torch.simulation.parameter import SimulationError
 from mkc_torch.simulation.protocol import Changes, refuse_no_recording

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from mkc_torch._arguments import checked_number, refuse_other_type, told
+from mkc_torch._support.arguments import checked_number, refuse_other_type, told
 
 __all__ = ["Parameter", "SimulationError", "known_parameters"]
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from mkc_torch._arguments import refuse_other_type
+from mkc_torch._support.arguments import refuse_other_type
 from mkc_torch.nonlinear import GaussianPrior
-from mkc_torch.recording import Recording
+from mkc_torch.recording.recording import Recording
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from mkc_torch.recording import Recording
-from mkc_torch.simulation.dynamics import Dynamics
-from mkc_torch.simulation.dynamics_correction import DynamicsCorrection
+from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.dynamics.correction import DynamicsCorrection
+from mkc_torch.simulation.dynamics.definition import Dynamics
 from mkc_torch.simulation.magnetometer import MagnetometerCorrection
 from mkc_torch.simulation.paired import Paired, PairedCorrection
 from mkc_torch.simulation.protocol import Correction, Simulation

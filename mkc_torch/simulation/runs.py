@@ -10,7 +10,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float, Shaped
 
-    from mkc_torch.recording import Recording
+    from mkc_torch.recording.recording import Recording
 
 __all__ = ["experiment_runs", "successive_runs"]
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from mkc_torch._arguments import refuse_other_type, refuse_text
+from mkc_torch._support.arguments import refuse_other_type, refuse_text
 from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
-from mkc_torch.recording import Recording
+from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
 from mkc_torch.simulation.parameter import Parameter, SimulationError, known_parameters
 from mkc_torch.simulation.protocol import Changes, Port, refuse_no_recording

@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from mkc_torch.challenge.draws import generator
-from mkc_torch.challenge.families import column_family, cubic_family, drift_families, families, step_family
-from mkc_torch.challenge.generator import draw_scene
-from mkc_torch.challenge.hidden import CATALOGUE
-from mkc_torch.challenge.noise import KINDS, draw_noise
+from mkc_torch.challenge.magnetometer.families import column_family, cubic_family, drift_families, families, step_family
+from mkc_torch.challenge.magnetometer.generator import draw_scene
+from mkc_torch.challenge.magnetometer.hidden import CATALOGUE
+from mkc_torch.challenge.magnetometer.noise import KINDS, draw_noise
+from mkc_torch.challenge.magnetometer.rotation import from_vector, product
+from mkc_torch.challenge.magnetometer.state_space import dense_covariance
 from mkc_torch.challenge.power import Metric, Question, attitude_gains, powers, range_of
-from mkc_torch.challenge.rotation import from_vector, product
-from mkc_torch.challenge.state_space import dense_covariance
 
 SHARE = 0.1
 

@@ -10,9 +10,9 @@ pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
 from mkc_torch.challenge.key import digest
-from mkc_torch.challenge.magnetometer import magnetometer
+from mkc_torch.challenge.magnetometer.subject import magnetometer
 from mkc_torch.challenge.run import run_challenge
-from mkc_torch.recording import Recording
+from mkc_torch.recording.recording import Recording
 
 DURATION = 10.0
 

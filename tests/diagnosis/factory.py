@@ -5,7 +5,7 @@ import math
 
 import torch
 
-from mkc_torch.diagnosis.advice import advice_of
+from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.result import (
     Alternative,
     Candidate,

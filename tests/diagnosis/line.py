@@ -3,7 +3,7 @@
 import torch
 
 from mkc_torch.nonlinear import GaussianPrior
-from mkc_torch.recording import Recording
+from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation import Port
 
 

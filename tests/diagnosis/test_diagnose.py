@@ -8,10 +8,10 @@ import torch
 
 from mkc_torch import diagnose
 from mkc_torch.diagnosis import DiagnosedModel
-from mkc_torch.diagnosis.diagnosed_model import ModelFileError
-from mkc_torch.diagnosis.diagnosis_file import diagnosis_to_json
-from mkc_torch.effects.hard_iron_step import HardIronStep
-from mkc_torch.recording import MissingColumnError, Recording
+from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
+from mkc_torch.diagnosis.files.model import ModelFileError
+from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
+from mkc_torch.recording.recording import MissingColumnError, Recording
 from mkc_torch.simulation import Magnetometer
 from tests.shared_data import shared_data
 from tests.simulation.tumbling import FIELD, changed, tumbling

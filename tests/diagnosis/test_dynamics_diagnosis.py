@@ -8,10 +8,11 @@ import torch
 from scipy.integrate import solve_ivp
 
 from mkc_torch import Recording, diagnose
-from mkc_torch.diagnosis.candidates import candidate_terms
-from mkc_torch.diagnosis.linearise import linearise, tangents_of
-from mkc_torch.diagnosis.model import JointModel
-from mkc_torch.diagnosis.refit import fitted
+from mkc_torch.diagnosis.linearised.linearise import linearise
+from mkc_torch.diagnosis.linearised.tangents import tangents_of
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics, Parameter
 from tests.shared_data import shared_data

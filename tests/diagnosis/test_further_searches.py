@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from mkc_torch.effects import CATALOGUE
-from mkc_torch.recording import Recording
+from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation import Dynamics
 
 diagnosis_of = importlib.import_module("mkc_torch.diagnosis.diagnose")
-ending_of = importlib.import_module("mkc_torch.diagnosis.ending")
+ending_of = importlib.import_module("mkc_torch.diagnosis.evidence.after_the_search")
 
 
 EFFECTS = [effect for effect in CATALOGUE if effect.id in ("cubic_stiffness", "quadratic_drag")]

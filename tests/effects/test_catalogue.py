@@ -15,9 +15,9 @@ from mkc_torch.effects import (
     LinearEffect,
     SignalEffect,
 )
-from mkc_torch.effects.field_gradient import FieldGradient
-from mkc_torch.effects.magnetic_pole import MagneticPole
-from mkc_torch.effects.protocol import per
+from mkc_torch.effects.courses import per
+from mkc_torch.effects.sensor.field_gradient import FieldGradient
+from mkc_torch.effects.sensor.magnetic_pole import MagneticPole
 from tests.effects.contexts import make_context, size_of
 
 IDS = (

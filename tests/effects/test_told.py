@@ -6,15 +6,15 @@ import pytest
 import torch
 
 from mkc_torch.effects import CATALOGUE, SENSOR, Context
-from mkc_torch.effects.cubic_nonlinearity import CubicNonlinearity
-from mkc_torch.effects.field_gradient import FieldGradient
-from mkc_torch.effects.heading_reset import HeadingReset
-from mkc_torch.effects.offset_drift import OffsetDrift
-from mkc_torch.effects.protocol import ComponentsEffect, FormedEffect, MomentsEffect, PlacedEffect, TellingEffect
-from mkc_torch.effects.temperature_offset import TemperatureOffset
-from mkc_torch.effects.unrecorded import COURSE, Unrecorded
+from mkc_torch.effects.base import ComponentsEffect, FormedEffect, MomentsEffect, PlacedEffect, TellingEffect
+from mkc_torch.effects.sensor.cubic_nonlinearity import CubicNonlinearity
+from mkc_torch.effects.sensor.field_gradient import FieldGradient
+from mkc_torch.effects.sensor.heading_reset import HeadingReset
+from mkc_torch.effects.sensor.offset_drift import OffsetDrift
+from mkc_torch.effects.sensor.temperature_offset import TemperatureOffset
+from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
 from tests.effects.contexts import make_context
-from tests.effects.test_dynamics_catalogue import make_context as make_dynamic_context
+from tests.effects.dynamics.test_dynamics_catalogue import make_context as make_dynamic_context
 
 FORMED = [effect for effect in CATALOGUE if isinstance(effect, FormedEffect)]
 GRADIENT = FieldGradient()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mkc_torch.density_fit import domain_rule
+from mkc_torch.density.fit import domain_rule
 from mkc_torch.linear import MKCRegression, em
 
 PATH = Path(__file__).parents[2] / "examples" / "paper" / "example_2.py"

@@ -8,8 +8,8 @@ from types import ModuleType
 import pytest
 import torch
 
-from mkc_torch.entropy_like import entropy_like
 from mkc_torch.linear import LeastEntropyLike, LeastSquares
+from mkc_torch.losses.entropy_like import entropy_like
 from tests.literature import hbk
 
 FOLDER = Path(__file__).parents[2] / "examples" / "paper"

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from mkc_torch import Recording
-from mkc_torch.coverage import fibonacci_sphere
+from mkc_torch.calibration.coverage import fibonacci_sphere
 from mkc_torch.linear import MKCRegression
-from mkc_torch.recording import write_table
+from mkc_torch.recording.recording import write_table
 from tests.examples.test_lel_examples import FOLDER, assert_is_picture, example, run
 
 

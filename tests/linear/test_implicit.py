@@ -10,7 +10,7 @@ from torch.func import vmap
 
 from mkc_torch import EllipsoidFit
 from mkc_torch.linear import FixedPointLinear, LeastSquares, MKCRegression
-from mkc_torch.linear.implicit import NotDifferentiableError
+from mkc_torch.linear._implicit.refusal import NotDifferentiableError
 
 # torch's own forward mode
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")

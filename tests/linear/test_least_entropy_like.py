@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from torch import Tensor
 
-from mkc_torch.entropy_like import entropy_like
 from mkc_torch.linear import LeastEntropyLike, LeastSquares, RankDeficientError
 from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear.least_entropy_like import _Directions
+from mkc_torch.losses.entropy_like import entropy_like
 from tests.literature import hbk
 
 properties = settings(derandomize=True, deadline=None, max_examples=20)

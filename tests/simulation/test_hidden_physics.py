@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from mkc_torch import Recording
-from mkc_torch.diagnosis.linearise import tangents_of
-from mkc_torch.diagnosis.model import JointModel, Term, with_constant
+from mkc_torch.diagnosis.linearised.tangents import tangents_of
+from mkc_torch.diagnosis.model.joint import JointModel, with_constant
+from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics
-from tests.simulation.runge_kutta import runge_kutta
+from tests.simulation.dynamics.runge_kutta import runge_kutta
 
 OF = {effect.id: effect for effect in DYNAMICS}
 TIME = np.arange(150) * 0.04
@@ -224,7 +225,7 @@ def test_a_recorded_spin_drives_the_lift():
     truth = runge_kutta(turned(lambda t: 0.01 * spun(t)), [0.0, 1.0, 20.0, 5.0], TIME)
     recording = table(time=TIME, x=truth[:, 0], y=truth[:, 1], spin=spun(TIME))
     simulation = type("Ball", (Ball,), {"step": 0.01})().prepare(recording)
-    from mkc_torch.diagnosis.drivers import find_drivers
+    from mkc_torch.diagnosis.model.drivers import find_drivers
 
     (driver,) = find_drivers(simulation.recording, simulation.system.columns, frozenset({"spin"})).drivers
     model = JointModel(simulation, (Term(OF["magnus_lift"], driver, {}, "exchange of vx and vy"),))

@@ -4,7 +4,7 @@ import torch
 from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.nonlinear import load_forward_mode
-from mkc_torch.recording import MissingColumnError
+from mkc_torch.recording.recording import MissingColumnError
 from mkc_torch.simulation import Paired, SimulationError
 
 COUNT = 400

@@ -6,7 +6,7 @@ import torch
 
 from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis import DiagnosedModel
-from mkc_torch.recording import MissingColumnError
+from mkc_torch.recording.recording import MissingColumnError
 from mkc_torch.simulation import Parameter, SimulationError, Static
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from mkc_torch.recording import Recording
+from mkc_torch.recording.recording import Recording
 
 FIELD = np.array([4.0, 20.0, -42.0])  # µT: east, north, up
 OFFSET = np.array([12.0, -7.5, 21.0])  # µT

@@ -47,7 +47,7 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from mkc_torch import diagnose
-from mkc_torch.recording import Recording
+from mkc_torch.recording.recording import Recording
 
 if TYPE_CHECKING:
     from jaxtyping import Float

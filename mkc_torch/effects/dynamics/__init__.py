@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mkc_torch.effects.base import Effect
 from mkc_torch.effects.dynamics.added_mass import AddedMass
 from mkc_torch.effects.dynamics.backlash import Backlash
 from mkc_torch.effects.dynamics.bouc_wen_hysteresis import BoucWenHysteresis
@@ -24,7 +25,6 @@ from mkc_torch.effects.dynamics.sensor_lag import SensorLag
 from mkc_torch.effects.dynamics.stribeck_friction import StribeckFriction
 from mkc_torch.effects.dynamics.thermal_loss import ThermalLoss
 from mkc_torch.effects.dynamics.unknown_rate import UnknownRate
-from mkc_torch.effects.protocol import Effect
 
 __all__ = ["DYNAMICS"]
 

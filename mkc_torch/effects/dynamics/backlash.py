@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.effects.protocol import Context, Shape
+from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.runs import first_of_runs, passed_on_within, run_numbers
 from mkc_torch.effects.share import ShareEffect
 

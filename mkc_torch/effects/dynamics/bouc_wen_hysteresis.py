@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.unit_text import quotient
+from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.dynamics.rate import RateEffect
-from mkc_torch.effects.protocol import Context, Quantity, Shape
 from mkc_torch.effects.runs import first_of_runs, passed_on
-from mkc_torch.effects.units import quotient
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int

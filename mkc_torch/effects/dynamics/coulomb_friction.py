@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.unit_text import sized
+from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.dynamics.rate import RateEffect
-from mkc_torch.effects.protocol import Context, Shape
-from mkc_torch.effects.units import sized
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.effects.base import Effect
+from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.dynamics.rate import RateEffect
-from mkc_torch.effects.protocol import Context, Effect, Quantity, Shape
 
 if TYPE_CHECKING:
     from jaxtyping import Float

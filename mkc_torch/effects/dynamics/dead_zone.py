@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from mkc_torch.effects.protocol import Context, Shape
+from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.share import CORNER, SOFTNESS, ShareEffect, soft_clip
 
 if TYPE_CHECKING:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from mkc_torch.effects.protocol import Context, GainEffect, Quantity, Shape
-from mkc_torch.effects.units import quotient
+from mkc_torch._support.unit_text import quotient
+from mkc_torch.effects.base import GainEffect
+from mkc_torch.effects.context import Context, Quantity, Shape
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.effects.protocol import Context, Effect, Quantity, Shape, lagged
+from mkc_torch.effects.base import Effect
+from mkc_torch.effects.context import Context, Quantity, Shape
+from mkc_torch.effects.courses import lagged
 from mkc_torch.effects.share import ShareEffect
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.dynamics.rate import RateEffect
-from mkc_torch.effects.protocol import Context, Shape
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -7,6 +7,7 @@ of them would only say again, less well, what an effect on a rate or an input sa
 
 from __future__ import annotations
 
+from mkc_torch.effects.base import Effect
 from mkc_torch.effects.paired.clock_drift import ClockDrift
 from mkc_torch.effects.paired.delay import Delay
 from mkc_torch.effects.paired.driver_linear import DriverLinear
@@ -14,7 +15,6 @@ from mkc_torch.effects.paired.driver_quadratic import DriverQuadratic
 from mkc_torch.effects.paired.gain import Gain
 from mkc_torch.effects.paired.offset import Offset
 from mkc_torch.effects.paired.output_saturation import OutputSaturation
-from mkc_torch.effects.protocol import Effect
 
 __all__ = ["PAIRED"]
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.paired.between import shifted
-from mkc_torch.effects.protocol import Context, Quantity, Shape
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.effects.protocol import Context, GainEffect, Shape
+from mkc_torch.effects.base import GainEffect
+from mkc_torch.effects.context import Context, Shape
 
 if TYPE_CHECKING:
     from jaxtyping import Float

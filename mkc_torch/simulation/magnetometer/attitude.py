@@ -8,17 +8,18 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.coverage import coverage
-from mkc_torch.ellipsoid import MIN_INFORMATION, NotIdentifiableError
+from mkc_torch.calibration.coverage import coverage
+from mkc_torch.calibration.ellipsoid_fit import MIN_INFORMATION
+from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.linear import LeastTrimmedSquares
 from mkc_torch.linear._problem import RankDeficientError
 from mkc_torch.nonlinear import GaussianPrior, beside
-from mkc_torch.recording import Recording, RecordingError
-from mkc_torch.simulation.heading import HeadingJump, heading_jumps
+from mkc_torch.recording.recording import Recording, RecordingError
+from mkc_torch.simulation.magnetometer.heading import HeadingJump, heading_jumps
 from mkc_torch.simulation.magnetometer.matrix import SOFT_IRON
+from mkc_torch.simulation.magnetometer.rotation import from_quaternion, rotated
 from mkc_torch.simulation.magnetometer.view import AXES, GYRO, INDEPENDENT, QUATERNION, VECTOR, View, thinned
 from mkc_torch.simulation.protocol import Changes, Port
-from mkc_torch.simulation.rotation import from_quaternion, rotated
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mkc_torch.recording import Recording
+from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.matrix import MATRIX_OF_VIEW
 from mkc_torch.simulation.magnetometer.view import AXES
 from mkc_torch.simulation.protocol import Changes, Port

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.ellipsoid import EllipsoidFit
+from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
 from mkc_torch.nonlinear import GaussianPrior
-from mkc_torch.recording import Recording
+from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.matrix import SYMMETRIC
 from mkc_torch.simulation.magnetometer.view import AXES, View, length_of
 from mkc_torch.simulation.protocol import Changes, Port

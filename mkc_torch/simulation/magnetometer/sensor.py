@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mkc_torch.calibration import prepared
-from mkc_torch.ellipsoid import NotIdentifiableError
-from mkc_torch.recording import Recording
+from mkc_torch.calibration.calibrate import prepared
+from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.attitude import AttitudeView, with_attitude
 from mkc_torch.simulation.magnetometer.gyro import GyroView
 from mkc_torch.simulation.magnetometer.norm import NormView
@@ -29,7 +29,7 @@ class Magnetometer:
             before the gyroscope because the drift of a gyroscope enters the vector as structure of its own.
 
     Example:
-        >>> from mkc_torch.demo import simulated_recording
+        >>> from mkc_torch.recording.demonstration import simulated_recording
         >>> prepared_simulation = Magnetometer().prepare(simulated_recording()[0])
         >>> prepared_simulation.channels, prepared_simulation.unit
         (('norm',), 'µT')

@@ -1,0 +1,232 @@
+"""The calibration of a magnetometer: one recording in, offset, matrix, their errors and what was noticed out."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.calibration.coverage import Coverage
+from mkc_torch.calibration.ellipsoid import ellipsoid_from_coefficients
+from mkc_torch.calibration.ellipsoid_fit import MIN_POINTS, EllipsoidFit
+from mkc_torch.calibration.file import Matrix, Vector
+from mkc_torch.calibration.impossible_samples import without_impossible
+from mkc_torch.calibration.recorded_ellipsoid import recorded_ellipsoid
+from mkc_torch.calibration.result import Calibration, Spread
+from mkc_torch.functional import mkc_weight
+from mkc_torch.linear import MKCRegression
+from mkc_torch.recording.disturbance import disturbed_intervals
+from mkc_torch.recording.recording import Recording, RecordingError
+from mkc_torch.recording.unit_warnings import RECORDED, field_warning, time_warning
+
+__all__ = ["Calibration", "Matrix", "Spread", "Vector", "calibrate", "prepared"]
+
+REJECTED_BELOW = 0.5
+"""A sample of less than this weight counts as rejected."""
+
+MAX_REJECTED = 0.2
+"""Above this share of rejected samples one ellipsoid is a doubtful model, and a warning says so."""
+
+MUCH_SCATTER = 0.1
+"""Scatter of the calibrated field's length, as a share of the radius, above which a warning says so."""
+
+UNUSUAL_RATIO = 1.5
+"""Longest over shortest semi-axis above which a warning says so."""
+
+ENOUGH_INFORMATION = 0.1
+"""Information, as a share of even coverage, at which directions that are missing do no harm."""
+
+_LEAST = 1e-60
+FEW_SAMPLES = 50
+_AXES = ("mag_x", "mag_y", "mag_z")
+
+
+def prepared(recording: Recording) -> Recording:
+    """The samples a calibration uses: those with a finite and possible field, in the order of time if there is a time.
+
+    Raises:
+        MissingColumnError: no ``mag_x``, ``mag_y`` or ``mag_z``.
+        RecordingError: fewer than nine samples are left, or values whose squares no number holds.
+
+    Example:
+        >>> angle = torch.linspace(0.0, 6.0, 30)
+        >>> angle[3] = math.nan
+        >>> len(prepared(Recording({"mag_x": angle.cos(), "mag_y": angle.sin(), "mag_z": angle})))
+        29
+    """
+    usable = recording.finite(*_AXES)
+    if usable.time is not None:
+        usable = usable.sorted_by_time()
+    if len(usable) < MIN_POINTS:
+        where = f"{recording.name}: " if recording.name else ""
+        found = "1 sample is" if len(usable) == 1 else f"{len(usable)} samples are"
+        reasons = " ".join(usable.warnings)
+        raise RecordingError(
+            f"{where}{found} too few, an ellipsoid needs at least {MIN_POINTS}; record while turning the sensor "
+            f"through all directions.{' ' + reasons if reasons else ''}"
+        )
+    usable = without_impossible(usable, *_AXES)
+    largest = float(usable.magnetometer().abs().max())
+    if largest > 1.0 / _LEAST or 0.0 < largest < _LEAST:
+        where = f"{recording.name}: " if recording.name else ""
+        raise RecordingError(
+            f"{where}the largest value of {', '.join(_AXES)} is {largest:.3g}, which is no magnetic field in any unit; "
+            "check these columns."
+        )
+    return usable
+
+
+def calibrate(recording: Recording, *, field_strength: float | None = None, seed: int = 0) -> Calibration:
+    """Calibrate the magnetometer of a recording by MKC-EM on the linear ellipsoid fit.
+
+    Samples that are not finite, or that no field explains, are left out and the rest is sorted by time, which the
+    warnings tell. Standard errors allow for autocorrelation where there is a time; without one, samples count as
+    independent. Where the radius does not fit the unit, it is called "recorded units", and a warning says why.
+
+    Args:
+        recording: with columns ``mag_x``, ``mag_y``, ``mag_z``, in any one unit, and ``time`` in s where it has one.
+        field_strength: length of the corrected field in µT; default the radius of the ellipsoid, in its own unit.
+        seed: of the robust start.
+
+    Raises:
+        MissingColumnError: a column of the magnetometer is not there.
+        RecordingError: fewer than nine usable samples.
+        NotIdentifiableError: the samples do not determine an ellipsoid.
+        ValueError: a field strength that is not positive.
+
+    Example:
+        >>> from mkc_torch.calibration.coverage import fibonacci_sphere
+        >>> points = fibonacci_sphere(200) * torch.tensor([40.0, 50.0, 60.0]) + torch.tensor([1.0, 2.0, 3.0])
+        >>> points[:20] += 25.0
+        >>> names = ("mag_x", "mag_y", "mag_z")
+        >>> result = calibrate(Recording(dict(zip(names, points.unbind(-1)))))
+        >>> [round(v, 3) for v in result.center], result.rejected
+        ([1.0, 2.0, 3.0], 20)
+    """
+    if field_strength is not None and not (math.isfinite(field_strength) and field_strength > 0):
+        raise ValueError(f"Expected argument `field_strength` to be positive but got {field_strength}.")
+    usable = prepared(recording)
+    points = usable.magnetometer()
+    fit = recorded_ellipsoid(usable, seed)
+    radius = float(fit.radius_)
+    strength = radius if field_strength is None else field_strength
+    scale = strength / radius
+    matrix_se = fit.calibration_matrix_se_ if field_strength is None else strength * fit.root_se_
+    density = _density(fit)
+    length = torch.linalg.vector_norm(fit.calibrate(points), dim=-1)
+    # of all samples, those that were left out while the sensor rested among them
+    rejected = mkc_weight((length / radius).square() - 1.0, density[0], density[1]) < REJECTED_BELOW
+    found = fit.coverage_
+    assert isinstance(found, Coverage)
+    unit = usable.units[_AXES[0]]
+    size = field_warning(radius, unit, "radius of the ellipsoid is", "all numbers")
+    unit = unit if size is None else RECORDED
+    norm = torch.linalg.vector_norm(points, dim=-1)
+    return Calibration(
+        recording=usable.name,
+        samples=len(points),
+        unit=unit,
+        center=_vector(fit.center_),
+        center_se=_vector(fit.center_se_),
+        semi_axes=_vector(fit.semi_axes_),
+        semi_axes_se=_vector(fit.semi_axes_se_),
+        rotation=_matrix(fit.rotation_),
+        matrix=_matrix(scale * fit.calibration_matrix_),
+        matrix_se=_matrix(matrix_se),
+        radius=radius,
+        field_strength=strength,
+        field_unit=unit if field_strength is None else "µT",
+        sigma=density[0],
+        d=density[1],
+        bound=density[2],
+        before=_spread(norm - norm.median()),
+        after=_spread(length - radius),
+        rejected=int(rejected.sum()),
+        disturbed=() if usable.time is None else disturbed_intervals(usable.time, rejected),
+        coverage=found,
+        warnings=(
+            *usable.warnings,
+            *(sentence for sentence in (size, time_warning(usable)) if sentence),
+            *_warnings(fit, found, float(rejected.double().mean())),
+        ),
+    )
+
+
+def _density(fit: EllipsoidFit) -> tuple[float, float, float]:
+    """σ, d and bound of the algebraic residual about the centre.
+
+    The estimator's residual is about another origin, which only multiplies it.
+    """
+    estimator = fit.estimator_
+    assert isinstance(estimator, MKCRegression)
+    local = ellipsoid_from_coefficients(estimator.coef_)
+    factor = float(1.0 - local.center @ local.shape @ local.center)
+    return float(estimator.sigma_), factor * float(estimator.d_), factor * float(estimator.bound_)
+
+
+def _warnings(fit: EllipsoidFit, found: Coverage, rejected_share: float) -> list[str]:
+    warnings = []
+    if rejected_share > MAX_REJECTED:
+        warnings.append(
+            f"{100.0 * rejected_share:.0f} % of the samples do not fit one ellipsoid: the sensor's offset may have "
+            "changed during the recording, or something magnetic was near for long. `mkc diagnose` says what changed, "
+            "and when; or record again away from it, or calibrate the parts of the recording separately."
+        )
+    scatter = float(robust_scale(fit.residual_.unsqueeze(-1))) / float(fit.radius_)
+    if scatter > MUCH_SCATTER:
+        warnings.append(
+            f"The length of the calibrated field scatters by {100.0 * scatter:.0f} % of the radius; that of a sensor "
+            "which is calibrated in a steady field scatters by one to three. Offset and semi-axes may be off by more "
+            "than their standard errors say; `mkc diagnose` says what disturbs it."
+        )
+    ratio = float(fit.semi_axes_[2] / fit.semi_axes_[0])
+    if ratio > UNUSUAL_RATIO:
+        warnings.append(
+            f"The longest semi-axis is {ratio:.2g} times the shortest. The gains of one chip differ by some per cent, "
+            "and iron nearby seldom adds more than some ten: check that all three columns are in one unit, that none "
+            "is cut off at the end of its range, and the directions covered."
+        )
+    if len(fit.weights_) < FEW_SAMPLES:
+        warnings.append(
+            f"{len(fit.weights_)} samples are few for nine unknowns: the true errors can be far larger than the "
+            f"standard errors say. Record {FEW_SAMPLES} at least."
+        )
+    if found.gaps:
+        warnings.append(_gaps(fit, found))
+    if not bool(torch.as_tensor(getattr(fit.estimator_, "converged_", True)).all()):
+        warnings.append("The fit stopped before it came to rest; its last digits are uncertain.")
+    return warnings
+
+
+def _gaps(fit: EllipsoidFit, found: Coverage) -> str:
+    """Which directions are missing, and what that means for the result."""
+    missing = "; ".join(str(gap) for gap in found.gaps)
+    worst = 100.0 * float((torch.cat([fit.center_se_, fit.semi_axes_se_]) / fit.radius_).max())
+    known = f"to {worst:.1g} % of the radius" if worst < math.inf else "but how well is not known"
+    if found.information >= ENOUGH_INFORMATION:
+        means = f"The others determine offset and semi-axes {known}, so the calibration holds all the same"
+    else:
+        means = (
+            f"The others determine offset and semi-axes {known}, if nothing changed meanwhile: what is known worst is "
+            f"known {found.information**-0.5:.1g} times less well than from all directions, and a disturbance counts "
+            "as much more"
+        )
+    return (
+        f"Directions not covered: {missing}. {means}. To be sure, turn the sensor so that the field points there too."
+    )
+
+
+def _spread(residual: Tensor) -> Spread:
+    return Spread(1.4826 * float(residual.abs().median()), float(residual.square().mean().sqrt()))
+
+
+def _vector(values: Tensor) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def _matrix(values: Tensor) -> Matrix:
+    a, b, c = values
+    return _vector(a), _vector(b), _vector(c)

@@ -1,0 +1,85 @@
+"""Samples that no field explains: codes for a missing value, and numbers that a transmission spoiled."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch._support.order_statistic import order_statistic
+from mkc_torch.calibration.turning import thin_at_rest
+from mkc_torch.recording.formats.base import counted
+from mkc_torch.recording.recording import Recording
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["without_impossible"]
+
+_APART = 20.0
+"""How many times as far from the middle as all others a sample is that no field explains. One that something magnetic
+disturbs has others between, before and after the worst of it."""
+
+_TURNED = 4.0
+"""How many times the middle measurement a turn can change it by, whatever the others do: a turn over is twice."""
+
+_MOST = 0.25
+"""The share of samples that can be such."""
+
+_NAMED = 4
+
+
+def without_impossible(recording: Recording, *names: str) -> Recording:
+    """The samples but for those whose values stand far apart from all others; ``warnings`` names them.
+
+    Args:
+        recording: in the order of time, if there is a time, and finite in these columns.
+        names: the columns of one sensor.
+
+    Example:
+        >>> import torch
+        >>> angle = torch.linspace(0.0, 6.0, 30)
+        >>> x = angle.cos()
+        >>> x[3] = x[20] = 32767.0
+        >>> recording = Recording({"time": torch.arange(30.0), "x": x, "y": angle.sin()})
+        >>> without_impossible(recording, "x", "y").warnings
+        ('Left out 2 of 30 samples that no field explains: `x` is 32767 2 times, first at 3 s.',)
+    """
+    points = recording.stack(*names)
+    middle = points.median(0).values
+    # the largest component, for the square of a number can be none
+    away = (points - middle).abs()
+    limit = max(_limit(away.amax(-1), thin_at_rest(points)), _TURNED * float(middle.abs().max()))
+    kept = away.amax(-1) <= limit
+    if bool(kept.all()):
+        return recording
+    found = list(_found(recording, away > limit, names))
+    more = [f"and {len(found) - _NAMED} more values"] if len(found) > _NAMED else []
+    left_out = int((~kept).sum())
+    return recording.rows(
+        kept,
+        f"Left out {left_out} of {len(recording)} samples that no field explains: "
+        f"{'; '.join([*found[:_NAMED], *more])}.",
+    )
+
+
+def _limit(away: Float[Tensor, " N"], taken: Bool[Tensor, " N"]) -> float:
+    """The distance beyond which there is nothing for long: from the first wide gap among the outer samples on."""
+    outer = away[taken].unsqueeze(-1)
+    begin = order_statistic(outer, None, math.ceil((1.0 - _MOST) * len(outer)))
+    ordered = away[away >= begin].sort().values
+    gaps = ((ordered[1:] > _APART * ordered[:-1]) & (ordered[:-1] > 0)).nonzero().flatten()
+    return float(ordered[gaps[0]]) if len(gaps) > 0 else math.inf
+
+
+def _found(recording: Recording, far: Bool[Tensor, "N k"], names: tuple[str, ...]) -> Iterator[str]:
+    for column, name in enumerate(names):
+        values, index = recording[name][far[:, column]].unique(return_inverse=True)
+        rows = far[:, column].nonzero().flatten()
+        for number, value in enumerate(values.tolist()):
+            at = rows[index == number]
+            first = f"sample {int(at[0]) + 1}" if recording.time is None else f"{float(recording.time[at[0]]):.6g} s"
+            times = "" if len(at) == 1 else f" {counted(len(at), 'time')}, first"
+            yield f"`{name}` is {value:.6g}{times} at {first}"

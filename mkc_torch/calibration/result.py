@@ -1,0 +1,237 @@
+"""A calibration: what it holds and does, and calibration.json, its text of the schema "mkc-calibration/1"."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from mkc_torch.calibration.coverage import Coverage, Gap, nearest_axis
+from mkc_torch.calibration.file import (
+    CalibrationFileError,
+    CheckedValues,
+    Matrix,
+    Vector,
+    finite_or_none,
+    refuse_constant,
+)
+from mkc_torch.functional import mkc_weight
+from mkc_torch.recording.disturbance import Interval
+from mkc_torch.recording.recording import Recording
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["SCHEMA", "Calibration", "Spread", "calibration_from_json", "calibration_to_json"]
+
+SCHEMA = "mkc-calibration/1"
+
+
+class Spread(NamedTuple):
+    """The size of residuals: 1.4826 times their median absolute value, and their root mean square."""
+
+    robust: float
+    rms: float
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a recording says about its magnetometer: ``field = matrix @ (measured - center)``.
+
+    Lengths are in ``unit``, the recording's, but for the corrected field, which is in ``field_unit``.
+
+    Attributes:
+        recording: name of the recording.
+        samples: samples in the fit.
+        unit: of what was measured.
+        center, center_se: offset (hard iron) and its standard errors.
+        semi_axes, semi_axes_se: of the ellipsoid, ascending.
+        rotation: columns along the semi-axes, determinant +1.
+        matrix, matrix_se: the calibration matrix, symmetric.
+        radius: geometric mean of the semi-axes.
+        field_strength, field_unit: the length of the corrected field: the radius, unless it was given.
+        sigma, d, bound: MKC density of :meth:`algebraic_residual`, no units; ``sigma`` is inf for Gaussian residuals.
+        before: of the measured norm about its median.
+        after: of :meth:`norm_residual`, rejected samples included.
+        rejected: number of samples of weight below one half.
+        disturbed: where rejected samples stand close together in time.
+        coverage: of directions, by the samples in use.
+        warnings: sentences about the recording and the fit.
+    """
+
+    recording: str
+    samples: int
+    unit: str
+    center: Vector
+    center_se: Vector
+    semi_axes: Vector
+    semi_axes_se: Vector
+    rotation: Matrix
+    matrix: Matrix
+    matrix_se: Matrix
+    radius: float
+    field_strength: float
+    field_unit: str
+    sigma: float
+    d: float
+    bound: float
+    before: Spread
+    after: Spread
+    rejected: int
+    disturbed: tuple[Interval, ...]
+    coverage: Coverage
+    warnings: tuple[str, ...]
+
+    @property
+    def rejected_share(self) -> float:
+        return self.rejected / self.samples
+
+    def corrected(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """The field in ``field_unit`` from measurements in ``unit``."""
+        center, matrix = points.new_tensor(self.center), points.new_tensor(self.matrix)
+        return (points - center) @ matrix.mT
+
+    def norm_residual(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """Length of the corrected field less what it should be, in ``unit``."""
+        relative = torch.linalg.vector_norm(self.corrected(points), dim=-1) / self.field_strength
+        return self.radius * (relative - 1.0)
+
+    def algebraic_residual(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """``(|field| / field_strength)² - 1``, twice the relative error of the length to first order."""
+        return (self.corrected(points) / self.field_strength).square().sum(-1) - 1.0
+
+    def weight(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """The weight in [0, 1] with which measurements enter the fit."""
+        return mkc_weight(self.algebraic_residual(points), self.sigma, self.d)
+
+    def apply(self, recording: Recording) -> dict[str, Float[Tensor, " N"]]:
+        """The corrected field of a recording, row by row: ``time`` where it has one, ``field_x``, ``field_y``,
+        ``field_z`` in ``field_unit``. No row is dropped; where a measurement is missing, so is the field.
+
+        Raises:
+            MissingColumnError: the recording has no ``mag_x``, ``mag_y`` or ``mag_z``.
+
+        Example:
+            >>> from mkc_torch.calibration.calibrate import calibrate
+            >>> from mkc_torch.recording.demonstration import simulated_recording
+            >>> recording, _ = simulated_recording()
+            >>> calibration = calibrate(recording, field_strength=48.0)
+            >>> field = calibration.apply(recording)
+            >>> list(field), round(float(torch.stack(list(field.values())[1:]).norm(dim=0).median()), 1)
+            (['time', 'field_x', 'field_y', 'field_z'], 48.0)
+        """
+        field = self.corrected(recording.magnetometer())
+        time = {} if recording.time is None else {"time": recording.time}
+        return time | dict(zip(("field_x", "field_y", "field_z"), field.unbind(-1), strict=True))
+
+    def to_json(self) -> str:
+        """The calibration as JSON of the schema "mkc-calibration/1", from which :meth:`from_json` makes it again.
+
+        Numbers round-trip exactly. JSON has no infinity and no NaN: ``sigma`` is the string "inf" where the residuals
+        are Gaussian, and a standard error that is not known is null.
+        """
+        return calibration_to_json(self)
+
+    @staticmethod
+    def from_json(text: str) -> Calibration:
+        """The calibration of a JSON text.
+
+        Raises:
+            CalibrationFileError: not JSON, of another schema, or a value that is missing or of the wrong kind.
+
+        Example:
+            >>> Calibration.from_json('{"schema": "mkc-model/1"}')
+            Traceback (most recent call last):
+            mkc_torch.calibration.result.CalibrationFileError: this is no calibration: its schema is "mkc-model/1", ...
+        """
+        return calibration_from_json(text)
+
+
+def calibration_to_json(calibration: Calibration) -> str:
+    """The text of calibration.json; see :meth:`Calibration.to_json`."""
+    c = calibration
+    content = {
+        "schema": SCHEMA,
+        "recording": c.recording,
+        "samples": c.samples,
+        "unit": c.unit,
+        "center": {"value": c.center, "standard_error": finite_or_none(c.center_se)},
+        "semi_axes": {"value": c.semi_axes, "standard_error": finite_or_none(c.semi_axes_se)},
+        "rotation": c.rotation,
+        "matrix": {"value": c.matrix, "standard_error": [finite_or_none(row) for row in c.matrix_se]},
+        "radius": c.radius,
+        "field_strength": {"value": c.field_strength, "unit": c.field_unit},
+        "noise": {
+            "residual": "(|matrix (measured - center)| / field_strength)^2 - 1",
+            "sigma": "inf" if math.isinf(c.sigma) else c.sigma,
+            "d": c.d,
+            "bound": c.bound,
+        },
+        "residual": {"before": c.before._asdict(), "after": c.after._asdict()},
+        "rejected": {"count": c.rejected, "share": c.rejected_share, "intervals": c.disturbed},
+        "coverage": {
+            "fraction": c.coverage.fraction,
+            "information": c.coverage.information,
+            "gaps": [
+                {"axis": nearest_axis(g.direction), "direction": g.direction, "degrees": g.degrees}
+                for g in c.coverage.gaps
+            ],
+        },
+        "warnings": c.warnings,
+    }
+    text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
+    # lists of numbers on one line; a text in JSON holds no line end, so none is touched
+    return re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda m: "[" + " ".join(m[1].split()) + "]", text) + "\n"
+
+
+def calibration_from_json(text: str) -> Calibration:
+    """The calibration of a text; see :meth:`mkc_torch.calibration.Calibration.from_json`."""
+    try:
+        content = json.loads(text, parse_constant=refuse_constant)
+    except json.JSONDecodeError as error:
+        raise CalibrationFileError(
+            f"this is no calibration: line {error.lineno} is not JSON ({error.msg}); give it a calibration.json."
+        ) from error
+    schema = content.get("schema") if isinstance(content, dict) else None
+    if schema != SCHEMA:
+        told = f'its schema is "{schema}", not "{SCHEMA}"' if isinstance(schema, str) else "it names no schema"
+        raise CalibrationFileError(f"this is no calibration: {told}; give it a calibration.json.")
+    c = CheckedValues(content)
+    return Calibration(
+        recording=c.text("recording"),
+        samples=c.count("samples", least=1),
+        unit=c.text("unit"),
+        center=c.vector("center", "value"),
+        center_se=c.vector("center", "standard_error", unknown=True),
+        semi_axes=c.vector("semi_axes", "value"),
+        semi_axes_se=c.vector("semi_axes", "standard_error", unknown=True),
+        rotation=c.matrix("rotation"),
+        matrix=c.matrix("matrix", "value"),
+        matrix_se=c.matrix("matrix", "standard_error", unknown=True),
+        radius=c.positive("radius"),
+        field_strength=c.positive("field_strength", "value"),
+        field_unit=c.text("field_strength", "unit"),
+        sigma=c.sigma(),
+        d=c.positive("noise", "d"),
+        bound=c.positive("noise", "bound"),
+        before=Spread(c.number("residual", "before", "robust"), c.number("residual", "before", "rms")),
+        after=Spread(c.number("residual", "after", "robust"), c.number("residual", "after", "rms")),
+        rejected=c.count("rejected", "count"),
+        disturbed=tuple(
+            Interval(*c.numbers("rejected", "intervals", i, length=2)) for i in c.each("rejected", "intervals")
+        ),
+        coverage=Coverage(
+            fraction=c.number("coverage", "fraction"),
+            gaps=tuple(
+                Gap(c.vector("coverage", "gaps", i, "direction"), c.number("coverage", "gaps", i, "degrees"))
+                for i in c.each("coverage", "gaps")
+            ),
+            information=c.number("coverage", "information"),
+        ),
+        warnings=tuple(c.text("warnings", i) for i in c.each("warnings")),
+    )

@@ -1,0 +1,162 @@
+"""Forces on the rate of a speed: drag, springs, stops, cogging, wind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from mkc_torch.challenge.dynamics.plant import Array, RateChange
+
+
+def added(row: int, force: Callable[[Array, Array], Array]) -> RateChange:
+    """What adds ``size · force(states, inputs)`` to the rate of one state."""
+
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:
+        rates = known.copy()
+        rates[row] += size * force(x, u)
+        return rates, z
+
+    return change
+
+
+def drag_factor(speed: Array, typical: float, reynolds: float) -> Array:
+    """Drag over ``-v`` of a sphere, 1 at the typical speed, whose coefficient depends on Reynolds' number.
+
+    Args:
+        speed: absolute.
+        typical: speed at which Reynolds' number is ``reynolds``.
+        reynolds: there.
+
+    References:
+        Schiller & Naumann, "A drag coefficient correlation", VDI-Zeitung 77 (1935), with a floor of 0.42.
+
+    Example:
+        >>> float(drag_factor(np.array(2.0), 2.0, 1e3))
+        1.0
+    """
+
+    def raw(v: Array) -> Array:
+        return 0.42 * v / typical + 24.0 / reynolds * (1.0 + 0.15 * (reynolds * v / typical) ** 0.687)
+
+    return raw(speed) / raw(np.asarray(typical))
+
+
+def sphere_drag(row: int, typical: float, reynolds: float) -> RateChange:
+    """Drag on one speed; its size is the deceleration at the typical speed, over that speed."""
+    return added(row, lambda x, _: -x[row] * drag_factor(np.abs(x[row]), typical, reynolds))
+
+
+def flight_drag(rows: tuple[int, int], typical: float, reynolds: float, wind: float = 0.0) -> RateChange:
+    """Drag on a body that flies: along its velocity through the air, which moves with the first axis."""
+
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
+        one, other = x[rows[0]] - wind, x[rows[1]]
+        factor = size * drag_factor(np.hypot(one, other), typical, reynolds)
+        rates = known.copy()
+        rates[rows[0]] -= factor * one
+        rates[rows[1]] -= factor * other
+        return rates, z
+
+    return change
+
+
+def creeping_drag(rows: tuple[int, int], typical: float) -> RateChange:
+    """Oseen's drag of a small body in a viscous medium: Stokes' with a first correction for inertia."""
+
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
+        one, other = x[rows[0]], x[rows[1]]
+        factor = size * (1.0 + 3.0 / 16.0 * 0.5 * np.hypot(one, other) / typical)
+        rates = known.copy()
+        rates[rows[0]] -= factor * one
+        rates[rows[1]] -= factor * other
+        return rates, z
+
+    return change
+
+
+def hardening(row: int, position: int, reach: float) -> RateChange:
+    """A flexure whose force grows as a hyperbolic sine; ``size x³`` for deflections far below ``reach``."""
+    return added(row, lambda x, _: -6.0 * reach**3 * (np.sinh(x[position] / reach) - x[position] / reach))
+
+
+def contact(row: int, position: int, place: float, ways: tuple[float, ...], loss: float = 0.2) -> RateChange:
+    """A bumper beyond a place, on the sides ``ways`` (1, -1): Hertz's contact that loses energy.
+
+    References:
+        Hunt & Crossley, "Coefficient of restitution interpreted as damping in vibroimpact", J. Appl. Mech. 42 (1975).
+    """
+
+    def force(x: Array, _: Array) -> Array:
+        total = np.zeros_like(x[row])
+        for way in ways:
+            depth = np.maximum(way * x[position] - place, 0.0)
+            total = total - way * depth**1.5 * np.maximum(1.0 + loss * way * x[row], 0.0)
+        return total
+
+    return added(row, force)
+
+
+def cogging(row: int, position: int, order: int, phase: float, second: float) -> RateChange:
+    """Magnets that pull: a force with a period of the turn, and a share ``second`` of twice that."""
+    return added(
+        row,
+        lambda x, _: np.sin(order * x[position] + phase) + second * np.sin(2.0 * (order * x[position] + phase) + 1.0),
+    )
+
+
+def wind(row: int, speed: float) -> RateChange:
+    """A steady wind of that speed: by the square of the velocity relative to it; 1 at standstill."""
+
+    def force(x: Array, _: Array) -> Array:
+        relative = 1.0 - x[row] / speed
+        return relative * np.abs(relative)
+
+    return added(row, force)
+
+
+def warming_bias(row: int, constant: float, share: float) -> RateChange:
+    """A bias of the actuator that loses a share as it warms up, with one own state."""
+
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
+        rates = known.copy()
+        rates[row] += size * (1.0 - share * z[0])
+        return rates, (1.0 - z) / constant
+
+    return change
+
+
+def hum(row: int, frequency: float) -> RateChange:
+    """A machine nearby that shakes: an oscillator of its own frequency in Hz, two own states."""
+    omega = 2.0 * np.pi * frequency
+
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
+        rates = known.copy()
+        rates[row] += size * (z[0] - 1.0)
+        return rates, np.stack([-omega * z[1], omega * (z[0] - 1.0)])
+
+    return change
+
+
+def lift(rows: tuple[int, int], constant: float) -> RateChange:
+    """Magnus' force on a spinning body, at right angles to its velocity; the spin fades, which takes an own state."""
+
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
+        left = size * (1.0 - z[0])
+        rates = known.copy()
+        rates[rows[0]] -= left * x[rows[1]]
+        rates[rows[1]] += left * x[rows[0]]
+        return rates, (1.0 - z) / constant
+
+    return change
+
+
+def fading_drive(row: int, load: int, gain: float, constant: float) -> RateChange:
+    """A motor's torque that fades as its windings heat up: a part of what a current drives, one own state."""
+
+    def change(x: Array, z: Array, u: Array, known: Array, size: Array) -> tuple[Array, Array]:  # noqa: ARG001
+        rates = known.copy()
+        rates[row] -= gain * x[load] * size * z[0] / (1.0 + size * z[0])
+        return rates, (x[load] ** 2 - z) / constant
+
+    return change

@@ -1,0 +1,186 @@
+"""A case of the proof for differential equations: a recording, a second one, and the key."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+import torch
+from torch import Generator, Tensor
+
+from mkc_torch.challenge import draws
+from mkc_torch.challenge.dynamics import cart_pole, motor, pendulum, projectile, tanks, thermal
+from mkc_torch.challenge.dynamics.errors import OUTLIERS, Errors, draw_errors, sample, spoil
+from mkc_torch.challenge.dynamics.hidden import Draw
+from mkc_torch.challenge.dynamics.integrate import Course, simulate
+from mkc_torch.challenge.dynamics.oracle import Power, can_be_named, names, power
+from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Setting, Trial
+from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.second import oracle_rms
+from mkc_torch.challenge.dynamics.sizes import draw_size
+from mkc_torch.challenge.key import Key, KeyEffect, KeyRival
+from mkc_torch.challenge.magnetometer.decoys import plain
+from mkc_torch.challenge.magnetometer.generator import Case
+from mkc_torch.challenge.thresholds import INSEPARABLE_BELOW
+from mkc_torch.recording.recording import Recording
+
+OUTSIDE_SHARE = 0.08
+"""Share of the cases whose effect no diagnosis with the catalogue can name."""
+
+_DIGITS = 7
+"""Significant ones, of inputs and outputs as a logger prints them."""
+
+
+@dataclass(frozen=True)
+class System:
+    """One of the systems: how its runs are drawn, and what can be hidden in it."""
+
+    draw: Callable[[Generator], Setting]
+    inside: Sequence[Draw]
+    outside: Sequence[Draw]
+
+
+SYSTEMS: Mapping[str, System] = MappingProxyType(
+    {
+        "pendulum": System(pendulum.draw, pendulum.INSIDE, pendulum.OUTSIDE),
+        "cart_pole": System(cart_pole.draw, cart_pole.INSIDE, cart_pole.OUTSIDE),
+        "tanks": System(tanks.draw, tanks.INSIDE, tanks.OUTSIDE),
+        "motor": System(motor.draw, motor.INSIDE, motor.OUTSIDE),
+        "projectile": System(projectile.draw, projectile.INSIDE, projectile.OUTSIDE),
+        "thermal": System(thermal.draw, thermal.INSIDE, thermal.OUTSIDE),
+    }
+)
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """A recording's columns, what its sensors added (m, T, R), and which samples are bad."""
+
+    columns: dict[str, Tensor]
+    errors: Array
+    bad: np.ndarray
+
+
+def draw(seed: int, index: int, *, empty: bool = False) -> Case:
+    """The case at that address; the same address gives the same case.
+
+    Args:
+        seed: of the proof.
+        index: of the case.
+        empty: hide nothing.
+    """
+
+    def stream(what: str) -> Generator:
+        return draws.generator(seed, index, "dynamics", what)
+
+    system = draws.choose(stream("system"), tuple(SYSTEMS))
+    setting = SYSTEMS[system].draw(stream("setting"))
+    plant, name = setting.plant, f"{system}_{index:05d}"
+    scene = Scene(plant, setting.trial, simulate(plant, setting.trial))
+    errors = draw_errors(stream("noise"), scene.course.outputs)
+    if empty:
+        measured = _measured(stream, "", plant, setting.trial, scene.course, errors)
+        return Case(Recording(measured.columns, name=name), None, _key(name, "empty", plant, errors, measured))
+    kind, hidden, size, seen = hide(stream, SYSTEMS[system], scene, errors)
+    measured = _measured(stream, "", plant, setting.trial, simulate(plant, setting.trial, hidden, size), errors)
+    later = simulate(plant, setting.later, hidden, size)
+    again = _measured(stream, "later ", plant, setting.later, later, errors)
+    key = replace(
+        _key(name, kind, plant, errors, measured),
+        effects=(_key_effect(hidden, size, seen),),
+        second_outliers=_numbers(again.bad),
+        oracle_rms=oracle_rms(plant, setting.later, hidden, size, errors, again.errors, ~again.bad),
+    )
+    return Case(Recording(measured.columns, name=name), Recording(again.columns, name=f"{name}_second"), key)
+
+
+def hide(
+    stream: Callable[[str], Generator], system: System, scene: Scene, errors: Errors
+) -> tuple[str, Hidden, float, Power]:
+    """An effect: its kind, itself, its size, and how well it can be seen at that size."""
+    g = stream("effect")
+    outside = draws.happens(g, OUTSIDE_SHARE)
+    hidden = draws.choose(g, system.outside if outside else system.inside)(g, scene)
+    known = frozenset() if outside else names(scene)
+    while not (outside or can_be_named(hidden, known)):
+        hidden = draws.choose(g, system.inside)(g, scene)
+    size = draw_size(stream("size"), hidden, scene, errors, outside=outside)
+    seen = power(scene.plant, scene.trial, hidden, size, errors)
+    return "outside" if outside else "single", hidden, size, seen
+
+
+def _measured(
+    stream: Callable[[str], Generator], when: str, plant: Plant, trial: Trial, course: Course, errors: Errors
+) -> _Measured:
+    """What a logger writes: runs below one another, inputs, outputs with errors, and columns that mean nothing."""
+    samples, runs = trial.samples, trial.runs
+    noise = sample(stream(f"{when}errors"), errors, samples, runs)
+    bad, mask = spoil(stream(f"{when}outliers"), errors, samples, runs)
+    seen = course.outputs + noise + bad
+    time = torch.arange(samples, dtype=torch.float64).mul(trial.step).round(decimals=6)
+    columns = {"time": time.repeat(runs)}
+    if runs > 1:
+        columns["experiment"] = torch.arange(runs, dtype=torch.float64).repeat_interleave(samples)
+    columns |= {name: _column(values) for name, values in zip(plant.inputs, trial.inputs, strict=True)}
+    columns |= {name: _column(values) for name, values in zip(plant.outputs, seen, strict=True)}
+    return _Measured(columns | _decoys(stream(f"{when}decoys"), plant, columns), noise + bad, mask)
+
+
+def _decoys(g: Generator, plant: Plant, columns: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """A trend of the temperature and, where there is an input, a noisy copy of it."""
+    count = len(columns["time"])
+    found = {"temperature": 22.0 + plain(g, "trend", torch.arange(count, dtype=torch.float64))}
+    if plant.inputs:
+        sent = columns[plant.inputs[0]]
+        found["aux_1"] = draws.uniform(g, 0.5, 2.0) * (sent + 0.2 * sent.std() * draws.normal(g, count))
+    return {name: values.round(decimals=4) for name, values in found.items()}
+
+
+def _column(values: Array) -> Tensor:
+    """(T, R) as one column, run after run, to so many digits."""
+    flat = values.T.ravel()
+    unit = 10.0 ** (np.floor(np.log10(np.abs(flat).max() + 1e-300)) - _DIGITS + 1)
+    return torch.from_numpy(np.round(flat / unit) * unit)
+
+
+def _numbers(mask: np.ndarray) -> tuple[int, ...]:
+    """Bad samples of (m, T, R), numbered output by output and run by run."""
+    return tuple(np.flatnonzero(mask.transpose(0, 2, 1)).tolist())
+
+
+def _key(name: str, kind: str, plant: Plant, errors: Errors, measured: _Measured) -> Key:
+    return Key(
+        name=name,
+        kind=kind,
+        mode=plant.name,
+        effects=(),
+        noise=errors.numbers(plant.outputs),
+        outlier_kind={"share": OUTLIERS},
+        outliers=_numbers(measured.bad),
+        second_outliers=(),
+        decoys={},
+        sensor=plant.parameters,
+        field_strength=0.0,
+        oracle_rms=0.0,
+        columns=tuple(measured.columns),
+    )
+
+
+def _key_effect(hidden: Hidden, size: float, seen: Power) -> KeyEffect:
+    told = [KeyRival(rival.effect, (), rival.z_sep, rival.at) for rival in (*seen.rivals, *seen.larger)]
+    return KeyEffect(
+        effect=hidden.effect,
+        form=hidden.form,
+        drivers=(),
+        withheld="",
+        onset=None,
+        size=size,
+        parameters=(),
+        z=seen.z,
+        z_sep=seen.z_sep,
+        rival=told[0] if told else None,
+        inseparable=tuple(rival for rival in told if rival.z_sep < INSEPARABLE_BELOW),
+        at=hidden.at,
+    )

@@ -1,0 +1,222 @@
+"""What can be hidden in several systems: effects drawn to the size of a scene, with the names that a diagnosis has."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from torch import Generator
+
+from mkc_torch.challenge.draws import choose, happens, log_uniform, uniform
+from mkc_torch.challenge.dynamics import flows, forces, transducers
+from mkc_torch.challenge.dynamics.friction import bristles, rubber
+from mkc_torch.challenge.dynamics.plant import Hidden
+from mkc_torch.challenge.dynamics.scene import Scene
+
+Draw = Callable[[Generator, Scene], Hidden]
+
+
+def rate_of(state: str) -> str:
+    """Where a diagnosis says that it acts."""
+    return f"rate of {state}"
+
+
+def dry_friction(speed: str, position: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        form = bristles(
+            scene.plant.row(speed), uniform(g, 0.008, 0.015) * scene.largest(position), scene.typical(speed)
+        )
+        return Hidden(
+            "coulomb_friction", "LuGre without a rise", (rate_of(speed),), 0.5 * scene.pace(speed), form, own=1
+        )
+
+    return draw
+
+
+def sticking_friction(speed: str, position: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        form = bristles(
+            scene.plant.row(speed),
+            uniform(g, 0.008, 0.015) * scene.largest(position),
+            uniform(g, 0.3, 0.8) * scene.typical(speed),
+            rise=uniform(g, 1.0, 2.5),
+        )
+        return Hidden(
+            "stribeck_friction", "LuGre with Tustin's rise", (rate_of(speed),), 0.4 * scene.pace(speed), form, own=1
+        )
+
+    return draw
+
+
+def blunt_drag(speed: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        typical = scene.typical(speed)
+        form = forces.sphere_drag(scene.plant.row(speed), typical, log_uniform(g, 500.0, 5e4))
+        large = 0.7 * scene.pace(speed) / typical
+        return Hidden("quadratic_drag", "drag coefficient of Reynolds' number", (rate_of(speed),), large, form)
+
+    return draw
+
+
+def hard_spring(speed: str, position: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        reach = scene.largest(position)
+        form = forces.hardening(scene.plant.row(speed), scene.plant.row(position), uniform(g, 0.6, 1.2) * reach)
+        large = scene.pace(speed) / reach**3
+        return Hidden("cubic_stiffness", "hyperbolic sine", (rate_of(speed),), large, form)
+
+    return draw
+
+
+def bumper(speed: str, position: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        x, reach = scene.state(position), scene.largest(position)
+        further = 1.0 if x.max() >= -x.min() else -1.0
+        ways = (1.0, -1.0) if happens(g, 0.5) else (further,)
+        form = forces.contact(scene.plant.row(speed), scene.plant.row(position), uniform(g, 0.55, 0.85) * reach, ways)
+        large = 20.0 * scene.pace(speed) / (0.2 * reach) ** 1.5
+        return Hidden("hard_stop", "Hunt and Crossley's contact", (rate_of(speed),), large, form)
+
+    return draw
+
+
+def magnets(speed: str, angle: str, orders: tuple[int, ...]) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        form = forces.cogging(
+            scene.plant.row(speed),
+            scene.plant.row(angle),
+            choose(g, orders),
+            uniform(g, 0.0, 2.0 * math.pi),
+            uniform(g, 0.1, 0.25),
+        )
+        return Hidden(
+            "position_periodic_force", "cogging, second harmonic", (rate_of(speed),), 0.7 * scene.pace(speed), form
+        )
+
+    return draw
+
+
+def steady_wind(speed: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        form = forces.wind(scene.plant.row(speed), uniform(g, 4.0, 10.0) * scene.largest(speed))
+        return Hidden("constant_force", "steady wind", (rate_of(speed),), scene.pace(speed), form)
+
+    return draw
+
+
+def warm_bias(speed: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        form = forces.warming_bias(scene.plant.row(speed), uniform(g, 0.1, 0.5) * scene.length, uniform(g, 0.0, 0.15))
+        return Hidden("constant_force", "bias that warms up", (rate_of(speed),), scene.pace(speed), form, own=1)
+
+    return draw
+
+
+def late_actuator(name: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        pipe = happens(g, 0.5)
+        change = transducers.transport if pipe else transducers.lags(4)
+        return Hidden(
+            "input_delay",
+            "transport" if pipe else "four lags in series",
+            (f"input {name}",),
+            0.05 * scene.length,
+            inputs=transducers.only(scene.plant.inputs.index(name), change),
+        )
+
+    return draw
+
+
+def weak_actuator(name: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        change = transducers.soft_limit(scene.largest_input(name), uniform(g, 4.0, 10.0))
+        return Hidden(
+            "input_saturation",
+            "smooth limit",
+            (f"input {name}",),
+            2.5,
+            inputs=transducers.only(scene.plant.inputs.index(name), change),
+        )
+
+    return draw
+
+
+def lapped_valve(name: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+        change = transducers.soft_gap(scene.largest_input(name))
+        return Hidden(
+            "dead_zone",
+            "smooth overlap",
+            (f"input {name}",),
+            0.4,
+            inputs=transducers.only(scene.plant.inputs.index(name), change),
+        )
+
+    return draw
+
+
+def worn_drive(name: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+        change = transducers.worn_linkage(scene.largest_input(name))
+        return Hidden(
+            "backlash",
+            "several gaps in series",
+            (f"input {name}",),
+            0.4,
+            inputs=transducers.only(scene.plant.inputs.index(name), change),
+        )
+
+    return draw
+
+
+def bushing(speed: str, position: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        reach = scene.largest(position)
+        form = rubber(scene.plant.row(speed), tuple(reach * uniform(g, 0.1, 0.5) for _ in range(3)))
+        large = 2.0 * scene.pace(speed) / reach
+        return Hidden("bouc_wen_hysteresis", "elements with several yields", (rate_of(speed),), large, form, own=3)
+
+    return draw
+
+
+def slow_sensor() -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+        return Hidden(
+            "sensor_lag",
+            "two lags in series",
+            scene.plant.outputs,
+            0.03 * scene.length,
+            outputs=transducers.housing,
+        )
+
+    return draw
+
+
+def full_vessel(level: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        top, power = scene.largest(level), choose(g, (1.5, 2.5))
+        form = flows.weir(scene.plant.row(level), uniform(g, 0.55, 0.85) * top, power)
+        large = 5.0 * scene.pace(level) / (0.2 * top) ** power
+        name = "rectangular weir" if power == 1.5 else "V-notch weir"
+        return Hidden("overflow", name, (rate_of(level),), large, form)
+
+    return draw
+
+
+def gravel_leak(level: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        typical = scene.typical(level)
+        form = flows.seepage(scene.plant.row(level), uniform(g, 0.0, 0.3) / typical)
+        return Hidden(
+            "linear_drag", "Darcy and Forchheimer's leak", (rate_of(level),), scene.pace(level) / typical, form
+        )
+
+    return draw
+
+
+def machine_nearby(speed: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        form = forces.hum(scene.plant.row(speed), uniform(g, 5.0, 30.0) / scene.length)
+        return Hidden("vibration", "sinusoid of time", (rate_of(speed),), scene.pace(speed), form, own=2)
+
+    return draw

@@ -1,0 +1,114 @@
+"""The generator's own integration: Runge and Kutta's classical method at a fixed fine step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Trial
+
+
+@dataclass(frozen=True)
+class Course:
+    """States (n, F, R) at the fine moments, the inputs (k, F, R) that were sent, and the outputs (m, T, R)."""
+
+    states: Array
+    inputs: Array
+    outputs: Array
+
+
+def between(values: Array, parts: int) -> Array:
+    """Signals (k, T, R) at ``parts`` moments an interval: (k, (T - 1) parts + 1, R), linear between samples.
+
+    Example:
+        >>> between(np.array([[[0.0], [1.0]]]), 2)[0, :, 0].tolist()
+        [0.0, 0.5, 1.0]
+    """
+    share = np.arange(parts)[None, None, :, None] / parts
+    inside = values[:, :-1, None] * (1.0 - share) + values[:, 1:, None] * share
+    k, samples, runs = values.shape
+    return np.concatenate([inside.reshape(k, (samples - 1) * parts, runs), values[:, -1:]], 1)
+
+
+def simulate(plant: Plant, trial: Trial, hidden: Hidden | None = None, size: float = 0.0) -> Course:
+    """The runs of a trial, with something hidden or nothing.
+
+    Args:
+        plant: the system.
+        trial: the runs.
+        hidden: what acts beside the known physics.
+        size: of it.
+    """
+    h = trial.step / plant.fine
+    half = between(trial.inputs, 2 * plant.fine)
+    sent = half if hidden is None else hidden.inputs(half, 0.5 * h, size)
+    states = _states(plant, h, sent, trial.begin, hidden, np.full(trial.runs, size))
+    return Course(states, half[:, ::2], _measured(plant, states, h, hidden, size))
+
+
+def outputs_of_sizes(plant: Plant, trial: Trial, hidden: Hidden, sizes: Array) -> list[Array]:
+    """Outputs (m, T, R) for each of several sizes, which are integrated side by side as so many more runs."""
+    h = trial.step / plant.fine
+    half = between(trial.inputs, 2 * plant.fine)
+    sent = np.concatenate([hidden.inputs(half, 0.5 * h, size) for size in sizes], -1)
+    begin = np.tile(trial.begin, len(sizes))
+    states = _states(plant, h, sent, begin, hidden, np.repeat(sizes, trial.runs))
+    parts = np.split(states, len(sizes), -1)
+    return [_measured(plant, part, h, hidden, size) for part, size in zip(parts, sizes, strict=True)]
+
+
+def _states(plant: Plant, h: float, sent: Array, begin: Array, hidden: Hidden | None, sizes: Array) -> Array:
+    """(n, F, R) for inputs (k, 2F - 1, R), first states (n, R) and the size of what is hidden in each run (R,)."""
+    own = 0 if hidden is None else hidden.own
+    n, p = len(plant.states), plant.values
+
+    def rate(x: Array, u: Array) -> Array:
+        known = plant.rate(x[:n], u, p)
+        if hidden is None or hidden.rate is None:
+            return known
+        rates, inner = hidden.rate(x[:n], x[n:], u, known, sizes)
+        return np.concatenate([rates, inner]) if own else rates
+
+    x = np.concatenate([begin, np.zeros((own, begin.shape[1]))])
+    path = np.empty((sent.shape[1] // 2 + 1, *x.shape))
+    path[0] = x
+    for k in range(len(path) - 1):
+        a, b, c = sent[:, 2 * k], sent[:, 2 * k + 1], sent[:, 2 * k + 2]
+        k1 = rate(x, a)
+        k2 = rate(x + 0.5 * h * k1, b)
+        k3 = rate(x + 0.5 * h * k2, b)
+        x = x + h / 6.0 * (k1 + 2.0 * (k2 + k3) + rate(x + h * k3, c))
+        path[k + 1] = x
+    return path.transpose(1, 0, 2)[:n]
+
+
+def _measured(plant: Plant, states: Array, h: float, hidden: Hidden | None, size: float) -> Array:
+    """Outputs (m, T, R) of states (n, F, R)."""
+    found = states[[plant.row(name) for name in plant.outputs]]
+    return (found if hidden is None else hidden.outputs(found, h, size))[:, :: plant.fine]
+
+
+def variation(jacobian: Array, forcing: Array, begin: Array, step: float) -> Array:
+    """Solutions of the variational equation ``δẋ = A δx + f`` along a course.
+
+    Args:
+        jacobian: A (F, R, n, n) at moments ``step`` apart, an odd number of them.
+        forcing: f (F, R, n, K), one column a direction.
+        begin: δx (R, n, K) at the beginning.
+        step: in s; the method takes two at once.
+
+    Returns:
+        δx ((F + 1) / 2, R, n, K) at every other moment.
+    """
+    h = 2.0 * step
+    out = np.empty((len(jacobian) // 2 + 1, *begin.shape))
+    out[0] = d = begin
+    for k in range(len(out) - 1):
+        a, b, c = jacobian[2 * k : 2 * k + 3]
+        f, g, e = forcing[2 * k : 2 * k + 3]
+        k1 = a @ d + f
+        k2 = b @ (d + 0.5 * h * k1) + g
+        k3 = b @ (d + 0.5 * h * k2) + g
+        out[k + 1] = d = d + h / 6.0 * (k1 + 2.0 * (k2 + k3) + c @ (d + h * k3) + e)
+    return out

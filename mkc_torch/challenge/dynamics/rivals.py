@@ -1,0 +1,190 @@
+"""What a diagnosis could say of a system: textbook forms of missing physics, each linear in its amplitudes.
+
+Written anew from the same textbooks as the catalogue, so that the oracle owes it nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from mkc_torch.challenge.dynamics.hidden import rate_of
+from mkc_torch.challenge.dynamics.plant import Array
+from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.transducers import lagged, play, transport
+
+_REVERSED = 0.05
+"""Share of the time in either direction from which a state counts as one that reverses."""
+
+_SHIFTS = tuple(float(s) for s in np.geomspace(0.0007, 0.1, 12))
+"""Delays and lags, as shares of a run."""
+
+SUPERSETS = {
+    "coulomb_friction": ("stribeck_friction", "load_dependent_friction"),
+}
+"""Effects that contain another: not its rivals, for they can always follow it."""
+
+
+@dataclass(frozen=True)
+class Account:
+    """One form: what it adds to the rates (n, F, R, q), or to the outputs (m, T, R, q), for amplitudes of one.
+
+    ``positive`` says that amplitudes of the other sign are not physics.
+    """
+
+    effect: str
+    at: tuple[str, ...]
+    forcing: Array | None
+    outputs: Array | None
+    positive: bool
+
+
+def accounts(scene: Scene, gains: Array) -> list[Account]:
+    """All forms at all places.
+
+    Args:
+        scene: whose course the forms are taken along.
+        gains: derivative of the rates by the inputs (n, k, F, R).
+    """
+    plant = scene.plant
+    found: list[Account] = []
+    for row, state in enumerate(plant.states):
+        if state in plant.speeds:
+            continue
+        for effect, columns, positive in rate_forms(scene, state):
+            forcing = np.zeros((len(plant.states), *columns.shape))
+            forcing[row] = columns
+            found.append(Account(effect, (rate_of(state),), forcing, None, positive))
+    found += _exchanges(scene)
+    for k, name in enumerate(plant.inputs):
+        step = scene.trial.step / plant.fine
+        for effect, course in input_forms(scene.course.inputs[[k]], step, scene.length):
+            forcing = gains[:, k] * course
+            found.append(Account(effect, (f"input {name}",), forcing[..., None], None, True))
+    found += _lags(scene)
+    return found
+
+
+def rate_forms(scene: Scene, state: str) -> Iterator[tuple[str, Array, bool]]:
+    """Forms on the rate of one state: effect, columns (F, R, q), and whether amplitudes are positive."""
+    plant, v = scene.plant, scene.state(state)
+    position = next((name for name, speed in plant.speeds.items() if speed == state), None)
+    yield "constant_force", np.ones_like(v)[..., None], False
+    yield "linear_drag", -v[..., None], True
+    yield "quadratic_drag", -(v * np.abs(v))[..., None], True
+    if _reverses(v):
+        yield from _frictions(v, scene.typical(state), _load(scene, state, position))
+    if position is not None:
+        yield from _position_forms(scene.state(position), plant.units[position], named_height=position == "height")
+        rates = plant.rate(scene.course.states, scene.course.inputs, plant.values)
+        yield "added_mass", -rates[plant.row(state)][..., None], True
+        if _reverses(v):
+            for share in (0.05, 0.1, 0.2, 0.4, 0.8):
+                yield "bouc_wen_hysteresis", -wound_up(scene.state(position), share)[..., None], True
+    elif plant.units[state] == "°C":
+        yield "thermal_loss", -(((v + 273.15) / 293.15) ** 4 - 1.0)[..., None] * 293.15 / 4.0, True
+    else:
+        for share in (0.45, 0.55, 0.65, 0.75, 0.85, 0.93):
+            yield "overflow", -np.maximum(v - share * v.max(), 0.0)[..., None], True
+
+
+def _load(scene: Scene, state: str, position: str | None) -> Array | None:
+    """What drives a speed against what holds it, both at standstill (F, R); None without inputs or a position."""
+    plant, course = scene.plant, scene.course
+    if position is None or not plant.inputs:
+        return None
+    row = plant.row(state)
+    still = course.states.copy()
+    still[row] = 0.0
+    driven = plant.rate(still, course.inputs, plant.values)[row]
+    held = plant.rate(still, np.zeros_like(course.inputs), plant.values)[row]
+    return np.abs(driven - 2.0 * held)
+
+
+def _frictions(v: Array, typical: float, load: Array | None) -> Iterator[tuple[str, Array, bool]]:
+    for width in (0.3, 0.1, 0.03):
+        dry = -np.tanh(v / (width * typical))
+        yield "coulomb_friction", dry[..., None], True
+        if load is not None:
+            yield "load_dependent_friction", np.stack([dry, dry * load], -1), True
+        for speed in (0.15, 0.4, 1.0):
+            rise = np.exp(-((v / (speed * typical)) ** 2))
+            yield "stribeck_friction", np.stack([dry, dry * rise], -1), True
+
+
+def wound_up(x: Array, share: float) -> Array:
+    """Bouc and Wen's hysteretic deflection (F, R) along positions (F, R), that yields at a share of the largest."""
+    limit = share * np.abs(x).max()
+    z = np.zeros_like(x)
+    for k in range(1, len(x)):
+        way = x[k] - x[k - 1]
+        z[k] = z[k - 1] + way * (1.0 - np.where(way * z[k - 1] > 0.0, np.abs(z[k - 1]) / limit, 0.0))
+    return z
+
+
+def _position_forms(x: Array, unit: str, *, named_height: bool) -> Iterator[tuple[str, Array, bool]]:
+    if _reverses(x):
+        yield "cubic_stiffness", -(x[..., None] ** 3), False
+    for share in (0.45, 0.55, 0.65, 0.75, 0.85, 0.93):
+        place = share * np.abs(x).max()
+        yield "hard_stop", np.stack([-np.maximum(x - place, 0.0), np.maximum(-place - x, 0.0)], -1), True
+    if named_height:
+        for surface in (0.3, 0.6, 0.9):
+            for draught in (0.1, 0.3, 1.0):
+                dip = np.clip((surface - x / np.abs(x).max()) / draught, 0.0, 1.0)
+                yield "buoyancy", dip[..., None], True
+    if unit == "rad":
+        for order in (1, 2, 3, 4, 6, 8, 12, 24):
+            yield "position_periodic_force", np.stack([np.sin(order * x), np.cos(order * x)], -1), False
+
+
+def input_forms(u: Array, step: float, length: float) -> Iterator[tuple[str, Array]]:
+    """Forms of one input (1, F, R): effect and what it adds (F, R)."""
+    largest = float(np.abs(u).max())
+    for share in _SHIFTS:
+        yield "input_delay", (transport(u, step, share * length) - u)[0]
+    for share in (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9):
+        yield "input_saturation", (np.clip(u, -share * largest, share * largest) - u)[0]
+    for share in (0.03, 0.06, 0.1, 0.2, 0.3):
+        yield "dead_zone", -np.clip(u, -share * largest, share * largest)[0]
+        yield "backlash", (play(u, share * largest) - u)[0]
+
+
+def _exchanges(scene: Scene) -> list[Account]:
+    plant, found = scene.plant, []
+    free = [state for state in plant.states if state not in plant.speeds]
+    for one, other in combinations(free, 2):
+        if plant.units[one] != plant.units[other]:
+            continue
+        away = scene.state(other) - scene.state(one)
+        forcing = np.zeros((len(plant.states), *away.shape, 2))
+        forcing[plant.row(one), ..., 0] = away
+        forcing[plant.row(other), ..., 1] = -away
+        places = (rate_of(one), rate_of(other))
+        found.append(Account("coupling", places, forcing, None, True))
+        if plant.units[one] == "m/s":
+            turned = np.zeros((len(plant.states), *away.shape, 1))
+            turned[plant.row(one), ..., 0] = -scene.state(other)
+            turned[plant.row(other), ..., 0] = scene.state(one)
+            found.append(Account("magnus_lift", places, turned, None, False))
+    return found
+
+
+def _lags(scene: Scene) -> list[Account]:
+    plant, step = scene.plant, scene.trial.step / scene.plant.fine
+    measured = scene.course.states[[plant.row(name) for name in plant.outputs]]
+    found = []
+    for share in _SHIFTS:
+        behind = (lagged(measured, step, share * scene.length) - measured)[:, :: plant.fine]
+        traces = np.zeros((*behind.shape, len(behind)))
+        for k, one in enumerate(behind):
+            traces[k, ..., k] = one
+        found.append(Account("sensor_lag", plant.outputs, None, traces, True))
+    return found
+
+
+def _reverses(values: Array) -> bool:
+    return min(float((values > 0).mean()), float((values < 0).mean())) > _REVERSED

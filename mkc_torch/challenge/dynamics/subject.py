@@ -1,0 +1,38 @@
+"""The proof of differential equations of a user's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mkc_torch.challenge.dynamics import generator
+from mkc_torch.challenge.dynamics.second import ratio_to_oracle
+from mkc_torch.challenge.dynamics.thresholds import THRESHOLDS
+from mkc_torch.challenge.magnetometer.generator import Case
+from mkc_torch.challenge.subject import Subject
+
+
+def dynamics() -> Subject:
+    """Recordings of six systems, each to be compared with a simulation as a user would write it."""
+    return Subject(
+        name="dynamics",
+        cases=100,
+        empty=150,
+        draw=_draw,
+        ratio=ratio_to_oracle,
+        thresholds=THRESHOLDS,
+        simulations=Path(__file__).with_name("naive.py"),
+    )
+
+
+def simulation_class(recording: Path) -> str:
+    """The class in the file of simulations that a recording is of, by the name of its file.
+
+    Example:
+        >>> simulation_class(Path("cart_pole_00012.csv"))
+        'CartPole'
+    """
+    return "".join(word.capitalize() for word in recording.stem.split("_")[:-1])
+
+
+def _draw(seed: int, index: int, empty: bool) -> Case:
+    return generator.draw(seed, index, empty=empty)

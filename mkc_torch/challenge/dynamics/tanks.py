@@ -1,0 +1,94 @@
+"""Two tanks side by side, each with a pump and an outlet of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+from torch import Generator
+
+from mkc_torch.challenge.draws import uniform, whole
+from mkc_torch.challenge.dynamics import flows, forces, hidden
+from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Setting, Trial
+from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.signals import excitation, moments
+
+STEP = 2.0
+"""s."""
+
+FLOOR = 1e-4
+"""Level below which an outlet is held to be dry, m."""
+
+
+def rate(x: Array, u: Array, p: Array) -> Array:
+    out = np.sqrt(np.maximum(x, FLOOR))
+    return np.array([p[0] * u[0] - p[2] * out[0], p[1] * u[1] - p[3] * out[1]])
+
+
+def draw(g: Generator) -> Setting:
+    plant = Plant(
+        "tanks",
+        ("level_1", "level_2"),
+        ("pump_1", "pump_2"),
+        ("level_1", "level_2"),
+        {"level_1": "m", "level_2": "m"},
+        {},
+        {
+            "pump_gain_1": uniform(g, 0.0012, 0.0018),
+            "pump_gain_2": uniform(g, 0.0012, 0.0018),
+            "outlet_1": uniform(g, 0.009, 0.014),
+            "outlet_2": uniform(g, 0.009, 0.014),
+        },
+        rate,
+        fine=4,
+    )
+    runs = whole(g, 1, 2)
+    return Setting(plant, trial(g, runs, 320 // runs), trial(g, 1, 200))
+
+
+def trial(g: Generator, runs: int, samples: int) -> Trial:
+    """Pumps between 0.5 and 9.5 V, from a first level of 0.1 to 0.7 m."""
+    time = moments(STEP, samples)
+    pumps = [
+        [5.0 + uniform(g, 2.5, 4.5) * excitation(g, time, uniform(g, 60.0, 150.0)) for _ in range(runs)]
+        for _ in range(2)
+    ]
+    begin = np.array([[uniform(g, 0.1, 0.7) for _ in range(runs)] for _ in range(2)])
+    return Trial(STEP, np.stack([np.stack(one, -1) for one in pumps]), begin)
+
+
+def pipe_between(g: Generator, scene: Scene) -> Hidden:
+    """A pipe with a filter in it, by Darcy and Forchheimer."""
+    away = np.abs(scene.state("level_1") - scene.state("level_2"))
+    typical, bend = float(np.median(away)), uniform(g, 0.0, 0.5)
+    form = flows.exchange(0, 1, lambda head: flows.forchheimer(head, bend / typical), uniform(g, 0.7, 1.4))
+    places = (hidden.rate_of("level_1"), hidden.rate_of("level_2"))
+    return Hidden("coupling", "Darcy and Forchheimer's pipe", places, scene.pace("level_1") / typical, form)
+
+
+def dripping_tap(level: str) -> hidden.Draw:
+    def draw_tap(g: Generator, scene: Scene) -> Hidden:
+        form = flows.tap(scene.plant.row(level), uniform(g, 3.0, 8.0) * scene.largest(level))
+        return Hidden("constant_force", "tap on a main", (hidden.rate_of(level),), scene.pace(level), form)
+
+    return draw_tap
+
+
+def wavy_inflow(g: Generator, scene: Scene) -> Hidden:
+    """Rain that comes and goes."""
+    form = forces.hum(0, uniform(g, 3.0, 15.0) / scene.length)
+    return Hidden("vibration", "sinusoid of time", (hidden.rate_of("level_1"),), scene.pace("level_1"), form, own=2)
+
+
+INSIDE = (
+    pipe_between,
+    hidden.full_vessel("level_1"),
+    hidden.full_vessel("level_2"),
+    hidden.gravel_leak("level_1"),
+    dripping_tap("level_1"),
+    dripping_tap("level_2"),
+    hidden.late_actuator("pump_1"),
+    hidden.weak_actuator("pump_2"),
+    hidden.lapped_valve("pump_1"),
+    hidden.worn_drive("pump_2"),
+    hidden.slow_sensor(),
+)
+OUTSIDE = (wavy_inflow,)

@@ -1,0 +1,98 @@
+"""The columns of a recording beside the magnetometer's: recorded drivers, motion, decoys."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Generator, Tensor
+
+from mkc_torch.challenge.draws import choose, happens, normal, uniform
+from mkc_torch.challenge.magnetometer import rotation
+from mkc_torch.challenge.magnetometer.decoys import Decoy, decoy_column, draw_decoys
+from mkc_torch.challenge.magnetometer.drivers import recorded_current, recorded_temperature, recorded_voltage
+from mkc_torch.challenge.magnetometer.noise import Noise
+from mkc_torch.challenge.magnetometer.scene import Scene
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+MODES = ("norm", "gyro", "attitude")
+MODE_SHARES = (0.60, 0.15, 0.25)
+PRESENT: Mapping[str, float] = {"temperature": 0.6, "current": 0.5, "position": 0.4, "voltage": 0.3, "accel": 0.2}
+"""Shares of the recordings that have a column which nothing needs."""
+
+_DECIMALS: Mapping[str, int] = {"mag": 4, "gyro": 5, "accel": 4, "position": 4, "temperature": 4, "q": 6}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Which columns a recording has, and its second too; ``copied`` is the driver that decoys may resemble."""
+
+    mode: str
+    present: frozenset[str]
+    copied: str
+    decoys: Mapping[str, Decoy]
+
+
+def draw_plan(g: Generator, needed: frozenset[str], withheld: frozenset[str]) -> Plan:
+    """Columns that hold what is needed, nothing that is withheld, and others as chance has it."""
+    mode = choose(g, MODES, MODE_SHARES)
+    lucky = frozenset(name for name, share in PRESENT.items() if happens(g, share))
+    driver = next(iter(sorted(needed | withheld)), "")
+    decoys = draw_decoys(g, copies=driver != "")
+    named = {f"aux_{k}": decoy for k, decoy in enumerate(decoys, start=1)}
+    return Plan(mode, (lucky | needed) - withheld, driver, named)
+
+
+def draw_columns(g: Generator, plan: Plan, scene: Scene, noise: Noise) -> dict[str, Float[Tensor, " N"]]:
+    """The columns, but for time and magnetometer.
+
+    The recorded attitude's errors are part of the columns: they reach the residual through the attitude.
+    """
+    columns: dict[str, Tensor] = {}
+    count = len(scene.time)
+    if plan.mode == "gyro":
+        bias = uniform(g, 0.0, 0.01) * normal(g, 3)
+        columns |= _vector("gyro", scene.motion.gyro + bias + 0.005 * normal(g, count, 3))
+    if plan.mode == "attitude":
+        columns |= dict(zip(("q_w", "q_x", "q_y", "q_z"), _recorded_attitude(g, scene, noise).unbind(-1), strict=True))
+    if "accel" in plan.present:
+        columns |= _vector("accel", scene.motion.accel + 0.05 * normal(g, count, 3))
+    if "position" in plan.present:
+        columns |= _vector("position", scene.motion.position + 0.005 * normal(g, count, 3))
+    if "temperature" in plan.present:
+        columns["temperature"] = recorded_temperature(g, scene.temperature)
+    if "current" in plan.present:
+        columns["current"] = recorded_current(g, scene.current)
+    if "voltage" in plan.present:
+        columns["voltage"] = recorded_voltage(g, scene.current)
+    driver = _driver(plan.copied, scene)
+    columns |= {name: decoy_column(g, decoy, scene.time, driver) for name, decoy in plan.decoys.items()}
+    return rounded(columns)
+
+
+def rounded(columns: Mapping[str, Float[Tensor, " N"]]) -> dict[str, Float[Tensor, " N"]]:
+    """As a logger would print them."""
+    return {name: values.round(decimals=_DECIMALS.get(name.split("_")[0], 4)) for name, values in columns.items()}
+
+
+def _driver(name: str, scene: Scene) -> Tensor | None:
+    drivers = {"temperature": scene.temperature, "current": scene.current, "position": scene.motion.position[:, 0]}
+    return drivers.get(name)
+
+
+def _vector(name: str, values: Float[Tensor, "N 3"]) -> dict[str, Tensor]:
+    return {f"{name}_{axis}": column for axis, column in zip("xyz", values.unbind(-1), strict=True)}
+
+
+def _recorded_attitude(g: Generator, scene: Scene, noise: Noise) -> Float[Tensor, "N 4"]:
+    """Turned away from the truth by the noise's process about each world axis, and by a constant error."""
+    if noise.attitude is None:
+        return scene.motion.attitude
+    errors = torch.stack([noise.attitude.sample(g, len(scene.time)) for _ in range(3)], -1)
+    constant = math.radians(uniform(g, 0.0, 1.0)) * normal(g, 3)
+    return rotation.product(rotation.from_vector(errors + constant), scene.motion.attitude)

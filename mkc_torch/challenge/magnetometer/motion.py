@@ -1,0 +1,104 @@
+"""A hand that tumbles a sensor, standing or walking."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Generator, Tensor
+
+from mkc_torch.challenge.draws import choose, happens, normal, smooth, uniform
+from mkc_torch.challenge.magnetometer import rotation
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+RATE = 50.0
+"""Samples per second."""
+
+DURATION = 90.0
+"""Seconds."""
+
+WALKING_SHARE = 0.3
+"""Share of the motions in which the hand is carried a few metres."""
+
+STIFF_SHARE = 0.1
+"""Share of the motions that turn little about one body axis, and so leave directions poorly covered."""
+
+REST_SHARE, LONGEST_REST = 0.15, 0.4
+"""Share of the motions in which the sensor lies still for a while, and the longest such while, as a share of the
+recording."""
+
+_GRAVITY = torch.tensor([0.0, 0.0, 9.81], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where a sensor was and how it was turned: time in s, position in m, rates in rad/s."""
+
+    time: Float[Tensor, " N"]
+    attitude: Float[Tensor, "N 4"]  # unit quaternion, world from body
+    position: Float[Tensor, "N 3"]  # world axes
+    gyro: Float[Tensor, "N 3"]  # body axes
+    walks: bool
+
+    @property
+    def rotation(self) -> Float[Tensor, "N 3 3"]:
+        """World from body."""
+        return rotation.matrix(self.attitude)
+
+    @property
+    def accel(self) -> Float[Tensor, "N 3"]:
+        """Specific force in body axes, m/s²; g upwards at rest."""
+        step = float(self.time[1] - self.time[0])
+        velocity = torch.gradient(self.position, spacing=step, dim=0)[0]
+        return self.into_body(torch.gradient(velocity, spacing=step, dim=0)[0] + _GRAVITY)
+
+    def into_body(self, vectors: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """World vectors in body axes."""
+        return torch.einsum("nij,ni->nj", self.rotation, vectors)
+
+
+def tumble(g: Generator, *, duration: float = DURATION, rate: float = RATE, start: float = 0.0) -> Motion:
+    """A random motion: turning at 1-3 rad/s (root mean square), hands within about half a metre, walking or not.
+
+    Args:
+        duration: in s.
+        rate: samples per second.
+        start: time of the first sample in s.
+    """
+    count, step = round(duration * rate), 1.0 / rate
+    time = start + torch.arange(count, dtype=torch.float64) * step
+    size = torch.ones(3, dtype=torch.float64)
+    if happens(g, STIFF_SHARE):
+        size[int(uniform(g, 0.0, 3.0)) % 3] = 0.3
+    moves = _moves(g, count)
+    gyro = uniform(g, 1.0, 3.0) * size / size.square().mean().sqrt() / 3.0**0.5 * smooth(g, count, 3, step, 2.0)
+    gyro = gyro * moves[:, None]
+    turns = rotation.from_vector(gyro * step)
+    first = torch.nn.functional.normalize(normal(g, 4), dim=0)
+    attitude = rotation.running_product(torch.cat([first[None], turns[:-1]]))
+    walks = happens(g, WALKING_SHARE)
+    hand = 0.5 * torch.tanh(0.5 * smooth(g, count, 3, step, 3.0))
+    body = smooth(g, count, 3, step, 25.0) * torch.tensor([2.0, 2.0, 0.05]) if walks else torch.zeros(count, 3)
+    # where it lies it stays
+    position = (hand + body)[(moves.cumsum(0) - 1).clamp(min=0)]
+    return Motion(time, attitude, position, gyro, walks)
+
+
+def _moves(g: Generator, count: int) -> Int[Tensor, " N"]:
+    """1 where a sensor moves, 0 where it lies still: at the beginning, say, before it is picked up."""
+    moves = torch.ones(count, dtype=torch.int64)
+    if happens(g, REST_SHARE):
+        length = int(uniform(g, 0.05, LONGEST_REST) * count)
+        first = choose(g, (0, count - length, int(uniform(g, 0.0, 1.0) * (count - length))))
+        moves[first : first + length] = 0
+    return moves
+
+
+def within(motion: Motion, other: Motion) -> Motion:
+    """The motion carried to where the other was, and held within its reach."""
+    place, middle = motion.position.mean(0), other.position.mean(0)
+    reach = [float(torch.linalg.vector_norm(m.position - m.position.mean(0), dim=-1).max()) for m in (motion, other)]
+    return replace(motion, position=middle + min(1.0, reach[1] / reach[0]) * (motion.position - place))

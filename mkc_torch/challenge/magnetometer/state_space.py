@@ -1,0 +1,107 @@
+"""Whitening under a covariance ``diag(white) + Σ G_k C_k G_kᵀ``, C_k of autoregressive processes, by a Kalman filter.
+
+Exact, and linear in the number of samples: the dense covariance of 90 s with attitude would have 13500 rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mkc_torch.challenge.magnetometer.process import Process
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+def whitened(
+    values: Float[Tensor, "N c K"],
+    white: Float[Tensor, "N c"],
+    gains: Float[Tensor, "N c s"],
+    processes: Sequence[Process],
+    keep: Float[Tensor, " N"] | None = None,
+) -> Float[Tensor, "N*c K"]:
+    """``L⁻¹ values`` with ``L Lᵀ`` the covariance.
+
+    Args:
+        values: columns to whiten, each a series of N samples of c channels.
+        white: variance of the independent part.
+        gains: how each process enters each channel.
+        processes: the s processes, one of another independent.
+        keep: samples in use; the rows of the others are zero and tell nothing.
+
+    Returns:
+        Columns whose inner products are those of the inverse covariance.
+    """
+    count, channels, columns = values.shape
+    used = torch.ones(count, dtype=torch.bool) if keep is None else keep
+    if not processes:
+        return (values / white.sqrt()[..., None] * used[:, None, None]).reshape(-1, columns)
+    transition, drive, start, places = _stacked(processes)
+    rows = np.zeros((count, channels, len(start)))
+    rows[:, :, places] = gains.numpy()
+    y, variance, use = values.numpy(), white.numpy(), used.tolist()
+    covariance, state = start, np.zeros((len(start), columns))
+    out = np.zeros((count, channels, columns))
+    for k in range(count):
+        if k:
+            state = transition @ state
+            covariance = transition @ covariance @ transition.T + drive
+        if not use[k]:
+            continue
+        for c in range(channels):
+            h = rows[k, c]
+            ph = covariance @ h
+            total = h @ ph + variance[k, c]
+            error = y[k, c] - h @ state
+            out[k, c] = error / total**0.5
+            state = state + (ph / total)[:, None] * error
+            covariance = covariance - np.outer(ph, ph / total)
+    return torch.from_numpy(out.reshape(-1, columns))
+
+
+def dense_covariance(
+    white: Float[Tensor, "N c"], gains: Float[Tensor, "N c s"], processes: Sequence[Process]
+) -> Float[Tensor, "N*c N*c"]:
+    """The covariance itself, for short series."""
+    count = len(white)
+    total = torch.diag(white.reshape(-1))
+    for k, process in enumerate(processes):
+        series = torch.from_numpy(_series_covariance(process, count))
+        g = gains[..., k]
+        total = total + torch.einsum("nc,nm,md->ncmd", g, series, g).reshape(total.shape)
+    return total
+
+
+def _series_covariance(process: Process, count: int) -> np.ndarray:
+    f, p = process.transition(), process.start()
+    drive = np.zeros_like(p)
+    drive[0, 0] = process.innovation**2
+    c = np.zeros((count, count))
+    for k in range(count):
+        ahead = p
+        for j in range(k, count):
+            c[k, j] = c[j, k] = ahead[0, 0]
+            ahead = f @ ahead
+        p = f @ p @ f.T + drive
+    return c
+
+
+def _stacked(processes: Sequence[Process]) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[int]]:
+    """Transition, covariance of the drive, covariance at the start, and where each process stands in the state."""
+    size = sum(len(process.coefficients) for process in processes)
+    transition, drive, start = np.zeros((3, size, size))
+    places, at = [], 0
+    for process in processes:
+        order = len(process.coefficients)
+        part = slice(at, at + order)
+        transition[part, part] = process.transition()
+        start[part, part] = process.start()
+        drive[at, at] = process.innovation**2
+        places.append(at)
+        at += order
+    return transition, drive, start, places

@@ -1,0 +1,47 @@
+"""The commands of ``mkc``, one a file, each a function that typer makes a command of.
+
+What takes long to import, and not every command needs, is imported where it is used.
+"""
+
+from typing import Annotated
+
+import typer
+
+from mkc_torch import __version__
+from mkc_torch.cli.apply import apply
+from mkc_torch.cli.calibrate import calibrate
+from mkc_torch.cli.challenge import challenge
+from mkc_torch.cli.demo import demo
+from mkc_torch.cli.diagnose import diagnose
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    help="Find what a simulation lacks, calibrate, apply. `mkc demo` shows it, no file needed.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def _say_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"mkc {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _all_commands(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say which version this is.")
+    ] = False,
+) -> None:
+    """Options of no command in particular."""
+
+
+app.command()(diagnose)
+app.command()(calibrate)
+app.command()(apply)
+app.command()(challenge)
+app.command()(demo)

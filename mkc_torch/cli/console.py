@@ -1,0 +1,255 @@
+"""What the commands share: where they write, how they name columns, and how failures become one sentence."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Event, RLock, Thread
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.load import SimulationFileError
+
+FAILURES = (ValueError, OSError, ImportError, RuntimeError)
+"""What bad input, a full disk or a numerical breakdown raises."""
+
+_WIDTH_IN_A_PIPE = 100
+
+
+@dataclass(frozen=True)
+class Look:
+    """How text is set for where it goes; another process can set it too, and this one print it."""
+
+    terminal: bool
+    width: int
+
+    @classmethod
+    def of(cls, console: Console) -> Look:
+        return cls(console.is_terminal, console.width)
+
+    def set(self, show: Callable[[Console], None]) -> str:
+        """What ``show`` prints."""
+        text = io.StringIO()
+        show(_console(self.terminal, width=self.width, file=text))
+        return text.getvalue()
+
+
+def out() -> Console:
+    """Standard output: coloured on a terminal, plain text of a fixed width in a pipe."""
+    return _console(sys.stdout.isatty())
+
+
+def err() -> Console:
+    """Standard error, likewise."""
+    return _console(sys.stderr.isatty(), stderr=True)
+
+
+def _console(
+    terminal: bool, *, stderr: bool = False, width: int | None = None, file: io.StringIO | None = None
+) -> Console:
+    return Console(
+        file=file, stderr=stderr, soft_wrap=False,
+        highlight=False, markup=False, emoji=False,  # what a user wrote is printed as it is
+        force_terminal=terminal, no_color=None if terminal else True,
+        width=width if terminal else width or _WIDTH_IN_A_PIPE,
+    )  # fmt: skip
+
+
+def complain(subject: str | Path, error: BaseException) -> None:
+    """One line on standard error: which file, and why."""
+    sentence = sentence_of(error)
+    if not sentence.startswith(str(subject)):
+        sentence = f"{subject}: {sentence}"
+    err().print(f"mkc: {sentence}", soft_wrap=True)
+
+
+def sentence_of(error: BaseException) -> str:
+    """What an error says, on one line but for the code that a user's own file raised it in.
+
+    The system's own errors name the file.
+
+    Example:
+        >>> sentence_of(PermissionError(13, "Permission denied", "report.html"))
+        'report.html cannot be written or read: permission denied; choose another place.'
+    """
+    if isinstance(error, OSError) and error.strerror:
+        where = f"{error.filename} " if error.filename else ""
+        return f"{where}cannot be written or read: {error.strerror.lower()}; choose another place."
+    if isinstance(error, SimulationFileError):
+        return str(error)
+    return " ".join(str(error).split())
+
+
+def parsed_columns(text: str | None) -> dict[str, str]:
+    """``mag_x=mx,mag_y=my`` as names and the names they have in the file.
+
+    Raises:
+        typer.BadParameter: a part that is no such pair, or a name given twice.
+
+    Example:
+        >>> parsed_columns("mag_x=mx, mag_y=my")
+        {'mag_x': 'mx', 'mag_y': 'my'}
+    """
+    pairs: dict[str, str] = {}
+    for part in (text or "").split(","):
+        name, equals, source = (piece.strip() for piece in part.partition("="))
+        if not part.strip() and not text:
+            continue
+        if not (name and equals and source):
+            raise typer.BadParameter(f'"{part}" is no pair; write name=column, such as mag_x=mx,mag_y=my,mag_z=mz.')
+        if name in pairs:
+            raise typer.BadParameter(f'"{name}" is given twice.')
+        pairs[name] = source
+    return pairs
+
+
+def with_unit(recording: Recording, unit: str) -> Recording:
+    """The recording with its magnetometer in a unit of the user's own."""
+    own = {name: unit for name in ("mag_x", "mag_y", "mag_z") if name in recording}
+    return Recording(
+        recording.columns,
+        name=recording.name,
+        units=dict(recording.units) | own,
+        warnings=recording.warnings,
+        labels=recording.labels,
+    )
+
+
+def refuse_same_names(recordings: Sequence[Path]) -> None:
+    """Refuses recordings whose results would go to one place.
+
+    Raises:
+        typer.BadParameter: two have the same name, but for the ending and for capitals.
+    """
+    taken: dict[str, Path] = {}
+    for path in recordings:
+        other = taken.setdefault(path.stem.casefold(), path)
+        if other is not path:
+            raise typer.BadParameter(
+                f"{other} and {path} would write into the same folder, {path.stem}; "
+                "rename one, or give them in two calls with different --output."
+            )
+
+
+class Steps:
+    """What is being done, how much of it is, and for how long; without a bar it does nothing."""
+
+    def __init__(self, bar: Progress | None, total: int) -> None:
+        self._bar = bar
+        self._task = None if bar is None else bar.add_task("", total=total)
+
+    def __call__(self, name: str | None) -> None:
+        """To be called with the name of each thing begun, and with None when one is done."""
+        if self._bar is None or self._task is None:
+            return
+        if name is None:
+            self._bar.advance(self._task)
+        else:
+            self._bar.update(self._task, description=name)
+
+    def count(self, name: str, done: int, total: int) -> None:
+        """Name what is being done, and how much of it is."""
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, description=name, completed=done, total=total)
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """The bar is out of the way of what is printed meanwhile."""
+        if self._bar is None:
+            yield
+            return
+        with drawing:
+            self._bar.stop()
+            yield
+            self._bar.start()
+
+
+drawing = RLock()
+"""Held while something is drawn, and while this process is forked: a copy finds none of the locks of others taken."""
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=drawing.acquire, after_in_parent=drawing.release, after_in_child=drawing.release)
+
+_EVERY = 0.2  # s
+
+
+@contextmanager
+def progress(total: int) -> Iterator[Steps]:
+    """What is being done and for how long, on a terminal, with a bar over several things; nothing in a pipe."""
+    console = err()
+    if not console.is_terminal:
+        yield Steps(None, total)
+        return
+    over = (BarColumn(), MofNCompleteColumn()) if total > 1 else ()
+    parts = (SpinnerColumn(), TextColumn("{task.description}", markup=False), *over, TimeElapsedColumn())
+    with (
+        Progress(
+            *parts, console=console, transient=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False
+        ) as bar,
+        _refreshed(bar),
+    ):
+        yield Steps(bar, total)
+
+
+@contextmanager
+def _refreshed(bar: Progress) -> Iterator[None]:
+    """Draws the bar anew from time to time; a thread of its own does, for the work gives it no moment."""
+    done = Event()
+
+    def draw() -> None:
+        while not done.wait(_EVERY):
+            with drawing:
+                if bar.live.is_started:
+                    bar.refresh()
+
+    thread = Thread(target=draw, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+@contextmanager
+def interrupts_told(left: Callable[[], str]) -> Iterator[None]:
+    """One line on standard error when the user interrupts, with what ``left`` says of what there is and is not."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        err().print(f"mkc: interrupted; {left()}", soft_wrap=True)
+        raise
+
+
+def not_written(recordings: Iterable[Path], output: Path) -> str:
+    """Which recordings were not begun or left nothing behind, and for which something is there.
+
+    Example:
+        >>> not_written([Path("a.csv"), Path("b.csv")], Path("results"))
+        'nothing was written for a.csv, b.csv.'
+    """
+    paths = list(recordings)
+    there = [path for path in paths if (output / path.stem).is_dir()]
+    absent = ", ".join(str(path) for path in paths if path not in there)
+    told = [f"nothing was written for {absent}"] if absent else []
+    told += [f"{', '.join(str(output / path.stem) for path in there)} may be incomplete"] if there else []
+    return f"{'; '.join(told)}." if told else "all was written."
+
+
+@contextmanager
+def folder_removed_on_failure(folder: Path) -> Iterator[None]:
+    """Leaves no empty folder behind when what was to be written into it failed."""
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            folder.rmdir()
+        raise

@@ -1,0 +1,189 @@
+"""``mkc diagnose``: recordings in, and out for each what its simulation lacks, a model with it, and a report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mkc_torch._parallel.processes import in_processes, keep_memory, one_thread
+from mkc_torch.cli.console import (
+    FAILURES,
+    Look,
+    Steps,
+    complain,
+    err,
+    interrupts_told,
+    not_written,
+    out,
+    parsed_columns,
+    progress,
+    refuse_same_names,
+)
+from mkc_torch.cli.diagnosis_files import MAGNETOMETER, SIMULATIONS, Outcome, Request, diagnose_file, simulation_of
+from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
+
+
+def diagnose(
+    recordings: Annotated[list[Path], typer.Argument(metavar="REC...", help="CSV or Parquet files with a header.")],
+    output: Annotated[Path, typer.Option(help="Folder; each REC gets a folder of its name in it.")],
+    simulation: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help=f"What they are compared with: {', '.join(SIMULATIONS)}, or FILE.py:CLASS, whose code is run.",
+        ),
+    ] = None,
+    simulated: Annotated[
+        Path | None,
+        typer.Option(metavar="SIM.csv", help="Instead of --simulation: what a simulator wrote, in the same columns."),
+    ] = None,
+    columns: Annotated[
+        str | None,
+        typer.Option(metavar="NAME=COLUMN,...", help="What the columns are called: mag_x=mx,temperature=IMU_T"),
+    ] = None,
+    unit: Annotated[
+        str | None, typer.Option(help="Unit of the magnetometer's columns, such as counts; default: µT.")
+    ] = None,
+    experiments: Annotated[
+        str | None,
+        typer.Option(metavar="COLUMN", help="Column that separates runs in one table; default: experiment, if any."),
+    ] = None,
+    level: Annotated[float, typer.Option(metavar="RATE", help="Rate of false alarms.")] = LEVEL,
+    surrogates: Annotated[
+        int | None,
+        typer.Option(metavar="N", help=f"Draws of noise for each p-value; default: {SURROGATES}, more at a low level."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, metavar="S", help="Of the draws of noise.")] = 0,
+    force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
+) -> None:
+    """Say what a simulation lacks: where recordings differ from it, by what physics, how sure, and how much it helps.
+
+    Each REC gets diagnosis.json, model.json (for `mkc apply`) and report.html. Exits with 0 when every recording was
+    diagnosed, whatever was found, and 1 when some were not.
+    """
+    request = Request(
+        simulation=_known(simulation, simulated),
+        simulated=simulated,
+        columns=_columns(columns, experiments),
+        unit=_unit(unit, simulation),
+        level=_level(level),
+        surrogates=_surrogates(surrogates, level),
+        seed=seed,
+        force=force,
+    )
+    refuse_same_names(recordings)
+    total, failed, left = 0, 0, list(recordings)
+    with interrupts_told(lambda: not_written(left, output)):
+        _refuse_unusable(request)
+    one_thread()
+    keep_memory()
+    look = Look.of(out())
+    with (
+        interrupts_told(lambda: not_written(left, output)),
+        progress(len(recordings)) as step,
+        # a single one is worked on in this process, and says which experiment it is at
+        in_processes(
+            partial(_diagnosed, output, request, look, step if len(recordings) == 1 else None), recordings
+        ) as results,
+    ):
+        for path, result in zip(recordings, results, strict=True):
+            step(f"diagnosing {path.name}")
+            outcomes = _waited_for(result, path)
+            _tell(outcomes, step)
+            total += len(outcomes)
+            failed += sum(outcome.failed for outcome in outcomes)
+            left.remove(path)
+            step(None)
+    if total > 1 and failed:
+        err().print(f"mkc: {failed} of {total} recordings were not diagnosed.", soft_wrap=True)
+    raise typer.Exit(1 if failed else 0)
+
+
+def _diagnosed(output: Path, request: Request, look: Look, step: Steps | None, path: Path) -> list[Outcome]:
+    return diagnose_file(path, output / path.stem, request, look, step)
+
+
+def _waited_for(result: Callable[[], list[Outcome]], path: Path) -> list[Outcome]:
+    try:
+        return result()
+    except BrokenProcessPool:
+        return [Outcome(f"{path}: its process ended, perhaps for lack of memory; try it in a call of its own.", True)]
+
+
+def _tell(outcomes: list[Outcome], step: Steps) -> None:
+    with step.aside():
+        for outcome in outcomes:
+            if outcome.failed:
+                err().print(f"mkc: {outcome.text}", soft_wrap=True)
+            else:
+                typer.echo(outcome.text, nl=False)
+
+
+def _known(simulation: str | None, simulated: Path | None) -> str:
+    if (simulation is None) == (simulated is None):
+        raise typer.BadParameter(
+            "give one of --simulation and --simulated: a simulation's name, or the table that one wrote."
+        )
+    if simulation is not None and simulation not in SIMULATIONS and ".py:" not in simulation:
+        raise typer.BadParameter(
+            f'--simulation "{simulation}" is not known; known: {", ".join(SIMULATIONS)}. Name one of them, or one of '
+            "your own as FILE.py:CLASS."
+        )
+    return simulation or ""
+
+
+def _refuse_unusable(request: Request) -> None:
+    """Said once, before anything is written, and not again for each recording."""
+    try:
+        simulation_of(request)
+    except FAILURES as error:
+        complain(request.simulated or request.simulation, error)
+        raise typer.Exit(1) from None
+
+
+def _columns(columns: str | None, experiments: str | None) -> dict[str, str]:
+    names = parsed_columns(columns)
+    if experiments is None:
+        return names
+    if not experiments.strip():
+        raise typer.BadParameter("--experiments is empty; name the column that separates the runs.")
+    if names.setdefault("experiment", experiments.strip()) != experiments.strip():
+        raise typer.BadParameter("--columns and --experiments name different columns for experiment; leave one out.")
+    return names
+
+
+def _unit(unit: str | None, simulation: str | None) -> str:
+    if unit is None:
+        return "µT"
+    if not unit.strip():
+        raise typer.BadParameter("--unit is empty; name the unit, such as counts.")
+    if simulation != MAGNETOMETER:
+        raise typer.BadParameter(
+            "--unit is that of a magnetometer's columns; a simulation of your own says its units in its `units`."
+        )
+    return unit
+
+
+def _level(level: float) -> float:
+    if not 0.0 < level < 1.0:
+        raise typer.BadParameter(f"--level must be a rate between 0 and 1 but is {level:g}.")
+    return level
+
+
+def _surrogates(count: int | None, level: float) -> int:
+    """Draws for each p-value: no p-value can be smaller than one over their number plus one."""
+    fewest = math.ceil(1.0 / level - 1.0 - 1e-9)
+    if count is None:
+        return max(SURROGATES, fewest)
+    if count < fewest:
+        raise typer.BadParameter(
+            f"--surrogates must be at least {fewest} at level {level:g}, for no p-value is smaller than "
+            f"1 / (surrogates + 1), but is {count}."
+        )
+    return count

@@ -1,0 +1,226 @@
+"""From a recording's file to the files of its diagnosis: what `mkc diagnose` and `mkc challenge` both run."""
+
+from __future__ import annotations
+
+import re
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mkc_torch._parallel.early_import import load_early
+from mkc_torch._support.files import claim_folder, write_atomically
+from mkc_torch.cli.console import FAILURES, Look, folder_removed_on_failure, sentence_of, with_unit
+from mkc_torch.cli.diagnosis_summary import show
+from mkc_torch.diagnosis import Diagnosis, diagnose
+from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
+from mkc_torch.diagnosis.files.python_source import SourceError
+from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.load import load_simulation, raised_in
+
+if TYPE_CHECKING:
+    from mkc_torch.simulation import Simulation
+
+__all__ = [
+    "MAGNETOMETER",
+    "SIMULATIONS",
+    "WRITTEN",
+    "Outcome",
+    "Request",
+    "diagnose_file",
+    "folder_names",
+    "named_simulation",
+    "paired_simulation",
+    "simulation_of",
+    "write_diagnosis",
+]
+
+MAGNETOMETER = "magnetometer"
+SIMULATIONS = (MAGNETOMETER,)
+"""Simulations that are known by name."""
+
+_EXPERIMENT = "experiment"
+WRITTEN = ("diagnosis.json", "model.json", "corrected.py", "report.html")
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of each recording: to be compared with a simulation, or with what ``simulated`` holds of one."""
+
+    simulation: str = MAGNETOMETER
+    simulated: Path | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
+    unit: str = "µT"
+    level: float = LEVEL
+    surrogates: int = SURROGATES
+    seed: int = 0
+    force: bool = False
+    report: bool = True
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A recording, or one experiment of it: its summary, or the sentence that says why there is none."""
+
+    text: str
+    failed: bool
+
+
+def diagnose_file(
+    path: Path, folder: Path, request: Request, look: Look, step: Callable[[str], None] | None = None
+) -> list[Outcome]:
+    """Diagnose a file into a folder.
+
+    Each experiment of a table that holds several is diagnosed on its own, into a folder in it, but for a simulation
+    that takes several at once. One that fails does not keep the others from being done. ``step`` is told which it is.
+    """
+    try:
+        recording = Recording.read(path, columns=request.columns)
+        simulation = simulation_of(request)
+        if request.simulated is None and request.simulation == MAGNETOMETER:
+            recording = with_unit(recording, request.unit)
+        claim_folder(folder, overwrite=request.force, files=WRITTEN)
+    except Exception as error:
+        return [_failed(path, "", error)]
+    if request.report:
+        load_early("matplotlib.figure")
+    with folder_removed_on_failure(folder):
+        parts, outcomes = list(_parts(recording, simulation, folder)), []
+        for number, (label, part, place) in enumerate(parts, start=1):
+            if step is not None and len(parts) > 1:
+                step(f"diagnosing {path.name}, experiment {label} ({number} of {len(parts)})")
+            outcomes.append(_outcome(path, label, simulation, part, place, request, look))
+        if all(outcome.failed for outcome in outcomes):
+            _remove_if_empty(folder)
+    return outcomes
+
+
+def write_diagnosis(
+    diagnosis: Diagnosis, folder: Path, *, force: bool, report: bool = True, note: str = ""
+) -> list[Path]:
+    """Write diagnosis.json, model.json and report.html of a diagnosis into a folder.
+
+    Of differential equations also corrected.py, the simulation with what was found. ``note`` is said in the report.
+    """
+    from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
+    from mkc_torch.report import diagnosis_report
+
+    texts = {"diagnosis.json": diagnosis_to_json(diagnosis)}
+    if diagnosis.model is not None:
+        texts["model.json"] = diagnosis.model.to_json()
+        with suppress(SourceError):
+            texts["corrected.py"] = diagnosis.model.to_python()
+    for name in {"model.json", "corrected.py"} - set(texts):
+        (folder / name).unlink(missing_ok=True)  # an old one would be taken for this diagnosis' own
+    if report:
+        texts["report.html"] = diagnosis_report(diagnosis, note=note)
+    for name, text in texts.items():
+        write_atomically(folder / name, text, overwrite=force)
+    return [folder / name for name in texts]
+
+
+def folder_names(labels: list[str]) -> list[str]:
+    """A folder's name for each label, no two alike on any file system.
+
+    Example:
+        >>> folder_names(["run 1", "a/b", "A:B", "..", ""])
+        ['run 1', 'a_b', 'A_B_2', '_', '__2']
+    """
+    names: list[str] = []
+    taken: set[str] = set()
+    for label in labels:
+        plain = re.sub(r"[^\w .+-]", "_", label).strip(" .")[:100] or "_"
+        name, count = plain, 1
+        while name.casefold() in taken:
+            count += 1
+            name = f"{plain}_{count}"
+        taken.add(name.casefold())
+        names.append(name)
+    return names
+
+
+def _parts(recording: Recording, simulation: Simulation, folder: Path) -> Iterator[tuple[str, Recording, Path]]:
+    """The experiments of a table, with their labels and folders; itself, if it has none or they are taken together."""
+    if _EXPERIMENT not in recording or getattr(simulation, "joins_experiments", False):
+        yield "", recording, folder
+        return
+    parts = recording.experiments()
+    for (label, part), name in zip(parts.items(), folder_names(list(parts)), strict=True):
+        yield label, part, folder / name
+
+
+def _outcome(
+    path: Path, label: str, simulation: Simulation, recording: Recording, folder: Path, request: Request, look: Look
+) -> Outcome:
+    try:
+        # the whole folder was claimed before
+        claim_folder(folder, overwrite=request.force or not label, files=WRITTEN)
+        with folder_removed_on_failure(folder):
+            diagnosis = diagnose(
+                simulation, recording, level=request.level, surrogates=request.surrogates, seed=request.seed
+            )
+            files = write_diagnosis(diagnosis, folder, force=request.force, report=request.report)
+    except Exception as error:
+        own = raised_in(request.simulation, error) if ".py:" in request.simulation else None
+        return _failed(path, label, own or error)
+    return Outcome(look.set(lambda console: show(console, diagnosis, files)), failed=False)
+
+
+def named_simulation(name: str) -> Simulation:
+    """The magnetometer, or a user's own of ``FILE.py:NAME``.
+
+    Raises:
+        SimulationFileError: the file cannot be used.
+    """
+    from mkc_torch.simulation import Magnetometer
+
+    return Magnetometer() if name == MAGNETOMETER else load_simulation(name)
+
+
+def paired_simulation(path: Path, columns: Mapping[str, str]) -> Simulation:
+    """What a simulator wrote; columns are renamed like those of the recording, where it has them under those names.
+
+    Raises:
+        ValueError, OSError: the file cannot be used.
+    """
+    from mkc_torch.simulation import Paired
+
+    table = Recording.read(path)
+    return Paired(Recording.read(path, columns={name: column for name, column in columns.items() if column in table}))
+
+
+def simulation_of(request: Request) -> Simulation:
+    """What the recordings are compared with.
+
+    Raises:
+        ValueError, OSError: a file of it cannot be used.
+    """
+    if request.simulated is not None:
+        return paired_simulation(request.simulated, request.columns)
+    return named_simulation(request.simulation)
+
+
+def _failed(path: Path, label: str, error: Exception) -> Outcome:
+    subject = f"{path}, experiment {label}" if label else str(path)
+    sentence = sentence_of(error) if isinstance(error, FAILURES) else _unexpected(error)
+    sentence = sentence.removeprefix(f"{path.stem}/{label}: " if label else f"{path.stem}: ")  # the path says it
+    return Outcome(sentence if sentence.startswith(subject) else f"{subject}: {sentence}", failed=True)
+
+
+def _unexpected(error: Exception) -> str:
+    """What is no fault of the user's, with the place to look at."""
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f" in {Path(frames[-1].filename).name}, line {frames[-1].lineno}" if frames else ""
+    told = sentence_of(error)
+    return (
+        f"an error of the program's own ({type(error).__name__}{where}{f': {told}' if told else ''}); please report it."
+    )
+
+
+def _remove_if_empty(folder: Path) -> None:
+    try:
+        folder.rmdir()
+    except OSError:
+        return

@@ -1,0 +1,102 @@
+"""A diagnosis on the terminal: the verdict, each finding in a few lines, then noise, what to do and the files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from mkc_torch.diagnosis.result import Diagnosis, Finding
+from mkc_torch.report.diagnosis import findings as say
+from mkc_torch.report.diagnosis import verdict as top
+from mkc_torch.report.words.typesetting import plain, typeset
+
+_LABEL = 9  # letters of the longest label
+_MOST_LINES = 6
+_MOST_WARNINGS = 6
+_STYLE: dict[top.Tone, str] = {"good": "bold green", "found": "bold cyan", "faint": "bold", "open": "bold yellow"}
+
+
+def show(console: Console, diagnosis: Diagnosis, files: list[Path]) -> None:
+    """Print the summary of a diagnosis and the files that hold it."""
+    d = diagnosis
+    console.print()
+    against = f" against {plain(d.simulation)}" if d.simulation else ""
+    console.print(Text(f"{plain(d.recording) or 'recording'}{against}", style="bold"))
+    console.print(Text(top.headline(d), style=_STYLE[top.tone(d)]))
+    for i, finding in enumerate(d.findings, 1):
+        if len(d.findings) > 1:
+            console.print(Text(f"{i}  {say.finding_name(finding)}", style="bold"))
+        console.print(_facts(_of_finding(finding, d, first=i == 1)))
+    console.print(_facts(_of_all(d)))
+    for file in files:
+        # outside the table, where a long path would be broken and could not be copied
+        console.print(Text.assemble(f"{'written':<{_LABEL + 3}}", (str(file), "cyan")), soft_wrap=True)
+
+
+def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Iterator[tuple[str, str]]:
+    f = finding
+    lines = [line for p in f.parameters for line in say.named_lines(p, f.channels)]
+    if len(lines) > _MOST_LINES:
+        lines = [say.largest(p) for p in f.parameters[:_MOST_LINES]]
+        lines.append("and more, see the report")
+    if lines:
+        yield "size", "\n".join(lines)
+    acts = f"; {say.acts_on(f)}" if f.channels else ""
+    yield "where", say.where(f, say.clock_of(diagnosis.traces)) + acts
+    if f.region is not None:
+        yield "mostly", say.region(f.region)
+    if f.experiments:
+        yield "in", say.experiments(f.experiments)
+    yield "driven by", say.driven_by(f)
+    yield "how sure", f"{say.evidence(f.p_value, diagnosis.surrogates)}, after the whole search"
+    if f.held_out is None:
+        yield "held out", f"not measured: {plain(f.held_out_note)}"
+    else:
+        residual = say.improvement(f.held_out.rmse_before, f.held_out.rmse_after, f.held_out.unit)
+        note = f"\n{plain(f.held_out_note)}" if f.held_out_note else ""
+        zero = "; 0 is no better" if first else ""
+        yield "held out", f"{say.better(f.held_out)}: residual {residual}, {say.gain(f.held_out)}{zero}{note}"
+    if say.inseparable(f):
+        yield "!or", f"{say.rivals(f)}: this recording cannot tell"
+    if not f.plausible:
+        yield "!doubtful", typeset(f.plausibility) or "no plausible size"
+
+
+def _of_all(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
+    d = diagnosis
+    if len(d.findings) > 1:
+        yield "together", f"residual {say.residual_sizes(d)} on held-out data"
+    if not d.findings:
+        searched = f"{d.candidates_tried:,} candidates tried, level {d.level:g}"
+        yield "how sure", f"{say.evidence(d.p_value, d.surrogates)}; {searched}"
+    beside = say.smooth_fit(d)
+    if beside:
+        yield "compare", beside
+    yield "noise", say.noise_model(d.noise)
+    for sentence in top.to_do(d):
+        yield "to do", sentence
+    command = top.apply_command(d)
+    if command:
+        yield "to do", command
+    warnings = top.warned(d)
+    for warning in warnings[:_MOST_WARNINGS]:
+        yield "!warning", warning
+    if len(warnings) > _MOST_WARNINGS:
+        yield "!warning", f"{len(warnings) - _MOST_WARNINGS} more; see the report"
+
+
+def _facts(rows: Iterator[tuple[str, str]]) -> Table:
+    """Names and values; a name that begins with an exclamation mark stands out."""
+    table = Table.grid(padding=(0, 3, 0, 0))
+    table.add_column(no_wrap=True, min_width=_LABEL)
+    table.add_column(overflow="fold")
+    last = ""
+    for name, value in rows:
+        label = Text("" if name == last else name.removeprefix("!"), style="bold yellow" if name[0] == "!" else "")
+        table.add_row(label, Text(value))
+        last = name
+    return table

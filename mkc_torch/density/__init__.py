@@ -1,0 +1,26 @@
+"""The MKC density: its energy and normaliser, the distribution, its fit to residuals, and how robust it is."""
+
+from mkc_torch.density.distribution import MKCDistribution
+from mkc_torch.density.fit import DensityFit, fit_density
+from mkc_torch.density.robustness import (
+    bandwidth_for_efficiency,
+    breakdown_point,
+    error_bound,
+    error_bound_slope,
+    gaussian_breakdown,
+    gaussian_efficiency,
+    least_bandwidth,
+)
+
+__all__ = [
+    "DensityFit",
+    "MKCDistribution",
+    "bandwidth_for_efficiency",
+    "breakdown_point",
+    "error_bound",
+    "error_bound_slope",
+    "fit_density",
+    "gaussian_breakdown",
+    "gaussian_efficiency",
+    "least_bandwidth",
+]

@@ -1,0 +1,444 @@
+"""Fit σ and d of the MKC density to residuals by maximum likelihood: the E-step of MKC-EM (Algorithm 2 of the paper).
+
+The mean negative log-likelihood of each channel is a function of two numbers. It is minimised by a safeguarded Newton
+method with analytic derivatives in κ = 1/σ², of which σ = ∞ is a finite value, and log d. A step in log κ would go too
+far: where the tail is already more than there are outliers, the likelihood falls exponentially.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.arguments import as_numbers, checked_number, checked_whole, refuse_bad_weight, refuse_not_real
+from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.density.energy import KAPPA_MAX, SIGMA_LEAST, energy_value
+from mkc_torch.density.normalizer import head_rule, integrate, log_partition_value, tail_density
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+_KAPPA_OFFSET = 0.02
+"""Steps in κ are measured in shares of κ and this: a thousandth matters near a Gaussian, and nowhere else."""
+
+_LONGEST, _FURTHEST_DOWN = 2.0, math.exp(-2.0)
+"""Of a step, in log d and in shares of κ; and the share of κ that a step leaves at least."""
+
+
+class Derivatives(NamedTuple):
+    """A function of (κ, log d): value, gradient and Hessian, each of shape (*, m)."""
+
+    value: Tensor
+    kappa: Tensor
+    log_d: Tensor
+    kappa_kappa: Tensor
+    kappa_log_d: Tensor
+    log_d_log_d: Tensor
+
+
+def _energy_terms(q: Tensor, kappa: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """exp(-x), E, -∂E/∂κ and ∂²E/∂κ² at q = z²/2, x = κ q."""
+    x = kappa * q
+    w = torch.exp(-x)
+    divisor = torch.where(kappa > 0, kappa, 1.0)
+    qw = q * w
+    e = -torch.expm1(-x) / divisor
+    first = (e - qw) / divisor
+    second = (2.0 * first - q * qw) / divisor
+    # below this x the differences lose more digits than two terms of the series leave out
+    small = x < (1e-5 if q.dtype == torch.float64 else 1e-2)
+    q2 = q * q
+    e = torch.where(small, q - 0.5 * q * x, e)
+    first = torch.where(small, q2 * (0.5 - x / 3.0), first)
+    second = torch.where(small, q * q2 * (1.0 / 3.0 - 0.25 * x), second)
+    return w, e, first, second
+
+
+def _mean(values: Tensor, weight: Tensor | None) -> Tensor:
+    """Mean over samples; ``weight`` sums to one over them."""
+    return values.mean(-2) if weight is None else (weight * values).sum(-2)
+
+
+def energy_derivatives(error: Tensor, weight: Tensor | None, kappa: Tensor, log_d: Tensor) -> Derivatives:
+    q = 0.5 * (error * torch.exp(-log_d).unsqueeze(-2)).square()
+    w, e, first, second = _energy_terms(q, kappa.unsqueeze(-2))
+    qw = q * w
+    q2w = q * qw
+    mean_qw, mean_q2w = _mean(qw, weight), _mean(q2w, weight)
+    return Derivatives(
+        value=_mean(e, weight),
+        kappa=-_mean(first, weight),
+        log_d=-2.0 * mean_qw,
+        kappa_kappa=_mean(second, weight),
+        kappa_log_d=2.0 * mean_q2w,
+        log_d_log_d=4.0 * (mean_qw - kappa * mean_q2w),
+    )
+
+
+def normaliser_derivatives(kappa: Tensor, log_d: Tensor, log_bound: Tensor) -> Derivatives:
+    """Derivatives of log(d Z(κ, bound / d))."""
+    length = torch.exp(log_bound - log_d)
+    tail = tail_density(kappa)
+    k = torch.where(tail > 0, kappa, 1.0)
+    tail_1, tail_2 = tail / k.pow(2), tail * (1.0 - 2.0 * k) / k.pow(4)
+    nodes, weights = head_rule(kappa, length)
+    _, e, first, second = _energy_terms(0.5 * nodes.square(), kappa.unsqueeze(-1))
+    p = torch.exp(-e)
+
+    z = integrate(p, tail, length, weights)
+    z_k = integrate(first * p, tail_1, length, weights) / z
+    z_kk = integrate((first.square() - second) * p, tail_2, length, weights) / z
+    w_end, e_end, first_end, _ = _energy_terms(0.5 * length.square(), kappa)
+    edge = 2.0 * torch.exp(-e_end) / z
+    l_1 = length * edge
+    l_2 = length * l_1 * (-length * w_end - edge) + l_1
+    return Derivatives(
+        value=torch.log(z) + log_d,
+        kappa=z_k,
+        log_d=1.0 - l_1,
+        kappa_kappa=z_kk - z_k.square(),
+        kappa_log_d=-l_1 * (first_end - z_k),
+        log_d_log_d=l_2,
+    )
+
+
+@dataclass(frozen=True)
+class DensityState:
+    """Where a fit stands, every field (*, m); ``value`` is the mean negative log-likelihood at the last step."""
+
+    kappa: Tensor
+    log_d: Tensor
+    log_bound: Tensor
+    log_d_min: Tensor
+    damping: Tensor
+    value: Tensor
+    free_kappa: bool = True
+    free_d: bool = True
+
+    def select(self, index: Tensor) -> DensityState:
+        """The state of the problems at ``index``."""
+        fields = ("kappa", "log_d", "log_bound", "log_d_min", "damping", "value")
+        return replace(self, **{f: getattr(self, f)[index] for f in fields})
+
+
+def negative_log_likelihood(error: Tensor, weight: Tensor | None, state: DensityState) -> Float[Tensor, "*batch m"]:
+    """Mean negative log-density of the residuals of each channel."""
+    z = error * torch.exp(-state.log_d).unsqueeze(-2)
+    return _mean(energy_value(z, state.kappa.unsqueeze(-2)), weight) + state.log_d + _log_z(state)
+
+
+def _log_z(state: DensityState) -> Tensor:
+    return log_partition_value(state.kappa, torch.exp(state.log_bound - state.log_d))
+
+
+def initial_state(
+    error: Float[Tensor, "*batch N m"],
+    weight: Float[Tensor, "*batch N m"] | None,
+    scale: Float[Tensor, "*batch m"],
+    bound: Float[Tensor, "*batch m"],
+    d_min: Float[Tensor, "*batch m"],
+    *,
+    kappa: Float[Tensor, "*batch m"] | None = None,
+    d: Float[Tensor, "*batch m"] | None = None,
+    tails: Sequence[float | Tensor] = (0.1, 0.4, 1.5),
+) -> DensityState:
+    """The likeliest of a Gaussian and of densities with κ from ``tails`` and the given scale.
+
+    ``kappa`` or ``d`` given stays as it is.
+    """
+    rms = torch.sqrt(_mean(error.square(), weight)).clamp(min=d_min)
+    log_bound, log_d_min = torch.log(bound), torch.log(d_min)
+    blank = DensityState(rms, rms, log_bound, log_d_min, torch.full_like(rms, 1e-3), rms, kappa is None, d is None)
+    best: DensityState | None = None
+    for start_kappa, start_d in ((0.0, rms), *((tail, scale) for tail in tails)):
+        state = replace(
+            blank,
+            kappa=torch.as_tensor(start_kappa).to(rms).expand_as(rms) if kappa is None else kappa.expand_as(rms),
+            log_d=torch.log(start_d.clamp(min=d_min)) if d is None else torch.log(d).expand_as(rms),
+        )
+        state = replace(state, value=negative_log_likelihood(error, weight, state))
+        if best is None:
+            best = state
+        else:
+            better = state.value < best.value
+            best = replace(
+                best,
+                kappa=torch.where(better, state.kappa, best.kappa),
+                log_d=torch.where(better, state.log_d, best.log_d),
+                value=torch.where(better, state.value, best.value),
+            )
+    assert best is not None
+    return best
+
+
+def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> DensityState:
+    """One damped Newton step in (κ, log d) within κ in [0, 400] and d in [d_min, bound]; never uphill."""
+    fit = energy_derivatives(error, weight, state.kappa, state.log_d)
+    norm = normaliser_derivatives(state.kappa, state.log_d, state.log_bound)
+    total = Derivatives(*(a + b for a, b in zip(fit, norm, strict=True)))
+    chain = state.kappa + _KAPPA_OFFSET
+    g_s, g_l = total.kappa * chain, total.log_d
+    h_ss = total.kappa_kappa * chain.square()
+    h_sl, h_ll = total.kappa_log_d * chain, total.log_d_log_d
+    held_s = ((state.kappa <= 0) & (g_s > 0)) | ((state.kappa >= KAPPA_MAX) & (g_s < 0))
+    held_l = ((state.log_d <= state.log_d_min) & (g_l > 0)) | ((state.log_d >= state.log_bound) & (g_l < 0))
+    if not state.free_kappa:
+        held_s = torch.ones_like(held_s)
+    if not state.free_d:
+        held_l = torch.ones_like(held_l)
+    g_s, g_l = torch.where(held_s, 0.0, g_s), torch.where(held_l, 0.0, g_l)
+    h_sl = torch.where(held_s | held_l, 0.0, h_sl)
+    h_ss, h_ll = torch.where(held_s, 1.0, h_ss), torch.where(held_l, 1.0, h_ll)
+    # on scales of their own: near a Gaussian the curvature by κ is a thousandth of that by log d
+    r_s, r_l = (h.abs().clamp(min=1e-8 * (h_ss.abs() + h_ll.abs())).rsqrt() for h in (h_ss, h_ll))
+    a, b, c = h_ss * r_s * r_s, h_sl * r_s * r_l, h_ll * r_l * r_l
+    # Levenberg's shift also lifts the smaller eigenvalue above 0
+    middle, spread = 0.5 * (a + c), torch.hypot(0.5 * (a - c), b)
+    shift = (spread - middle + 1e-3).clamp(min=0.0) + state.damping
+    a, c = a + shift, c + shift
+    determinant = a * c - b * b
+    g_s, g_l = g_s * r_s, g_l * r_l
+    step_s, step_l = r_s * (b * g_l - c * g_s) / determinant, r_l * (b * g_s - a * g_l) / determinant
+    longest = torch.maximum(step_s.abs(), step_l.abs())
+    shorten = (_LONGEST / longest.clamp(min=_LONGEST)).nan_to_num(0.0)
+    grown = (1.0 + shorten * step_s.nan_to_num(0.0)).clamp(min=_FURTHEST_DOWN)
+    kappa = (chain * grown - _KAPPA_OFFSET).clamp(0.0, KAPPA_MAX)
+    log_d = torch.minimum(
+        torch.maximum(state.log_d + shorten * step_l.nan_to_num(0.0), state.log_d_min), state.log_bound
+    )
+    proposal = replace(
+        state,
+        kappa=kappa if state.free_kappa else state.kappa,
+        log_d=log_d if state.free_d else state.log_d,
+    )
+    value = negative_log_likelihood(error, weight, proposal)
+    better = value <= total.value
+    return replace(
+        state,
+        kappa=torch.where(better, proposal.kappa, state.kappa),
+        log_d=torch.where(better, proposal.log_d, state.log_d),
+        damping=torch.where(better, 0.1 * state.damping, 10.0 * state.damping).clamp(1e-9, 1e6),
+        value=torch.where(better, value, total.value),
+    )
+
+
+def conclusive(before: DensityState, after: DensityState) -> Tensor:
+    """Whether a step says something about rest: it was taken, or no shorter one is worth trying. Shape (*, m)."""
+    return (after.damping <= before.damping) | (after.damping >= 1e3)
+
+
+@dataclass(frozen=True)
+class DensityFit:
+    """A fitted MKC density, as :func:`fit_density` gives it.
+
+    Attributes:
+        sigma, d, bound: bandwidth (``inf`` for a Gaussian channel), scale and half-width of the domain, (*, m).
+        log_likelihood: mean, in nats per residual, (*, m); compare only at equal ``bound``.
+        converged: (*, m).
+        n_iter: Newton steps made.
+
+    Example:
+        >>> from mkc_torch import MKCDistribution
+        >>> error = torch.linspace(-1.0, 1.0, 101, dtype=torch.float64).erfinv().clamp(-3.0, 3.0).unsqueeze(-1)
+        >>> fit = fit_density(error, bound=10.0)
+        >>> round(float(fit.bound)), bool(fit.converged)
+        (10, True)
+        >>> density = MKCDistribution(fit.sigma, fit.d, fit.bound)
+        >>> bool((density.log_prob(error).mean(0) - fit.log_likelihood).abs() < 1e-9)
+        True
+    """
+
+    sigma: Float[Tensor, "*batch m"]
+    d: Float[Tensor, "*batch m"]
+    bound: Float[Tensor, "*batch m"]
+    log_likelihood: Float[Tensor, "*batch m"]
+    converged: Bool[Tensor, "*batch m"]
+    n_iter: int
+
+
+def domain_rule(
+    error: Float[Tensor, "*batch N m"],
+    scale: Float[Tensor, "*batch m"],
+    used: Tensor | None = None,
+    scales: float = 10.0,
+) -> Float[Tensor, "*batch m"]:
+    """The half-width of the domain: half the range of the residuals of a robust fit, and no less than 10 scales.
+
+    The normaliser depends on the length of the domain alone when both its ends lie on the flat tail, so the domain is
+    an interval of that length that covers the residuals, centred on them or not. Ten scales leave Gaussian data at
+    σ = ∞, where a = max|e| over-fits the tail; half the range instead of a multiple of max|e| keeps the tail of
+    one-sided outliers as dense as it is.
+
+    Args:
+        error: residuals.
+        scale: robust scale of each channel.
+        used: boolean mask of the residuals that count.
+        scales: least half-width in scales.
+    """
+    high = error if used is None else torch.where(used, error, -torch.inf)
+    low = error if used is None else torch.where(used, error, torch.inf)
+    return torch.maximum(0.5 * (high.amax(-2) - low.amin(-2)), scales * scale)
+
+
+def refuse_narrow_bound(bound: Tensor, scale: Tensor) -> None:
+    """Refuse a domain that the head of the density does not fit in."""
+    narrow = bound < 2.0 * scale
+    if bool(narrow.any()):
+        first = narrow.nonzero()[0]
+        raise ValueError(
+            f"Expected argument `bound` to be at least two robust scales of the residuals, "
+            f"{2.0 * scale[tuple(first)].item():.4g}, but got {bound[tuple(first)].item():.4g}; it is the half-width "
+            "of the domain that errors can lie in, in the unit of the data."
+        )
+
+
+def fit_density(
+    error: Float[Tensor, "*batch N m"],
+    *,
+    sigma: float | Float[Tensor, " m"] | None = None,
+    d: float | Float[Tensor, " m"] | None = None,
+    bound: float | Float[Tensor, " m"] | None = None,
+    weight: Float[Tensor, "*batch N m"] | None = None,
+    d_min: float | Float[Tensor, " m"] | None = None,
+    max_iter: int = 100,
+    tol: float = 1e-12,
+) -> DensityFit:
+    """Maximum-likelihood σ and d of residuals, all channels and batches at once.
+
+    Args:
+        error: residuals (*, N, m), centred as the fit left them.
+        sigma: keeps σ at this value in [0.05, inf] (``inf``: Gaussian) and fits d alone, Remark 7 of the paper.
+        d: keeps d at this value and fits σ alone, Remark 6.
+        bound: half-width of the domain, in the unit of ``error``, at least two robust scales of them; default by
+            :func:`domain_rule`. A residual beyond it counts as one on the flat tail.
+        weight: non-negative weights of the residuals, (*, N, m) or (N, 1).
+        d_min: floor under d; default a tenth of the robust scale, since the likelihood grows without limit as d → 0
+            on residuals that a fit has interpolated.
+        max_iter: Newton steps at most.
+        tol: a channel has converged when a step lowers its mean negative log-likelihood by less.
+
+    Returns:
+        The fit, with the domain it was made on: likelihoods compare only on the same domain.
+
+    Raises:
+        TypeError: residuals or weights that are no real tensor, or a parameter that is no number.
+        ValueError: fewer than two residuals, non-finite ones, a parameter out of range, or shapes that do not fit.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (29)-(31), Algorithm 2, Remarks 6 and 7.
+
+    Example:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> error = torch.randn(10_000, 1, generator=generator, dtype=torch.float64)
+        >>> fit = fit_density(error)
+        >>> bool(fit.sigma > 8), round(float(fit.d), 1)
+        (True, 1.0)
+    """
+    refuse_not_real("error", error)
+    if error.dtype in (torch.float16, torch.bfloat16):
+        raise TypeError(f"Expected argument `error` of dtype float32 or float64 but got {error.dtype}; use .float().")
+    if error.dim() < 2 or error.shape[-2] < 2 or error.shape[-1] == 0:
+        mend = "; one channel is error.unsqueeze(-1)" if error.dim() == 1 and len(error) > 1 else ""
+        raise ValueError(
+            f"Expected argument `error` of shape (*, N >= 2, m) with a channel at least but got {tuple(error.shape)}"
+            f"{mend}."
+        )
+    if not bool(torch.isfinite(error).all()):
+        raise ValueError(
+            f"Expected argument `error` to be finite but got {int((~torch.isfinite(error)).sum())} values that are "
+            "not; leave those residuals out."
+        )
+    checked_whole("max_iter", max_iter, 1, "100 is ample")
+    checked_number("tol", tol, ends="[)", advice="1e-12 suits float64")
+    shape = (*error.shape[:-2], error.shape[-1])
+
+    def parameter(name: str, value: float | Tensor | None, least: float = 0.0, infinite: bool = False) -> Tensor | None:
+        if value is None:
+            return None
+        t = as_numbers(name, value, error.dtype, error.device).to(error)
+        if not bool(((t > 0) & (t >= least) & (torch.isfinite(t) | infinite)).all()):
+            wanted = f"in [{least:.4g}, inf]" if infinite else "positive and finite"
+            raise ValueError(f"Expected argument `{name}` to be {wanted} but got {value}.")
+        try:
+            return t.expand(shape)
+        except RuntimeError:
+            raise ValueError(
+                f"Expected argument `{name}` to be a number or of shape (m,) or {shape} but got {tuple(t.shape)}."
+            ) from None
+
+    normalised = None
+    if weight is not None:
+        weight = _full_weight(weight, error)
+        normalised = weight / weight.sum(-2, keepdim=True)
+    scale = robust_scale(error, weight)
+    tiny = torch.finfo(error.dtype).tiny ** 0.5
+    scale = torch.where(scale > 0, scale, torch.sqrt(_mean(error.square(), normalised))).clamp(min=tiny)
+    floor = parameter("d_min", d_min)
+    half_width = parameter("bound", bound)
+    if half_width is not None:
+        refuse_narrow_bound(half_width, scale)
+    else:
+        half_width = domain_rule(error, scale, None if weight is None else weight > 0)
+    if floor is not None and bool((floor >= half_width).any()):
+        raise ValueError(
+            f"Expected argument `d_min` below the half-width of the domain, {half_width.tolist()}, but got {d_min}; it "
+            "is the precision of the residuals."
+        )
+    fixed_sigma, fixed_d = parameter("sigma", sigma, SIGMA_LEAST, infinite=True), parameter("d", d)
+    if fixed_d is not None and bound is not None and bool((fixed_d >= half_width).any()):
+        raise ValueError(f"Expected argument `d` below `bound` but got {d} and {bound}; widen `bound`.")
+    state = initial_state(
+        error,
+        normalised,
+        scale,
+        half_width,
+        0.1 * scale if floor is None else floor,
+        kappa=None if fixed_sigma is None else fixed_sigma.pow(-2),
+        d=fixed_d,
+    )
+    still = torch.zeros(shape, dtype=torch.int64, device=error.device)
+    n_iter = 0
+    while n_iter < max_iter:
+        n_iter += 1
+        before = state
+        state = newton_step(error, normalised, state)
+        rounding = 8 * torch.finfo(error.dtype).eps * state.value.abs().clamp(min=1.0)
+        improved = before.value - state.value > tol + rounding
+        still = torch.where(improved, 0, still + conclusive(before, state).to(still.dtype))
+        if bool((still >= 2).all()):
+            break
+    return DensityFit(
+        sigma=state.kappa.rsqrt(),
+        d=torch.exp(state.log_d),
+        bound=torch.exp(state.log_bound),
+        log_likelihood=-state.value,
+        converged=still >= 2,
+        n_iter=n_iter,
+    )
+
+
+def _full_weight(weight: Tensor, error: Float[Tensor, "*batch N m"]) -> Float[Tensor, "*batch N m"]:
+    refuse_bad_weight(weight)
+    try:
+        # weights (N,) of as many channels as samples would be taken for those of channels
+        full = weight.to(error).expand_as(error) if weight.dim() > 1 else None
+    except RuntimeError:
+        full = None
+    if full is None:
+        mend = "; one weight a sample is weight.unsqueeze(-1)" if weight.dim() == 1 else ""
+        raise ValueError(
+            f"Expected argument `weight` of shape {tuple(error.shape)} or {(error.shape[-2], 1)} but got "
+            f"{tuple(weight.shape)}{mend}."
+        )
+    total = full.sum(-2)
+    if not bool((torch.isfinite(total) & (total > 0)).all()):
+        raise ValueError(
+            "Expected argument `weight` to be finite, >= 0 and positive somewhere in every channel but got channels "
+            f"of the sums {total.tolist()}."
+        )
+    return full

@@ -1,0 +1,183 @@
+"""The normaliser of the MKC density: quadrature on the head, the flat tail in closed form."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mkc_torch._support.arguments import refuse_no_tensor
+from mkc_torch.density._normalizer_of_few import few, log_partition_and_slopes
+from mkc_torch.density.energy import energy, energy_dkappa, energy_value
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["log_partition"]
+
+_HEAD_TOLERANCE = 1e-13
+
+
+def _head_quadrature(count: int) -> tuple[Tensor, Tensor]:
+    """Nodes on [0, 1] and weights of an even integrand on [-1, 1]: Gauss-Legendre under sinh(2t), denser near 0."""
+    x, w = np.polynomial.legendre.leggauss(count)
+    t = 0.5 * (x + 1.0)
+    nodes, weights = np.sinh(2.0 * t) / np.sinh(2.0), 2.0 * w * np.cosh(2.0 * t) / np.sinh(2.0)
+    return torch.from_numpy(nodes), torch.from_numpy(weights)
+
+
+_NODES, _WEIGHTS = _head_quadrature(32)
+
+
+def tail_density(kappa: Tensor) -> Tensor:
+    """``exp(-1 / kappa)``, the unnormalised density of the flat tail, with value and gradient 0 at ``kappa = 0``."""
+    positive = kappa > 1e-3  # exp(-1000) is 0 in float64
+    return torch.where(positive, torch.exp(-1.0 / torch.where(positive, kappa, 1.0)), 0.0)
+
+
+def head_reach(kappa: Tensor) -> Tensor:
+    """The ``z`` beyond which the density exceeds its flat tail by less than 1e-13; a constant for autograd."""
+    k = kappa.detach().clamp(min=1e-3)
+    excess = k * torch.nn.functional.softplus(1.0 / k + math.log(_HEAD_TOLERANCE), threshold=30.0)
+    return torch.sqrt(-2.0 * torch.log(excess) / k)
+
+
+def head_rule(kappa: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+    """Quadrature on the head: nodes ``u`` in [0, min(length, reach)] and weights for both signs, shape (*, nodes).
+
+    A negative length gives negative nodes and weights, so that integrals are odd in it.
+    """
+    reach = head_reach(kappa)
+    end = torch.maximum(torch.minimum(length, reach), -reach).unsqueeze(-1)
+    return end * _NODES.to(end), end * _WEIGHTS.to(end)
+
+
+def integrate(
+    values: Float[Tensor, "*batch nodes"],
+    tail: Float[Tensor, "*batch"],
+    length: Float[Tensor, "*batch"],
+    weights: Float[Tensor, "*batch nodes"],
+) -> Float[Tensor, "*batch"]:
+    """Integral over the domain of a function that is constant on the tail: the tail exactly, the head by quadrature.
+
+    Args:
+        values: the function at the nodes of :func:`head_rule`.
+        tail: its value on the flat tail.
+        length: half-width of the domain.
+        weights: those of :func:`head_rule`.
+    """
+    return 2.0 * length * tail + (weights * (values - tail.unsqueeze(-1))).sum(-1)
+
+
+def partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """``Z``, the integral of ``exp(-energy(u, kappa))`` over ``|u| <= length``; odd in ``length``.
+
+    Args:
+        kappa, length: as in :func:`log_partition`.
+    """
+    return _partition(kappa, length, energy)
+
+
+def log_partition_value(kappa: Tensor, length: Tensor) -> Tensor:
+    """:func:`log_partition` where nothing is differentiated."""
+    return torch.log(_partition(kappa, length, energy_value))
+
+
+def _partition(kappa: Tensor, length: Tensor, energy: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    kappa, length = torch.broadcast_tensors(kappa, length)
+    tail = tail_density(kappa)
+    nodes, weights = head_rule(kappa, length)
+    return integrate(torch.exp(-energy(nodes, kappa.unsqueeze(-1))), tail, length, weights)
+
+
+def log_partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """``log Z``, ``Z`` being the integral of ``exp(-energy(u, kappa))`` over ``|u| <= length``.
+
+    The flat tail ``2 length exp(-1 / kappa)`` is taken analytically and a fixed rule of 32 nodes sits on the head,
+    whose width it knows, so the relative error of ``Z`` stays below 1e-12 in float64 for ``kappa`` in [0, 400] and
+    ``length`` up to 1e7.
+
+    Args:
+        kappa: ``1 / sigma^2`` in [0, 400].
+        length: half-width of the domain in units of ``d``; broadcast against ``kappa``.
+
+    Raises:
+        TypeError: an argument is no tensor.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
+
+    Example:
+        >>> log_partition(torch.tensor(1 / 9.0).double(), torch.tensor(10.0).double()).exp()
+        tensor(2.6348, dtype=torch.float64)
+    """
+    refuse_no_tensor("kappa", kappa, "a tensor")
+    refuse_no_tensor("length", length, "a tensor")
+    if kappa.shape != length.shape:
+        kappa, length = torch.broadcast_tensors(kappa, length)
+    if torch.compiler.is_compiling():
+        return torch.log(partition(kappa, length))
+    value: Tensor = _LogPartition.apply(kappa, length)[0]  # type: ignore[no-untyped-call]
+    return value
+
+
+def _log_partition_and_slopes(
+    kappa: Tensor, length: Tensor, energy: Callable[[Tensor, Tensor], Tensor]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """``log Z`` and its derivatives by kappa and by length, differentiable if the energy is."""
+    tail = tail_density(kappa)
+    tail_slope = tail / torch.where(tail > 0, kappa, 1.0).square()
+    nodes, weights = head_rule(kappa, length)
+    own = kappa.unsqueeze(-1)
+    density = torch.exp(-energy(nodes, own))
+    z = integrate(density, tail, length, weights)
+    by_kappa = integrate(-energy_dkappa(nodes, own) * density, tail_slope, length, weights) / z
+    by_length = 2.0 * torch.exp(-energy(length, kappa)) / z
+    return torch.log(z), by_kappa, by_length
+
+
+class _LogPartition(torch.autograd.Function):
+    """Value and both slopes at once: autograd through the quadrature takes several times as long on a few channels."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(kappa: Tensor, length: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        if few(kappa, length):
+            k, reach = (one.detach().double().numpy() for one in (kappa, length))
+            found = log_partition_and_slopes(k, reach, _NODES.numpy(), _WEIGHTS.numpy(), _HEAD_TOLERANCE)
+            value, by_kappa, by_length = (torch.as_tensor(one, dtype=kappa.dtype) for one in found)
+            return value, by_kappa, by_length
+        return _log_partition_and_slopes(kappa, length, energy_value)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: tuple[Tensor, Tensor, Tensor]) -> None:
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*inputs, *output[1:])
+        ctx.save_for_forward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor | None, *_: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+        if grad is None:
+            return None, None
+        kappa, length, by_kappa, by_length = ctx.saved_tensors
+        if torch.is_grad_enabled():
+            by_kappa, by_length = _log_partition_and_slopes(kappa, length, energy)[1:]
+        wants = ctx.needs_input_grad
+        return grad * by_kappa if wants[0] else None, grad * by_length if wants[1] else None
+
+    @staticmethod
+    def jvp(ctx: Any, kappa_t: Tensor | None, length_t: Tensor | None) -> tuple[Tensor, None, None]:
+        kappa, length = ctx.saved_tensors
+        value, by_kappa, by_length = _log_partition_and_slopes(kappa, length, energy)
+        change = torch.zeros_like(value)
+        if kappa_t is not None:
+            change = change + by_kappa * kappa_t
+        if length_t is not None:
+            change = change + by_length * length_t
+        return change, None, None

@@ -1,0 +1,144 @@
+"""Whether noise that wanders in several channels is one course along one direction: a cause that was not recorded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.linearised.linear_search import log_survival
+from mkc_torch.diagnosis.linearised.linearise import Linearised
+from mkc_torch.diagnosis.linearised.tangents import Slow
+from mkc_torch.diagnosis.linearised.wander import SlowPart
+from mkc_torch.diagnosis.noise.cosine_basis import cosines
+from mkc_torch.effects.context import Shape
+from mkc_torch.effects.sensor.unrecorded import COURSE
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["CommonCause", "common_cause"]
+
+_ROUNDS, _SETTLED = 40, 1e-2
+_LEAST = 1e-6
+"""Smallest variance of a direction, over that of all channels together."""
+
+_ROUNDED = 1e-12
+"""Share of the largest eigenvalue below which one is lost in rounding."""
+
+_TOLD = 1e-2
+"""Courses whose amplitude is a smaller share of the largest one are not told."""
+
+
+@dataclass(frozen=True)
+class CommonCause:
+    """What the channels of a wander have in common.
+
+    Attributes:
+        gain: nats by which channels that hang together make the noise likelier than channels that do not.
+        p_value: of that gain, were each channel to wander for itself.
+        direction: (c,), change of the channels at a course of 1, as it is in the residual.
+        shape: the course, which spans a range of 1.
+    """
+
+    gain: float
+    p_value: float
+    direction: Float[Tensor, " c"]
+    shape: Shape
+
+    def towards(self, direction: Float[Tensor, " c"]) -> CommonCause:
+        """The same, of two ways to say it the one whose direction is less than a right angle away from this one."""
+        if float(self.direction @ direction) >= 0.0:
+            return self
+        return replace(self, direction=-self.direction, shape={name: -value for name, value in self.shape.items()})
+
+
+def common_cause(linearised: Linearised, slow: Slow | None) -> CommonCause | None:
+    """The likeliest covariance between the channels of a wander, against one that is diagonal.
+
+    A sensor's axes wander for themselves; what moves them together is one cause. Variance components are found by
+    minorisation and maximisation, Zhou, Hu, Zhou & Lange, "MM algorithms for variance components models", J. Comput.
+    Graph. Stat. 28 (2019); twice the gain has, were there none, a chi-square distribution with the number of
+    covariances as its degrees of freedom (Wilks 1938).
+
+    Args:
+        linearised: a fit and the series that it leaves.
+        slow: the courses of its wander.
+
+    Returns:
+        None where nothing wanders, or in one channel alone.
+    """
+    if slow is None or slow.channels < 2 or not linearised.wanders:
+        return None
+    part = linearised.search.slow_part(linearised.series)
+    c = slow.channels
+    start = torch.diag(part.size * torch.ones(c, dtype=part.inner.dtype))
+    apart, alone, _ = _likeliest(part, start, _diagonal)
+    likely, together, courses = _likeliest(part, apart, _free)
+    gain = max(together - alone, 0.0)
+    dof = likely.new_tensor(0.5 * c * (c - 1))
+    p_value = float(log_survival(likely.new_tensor(2.0 * gain), dof).exp())
+    along = torch.linalg.eigh(likely).eigenvectors[:, -1]
+    relative = part.scale[:c] / part.scale[0]
+    amplitudes = part.scale[::c] * (courses @ along)
+    course = cosines(len(amplitudes), len(slow.tangents)) @ amplitudes
+    span = float(course.max() - course.min())
+    told = amplitudes.abs() > _TOLD * amplitudes.abs().max()
+    shape = {
+        f"{COURSE}{k + 1}": math.sqrt(2.0) * float(amplitudes[k]) / span for k in told.nonzero().flatten().tolist()
+    }
+    return CommonCause(gain, p_value, span * relative * along, shape)
+
+
+def _likeliest(
+    part: SlowPart, start: Float[Tensor, "c c"], step: Callable[[Tensor, Tensor, Tensor], Tensor]
+) -> tuple[Float[Tensor, "c c"], float, Float[Tensor, "K c"]]:
+    """Covariance of the channels, over the white part's variance; its log-likelihood; and the courses it predicts."""
+    covariance, (value, courses, seen, expected) = start, _at(part, start)
+    for _ in range(_ROUNDS):
+        moved = step(covariance, seen, expected)
+        moved = 0.5 * (moved + moved.mT) + _LEAST * moved.trace() * torch.eye(len(moved), dtype=moved.dtype)
+        found = _at(part, moved)
+        gained = found[0] - value
+        if gained > 0.0:
+            covariance, (value, courses, seen, expected) = moved, found
+        if gained < _SETTLED:
+            break
+    return covariance, value, courses
+
+
+def _at(part: SlowPart, covariance: Float[Tensor, "c c"]) -> tuple[float, Tensor, Tensor, Tensor]:
+    """Log-likelihood, predicted courses (K, c), and the two sides of its slope: what is seen and what is expected."""
+    c, inverse = len(covariance), torch.linalg.inv(covariance)
+    K = len(part.inner) // c
+    precision = part.gram.clone()
+    precision.unflatten(0, (K, c)).unflatten(2, (K, c)).diagonal(dim1=0, dim2=2).add_(inverse.unsqueeze(-1))
+    root = torch.linalg.cholesky(precision)
+    mean = torch.cholesky_solve(part.inner.unsqueeze(-1), root).squeeze(-1)
+    left = max(part.power - float(part.inner @ mean), 1e-12 * part.power)
+    log_det = 2.0 * float(root.diagonal().log().sum()) + K * float(torch.logdet(covariance))
+    value = -0.5 * log_det - 0.5 * part.dof * math.log(left)
+    courses = mean.unflatten(0, (K, c))
+    score = courses @ inverse
+    known = torch.cholesky_inverse(root).unflatten(0, (K, c)).unflatten(2, (K, c)).diagonal(dim1=0, dim2=2).sum(-1)
+    expected = K * inverse - inverse @ known @ inverse
+    return value, courses, score.mT @ score * (part.dof / left), expected
+
+
+def _diagonal(covariance: Tensor, seen: Tensor, expected: Tensor) -> Tensor:
+    ratio = seen.diagonal() / expected.diagonal().clamp(min=1e-300)
+    return torch.diag(covariance.diagonal() * ratio.clamp(min=0.0).sqrt())
+
+
+def _free(covariance: Tensor, seen: Tensor, expected: Tensor) -> Tensor:
+    # what is expected of a direction that hardly moves is a difference of large numbers, and may round below zero
+    values, vectors = torch.linalg.eigh(0.5 * (expected + expected.mT))
+    values = values.clamp(min=_ROUNDED * float(values.abs().max()))
+    root, inverse = (vectors * values.sqrt()) @ vectors.mT, (vectors * values.rsqrt()) @ vectors.mT
+    inner = root @ covariance @ seen @ covariance @ root
+    values, vectors = torch.linalg.eigh(0.5 * (inner + inner.mT))
+    return inverse @ (vectors * values.clamp(min=0.0).sqrt()) @ vectors.mT @ inverse

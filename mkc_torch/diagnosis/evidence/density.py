@@ -1,0 +1,171 @@
+"""Whether the density of the residuals is right: their probability-integral transform, against a Student-t's."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.density.distribution import MKCDistribution
+from mkc_torch.diagnosis.result import DensityCheck
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["density_checks", "density_warnings", "effective_size", "kolmogorov", "student_cdf", "student_fit"]
+
+_FREEDOM = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
+"""Degrees of freedom that are tried."""
+
+_BEYOND = 1.95
+"""Kolmogorov's statistic, distance times root of N, that one set of samples in a thousand exceeds; of a density that
+was fitted to them far fewer do."""
+
+_CLOSER = 0.5
+"""Share of the density's distance that a Student-t's has to be below."""
+
+_ROUNDS, _NODES = 30, 2001
+
+
+def density_checks(
+    residual: Float[Tensor, "N m"],
+    sigma: Float[Tensor, " m"],
+    d: Float[Tensor, " m"],
+    bound: Float[Tensor, " m"],
+    channels: Sequence[str],
+) -> tuple[DensityCheck, ...]:
+    """How far the residuals of each channel, outliers among them, are from their density, and from a Student-t.
+
+    Their sizes go through the density's distribution function (probability-integral transform), which makes them
+    uniform if it is theirs; the distance is Kolmogorov's from that. The other one is that of the likeliest Student-t
+    around zero. That one is the closer if the density's distance is beyond what so many samples allow, as many as their
+    autocorrelation leaves, while the Student-t is likelier, at half the distance, and within what they allow.
+
+    Args:
+        residual: of the final model.
+        sigma, d, bound: of the density.
+        channels: their names.
+
+    Example:
+        >>> order = torch.randperm(4000, generator=torch.Generator().manual_seed(0)).double()
+        >>> cauchy = torch.tan(torch.pi * ((order + 0.5) / 4000 - 0.5)).unsqueeze(-1)
+        >>> sigma, d, bound = (torch.tensor([v], dtype=torch.float64) for v in (3.0, 1.0, 2000.0))
+        >>> (check,) = density_checks(cauchy, sigma, d, bound, ["norm"])
+        >>> check.degrees_of_freedom, check.closer
+        (1.0, True)
+    """
+    size = residual.abs()
+    density = MKCDistribution(sigma, d, bound, validate_args=False)
+    uniform = 2.0 * density.cdf(size) - 1.0
+    # beyond the domain it is as on its edge
+    likelihood = density.log_prob(torch.minimum(size, bound)).mean(0)
+    found = []
+    for k, channel in enumerate(channels):
+        distance = kolmogorov(uniform[:, k])
+        allowed = _BEYOND / math.sqrt(effective_size(uniform[:, k]))
+        freedom, scale, other = student_fit(residual[:, k])
+        near = kolmogorov(student_cdf(size[:, k] / scale, freedom))
+        closer = distance > allowed and other > float(likelihood[k]) and near < min(_CLOSER * distance, allowed)
+        found.append(DensityCheck(channel, distance, near, freedom, allowed, closer))
+    return tuple(found)
+
+
+def density_warnings(checks: Sequence[DensityCheck]) -> tuple[str, ...]:
+    """A sentence on the channels whose residuals are clearly not of the density fitted to them, and of a Student-t.
+
+    Outliers that neither of the two describes are not told of.
+
+    Example:
+        >>> density_warnings([DensityCheck("norm", 0.12, 0.01, 2.0, 0.05, True)])[0].partition(":")[0]
+        'The density does not describe the residuals of norm'
+    """
+    misfit = [check for check in checks if check.closer]
+    if not misfit:
+        return ()
+    worst = max(misfit, key=lambda check: check.distance)
+    return (
+        f"The density does not describe the residuals of {', '.join(check.channel for check in misfit)}: its "
+        f"distribution function is off by up to {worst.distance:.2g}, that of a Student-t with "
+        f"{worst.degrees_of_freedom:g} degrees of freedom by {worst.student_distance:.2g}. A misfit of the tail must "
+        "not be read as physics.",
+    )
+
+
+def kolmogorov(uniform: Float[Tensor, " N"]) -> float:
+    """Largest distance of the empirical distribution function from that of the uniform distribution on [0, 1].
+
+    Example:
+        >>> round(kolmogorov(torch.tensor([0.1, 0.3, 0.5, 0.9])), 2)
+        0.25
+    """
+    ordered = uniform.sort().values
+    N = len(ordered)
+    below = torch.arange(N, dtype=ordered.dtype) / N
+    return float(torch.maximum(ordered - below, below + 1.0 / N - ordered).max())
+
+
+def effective_size(values: Float[Tensor, " N"]) -> float:
+    """How many independent samples tell as much of the mean: N over the integrated autocorrelation time.
+
+    Summed over pairs of lags as long as they are positive. Geyer, "Practical Markov chain Monte Carlo", Statistical
+    Science 7 (1992), 3.3.
+
+    Example:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> white = torch.randn(4000, generator=generator, dtype=torch.float64)
+        >>> effective_size(white) > 3000, effective_size(white.repeat_interleave(10)) < 6000
+        (True, True)
+    """
+    N = len(values)
+    centred = values - values.mean()
+    spectrum = torch.fft.rfft(centred, n=2 * N)
+    covariance = torch.fft.irfft(spectrum.abs().square(), n=2 * N)[: N - N % 2]
+    if float(covariance[0]) <= 0.0:
+        return float(N)
+    pairs = covariance.unflatten(0, (-1, 2)).sum(-1) / covariance[0]
+    positive = (pairs > 0.0).to(pairs.dtype).cumprod(0)
+    time = 2.0 * float((pairs * positive).sum()) - 1.0
+    return N / max(time, 1.0)
+
+
+def student_fit(error: Float[Tensor, " N"]) -> tuple[float, float, float]:
+    """Degrees of freedom, scale and mean log-likelihood of the likeliest Student-t around zero.
+
+    The scale by the EM algorithm of Lange, Little & Taylor, "Robust statistical modeling using the t distribution",
+    JASA 84 (1989).
+    """
+    freedom = error.new_tensor(_FREEDOM).unsqueeze(-1)
+    square = error.square()
+    least = torch.finfo(error.dtype).tiny  # of residuals that are all zero
+    variance = square.median().clamp(min=least).expand(len(freedom), 1)
+    for _ in range(_ROUNDS):
+        weight = (freedom + 1.0) / (freedom + square / variance)
+        variance = (weight * square).mean(-1, keepdim=True).clamp(min=least)
+    likelihood = (
+        torch.lgamma(0.5 * (freedom + 1.0))
+        - torch.lgamma(0.5 * freedom)
+        - 0.5 * torch.log(math.pi * freedom * variance)
+        - 0.5 * (freedom + 1.0) * torch.log1p(square / (freedom * variance)).mean(-1, keepdim=True)
+    )
+    best = int(likelihood.argmax())
+    return _FREEDOM[best], float(variance[best].sqrt()), float(likelihood[best])
+
+
+def student_cdf(size: Float[Tensor, " N"], freedom: float) -> Float[Tensor, " N"]:
+    """Probability that the absolute value of a Student-t of scale one is at most ``size``.
+
+    With ``x = √ν tan θ`` it is the integral of ``cos^(ν-1)``, here by trapezoids.
+
+    Example:
+        >>> student_cdf(torch.tensor([1.0, 12.706], dtype=torch.float64), 1.0)
+        tensor([0.5000, 0.9500], dtype=torch.float64)
+    """
+    angle = torch.linspace(0.0, 0.5 * math.pi, _NODES, dtype=size.dtype)
+    density = torch.cos(angle).clamp(min=0.0) ** (freedom - 1.0)
+    total = torch.cat([density.new_zeros(1), torch.cumulative_trapezoid(density, angle)])
+    place = torch.atan(size / math.sqrt(freedom)) / angle[-1] * (_NODES - 1)
+    left = place.long().clamp(max=_NODES - 2)
+    return torch.lerp(total[left], total[left + 1], place - left) / total[-1]

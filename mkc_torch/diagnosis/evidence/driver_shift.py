@@ -1,0 +1,115 @@
+"""Whether an effect follows the course of its driver as recorded: the same driver, shifted in time, as a null."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.linearised.linearise import linearise
+from mkc_torch.diagnosis.linearised.tangents import Tangents, candidate_tangents
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.result import DriverShift, Finding
+from mkc_torch.diagnosis.search.locate import Located
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["shift_warning", "shifted"]
+
+_SHARE = 0.25
+"""Of the recording, by which a driver is shifted at most, and which is left out at both ends whatever the shift."""
+
+_COPIES = 19
+"""To either side."""
+
+_AT_ONCE = 19
+"""Copies that are laid out together."""
+
+_FEWEST = 200
+"""With fewer samples in the middle there is nothing to compare."""
+
+_MANY = 0.1
+"""A larger share of copies that gain as much is warned of."""
+
+_AS_MUCH = 0.999
+"""Share of the gain that a copy has to have: those of a ramp are the ramp again, to rounding."""
+
+
+def shifted(model: JointModel, located: Located) -> DriverShift | None:
+    """Compare the gain of an effect with its gains when its driver comes earlier or later.
+
+    The motion, the parameters and the noise stay where they are, only the driver moves, and all shifts are judged on
+    the same samples in the middle, so that no end of the driver meets its beginning. What a model of the noise misses
+    is in all of these gains alike.
+
+    Harris, "Nonsense correlations in neuroscience", bioRxiv 2020.11.29.402719 (2020), the linear shift.
+
+    Args:
+        model: the simulation without the effect.
+        located: the effect.
+
+    Returns:
+        None where the effect has no recorded driver, or acts where a shift would take a simulation of its own, or the
+        recording is short.
+    """
+    term = located.term
+    pointwise = located.tangents.pointwise[term.port]
+    N = len(located.values)
+    most = int(_SHARE * N)
+    if term.driver is None or pointwise is None or model.prepared.ports[term.port].clock is not None:
+        return None
+    if N - 2 * most < _FEWEST:
+        return None
+    middle = slice(most, N - most)
+    parameters = located.fit.parameters[: model.size]
+    counts = located.counts[middle]
+    bare = _cut(located.tangents, middle)
+    search = linearise(model, parameters, located.values[middle], counts, bare)
+
+    def gains(steps: Sequence[int]) -> Float[Tensor, " steps"]:
+        copies = [_moved(term, by) for by in steps]
+        moved = candidate_tangents(model, parameters, copies, located.tangents.pointwise)
+        return search.gains_of([one[middle] for one in moved], counts).ratio[:, 0]
+
+    steps = [most * k // _COPIES for k in range(-_COPIES, _COPIES + 1) if k]
+    found = torch.cat([gains(steps[k : k + _AT_ONCE]) for k in range(0, len(steps), _AT_ONCE)])
+    time = model.prepared.time
+    return DriverShift(
+        len(steps), int((found >= _AS_MUCH * gains([0])).sum()), most * float(time[-1] - time[0]) / (N - 1)
+    )
+
+
+def _moved(term: Term, by: int) -> Term:
+    """The same with its driver so many samples later, held at its ends."""
+    assert term.driver is not None
+    values = term.driver.values
+    rows = (torch.arange(len(values)) - by).clamp(0, len(values) - 1)
+    return replace(term, driver=replace(term.driver, values=values[rows]))
+
+
+def _cut(tangents: Tangents, rows: slice) -> Tangents:
+    slow = tangents.slow
+    return Tangents(
+        tangents.nuisance[rows],
+        (),
+        {name: None if one is None else one[rows] for name, one in tangents.pointwise.items()},
+        None if slow is None else replace(slow, tangents=slow.tangents[rows]),
+    )
+
+
+def shift_warning(finding: Finding) -> tuple[str, ...]:
+    """A sentence where many shifted copies of the driver do as well."""
+    found = finding.driver_shift
+    if found is None or found.as_good <= _MANY * found.copies:
+        return ()
+    columns = ", ".join(finding.drivers)
+    return (
+        f"{found.as_good} of {found.copies} copies of {columns}, shifted by up to {found.reach:.3g} s, gain as much "
+        f"for {finding.effect} as the column itself: its timing does not show that it is the driver, rather than "
+        "something else that changes as slowly.",
+    )

@@ -1,0 +1,140 @@
+"""Held-out evidence: with and without the findings, on blocks of the recording that the fit has not seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.side_by_side import each
+from mkc_torch.functional import mkc_nll
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["Evidence", "HeldOutBlocks", "blocks_of", "gain_interval", "held_out", "scored"]
+
+FOLDS = 5
+BLOCKS_PER_FOLD = 5
+_GAP = 0.01
+"""Left out beside a held-out block, as a share of the recording; a correlation time at least."""
+
+
+@dataclass(frozen=True)
+class HeldOutBlocks:
+    """Blocks of consecutive samples, one fold each: block and fold of every sample, and what training leaves out."""
+
+    block: Tensor
+    fold: Tensor
+    train: tuple[Bool[Tensor, " N"], ...]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A model on held-out samples: log-likelihood of each (N,), residual (N, m), the density's σ and d (m,).
+
+    ``parameters`` are those of the fits without each fold, (folds, p), which leave out this share of the samples.
+    """
+
+    log_likelihood: Float[Tensor, " N"]
+    residual: Float[Tensor, "N m"]
+    sigma: Float[Tensor, " m"]
+    d: Float[Tensor, " m"]
+    parameters: Float[Tensor, "folds p"]
+    left_out: float
+
+    @property
+    def jackknife(self) -> Float[Tensor, " p"]:
+        """Standard errors of the parameters by leaving one fold out at a time.
+
+        Each fold is made of blocks all over the recording, so they see what a model of the noise, or of the effect's
+        form, does not. Efron & Tibshirani, "An Introduction to the Bootstrap" (1993), (11.5).
+        """
+        return ((1.0 - self.left_out) / self.left_out * self.parameters.var(0, correction=0)).sqrt()
+
+
+def blocks_of(N: int, correlation: int) -> HeldOutBlocks:
+    """Twenty-five blocks, five folds; between training and held-out samples lies a correlation time at least.
+
+    But no more than half a block, so that training blocks are left: noise that wanders for longer leans both ways.
+
+    Args:
+        N: number of samples.
+        correlation: integrated correlation time in samples.
+    """
+    count = FOLDS * BLOCKS_PER_FOLD
+    block = (torch.arange(N) * count).div(N, rounding_mode="floor")
+    fold = block % FOLDS
+    # never so much that training blocks of an ordinary recording are left empty
+    gap = max(1, min(max(math.ceil(_GAP * N), correlation), N // (2 * count)))
+    train = []
+    for k in range(FOLDS):
+        near = (fold == k).to(torch.float64).reshape(1, 1, -1)
+        widened = torch.nn.functional.max_pool1d(near, 2 * gap + 1, stride=1, padding=gap)
+        train.append(widened.reshape(-1) == 0)
+    return HeldOutBlocks(block, fold, tuple(train))
+
+
+def held_out(
+    fit: FittedModel,
+    blocks: HeldOutBlocks,
+    reread: Callable[[Bool[Tensor, " N"]], tuple[JointModel, Float[Tensor, " p"]]] | None = None,
+) -> Evidence:
+    """Refit on all folds but one, judge on that one, for each fold.
+
+    Args:
+        fit: on all folds.
+        blocks: of which a fold is made.
+        reread: the model to fit to these samples, and where to begin; default the fit's own, shapes of effects as they
+            are.
+    """
+    N = len(fit.residual)
+    log_likelihood = fit.residual.new_zeros(N)
+    residual = torch.zeros_like(fit.residual)
+
+    def without(train: Bool[Tensor, " N"]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        rows = train.to(fit.residual.dtype)
+        model, start = (fit.model, fit.parameters) if reread is None else reread(train)
+        found = fitted(model, start, fit.bound, rows=rows, graduate=False)
+        return model.residual(found.parameters).detach(), found.sigma, found.d, found.bound, found.parameters
+
+    folds = each(fit, [partial(without, train) for train in blocks.train])
+    for number, (out, *density, _) in enumerate(folds):
+        seen = blocks.fold == number
+        residual[seen] = out[seen]
+        log_likelihood[seen] = scored(out, *density)[seen]
+    _, sigma, d, _, parameters = zip(*folds, strict=True)
+    middle = torch.stack(sigma).median(0).values, torch.stack(d).median(0).values
+    left_out = 1.0 - float(torch.stack(blocks.train).double().mean())
+    return Evidence(log_likelihood, residual, *middle, torch.stack(parameters), left_out)
+
+
+def scored(residual: Tensor, sigma: Tensor, d: Tensor, bound: Tensor) -> Float[Tensor, " N"]:
+    """Log-likelihood of each sample, over its channels."""
+    return -mkc_nll(residual, sigma, d, bound).sum(-1)
+
+
+def gain_interval(
+    difference: Float[Tensor, " N"],
+    block: Tensor,
+    generator: torch.Generator,
+    draws: int = 2000,
+    *,
+    coverage: float = 0.95,
+) -> tuple[float, tuple[float, float]]:
+    """Mean of paired differences, and its interval, of 95 % by default, by a bootstrap of whole blocks."""
+    count = int(block.max()) + 1
+    total = difference.new_zeros(count).index_add(0, block, difference)
+    size = difference.new_zeros(count).index_add(0, block, torch.ones_like(difference))
+    drawn = torch.randint(count, (draws, count), generator=generator)
+    means = total[drawn].sum(-1) / size[drawn].sum(-1)
+    tail = 0.5 * (1.0 - coverage)
+    low, high = torch.quantile(means, torch.tensor([tail, 1.0 - tail], dtype=means.dtype)).tolist()
+    return float(difference.mean()), (low, high)

@@ -1,0 +1,77 @@
+"""Whether a smooth correction by recorded columns finds what no effect accounts for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from mkc_torch.diagnosis.evidence.ceiling import Ceiling, ceiling
+from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, gain_interval
+from mkc_torch.diagnosis.model.drivers import Driver
+from mkc_torch.diagnosis.model.fit import FittedModel
+
+__all__ = ["remaining", "remaining_warning"]
+
+_SURE = 0.99
+"""Coverage of the intervals on what columns add: a warning is to be rarer than a finding that is none."""
+
+_WORTH = 0.01
+"""Nats per sample that the correction has to gain, which makes residuals smaller by about a hundredth."""
+
+
+def remaining(
+    alone: Ceiling,
+    corrected: Evidence,
+    fit: FittedModel,
+    drivers: Sequence[Driver],
+    blocks: HeldOutBlocks,
+    seed: int,
+) -> tuple[str, ...]:
+    """The columns along which something smooth remains in a model that passed for complete.
+
+    A ceiling above the model is no evidence by itself: noise that wanders for longer than a block is tracked by any
+    slow course, on unseen blocks too. So, beside the whole model, columns have to be taken up without most of the
+    folds, and to add to what courses of time reach alone. What goes so slowly that time does as well is not told of; a
+    column that happens to wander as the noise does can still pass.
+
+    Args:
+        alone: the ceiling beside the simulation alone.
+        corrected: the model on held-out blocks.
+        fit: the model.
+        drivers: the columns.
+        blocks: to predict.
+        seed: of the bootstraps.
+    """
+
+    def gain(better: Evidence, worse: Evidence, coverage: float) -> tuple[float, float]:
+        difference = better.log_likelihood - worse.log_likelihood
+        generator = torch.Generator().manual_seed(seed)
+        mean, (low, _) = gain_interval(difference, blocks.block, generator, coverage=coverage)
+        return mean, low
+
+    if gain(alone.evidence, corrected, 0.95)[1] <= 0.0:
+        return ()
+    beside = ceiling(fit.model, fit, drivers, blocks) if fit.model.terms else alone
+    mean, low = gain(beside.evidence, corrected, _SURE)
+    if not beside.columns or mean < _WORTH or low <= 0.0:
+        return ()
+    time = ceiling(fit.model, fit, (), blocks)
+    return beside.columns if gain(beside.evidence, time.evidence, _SURE)[1] > 0.0 else ()
+
+
+def remaining_warning(columns: Sequence[str]) -> tuple[str, ...]:
+    """The sentence that says so.
+
+    Example:
+        >>> remaining_warning(["temperature"])
+        ('Something smooth remains along temperature that no effect of the catalogue accounts for: ...',)
+        >>> remaining_warning([])
+        ()
+    """
+    if not columns:
+        return ()
+    return (
+        f"Something smooth remains along {', '.join(columns)} that no effect of the catalogue accounts for: a smooth "
+        "correction by recorded columns is clearly better on blocks that it has not seen.",
+    )

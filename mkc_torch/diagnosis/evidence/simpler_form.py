@@ -1,0 +1,79 @@
+"""Simpler forms of what was found, where blocks that the fit has not seen are predicted as well by them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_out
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted, repeats
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shaped import shape_fitted
+from mkc_torch.diagnosis.noise.innovations import either_way
+from mkc_torch.diagnosis.search.ranking import SEPARABLE
+from mkc_torch.effects.base import NestedEffect
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+__all__ = ["simplified"]
+
+Holds = Callable[[FittedModel, Evidence], bool]
+
+
+def simplified(
+    fit: FittedModel, evidence: Evidence, blocks: HeldOutBlocks, holds: Holds
+) -> tuple[FittedModel, Evidence]:
+    """The fit with the simpler form of each effect that unseen blocks do not speak against, and its evidence.
+
+    They do where they are clearly less likely by it, with their noise taken for white, and it leaves more that is new
+    in their samples, with it taken for coloured.
+
+    All effects are asked again with each that is found: what one needed while another was missing, it may not need any
+    more.
+
+    Args:
+        fit: with all effects that were found.
+        evidence: of it, on the blocks.
+        blocks: held out.
+        holds: whether a fit, with its evidence, still makes a finding of the last effect.
+    """
+    for number in range(len(fit.model.terms)):
+        start = _simpler(fit, number)
+        if start is None:
+            continue
+        try:
+            other = shape_fitted(fitted(*start, fit.bound, graduate=False))
+        except ValueError:
+            continue
+        if not repeats(other):
+            continue
+        after = held_out(other, blocks)
+        lost = float((evidence.log_likelihood - after.log_likelihood).sum())
+        as_well = lost <= SEPARABLE or either_way(after.residual, evidence.residual) <= 0.0
+        if as_well and holds(other, after):
+            fit, evidence = other, after
+    return fit, evidence
+
+
+def _simpler(fit: FittedModel, number: int) -> tuple[JointModel, Float[Tensor, " p"]] | None:
+    """The model with the simpler form of one effect, and where to start; None where there is none."""
+    terms = list(fit.model.terms)
+    effect = terms[number].effect
+    if not isinstance(effect, NestedEffect):
+        return None
+    terms[number] = replace(terms[number], effect=effect.simpler)
+    model = JointModel(fit.model.prepared, terms)
+    size = model.sizes[number]
+    if size >= fit.model.sizes[number]:
+        return None
+    before, own, behind = fit.parameters.split(
+        [
+            fit.model.base + sum(fit.model.sizes[:number]),
+            fit.model.sizes[number],
+            sum(fit.model.sizes[number + 1 :]),
+        ]
+    )
+    return model, fit.parameters.new_tensor([*before, *own.reshape(size, -1).mean(-1), *behind])

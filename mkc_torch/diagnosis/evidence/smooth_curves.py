@@ -1,0 +1,216 @@
+"""Smooth curves of every column and of time, as changes at a simulation's ports."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.evidence.held_out import HeldOutBlocks
+from mkc_torch.diagnosis.model.drivers import Driver
+from mkc_torch.diagnosis.model.joint import JointModel, port_jacobian, through_port, with_constant
+from mkc_torch.diagnosis.noise.cosine_basis import cosines
+from mkc_torch.simulation.protocol import Port
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["Smooth", "curves_of", "legendre", "smooth_tangents"]
+
+DEGREE = 5
+"""Of the curves of columns."""
+
+COURSES = 10
+"""Slow courses of time; cosines, for a polynomial runs away in a block at either end."""
+
+TIME = ""
+"""Instead of a column's name, which no column has."""
+
+MOST_COLUMNS = 300
+"""Tangents that are made; of more columns of a recording, the ones that promise most."""
+
+_TINY = torch.finfo(torch.float64).tiny
+
+_FREE = 1e-3
+"""Roughness of a straight line, beside that of a curve of degree one."""
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """Tangents of the simulation's own parameters, then those of the curves, and what belongs to each.
+
+    Attributes:
+        tangents: (N, m, P), of the residual.
+        own: how many of them are the parameters'.
+        groups: for each column and port, the numbers of its tangents.
+        names: of the groups' columns.
+        roughness: (P,), what a tangent is penalised by: the more, the higher the degree; 0 for the parameters.
+        allowed: (folds, groups), which of them training without a fold may take up.
+    """
+
+    tangents: Float[Tensor, "N m P"]
+    own: int
+    groups: tuple[Tensor, ...]
+    names: tuple[str, ...]
+    roughness: Float[Tensor, " P"]
+    allowed: Bool[Tensor, "folds groups"]
+
+
+def legendre(values: Float[Tensor, "N k"], degree: int) -> Float[Tensor, "N k degree"]:
+    """Legendre polynomials P_1 to P_degree over the range of each column, less their means.
+
+    Example:
+        >>> legendre(torch.tensor([[0.0], [1.0], [2.0]]), 2)[:, 0]
+        tensor([[-1.0000,  0.5000],
+                [ 0.0000, -1.0000],
+                [ 1.0000,  0.5000]])
+    """
+    low, high = values.amin(0), values.amax(0)
+    t = (2.0 * values - low - high) / (high - low)
+    found = [torch.ones_like(t), t]
+    for n in range(1, degree):
+        found.append(((2 * n + 1) * t * found[n] - n * found[n - 1]) / (n + 1))
+    curves = torch.stack(found[1:], -1)
+    return curves - curves.mean(0)
+
+
+def curves_of(drivers: Sequence[Driver], N: int) -> dict[str, Float[Tensor, "N degree"]]:
+    """The curves of time, which stands first, and of each column."""
+    found = {TIME: cosines(COURSES, N)}
+    if drivers:
+        columns = [name for driver in drivers for name in driver.columns]
+        made = legendre(torch.cat([driver.values for driver in drivers], -1), DEGREE)
+        found |= dict(zip(columns, made.unbind(1), strict=True))
+    return found
+
+
+@dataclass(frozen=True)
+class _Around:
+    """A model at some parameters: tangents of these, and of its ports where they are pointwise."""
+
+    model: JointModel
+    parameters: Tensor  # (p,)
+    own: Tensor  # (N, m, p)
+    pointwise: Mapping[str, Tensor | None]  # (N, m, c)
+
+    @classmethod
+    def of(cls, model: JointModel, parameters: Tensor) -> _Around:
+        pointwise = {
+            name: port_jacobian(model, parameters, name) if port.pointwise else None
+            for name, port in model.prepared.ports.items()
+        }
+        return cls(model, parameters, torch.func.jacfwd(model.residual)(parameters), pointwise)
+
+    @property
+    def ports(self) -> dict[str, Port]:
+        """Those where curves can enter, each place once."""
+        places: dict[tuple[tuple[str, ...], str], str] = {}
+        for name, port in self.model.prepared.ports.items():
+            places.setdefault((port.channels, port.unit), name)
+        return {name: self.model.prepared.ports[name] for name in places.values()}
+
+    def backward(self, port: str, left: Float[Tensor, "N m"]) -> Float[Tensor, "N c"]:
+        """What residuals say of a change at a port, by reverse mode where it is not pointwise."""
+        known = self.pointwise[port]
+        if known is not None:
+            return torch.einsum("nmc,nm->nc", known, left)
+        changes, prepared = self.model.changes(self.parameters), self.model.prepared
+        zero = left.new_zeros(len(left), len(prepared.ports[port].channels))
+
+        def residual(change: Tensor) -> Tensor:
+            held = with_constant(changes, port, prepared.ports[port].at(change))
+            return prepared.residual(self.parameters[: self.model.base], held)
+
+        pulled: Tensor = torch.func.vjp(residual, zero)[1](left)[0]
+        return pulled
+
+
+def smooth_tangents(
+    model: JointModel,
+    parameters: Float[Tensor, " p"],
+    curves: Mapping[str, Float[Tensor, "N degree"]],
+    weights: Float[Tensor, "N m"],
+    blocks: HeldOutBlocks,
+) -> Smooth:
+    """The tangents of curves at every port of a simulation.
+
+    Args:
+        model, parameters: around which the residual is taken for linear.
+        curves: of each column.
+        weights: of the residuals, over the squares of their scales.
+        blocks: without each fold of which the columns are chosen anew, where they are too many.
+    """
+    around = _Around.of(model, parameters)
+    ports = around.ports
+    own, width = around.own.shape[-1], sum(len(port.channels) for port in ports.values())
+    room = (MOST_COLUMNS - own - COURSES * width) // (DEGREE * width)
+    allowed = _promising(around, curves, weights, blocks, max(room, 1))
+    used = [k for k in range(len(curves)) if bool(allowed[:, k].any())]
+    names = [list(curves)[k] for k in used]
+    joined = torch.cat([curves[name] for name in names], -1)
+    tangents, groups, roughness, start = [around.own], [], [joined.new_zeros(own)], own
+    for port in ports:
+        c = len(ports[port].channels)
+        courses = joined[:, None, :, None] * torch.eye(c, dtype=joined.dtype)[:, None, :]
+        entering = ports[port].at(courses.flatten(2))
+        tangents.append(through_port(model, parameters, port, entering, around.pointwise[port]))
+        for name in names:
+            degree = torch.arange(curves[name].shape[-1], dtype=joined.dtype)
+            groups.append(torch.arange(start, start + c * len(degree)))
+            roughness.append((degree.square() + _FREE).repeat_interleave(c))
+            start += c * len(degree)
+    return Smooth(
+        torch.cat(tangents, -1),
+        own,
+        tuple(groups),
+        tuple(names) * len(ports),
+        torch.cat(roughness),
+        allowed[:, used].repeat(1, len(ports)),
+    )
+
+
+def _promising(
+    around: _Around, curves: Mapping[str, Tensor], weights: Float[Tensor, "N m"], blocks: HeldOutBlocks, room: int
+) -> Bool[Tensor, "folds curves"]:
+    """For each fold, the columns whose curves promise most by the residuals of the others; time always.
+
+    As many as there is room for all that any fold chooses; they mostly agree.
+    """
+    allowed = torch.ones(len(blocks.train), len(curves), dtype=torch.bool)
+    columns = [k for k, name in enumerate(curves) if name != TIME]
+    if len(columns) <= room:
+        return allowed
+    basis = torch.linalg.qr(torch.stack([curve for name, curve in curves.items() if name != TIME])).Q
+    scores = _scores(around, basis, [weights * train.unsqueeze(-1) for train in blocks.train])
+    order = scores.argsort(descending=True)
+    most = 1
+    while len(order[:, : most + 1].unique()) <= room:
+        most += 1
+    allowed[:, columns] = torch.zeros_like(scores, dtype=torch.bool).scatter(1, order[:, :most], True)
+    return allowed
+
+
+def _scores(
+    around: _Around, basis: Float[Tensor, "D N degree"], weights: Sequence[Float[Tensor, "N m"]]
+) -> Float[Tensor, "folds D"]:
+    """The square of what is left beside the parameters, along the curves of each column, over all ports."""
+    left = [_left(around, one) for one in weights]
+    total = basis.new_zeros(len(weights), len(basis))
+    for port in around.ports:
+        back = torch.stack([around.backward(port, one) for one in left])
+        # ports have units of their own
+        back = back / back.square().mean((1, 2), keepdim=True).sqrt().clamp(min=_TINY)
+        total += torch.einsum("dnj,fnc->fdjc", basis, back).square().sum((2, 3))
+    return total
+
+
+def _left(around: _Around, weights: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
+    """Weighted residuals, less what the parameters take over."""
+    residual = around.model.residual(around.parameters).detach()
+    weighted = weights.unsqueeze(-1) * around.own
+    gram = torch.einsum("nmp,nmq->pq", weighted, around.own)
+    step = torch.linalg.lstsq(gram, torch.einsum("nmp,nm->p", weighted, residual).unsqueeze(-1)).solution
+    return weights * (residual - (around.own @ step).squeeze(-1))

@@ -1,0 +1,94 @@
+"""What is located where no candidate is: a cause that was not recorded, told by what a wander's channels share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.evidence.common_cause import common_cause
+from mkc_torch.diagnosis.linearised.linearise import linearise
+from mkc_torch.diagnosis.linearised.tangents import candidate_tangents
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.search.locate import Located
+from mkc_torch.diagnosis.search.ranking import Ranked
+from mkc_torch.effects.context import Shape
+from mkc_torch.effects.sensor.unrecorded import Unrecorded
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["course_without", "located_cause"]
+
+_SHARE = 0.1
+"""Of the level: the question is asked last, of recordings in which the search found nothing."""
+
+
+def located_cause(base: FittedModel, located: Located, level: float, surrogates: int) -> Located | None:
+    """A search that found nothing, with the cause that moves the channels of the wander together; None without one.
+
+    Args:
+        base: the simulation alone.
+        located: what the search has, though it does not count.
+        level: of false alarms.
+        surrogates: draws of noise that other p-values are from, than which none can be smaller.
+    """
+    slow = located.tangents.slow
+    cause = common_cause(located.beside_nothing, slow)
+    if cause is None or slow is None or slow.port != Unrecorded.port or cause.p_value > _SHARE * level:
+        return None
+    model, start = _with_cause(base, cause.direction, cause.shape)
+    term = model.terms[-1]
+    fit = fitted_beside(base, model, start, graduate=False)
+    tangents = candidate_tangents(base.model, base.parameters, [term], located.tangents.pointwise)
+    others = [replace(one, gap=max(cause.gain - one.gain, 0.0)) for one in located.ranking]
+    return replace(
+        located,
+        term=term,
+        fit=fit,
+        p_value=max(cause.p_value / _SHARE, 1.0 / (1 + surrogates)),
+        beyond=0.0,
+        stretch=None,
+        ranking=(Ranked(len(located.terms), cause.gain, 0.0), *others),
+        linearised=located.linearised.with_more(tangents, located.counts),
+        tangents=replace(located.tangents, candidates=(*located.tangents.candidates, *tangents)),
+        terms=(*located.terms, term),
+    )
+
+
+def course_without(
+    base: FittedModel, located: Located, train: Bool[Tensor, " N"]
+) -> tuple[JointModel, Float[Tensor, " p"]]:
+    """The model with the course as these samples alone tell it, and where to begin.
+
+    Args:
+        base: the simulation alone.
+        located: what :func:`located_cause` found.
+        train: the samples.
+    """
+    counts = located.counts * train.unsqueeze(-1)
+    known = linearise(
+        base.model,
+        base.parameters,
+        counts * located.values,
+        counts,
+        located.tangents.bare,
+        colour=located.linearised.colour,
+    )
+    direction = -located.fit.model.gammas(located.fit.parameters)[-1]
+    cause = common_cause(known, located.tangents.slow)
+    if cause is None:
+        return _with_cause(base, torch.zeros_like(direction), located.term.shape)
+    cause = cause.towards(direction)
+    return _with_cause(base, cause.direction, cause.shape)
+
+
+def _with_cause(
+    base: FittedModel, direction: Float[Tensor, " c"], shape: Shape
+) -> tuple[JointModel, Float[Tensor, " p"]]:
+    # the residual is what was recorded less the prediction
+    return base.model.with_term(Term(Unrecorded(), None, shape)), torch.cat([base.parameters, -direction])

@@ -1,0 +1,1 @@
+"""Files that a diagnosis is written to and read from."""

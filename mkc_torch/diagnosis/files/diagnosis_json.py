@@ -1,0 +1,235 @@
+"""diagnosis.json: the text of a diagnosis, of the schema "mkc-diagnosis/1", and the check that it is one."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+from mkc_torch.diagnosis.result import DensityCheck, Diagnosis, Finding, HeldOut, Noise, Number, Parameter, Spread
+
+__all__ = ["SCHEMA", "DiagnosisFileError", "diagnosis_to_json", "json_schema", "validate"]
+
+SCHEMA = "mkc-diagnosis/1"
+
+Path = tuple[str | int, ...]
+
+
+class DiagnosisFileError(ValueError):
+    """Content that is no diagnosis; the sentence says where and why."""
+
+
+def diagnosis_to_json(diagnosis: Diagnosis) -> str:
+    """The diagnosis as JSON of the schema "mkc-diagnosis/1", checked against it. Needs the ``cli`` extra.
+
+    Numbers round-trip exactly. JSON has no infinity and no NaN: a bandwidth is the string "inf" where the density is
+    Gaussian, and a standard error, a bound of an interval or a gap that is not known is null. Any other number that
+    is not finite is refused.
+
+    Raises:
+        DiagnosisFileError: the diagnosis does not fit the schema.
+    """
+    d = diagnosis
+    content = {
+        "schema": SCHEMA,
+        "recording": d.recording,
+        "simulation": d.simulation,
+        "samples": d.samples,
+        "level": d.level,
+        "p_value": d.p_value,
+        "noise": _noise(d.noise),
+        "search": {"candidates": d.candidates_tried, "surrogates": d.surrogates, "seed": d.seed},
+        "verdict": d.verdict,
+        "findings": [_finding(f) for f in d.findings],
+        "baseline": _spread(d.baseline),
+        "corrected": _spread(d.corrected),
+        "ceiling": None if d.ceiling is None else _spread(d.ceiling),
+        "advice": d.advice,
+        "warnings": d.warnings,
+    }
+    _refuse_not_finite(content)
+    text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
+    validate(json.loads(text))
+    # lists of numbers on one line; a text in JSON holds no line end, so none is touched
+    return re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda m: "[" + " ".join(m[1].split()) + "]", text) + "\n"
+
+
+def validate(content: Mapping[str, Any]) -> None:
+    """Check the content of a diagnosis.json, as ``json.loads`` gives it. Needs the ``cli`` extra.
+
+    Raises:
+        DiagnosisFileError: the content does not fit the schema, or contradicts itself.
+
+    Example:
+        >>> validate({"schema": "mkc-diagnosis/1"})
+        Traceback (most recent call last):
+        mkc_torch.diagnosis.files.diagnosis_json.DiagnosisFileError: this is no diagnosis: ...
+    """
+    from jsonschema import Draft202012Validator  # here, so that diagnoses need no such package until one is written
+    from jsonschema.exceptions import best_match
+
+    _refuse_not_finite(content)
+    error = best_match(Draft202012Validator(json_schema()).iter_errors(content))
+    if error is not None:
+        message = error.message if len(error.message) <= 200 else error.message[:199] + "…"
+        raise DiagnosisFileError(f"this is no diagnosis: {_where(tuple(error.absolute_path))}: {message}.")
+    for i, finding in enumerate(content["findings"]):
+        for k, parameter in enumerate(finding["parameters"]):
+            if not _alike(parameter["value"], parameter["standard_error"]):
+                place = _where(("findings", i, "parameters", k, "standard_error"))
+                raise DiagnosisFileError(f"this is no diagnosis: {place} has not the shape of the value.")
+            if "components" in parameter and len(parameter["components"]) != _count(parameter["value"]):
+                place = _where(("findings", i, "parameters", k, "components"))
+                raise DiagnosisFileError(f"this is no diagnosis: {place} are not as many as the numbers of the value.")
+        for k, (start, end) in enumerate(finding["intervals"]):
+            if end < start:
+                place = _where(("findings", i, "intervals", k))
+                raise DiagnosisFileError(f"this is no diagnosis: {place} ends before it starts.")
+
+
+@cache
+def json_schema() -> dict[str, Any]:
+    """The JSON Schema (draft 2020-12) of diagnosis.json, which is a file of this package.
+
+    Example:
+        >>> json_schema()["title"]
+        'mkc-diagnosis/1'
+    """
+    file = files("mkc_torch.diagnosis.files").joinpath("schema", "diagnosis.schema.json")
+    schema: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return schema
+
+
+def _noise(noise: Noise) -> dict[str, Any]:
+    return {
+        "model": noise.model,
+        "parameters": dict(noise.parameters),
+        "sigma": [_sigma(s) for s in noise.sigma],
+        "d": noise.d,
+        "bound": noise.bound,
+        "description": noise.description,
+        **({"units": dict(noise.units)} if noise.units else {}),
+        **({"unit": noise.unit} if noise.unit else {}),
+        **({"density_check": [_density_check(check) for check in noise.checks]} if noise.checks else {}),
+    }
+
+
+def _density_check(check: DensityCheck) -> dict[str, Any]:
+    return {
+        "channel": check.channel,
+        "distance": check.distance,
+        "student_t_distance": check.student_distance,
+        "degrees_of_freedom": check.degrees_of_freedom,
+        "allowed": check.allowed,
+    }
+
+
+def _spread(spread: Spread) -> dict[str, Any]:
+    return {
+        "log_likelihood": spread.log_likelihood,
+        "rmse": spread.rmse,
+        "sigma": [_sigma(s) for s in spread.sigma],
+        "d": spread.d,
+    }
+
+
+def _finding(finding: Finding) -> dict[str, Any]:
+    f = finding
+    return {
+        "effect": f.effect,
+        "drivers": f.drivers,
+        "channels": f.channels,
+        "intervals": f.intervals,
+        "onset": f.onset,
+        "equation": f.equation,
+        "explanation": f.explanation,
+        "parameters": [_parameter(p) for p in f.parameters],
+        "p_value": f.p_value,
+        "held_out": None if f.held_out is None else _held_out(f.held_out),
+        "held_out_note": f.held_out_note,
+        "alternatives": [
+            {
+                "effect": a.effect,
+                "drivers": a.drivers,
+                "log_likelihood_gap": _known(a.log_likelihood_gap),
+                "separable": a.separable,
+                **({"at": a.at} if a.at else {}),
+                **({"told_by": a.told_by} if a.told_by else {}),
+            }
+            for a in f.alternatives
+        ],
+        "plausible": f.plausible,
+        "plausibility": f.plausibility,
+        **({} if f.onset_interval is None else {"onset_interval": f.onset_interval}),
+        **({} if f.driver_shift is None else {"driver_shift": asdict(f.driver_shift)}),
+        **({} if f.region is None else {"region": asdict(f.region)}),
+        **({"experiments": f.experiments} if f.experiments else {}),
+        **({"moments": f.moments} if f.moments else {}),
+        **({"references": [asdict(one) for one in f.references]} if f.references else {}),
+        **({"advice": f.advice} if f.advice else {}),
+        **({"comes_and_goes": True} if f.comes_and_goes else {}),
+    }
+
+
+def _parameter(parameter: Parameter) -> dict[str, Any]:
+    p = parameter
+    told = {"name": p.name, "value": p.value, "standard_error": _known(p.standard_error), "unit": p.unit}
+    return {**told, **({"components": p.components} if p.components else {})}
+
+
+def _held_out(held_out: HeldOut) -> dict[str, Any]:
+    return {
+        "log_likelihood_gain": held_out.log_likelihood_gain,
+        "confidence_interval": _known(held_out.confidence_interval),
+        "rmse_before": held_out.rmse_before,
+        "rmse_after": held_out.rmse_after,
+        "unit": held_out.unit,
+    }
+
+
+def _sigma(sigma: float) -> float | str:
+    return "inf" if sigma == math.inf else sigma
+
+
+def _known(value: Number | None) -> Any:
+    """The value with None where it is not finite."""
+    if isinstance(value, Sequence):
+        return [_known(v) for v in value]
+    return value if value is not None and math.isfinite(value) else None
+
+
+def _alike(value: Any, error: Any) -> bool:
+    """Whether a standard error has the shape of its value; None has any."""
+    if isinstance(value, list) and isinstance(error, list):
+        return len(value) == len(error) and all(_alike(v, e) for v, e in zip(value, error, strict=True))
+    return error is None or not (isinstance(value, list) or isinstance(error, list))
+
+
+def _count(value: Any) -> int:
+    return len(value) if isinstance(value, list) else 1
+
+
+def _refuse_not_finite(content: Mapping[str, Any]) -> None:
+    for path, value in _leaves(content, ()):
+        if isinstance(value, float) and not math.isfinite(value):
+            raise DiagnosisFileError(f"this is no diagnosis: {_where(path)} is {value}, which JSON has no number for.")
+
+
+def _leaves(value: Any, path: Path) -> Iterator[tuple[Path, Any]]:
+    if isinstance(value, Mapping):
+        for key, child in value.items():
+            yield from _leaves(child, (*path, key))
+    elif isinstance(value, (list, tuple)):
+        for i, child in enumerate(value):
+            yield from _leaves(child, (*path, i))
+    else:
+        yield path, value
+
+
+def _where(path: Path) -> str:
+    return f"`{'.'.join(str(key) for key in path)}`" if path else "the whole"

@@ -1,0 +1,206 @@
+"""A simulation with what it lacked as Python that a person can read and keep."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from mkc_torch.effects.base import CodedEffect
+from mkc_torch.recording.recording import DEFAULT_UNITS
+from mkc_torch.simulation.dynamics.definition import Dynamics
+from mkc_torch.simulation.dynamics.user_functions import kinematic
+from mkc_torch.simulation.parameter import Parameter
+
+if TYPE_CHECKING:
+    from mkc_torch.diagnosis.files.model import DiagnosedModel
+    from mkc_torch.diagnosis.model.term import Term
+
+__all__ = ["SourceError", "python_source"]
+
+_DIGITS = 9
+_FROM_HERE: Mapping[str, str] = {
+    "lagged(": "from mkc_torch.effects.base import lagged",
+    "played(": "from mkc_torch.effects.dynamics.backlash import played",
+    "shifted(": "from mkc_torch.effects.paired.between import shifted",
+    "soft_clip(": "from mkc_torch.effects.share import soft_clip",
+    "beyond(": "from mkc_torch.effects.dynamics.rate import beyond",
+    "SimpleNamespace(": "from types import SimpleNamespace",
+    "Parameter(": "from mkc_torch.simulation import Parameter",
+}
+
+
+class SourceError(ValueError):
+    """A model that cannot be written out; the sentence says why."""
+
+
+def python_source(model: DiagnosedModel, module: str | None = None) -> str:
+    """The text of a module with a class derived from the diagnosed one, see :meth:`DiagnosedModel.to_python`."""
+    system = model.source
+    if not isinstance(system, Dynamics):
+        raise SourceError(
+            f'Only differential equations are written out as Python, but the model is of "{model.simulation}"'
+            f"{'' if system else '; give its simulation with `simulation=`'}."
+        )
+    kind = type(system)
+    measured = tuple(map(str, model.state.get("outputs", system.outputs or system.states)))
+    rates: list[str] = []
+    memories = tuple(_memory(state) for term in model.terms if (state := _remembering(term)))
+    inputs: list[str] = []
+    outputs: list[str] = []
+    for term, gamma in zip(model.terms, model.gammas, strict=True):
+        lines = _lines(term, [_rounded(float(one)) for one in gamma], system, measured)
+        place = outputs if term.port == "output" else inputs if term.port.startswith("input ") else rates
+        place += [f"# {term.effect.id}: {term.effect.equation}", *lines]
+    told = ", ".join(term.effect.id.replace("_", " ") for term in model.terms) or "nothing more"
+    body = [
+        f"class Corrected{kind.__name__}({kind.__name__}):",
+        f'    """{kind.__name__} with the parameters that a recording gave it, and {told}."""',
+        "",
+        "    parameters = {",
+        *(f"        {line}" for line in _parameters(system, model.theta.tolist())),
+        "    }",
+        *_states(kind.__name__, memories),
+        *_actuated(inputs),
+        *_derivative(memories, rates),
+        *_sensed(outputs),
+    ]
+    text = "\n".join(body)
+    module = module or kind.__module__.removeprefix("_simulation_")
+    # in the order of standard library, torch, the package, the user's own file
+    used = [line for name, line in _FROM_HERE.items() if name in text]
+    first = [line for line in used if "mkc_torch" not in line]
+    own = sorted(line for line in used if "mkc_torch" in line)
+    torch = ["import torch"] if "torch." in text else []
+    groups = [first, [*torch, *own], [f"from {module} import {kind.__name__}"]]
+    imports = "\n\n".join("\n".join(group) for group in groups if group)
+    return (
+        f'"""{kind.__name__}, corrected by what `mkc diagnose` found; every number is of that recording."""\n\n'
+        f"{imports}\n\n\n{text}\n"
+    )
+
+
+def _parameters(system: Dynamics, theta: Sequence[float]) -> list[str]:
+    lines = []
+    for (name, one), value in zip(system.parameters.items(), theta, strict=False):
+        number = repr(_rounded(value))
+        if isinstance(one, Parameter):
+            told = [
+                f"{key}={json.dumps(known, ensure_ascii=False)}"
+                for key, known, free in (
+                    ("lower", one.lower, -float("inf")),
+                    ("upper", one.upper, float("inf")),
+                    ("unit", one.unit, ""),
+                )
+                if known != free
+            ]
+            number = f"Parameter({', '.join([number, *told])})"
+        lines.append(f'"{name}": {number},')
+    return lines
+
+
+def _states(base: str, memories: Sequence[str]) -> list[str]:
+    """The states with the internal ones that effects bring."""
+    told = ", ".join(json.dumps(name) for name in memories)
+    return [f"    states = (*{base}.states, {told})"] if memories else []
+
+
+def _actuated(inputs: list[str]) -> list[str]:
+    if not inputs:
+        return []
+    lines = ["acting = SimpleNamespace(**vars(u))", *inputs, "return super().actuated(time, acting, p, run)"]
+    return ["", "    def actuated(self, time, u, p, run):", *(f"        {line}" for line in lines)]
+
+
+def _derivative(memories: Sequence[str], rates: list[str]) -> list[str]:
+    if not rates:
+        return []
+    still = [f'rates["{name}"] = torch.zeros_like(x.{name})' for name in memories]
+    return [
+        "",
+        "    def derivative(self, time, x, u, p):",
+        *(f"        {line}" for line in ["rates = self.plain_rates(time, x, u, p)", *still, *rates, "return rates"]),
+        "",
+        "    def plain_rates(self, time, x, u, p):",
+        "        rates = super().derivative(time, x, u, p)",
+        '        return dict(rates) if hasattr(rates, "keys") else dict(zip(self.states, rates))',
+    ]
+
+
+def _sensed(outputs: list[str]) -> list[str]:
+    if not outputs:
+        return []
+    lines = ["y = super().sensed(time, y, p, run)", "shown = dict(y)", *outputs, "return shown"]
+    return ["", "    def sensed(self, time, y, p, run):", *(f"        {line}" for line in lines)]
+
+
+def _remembering(term: Term) -> str:
+    """The state whose rate an effect with memory acts on; empty for others."""
+    kind, _, state = term.port.rpartition("rate of ")
+    return state if kind.startswith("hysteretic") else ""
+
+
+def _memory(state: str) -> str:
+    return f"memory_of_{state}"
+
+
+def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Sequence[str]) -> list[str]:
+    """Assignments that add an effect to what it acts on."""
+    if term.driver is not None or not isinstance(term.effect, CodedEffect):
+        raise SourceError(
+            f"{term.effect.id} cannot be written out as Python: "
+            + ("it is driven by a recorded column." if term.driver else "it has no `code` method.")
+        )
+    shape = {name: _rounded(value) for name, value in term.shape.items()}
+    before: list[str] = []
+    if "rate of " in term.port:
+        state = term.port.rpartition("rate of ")[2]
+        targets, names = [f'rates["{state}"]'], _parts(state, system)
+        before = _load(state) if term.port.startswith("loaded") else []
+        targets += [f'rates["{_memory(one)}"]' for one in [_remembering(term)] if one]
+    elif term.port.startswith("exchange of "):
+        one, _, other = term.port.removeprefix("exchange of ").partition(" and ")
+        targets = [f'rates["{one}"]', f'rates["{other}"]']
+        names = {"own": f"x.{one}", "other": f"x.{other}"}
+    elif term.port.startswith("input "):
+        name = term.port.removeprefix("input ")
+        targets, names = [f"acting.{name}"], {"own": f"u.{name}"}
+    else:
+        targets, names = [f'shown["{name}"]' for name in measured], {name: f'y["{name}"]' for name in measured}
+    added = term.effect.code(gamma, shape, names)
+    each = zip(targets, added, strict=False)
+    return [*before, *(f"{target} = {target} {_signed(expression)}" for target, expression in each)]
+
+
+def _signed(expression: str) -> str:
+    return f"- {expression[1:]}" if expression.startswith("-") else f"+ {expression}"
+
+
+def _parts(state: str, system: Dynamics) -> dict[str, str]:
+    """Expressions of what an effect on the rate of a state refers to."""
+    known = {name: one if isinstance(one, Parameter) else Parameter(one) for name, one in system.parameters.items()}
+    position = next((name for name, rate in kinematic(system, known).items() if rate == state), state)
+    celsius = system.units.get(state, DEFAULT_UNITS.get(state, "")) == "°C"
+    return {
+        "own": f"x.{state}",
+        **dict.fromkeys(("position", "angle", "deflection"), f"x.{position}"),
+        "load": "load",
+        "rate": f'self.plain_rates(time, x, u, p)["{state}"]',
+        "memory": f"x.{_memory(state)}",
+        "zero": "273.15" if celsius else "0.0",
+    }
+
+
+def _load(state: str) -> list[str]:
+    """Lines that compute how hard the inputs work, at this speed, against what acts at standstill without them."""
+    return [
+        f'still = SimpleNamespace(**{{**vars(x), "{state}": torch.zeros_like(x.{state})}})',
+        "idle = SimpleNamespace(**{name: torch.zeros_like(one) for name, one in vars(u).items()})",
+        f'coasting = self.plain_rates(time, x, idle, p)["{state}"]',
+        f'held = self.plain_rates(time, still, idle, p)["{state}"]',
+        f'load = (self.plain_rates(time, x, u, p)["{state}"] - coasting - held).abs()',
+    ]
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{_DIGITS}g}")

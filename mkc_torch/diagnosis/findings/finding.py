@@ -1,0 +1,340 @@
+"""A located effect as a finding that a user reads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.unit_text import ratio, tidy
+from mkc_torch.diagnosis.evidence.held_out import scored
+from mkc_torch.diagnosis.evidence.switched import comes_and_goes, memory_of
+from mkc_torch.diagnosis.findings.formula import formulas
+from mkc_torch.diagnosis.findings.regions import attributed, map_of, region_of, shares_of_runs
+from mkc_torch.diagnosis.findings.what_to_record import SAME, told_by
+from mkc_torch.diagnosis.linearised.estimate import Estimate
+from mkc_torch.diagnosis.model.term import Term, follows_signal
+from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter, Reference
+from mkc_torch.diagnosis.search.locate import Located
+from mkc_torch.diagnosis.search.ranking import SEPARABLE
+from mkc_torch.effects.base import (
+    ComponentsEffect,
+    Effect,
+    FormedEffect,
+    MomentsEffect,
+    PartEffect,
+    PlacedEffect,
+    RelativeEffect,
+    ShapeUnitsEffect,
+    TellingEffect,
+)
+from mkc_torch.effects.context import Context
+from mkc_torch.effects.sensor.unknown import UNKNOWN
+from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
+from mkc_torch.nonlinear import beside
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["finding_of", "gain_of", "intervals_of", "labels", "parameters_of", "places_of"]
+
+_MOST_ALTERNATIVES = 5
+_FARTHEST = 30.0
+_BLOCKS, _MOST_GAIN, _CONCENTRATED = 60, 0.9, 0.35
+_POINTS = 80
+_NORMAL_95 = 1.959964
+_SECONDS = ("lag", "time_constant", "middle", "width", "delay")
+
+
+def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | None, note: str) -> Finding:
+    """The finding for the effect ``number`` of the final model.
+
+    Args:
+        located: the search that named it.
+        final: the final parameters.
+        number: of the effect among the model's terms.
+        held, note: its held-out evidence, or why there is none.
+    """
+    term = final.fit.model.terms[number]
+    gamma, covariance = _own(final, number)
+    context = _context(final, term)
+    channels = places_of(term, context.channels)
+    plausible, told = _plausibility(term, gamma, context)
+    where = attributed(final.fit, number)
+    curve = _curve(term, gamma, covariance, context)
+    shape = _shape_parameters(term, context, final.shape_errors[number])
+    of_time = isinstance(term.effect, Unrecorded)
+    told_as = formulas(curve) if term.effect.id == UNKNOWN and not of_time and curve is not None else ()
+    moments = term.effect.moments(context) if isinstance(term.effect, MomentsEffect) else ()
+    gain, time, onset = gain_of(final, number), final.fit.model.prepared.time, term.shape.get("onset")
+    return Finding(
+        effect=term.effect.id,
+        drivers=term.columns,
+        channels=channels,
+        intervals=intervals_of(gain, time),
+        onset=moments[0] if moments else onset,
+        equation="; ".join([_equation(term, context), *told_as]),
+        explanation=term.effect.explanation,
+        parameters=(*parameters_of(term, gamma, covariance, context), *shape),
+        p_value=located.p_value,
+        held_out=held,
+        held_out_note=note,
+        alternatives=_alternatives(located, term),
+        plausible=plausible,
+        plausibility=told,
+        curve=curve,
+        region=None if where is None else region_of(where),
+        experiments=() if where is None else shares_of_runs(where),
+        map=None if where is None else map_of(where),
+        moments=moments,
+        references=_references(term),
+        advice=term.effect.advice,
+        again=_again(term.effect),
+        placed=isinstance(term.effect, PlacedEffect) and term.effect.placed,
+        comes_and_goes=onset is not None and comes_and_goes(gain, time, onset, memory_of(final.colour.coefficients)),
+    )
+
+
+def _equation(term: Term, context: Context) -> str:
+    """In the form that the shape chose."""
+    effect = term.effect
+    return effect.equation_of(term.shape, context) if isinstance(effect, FormedEffect) else effect.equation
+
+
+def _references(term: Term) -> tuple[Reference, ...]:
+    if term.driver is None:
+        return ()
+    values = term.driver.reference.tolist()
+    return tuple(Reference(*one) for one in zip(term.columns, values, term.driver.units, strict=True))
+
+
+def _again(effect: Effect) -> str:
+    return effect.again if isinstance(effect, TellingEffect) else ""
+
+
+def places_of(term: Term, channels: Sequence[str]) -> tuple[str, ...]:
+    """Where a term acts, as a user reads it: channels of a residual, or the rates and inputs of a simulation."""
+    if "rate of " in term.at or term.at.startswith("exchange of "):
+        return tuple(f"rate of {name}" for name in channels)
+    return tuple(f"input {name}" for name in channels) if term.at.startswith("input ") else tuple(channels)
+
+
+def _own(final: Estimate, number: int) -> tuple[Tensor, Tensor]:
+    """γ of one effect and its covariance."""
+    model = final.fit.model
+    start = model.base + sum(model.sizes[:number])
+    mine = slice(start, start + model.sizes[number])
+    return final.fit.parameters[mine], final.covariance[mine, mine]
+
+
+def _context(final: Estimate, term: Term) -> Context:
+    model = final.fit.model
+    return term.context(model.prepared, model.signals(final.fit.parameters).get(term.port))
+
+
+def parameters_of(
+    term: Term, gamma: Float[Tensor, " q"], covariance: Float[Tensor, "q q"], context: Context
+) -> tuple[Parameter, ...]:
+    """γ as named quantities with units and standard errors."""
+    error = covariance.diagonal().clamp(min=0.0).sqrt()
+    readings = getattr(term.effect, "readings", None)
+    parameters, start = [], 0
+    for quantity in term.effect.quantities(term.shape, context):
+        mine = slice(start, start + quantity.size)
+        value, spread = gamma[mine], error[mine]
+        start += quantity.size
+        if readings is not None:
+            value, spread = readings(quantity.name, value, covariance[mine, mine])
+        components = _components(term, quantity.name, quantity.size, context)
+        parameters.append(Parameter(quantity.name, _numbers(value), _numbers(spread), tidy(quantity.unit), components))
+    return tuple(parameters)
+
+
+def _components(term: Term, quantity: str, size: int, context: Context) -> tuple[str, ...]:
+    """What the numbers of a quantity are: as the effect says, or one for each channel."""
+    if size < 2:
+        return ()
+    own = term.effect.components(quantity, term.shape, context) if isinstance(term.effect, ComponentsEffect) else ()
+    return own or (tuple(context.channels) if size == len(context.channels) else ())
+
+
+def _shape_parameters(term: Term, context: Context, errors: Mapping[str, float]) -> tuple[Parameter, ...]:
+    chosen = term.effect.choices if isinstance(term.effect, FormedEffect) else ()
+    return tuple(
+        Parameter(name, value, errors.get(name), _unit_of_shape(term, name, context))
+        for name, value in term.shape.items()
+        if name != "onset" and not name.startswith(COURSE) and name not in chosen
+    )
+
+
+def _unit_of_shape(term: Term, name: str, context: Context) -> str:
+    if isinstance(term.effect, RelativeEffect) and name in term.effect.relative:
+        part = term.effect.relative[name][0]
+        return context.units[0] if part == "driver" else context.unit_of(part)
+    if isinstance(term.effect, ShapeUnitsEffect) and (own := term.effect.unit_of_shape(name, context)):
+        return own
+    return "s" if name in _SECONDS else ""
+
+
+def _numbers(values: Tensor) -> Number:
+    if values.dim() == 0 or values.numel() == 1:
+        return float(values)
+    return tuple(_numbers(v) for v in values)
+
+
+def _plausibility(term: Term, gamma: Tensor, context: Context) -> tuple[bool, str]:
+    limit = term.effect.plausible
+    first = term.effect.quantities(term.shape, context)[0]
+    largest = float(gamma[: first.size].abs().max())
+    if not math.isfinite(limit):
+        return True, "No plausible size is known for this effect; judge it by its equation."
+    known = getattr(term.effect, "plausible_unit", "") or first.unit
+    times = ratio(known, first.unit)
+    if times is None:
+        return True, f"Its size is in {first.unit or 'no unit'}; what is plausible is known in {known} alone."
+    limit *= times
+    unit = f" {tidy(first.unit)}" if first.unit else ""
+    told = f"Its largest value, {largest:.3g}{unit}, is"
+    if largest <= limit:
+        return True, f"{told} within the {limit:g}{unit} that is plausible ({term.effect.source})."
+    return False, f"{told} beyond the {limit:g}{unit} that is plausible ({term.effect.source}): doubt it."
+
+
+def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
+    """Rivals of the search, nearest first: all that the data do not tell apart, and the next few."""
+    found = []
+    if term.driver is not None:
+        found += [
+            Alternative(term.effect.id, (copy,), 0.0, False, term.at, told_by=SAME) for copy in term.driver.copies
+        ]
+    own = [ranked.number for ranked in located.ranking if located.terms[ranked.number].key == term.key]
+    for ranked in located.ranking:
+        rival = located.terms[ranked.number]
+        if rival.key == term.key or ranked.gap > _FARTHEST:
+            continue
+        gap = max(ranked.gap, 0.0)
+        again, told = _again(rival.effect), ""
+        if own and gap < SEPARABLE:
+            told = told_by(located, own[0], ranked.number)
+        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= SEPARABLE, rival.at, again, told))
+    near = [a for a in found if not a.separable]
+    return tuple(near + [a for a in found if a.separable][: max(0, _MOST_ALTERNATIVES - len(near))])
+
+
+def gain_of(final: Estimate, number: int) -> Float[Tensor, " N"]:
+    """What one effect gains at each sample, in nats, all else as it is."""
+    fit = final.fit
+    model, parameters = fit.model, fit.parameters.clone()
+    start = model.base + sum(model.sizes[:number])
+    with_it = scored(model.residual(parameters), fit.sigma, fit.d, fit.bound)
+    parameters[start : start + model.sizes[number]] = 0.0
+    return (with_it - scored(model.residual(parameters), fit.sigma, fit.d, fit.bound)).detach()
+
+
+def intervals_of(gain: Float[Tensor, " N"], time: Float[Tensor, " N"]) -> tuple[tuple[float, float], ...]:
+    """Where an effect's gain is concentrated: the fewest of sixty blocks that hold nine tenths of it.
+
+    Empty where that is more than a third of the recording, and where runs share their times.
+    """
+    N = len(time)
+    count = min(_BLOCKS, N // 10)
+    if count < 10 or bool((time.diff() < 0).any()):
+        return ()
+    block = (torch.arange(N) * count).div(N, rounding_mode="floor")
+    total = gain.new_zeros(count).index_add(0, block, gain).clamp(min=0.0)
+    order = total.argsort(descending=True)
+    needed = int((total[order].cumsum(0) < _MOST_GAIN * total.sum()).sum()) + 1
+    if float(total.sum()) <= 0 or needed > _CONCENTRATED * count:
+        return ()
+    inside = torch.zeros(count, dtype=torch.bool)
+    inside[order[:needed]] = True
+    intervals: list[tuple[float, float]] = []
+    for k in inside.nonzero().squeeze(-1).tolist():
+        rows = (block == k).nonzero().squeeze(-1)
+        first, last = float(time[rows[0]]), float(time[rows[-1]])
+        if intervals and inside[k - 1] and k > 0:
+            intervals[-1] = (intervals[-1][0], last)
+        else:
+            intervals.append((first, last))
+    return tuple(intervals)
+
+
+def _curve(term: Term, gamma: Tensor, covariance: Tensor, context: Context) -> Curve | None:
+    """The effect's change at its port along its driver, along the signal, or along time, with its 95 % band."""
+    made = _along(term, context)
+    if made is None:
+        return None
+    driver, unit, x, synthetic = made
+    shape = {name: value for name, value in term.shape.items() if name != "lag"}
+
+    def change(gamma: Tensor) -> Tensor:
+        return term.effect.change(gamma, shape, replace(synthetic, signal=beside(synthetic.signal, gamma[0])))
+
+    slope = torch.func.jacfwd(change)(gamma)
+    variance = torch.einsum("ncq,qr,ncr->nc", slope, covariance, slope).clamp(min=0.0)
+    channels, value_unit = places_of(term, context.channels), tidy(context.signal_unit)
+    return Curve(driver, unit, x, change(gamma), _NORMAL_95 * variance.sqrt(), channels, value_unit)
+
+
+def _along(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | None:
+    if context.parts and term.driver is None:
+        return _along_part(term, context)
+    flat = context.signal.median(0).values.expand(_POINTS, -1)
+    if term.driver is not None:
+        values = context.drivers
+        if values.shape[1] == 1:
+            x = torch.linspace(float(values.min()), float(values.max()), _POINTS, dtype=values.dtype)
+            drivers, name, unit = x.unsqueeze(-1), term.columns[0], term.driver.units[0]
+            shown = x + term.driver.reference
+        else:
+            direction = torch.linalg.svd(values - values.mean(0), full_matrices=False).Vh[0]
+            along = values @ direction
+            x = torch.linspace(float(along.min()), float(along.max()), _POINTS, dtype=values.dtype)
+            drivers, unit, shown = x.unsqueeze(-1) * direction, term.driver.units[0], x
+            name = f"{term.columns[0].rpartition('_')[0]}, main direction"
+        time = torch.arange(_POINTS, dtype=values.dtype)
+        return name, unit, shown, replace(context, time=time, drivers=drivers, signal=flat)
+    if follows_signal(term.effect):
+        reach = float(context.signal.abs().max())
+        x = torch.linspace(-reach, reach, _POINTS, dtype=context.signal.dtype)
+        signal = x.unsqueeze(-1).expand(-1, context.signal.shape[1])
+        time = torch.arange(_POINTS, dtype=x.dtype)
+        none = context.drivers.new_zeros(_POINTS, 0)
+        return "field on the axis", context.signal_unit, x, replace(context, time=time, signal=signal, drivers=none)
+    index = torch.linspace(0, len(context.time) - 1, 4 * _POINTS).long()
+    time, signal = context.time[index], context.signal[index]
+    none = context.drivers.new_zeros(len(index), 0)
+    return "time", "s", time, replace(context, time=time, drivers=none, signal=signal)
+
+
+def _along_part(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | None:
+    """Over the range of the part of the signal that the effect mainly follows, the others at their medians."""
+    part = term.effect.along if isinstance(term.effect, PartEffect) else ""
+    if part not in context.parts:
+        return None
+    name = context.parts[part]
+    values = context.component(name)
+    x = torch.linspace(float(values.min()), float(values.max()), _POINTS, dtype=values.dtype)
+    signal = context.signal.median(0).values.expand(_POINTS, -1).clone()
+    signal[:, (context.carries or context.channels).index(name)] = x
+    time = torch.arange(_POINTS, dtype=x.dtype)
+    synthetic = replace(context, time=time, signal=signal, drivers=context.drivers.new_zeros(_POINTS, 0))
+    return name, context.unit_of(part), x, synthetic
+
+
+def labels(terms: Sequence[Term]) -> tuple[str, ...]:
+    """``effect (driver)`` of terms, and at which place of a simulation where several could be meant."""
+    places: dict[tuple[str, tuple[str, ...]], set[str]] = {}
+    for term in terms:
+        places.setdefault((term.effect.id, term.columns), set()).add(term.port)
+    several = {key for key, found in places.items() if len(found) > 1}
+    return tuple(
+        t.effect.id
+        + (f" ({', '.join(t.columns)})" if t.columns else "")
+        + (f" at {t.port}" if (t.effect.id, t.columns) in several else "")
+        for t in terms
+    )

@@ -1,0 +1,58 @@
+"""The noise that is left, in words and numbers."""
+
+from __future__ import annotations
+
+import torch
+
+from mkc_torch.diagnosis.evidence.density import density_checks
+from mkc_torch.diagnosis.linearised.estimate import Estimate
+from mkc_torch.diagnosis.linearised.tangents import CORNERS
+from mkc_torch.diagnosis.result import Noise, Number
+
+__all__ = ["noise_summary"]
+
+_CLEAR = 3.0
+"""Nats by which a wander has to be likelier than none to be told of."""
+
+_COLOURED = 0.05
+"""Sum of squared autoregression coefficients from which noise is called coloured."""
+
+
+def noise_summary(final: Estimate) -> Noise:
+    """White, autoregressive, or wandering like a random walk, with its numbers, and how well its density fits."""
+    fit, wander = final.fit, final.noise
+    prepared = fit.model.prepared
+    orders = final.colour.coefficients
+    coloured = any(float(phi.square().sum()) > _COLOURED for phi in orders)
+    parameters: dict[str, Number] = {}
+    units: dict[str, str] = {}
+    clear = wander.size > 0 and wander.gain > _CLEAR
+    if clear:
+        parameters["wander"] = final.wander_spread
+        units["wander"] = next(port.unit for port in prepared.ports.values() if port.wanders)
+        if wander.family > 0:
+            length = float(prepared.time[-1] - prepared.time[0])
+            parameters["wander_period"] = 2.0 * length / CORNERS[wander.family - 1]
+            units["wander_period"] = "s"
+    if coloured:
+        parameters["autoregression"] = tuple(tuple(phi.tolist()) for phi in orders)
+    if clear and wander.family == 0:
+        model = "random_walk"
+        size = f"{parameters['wander']:.2g} {units['wander']}"
+        told = f"noise around an offset that wanders like a random walk, by {size} in all"
+    elif clear or coloured:
+        model, told = "ar", "coloured noise" + (", with a slow part that enters with the offset" if clear else "")
+    else:
+        model, told = "white", "white noise"
+    tail = "Gaussian" if bool(torch.isinf(fit.sigma).all()) else "heavy-tailed"
+    return Noise(
+        model,  # type: ignore[arg-type]
+        parameters,
+        tuple(fit.sigma.tolist()),
+        tuple(fit.d.tolist()),
+        tuple(fit.bound.tolist()),
+        f"{tail} {told}",
+        units,
+        prepared.unit,
+        density_checks(fit.residual, fit.sigma, fit.d, fit.bound, prepared.channels),
+    )

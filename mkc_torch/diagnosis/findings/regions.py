@@ -1,0 +1,173 @@
+"""Where in the space of a simulation's states, and in which of its runs, a finding's gain arises.
+
+The gain of an effect is the integral of the likelihood's slope along the way from nothing to its size, and the slope is
+a sum over the moments at which the effect acts: integrated gradients (Sundararajan, Taly & Yan, ICML 2017), through the
+simulation. What is summed belongs to a moment's states, though the outputs show it later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.evidence.held_out import scored
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.joint import with_constant
+from mkc_torch.diagnosis.result import Region, StateMap
+from mkc_torch.simulation.protocol import Changes
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+__all__ = ["Attribution", "attributed", "map_of", "region_of", "shares_of_runs"]
+
+_NODES = 6
+_TIMES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
+_CLEARLY = 0.3
+"""What the share of the gain in a region has to exceed its share of the time by to be told."""
+
+_MOST, _SLICES = 1.25, 20
+"""Where more is gained than this share of the gain, and lost elsewhere, it says nothing of where the gain arises."""
+
+_BINS = 24
+_REVERSES = 0.05
+
+
+@dataclass(frozen=True)
+class Attribution:
+    """The gain of an effect, moment by moment.
+
+    Attributes:
+        nats: (G,), of each moment at the port; their sum is the gain.
+        places: by name, the components of the signal that passes the port, (G,) each.
+        units: of these, where they are known.
+        parts: what some of them are to each other, such as ``{"own": "speed", "position": "angle"}``.
+        run: (G,), number of each moment's run; None where there are no runs.
+    """
+
+    nats: Float[Tensor, " G"]
+    places: Mapping[str, Float[Tensor, " G"]]
+    units: Mapping[str, str]
+    parts: Mapping[str, str]
+    run: Int[Tensor, " G"] | None
+
+
+def attributed(fit: FittedModel, number: int) -> Attribution | None:
+    """The gain of one effect of a model, the rest of its parameters held.
+
+    Args:
+        fit: the model.
+        number: of the effect among its terms.
+
+    Returns:
+        The attribution; None for a port of which it is not known what its components are to each other, and where the
+        simulation has no answer without the effect.
+    """
+    model, term = fit.model, fit.model.terms[number]
+    prepared, port = model.prepared, model.prepared.ports[term.port]
+    if not port.parts:
+        return None
+    start = model.base + sum(model.sizes[:number])
+    mine = slice(start, start + model.sizes[number])
+    gamma = fit.parameters[mine]
+    width = len(port.channels)
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    signal = model.signals(fit.parameters)[term.port].detach()
+    nats = torch.zeros_like(signal[:, 0])
+    for node, weight in zip(0.5 * (nodes + 1.0), 0.5 * weights, strict=True):
+        parameters = fit.parameters.clone()
+        parameters[mine] = node * gamma
+        changes = model.changes(parameters)
+        there = model.signals(parameters)[term.port]
+
+        def likelihood(change: Tensor, theta: Tensor = parameters[: model.base], changes: Changes = changes) -> Tensor:
+            residual = prepared.residual(theta, with_constant(changes, term.port, change))
+            return scored(residual, fit.sigma, fit.d, fit.bound).sum()
+
+        slope = torch.func.grad(likelihood)(there.new_zeros(len(there), width))
+        added = term.effect.change(gamma, term.shape, term.context(prepared, there))[:, :width]
+        nats = nats + float(weight) * (slope * added).sum(-1)
+    if not bool(nats.isfinite().all()):
+        return None
+    names = port.carries or port.channels
+    units = {name: port.part_units[part] for part, name in port.parts.items() if port.part_units.get(part)}
+    # where a rate is large is not where a system is
+    places = {
+        name: course for name, course in zip(names, signal.unbind(-1), strict=False) if name != port.parts.get("rate")
+    }
+    return Attribution(nats.detach(), places, units, port.parts, port.run)
+
+
+def region_of(found: Attribution) -> Region | None:
+    """The part of one state's range whose share of the gain exceeds its share of the time most; None if not clearly."""
+    whole = float(found.nats.sum())
+    if not whole > 0.0:
+        return None
+    best: Region | None = None
+    for name, values in found.places.items():
+        if _gained(found.nats, values) > _MOST * whole:
+            continue
+        for kind, bound, inside in _parts_of(values):
+            time = float(inside.double().mean())
+            gain = float(found.nats[inside].sum()) / whole
+            region = Region(name, found.units.get(name, ""), kind, bound, min(gain, 1.0), time)
+            if best is None or gain - time > best.share_of_gain - best.share_of_time:
+                best = region
+    if best is None or best.share_of_gain - best.share_of_time < _CLEARLY:
+        return None
+    return best
+
+
+def _gained(nats: Float[Tensor, " G"], values: Float[Tensor, " G"]) -> float:
+    """Sum over those slices of a state's range that gain; slices of as many moments each."""
+    return sum(max(float(part.sum()), 0.0) for part in nats[values.argsort()].chunk(_SLICES))
+
+
+def _parts_of(values: Float[Tensor, " G"]) -> Iterator[tuple[str, float, Bool[Tensor, " G"]]]:
+    """Ends of the range, and where values of either sign occur, its middle and what is far from it."""
+    if float(values.max()) == float(values.min()):
+        return
+    shares = values.new_tensor(_TIMES)
+    low, high = values.quantile(shares).tolist(), values.quantile(1.0 - shares).tolist()
+    yield from (("below", bound, values <= bound) for bound in low)
+    yield from (("above", bound, values >= bound) for bound in high)
+    if min(float((values > 0).double().mean()), float((values < 0).double().mean())) > _REVERSES:
+        size = values.abs()
+        near, far = size.quantile(shares).tolist(), size.quantile(1.0 - shares).tolist()
+        yield from (("near zero", bound, size <= bound) for bound in near)
+        yield from (("far from zero", bound, size >= bound) for bound in far)
+
+
+def shares_of_runs(found: Attribution) -> tuple[float, ...]:
+    """Each run's share of the gain; empty for a single one, and where some lose what others gain."""
+    if found.run is None or not float(found.nats.sum()) > 0.0:
+        return ()
+    count = int(found.run.max()) + 1
+    if count < 2:
+        return ()
+    total = found.nats.new_zeros(count).index_add(0, found.run, found.nats)
+    shares = total / total.sum()
+    return tuple(shares.tolist()) if float(shares.max()) <= _MOST else ()
+
+
+def map_of(found: Attribution) -> StateMap | None:
+    """The gain over the position and its speed, or over the two components that an effect refers to; None for one."""
+    order = [found.parts[part] for part in ("position", "own", "other", "sideways") if part in found.parts]
+    names = list(dict.fromkeys(name for name in (*order, *found.places) if name in found.places))
+    names = [name for name in names if float(found.places[name].max()) > float(found.places[name].min())][:2]
+    if len(names) < 2:
+        return None
+    x, y = (found.places[name] for name in names)
+    edges = [torch.linspace(float(v.min()), float(v.max()), _BINS + 1, dtype=v.dtype) for v in (x, y)]
+    across, up = (torch.bucketize(v.contiguous(), e[1:-1].contiguous()) for v, e in zip((x, y), edges, strict=True))
+    cell = across * _BINS + up
+    zero = found.nats.new_zeros(_BINS * _BINS)
+    moments = zero.index_add(0, cell, torch.ones_like(found.nats))
+    nats = zero.index_add(0, cell, found.nats)
+    nats = torch.where(moments > 0, nats, torch.nan).reshape(_BINS, _BINS)
+    return StateMap((names[0], names[1]), tuple(found.units.get(n, "") for n in names), (edges[0], edges[1]), nats)

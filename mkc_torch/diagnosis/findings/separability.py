@@ -1,0 +1,35 @@
+"""How well candidates can be told apart on a recording, whatever is found in it."""
+
+from __future__ import annotations
+
+import torch
+
+from mkc_torch.diagnosis.findings.finding import labels
+from mkc_torch.diagnosis.result import Separability
+from mkc_torch.diagnosis.search.locate import Located
+
+__all__ = ["separability"]
+
+_MOST = 8
+
+
+def separability(located: Located) -> Separability:
+    """The matrix of the leading candidates, each at its best shape, in the metric of the noise.
+
+    The trace of a candidate is its tangent along the γ that fits best. Its share is the squared length that is left
+    once the simulation's own parameters, and then the rival, have taken over what they can, over that before the rival.
+    """
+    numbers = [ranked.number for ranked in located.ranking[:_MOST]]
+    traces, spaces, left = [], [], []
+    for number in numbers:
+        trace, space, kept = located.linearised.search.trace(number, located.linearised.series)
+        traces.append(trace)
+        spaces.append(space)
+        left.append(kept)
+    share = torch.ones(len(numbers), len(numbers), dtype=torch.float64)
+    for i, trace in enumerate(traces):
+        length = float(trace.square().sum())
+        for j, space in enumerate(spaces):
+            taken = float((space.mT @ trace).square().sum())
+            share[i, j] = max(0.0, 1.0 - taken / length) if i != j and length > 0 else 0.0
+    return Separability(labels([located.terms[n] for n in numbers]), share, torch.tensor(left, dtype=torch.float64))

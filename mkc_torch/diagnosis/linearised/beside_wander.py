@@ -1,0 +1,111 @@
+"""Pseudo-residuals around a wander: an outlier is what is far from the noise's own slow course, not from zero."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.density.fit import fit_density
+from mkc_torch.diagnosis.linearised.linearise import Linearised, linearise
+from mkc_torch.diagnosis.linearised.tangents import Slow, Tangents
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.noise.bursts import near_median, of_all, out_of_bursts, together
+from mkc_torch.diagnosis.noise.pseudo_residual import pseudo_residual
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["Local", "beside_wander", "explained"]
+
+_ROUNDS = 4
+
+_MEDIANS = 75
+"""Windows of a running median that make up a recording."""
+
+_FAR = 2.6
+"""Robust scales beyond which what is left beside the wander does not count. Where outliers five scales away are many,
+the likeliest density is so wide that most of them would, and in bursts of one sign they pass for a wander."""
+
+_ALIKE = 1e-10
+"""Smallest eigenvalue, over the largest, of tangents on scales of their own that still tells them apart."""
+
+_EXCEPTION = 1.0 / 3.0
+"""Largest share of the residuals that can be bursts: what is off more often is physics that is not in the model yet."""
+
+_SETTLED = 5e-3
+"""Share of the residuals that may still come to count or cease to."""
+
+
+@dataclass(frozen=True)
+class Local:
+    """Residuals that are judged by their distance from the wander, and the noise they make.
+
+    Attributes:
+        values: the pseudo-residuals.
+        counts: 0 where a residual is rejected.
+        noise: their colour and wander; a search without candidates.
+        slow: the courses of the wander, with the share of each channel.
+    """
+
+    values: Float[Tensor, "N m"]
+    counts: Float[Tensor, "N m"]
+    noise: Linearised
+    slow: Slow | None
+
+
+def beside_wander(fit: FittedModel, model: JointModel, parameters: Float[Tensor, " p"], tangents: Tangents) -> Local:
+    """The pseudo-residual of a fit, around the likeliest wander of its noise.
+
+    The fit alone takes a wander that is larger than the white noise for a heavy tail, and turns down its excursions.
+
+    Args:
+        fit: its residuals are judged.
+        model, parameters: where the tangents are from; ``fit`` may have a term more.
+        tangents: of the parameters and of the ports.
+    """
+    slow = tangents.slow
+    if slow is None:
+        values, counts = fit.pseudo
+        return Local(values, counts, linearise(model, parameters, values, counts, tangents.bare), None)
+    # a burst must not pull the first course its way
+    counts = near_median(fit.residual, len(fit.residual) // _MEDIANS)
+    values = counts * fit.residual
+    noise = linearise(model, parameters, values, counts, tangents.bare, white=True)
+    family = noise.search.noise_fit(noise.series).family
+    for number in range(_ROUNDS):
+        course = slow.course(noise.search.courses(noise.series))
+        # beside a wander the simulation's own parameters are not where a fit without one has them
+        course = course + explained(fit.residual - course, counts, tangents.nuisance)
+        quick = fit.residual - course
+        density = fit_density(quick, bound=fit.bound)
+        before = counts
+        values, counts = pseudo_residual(quick, density.sigma, density.d)
+        alone = out_of_bursts((quick.abs() <= _FAR * robust_scale(quick)).to(quick.dtype))
+        near = of_all(alone * together(quick, counts * alone))
+        if float(near.mean()) < 1.0 - _EXCEPTION:
+            near = alone
+        values, counts = values * near, counts * near
+        values = values + counts * course
+        if number > 0 and float((counts != before).double().mean()) < _SETTLED:
+            break
+        slow = slow.with_shares(noise.search.shares(noise.series, slow.channels))
+        one = replace(tangents.bare, slow=slow.of_family(family))
+        noise = linearise(model, parameters, values, counts, one, colour=noise.colour_beside())
+    noise = linearise(model, parameters, values, counts, replace(tangents.bare, slow=slow), near=noise.colour_beside())
+    return Local(values, counts, noise, slow)
+
+
+def explained(
+    values: Float[Tensor, "N m"], counts: Float[Tensor, "N m"], nuisance: Float[Tensor, "N m p"]
+) -> Float[Tensor, "N m"]:
+    """What the simulation's own parameters explain of it, by least squares where samples count."""
+    columns = (counts.unsqueeze(-1) * nuisance).flatten(0, 1)
+    scale = torch.linalg.vector_norm(columns, dim=0).clamp(min=1e-300).reciprocal()
+    gram = scale.unsqueeze(-1) * (columns.mT @ columns) * scale
+    inner = scale * (columns.mT @ (counts * values).flatten())
+    return nuisance @ (scale * (torch.linalg.pinv(gram, hermitian=True, rtol=_ALIKE) @ inner))

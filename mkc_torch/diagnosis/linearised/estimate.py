@@ -1,0 +1,139 @@
+"""The final parameters: one step of generalised least squares from the robust fit, and their covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.linearised.beside_wander import Local, beside_wander
+from mkc_torch.diagnosis.linearised.linearise import linearise
+from mkc_torch.diagnosis.linearised.tangents import Tangents, tangents_of
+from mkc_torch.diagnosis.linearised.wander import NoiseFit
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.grid import reach_of
+from mkc_torch.diagnosis.model.shaped import ShapedModel
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.noise.colour import Colour
+from mkc_torch.nonlinear import beside
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["Estimate", "estimate"]
+
+_MOST_ERRORS = 5.0
+
+_AT_END = 1e-6
+_UNKNOWN = 0.5
+"""Share of a number beyond which its error says no more than that it is not known."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A fit with its final parameters, their covariance (p, p), and the noise that is left.
+
+    Attributes:
+        fit, covariance: what was found.
+        noise, colour: that are left; ``wander_spread`` is that of the wander over the recording, in its port's unit.
+        shape_errors: standard errors of the numbers of each effect's shape that were fitted and are known.
+    """
+
+    fit: FittedModel
+    covariance: Float[Tensor, "p p"]
+    noise: NoiseFit
+    colour: Colour
+    wander_spread: float
+    shape_errors: tuple[Mapping[str, float], ...]
+
+    @property
+    def standard_error(self) -> Float[Tensor, " p"]:
+        return self.covariance.diagonal().clamp(min=0.0).sqrt()
+
+    def at_least(self, error: Float[Tensor, " p"]) -> Estimate:
+        """The same with standard errors that are nowhere smaller than these; correlations stay."""
+        own = self.standard_error
+        larger = torch.where(own > 0, torch.maximum(error / own.clamp(min=1e-300), torch.ones_like(own)), 1.0)
+        return replace(self, covariance=larger.unsqueeze(-1) * self.covariance * larger)
+
+
+def estimate(fit: FittedModel) -> Estimate:
+    """One step of generalised least squares on the pseudo-residuals, with the colour and wander of their noise.
+
+    The M-estimate weighs samples as if they were independent; where noise is coloured this step is the more precise
+    one, and its covariance respects the autocorrelation. A step of more than five standard errors is a fit that the
+    noise model does not describe, and is not taken.
+    """
+    model, parameters = fit.model, fit.parameters
+    tangents = tangents_of(model, parameters)
+    local = beside_wander(fit, model, parameters, tangents)
+    found = linearise(
+        model,
+        parameters,
+        local.values,
+        local.counts,
+        replace(tangents, slow=local.slow),
+        colour=local.noise.colour,
+        joint=True,
+    )
+    step, covariance = found.search.estimate(0, found.series)
+    error = covariance.diagonal().clamp(min=1e-300).sqrt()
+    if float((step.abs() / error).max()) <= _MOST_ERRORS:
+        parameters = parameters - step
+        if model.bounds is not None:
+            parameters = parameters.clamp(*model.bounds)
+        residual = model.residual(parameters).detach()
+        # there may be no trajectory a step away
+        if bool(residual.isfinite().all()):
+            fit = replace(fit, parameters=parameters, residual=residual)
+    noise = found.search.noise_fit(found.series)
+    spread = found.search.wander_spread(noise) if noise.size > 0 else 0.0
+    plain = Estimate(fit, covariance, noise, found.colour, spread, tuple({} for _ in fit.model.terms))
+    return _shapes_free(plain.at_least(found.search.doubted_error(0, found.series)), tangents, local)
+
+
+def _shapes_free(plain: Estimate, tangents: Tangents, local: Local) -> Estimate:
+    """The same with what the fitted numbers of shapes leave unknown of the parameters, and of themselves.
+
+    A number at the end of its range is held there, as it was in the fit.
+    """
+    model, parameters = plain.fit.model, plain.fit.parameters
+    inside = [_inside(term, reach_of(term, model.prepared)) for term in model.terms]
+    shaped = ShapedModel(model, inside)
+    start = shaped.start(parameters)
+    if shaped.size == shaped.joint:
+        return plain
+
+    def residual(numbers: Tensor) -> Tensor:
+        return shaped.residual(torch.cat([beside(parameters, numbers[0]), numbers]))
+
+    model.residual(parameters)  # forward mode starts from the trajectory that was found last
+    columns = torch.func.jacfwd(residual)(start[shaped.joint :])
+    if not bool(columns.isfinite().all()):
+        return plain
+    wide = replace(tangents, nuisance=torch.cat([tangents.nuisance, columns], -1), slow=local.slow)
+    found = linearise(shaped, start, local.values, local.counts, wide, colour=local.noise.colour, joint=True)
+    error = found.search.estimate(0, found.series)[1].diagonal().clamp(min=0.0).sqrt()
+    numbers = [term.shape[name] for term, reach in zip(model.terms, inside, strict=True) for name in reach]
+    errors = shaped.per_effect(shaped.spread(numbers, error[shaped.joint :]).tolist())
+    known = [
+        {
+            name: one
+            for name, one in found.items()
+            if 0.0 < one < _UNKNOWN * (term.shape[name] if reach[name][0] > 0 else reach[name][1])
+        }
+        for term, reach, found in zip(model.terms, inside, errors, strict=True)
+    ]
+    return replace(plain.at_least(error[: shaped.joint]), shape_errors=tuple(known))
+
+
+def _inside(term: Term, reach: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    """The numbers of a shape that are not at an end of their range."""
+    return {
+        name: (low, high)
+        for name, (low, high) in reach.items()
+        if low + _AT_END * abs(low) < term.shape[name] < high - _AT_END * abs(high)
+    }

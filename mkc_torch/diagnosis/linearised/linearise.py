@@ -1,0 +1,367 @@
+"""From a fitted model to a search: tangents of the parameters, of every candidate and of wandering noise, whitened."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch._parallel.fork import shared
+from mkc_torch.diagnosis.linearised.linear_search import Gains, LinearSearch
+from mkc_torch.diagnosis.linearised.tangents import AT_ONCE, Slow, Tangents, in_blocks
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.noise.colour import (
+    Colour,
+    autoregressive,
+    colour_of,
+    colour_of_fast,
+    enters_at_port,
+    port_colour,
+)
+from mkc_torch.diagnosis.noise.cosine_basis import dct
+from mkc_torch.diagnosis.noise.gaps import Filling, Gaps
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["Linearised", "linearise"]
+
+
+_MOST, _MARGIN, _FEWEST = 0.9, 3.0, 1000
+_FILLED_AT_ONCE = 64
+"""Candidates whose tangents are moved about together: they stay in a core's own memory. To fill them, a large matrix
+passes by each time."""
+
+_ALTERNATIONS, _SETTLED = 8, 10.0
+"""Steps at most between the colour and a wander beside it, and the nats that a step has to bring: as many as a colour,
+which is some twenty numbers, gains by chance."""
+
+_REACHED = 0.98
+"""Share of a random walk's power that lies at the frequencies that it reaches."""
+
+_PLAUSIBLE = 6.0
+"""Nats that a colour may be less likely than another one: as many as one of more numbers gains by chance."""
+
+_FARTHEST = 10.0
+"""Times that a step may go beyond, of the root of a spectrum."""
+
+_REFILLED = 2
+"""Times that the colour is read again, with what it says of rejected samples."""
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """A search and the series it is about.
+
+    Attributes:
+        search: over the candidates.
+        series: (M,), the whitened pseudo-residual, and what the prior pulls at.
+        colour: of the stationary part of the noise.
+        entrance: where wandering noise enters, coloured noise may too: the port's pointwise tangents, and the
+            autoregression of noise that gives such residuals; None where there is no such port.
+        filling: what stands in for rejected samples.
+        others: noise from where the alternation between colour and wander was not begun.
+    """
+
+    search: LinearSearch
+    series: Float[Tensor, " M"]
+    colour: Colour
+    entrance: tuple[Tensor, Tensor] | None
+    filling: Filling
+    others: tuple[Linearised, ...] = ()
+
+    def plausible(self) -> list[Colour]:
+        """Other colours that the noise may have: nearly as likely ones, to which the alternation comes from elsewhere.
+
+        A spectrum of twenty numbers that a wander hides in part has several.
+        """
+        settled = [_settled(one) for one in self.others]
+        return [one.colour for one in settled if one.evidence > self.evidence - _PLAUSIBLE]
+
+    def colour_beside(self) -> Colour:
+        """The colour of what is left beside the wander."""
+        K, m = self.colour.root.shape
+        power = self.search.stationary(self.series)[: K * m].unflatten(0, (K, m))
+        return colour_of(power * self.colour.root.square())
+
+    @property
+    def wanders(self) -> bool:
+        """Whether a wander makes the noise likelier."""
+        return self.search.noise_fit(self.series).gain > 0
+
+    def colour_ahead(self) -> Colour:
+        """Twice as far from the present colour as :meth:`colour_beside`: that goes slowly where a wander is strong.
+
+        Salakhutdinov & Roweis, "Adaptive overrelaxed bound optimization methods", ICML (2003).
+        """
+        step = self.colour_beside()
+        beyond = (step.root / self.colour.root).clamp(1.0 / _FARTHEST, _FARTHEST)
+        return replace(step, root=step.root * beyond)
+
+    def recoloured(self, colour: Colour) -> Linearised:
+        """The same beside noise of another colour, with what stands in for rejected samples as it is."""
+        factor = (self.colour.root / colour.root).flatten()
+        own, rows = self.series[: len(factor)], len(self.series) - len(factor)
+        # what the prior pulls at is on the scale of the residuals
+        scale = (factor * own).std() / own.std()
+        factor = torch.cat([factor, scale.expand(rows)])
+        return replace(self, search=self.search.scaled(factor), series=factor * self.series, colour=colour)
+
+    @property
+    def evidence(self) -> float:
+        """Log-likelihood of the residuals by their own noise, up to a constant that all noise of a recording shares."""
+        log_det = float(self.colour.root.log().sum()) + 0.5 * self.filling.log_det
+        return self.search.noise_fit(self.series).log_likelihood - log_det
+
+    def gains_of(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> Gains:
+        """The likelihood ratios of other candidates on the series."""
+        return self.search.with_candidates(self._columns(tangents, counts)).gains(self.series.unsqueeze(-1))
+
+    def with_more(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> Linearised:
+        """The same with other candidates after its own."""
+        return replace(self, search=self.search.with_more(self._columns(tangents, counts)))
+
+    def without(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> Linearised:
+        """The same with these tangents taken out of everything too."""
+        return replace(self, search=self.search.without(torch.cat(self._columns(tangents, counts), -1)))
+
+    def _columns(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> list[Tensor]:
+        rows = len(self.series) - self.colour.root.numel()
+        columns = _each(lambda joined: self._whitened(counts.unsqueeze(-1) * joined), tangents)
+        return [torch.cat([c, c.new_zeros(rows, c.shape[1])]) for c in columns]
+
+    def _whitened(self, values: Float[Tensor, "N m c"]) -> Float[Tensor, "Km c"]:
+        return self.colour.scaled(self.filling(dct(values, len(self.colour.root))))
+
+    def entering(self, count: int, generator: torch.Generator) -> Float[Tensor, "M B"] | None:
+        """Draws of coloured noise that enters at the port, of variance one once whitened."""
+        if self.entrance is None:
+            return None
+        pointwise, coefficients = self.entrance
+        N, _, channels = pointwise.shape
+        drawn = autoregressive(coefficients, N, channels * count, generator).reshape(N, channels, count)
+        flat = self._whitened(torch.einsum("nmc,ncb->nmb", pointwise, drawn))
+        rows = len(self.series) - len(flat)
+        prior = torch.randn(rows, count, generator=generator, dtype=flat.dtype)
+        # the colour knows how much there is at each frequency; the draws know how frequencies hang together
+        return torch.cat([flat / flat.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-300), prior])
+
+
+def linearise(
+    model: JointModel,
+    parameters: Float[Tensor, " p"],
+    pseudo: Float[Tensor, "N m"],
+    counts: Float[Tensor, "N m"],
+    tangents: Tangents,
+    *,
+    colour: Colour | None = None,
+    near: Colour | None = None,
+    white: bool = False,
+    wander: bool = True,
+    joint: bool = False,
+) -> Linearised:
+    """A search around a fit.
+
+    Args:
+        model, parameters: the fit.
+        pseudo: its pseudo-residual, without the effect that is sought.
+        counts: 0 where a residual was rejected; there the tangents say nothing either.
+        tangents: at the fit.
+        colour: of the noise; default the likeliest one of ``pseudo``.
+        near: a colour that is close to it.
+        white: beside the wander, noise counts as white.
+        wander: allow for noise that wanders at the ports.
+        joint: the one candidate is all of the parameters, to be estimated together.
+    """
+    m = pseudo.shape[1]
+    pull = _Pull.of(model, parameters)
+    kept = _bandwidth(tangents.nuisance)
+    slow = tangents.slow if wander else None
+    seen = _Seen.of(pseudo, counts, tangents, slow, kept)
+    gaps = Gaps(counts, kept)
+    plain = Colour(tuple(pseudo.new_zeros(0) for _ in range(m)), pseudo.new_ones(kept, m) * _level(pseudo))
+    if white:
+        return _searching(plain, pull, seen, slow, gaps)
+    bare = replace(seen, candidates=())
+    if joint:
+        own = _coloured(plain, near, pull, bare, slow, gaps).colour if colour is None else colour
+        return _searching(own, pull, seen, slow, gaps, joint=True)
+    if colour is None:
+        found = _coloured(plain, near, pull, bare, slow, gaps)
+    else:
+        found = _searching(colour, pull, bare, slow, gaps)
+    candidates = [
+        pull.below(found.colour.scaled(one)) for one in _each(found.filling, seen.candidates, _FILLED_AT_ONCE)
+    ]
+    found = replace(found, search=found.search.with_candidates(candidates))
+    pointwise = None if slow is None else tangents.pointwise[slow.port]
+    if slow is None or pointwise is None or not tangents.candidates:
+        return found
+    block = counts.unsqueeze(-1) * pointwise
+    # the wander is drawn for itself
+    beside = pseudo - counts * slow.course(found.search.courses(found.series))
+    if not enters_at_port(beside, block):
+        return found
+    return replace(found, entrance=(block, port_colour(beside, block)))
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What a search is about, in the K slowest coefficients of the cosine basis, where a colour is a division."""
+
+    pseudo: Tensor  # (K, m)
+    nuisance: Tensor  # (K, m, p)
+    candidates: tuple[Tensor, ...]  # (K, m, q)
+    slow: Tensor  # (K, m, k)
+
+    @classmethod
+    def of(cls, pseudo: Tensor, counts: Tensor, tangents: Tangents, slow: Slow | None, kept: int) -> _Seen:
+        values = dct(pseudo, kept)
+        nuisance, *candidates = _each(
+            lambda joined: dct(counts.unsqueeze(-1) * joined, kept), [tangents.nuisance, *tangents.candidates]
+        )
+        moved = nuisance[..., :0] if slow is None else slow.transformed(counts, kept)
+        return cls(values, nuisance, tuple(candidates), moved)
+
+    def filled(self, filling: Filling) -> _Seen:
+        """The same with what noise is expected at rejected samples, in all of it alike."""
+        pseudo, nuisance, *candidates = _each(
+            filling, [self.pseudo.unsqueeze(-1), self.nuisance, *self.candidates], _FILLED_AT_ONCE
+        )
+        return _Seen(pseudo.squeeze(-1), nuisance, tuple(candidates), filling(self.slow))
+
+
+def _each(function: Callable[[Tensor], Tensor], columns: Sequence[Tensor], at_once: int = AT_ONCE) -> list[Tensor]:
+    """A function of columns, of each of these matrices."""
+    return [
+        done
+        for block in in_blocks(columns, at_once)
+        for done in function(torch.cat([*block], -1)).split([c.shape[-1] for c in block], -1)
+    ]
+
+
+def _searching(
+    colour: Colour, pull: _Pull, seen: _Seen, slow: Slow | None, gaps: Gaps, *, joint: bool = False
+) -> Linearised:
+    """A search of what has its rejected samples filled."""
+    filling = gaps.filling(colour)
+    seen = seen.filled(filling)
+    flat = colour.scaled(seen.pseudo)
+    parameters = pull.under(colour.scaled(seen.nuisance), flat)
+    candidates = [pull.below(colour.scaled(one)) for one in seen.candidates]
+    search = LinearSearch(
+        parameters[:, :0] if joint else parameters,
+        [parameters] if joint else candidates,
+        pull.below(colour.scaled(seen.slow)),
+        flat.new_zeros(0, 0) if slow is None else slow.scales,
+    )
+    return Linearised(search, pull.beside(flat), colour, None, filling)
+
+
+def _coloured(
+    plain: Colour, near: Colour | None, pull: _Pull, seen: _Seen, slow: Slow | None, gaps: Gaps
+) -> Linearised:
+    """With the likeliest colour of the noise beside a wander at the port, by alternating between the two."""
+    alone = replace(seen, slow=seen.slow[..., :0])
+
+    def beside_nothing() -> Colour:
+        best = _searching(plain, pull, alone, None, gaps).colour_beside()
+        for _ in range(_REFILLED):
+            found = _searching(best, pull, alone, None, gaps)
+            if found.filling.nothing:
+                break
+            best = found.colour_beside()
+        return best
+
+    if slow is None:
+        return _searching(beside_nothing(), pull, seen, None, gaps)
+
+    def beside_wander() -> Colour:
+        return _searching(plain, pull, seen, slow, gaps).colour_beside() if near is None else near
+
+    def tried(colour: Callable[[], Colour]) -> Linearised:
+        return _searching(colour(), pull, seen, slow, gaps)
+
+    def beyond_wander() -> Colour:
+        spread = (seen.slow.square() * slow.scales[0].square()).sum(-1)
+        return colour_of_fast(seen.pseudo.square(), ((spread.cumsum(0) / spread.sum(0)) < _REACHED).sum(0))
+
+    # from the side of no wander, from that of no colour, and from where there is no wander: each could pass for another
+    colours = (beside_nothing, beside_wander, beyond_wander)
+    starts = shared([partial(tried, colour) for colour in colours], [slow, slow.tangents, slow.scales])
+    best = max(starts, key=lambda found: found.evidence)
+    return replace(_settled(best), others=tuple(one for one in starts if one is not best))
+
+
+def _settled(found: Linearised) -> Linearised:
+    """With the colour that alternating between it and the wander comes to.
+
+    What stands in for rejected samples stays: it follows any colour, and would lead it on. The family of the wander
+    stays too until the colour has settled, and is asked for again then: each is decomposed anew for every colour.
+    """
+    tried: set[int] = set()
+    while (wander := found.search.noise_fit(found.series)).gain > 0 and wander.family not in tried:
+        tried.add(wander.family)
+        found = _settled_in(replace(found, search=found.search.of_family(wander.family)))
+        found = replace(found, search=found.search.of_family(None))
+    return found
+
+
+def _settled_in(found: Linearised) -> Linearised:
+    for _ in range(_ALTERNATIONS):
+        step = found.recoloured(found.colour_ahead())
+        if step.evidence <= found.evidence + _SETTLED:
+            # it may have gone too far, as the one that cannot has not
+            step = max(step, found.recoloured(found.colour_beside()), key=lambda one: one.evidence)
+        if step.evidence <= found.evidence + _SETTLED:
+            break
+        found = step
+    return found
+
+
+def _level(pseudo: Tensor) -> Tensor:
+    """Root mean square of each channel: noisy channels count for less from the start."""
+    return pseudo.square().mean(0).sqrt().clamp(min=1e-300)
+
+
+def _bandwidth(nuisance: Float[Tensor, "N m p"]) -> int:
+    """How many of the slowest cosine coefficients hold what moves: three times as many as hold nine tenths of it."""
+    N = len(nuisance)
+    power = dct(nuisance).square().sum(1)
+    share = (power / power.sum(0).clamp(min=1e-300)).cumsum(0)
+    typical = (share < _MOST).sum(0).double().median()
+    return int(min(N, max(_FEWEST, _MARGIN * float(typical))))
+
+
+@dataclass(frozen=True)
+class _Pull:
+    """A Gaussian prior as rows below the whitened residuals."""
+
+    root: Tensor  # (r, p)
+    distance: Tensor  # (r,)
+
+    @classmethod
+    def of(cls, model: JointModel, parameters: Tensor) -> _Pull:
+        prior = model.prior
+        if prior is None:
+            return cls(parameters.new_zeros(0, len(parameters)), parameters.new_zeros(0))
+        precision = prior.precision if prior.precision.dim() == 2 else torch.diag(prior.precision)
+        values, vectors = torch.linalg.eigh(precision)
+        known = values > 0
+        root = values[known].sqrt().unsqueeze(-1) * vectors[:, known].mT
+        return cls(root, root @ (parameters - prior.mean))
+
+    def under(self, nuisance: Tensor, flat: Tensor) -> Tensor:
+        """The parameters' tangents, with rows on the scale of the residuals."""
+        return torch.cat([nuisance, flat.std() * self.root])
+
+    def below(self, columns: Tensor) -> Tensor:
+        """Other tangents: the prior does not know of them."""
+        return torch.cat([columns, columns.new_zeros(len(self.distance), columns.shape[-1])])
+
+    def beside(self, flat: Tensor) -> Tensor:
+        return torch.cat([flat, flat.std() * self.distance])

@@ -1,0 +1,188 @@
+"""Tangents of a residual: what it changes by with each parameter, each candidate and each slow course."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, TypeVar
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.model.joint import JointModel, directions, port_jacobian, through_port
+from mkc_torch.diagnosis.model.term import Term, follows_signal
+from mkc_torch.diagnosis.noise.cosine_basis import cosines, dct, dct_of_courses
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["Slow", "Tangents", "candidate_tangents", "tangents_of"]
+
+T = TypeVar("T")
+
+SLOW_COURSES = 120
+"""Cosine courses of each wandering channel: on 90 s they reach 0.67 Hz."""
+
+CORNERS, WALKS = (25.0, 25.0), (0.0, 5.0)
+"""Beside a random walk: numbers of the courses beyond which a wander falls off, and up to which a walk beside it is
+larger."""
+
+AT_ONCE = 8
+
+
+@dataclass(frozen=True)
+class Tangents:
+    """How the residual moves.
+
+    Attributes:
+        nuisance: with the parameters, (N, m, p).
+        candidates: with each candidate's γ, (N, m, q).
+        pointwise: through each port whose samples are apart, (N, m, channels); of the others None.
+        slow: with slow courses at the port that wanders; None where none does.
+    """
+
+    nuisance: Float[Tensor, "N m p"]
+    candidates: tuple[Float[Tensor, "N m q"], ...]
+    pointwise: dict[str, Tensor | None]
+    slow: Slow | None
+
+    @property
+    def parts(self) -> tuple[Tensor, ...]:
+        """All that are numbers of their own."""
+        slow = () if self.slow is None else (self.slow.tangents, self.slow.scales)
+        return (self.nuisance, *self.candidates, *(one for one in self.pointwise.values() if one is not None), *slow)
+
+    @property
+    def bare(self) -> Tangents:
+        """The same without candidates."""
+        return replace(self, candidates=())
+
+
+@dataclass(frozen=True)
+class Slow:
+    """Slow courses of a port's channels, and their standard deviations in each family of wander (F, k).
+
+    ``tangents`` are those of each course of each channel, (N, m, k), or, where the port is ``pointwise``, those of the
+    channels, (N, m, c), which the courses modulate.
+    """
+
+    port: str
+    channels: int
+    tangents: Tensor
+    pointwise: bool
+    scales: Tensor
+
+    @property
+    def count(self) -> int:
+        """Courses of each channel."""
+        return self.scales.shape[1] // self.channels
+
+    def transformed(self, counts: Float[Tensor, "N m"], kept: int) -> Float[Tensor, "K m k"]:
+        """The K slowest cosine coefficients of the tangents, where residuals count."""
+        moved = counts.unsqueeze(-1) * self.tangents
+        return dct_of_courses(moved, self.count, kept) if self.pointwise else dct(moved, kept)
+
+    def course(self, amplitudes: Float[Tensor, " k"]) -> Float[Tensor, "N m"]:
+        """What courses of these amplitudes add to the residual."""
+        if not self.pointwise:
+            return self.tangents @ amplitudes
+        wander = cosines(self.count, len(self.tangents)) @ amplitudes.unflatten(0, (-1, self.channels))
+        return torch.einsum("nmc,nc->nm", self.tangents, wander)
+
+    def with_shares(self, shares: Float[Tensor, " c"]) -> Slow:
+        """The same with so many times the variance in each channel."""
+        return replace(self, scales=self.scales * shares.sqrt().repeat(self.scales.shape[1] // len(shares)))
+
+    def of_family(self, number: int) -> Slow:
+        """The same with one family of wander only."""
+        return replace(self, scales=self.scales[number : number + 1])
+
+
+def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Sequence[Term] = ()) -> Tangents:
+    """The tangents at these parameters, by forward mode."""
+    prepared = model.prepared
+    pointwise = {
+        name: port_jacobian(model, parameters, name) if port.pointwise else None
+        for name, port in prepared.ports.items()
+    }
+    independent = parameters.new_tensor([float(one) for one in prepared.independent])
+    # forward mode starts from the trajectory that was found last, and has to find it again
+    model.residual(parameters)
+    nuisance = torch.func.jacfwd(model.residual)(parameters)
+    if not bool(nuisance.isfinite().all()):
+        effects = [
+            f"the size of {t.effect.id}" for t, n in zip(model.terms, model.sizes, strict=True) for _ in range(n)
+        ]
+        finite = nuisance.isfinite().flatten(0, 1).all(0).tolist()
+        names = zip((*prepared.parameter_names, *effects), finite, strict=True)
+        lost = dict.fromkeys(name for name, known in names if not known)
+        raise ValueError(
+            f"The simulation's outputs have no finite slope by {', '.join(lost)} at the fitted values. Bound "
+            "these parameters, or start them elsewhere."
+        )
+    start = model.base
+    for term, size in zip(model.terms, model.sizes, strict=True):
+        if follows_signal(term.effect):
+            nuisance[..., start : start + size] *= independent[:, None]
+        start += size
+    slow = _slow_courses(model, parameters, pointwise)
+    return Tangents(nuisance, candidate_tangents(model, parameters, terms, pointwise), pointwise, slow)
+
+
+def candidate_tangents(
+    model: JointModel, parameters: Float[Tensor, " p"], terms: Sequence[Term], pointwise: dict[str, Tensor | None]
+) -> tuple[Float[Tensor, "N m q"], ...]:
+    """Those of each candidate's γ; zeros where they are not finite.
+
+    Args:
+        model, parameters: where.
+        terms: the candidates.
+        pointwise: as :class:`Tangents` has it.
+    """
+    prepared = model.prepared
+    signals = model.signals(parameters)
+    independent = parameters.new_tensor([float(one) for one in prepared.independent])
+    courses = [directions(t, t.context(prepared, signals.get(t.port))) for t in terms]
+    found: list[Tensor | None] = [None] * len(terms)
+    for name, known in pointwise.items():
+        members = [i for i, term in enumerate(terms) if term.port == name]
+        # trajectories are solved for side by side; products of samples are small enough for a core's own memory
+        for block in [members] if known is None else in_blocks(members):
+            if not block:
+                continue
+            joined = torch.cat([courses[i] for i in block], -1)
+            moved = through_port(model, parameters, name, joined, known)
+            finite = bool(moved.isfinite().all())
+            for i, part in zip(block, moved.split([courses[i].shape[-1] for i in block], -1), strict=True):
+                part = independent[:, None] * part if follows_signal(terms[i].effect) else part
+                # one that has no slope here is none that could be named
+                found[i] = part if finite or bool(part.isfinite().all()) else torch.zeros_like(part)
+    return tuple(t for t in found if t is not None)
+
+
+def in_blocks(items: Sequence[T], at_once: int = AT_ONCE) -> list[Sequence[T]]:
+    """A few at a time."""
+    return [items[first : first + at_once] for first in range(0, len(items), at_once)]
+
+
+def _slow_courses(model: JointModel, parameters: Tensor, pointwise: dict[str, Tensor | None]) -> Slow | None:
+    N = len(model.prepared.time)
+    count = min(SLOW_COURSES, N // 10)
+    wandering = [name for name, port in model.prepared.ports.items() if port.wanders]
+    if not wandering or count == 0:
+        return None
+    name = wandering[0]
+    c = len(model.prepared.ports[name].channels)
+    k = torch.arange(1, count + 1, dtype=parameters.dtype).repeat_interleave(c)
+    others = (
+        (1.0 + (k / corner).square()).reciprocal() + (walk / k).square()
+        for corner, walk in zip(CORNERS, WALKS, strict=True)
+    )
+    scales = torch.stack([1.0 / k, *(square.sqrt() for square in others)])
+    known = pointwise[name]
+    if known is not None:
+        return Slow(name, c, known, True, scales)
+    courses = cosines(count, N)
+    eye = torch.eye(c, dtype=courses.dtype)
+    spread = (courses[:, None, :, None] * eye[:, None, :]).reshape(N, c, count * c)
+    return Slow(name, c, through_port(model, parameters, name, spread, None), False, scales)

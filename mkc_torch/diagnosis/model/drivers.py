@@ -1,0 +1,224 @@
+"""Which columns of a recording can drive an effect, and what they are to it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.recording.recording import Recording
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["ANY", "Driver", "Drivers", "find_drivers"]
+
+FEWEST_FINITE = 0.5
+"""A column with a smaller share of finite values is no driver."""
+
+COPY = 1e-9
+"""Two columns whose correlation is nearer to ±1 than this are one driver."""
+
+_REPEATS = 0.995
+"""Correlation with a measured column from which one repeats it."""
+
+_WILD, _FEW, _ALONE = 50.0, 5e-3, 3
+"""Times the range of all others that a value is off, the share of the samples that may be, and how many in a row."""
+
+ANY = "any"
+"""The role of a column whose role is not known."""
+
+_ROLE_OF_NAME: Mapping[str, str] = {"temperature": "temperature", "temp": "temperature", "current": "current"}
+_ROLE_OF_UNIT: Mapping[str, str] = {"°C": "temperature", "K": "temperature", "A": "current"}
+_POSITION = ("position_x", "position_y", "position_z")
+
+
+@dataclass(frozen=True)
+class Driver:
+    """One or several columns that drive an effect together.
+
+    Attributes:
+        columns: their names.
+        role: "temperature", "current", "position" or "any".
+        values: (N, k), finite, less ``reference``.
+        reference: (k,), the columns' means.
+        units: of the columns.
+        copies: names of columns that are the same but for offset and gain.
+    """
+
+    columns: tuple[str, ...]
+    role: str
+    values: Float[Tensor, "N k"]
+    reference: Float[Tensor, " k"]
+    units: tuple[str, ...]
+    copies: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Drivers:
+    """The drivers of a recording, and sentences about columns that are none."""
+
+    drivers: tuple[Driver, ...]
+    warnings: tuple[str, ...]
+
+
+def find_drivers(
+    recording: Recording,
+    taken: frozenset[str],
+    roles: frozenset[str] = frozenset(),
+    measured: frozenset[str] = frozenset(),
+) -> Drivers:
+    """The drivers among a recording's columns.
+
+    A column's role comes from its name (``temperature``, ``temp_imu``, ``current_2`` …) or its unit. Missing values
+    are filled from their neighbours in time; a few that are far from all others count as missing.
+
+    Args:
+        recording: the samples in use.
+        taken: columns that the simulation uses itself.
+        roles: further roles, of a user's own effects: a column has one if its name is that or begins with it.
+        measured: columns that are compared with the simulation; what repeats one of them drives nothing.
+
+    Example:
+        >>> ramp = torch.linspace(20.0, 30.0, 50)
+        >>> columns = {"time": ramp, "temp_imu": ramp, "load": ramp.sin(), "state": torch.ones(50)}
+        >>> found = find_drivers(Recording(columns), frozenset({"time"}))
+        >>> [(d.columns, d.role) for d in found.drivers], found.warnings
+        ([(('temp_imu',), 'temperature'), (('load',), 'any')], ('Column `state` is constant and can drive nothing.',))
+    """
+    warnings: list[str] = []
+    usable: dict[str, Tensor] = {}
+    for name in recording.names:
+        if name in taken or name == "experiment":
+            continue
+        values, complaint = _usable(name, recording[name])
+        repeated = None if values is None else _repeated(values, recording, measured)
+        if repeated is not None:
+            values, complaint = None, [f"Column `{name}` repeats `{repeated}` and is left out: it drives nothing."]
+        warnings += complaint
+        if values is not None:
+            usable[name] = values
+    drivers = []
+    if all(name in usable for name in _POSITION):
+        columns = torch.stack([usable.pop(name) for name in _POSITION], -1)
+        drivers.append(_driver(_POSITION, "position", columns, tuple(recording.units[n] for n in _POSITION)))
+    known = {name: _own_role(name, roles) or role_of(name, recording.units[name]) for name in usable}
+    drivers += _singles(usable, recording.units, known, warnings)
+    return Drivers(tuple(drivers), tuple(warnings))
+
+
+def _driver(
+    columns: tuple[str, ...], role: str, values: Tensor, units: tuple[str, ...], copies: tuple[str, ...] = ()
+) -> Driver:
+    reference = values.mean(0)
+    return Driver(columns, role, values - reference, reference, units, copies)
+
+
+def role_of(name: str, unit: str) -> str:
+    """The role of a column by its name's first word, else by its unit.
+
+    Example:
+        >>> role_of("temperature", "°C"), role_of("esc_power", "A"), role_of("current_3", ""), role_of("rpm", "")
+        ('temperature', 'current', 'current', 'any')
+    """
+    return _ROLE_OF_NAME.get(name.lower().split("_")[0]) or _ROLE_OF_UNIT.get(unit, ANY)
+
+
+def _own_role(name: str, roles: frozenset[str]) -> str:
+    """The role of a user's effect that a column's name says; the longest, if several."""
+    fitting = [role for role in roles - {ANY, "position"} if (name == role or name.startswith(f"{role}_"))]
+    return max(fitting, key=len, default="")
+
+
+def _usable(name: str, values: Tensor) -> tuple[Tensor | None, list[str]]:
+    finite = values.isfinite()
+    share = float(finite.double().mean())
+    if share < FEWEST_FINITE:
+        found = "no finite values" if share == 0 else f"only {share:.0%} finite values"
+        return None, [f"Column `{name}` has {found} and is left out."]
+    warnings = []
+    if share < 1.0:
+        warnings.append(f"Column `{name}` lacks {int((~finite).sum())} values, filled from their neighbours in time.")
+        values = _filled(values, finite)
+    wild = _wild(values)
+    if bool(wild.any()):
+        first, last = (f"{float(end):.6g}" for end in torch.aminmax(values[wild]))
+        told = first if first == last else f"between {first} and {last}"
+        warnings.append(
+            f"Column `{name}` has {int(wild.sum())} value{'s' if int(wild.sum()) > 1 else ''} ({told}) far from all "
+            "others; they count as missing, and are filled from their neighbours in time."
+        )
+        values = _filled(values, ~wild)
+    spread = float(values.amax() - values.amin())
+    if spread <= 1e-12 * float(values.abs().amax()):
+        return None, [*warnings, f"Column `{name}` is constant and can drive nothing."]
+    return values, warnings
+
+
+def _wild(values: Float[Tensor, " N"]) -> Bool[Tensor, " N"]:
+    """A few values that are far from all others and come alone, or are all the same: glitches, and codes for none."""
+    few = max(int(_FEW * len(values)), 1)
+    ordered = values.sort().values
+    span = ordered[-1 - few] - ordered[few]
+    far = (values - ordered[len(values) // 2]).abs() > _WILD * span
+    if not bool(span > 0) or not 0 < int(far.sum()) <= few:
+        return torch.zeros_like(far)
+    _, length = torch.unique_consecutive(far, return_counts=True)
+    runs = length[int(not bool(far[0])) :: 2]
+    same = bool((values[far] == values[far][0]).all())
+    return far if same or int(runs.max()) <= _ALONE else torch.zeros_like(far)
+
+
+def _repeated(values: Float[Tensor, " N"], recording: Recording, measured: frozenset[str]) -> str | None:
+    """The measured column that these values are but for offset, gain and rounding."""
+    unit = _centred(values)
+    for name in sorted(measured):
+        if name in recording and bool(recording[name].isfinite().all()):
+            other = _centred(recording[name])
+            if abs(float(unit @ other)) > _REPEATS:
+                return name
+    return None
+
+
+def _centred(values: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
+    away = values - values.mean()
+    return away / torch.linalg.vector_norm(away).clamp(min=1e-300)
+
+
+def _filled(values: Tensor, finite: Tensor) -> Tensor:
+    known = finite.nonzero().squeeze(-1)
+    index = torch.arange(len(values))
+    right = torch.searchsorted(known, index).clamp(max=len(known) - 1)
+    left = (right - (known[right] > index).long()).clamp(min=0)
+    a, b = known[left], known[right]
+    share = ((index - a).double() / (b - a).clamp(min=1)).clamp(0.0, 1.0)
+    return torch.lerp(values[a], values[b], share)
+
+
+def _singles(
+    usable: Mapping[str, Tensor], units: Mapping[str, str], roles: Mapping[str, str], warnings: list[str]
+) -> list[Driver]:
+    """One driver for each group of columns that are copies of one another; a known role goes before an unknown one."""
+    if not usable:
+        return []
+    names = sorted(usable, key=lambda name: roles[name] == ANY)
+    table = torch.stack([usable[name] for name in names])
+    centred = table - table.mean(-1, keepdim=True)
+    centred = centred / torch.linalg.vector_norm(centred, dim=-1, keepdim=True)
+    same = (centred @ centred.mT).abs() > 1.0 - COPY
+    drivers, done = [], set()
+    for i, name in enumerate(names):
+        if i in done:
+            continue
+        group = [j for j in same[i].nonzero().squeeze(-1).tolist() if j >= i and j not in done]
+        done.update(group)
+        copies = tuple(names[j] for j in group if j != i)
+        if copies:
+            told = ", ".join(f"`{copy}`" for copy in copies)
+            warnings.append(f"Column `{name}` and {told} are copies of one another: this data cannot tell them apart.")
+        drivers.append(_driver((name,), roles[name], usable[name].unsqueeze(-1), (units[name],), copies))
+    order = {name: k for k, name in enumerate(usable)}
+    return sorted(drivers, key=lambda d: order[d.columns[0]])

@@ -1,0 +1,139 @@
+"""Joint robust refits of a simulation with candidate effects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch import nonlinear
+from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.noise.pseudo_residual import pseudo_residual
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_beside", "repeats", "without_term"]
+
+_CLIP = 2.0
+_SHARES = (1.0, 0.3, 0.1, 0.01, 0.0)
+
+
+@dataclass(frozen=True)
+class FittedModel:
+    """A joint model at its most likely parameters.
+
+    Attributes:
+        model, parameters: what was fitted.
+        sigma, d, bound: (m,) of the MKC density.
+        residual, weights: (N, m).
+        log_likelihood: in nats, of all samples and channels.
+        converged: whether another step would bring nothing.
+    """
+
+    model: JointModel
+    parameters: Float[Tensor, " p"]
+    sigma: Float[Tensor, " m"]
+    d: Float[Tensor, " m"]
+    bound: Float[Tensor, " m"]
+    residual: Float[Tensor, "N m"]
+    weights: Float[Tensor, "N m"]
+    log_likelihood: float
+    converged: bool
+
+    @property
+    def pseudo(self) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
+        """The pseudo-residual, and 1 where it counts."""
+        return pseudo_residual(self.residual, self.sigma, self.d)
+
+
+def fitted(
+    model: JointModel,
+    start: Float[Tensor, " p"],
+    bound: Float[Tensor, " m"] | None = None,
+    *,
+    rows: Float[Tensor, " N"] | None = None,
+    graduate: bool = True,
+) -> FittedModel:
+    """The most likely parameters of a joint model.
+
+    Args:
+        model: a simulation with effects.
+        start: where to begin.
+        bound: half-width of the density's domain; None for the rule of :func:`mkc_torch.nonlinear.fit`.
+        rows: weights of the samples; 0 leaves one out.
+        graduate: False for a start near the answer.
+    """
+    found = nonlinear.fit(
+        model.residual,
+        _usable(model, start),
+        bound=bound,
+        weight=rows,
+        prior=model.prior,
+        lower=None if model.bounds is None else model.bounds[0],
+        upper=None if model.bounds is None else model.bounds[1],
+        graduate=graduate,
+        covariance=None,
+        max_iter=60,
+        tol=1e-7,
+    )
+    return FittedModel(
+        model,
+        found.theta,
+        found.sigma,
+        found.d,
+        found.bound,
+        model.residual(found.theta).detach(),
+        found.weights,
+        float(found.log_likelihood) * len(model.prepared.time),
+        bool(found.converged),
+    )
+
+
+def fitted_beside(
+    base: FittedModel, model: JointModel, start: Float[Tensor, " p"], *, graduate: bool = True
+) -> FittedModel:
+    """A model with one more effect on the domain of a fit without it; that fit, where the effect has no answer."""
+    try:
+        return fitted(model, start, base.bound, graduate=graduate)
+    except ValueError:
+        none = base.parameters.new_zeros(model.size - base.model.size)
+        return replace(base, model=model, parameters=torch.cat([base.parameters, none]))
+
+
+def without_term(fit: FittedModel, number: int) -> FittedModel:
+    """The simulation with all effects of a fit but one, as a start for fits: at its parameters, not fitted anew."""
+    model, place = fit.model, fit.model.base + sum(fit.model.sizes[:number])
+    left = JointModel(model.prepared, (*model.terms[:number], *model.terms[number + 1 :]))
+    parameters = torch.cat([fit.parameters[:place], fit.parameters[place + model.sizes[number] :]])
+    return replace(fit, model=left, parameters=parameters)
+
+
+def _usable(model: JointModel, start: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
+    """The start, its effects made smaller where the simulation with them has no finite answer."""
+    if not model.terms:
+        return start
+    for share in _SHARES:
+        smaller = torch.cat([start[: model.base], share * start[model.base :]])
+        if bool(model.residual(smaller).isfinite().all()):
+            return smaller
+    return start
+
+
+def clipped_residual(residual: Float[Tensor, "N m"]) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
+    """Pseudo-residual of Huber's score at two robust scales: what a redescending score takes for outliers still counts.
+
+    Huber, "Robust Statistics" (1981), 7.6.
+    """
+    scale = robust_scale(residual)
+    z = residual / scale.clamp(min=1e-300)
+    slope = (z.abs() < _CLIP).to(z.dtype).mean(0).clamp(min=0.2)
+    return scale * z.clamp(-_CLIP, _CLIP) / slope, torch.ones_like(residual)
+
+
+def repeats(fit: FittedModel) -> bool:
+    """Whether the simulation is finite there once more: a trajectory found on the way of a fit may be lost again."""
+    return bool(fit.model.residual(fit.parameters).isfinite().all())

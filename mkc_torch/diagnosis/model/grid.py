@@ -1,0 +1,130 @@
+"""All candidates of a recording: effect × driver × shape."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.model.drivers import Driver
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.effects.base import (
+    ChoosyEffect,
+    ContinuousEffect,
+    Effect,
+    OptionalDriverEffect,
+    RelativeEffect,
+    ShapedEffect,
+)
+from mkc_torch.effects.context import Shape
+from mkc_torch.effects.sensor.unknown import UNKNOWN
+from mkc_torch.effects.sensor.unrecorded import COURSE
+from mkc_torch.simulation.protocol import Port, PreparedSimulation
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["candidate_terms", "described", "finer", "reach_of"]
+
+_STEPS = 8
+
+
+def candidate_terms(
+    prepared: PreparedSimulation, drivers: Sequence[Driver], effects: Sequence[Effect]
+) -> tuple[Term, ...]:
+    """Each effect that has its port in the simulation, with each driver of its roles and each shape of its grid."""
+    terms = []
+    for effect in effects:
+        places = [name for name, port in prepared.ports.items() if _fits(effect, name, port)]
+        # a role that is known says what the column does; an effect of unknown roles takes what is left over
+        alone = not effect.roles or (isinstance(effect, OptionalDriverEffect) and effect.driver_optional)
+        fitting = [*([None] if alone else []), *(d for d in drivers if _drives(d, effect))]
+        shapes = effect.shapes(prepared.time)
+        terms += [
+            Term(effect, driver, shape, "" if at == effect.port else at)
+            for at in places
+            for driver in fitting
+            for shape in (absolute(effect, shape, prepared.ports[at], driver) for shape in shapes)
+        ]
+    return tuple(terms)
+
+
+def _fits(effect: Effect, name: str, port: Port) -> bool:
+    """Whether an effect acts at a port."""
+    needs = effect.needs if isinstance(effect, ChoosyEffect) else ()
+    return effect.port in (name, port.kind) and set(needs) <= set(port.parts)
+
+
+def absolute(effect: Effect, shape: Shape, port: Port, driver: Driver | None = None) -> Shape:
+    """A shape in units, of one in shares of what passes through the port or of what drives the effect."""
+    if not isinstance(effect, RelativeEffect):
+        return shape
+    known = dict(port.sizes)
+    if driver is not None:
+        away = torch.linalg.vector_norm(driver.values, dim=-1)
+        known["driver"] = float(away.median()), float(away.max())
+    sizes = {name: dict(zip(("typical", "largest"), values, strict=True)) for name, values in known.items()}
+    return {**shape} | {name: shape[name] * sizes[part][which] for name, (part, which) in effect.relative.items()}
+
+
+def reach_of(term: Term, prepared: PreparedSimulation) -> dict[str, tuple[float, float]]:
+    """Least and greatest values, in units, of the numbers of a shape that are fitted together with γ.
+
+    Raises:
+        ValueError: the effect names a number that its shape does not have, or a range with nothing in it.
+    """
+    if not isinstance(term.effect, ShapedEffect):
+        return {}
+    port, reach = prepared.ports[term.port], term.effect.fitted_shape
+    for name, (low, high) in reach.items():
+        if name not in term.shape or not low < high:
+            raise ValueError(
+                f"Expected `fitted_shape` of {term.effect.id} to hold numbers of its shape ({', '.join(term.shape)}) "
+                f"with a least and a greater value but got `{name}`: ({low}, {high}); mend it or "
+                "leave it out."
+            )
+    of_length = term.effect.continuous if isinstance(term.effect, ContinuousEffect) else {}
+    length = float(prepared.time[-1] - prepared.time[0])
+    ends = [
+        absolute(term.effect, {**term.shape, **{n: r[k] for n, r in reach.items()}}, port, term.driver) for k in (0, 1)
+    ]
+    least, most = ({name: end[name] * (length if name in of_length else 1.0) for name in reach} for end in ends)
+    return {name: (least[name], most[name]) for name in reach}
+
+
+def _drives(driver: Driver, effect: Effect) -> bool:
+    """Whether a driver has one of an effect's roles; a curve without a name follows any one column."""
+    return driver.role in effect.roles or (bool(effect.roles) and effect.id == UNKNOWN and len(driver.columns) == 1)
+
+
+def finer(term: Term, name: str, time: Float[Tensor, " N"], rounds: int) -> tuple[Term, ...]:
+    """The same effect with one number of its shape varied: over an eighth of its range to either side, then ever less.
+
+    Args:
+        term: the effect.
+        name: of the number, one of those that the effect calls continuous.
+        time: of the recording.
+        rounds: how often the range was narrowed before.
+    """
+    assert isinstance(term.effect, ContinuousEffect)
+    low, high = (share * float(time[-1] - time[0]) for share in term.effect.continuous[name])
+    offset = float(time[0]) if name == "onset" else 0.0
+    value = term.shape[name]
+    reach = (high - low) / _STEPS ** (rounds + 1)
+    values = {min(max(value + reach * k / _STEPS, low + offset), high + offset) for k in range(-_STEPS, _STEPS + 1)}
+    return tuple(replace(term, shape={**term.shape, name: v}) for v in sorted(values))
+
+
+def described(shape: Shape) -> str:
+    """A shape as a user reads it.
+
+    Example:
+        >>> described({"onset": 12.345, "lag": 0.5})
+        'onset 12.35 s, lag 0.5 s'
+    """
+    units: Mapping[str, str] = {"onset": " s", "lag": " s", "time_constant": " s", "delay": " s"}
+    told = {name: value for name, value in shape.items() if not name.startswith(COURSE)}
+    return ", ".join(f"{name.replace('_', ' ')} {value:.4g}{units.get(name, '')}" for name, value in told.items())

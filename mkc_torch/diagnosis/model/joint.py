@@ -1,0 +1,209 @@
+"""A simulation together with the effects found so far: one vector of parameters, one residual."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.model.term import Term, follows_signal, limits
+from mkc_torch.effects.base import GainEffect, LinearEffect
+from mkc_torch.effects.context import Context, Shape
+from mkc_torch.effects.courses import combined, gained
+from mkc_torch.nonlinear import GaussianPrior, beside
+from mkc_torch.simulation.protocol import Change, Changes, FreeChange, PreparedSimulation
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["JointModel", "directions", "port_jacobian", "summed", "through_port", "with_constant"]
+
+_CHUNK = 64
+
+
+class JointModel:
+    """A prepared simulation with effects at its ports; parameters are the simulation's, then each effect's γ.
+
+    Args:
+        prepared: the simulation of the recording.
+        terms: the effects in it.
+    """
+
+    def __init__(self, prepared: PreparedSimulation, terms: Sequence[Term] = ()) -> None:
+        self.prepared = prepared
+        self.terms = tuple(terms)
+        self.base = len(prepared.parameter_names)
+        self._follow = tuple(follows_signal(t.effect) for t in self.terms)
+        self.sizes = tuple(t.size(t.context(prepared, None)) for t in self.terms)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return self.base + sum(self.sizes)
+
+    @property
+    def prior(self) -> GaussianPrior | None:
+        """The simulation's own, padded: nothing is known of effects beforehand."""
+        known = self.prepared.prior
+        if known is None or not self.terms:
+            return known
+        more = known.mean.new_zeros(self.size - self.base)
+        precision = known.precision
+        if precision.dim() == 1:
+            return GaussianPrior(torch.cat([known.mean, more]), torch.cat([precision, more]))
+        return GaussianPrior(torch.cat([known.mean, more]), torch.block_diag(precision, torch.diag(more)))
+
+    def gammas(self, parameters: Float[Tensor, " p"]) -> tuple[Tensor, ...]:
+        """Of the effects, in their order."""
+        return torch.split(parameters[self.base :], list(self.sizes)) if self.terms else ()
+
+    @property
+    def bounds(self) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"]] | None:
+        """Least and greatest values; None if all are free."""
+        known = self.prepared.bounds
+        reach = [limits(term.effect) for term in self.terms]
+        if known is None and all(one == (-torch.inf, torch.inf) for one in reach):
+            return None
+        free = self.prepared.time.new_full((self.base,), torch.inf)
+        low, high = (-free, free) if known is None else known
+        least, most = (
+            [free.new_full((size,), one[side]) for one, size in zip(reach, self.sizes, strict=True)] for side in (0, 1)
+        )
+        return torch.cat([low, *least]), torch.cat([high, *most])
+
+    def changes(self, parameters: Float[Tensor, " p"]) -> dict[str, Change]:
+        """What the effects add at each port."""
+        total: dict[str, Change] = {}
+        known = zip(self.terms, self.gammas(parameters), self._follow, self._courses, strict=True)
+        for term, gamma, follows, courses in known:
+            change = self._change(term, gamma) if courses is None else _constant(courses(gamma))
+            total[term.port] = summed(total.get(term.port), change if follows else FreeChange(change))
+        return total
+
+    def _change(self, term: Term, gamma: Tensor) -> Change:
+        def change(signal: Tensor) -> Tensor:
+            return term.effect.change(gamma, term.shape, term.context(self.prepared, signal))
+
+        return change
+
+    @cached_property
+    def _courses(self) -> tuple[Callable[[Tensor], Tensor] | None, ...]:
+        """What each effect adds as a function of γ alone; None where it is more than a sum of known courses."""
+        return tuple(
+            None if follows else courses_of(term, term.context(self.prepared, None))
+            for term, follows in zip(self.terms, self._follow, strict=True)
+        )
+
+    def signals(self, parameters: Float[Tensor, " p"]) -> Mapping[str, Tensor]:
+        """What passes through each port, with the effects in it."""
+        return self.prepared.signals(parameters[: self.base], self.changes(parameters))
+
+    def residual(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, "N m"]:
+        """Recording less prediction."""
+        return self.prepared.residual(parameters[: self.base], self.changes(parameters))
+
+    def with_term(self, term: Term) -> JointModel:
+        return JointModel(self.prepared, (*self.terms, term))
+
+    def with_shape(self, shape: Shape) -> JointModel:
+        """The same with another shape of the last effect."""
+        return JointModel(self.prepared, (*self.terms[:-1], replace(self.terms[-1], shape=shape)))
+
+
+def port_jacobian(model: JointModel, parameters: Float[Tensor, " p"], port: str) -> Float[Tensor, "N m c"]:
+    """How the residual of each sample changes with what enters at a pointwise port, by forward mode."""
+    known = model.prepared.ports[port]
+    N = len(model.prepared.time)
+    zero = parameters.new_zeros(N, len(known.channels))
+
+    def residual(change: Tensor) -> Tensor:
+        moving = beside(parameters, change[0, 0])
+        return model.prepared.residual(moving[: model.base], with_constant(model.changes(moving), port, change))
+
+    columns = []
+    for k in range(len(known.channels)):
+        direction = torch.zeros_like(zero)
+        direction[:, k] = 1.0
+        columns.append(torch.func.jvp(residual, (zero,), (direction,))[1])
+    return torch.stack(columns, -1)
+
+
+def courses_of(term: Term, context: Context) -> Callable[[Tensor], Tensor] | None:
+    """A function of γ that is an effect's change, for one that adds courses of its own; None of any other."""
+    if isinstance(term.effect, LinearEffect):
+        return partial(combined, term.effect.basis(term.shape, context))
+    if isinstance(term.effect, GainEffect) and type(term.effect).change is GainEffect.change:
+        return partial(gained, term.effect.course(term.shape, context))
+    return None
+
+
+def _constant(added: Float[Tensor, "N c"]) -> Change:
+    return lambda _: added
+
+
+def summed(one: Change | None, other: Change) -> Change:
+    """Two changes at one port."""
+    if one is None:
+        return other
+    first = one
+
+    def both(signal: Tensor) -> Tensor:
+        added, more = first(signal), other(signal)
+        # the rate of a memory, where only one of them has it, comes last
+        width = max(added.shape[1], more.shape[1])
+        return _widened(added, width) + _widened(more, width)
+
+    return FreeChange(both) if isinstance(first, FreeChange) and isinstance(other, FreeChange) else both
+
+
+def _widened(added: Float[Tensor, "N c"], width: int) -> Float[Tensor, "N w"]:
+    """With zeros beside it."""
+    if added.shape[1] == width:
+        return added
+    return torch.cat([added, added.new_zeros(len(added), width - added.shape[1])], -1)
+
+
+def with_constant(changes: Changes, port: str, change: Float[Tensor, "N c"]) -> Changes:
+    """The same with a change at a port that does not depend on its signal."""
+    return {**changes, port: summed(changes.get(port), FreeChange(_constant(change)))}
+
+
+def directions(term: Term, context: Context) -> Float[Tensor, "N c q"]:
+    """How an effect's change at its port grows with γ at γ = 0, by forward mode where the effect does not say."""
+    if isinstance(term.effect, LinearEffect):
+        return term.effect.basis(term.shape, context)
+    if isinstance(term.effect, GainEffect) and type(term.effect).change is GainEffect.change:
+        # a gain on a course: the derivative is the course, channel by channel
+        eye = torch.eye(len(context.channels), dtype=context.signal.dtype)
+        return term.effect.course(term.shape, context)[:, None, None] * eye
+
+    def change(gamma: Tensor) -> Tensor:
+        return term.effect.change(gamma, term.shape, replace(context, signal=beside(context.signal, gamma[0])))
+
+    return torch.func.jacfwd(change)(context.signal.new_zeros(term.size(context)))
+
+
+def through_port(
+    model: JointModel,
+    parameters: Float[Tensor, " p"],
+    port: str,
+    courses: Float[Tensor, "N c q"],
+    pointwise: Float[Tensor, "N m c"] | None,
+) -> Float[Tensor, "N m q"]:
+    """Residual tangents of changes at a port; by the pointwise Jacobian where there is one, else by forward mode."""
+    if pointwise is not None:
+        return torch.einsum("nmc,ncq->nmq", pointwise, courses)
+    changes = model.changes(parameters)
+    zero = torch.zeros_like(courses[..., 0])
+
+    def residual(change: Tensor) -> Tensor:
+        return model.prepared.residual(parameters[: model.base], with_constant(changes, port, change))
+
+    def push(direction: Tensor) -> Tensor:
+        return torch.func.jvp(residual, (zero,), (direction,))[1]
+
+    return torch.vmap(push, in_dims=-1, out_dims=-1, chunk_size=_CHUNK)(courses)

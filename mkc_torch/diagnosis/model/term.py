@@ -1,0 +1,96 @@
+"""A term of a model: one effect at one port with its drivers and shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.model.drivers import Driver
+from mkc_torch.effects.base import Effect
+from mkc_torch.effects.context import Context, Shape
+from mkc_torch.simulation.protocol import Port, PreparedSimulation
+
+__all__ = ["Key", "Term", "context_at", "continuous", "follows_signal", "one_sided"]
+
+Key = tuple[str, tuple[str, ...], str]
+"""Of a candidate, whatever its shape: the effect's id, its columns and its port."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """An effect with its driver (None for time or the signal alone), its shape, and its port where it has a choice."""
+
+    effect: Effect
+    driver: Driver | None
+    shape: Shape
+    at: str = ""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        return () if self.driver is None else self.driver.columns
+
+    @property
+    def port(self) -> str:
+        """The port where it acts."""
+        return self.at or self.effect.port
+
+    @property
+    def key(self) -> Key:
+        """What it is, whatever its shape."""
+        return self.effect.id, self.columns, self.port
+
+    def context(self, prepared: PreparedSimulation, signal: Tensor | None) -> Context:
+        """What the effect sees."""
+        port = prepared.ports[self.port]
+        time = prepared.time if port.clock is None else port.clock.time
+        values = time.new_zeros(len(time), 0)
+        units: tuple[str, ...] = ()
+        if self.driver is not None:
+            values, units = self.driver.values, self.driver.units
+            values = port.at(values)
+        if signal is None:
+            signal = time.new_zeros(len(time), len(port.channels))
+        return context_at(port, time, values, units, signal)
+
+    def size(self, context: Context) -> int:
+        return sum(quantity.size for quantity in self.effect.quantities(self.shape, context))
+
+
+def context_at(port: Port, time: Tensor, drivers: Tensor, units: tuple[str, ...], signal: Tensor) -> Context:
+    """What an effect sees at a port."""
+    return Context(
+        time,
+        drivers,
+        units,
+        signal,
+        port.unit,
+        port.channels,
+        port.carries,
+        port.parts,
+        port.part_units,
+        port.run,
+    )
+
+
+def limits(effect: Effect) -> tuple[float, float]:
+    """Least and greatest value of an effect's γ."""
+    return getattr(effect, "least", -torch.inf), getattr(effect, "most", torch.inf)
+
+
+def one_sided(effect: Effect) -> bool:
+    """Whether an effect's γ cannot be negative."""
+    return limits(effect)[0] >= 0.0
+
+
+def continuous(term: Term) -> list[str]:
+    """The numbers of a candidate's shape that are closed in on."""
+    free = getattr(term.effect, "continuous", ())
+    return [name for name in term.shape if name in free]
+
+
+def follows_signal(effect: Effect) -> bool:
+    """Whether an effect is a function of the signal at its port."""
+    # asked thousands of times, and a protocol is asked for in 20 microseconds
+    return getattr(effect, "follows_signal", False)

@@ -1,0 +1,1 @@
+"""Noise of residuals: its colour, gaps, bursts, what is rejected."""

@@ -1,0 +1,50 @@
+"""Stretches of a recording in which a final fit rejects most samples: what no effect follows is not to go unseen."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.diagnosis.noise.pseudo_residual import REJECTED_BELOW
+from mkc_torch.recording.disturbance import Interval, disturbed_intervals
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["rejected_warning"]
+
+_SHORTEST = 0.5
+"""Seconds; shorter stretches are bursts of outliers."""
+
+_TOLD = 3
+
+
+def rejected_warning(time: Float[Tensor, " N"], weights: Float[Tensor, "N m"]) -> tuple[str, ...]:
+    """A sentence that names the longest stretches of rejected samples; none where there are none.
+
+    Args:
+        time: in s.
+        weights: of the residuals in the final fit, in [0, 1].
+
+    Example:
+        >>> import torch
+        >>> time = torch.arange(1000) / 50.0
+        >>> weights = torch.where((time > 4.0) & (time < 7.0), 0.0, 1.0).unsqueeze(-1)
+        >>> rejected_warning(time, weights)
+        ('Most samples were rejected from 4.0 to 7.0 s. ...',)
+    """
+    stretches = disturbed_intervals(time, (weights < REJECTED_BELOW).any(-1))
+    found = sorted((one for one in stretches if one.end - one.start >= _SHORTEST), key=_length, reverse=True)
+    if not found:
+        return ()
+    told = ", ".join(f"from {one.start:.1f} to {one.end:.1f} s" for one in sorted(found[:_TOLD]))
+    more = f" and in {len(found) - _TOLD} shorter stretches" if len(found) > _TOLD else ""
+    return (
+        f"Most samples were rejected {told}{more}. Something disturbed the measurement there that no effect follows: "
+        "something that passed by, say, or a burst of outliers.",
+    )
+
+
+def _length(interval: Interval) -> float:
+    return interval.end - interval.start

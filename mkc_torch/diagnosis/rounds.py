@@ -1,0 +1,190 @@
+"""One search after the other, each beside what the ones before found."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+
+from mkc_torch._parallel.fork import meanwhile
+from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
+from mkc_torch.diagnosis.evidence.simpler_form import simplified
+from mkc_torch.diagnosis.evidence.unrecorded_cause import course_without, located_cause
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.side_by_side import known_of, learn, with_memory
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.noise.colour import correlation_time
+from mkc_torch.diagnosis.noise.innovations import innovation_gain
+from mkc_torch.diagnosis.search.first_look import p_value_beside
+from mkc_torch.diagnosis.search.locate import Located, locate
+from mkc_torch.diagnosis.search.preference import ALIKE_COLUMNS, alike
+from mkc_torch.effects.sensor.unknown import UNKNOWN
+
+_NEAR = 0.05
+
+_BEYOND_DOUBT, _FURTHER = 8.0, 20.0
+"""Nats beyond all draws of noise from which unseen blocks need only not to be clearly worse with a first finding, and
+from which they need only to lean the way of a further one."""
+
+_QUIET, _GLANCE = 0.1, 49
+"""A p-value at a first look beside a finding above which nothing further is searched, and the draws that it takes."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """The arguments of :func:`diagnose` that are numbers."""
+
+    level: float
+    surrogates: int
+    max_findings: int
+    seed: int
+
+
+def _holds(
+    located: Located, before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int, *, first: bool
+) -> bool:
+    """Whether what was found counts.
+
+    Blocks weigh samples as if their noise was white, and miss what is plain in coloured noise: of the first finding,
+    which the draws of noise have judged, they need only to lean its way, or not clearly the other way where it is plain
+    beyond all draws; or to confirm it, by more than its number of parameters is worth, once the noise is filtered
+    white. What comes after a finding also has what that one's form left over, and they have to confirm it, or to lean
+    its way where it is plain beyond all draws.
+    """
+    difference = after.log_likelihood - before.log_likelihood
+    gain, (low, high) = gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))
+    if first:
+        plain = located.beyond > _BEYOND_DOUBT and high > 0.0
+        price = 0.5 * located.fit.model.sizes[-1] * math.log(len(after.log_likelihood))
+        return gain > 0.0 or plain or innovation_gain(before.residual, after.residual) > price
+    return low > 0.0 or (gain > 0.0 and located.beyond > _FURTHER)
+
+
+@dataclass(frozen=True)
+class Search:
+    """One search after the other: the first one, what was found, and what unseen blocks did not confirm.
+
+    ``evidence`` is that of the simulation alone and with one finding more each; ``left`` are candidates that are still
+    to be searched beside what was found, none once the search is over; ``given_up`` says why there was no next one, and
+    ``cut`` that there was a further finding when as much was found as was asked for.
+    """
+
+    first: Located | None
+    found: tuple[Located, ...]
+    unconfirmed: Located | None
+    blocks: HeldOutBlocks
+    evidence: tuple[Evidence, ...]
+    left: tuple[Term, ...]
+    given_up: str = ""
+    cut: bool = False
+
+    @property
+    def parts(self) -> tuple[object, ...]:
+        """What the next search goes on with."""
+        fits = [located.fit for located in self.found]
+        return self.first, *self.found, *fits, *(fit.model for fit in fits), self.blocks, *self.evidence
+
+
+def begun(base: FittedModel, terms: tuple[Term, ...], asked: Asked, generator: torch.Generator) -> Search:
+    """The first search, and its finding, if unseen blocks confirm it."""
+    prepared = base.model.prepared
+    correlation = max(correlation_time(one) for one in base.pseudo[0].unbind(1))
+    blocks = blocks_of(len(base.residual), math.ceil(correlation))
+    alone = with_memory(prepared, partial(held_out, base, blocks))
+
+    def searched() -> Located:
+        located = locate(base, terms, level=asked.level, surrogates=asked.surrogates, generator=generator)
+        located.fit.model.residual(located.fit.parameters)  # to be the newest that a simulation remembers
+        return located
+
+    with meanwhile([alone], known_of(prepared, ())) as judged:
+        first, newest = with_memory(prepared, searched)() if terms else (None, None)
+        [(evidence, newest_alone)] = judged()
+    learn(prepared, newest_alone)
+    begun = Search(first, (), None, blocks, (evidence,), terms)
+    if first is None:
+        return begun
+    learn(prepared, newest)
+    taken = _taken_up(begun, first, asked)
+    if taken.found:
+        return taken
+    cause = located_cause(base, first, asked.level, asked.surrogates)
+    if cause is None:
+        return taken
+    after = held_out(cause.fit, blocks, partial(course_without, base, cause))
+    # beside a course that may be any, little is left to be told
+    return replace(_taken_up(replace(taken, first=cause), cause, asked, after), left=())
+
+
+def continued(search: Search, asked: Asked, generator: torch.Generator) -> Search:
+    """The next search, beside what was found; none where a first look shows nothing."""
+    if _quiet(search, asked):
+        return replace(search, left=())
+    fit = search.found[-1].fit
+    try:
+        located = locate(
+            fit, search.left, level=asked.level, surrogates=asked.surrogates, generator=generator, parts=False
+        )
+        return _taken_up(search, located, asked)
+    except ValueError as error:
+        return replace(search, left=(), given_up=str(error))  # what was found before is not to be lost
+
+
+def _quiet(search: Search, asked: Asked) -> bool:
+    """Whether what is beside the last finding is far from anything that could count."""
+    return _beside(search, asked) > max(_QUIET, asked.level)
+
+
+def _beside(search: Search, asked: Asked) -> float:
+    """The p-value of a first look beside the last finding."""
+    last, near = search.found[-1], _near(search.found[-1].fit)
+    others = [all(not _same(term, one.term, near) for one in search.found) for term in last.terms]
+    return p_value_beside(last, others, _GLANCE, torch.Generator().manual_seed(asked.seed))
+
+
+def _taken_up(search: Search, located: Located, asked: Asked, after: Evidence | None = None) -> Search:
+    """With what was located, if it counts; ``after`` is its evidence, where that is not the fit's own."""
+    over = replace(search, left=())
+    if located.p_value > asked.level or asked.max_findings == 0:
+        return over
+    before = search.evidence[-1]
+    if after is None:
+        after = held_out(located.fit, search.blocks)
+
+    def holds(fit: FittedModel, evidence: Evidence) -> bool:
+        one = replace(located, fit=fit)
+        return _holds(one, before, evidence, search.blocks, asked.seed, first=not search.found)
+
+    if not holds(located.fit, after):
+        return replace(over, unconfirmed=located)
+    if len(search.found) == asked.max_findings:
+        return replace(over, cut=True)
+    fit, after = simplified(located.fit, after, search.blocks, holds)
+    found = (*search.found, replace(located, fit=fit))
+    near = _near(located.fit)
+    left = tuple(t for t in search.left if not _same(t, located.term, near))
+    taken = replace(search, found=found, evidence=(*search.evidence, after), left=left)
+    # a p-value of 0 is that of a look that sees nothing
+    full = len(found) == asked.max_findings and not 0.0 < _beside(taken, asked) <= asked.level
+    return replace(taken, left=()) if full else taken
+
+
+def _near(fit: FittedModel) -> float:
+    """Seconds within which a step is the same one."""
+    time = fit.model.prepared.time
+    return _NEAR * float(time[-1] - time[0])
+
+
+def _same(term: Term, found: Term, near: float) -> bool:
+    """Whether a candidate is the found effect again, or a curve over its driver.
+
+    A step further away than ``near``, in s, is another one; closer by, it would only mend how the first one rises.
+    """
+    if "onset" in term.shape and "onset" in found.shape:
+        return abs(term.shape["onset"] - found.shape["onset"]) < near
+    if term.key == found.key or (term.effect.id == UNKNOWN and term.columns == found.columns):
+        return True
+    # beside a driver that was found, a column that goes the same way would only share its amplitude
+    return term.driver is not None and found.driver is not None and alike(term.driver, found.driver) > ALIKE_COLUMNS

@@ -1,0 +1,1 @@
+"""The search for the strongest candidate and its p-value."""

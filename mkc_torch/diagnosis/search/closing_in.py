@@ -1,0 +1,137 @@
+"""The continuous numbers of an effect's shape, closed in on beyond the grid that is searched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.diagnosis.linearised.linearise import Linearised
+from mkc_torch.diagnosis.linearised.tangents import Tangents, candidate_tangents
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside, repeats
+from mkc_torch.diagnosis.model.grid import finer
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term, continuous
+from mkc_torch.functional import mkc_energy
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["closer", "coloured", "middle", "refined"]
+
+_ROUNDS = 3
+
+_CLEAR = 4.0
+"""Nats by which the noise of the search has to prefer another shape to the one of the joint fit."""
+
+_FLAT = 0.5
+"""Nats within which it does not tell neighbouring shapes apart."""
+
+
+def refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> FittedModel:
+    """The fit with the likeliest values of its shape's continuous numbers, closed in on one by one.
+
+    Args:
+        best: the fit.
+        base: what it is beside.
+        again: once more from there, with the amplitudes that fit the new shape.
+    """
+    term = best.model.terms[-1]
+    names = continuous(term)
+    if not names:
+        return best
+    for count in range(_ROUNDS):
+        for name in names:
+            shapes = finer(term, name, base.model.prepared.time, count)
+            value = [_energy(best, base.model.with_term(shape)) for shape in shapes]
+            term = shapes[min(range(len(shapes)), key=value.__getitem__)]
+    moved = fitted_beside(base, base.model.with_term(term), best.parameters, graduate=False)
+    if not (moved.log_likelihood > best.log_likelihood and repeats(moved)):
+        return best
+    return refined(moved, base) if again else moved
+
+
+def closer(
+    terms: Sequence[Term],
+    model: JointModel,
+    parameters: Tensor,
+    tangents: Tangents,
+    counts: Float[Tensor, "N m"],
+    linearised: Linearised,
+) -> tuple[Term, ...]:
+    """Candidates with the continuous numbers of their shapes closed in on under the noise of the search.
+
+    Only where a port is pointwise: elsewhere each shape takes a trajectory of its own.
+    """
+    closer = []
+    for term in terms:
+        names = continuous(term)
+        if not names or tangents.pointwise[term.port] is None:
+            continue
+        found = term
+        for count in range(_ROUNDS):
+            for name in names:
+                shapes = finer(found, name, model.prepared.time, count)
+                gains = linearised.gains_of(candidate_tangents(model, parameters, shapes, tangents.pointwise), counts)
+                found = shapes[int(gains.ratio[:, 0].argmax())]
+        if found.shape != term.shape:
+            closer.append(found)
+    return tuple(closer)
+
+
+def coloured(
+    best: FittedModel,
+    base: FittedModel,
+    around: FittedModel,
+    tangents: Tangents,
+    counts: Float[Tensor, "N m"],
+    linearised: Linearised,
+) -> FittedModel:
+    """The fit with the shape that the noise of the search makes of its own: a joint fit takes the noise for white.
+
+    That is another one where it is clearly better, else the middle one of those that are not told apart, as all onsets
+    within a burst of rejected samples are. ``around`` is the fit that the search is linear around.
+    """
+    own = best.model.terms[-1]
+    names = continuous(own)
+    if not names or tangents.pointwise[own.port] is None:
+        return best
+
+    def gains(terms: Sequence[Term]) -> list[float]:
+        beside = candidate_tangents(around.model, around.parameters, terms, tangents.pointwise)
+        return linearised.gains_of(beside, counts).ratio[:, 0].tolist()
+
+    others = closer([own], around.model, around.parameters, tangents, counts, linearised)
+    here, *there = gains([own, *others])
+    if there and there[0] > here + _CLEAR:
+        moved = others[0]
+    else:
+        moved = own
+        for name in names * _ROUNDS:
+            shapes = finer(moved, name, base.model.prepared.time, 1)
+            moved = shapes[middle(gains(shapes), [shape.shape for shape in shapes].index(moved.shape))]
+    if moved.shape == own.shape:
+        return best
+    fit = fitted_beside(base, best.model.with_shape(moved.shape), best.parameters, graduate=False)
+    return fit if fit.converged and repeats(fit) else best
+
+
+def middle(values: Sequence[float], place: int) -> int:
+    """The middle one of the neighbours of a place that are not told apart from it, by values in nats.
+
+    Example:
+        >>> middle([1.0, 7.0, 7.2, 7.1, 7.0, 7.2, 2.0, 7.2], 1)
+        3
+    """
+    first = last = place
+    while first > 0 and abs(values[first - 1] - values[place]) < _FLAT:
+        first -= 1
+    while last < len(values) - 1 and abs(values[last + 1] - values[place]) < _FLAT:
+        last += 1
+    return (first + last) // 2
+
+
+def _energy(fit: FittedModel, model: JointModel) -> float:
+    """Of another shape, at the same parameters."""
+    return float(mkc_energy(model.residual(fit.parameters), fit.sigma, fit.d).sum())

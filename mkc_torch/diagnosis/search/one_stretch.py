@@ -1,0 +1,61 @@
+"""Evidence of an effect that lies in one short stretch of the recording, as a burst of outliers does."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.diagnosis.linearised.beside_wander import explained
+from mkc_torch.diagnosis.noise.bursts import crowded
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["telling_stretch"]
+
+_STRETCHES = 25
+"""A stretch is as long as one of so many parts of the recording, as the blocks of the held-out evidence are."""
+
+_MOST = 0.5
+"""Share of the evidence from which it lies in one stretch."""
+
+
+def telling_stretch(
+    pseudo: Float[Tensor, "N m"],
+    counts: Float[Tensor, "N m"],
+    trace: Float[Tensor, "N m"],
+    nuisance: Float[Tensor, "N m p"],
+) -> tuple[int, int] | None:
+    """First sample and the one after the last of the stretch that most of the evidence is from; None if it is spread.
+
+    Of a recording without bursts of outliers elsewhere it is None too: there, nothing else could have made the stretch.
+
+    Args:
+        pseudo: pseudo-residual without the effect, with 0 where it does not count.
+        counts: 0 where a residual is rejected.
+        trace: the effect in it, at its likeliest size.
+        nuisance: tangents of the simulation's own parameters.
+
+    Example:
+        >>> import torch
+        >>> trace = torch.zeros(1000, 1, dtype=torch.float64)
+        >>> trace[400:420] = 1.0
+        >>> counts = torch.ones_like(trace)
+        >>> counts[700:730] = 0.0
+        >>> telling_stretch(trace, counts, trace, torch.ones(1000, 1, 1, dtype=torch.float64))
+        (380, 420)
+        >>> telling_stretch(trace, torch.ones_like(trace), trace, torch.ones(1000, 1, 1, dtype=torch.float64))
+    """
+    N = len(pseudo)
+    left = counts * (pseudo - explained(pseudo, counts, nuisance))
+    own = counts * (trace - explained(trace, counts, nuisance))
+    gain = (own * (left - 0.5 * own)).sum(-1)
+    width = max(N // _STRETCHES, 1)
+    within = gain.unfold(0, width, 1).sum(-1)
+    first = int(within.argmax())
+    if not float(within[first]) > _MOST * float(gain.sum()) > 0.0:
+        return None
+    elsewhere = crowded(1.0 - counts).amax(-1)
+    elsewhere[max(first - width, 0) : first + 2 * width] = False
+    return (first, first + width) if bool(elsewhere.any()) else None

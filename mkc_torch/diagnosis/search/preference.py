@@ -1,0 +1,112 @@
+"""Which of two accounts goes first where both fit: physics with a known driver, unless another is clearly better."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.model.drivers import ANY, Driver
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.term import Term, continuous, follows_signal
+from mkc_torch.diagnosis.noise.innovations import either_way
+from mkc_torch.effects.base import GainEffect, ShapedEffect
+from mkc_torch.effects.sensor.unknown import UNKNOWN
+from mkc_torch.simulation.protocol import PreparedSimulation
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["ALIKE_COLUMNS", "Preference", "alike", "schwarz"]
+
+NAMELESS, OVER_DRIVER, OVER_MOTION = 10.0, 0.25, 0.5
+"""A curve without a name can follow any named effect a little better: nats, and shares of its gain, that it gives.
+
+Of the motion itself all forces are functions, and it repeats itself: there a curve follows them more closely.
+"""
+
+ROLELESS, FOLLOWER, ALIKE_COLUMNS = 0.3, 0.95, 0.9
+"""A column of unknown role may be a consequence of a known driver; the second share holds above this correlation."""
+
+EVENT, ALIKE_EVENT = 0.05, 0.85
+"""An event in time that goes along with a known driver to more than this correlation gives this share."""
+
+
+AKAIKE = 1.0
+"""Nats for every number (Akaike's criterion)."""
+
+
+class Preference:
+    """Handicaps of candidates, in nats.
+
+    Args:
+        terms: all candidates; their drivers of known role are what others are compared with.
+        prepared: the simulation of the recording.
+    """
+
+    def __init__(self, terms: Sequence[Term], prepared: PreparedSimulation) -> None:
+        drivers = {
+            id(t.driver): t.driver for t in terms if t.driver is not None and t.driver.role not in (ANY, "position")
+        }
+        courses = [_unit(driver.values[:, 0]) for driver in drivers.values()]
+        self._known = torch.stack(courses) if courses else prepared.time.new_zeros(0, len(prepared.time))
+        self._prepared = prepared
+
+    def handicap(self, term: Term, gain: float) -> float:
+        """What a candidate's gain is lessened by before it is compared with others."""
+        fixed = share = 0.0
+        if term.effect.id == UNKNOWN:
+            fixed, share = NAMELESS, OVER_MOTION if term.driver is None else OVER_DRIVER
+        if term.driver is not None and term.driver.role == ANY:
+            share += FOLLOWER if self._alike(term.driver.values[:, 0]) > ALIKE_COLUMNS else ROLELESS
+        elif term.driver is None and isinstance(term.effect, GainEffect) and not follows_signal(term.effect):
+            course = term.effect.course(term.shape, term.context(self._prepared, None))
+            share += EVENT if self._alike(course) > ALIKE_EVENT else 0.0
+        return fixed + share * max(gain, 0.0)
+
+    def score(self, fit: FittedModel, base: FittedModel) -> float:
+        """Gain in nats less Schwarz's penalty, and less the handicap."""
+        gain = fit.log_likelihood - base.log_likelihood
+        score = gain - schwarz(fit) * fit.model.sizes[-1]
+        return score - self.handicap(fit.model.terms[-1], gain)
+
+    def by_innovations(self, one: FittedModel, other: FittedModel, price: float = AKAIKE) -> float:
+        """Nats by which the other of two fits is preferred, their noise taken for coloured: as a joint fit does not.
+
+        Each pays a price for every number it has. 0 where one has a handicap, which is meant for likelihoods.
+        """
+        terms = [fit.model.terms[-1] for fit in (one, other)]
+        if any(self.handicap(term, 1.0) > 0.0 for term in terms):
+            return 0.0
+        sizes = [fit.model.sizes[-1] + _fitted_numbers(fit.model.terms[-1]) for fit in (one, other)]
+        return either_way(one.residual, other.residual) - price * (sizes[1] - sizes[0])
+
+    def _alike(self, course: Float[Tensor, " N"]) -> float:
+        """Largest correlation with one of the known drivers, either sign."""
+        return float((self._known @ _unit(course)).abs().max()) if len(self._known) else 0.0
+
+
+def _fitted_numbers(term: Term) -> int:
+    """Of its shape."""
+    shaped = term.effect.fitted_shape if isinstance(term.effect, ShapedEffect) else {}
+    return len({*continuous(term), *shaped})
+
+
+def schwarz(fit: FittedModel) -> float:
+    """Nats for every number by Schwarz's criterion."""
+    return 0.5 * math.log(len(fit.residual))
+
+
+def alike(one: Driver, other: Driver) -> float:
+    """Correlation of two drivers of one column each, either sign; 0 for others."""
+    if one.values.shape[1] != 1 or other.values.shape[1] != 1:
+        return 0.0
+    return abs(float(_unit(one.values[:, 0]) @ _unit(other.values[:, 0])))
+
+
+def _unit(course: Tensor) -> Tensor:
+    centred = course - course.mean()
+    return centred / torch.linalg.vector_norm(centred).clamp(min=1e-300)

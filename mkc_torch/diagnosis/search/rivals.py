@@ -1,0 +1,110 @@
+"""Rivals of what a search has named: whether they keep its gain once fitted, and what they leave that is new."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+from mkc_torch.diagnosis.linearised.linearise import Linearised
+from mkc_torch.diagnosis.linearised.tangents import Tangents
+from mkc_torch.diagnosis.model.fit import FittedModel, repeats
+from mkc_torch.diagnosis.model.side_by_side import fitted_each, memory_kept
+from mkc_torch.diagnosis.model.term import Key, Term
+from mkc_torch.diagnosis.search.closing_in import refined
+from mkc_torch.diagnosis.search.preference import Preference, schwarz
+from mkc_torch.diagnosis.search.ranking import SEPARABLE, Ranked
+from mkc_torch.diagnosis.search.strongest import refitted
+
+__all__ = ["KEPT", "by_joint_fits"]
+
+KEPT = 0.8
+"""Share of the gain that a joint fit keeps of what the search, which is linear, has promised."""
+
+
+def by_joint_fits(
+    best: FittedModel,
+    base: FittedModel,
+    ranking: tuple[Ranked, ...],
+    terms: tuple[Term, ...],
+    linearised: Linearised,
+    tangents: Tangents,
+    prefer: Preference,
+    known: Sequence[FittedModel],
+) -> tuple[FittedModel, tuple[Ranked, ...]]:
+    """The fit, or a simpler one that is no worse; and the ranking, with rivals that lose much of their gain put back.
+
+    A port that is not pointwise bends the trajectory: a rival of the search can follow the one that the effect has
+    made, and yet not make one like it. So those that the search has as near as the effect are fitted, unless a
+    ``known`` fit keeps the gain.
+    """
+    own = best.model.terms[-1].key
+    reach = SEPARABLE + max([one.gap for one in ranking if terms[one.number].key == own], default=0.0)
+    near = [
+        one
+        for one in ranking
+        if one.gap < reach and terms[one.number].key != own and tangents.pointwise[terms[one.number].port] is None
+    ]
+    won = prefer.score(best, base)
+    fitted = {fit.model.terms[-1].key: fit for fit in reversed(known) if prefer.score(fit, base) >= KEPT * won}
+    new = [one for one in near if terms[one.number].key not in fitted]
+    works = [partial(_tried, best, base, terms[one.number], linearised, one.number) for one in new]
+    with memory_kept(base.model.prepared):
+        for fit in fitted_each(best, works, [terms[one.number] for one in new]) if new else ():
+            fitted[fit.model.terms[-1].key] = fit
+    fits = [fitted[terms[one.number].key] for one in near]
+    scores = [prefer.score(fit, base) for fit in fits]
+    behind = {one.number: won - score for one, score in zip(near, scores, strict=True) if score < KEPT * won}
+    told = sorted((replace(one, gap=max(one.gap, behind.get(one.number, 0.0))) for one in ranking), key=_gap)
+    told = [replace(one, gap=one.gap - told[0].gap) for one in told]
+    simpler = [
+        (score, fit)
+        for score, fit in zip(scores, fits, strict=True)
+        if fit.model.sizes[-1] < best.model.sizes[-1]
+        and score >= won
+        and prefer.by_innovations(best, fit, schwarz(best)) >= 0.0
+        and repeats(fit)
+    ]
+    if simpler:
+        return max(simpler, key=lambda one: one[0])[1], tuple(told)
+    bent = [fit for fit in known if tangents.pointwise[fit.model.terms[-1].port] is None]
+    return _by_innovations(best, tuple(told), terms, prefer, [*fits, *bent])
+
+
+def _by_innovations(
+    best: FittedModel,
+    ranking: tuple[Ranked, ...],
+    terms: tuple[Term, ...],
+    prefer: Preference,
+    fits: Sequence[FittedModel],
+) -> tuple[FittedModel, tuple[Ranked, ...]]:
+    """The fit, or one of another physics that clearly leaves less in coloured noise; and the ranking by that.
+
+    Joint fits take noise for white, and one that follows its slow course wins by it. What is new in each sample tells
+    two physics apart that are alike in the long run.
+    """
+    if not fits:
+        return best, ranking
+    fits = [best, *fits]
+    for fit in fits:
+        another = fit.model.terms[-1].key != best.model.terms[-1].key
+        if another and prefer.by_innovations(best, fit) > SEPARABLE and repeats(fit):
+            best = fit
+    own = best.model.terms[-1].key
+    behind: dict[Key, float] = {}
+    for fit in fits:
+        key, gap = fit.model.terms[-1].key, prefer.by_innovations(fit, best)
+        behind[key] = min(gap, behind.get(key, gap))
+    told = [
+        replace(one, gap=0.0 if key == own else max(one.gap, behind.get(key, 0.0)))
+        for one, key in ((one, terms[one.number].key) for one in ranking)
+    ]
+    return best, tuple(sorted(told, key=_gap))
+
+
+def _tried(best: FittedModel, base: FittedModel, term: Term, linearised: Linearised, number: int) -> FittedModel:
+    return refined(refitted(best, base, term, linearised, number), base)
+
+
+def _gap(one: Ranked) -> float:
+    return one.gap

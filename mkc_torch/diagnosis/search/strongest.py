@@ -1,0 +1,217 @@
+"""The candidates that a joint refit makes the most of, from starts that a bad first fit cannot hide."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.diagnosis.linearised.linearise import Linearised, linearise
+from mkc_torch.diagnosis.linearised.tangents import Tangents, tangents_of
+from mkc_torch.diagnosis.model.fit import FittedModel, clipped_residual, fitted_beside, repeats
+from mkc_torch.diagnosis.model.side_by_side import each, ending_at_fit, fitted_each
+from mkc_torch.diagnosis.model.term import Key, Term, one_sided
+from mkc_torch.diagnosis.search.closing_in import refined
+from mkc_torch.diagnosis.search.preference import Preference
+from mkc_torch.simulation.protocol import Beginning
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+T = TypeVar("T")
+
+__all__ = ["refitted", "strongest"]
+
+_SHORT_LIST = 6
+_PARTS, _BETTER = 2, 0.8
+_AWAY = 5.0
+"""Times that a parameter is larger, or smaller, than where its fit began."""
+
+_LEADING, _THIRD, _MUCH = 2, 0.6, 50.0
+"""Fits whose shapes are tried; a third one, where it has this share of the first one's score and as many nats."""
+
+_SHAPES = 5
+
+Start = tuple[Tensor, tuple[Tensor, Tensor]]
+"""Parameters to linearise around, and the pseudo-residual there with what counts of it."""
+
+Listed = tuple[Term, Tensor]
+"""A candidate worth a joint refit, with the parameters to start from, its γ the last ones."""
+
+
+def strongest(
+    base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *, parts: bool
+) -> tuple[list[FittedModel], Tangents]:
+    """The joint refits, the likeliest first; the leading ones each at its best shape, and behind them the others.
+
+    Beside them the tangents at the fit that they are beside.
+
+    Candidates are ranked by the likelihood's own score and by a clipped one, which still sees a stretch of samples that
+    the fit rejects; and, where one model over all of the recording runs away, around fits to parts of it, and around
+    where its fit began.
+    """
+    around = base.parameters
+    tangents = tangents_of(base.model, around, terms)
+    looks = [((around, base.pseudo), _SHORT_LIST), ((around, clipped_residual(base.residual)), 2)]
+    lists = each(base, [partial(_short_list, base, terms, start, tangents, most) for start, most in looks], terms)
+    fits: dict[Key, FittedModel] = {}
+    fitted_parts = _part_fits(base) if parts else []
+    listed: dict[Key, Listed] = {}
+    for one in chain(*(chosen for chosen, _ in lists)):
+        listed.setdefault(one[0].key, one)
+    starts = _refit_all(fits, base, list(listed.values()), prefer, fitted_parts)
+    if parts:
+        least = torch.stack([fit.d for fit in fits.values()]).amin(0)
+        started = [one.start for one in starts if one is not None and bool((one.scale < _BETTER * least).any())]
+        more = [
+            _short_list(base, terms, start, tangents_of(base.model, start[0], terms), 2)
+            for start in (*started, *_first_start(base))
+        ]
+        _refit_all(fits, base, [*chain(*(chosen for chosen, _ in more))], prefer)
+        lists += more
+    likeliest = torch.stack([log_p for _, log_p in lists]).amin(0)
+    order = [terms[number] for number in likeliest.argsort().tolist()]
+    leading = _at_best_shapes(_leading(list(fits.values()), base, prefer), base, order, prefer)
+    shaped = fitted_each(base, [partial(refined, fit, base) for fit in leading], terms)
+    shaped = [fit for fit in shaped if repeats(fit)] or [fit for fit in fits.values() if repeats(fit)]
+    if not shaped:
+        raise ValueError(
+            f"The simulation gave finite outputs while {len(fits)} effects were fitted, and gives none now at the same "
+            "parameters: it is at the edge of what can be solved. Shorten the experiments, or give a `segment`."
+        )
+    keys = {fit.model.terms[-1].key for fit in shaped}
+    parted = shaped, [fit for key, fit in fits.items() if key not in keys]
+    fitted = [fit for part in parted for fit in sorted(part, key=lambda fit: prefer.score(fit, base), reverse=True)]
+    return fitted, tangents
+
+
+def _short_list(
+    base: FittedModel, terms: tuple[Term, ...], start: Start, tangents: Tangents, most: int
+) -> tuple[list[Listed], Float[Tensor, " C"]]:
+    """The strongest candidates, noise taken for white, and the log of each one's p."""
+    parameters, (pseudo, counts) = start
+    plain = linearise(base.model, parameters, pseudo, counts, tangents, white=True, wander=False)
+    log_p = plain.search.gains(plain.series.unsqueeze(-1)).log_p[:, 0]
+    chosen: dict[Key, Listed] = {}
+    for number in log_p.argsort().tolist():
+        term = terms[number]
+        if term.key not in chosen:
+            gamma, _ = plain.search.estimate(number, plain.series)
+            if one_sided(term.effect):
+                gamma = gamma.clamp(max=0.0)
+                if not bool(gamma.any()):
+                    continue
+            chosen[term.key] = term, torch.cat([parameters, -gamma])
+        if len(chosen) >= most:
+            break
+    if not chosen:
+        # none has a size of a sign that its physics allows; one of them is still to be told to be nothing
+        size = base.model.with_term(terms[0]).sizes[-1]
+        chosen[terms[0].key] = terms[0], torch.cat([parameters, parameters.new_zeros(size)])
+    return list(chosen.values()), log_p
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A fit to a part of the recording, as a start, and the robust scale of its residuals there."""
+
+    start: Start
+    scale: Float[Tensor, " m"]
+
+
+def _part_fits(base: FittedModel) -> list[Callable[[], _Part | None]]:
+    """Works that fit parts of the recording; None where one cannot be fitted alone."""
+    N = len(base.model.prepared.time)
+
+    def fit_to(rows: Bool[Tensor, " N"]) -> _Part | None:
+        try:
+            theta = base.model.prepared.start(rows)
+        except ValueError:
+            return None
+        parameters = torch.cat([theta, base.parameters[base.model.base :]])
+        residual = base.model.residual(parameters)
+        return _Part((parameters, clipped_residual(residual)), robust_scale(residual[rows]))
+
+    part = torch.arange(N) * _PARTS // N
+    return [partial(fit_to, part == number) for number in range(_PARTS)]
+
+
+def _first_start(base: FittedModel) -> list[Start]:
+    """Around where the fit began, if a parameter of the equations went far from there: what they lack can drive it."""
+    prepared = base.model.prepared
+    if not isinstance(prepared, Beginning):
+        return []
+    theta, own = prepared.start(), base.model.base - prepared.beginnings
+    sizes = torch.stack([theta[:own], base.parameters[:own]]).abs()
+    if not bool((sizes.amax(0) > _AWAY * sizes.amin(0)).any()):
+        return []
+    parameters = torch.cat([theta, base.parameters[base.model.base :]])
+    residual = base.model.residual(parameters)
+    return [(parameters, clipped_residual(residual))] if bool(residual.isfinite().all()) else []
+
+
+def _refit_all(
+    fits: dict[Key, FittedModel],
+    base: FittedModel,
+    listed: Sequence[Listed],
+    prefer: Preference,
+    beside: Sequence[Callable[[], T]] = (),
+) -> list[T]:
+    """Put the joint refit of each into ``fits``, where it is the better one of its physics; others go on beside."""
+    works = [ending_at_fit(partial(fitted_beside, base, base.model.with_term(term), start)) for term, start in listed]
+    done: list[Any] = each(base, [*works, *beside], [term for term, _ in listed])
+    for (term, _), fit in zip(listed, done, strict=False):
+        if term.key not in fits or prefer.score(fit, base) > prefer.score(fits[term.key], base):
+            fits[term.key] = fit
+    return done[len(works) :]
+
+
+def _leading(fits: Sequence[FittedModel], base: FittedModel, prefer: Preference) -> list[FittedModel]:
+    """The first ones, and another that is close behind."""
+    first = sorted(fits, key=lambda fit: prefer.score(fit, base), reverse=True)[: _LEADING + 1]
+    close = max(_THIRD * prefer.score(first[0], base), _MUCH)
+    return [fit for place, fit in enumerate(first) if place < _LEADING or prefer.score(fit, base) > close]
+
+
+def _at_best_shapes(
+    fits: Sequence[FittedModel], base: FittedModel, terms: Sequence[Term], prefer: Preference
+) -> list[FittedModel]:
+    """Each fit, or a better one with another shape of the same effect, the likeliest of ``terms`` first.
+
+    Onsets are many, and closed in on later.
+    """
+    tried = []
+    for place, fit in enumerate(fits):
+        own = fit.model.terms[-1]
+        others = [t for t in terms if t.key == own.key and t.shape != own.shape]
+        tried += [(place, other) for other in others[:_SHAPES] if "onset" not in own.shape]
+    refits = fitted_each(base, [partial(_reshaped, fits[k], base, other) for k, other in tried], terms)
+    best = list(fits)
+    for (place, _), refit in zip(tried, refits, strict=True):
+        best[place] = max(best[place], refit, key=lambda fit: prefer.score(fit, base))
+    return best
+
+
+def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
+    fit.model.residual(fit.parameters)  # what other shapes of it begin with, where a simulation remembers
+    model = base.model.with_term(term)
+    kept = fit.parameters[: model.size]
+    more = kept.new_zeros(model.size - len(kept))
+    return fitted_beside(base, model, torch.cat([kept, more]), graduate=False)
+
+
+def refitted(best: FittedModel, base: FittedModel, term: Term, linearised: Linearised, number: int) -> FittedModel:
+    gamma, _ = linearised.search.estimate(number, linearised.series)
+    gamma = gamma.clamp(max=0.0) if one_sided(term.effect) else gamma
+    model = base.model.with_term(term)
+    found = fitted_beside(base, model, torch.cat([best.parameters[: base.model.size], -gamma]))
+    if found.log_likelihood >= base.log_likelihood and repeats(found):
+        return found
+    # it went astray from there: from nothing it only climbs
+    return fitted_beside(base, model, torch.cat([base.parameters, torch.zeros_like(gamma)]), graduate=False)

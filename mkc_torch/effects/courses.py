@@ -1,0 +1,73 @@
+"""Courses along a recording that several effects are made of."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.runs import first_of_runs, passed_on, run_numbers
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+__all__ = ["after", "combined", "gained", "lagged", "per"]
+
+_LEAST = 1e-12
+
+
+def gained(course: Float[Tensor, " N"], gain: Float[Tensor, " c"]) -> Float[Tensor, "N c"]:
+    """A course times a gain for each channel."""
+    return course.unsqueeze(-1) @ gain.unsqueeze(0)
+
+
+def per(unit: str, other: str) -> str:
+    """The unit of one for each of the other.
+
+    Example:
+        >>> per("µT", "A"), per("µT", ""), per("µT", "°C")
+        ('µT/A', 'µT', 'µT/K')
+    """
+    return f"{unit}/{'K' if other == '°C' else other}" if other else unit
+
+
+def after(time: Float[Tensor, " N"], onset: float) -> Float[Tensor, " N"]:
+    """0 before the onset, 1 from it on."""
+    return (time >= onset).to(time.dtype)
+
+
+def combined(basis: Float[Tensor, "N c q"], gamma: Float[Tensor, " q"]) -> Float[Tensor, "N c"]:
+    """``basis @ γ``."""
+    # as one matrix: with many γ at once the basis of each sample would be copied for each of them
+    return (basis.flatten(0, 1) @ gamma).unflatten(0, basis.shape[:2])
+
+
+def lagged(
+    values: Float[Tensor, " N"], time: Float[Tensor, " N"], lag: float, run: Int[Tensor, " N"] | None = None
+) -> Float[Tensor, " N"]:
+    """Values behind a first-order lag with this time constant in s, at rest before the first sample of each run.
+
+    ``lag ẏ = x − y``, exact for intervals of any length where x goes straight from sample to sample.
+
+    Args:
+        values: x at the samples.
+        time: of the samples in s.
+        lag: in s; nothing changes where it is not positive.
+        run: of each sample's run; None where a run begins when time goes back, and only there.
+
+    Example:
+        >>> time = torch.arange(0.0, 5.0, 0.01, dtype=torch.float64)
+        >>> float(lagged((time - 1.0).clamp(min=0.0), time, 1.0)[200])  # a ramp: 1 - (1 - 1 / e)
+        0.367...
+    """
+    if lag <= 0:
+        return values
+    first = first_of_runs(run_numbers(time) if run is None else run)
+    ratio = torch.cat([time.new_zeros(1), time.diff()]).clamp(min=0.0) / lag
+    keep = torch.where(first, 0.0, torch.exp(-ratio))
+    ratio = ratio.clamp(min=_LEAST)
+    late = torch.where(first, 0.0, -torch.expm1(-ratio) / ratio)
+    away = values - values[0]
+    before = torch.cat([away[:1], away[:-1]])
+    return values[0] + passed_on(keep, (late - keep) * before + (1.0 - late) * away)

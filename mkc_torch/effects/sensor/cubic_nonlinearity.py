@@ -1,0 +1,68 @@
+"""A sensor whose response bends at large fields."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.effects.context import Context, Quantity, Shape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+class CubicNonlinearity:
+    """The sensing element's response to the field is not quite a straight line.
+
+    Simulation: adds ``α_i B_i³`` to each axis of the sensor, with B the simulated measurement less its offset: the
+    first odd term beyond a linear response; or ``α_i B_i³ + β_i B_i²``, where the element also feels a magnet beside
+    it, which is an offset of the measurement: the cube of a sum has a square in it.
+    Drivers: none but the field itself.
+    Units: α in 1/µT², β in 1/µT.
+    Plausible: up to 4e-5 /µT², 10 % at 50 µT.
+    Source: data sheets of AMR, Hall and TMR sensors, linearity of 0.1-1 % of full scale.
+
+    Example:
+        >>> import torch
+        >>> from mkc_torch.effects import Context
+        >>> field = torch.tensor([[50.0, 0.0, -25.0]])
+        >>> context = Context(torch.zeros(1), torch.zeros(1, 0), (), field, "µT", ("x", "y", "z"))
+        >>> CubicNonlinearity().change(torch.tensor([4e-5, 4e-5, 4e-5]), {}, context)
+        tensor([[ 5.0000,  0.0000, -0.6250]])
+    """
+
+    id = "cubic_nonlinearity"
+    port = "sensor"
+    follows_signal = True
+    roles: tuple[str, ...] = ()
+    equation = "δB_i = α_i B_i³ (+ β_i B_i²)"
+    explanation = "The sensor's response is not a straight line: it bends at large fields."
+    advice = "Correct with the fitted coefficients; check the sensor's range setting."
+    again = "a response that bends is there at all times, wherever the field along an axis is large"
+    choices = ("terms",)
+    plausible = 4e-5
+    plausible_unit = "1/µT²"
+    source = (
+        "linearity of 0.1-1 % of full scale in data sheets of AMR, Hall and TMR sensors; 4e-5 /µT² are 10 % at 50 µT"
+    )
+
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
+        return ({}, {"terms": 2.0})
+
+    def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
+        return "δB_i = α_i B_i³" + (" + β_i B_i²" if "terms" in shape else "") + ",  for each axis i"
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
+        cubic = Quantity("coefficient", len(context.channels), f"1/{context.signal_unit}²")
+        if "terms" not in shape:
+            return (cubic,)
+        return cubic, Quantity("quadratic_coefficient", len(context.channels), f"1/{context.signal_unit}")
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
+        field = context.signal
+        if "terms" not in shape:
+            return gamma * field.pow(3)
+        cubic, quadratic = gamma.unflatten(-1, (2, -1)).unbind(-2)
+        return cubic * field.pow(3) + quadratic * field.square()

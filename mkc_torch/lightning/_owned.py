@@ -1,0 +1,75 @@
+"""A loss whose sigma and d the callback has taken over from the optimiser."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from lightning.pytorch import Trainer
+from torch import Tensor, nn
+from torch.utils.hooks import RemovableHandle
+
+from mkc_torch.density.energy import KAPPA_MAX
+from mkc_torch.losses.mkc import MKCLoss
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+
+__all__ = ["SIGMA_CAP"]
+
+SIGMA_CAP = 1000.0
+"""The largest σ that is logged, and that a loss with ``learn_sigma=True`` is set to. Two d from 0 its energy is the
+Gaussian's to one part in a million."""
+
+_D_MARGIN = 1e-6  # a learned d lies strictly between its floor and the bound
+
+
+@dataclass
+class OwnedLoss:
+    """A loss in the callback's hands: its name in the module, the hook on it, and what had gradients before."""
+
+    name: str
+    loss: MKCLoss
+    handle: RemovableHandle
+    learned: list[nn.Parameter]
+
+    @classmethod
+    def of(cls, name: str, loss: MKCLoss, hook: Callable[..., None]) -> OwnedLoss:
+        learned = [p for p in (loss.raw_kappa, loss.raw_d) if p is not None and p.requires_grad]
+        for parameter in learned:
+            parameter.requires_grad_(False)
+        return cls(name, loss, loss.register_forward_hook(hook, with_kwargs=True), learned)
+
+    def release(self) -> None:
+        self.handle.remove()
+        for parameter in self.learned:
+            parameter.requires_grad_(True)
+
+    def refuse_optimised(self, trainer: Trainer) -> None:
+        """Refuses a loss whose own parameters an optimiser would move as well."""
+        optimised = {id(p) for o in trainer.optimizers for group in o.param_groups for p in group["params"]}
+        own = [f"{self.name}.{key}" for key, p in self.loss.named_parameters() if id(p) in optimised]
+        if own:
+            raise ValueError(
+                f"Expected the sigma and d of the loss `{self.name}` in no optimiser but got {', '.join(own)}: "
+                "MKCExpectationMaximization fits them. Make that loss with `learn_sigma=False, learn_d=False, "
+                "normalize=True`, or leave its parameters out of `configure_optimizers`."
+            )
+
+    def assign(self, channels: Bool[Tensor, " m"], kappa: Float[Tensor, " m"], d: Float[Tensor, " m"]) -> None:
+        """Sets κ and d of the chosen channels and leaves those of the others as they are, to the last bit."""
+        loss = self.loss
+        stored = [t for t in (loss.raw_kappa, loss.raw_d, loss.fixed_kappa, loss.fixed_d) if t is not None]
+        before = [t.detach().clone() for t in stored]
+        if loss.raw_kappa is not None:
+            kappa = kappa.clamp(min=SIGMA_CAP**-2)
+        if loss.raw_d is not None:
+            low, high = loss.d_min.to(d), loss.bound.to(d)
+            d = torch.minimum(torch.maximum(d, low * (1.0 + _D_MARGIN)), high * (1.0 - _D_MARGIN))
+        loss.sigma = kappa.rsqrt().clamp(min=KAPPA_MAX**-0.5)
+        loss.d = d
+        for tensor, old in zip(stored, before, strict=True):
+            tensor.copy_(torch.where(channels.to(tensor.device), tensor, old))

@@ -1,0 +1,1 @@
+"""Derivatives of a fit by the implicit function theorem."""

@@ -1,0 +1,267 @@
+"""Differentiate a robust fit by what holds at its end: the gradient of its objective is zero.
+
+A fit is found by searches, steps and stops that have no useful derivative. Its result θ solves ``g(θ, x) = 0`` for the
+data x, so near the data at hand it moves by ``-H⁻¹ ∂g/∂x`` with H the Hessian of the objective. That is what
+``θ - H⁻¹ g(θ, x)`` has for a derivative when θ and H are constants. Applied once more to its own result it has the
+right second derivatives too: each application removes one order of the error, since ``1 - H⁻¹ ∂g/∂θ`` vanishes at the
+solution. Third derivatives are not right. Everything after the search is plain torch, so reverse and forward mode and
+vmap need no rules of their own.
+
+H is the Hessian of the likelihood in the coefficients, σ and d at once; of the coefficients alone it is
+``Σ x xᵀ w (1 - z² / σ²) / d²``, not the ``Σ x xᵀ w / d²`` of the fixed point (15).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from mkc_torch.density.energy import energy, inverse_square
+from mkc_torch.density.normalizer import log_partition
+from mkc_torch.linear._implicit.at_rest import FitData, Rest, at_rest
+from mkc_torch.linear._implicit.refusal import Refusing
+from mkc_torch.linear._mkc import coefficient_covariance
+from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, laid_out, linear_problem
+from mkc_torch.linear.covariance import CovarianceKind
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+__all__ = ["Given", "Layer", "fit_layer", "wanted"]
+
+_APPLICATIONS = 2
+"""Orders of derivatives that are right."""
+
+
+class Given(NamedTuple):
+    """What a fit is given beside the data, None where it is not: σ, d and domain (*, m), coefficients to start from."""
+
+    sigma: Tensor | None
+    d: Tensor | None
+    bound: Tensor | None
+    start: Tensor | None
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A differentiable fit in the user's batch dimensions; ``covariance`` and ``extras`` are constants."""
+
+    coef: Float[Tensor, "*batch n"]
+    weights: Float[Tensor, "*batch N m"]
+    kappa: Float[Tensor, "*batch m"]
+    d: Float[Tensor, "*batch m"]
+    bound: Float[Tensor, "*batch m"]
+    log_likelihood: Float[Tensor, " *batch"] | None
+    covariance: Float[Tensor, "*batch n n"]
+    differentiable: Bool[Tensor, " *batch"]
+    converged: Bool[Tensor, " *batch"]
+    extras: tuple[Tensor, ...]
+    single_channel: bool
+
+
+def wanted(*values: object) -> bool:
+    """Whether derivatives by any of these are being recorded, or a transform of ``torch.func`` is at work."""
+    if torch._C._are_functorch_transforms_active():
+        return True
+    return any(
+        (torch.is_grad_enabled() and value.requires_grad) or forward_ad.unpack_dual(value).tangent is not None
+        for value in values
+        if isinstance(value, Tensor)
+    )
+
+
+def fit_layer(
+    X: Float[Tensor, "*batch N m n"],
+    Y: Float[Tensor, "*batch N m"],
+    sample_weight: Float[Tensor, "*batch N"] | None,
+    solve: Callable[[LinearProblem, Given], Rest],
+    *,
+    sigma: float | Tensor | None,
+    d: float | Tensor | None,
+    bound: float | Tensor | None = None,
+    start: Tensor | None = None,
+    covariance: tuple[CovarianceKind, float | None] = ("sandwich", None),
+) -> Layer:
+    """A fit with derivatives by X, Y, the weights, and σ, d and domain where they are given.
+
+    Args:
+        X, Y, sample_weight: as in :func:`linear_problem`.
+        solve: the fit, from checked constants.
+        sigma, d, bound: a number, (m,) or (*, m); None is found by the fit.
+        start: coefficients (n,) or (*, n) to start from, or None.
+        covariance: kind and bandwidth of the covariance of the coefficients.
+
+    Raises:
+        ValueError: bad input, as in :func:`linear_problem`.
+    """
+    values = laid_out(X, Y, sample_weight)
+    rank = len(values.batch)
+    given = Given(*(_of_rank(v, rank, values.Y) for v in (sigma, d, bound, start)))
+    search = _Search(solve, covariance)
+    data = (_with_batch_rank(values.X, rank + 3), values.Y, values.sample_weight)
+    found: tuple[Tensor, ...] = _Solve.apply(search, *data, *given)  # type: ignore[no-untyped-call]
+    count = len(_Found._fields)
+    return _differentiable(values, given, _Found(*found[:count]), found[count:])
+
+
+def _with_batch_rank(value: Tensor, rank: int) -> Tensor:
+    return value.reshape((1,) * (rank - value.dim()) + tuple(value.shape))
+
+
+def _of_rank(value: float | Tensor | None, rank: int, like: Tensor) -> Tensor | None:
+    """A parameter with all the batch dimensions, of size 1 where it has none of its own, so that one more can lead."""
+    if value is None:
+        return None
+    t = value.to(like) if isinstance(value, Tensor) else torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    return _with_batch_rank(t, rank + 1)
+
+
+class _Found(NamedTuple):
+    """Constants that a search hands over, each with the user's batch dimensions in front."""
+
+    to_coef: Float[Tensor, "*#batch n n"]
+    beta: Float[Tensor, "*batch n"]
+    kappa: Float[Tensor, "*batch m"]
+    log_d: Float[Tensor, "*batch m"]
+    log_bound: Float[Tensor, "*batch m"]
+    unit: Float[Tensor, "*batch 1"]
+    total: Float[Tensor, "*batch 1"]
+    inverse: Float[Tensor, "*batch p p"]
+    cause: Int[Tensor, " *batch"]
+    converged: Bool[Tensor, " *batch"]
+    covariance: Float[Tensor, "*batch n n"]
+
+
+class _Search(NamedTuple):
+    solve: Callable[[LinearProblem, Given], Rest]
+    covariance: tuple[CovarianceKind, float | None]
+
+    @torch.no_grad()
+    def run(self, X: Tensor, Y: Tensor, weight: Tensor | None, given: Given) -> tuple[Tensor, ...]:
+        problem = linear_problem(X, Y, weight)
+        rest = self.solve(problem, given)
+        at = at_rest(problem, rest)
+        shared = problem.to_coef.shape[0] == 1
+        lead = (1,) * len(problem.batch) if shared else tuple(problem.batch)
+        covariance = coefficient_covariance(problem, at.beta, at.kappa, torch.exp(at.log_d), *self.covariance)
+        own = (
+            at.beta,
+            at.kappa,
+            at.log_d,
+            torch.zeros_like(at.log_d) if rest.log_bound is None else rest.log_bound,
+            at.unit,
+            at.total,
+            at.inverse,
+            at.cause,
+            rest.converged,
+        )
+        return (
+            problem.to_coef.reshape(lead + tuple(problem.to_coef.shape[1:])),
+            *(problem.restore(v) for v in own),
+            covariance,
+            *(problem.restore(v) for v in rest.extras),
+        )
+
+
+class _Solve(torch.autograd.Function):
+    """The search itself, whose results are constants to every transform; vmap hands it one batch dimension more."""
+
+    @staticmethod
+    def forward(
+        search: _Search,
+        X: Tensor,
+        Y: Tensor,
+        weight: Tensor | None,
+        sigma: Tensor | None,
+        d: Tensor | None,
+        bound: Tensor | None,
+        start: Tensor | None,
+    ) -> tuple[Tensor, ...]:
+        return search.run(X, Y, weight, Given(sigma, d, bound, start))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:  # noqa: ARG004
+        ctx.mark_non_differentiable(*output)
+        ctx.set_materialize_grads(False)
+        ctx.outputs = len(output)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[None, ...]:  # noqa: ARG004
+        return (None,) * 8
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> tuple[None, ...]:  # noqa: ARG004
+        return (None,) * ctx.outputs
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[int | None, ...], search: _Search, *inputs: Tensor | None
+    ) -> tuple[tuple[Tensor, ...], tuple[int | None, ...]]:
+        moved = [
+            None if v is None else v.unsqueeze(0) if dim is None else v.movedim(dim, 0)
+            for v, dim in zip(inputs, in_dims[1:], strict=True)
+        ]
+        X, Y, weight, *given = moved
+        assert X is not None
+        assert Y is not None
+        Y = Y.expand(info.batch_size, *Y.shape[1:])
+        if weight is not None:
+            weight = weight.expand(info.batch_size, *weight.shape[1:])
+        found: tuple[Tensor, ...] = _Solve.apply(search, X, Y, weight, *given)  # type: ignore[no-untyped-call]
+        to_coef, *others = found
+        if to_coef.shape[0] == 1:  # one X for all, kept once
+            return (to_coef.squeeze(0), *others), (None, *(0 for _ in others))
+        return found, (0,) * len(found)
+
+
+def _differentiable(values: CanonicalShapes, given: Given, found: _Found, extras: tuple[Tensor, ...]) -> Layer:
+    """The solution again, in plain torch from the data: found values, derivatives by two chord steps of Newton."""
+    rows = torch.matmul(values.X.flatten(-3, -2), found.to_coef)
+    likelihood = found.inverse.shape[-1] > found.beta.shape[-1]
+    n, m = found.beta.shape[-1], found.kappa.shape[-1]
+    shape = found.kappa.shape
+    kappa = found.kappa if given.sigma is None else inverse_square(given.sigma).expand(shape)
+    log_d = found.log_d if given.d is None else torch.log(given.d).expand(shape)
+    log_bound = found.log_bound if given.bound is None else torch.log(given.bound).expand(shape)
+    data = FitData(
+        rows=rows.reshape(rows.shape[-2:]) if rows.shape[:-2].numel() == 1 else rows,
+        Y=values.Y,
+        weight=values.sample_weight,
+        log_bound=log_bound if likelihood else None,
+        unit=found.unit,
+        total=found.total,
+    )
+    beta = found.beta
+    for _ in range(_APPLICATIONS):
+        gradient = data.gradient(beta, kappa, log_d)
+        move = -torch.matmul(found.inverse, gradient.unsqueeze(-1)).squeeze(-1)
+        beta = beta + found.unit * move[..., :n]
+        if likelihood:
+            kappa, log_d = kappa + move[..., n : n + m], log_d + move[..., n + m :]
+    unknowns = torch.cat([beta, kappa, log_d], -1)
+    unknowns = Refusing.apply(unknowns, found.cause, "")  # type: ignore[no-untyped-call]
+    beta, kappa, log_d = unknowns[..., :n], unknowns[..., n : n + m], unknowns[..., n + m :]
+    z = data.residual(beta) * torch.exp(-log_d).unsqueeze(-2)
+    log_likelihood = None
+    if likelihood:
+        counted = values.Y.shape[-2] if values.sample_weight is None else values.sample_weight.sum(-2)
+        norm = log_d + log_partition(kappa, torch.exp(log_bound - log_d))
+        log_likelihood = -(data.summed(energy(z, kappa.unsqueeze(-2))) + counted * norm).sum(-1)
+    return Layer(
+        coef=torch.matmul(found.to_coef, beta.unsqueeze(-1)).squeeze(-1),
+        weights=torch.exp(-0.5 * kappa.unsqueeze(-2) * z * z),
+        kappa=kappa,
+        d=torch.exp(log_d),
+        bound=torch.exp(log_bound),
+        log_likelihood=log_likelihood,
+        covariance=found.covariance,
+        differentiable=found.cause == 0,
+        converged=found.converged,
+        extras=extras,
+        single_channel=values.single_channel,
+    )

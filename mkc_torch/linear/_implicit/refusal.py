@@ -1,0 +1,78 @@
+"""Gradients that do not exist: which problems, and why."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = ["NotDifferentiableError"]
+
+
+class NotDifferentiableError(ValueError):
+    """A derivative was asked for of a fit that is no strict minimum, or that did not come to rest."""
+
+
+class Refusing(torch.autograd.Function):
+    """The identity, whose derivative is refused for problems with a cause against it.
+
+    Backward refuses only what is asked for: a problem left out of the loss has a gradient of zeros.
+    """
+
+    @staticmethod
+    def forward(value: Tensor, cause: Tensor, check: str) -> Tensor:
+        refused = cause != 0
+        if check and bool(refused.any()):
+            asked = refused & (value != 0).any(-1) if check == "asked" else refused
+            if _somewhere(asked):
+                raise NotDifferentiableError(_refusal(cause, refused))
+        return value.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, str], output: Tensor) -> None:  # noqa: ARG004
+        ctx.save_for_backward(inputs[1])
+        ctx.save_for_forward(inputs[1])
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        return Refusing.apply(grad, ctx.saved_tensors[0], "asked"), None, None  # type: ignore[no-untyped-call]
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: None) -> Tensor:
+        result: Tensor = Refusing.apply(tangent, ctx.saved_tensors[0], "all")  # type: ignore[no-untyped-call]
+        return result
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[int | None, int | None, None], value: Tensor, cause: Tensor, check: str
+    ) -> tuple[Tensor, int]:
+        size = info.batch_size
+        value, cause = (
+            v.expand(size, *v.shape) if dim is None else v.movedim(dim, 0)
+            for v, dim in zip((value, cause), in_dims[:2], strict=True)
+        )
+        return Refusing.apply(value, cause, check), 0  # type: ignore[no-untyped-call]
+
+
+def _somewhere(mask: Tensor) -> bool:
+    try:
+        return bool(mask.any())
+    except RuntimeError:  # gradients batched by autograd itself have no one value
+        return True
+
+
+_NOT_AT_REST, _NO_MINIMUM = 1, 2
+
+
+def _refusal(cause: Tensor, refused: Tensor) -> str:
+    first = tuple(int(i) for i in refused.nonzero()[0])
+    which = f"problem {', '.join(map(str, first))}" if first else "a fit"
+    leave_out = ", or leave the problem out of the loss by `differentiable_`" if first else ""
+    if int(cause[first]) == _NOT_AT_REST:
+        return f"Expected a fit at rest to differentiate but got {which} short of it; raise `max_iter`{leave_out}."
+    return (
+        f"Expected a strict minimum to differentiate at but got {which} where the Hessian of the objective is singular "
+        "or not positive definite, so that its result follows the data in no smooth way; take more samples, or a "
+        f"larger `sigma` or `d` where they are given{leave_out}."
+    )

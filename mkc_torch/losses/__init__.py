@@ -1,0 +1,23 @@
+"""Losses for networks, one a file, and what a trained one says of a sample."""
+
+from mkc_torch.losses.entropy_like import LELoss, entropy_like, least_entropy_like
+from mkc_torch.losses.generalized_cross_entropy import GeneralizedCrossEntropyLoss, graduated_sigma
+from mkc_torch.losses.heteroscedastic import HeteroscedasticMKCLoss, MKCHead, MKCHeadOutput
+from mkc_torch.losses.mkc import MKCLoss
+from mkc_torch.losses.uncertainty import beyond_bound, inlier_weight, outliers, predictive_interval
+
+__all__ = [
+    "GeneralizedCrossEntropyLoss",
+    "HeteroscedasticMKCLoss",
+    "LELoss",
+    "MKCHead",
+    "MKCHeadOutput",
+    "MKCLoss",
+    "beyond_bound",
+    "entropy_like",
+    "graduated_sigma",
+    "inlier_weight",
+    "least_entropy_like",
+    "outliers",
+    "predictive_interval",
+]

@@ -1,0 +1,351 @@
+"""MKC likelihood whose σ and d differ from sample to sample, and the layer of a network that predicts them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from mkc_torch._support.arguments import as_numbers, checked_whole, first_of, refuse_bad_batch, refuse_not_real
+from mkc_torch.density.energy import KAPPA_MAX, energy, inverse_square
+from mkc_torch.density.normalizer import log_partition
+from mkc_torch.losses._checks import (
+    Reduction,
+    at_least_float32,
+    checked_axis,
+    refuse_no_dimension,
+    refuse_other_reduction,
+    refuse_other_shapes,
+)
+from mkc_torch.losses.mkc import MKCLoss
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["HeteroscedasticMKCLoss", "MKCHead", "MKCHeadOutput"]
+
+KAPPA_MIN = 1e-6
+"""Least ``1 / sigma²`` that a head gives; beyond, the gradients of σ leave the range of float32."""
+
+_CHUNK = 1 << 14
+"""Elements whose normaliser is computed at once, each by a quadrature of 32 nodes."""
+
+_ROUNDING = 1e-5
+"""Relative distance beyond a limit that is taken for rounding of a value on the limit."""
+
+
+class _WideBuffers(nn.Module):
+    """Its own buffers stay in float32 at least: half would round them, or overflow."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> _WideBuffers:
+        def keep(t: Tensor) -> Tensor:
+            out = fn(t)
+            return t.to(out.device) if out.dtype in (torch.float16, torch.bfloat16) else out
+
+        if recurse:
+            for child in self.children():
+                child._apply(fn)
+        super()._apply(keep, recurse=False)  # type: ignore[no-untyped-call]
+        return self
+
+
+class HeteroscedasticMKCLoss(_WideBuffers):
+    """Negative log-likelihood of the MKC density with a bandwidth σ and a scale d for every element.
+
+    σ and d come from a network, :class:`MKCHead` say, beside the prediction: noise that differs from place to place is
+    told from outliers. With constant σ and d it is :class:`mkc_torch.MKCLoss`. A network that can single out samples
+    drives their d to its floor: give the head a physical ``d_min`` and watch a validation set.
+
+    The normaliser of every σ and d is a quadrature of 32 nodes, computed in chunks of bounded memory; it takes about a
+    microsecond an element on one core, some thirty times the rest of the loss. Where both have a dimension 1 that the
+    input has not, one value a sample for many channels say, it is computed once and shared.
+
+    Args:
+        bound: half-width a of the domain of the errors, in the unit of the target, a number or (m,).
+        channel_dim: the dimension of the input that holds the channels.
+        reduction: "none", "mean" (over elements, weighted where weights are given) or "sum".
+
+    Attributes:
+        bound: buffer () or (m,), saved in the state_dict.
+
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
+
+    Example:
+        >>> head = MKCHead(5, 2, bound=50.0, d_min=1e-3)
+        >>> loss = HeteroscedasticMKCLoss(bound=50.0)
+        >>> features, target = torch.randn(8, 5), torch.zeros(8, 2)
+        >>> prediction, sigma, d = head(features)
+        >>> loss(prediction, target, sigma, d).backward()
+    """
+
+    bound: Tensor
+
+    def __init__(
+        self, bound: float | Float[Tensor, " m"], *, channel_dim: int = -1, reduction: Reduction = "mean"
+    ) -> None:
+        super().__init__()
+        refuse_other_reduction(reduction)
+        refuse_no_dimension(channel_dim)
+        self.channel_dim = channel_dim
+        self.reduction = reduction
+        self.register_buffer("bound", _positive("bound", bound))
+
+    def forward(
+        self,
+        input: Float[Tensor, "*shape"],
+        target: Float[Tensor, "*shape"],
+        sigma: Float[Tensor, "*some"],
+        d: Float[Tensor, "*some"],
+        weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
+    ) -> Tensor:
+        """The loss of predictions against targets.
+
+        Args:
+            input: predictions, any shape; with a bound of shape (m,), ``channel_dim`` has size m.
+            target: targets of the same shape; nothing is broadcast.
+            sigma: bandwidths in [0.05, inf] of the shape of the input, or of that shape with any dimensions 1.
+            d: scales in (0, bound], in the unit of the target, of the shape of the input, or with any dimensions 1.
+            weight: non-negative weights, or a boolean mask that is True where an element counts; of the shape of the
+                input, or that shape without the channel dimension. What an element of weight 0 or False holds, NaN
+                included, reaches neither the value nor a gradient; nor do a σ and a d for which no element counts.
+
+        Returns:
+            A scalar, or for reduction "none" the shape of the input with 0 where masked; float32 at least. The mean is
+            the weighted mean over elements, and 0 if no element counts.
+
+        Raises:
+            TypeError: integer or complex input, target, sigma or d, or what is no tensor.
+            ValueError: shapes differ, are empty, or do not fit the bound's; a weight is negative, NaN or infinite; an
+                input or a target that counts is NaN or infinite; a sigma or d that counts is out of range. For the last
+                three the loss does not wait for an accelerator, nor are they seen in compiled code or under vmap: there
+                a NaN comes out as NaN.
+        """
+        axis = self._checked_axis(input, target)
+        dtype = torch.promote_types(at_least_float32(input), target.dtype)
+        for name, value in (("sigma", sigma), ("d", d)):
+            _refuse_other_shape(name, value, input)
+            dtype = torch.promote_types(dtype, value.dtype)
+        input, target = input.to(dtype), target.to(dtype)
+        error = input - target
+        sigma, d, bound = sigma.to(dtype), d.to(dtype), self.bound.to(dtype)
+        if weight is not None:
+            weight, counts = MKCLoss._checked_weight(weight, error, axis)
+            error = torch.where(counts, error, 0.0)
+            # what only masked elements use gives way to a value in range
+            sigma = torch.where(counts.to(dtype).sum_to_size(sigma.shape) > 0, sigma, 1.0)
+            d = torch.where(counts.to(dtype).sum_to_size(d.shape) > 0, d, bound.amin())
+        if bound.dim():
+            bound = bound.reshape([-1 if i == axis else 1 for i in range(error.dim())])
+        length = bound / d
+        refuse_bad_batch(input, target, None if weight is None else counts, error)
+        if not torch.compiler.is_compiling():
+            _refuse_out_of_range(sigma, d, length)
+        kappa = inverse_square(sigma)
+        values = energy(error / d, kappa) + (torch.log(d) + _log_partition(kappa, length))
+        if weight is not None:
+            values = weight * values
+        if self.reduction == "none":
+            return values
+        total = values.sum()
+        if self.reduction == "sum":
+            return total
+        if weight is None:
+            return total / error.numel()
+        elements = weight.sum()
+        return total / torch.where(elements > 0, elements, 1.0)
+
+    def _checked_axis(self, input: Tensor, target: Tensor) -> int:
+        refuse_other_shapes(input, target)
+        axis = checked_axis(input, self.channel_dim)
+        if self.bound.dim() and input.shape[axis] != self.bound.shape[0]:
+            raise ValueError(
+                f"Expected {self.bound.shape[0]} channels, as `bound` has, in dimension {self.channel_dim} "
+                f"but got {tuple(input.shape)}; pass one number as `bound` for any number of channels."
+            )
+        return axis
+
+    def extra_repr(self) -> str:
+        return f"bound={self.bound.tolist()}, channel_dim={self.channel_dim}, reduction={self.reduction!r}"
+
+
+class MKCHeadOutput(NamedTuple):
+    """Predictions with their bandwidths and scales, each (*, m)."""
+
+    location: Float[Tensor, "*batch m"]
+    sigma: Float[Tensor, "*batch m"]
+    d: Float[Tensor, "*batch m"]
+
+
+class MKCHead(_WideBuffers):
+    """The last layer of a network: a prediction with its σ and d for each of m channels.
+
+    ``1 / sigma²`` lies in [1e-6, 400], that is σ in [0.05, 1000], and d in [d_min, bound], by a sigmoid of a linear
+    function of the features. At first that function is constant: σ and d start at the given values everywhere, and
+    learn where they differ once the prediction has taken shape.
+
+    σ and d are computed in float32 at least, under autocast too. The weights of ``scales`` want no weight decay, its
+    bias least of all.
+
+    Args:
+        in_features: number of features.
+        num_channels: m, the number of predictions.
+        bound: that of the loss, in the unit of the target, a number or (m,).
+        d_min: floor under d, a number or (m,): the precision of the targets, below which no noise can be.
+        sigma_init: initial σ in (0.05, 1000), a number or (m,).
+        d_init: initial d in (d_min, bound), a number or (m,).
+
+    Attributes:
+        location: linear layer of the predictions.
+        scales: linear layer of what σ and d are made of.
+
+    Raises:
+        TypeError, ValueError: an argument of another kind, or out of range.
+
+    References:
+        Nix and Weigend, "Estimating the mean and variance of the target probability distribution", ICNN 1994: a scale
+        predicted beside the mean.
+
+    Example:
+        >>> head = MKCHead(5, 2, bound=50.0, d_min=1e-3, d_init=0.5)
+        >>> prediction, sigma, d = head(torch.randn(3, 5))
+        >>> sigma[0], d[0]
+        (tensor([3., 3.], grad_fn=<...>), tensor([0.5000, 0.5000], grad_fn=<...>))
+    """
+
+    bound: Tensor
+    d_min: Tensor
+
+    def __init__(
+        self,
+        in_features: int,
+        num_channels: int,
+        *,
+        bound: float | Float[Tensor, " m"],
+        d_min: float | Float[Tensor, " m"],
+        sigma_init: float | Float[Tensor, " m"] = 3.0,
+        d_init: float | Float[Tensor, " m"] = 1.0,
+    ) -> None:
+        super().__init__()
+        in_features = checked_whole("in_features", in_features, 1)
+        num_channels = checked_whole("num_channels", num_channels, 1)
+        given = {"bound": bound, "d_min": d_min, "sigma_init": sigma_init, "d_init": d_init}
+        values = {name: _positive(name, value, num_channels) for name, value in given.items()}
+        self.register_buffer("bound", values["bound"])
+        self.register_buffer("d_min", values["d_min"])
+        if not bool(((values["d_min"] < values["d_init"]) & (values["d_init"] < values["bound"])).all()):
+            raise ValueError(
+                f"Expected argument `d_init` between `d_min` {self.d_min.tolist()} and `bound` {self.bound.tolist()} "
+                f"but got {d_init}; a robust scale of the targets is a good start."
+            )
+        kappa = inverse_square(values["sigma_init"].double())
+        if not bool(((kappa > KAPPA_MIN) & (kappa < KAPPA_MAX)).all()):
+            raise ValueError(
+                f"Expected argument `sigma_init` in ({KAPPA_MAX**-0.5:g}, {KAPPA_MIN**-0.5:g}) but got {sigma_init}; "
+                "start at 10 for noise that is nearly Gaussian."
+            )
+        self.in_features = in_features
+        self.num_channels = num_channels
+        self.location = nn.Linear(in_features, num_channels)
+        self.scales = nn.Linear(in_features, 2 * num_channels)
+        low, high = self.d_min.double(), self.bound.double()
+        start = torch.logit(
+            torch.cat([(kappa - KAPPA_MIN) / (KAPPA_MAX - KAPPA_MIN), (values["d_init"].double() - low) / (high - low)])
+        )
+        with torch.no_grad():
+            self.scales.weight.zero_()
+            self.scales.bias.copy_(start)
+
+    def forward(self, features: Float[Tensor, "*batch n"]) -> MKCHeadOutput:
+        """Predictions, σ and d of each sample.
+
+        Args:
+            features: features, the n = ``in_features`` of a sample in the last dimension.
+
+        Returns:
+            ``(location, sigma, d)``, each (*, m); σ without unit, the others in the unit of the target.
+
+        Raises:
+            TypeError: integer or complex features, or what is no tensor.
+            ValueError: another number of features.
+        """
+        refuse_not_real("features", features)
+        if features.dim() == 0 or features.shape[-1] != self.in_features:
+            raise ValueError(
+                f"Expected argument `features` of shape (*, {self.in_features}) but got {tuple(features.shape)}."
+            )
+        location = self.location(features)
+        # in half precision a step of the raw d would be a step of a few per cent of d
+        with torch.autocast(features.device.type, enabled=False):
+            dtype = at_least_float32(self.scales.weight)
+            raw = nn.functional.linear(
+                features.to(dtype), self.scales.weight.to(dtype), self.scales.bias.to(dtype)
+            ).sigmoid()
+            raw_kappa, raw_d = raw.split(self.num_channels, -1)
+            sigma = (KAPPA_MIN + (KAPPA_MAX - KAPPA_MIN) * raw_kappa).rsqrt()
+            d = self.d_min + (self.bound - self.d_min) * raw_d
+        return MKCHeadOutput(location, sigma, d)
+
+    def extra_repr(self) -> str:
+        return f"{self.in_features}, {self.num_channels}, bound={self.bound.tolist()}, d_min={self.d_min.tolist()}"
+
+
+def _positive(name: str, value: float | Tensor, num_channels: int | None = None) -> Tensor:
+    """A number or one value a channel, (m,) where m is given."""
+    t = as_numbers(name, value).detach()
+    t = t.to(at_least_float32(t))
+    if t.dim() > 1 or (num_channels is not None and t.dim() == 1 and t.shape[0] not in (1, num_channels)):
+        wanted = "(m,)" if num_channels is None else f"({num_channels},)"
+        raise ValueError(f"Expected argument `{name}` to be a number or of shape {wanted} but got {tuple(t.shape)}.")
+    if not bool(((t > 0) & torch.isfinite(t)).all()):
+        raise ValueError(f"Expected argument `{name}` to be positive and finite but got {value}.")
+    return t.clone() if num_channels is None else t.expand(num_channels).clone()
+
+
+def _log_partition(kappa: Tensor, length: Tensor) -> Tensor:
+    """``log Z`` of every element, in chunks: the quadrature holds several times 32 numbers an element."""
+    kappa, length = torch.broadcast_tensors(kappa, length)
+    # compiled code sums over the nodes as it goes, and a loop would fix the size of the batch
+    if torch.compiler.is_compiling() or kappa.numel() <= _CHUNK:
+        return log_partition(kappa, length)
+    chunks = zip(kappa.reshape(-1).split(_CHUNK), length.reshape(-1).split(_CHUNK), strict=True)
+    return torch.cat([log_partition(*chunk) for chunk in chunks]).reshape(kappa.shape)
+
+
+def _refuse_other_shape(name: str, value: Tensor, input: Tensor) -> None:
+    refuse_not_real(name, value)
+    if value.dim() != input.dim() or any(a not in (1, b) for a, b in zip(value.shape, input.shape, strict=True)):
+        raise ValueError(
+            f"Expected argument `{name}` of the shape of `input`, {tuple(input.shape)}, or that with any dimensions 1, "
+            f"but got {tuple(value.shape)}; give it all dimensions, unsqueeze(-1) say for one value a sample."
+        )
+
+
+@torch.no_grad()
+def _refuse_out_of_range(sigma: Tensor, d: Tensor, length: Tensor) -> None:
+    """Refuse a σ or d out of range, where looking does not have to wait for an accelerator."""
+    if sigma.device.type != "cpu":
+        return
+    least = KAPPA_MAX**-0.5
+    try:
+        least_sigma, (shortest, longest) = sigma.amin().item(), (t.item() for t in torch.aminmax(length))
+    except RuntimeError:  # under vmap there is no one value
+        return
+    # a NaN is the least and fails every comparison
+    if not least_sigma >= least * (1.0 - _ROUNDING):
+        wrong = ~(sigma >= least * (1.0 - _ROUNDING))
+        raise ValueError(
+            f"Expected argument `sigma` in [{least:g}, inf] but got {first_of(sigma, wrong)}. Map the network's output "
+            "into it, as MKCHead does: rsqrt(400 * sigmoid(raw))."
+        )
+    if not (shortest >= 1.0 - _ROUNDING and longest < float("inf")):
+        wrong = ~((length >= 1.0 - _ROUNDING) & (length < float("inf")))
+        raise ValueError(
+            f"Expected argument `d` in (0, bound] but got {first_of(d.expand_as(length), wrong)}. Map the network's "
+            "output into it, as MKCHead does: d_min + (bound - d_min) * sigmoid(raw)."
+        )

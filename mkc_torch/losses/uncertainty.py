@@ -1,0 +1,210 @@
+"""What a fitted loss says of single samples: inlier weights, outlier flags, errors beyond the bound, intervals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.arguments import DIVERGED, checked_number, refuse_bad_batch, refuse_not_finite, seems_finite
+from mkc_torch.density.distribution import SIGMA_MIN, MKCDistribution
+from mkc_torch.functional import mkc_weight
+from mkc_torch.losses._checks import at_least_float32
+from mkc_torch.losses.mkc import MKCLoss, checked_loss
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+__all__ = ["BeyondBound", "Interval", "beyond_bound", "inlier_weight", "outliers", "predictive_interval"]
+
+
+@dataclass(frozen=True)
+class BeyondBound:
+    """How many errors of each channel that count lie beyond the loss's bound, and their share of the weight, (m,)."""
+
+    count: Int[Tensor, " m"]
+    share: Float[Tensor, " m"]
+
+
+class Interval(NamedTuple):
+    """Ends of an interval about each prediction, of its shape and unit."""
+
+    low: Float[Tensor, "*shape"]
+    high: Float[Tensor, "*shape"]
+
+
+@torch.no_grad()
+def inlier_weight(
+    loss: MKCLoss, input: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]
+) -> Float[Tensor, "*shape"]:
+    """How far the loss believes each element: ``exp(-e² / (2 d² σ²))``, 1 on the prediction and 0 far from it.
+
+    It is the weight of the error in the paper's fixed point (15), the loss's pull relative to that of least squares.
+    At σ = ∞ every weight is 1: the loss has found no outliers.
+
+    Args:
+        loss: the loss with its current σ and d.
+        input: predictions, as for the loss.
+        target: targets of the same shape. Where either is NaN, so is the weight.
+
+    Returns:
+        Weights in [0, 1] of the shape of ``input``, float32 at least, without a gradient.
+
+    Raises:
+        TypeError: a loss of another kind; integer or complex input or target, or what is no tensor.
+        ValueError: shapes differ, are empty, or have another number of channels than the loss.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (15).
+
+    Example:
+        >>> loss = MKCLoss(1, sigma=2.0, d=1.0)
+        >>> inlier_weight(loss, torch.zeros(3, 1), torch.tensor([[0.0], [2.0], [50.0]])).flatten()
+        tensor([1.0000, 0.6065, 0.0000])
+    """
+    loss = checked_loss(loss)
+    axis = loss._checked_axis(input, target)
+    return mkc_weight(_error(input, target), _along(loss.sigma, input, axis), _along(loss.d, input, axis))
+
+
+def outliers(
+    loss: MKCLoss, input: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"], weight_below: float = 0.1
+) -> Bool[Tensor, "*shape"]:
+    """Which elements the loss sets aside: those whose :func:`inlier_weight` is below a limit.
+
+    At the limit 0.1 these are the errors greater than 2.15 σ d; at σ = ∞ there are none, however large an error is.
+
+    Args:
+        loss, input, target: as in :func:`inlier_weight`.
+        weight_below: the limit, in (0, 1).
+
+    Returns:
+        Flags of the shape of ``input``, True for an outlier.
+
+    Raises:
+        TypeError: as in :func:`inlier_weight`.
+        ValueError: as in :func:`inlier_weight`; a limit outside (0, 1); an error that is NaN.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (15).
+
+    Example:
+        >>> loss = MKCLoss(1, sigma=2.0, d=1.0)
+        >>> outliers(loss, torch.zeros(3, 1), torch.tensor([[0.0], [2.0], [50.0]])).flatten()
+        tensor([False, False,  True])
+    """
+    checked_number("weight_below", weight_below, 0.0, 1.0, advice="0.1 is usual")
+    weight = inlier_weight(loss, input, target)
+    unknown = weight.isnan()
+    if bool(unknown.any()):
+        raise ValueError(
+            f"Expected `input - target` without NaN but got {int(unknown.sum())}, the first at index "
+            f"{tuple(unknown.nonzero()[0].tolist())}: neither inlier nor outlier. Where a target is missing put the "
+            "prediction, torch.where(torch.isfinite(target), target, input), which is never flagged."
+        )
+    return weight < weight_below
+
+
+@torch.no_grad()
+def beyond_bound(
+    loss: MKCLoss,
+    input: Float[Tensor, "*shape"],
+    target: Float[Tensor, "*shape"],
+    weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
+) -> BeyondBound:
+    """How many errors lie outside the domain on which the loss is a likelihood.
+
+    There the density is 0 and the loss a continuation with a finite gradient. A share of more than a few in a thousand
+    says that ``MKCLoss(bound=...)`` is smaller than what errors physically reach.
+
+    Args:
+        loss: the loss with its bound.
+        input: predictions, as for the loss.
+        target: targets of the same shape.
+        weight: as for the loss: non-negative weights or a mask, of the shape of ``input`` or without its channels.
+
+    Returns:
+        For each channel the number of elements of positive weight beyond the bound, and their share of the weight,
+        which is NaN for a channel of which nothing counts.
+
+    Raises:
+        TypeError: as in :func:`inlier_weight`.
+        ValueError: as the loss: shapes, channels, weights, an input or a target that counts and is not finite.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
+
+    Example:
+        >>> loss = MKCLoss(2, bound=10.0)
+        >>> target = torch.tensor([[0.0, 11.0], [-12.0, 1.0], [0.5, 0.0], [9.9, 0.0]])
+        >>> beyond_bound(loss, torch.zeros(4, 2), target)
+        BeyondBound(count=tensor([1, 1]), share=tensor([0.2500, 0.2500]))
+    """
+    loss = checked_loss(loss)
+    axis = loss._checked_axis(input, target)
+    error = _error(input, target)
+    weights, counts = loss._checked_weight(torch.ones_like(error) if weight is None else weight, error, axis)
+    refuse_bad_batch(input, target, counts, torch.where(counts, error, 0.0))
+    beyond = counts & (error.abs() > _along(loss.bound, input, axis))
+    others = [i for i in range(error.dim()) if i != axis]
+    count, outside, total = (
+        t.sum(others) if others else t for t in (beyond.to(torch.int64), torch.where(beyond, weights, 0.0), weights)
+    )
+    return BeyondBound(count, outside / total)
+
+
+@torch.no_grad()
+def predictive_interval(loss: MKCLoss, input: Float[Tensor, "*shape"], level: float = 0.9) -> Interval:
+    """The equal-tailed interval in which the density induced by the loss expects a target.
+
+    It is made of the noise alone: that the prediction itself is uncertain does not widen it. σ and d must have been
+    fitted, by learning them, by MKC-EM or by :func:`mkc_torch.fit_density` on residuals of data that the network has
+    not seen; those of a loss with ``normalize=False`` are what it was given.
+
+    Args:
+        loss: the loss with its current σ, d and bound.
+        input: predictions, any shape whose ``channel_dim`` has the loss's channels.
+        level: probability inside, in (0, 1).
+
+    Returns:
+        The ends ``(low, high)``, of the shape of ``input``, float32 at least, without a gradient. Where the tails hold
+        more than ``1 - level``, the ends lie far out on the flat tail, within ``bound`` of the prediction.
+
+    Raises:
+        TypeError: a loss of another kind; an integer or complex input, or what is no tensor.
+        ValueError: a level outside (0, 1), an input that is empty or not finite, or another number of channels than the
+            loss.
+
+    References:
+        Li et al., "Multi-kernel Correntropy Regression" (2023), (17).
+
+    Example:
+        >>> loss = MKCLoss(1, sigma=float("inf"), d=1.0, learn_sigma=False)
+        >>> predictive_interval(loss, torch.tensor([[10.0]]), level=0.95)
+        Interval(low=tensor([[8.0400]]), high=tensor([[11.9600]]))
+    """
+    checked_number("level", level, 0.0, 1.0, advice="0.9 leaves 5 % on either side")
+    loss = checked_loss(loss)
+    axis = loss._checked_axis(input, input)
+    if not seems_finite(input):
+        refuse_not_finite("input", input, DIVERGED)
+    # on the processor, since not every accelerator has float64
+    kappa, d, bound = (t.detach().cpu().double() for t in (loss.kappa, loss.d, loss.bound))
+    density = MKCDistribution(kappa.rsqrt().clamp(min=SIGMA_MIN), d, bound)  # rounding may lead below the least σ
+    half = density.icdf(torch.tensor(0.5 + 0.5 * level, dtype=torch.float64))
+    centre = input.to(at_least_float32(input))
+    half = _along(half.to(centre), input, axis)
+    return Interval(centre - half, centre + half)
+
+
+def _error(input: Tensor, target: Tensor) -> Tensor:
+    return input.to(at_least_float32(input)) - target.to(at_least_float32(target))
+
+
+def _along(per_channel: Float[Tensor, " m"], input: Tensor, axis: int) -> Tensor:
+    """Broadcast against the input, the channels being its dimension ``axis``."""
+    shape = [1] * input.dim()
+    shape[axis] = -1
+    return per_channel.reshape(shape)

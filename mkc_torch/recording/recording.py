@@ -1,0 +1,426 @@
+"""Recordings: tables of named, timed, unit-bearing columns."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mkc_torch._support.files import write_atomically
+from mkc_torch.recording.formats import check_ending, encoded, read_table
+from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, counted, listed
+from mkc_torch.recording.formats.cells import as_numbers, missing_warning, numbered, renamed, text_error
+from mkc_torch.recording.formats.csv import SEPARATORS
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["MissingColumnError", "Recording", "RecordingError", "write_table"]
+
+DEFAULT_UNITS: Mapping[str, str] = MappingProxyType(
+    {"time": "s", "temperature": "°C", "current": "A"}
+    | {
+        f"{quantity}_{axis}": unit
+        for quantity, unit, axes in (
+            ("mag", "µT", "xyz"),
+            ("field", "µT", "xyz"),
+            ("gyro", "rad/s", "xyz"),
+            ("accel", "m/s²", "xyz"),
+            ("position", "m", "xyz"),
+            ("q", "1", "wxyz"),
+        )
+        for axis in axes
+    }
+)
+"""The units of the columns whose names have a meaning."""
+
+_EXPERIMENT = "experiment"
+_GAP = 10.0  # in median intervals
+
+
+class Recording:
+    """A table of named columns of equal length: what a sensor, or a simulator, wrote down.
+
+    It does not change: each operation gives a new recording, and says in ``warnings`` what it dropped.
+
+    Args:
+        columns: name to values, 1-D tensors of one length >= 1; they are copied to the CPU as float64.
+        name: what the recording is called in messages and reports; a file's is its stem.
+        units: units of columns, beside or instead of the default ones: ``time`` s; ``mag_*`` and ``field_*`` µT;
+            ``gyro_*`` rad/s; ``accel_*`` m/s²; ``position_*`` m; ``q_*`` 1; ``temperature`` °C; ``current`` A.
+        warnings: sentences about what was found or dropped.
+        labels: for a column of whole numbers 0, 1, …, what each number stands for.
+
+    Raises:
+        RecordingError: no columns, no samples, lengths that differ, an unusable name, a unit of no column.
+
+    Example:
+        >>> recording = Recording({"time": torch.tensor([0.0, 0.1]), "mag_x": torch.tensor([20.0, 21.0])})
+        >>> recording["mag_x"], recording.units["mag_x"]
+        (tensor([20., 21.], dtype=torch.float64), 'µT')
+    """
+
+    __slots__ = ("_columns", "_labels", "_name", "_units", "_warnings")
+
+    def __init__(
+        self,
+        columns: Mapping[str, Tensor],
+        *,
+        name: str = "",
+        units: Mapping[str, str] | None = None,
+        warnings: Sequence[str] = (),
+        labels: Mapping[str, Sequence[str]] | None = None,
+    ) -> None:
+        units, labels = units or {}, labels or {}
+        _check_columns(columns, name)
+        for column in (*units, *labels):
+            if column not in columns:
+                raise _missing(column, columns, name)
+        copies = {key: values.detach().to("cpu", torch.float64, copy=True) for key, values in columns.items()}
+        known = {key: DEFAULT_UNITS.get(key, "") for key in columns}
+        self._columns = copies
+        self._units = known | dict(units)
+        self._labels = {key: tuple(values) for key, values in labels.items()}
+        self._name = name
+        self._warnings = tuple(warnings)
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Recording:
+        """Read a table from a file: CSV (``.csv``, ``.tsv``, ``.txt``) or Parquet (``.parquet``).
+
+        A CSV has a header line of column names, and values separated by comma, semicolon or tab. An empty cell and
+        ``nan`` become NaN; so do ``NA``, ``n/a`` and ``null``, of which ``warnings`` tells. Integers become float64.
+        Columns of text alone that nobody asked for are left out, which ``warnings`` tells; in the column ``experiment``
+        text is numbered, and ``labels`` has it.
+
+        Args:
+            path: the file.
+            columns: for each name a column is to get, the name it has in the file: ``{"mag_x": "mx"}``.
+
+        Returns:
+            The recording, with its rows as they are in the file.
+
+        Raises:
+            RecordingError: a file that is no such table: of an unknown kind, empty, without header or rows, with
+                lines of different length, columns of the same name, or text among numbers.
+            MissingColumnError: ``columns`` names a column that the file does not have.
+            FileNotFoundError: no such file.
+            ImportError: the reader's library is not installed.
+        """
+        path = Path(path)
+        table = read_table(path)
+        taken, warnings = renamed(table, columns or {}, path)
+        asked = set(columns or {}) | set(DEFAULT_UNITS) | {_EXPERIMENT}
+        values: dict[str, Tensor] = {}
+        labels: dict[str, list[str]] = {}
+        for name, series in taken.items():
+            numbers, bad = as_numbers(series)
+            if bad.any():
+                missing = numbers.is_null() & ~bad
+                if name == _EXPERIMENT:
+                    numbers, labels[name] = numbered(series)
+                elif name not in asked and (bad | missing).all():
+                    warnings.append(f"Column `{name}` holds no numbers and is left out.")
+                    continue
+                else:
+                    raise text_error(path, table, name, series, int(bad.arg_max()))
+            elif told := missing_warning(table, name, series):
+                warnings.append(told)
+            values[name] = torch.tensor(numbers.fill_null(math.nan).to_numpy())
+        if not values:
+            known = ", ".join(SEPARATORS.values())
+            raise RecordingError(f"{path}: no column holds numbers; separators can be {known}.")
+        return cls(values, name=path.stem, warnings=warnings, labels=labels)
+
+    @property
+    def columns(self) -> Mapping[str, Tensor]:
+        """Name to values, in the table's order; do not write into the tensors."""
+        return MappingProxyType(self._columns)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The columns' names, in the table's order."""
+        return tuple(self._columns)
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """The unit of each column; empty where it is unknown."""
+        return MappingProxyType(self._units)
+
+    @property
+    def labels(self) -> Mapping[str, tuple[str, ...]]:
+        """What the numbers 0, 1, … of a column stand for, where they stand for something."""
+        return MappingProxyType(self._labels)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences about what was found or dropped, from the file on."""
+        return self._warnings
+
+    @property
+    def time(self) -> Float[Tensor, " N"] | None:
+        """The column ``time`` in seconds; None if there is none."""
+        return self._columns.get("time")
+
+    def __len__(self) -> int:
+        return len(next(iter(self._columns.values())))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._columns
+
+    def __getitem__(self, name: str) -> Float[Tensor, " N"]:
+        if name not in self._columns:
+            raise _missing(name, self._columns, self._name)
+        return self._columns[name]
+
+    def __repr__(self) -> str:
+        return f"Recording({self._name!r}, {len(self)} samples: {', '.join(self._columns)})"
+
+    def stack(self, *names: str) -> Float[Tensor, "N k"]:
+        """The named columns side by side, as a new tensor.
+
+        Raises:
+            MissingColumnError: one of them is not there; the message lists those that are.
+
+        Example:
+            >>> Recording({"a": torch.zeros(4), "b": torch.ones(4)}).stack("b", "a")[0]
+            tensor([1., 0.], dtype=torch.float64)
+        """
+        if not names:
+            raise ValueError("Expected at least one column name but got none.")
+        return torch.stack([self[name] for name in names], dim=-1)
+
+    def magnetometer(self) -> Float[Tensor, "N 3"]:
+        """The columns ``mag_x``, ``mag_y``, ``mag_z``."""
+        return self.stack("mag_x", "mag_y", "mag_z")
+
+    def finite(self, *names: str) -> Recording:
+        """The rows in which the named columns (all columns, if none is named) are finite; ``warnings`` counts the rest.
+
+        Raises:
+            MissingColumnError: one of the columns is not there.
+            RecordingError: no row is left.
+
+        Example:
+            >>> Recording({"a": torch.tensor([1.0, math.nan, math.inf])}).finite("a").warnings
+            ('Dropped 2 of 3 samples that are not finite: `a` 1 NaN, 1 infinite.',)
+        """
+        names = names or self.names
+        keep = self.stack(*names).isfinite().all(-1)
+        if keep.all():
+            return self
+        counts = []
+        for name in dict.fromkeys(names):
+            nan, infinite = int(self[name].isnan().sum()), int(self[name].isinf().sum())
+            found = [f"{count} {what}" for count, what in ((nan, "NaN"), (infinite, "infinite")) if count]
+            counts += [f"`{name}` {', '.join(found)}"] if found else []
+        if not keep.any():
+            raise RecordingError(
+                f"{self._in()}no sample has finite values in all of {listed(names)}: {'; '.join(counts)}. "
+                "Leave out the columns that hold no values."
+            )
+        dropped = f"Dropped {int((~keep).sum())} of {len(self)} samples that are not finite: {'; '.join(counts)}."
+        return self.rows(keep, dropped)
+
+    def sorted_by_time(self) -> Recording:
+        """The samples in the order of their times, each time once.
+
+        The sort is stable and of samples at exactly the same time the first is kept. ``warnings`` counts what was
+        out of order, repeated, or without a finite time, and tells of gaps longer than ten median intervals. Where
+        there is a column ``experiment``, each experiment has its own clock: they follow one another in the order
+        of their first appearance.
+
+        Raises:
+            MissingColumnError: there is no column ``time``.
+            RecordingError: no sample has a finite time.
+
+        Example:
+            >>> Recording({"time": torch.tensor([0.0, 0.2, 0.1, 0.1])}).sorted_by_time().time
+            tensor([0.0000, 0.1000, 0.2000], dtype=torch.float64)
+        """
+        timed = self._with_times()
+        time, group = timed["time"].numpy(), timed._experiment_numbers()
+        by_group = np.argsort(group, kind="stable")
+        backward = int(((np.diff(time[by_group]) < 0) & (np.diff(group[by_group]) == 0)).sum())
+        order = np.lexsort((time, group))  # stable, the last key first
+        same_group = np.diff(group[order]) == 0
+        first = np.concatenate([[True], ~((np.diff(time[order]) == 0) & same_group)])
+        kept = order[first]
+        found = []
+        if backward:
+            found.append(f"The time ran backwards {counted(backward, 'time')}; the samples were sorted by time.")
+        if not first.all():
+            twin, original = order[~first], kept[np.cumsum(first) - 1][~first]
+            table = timed.stack(*timed.names).numpy()
+            a, b = table[twin], table[original]
+            differ = int(((a != b) & ~(np.isnan(a) & np.isnan(b))).any(-1).sum())
+            found.append(
+                f"Dropped {len(twin)} of {len(timed)} samples that repeat the time of an earlier one, "
+                f"{differ} of them with other values."
+            )
+        found += timed._gaps(time[kept], group[kept])
+        return timed.rows(torch.from_numpy(kept), *found)
+
+    def rows(self, chosen: Tensor, *warnings: str) -> Recording:
+        """The chosen rows, and the sentences that say why beside those there are.
+
+        Args:
+            chosen: a boolean for each row, or the numbers of rows in the order that they are to have.
+
+        Example:
+            >>> Recording({"a": torch.tensor([1.0, 2.0, 3.0])}).rows(torch.tensor([2, 0]))["a"]
+            tensor([3., 1.], dtype=torch.float64)
+        """
+        return Recording(
+            {name: values[chosen] for name, values in self._columns.items()},
+            name=self._name,
+            units=self._units,
+            warnings=(*self._warnings, *warnings),
+            labels=self._labels,
+        )
+
+    def experiments(self) -> dict[str, Recording]:
+        """The parts of the table that the column ``experiment`` separates, by label, in the order of appearance.
+
+        Without that column the whole is the one part, under the recording's own name.
+
+        Example:
+            >>> table = Recording({"experiment": torch.tensor([1, 1, 2]), "time": torch.tensor([0.0, 0.1, 0.0])})
+            >>> [(label, len(part), part.names) for label, part in table.experiments().items()]
+            [('1', 2, ('time',)), ('2', 1, ('time',))]
+        """
+        if _EXPERIMENT not in self:
+            return {self._name: self}
+        group = torch.from_numpy(self._experiment_numbers())
+        parts = {}
+        for number in range(int(group.max()) + 1):
+            part = self.rows(group == number)
+            label = self._experiment_label(part[_EXPERIMENT][0].item())
+            parts[label] = Recording(
+                {key: values for key, values in part.columns.items() if key != _EXPERIMENT},
+                name=f"{self._name}/{label}" if self._name else label,
+                units={key: unit for key, unit in self._units.items() if key != _EXPERIMENT},
+                warnings=self._warnings,
+                labels={key: values for key, values in self._labels.items() if key != _EXPERIMENT},
+            )
+        return parts
+
+    def _in(self) -> str:
+        return f"{self._name}: " if self._name else ""
+
+    def _with_times(self) -> Recording:
+        keep = self["time"].isfinite()
+        if keep.all():
+            return self
+        if not keep.any():
+            raise RecordingError(f"{self._in()}no sample has a finite time; the column `time` must hold seconds.")
+        return self.rows(keep, f"Dropped {int((~keep).sum())} of {len(self)} samples without a finite time.")
+
+    def _experiment_numbers(self) -> np.ndarray:
+        """For each sample 0, 1, … in the order in which the experiments first appear."""
+        if _EXPERIMENT not in self:
+            return np.zeros(len(self), dtype=np.int64)
+        _, first, inverse = np.unique(self[_EXPERIMENT].numpy(), return_index=True, return_inverse=True)
+        return np.argsort(np.argsort(first))[inverse]
+
+    def _experiment_label(self, value: float) -> str:
+        known = self._labels.get(_EXPERIMENT, ())
+        if value.is_integer() and 0 <= value < len(known):
+            return known[int(value)]
+        return str(int(value)) if value.is_integer() else repr(value)
+
+    def _gaps(self, time: np.ndarray, group: np.ndarray) -> list[str]:
+        inside = np.diff(group) == 0
+        intervals = np.where(inside, np.diff(time), 0.0)
+        if not inside.any():
+            return []
+        median = float(np.median(intervals[inside]))
+        count, longest = int((intervals > _GAP * median).sum()), int(np.argmax(intervals))
+        if not count:
+            return []
+        where = ""
+        if _EXPERIMENT in self:
+            values = self[_EXPERIMENT].numpy()[self._experiment_numbers() == group[longest]]
+            where = f" in experiment {self._experiment_label(float(values[0]))}"
+        return [
+            f"The time has {counted(count, 'gap')} of more than {_GAP:g} median intervals ({median:.4g} s); "
+            f"the longest, {intervals[longest]:.4g} s, begins at {time[longest]:.10g} s{where}."
+        ]
+
+
+def write_table(
+    path: str | os.PathLike[str],
+    columns: Mapping[str, Tensor],
+    *,
+    labels: Mapping[str, Sequence[str]] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write columns to a file, whole or not at all, such that :meth:`Recording.read` gives the same float64 back.
+
+    Args:
+        path: the target; its ending says the format, ``.csv``, ``.tsv``, ``.txt`` (a CSV) or ``.parquet``.
+        columns: name to values, 1-D tensors of one length; ``recording.columns`` for a recording.
+        labels: of columns of whole numbers 0, 1, …, what each stands for and is written instead; ``recording.labels``.
+        overwrite: replace an existing file.
+
+    Raises:
+        RecordingError: columns that are no table, or an ending that is not known.
+        FileExistsError: the file exists and ``overwrite`` is False.
+    """
+    path = Path(path)
+    check_ending(path)
+    table = Recording(columns, name=path.name)
+    known = labels or {}
+    told = {
+        name: np.array(known[name])[values.long().numpy()] if name in known else values.numpy()
+        for name, values in table.columns.items()
+    }
+    if _EXPERIMENT in told and _EXPERIMENT not in known:
+        told[_EXPERIMENT] = _whole(told[_EXPERIMENT])
+    data = encoded(path, told)
+    write_atomically(path, data, overwrite=overwrite)
+
+
+def _whole(numbers: np.ndarray) -> np.ndarray:
+    """Numbers of experiments, 1 and not 1.0, where all of them are whole."""
+    whole = np.isfinite(numbers) & (np.abs(numbers) < 2**53) & (numbers == np.round(numbers))
+    return numbers.astype(np.int64) if whole.all() else numbers
+
+
+def _check_columns(columns: Mapping[str, Tensor], name: str) -> None:
+    where = f"{name}: " if name else ""
+    if not columns:
+        raise RecordingError(f"{where}a recording needs at least one column.")
+    for key, values in columns.items():
+        if not isinstance(key, str) or not key or key != key.strip() or any(end in key for end in "\r\n"):
+            raise RecordingError(f"{where}{key!r} cannot name a column: one line of text, no spaces around it.")
+        if not isinstance(values, Tensor) or values.is_complex():
+            got = f"a tensor of {values.dtype}" if isinstance(values, Tensor) else type(values).__name__
+            raise RecordingError(f"{where}expected column `{key}` to be a real tensor but got {got}.")
+        if values.dim() != 1:
+            raise RecordingError(f"{where}expected column `{key}` to have shape (N,) but got {tuple(values.shape)}.")
+    lengths = {key: len(values) for key, values in columns.items()}
+    if len(set(lengths.values())) > 1:
+        told = ", ".join(f"`{key}` {length}" for key, length in lengths.items())
+        raise RecordingError(f"{where}the columns differ in length: {told}.")
+    if not all(lengths.values()):
+        raise RecordingError(f"{where}the columns hold no samples.")
+
+
+def _missing(name: str, present: Iterable[str], recording: str) -> MissingColumnError:
+    where = f"{recording}: " if recording else ""
+    return MissingColumnError(
+        f"{where}there is no column `{name}`; there are {listed(present)}. If it is there under another name, say so "
+        f'with `--columns {name}=...` (in Python `columns={{"{name}": "..."}}`).'
+    )

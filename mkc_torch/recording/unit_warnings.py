@@ -1,0 +1,129 @@
+"""Columns whose size does not fit their unit: named, never converted."""
+
+from __future__ import annotations
+
+import math
+
+from mkc_torch.recording.recording import Recording
+
+__all__ = ["RECORDED", "field_warning", "time_warning", "unit_warnings"]
+
+RECORDED = "recorded units"
+"""What measurements are in whose size does not fit the unit that they were taken for."""
+
+_AXES = "xyz"
+
+_FIELD = (10.0, 200.0)
+"""The Earth's field in µT is 22 to 67; iron nearby and a sensor's gains change it."""
+
+_GUESSES = (
+    (1e-5, 1e-4, "tesla (1 T = 1000000 µT)"),
+    (0.01, 0.1, "millitesla (1 mT = 1000 µT)"),
+    (0.1, 1.0, "gauss (1 gauss = 100 µT)"),
+    (200.0, 1000.0, "milligauss (10 mG = 1 µT)"),
+    (2e4, 1e5, "nanotesla (1000 nT = 1 µT)"),
+)
+
+
+_TIMES = ((1e3, "ms", 1e-3), (1e6, "µs", 1e-6), (math.inf, "ns", 1e-9))
+"""Up to which interval a time is taken for one in which unit: fifty samples a second are in the midst of it."""
+
+
+def unit_warnings(recording: Recording) -> tuple[str, ...]:
+    """A sentence for each group of columns that looks as if it were in another unit than the recording says.
+
+    Example:
+        >>> import torch
+        >>> angle = torch.linspace(0.0, 6.0, 20)
+        >>> columns = {"mag_x": 0.5 * angle.cos(), "mag_y": 0.5 * angle.sin(), "mag_z": 0.0 * angle}
+        >>> "gauss" in unit_warnings(Recording(columns))[0]
+        True
+    """
+    return tuple(
+        s for s in (_field(recording), _rate(recording), _acceleration(recording), time_warning(recording)) if s
+    )
+
+
+def _typical(recording: Recording, name: str) -> float | None:
+    names = [f"{name}_{axis}" for axis in _AXES]
+    if not all(n in recording for n in names):
+        return None
+    length = recording.stack(*names).square().sum(-1).sqrt()
+    length = length[length.isfinite()]
+    return float(length.median()) if len(length) else None
+
+
+def _field(recording: Recording) -> str | None:
+    size = _typical(recording, "mag")
+    if size is None:
+        return None
+    return field_warning(size, recording.units["mag_x"], "magnetometer measures about", "sizes of effects")
+
+
+def field_warning(size: float, unit: str, what: str, numbers: str) -> str | None:
+    """A sentence about a field that is in another unit than is said; None where it may be right.
+
+    Args:
+        size: of the field.
+        unit: that is said; any but µT is believed.
+        what: the subject and verb of the sentence.
+        numbers: what is in the columns' own unit.
+
+    Example:
+        >>> field_warning(46.0, "µT", "radius is", "offset") is None
+        True
+        >>> field_warning(46e3, "µT", "radius is", "offset").partition(".")[0]
+        "The radius is 46000 µT, which is not the size of the Earth's field; in nanotesla (1000 nT = 1 µT) it would be"
+    """
+    if unit != "µT" or _FIELD[0] <= size <= _FIELD[1]:
+        return None
+    found = [f"; in {name} it would be" for low, high, name in _GUESSES if low <= size <= high]
+    return (
+        f"The {what} {_shown(size)} µT, which is not the size of the Earth's field"
+        f"{found[0] if found else '; these may be raw counts'}. Nothing was converted: name the unit with `--unit`, or "
+        f"convert the columns; {numbers} are in the columns' own unit."
+    )
+
+
+def _rate(recording: Recording) -> str | None:
+    size = _typical(recording, "gyro")
+    if size is None or recording.units["gyro_x"] != "rad/s" or size <= 12.0:
+        return None
+    return (
+        f"The gyroscope turns at about {size:.3g} rad/s, faster than a hand or a vehicle; it may be in °/s. Nothing "
+        "was converted."
+    )
+
+
+def _acceleration(recording: Recording) -> str | None:
+    size = _typical(recording, "accel")
+    if size is None or recording.units["accel_x"] != "m/s²" or 3.0 <= size <= 40.0:
+        return None
+    return f"The accelerometer measures about {size:.3g} m/s² instead of 9.8; it may be in g. Nothing was converted."
+
+
+def time_warning(recording: Recording) -> str | None:
+    """A sentence about times of a sensor that are not in seconds; None where they may be.
+
+    Example:
+        >>> import torch
+        >>> recording = Recording({"time": 1.7e18 + 2e7 * torch.arange(20).double(), "mag_x": torch.zeros(20)})
+        >>> time_warning(recording).partition(".")[0]
+        'The samples lie 20000000 s apart by the column `time`, which looks like ns (50 samples a second then)'
+    """
+    time = recording.time
+    if time is None or len(time) < 10:
+        return None
+    interval = float(time.diff().abs().median())
+    if interval < 1.0 or "mag_x" not in recording:
+        return None
+    unit, seconds = next((u, s) for limit, u, s in _TIMES if interval < limit)
+    return (
+        f"The samples lie {_shown(interval)} s apart by the column `time`, which looks like {unit} "
+        f"({_shown(1.0 / (interval * seconds))} samples a second then). Nothing was converted: write seconds."
+    )
+
+
+def _shown(value: float) -> str:
+    """Three digits, all digits of a large number where they are not too many."""
+    return f"{float(f'{value:.3g}'):.0f}" if 1e3 <= value < 1e9 else f"{value:.3g}"

@@ -1,0 +1,122 @@
+"""The calibration report: what was found, how far to trust it, and what to do next, as one self-contained page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup, escape
+
+from mkc_torch.calibration.calibrate import ENOUGH_INFORMATION, MAX_REJECTED, Calibration, Vector, prepared
+from mkc_torch.calibration.coverage import nearest_axis
+from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.recording.recording import Recording
+from mkc_torch.report.calibration import pictures
+from mkc_torch.report.words import numbers as wording
+
+__all__ = ["Comparison", "calibration_report", "refusal_report"]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A row of a table that sets results side by side: its name, centre and semi-axes in the recording's unit."""
+
+    name: str
+    center: Vector
+    semi_axes: Vector
+
+
+def calibration_report(
+    calibration: Calibration, recording: Recording, *, note: str = "", comparison: Sequence[Comparison] = ()
+) -> str:
+    """The page for a calibration and the recording it was made from.
+
+    Args:
+        calibration: of ``mkc_torch.calibration.calibrate.calibrate``.
+        recording: the one it came from.
+        note: a sentence at the top of the page, such as that the data are simulated.
+        comparison: other results, or the truth, to set beside this one.
+
+    Returns:
+        HTML with its pictures in it.
+
+    Example:
+        >>> from mkc_torch.calibration.calibrate import calibrate
+        >>> from mkc_torch.recording.demonstration import simulated_recording
+        >>> recording, _ = simulated_recording()
+        >>> calibration_report(calibrate(recording), recording).startswith("<!doctype html>")
+        True
+    """
+    usable = prepared(recording)
+    points = usable.magnetometer()
+    in_use = calibration.corrected(points)[calibration.weight(points) >= 0.5]
+    return _render(
+        "calibration.html.j2",
+        c=calibration,
+        # what is said of the file, such as a gap in time, is no doubt about the result
+        doubtful=len(calibration.warnings) > len(usable.warnings),
+        enough=ENOUGH_INFORMATION,
+        rejects_many=calibration.rejected_share > MAX_REJECTED,
+        note=note,
+        comparison=comparison,
+        figures={
+            "sphere": Markup(pictures.sphere(calibration, points)),
+            "residual": Markup(pictures.residual(calibration, points, usable.time)),
+            "density": Markup(pictures.density(calibration, points)),
+            "coverage": Markup(pictures.coverage_map(calibration.coverage, in_use)),
+        },
+    )
+
+
+def refusal_report(recording: Recording, error: NotIdentifiableError) -> str:
+    """The page for a recording that determines no calibration: which directions are missing, and how to record them.
+
+    Args:
+        recording: the one that was refused.
+        error: the refusal.
+
+    Example:
+        >>> import torch
+        >>> from mkc_torch.calibration.calibrate import calibrate
+        >>> angle = torch.linspace(0.0, 6.0, 30)
+        >>> flat = Recording({"mag_x": angle.cos(), "mag_y": angle.sin(), "mag_z": 0 * angle}, name="flat")
+        >>> try:
+        ...     calibrate(flat)
+        ... except NotIdentifiableError as error:
+        ...     page = refusal_report(flat, error)
+        >>> "not identifiable" in page
+        True
+    """
+    picture = None
+    if error.coverage is not None and error.directions is not None:
+        picture = Markup(pictures.coverage_map(error.coverage, error.directions))
+    return _render(
+        "not_identifiable.html.j2",
+        recording=prepared(recording),
+        reason=str(error).removeprefix("Not identifiable: "),
+        coverage=error.coverage,
+        picture=picture,
+    )
+
+
+def _render(template: str, **values: Any) -> str:
+    environment = Environment(
+        loader=PackageLoader("mkc_torch.report"),
+        autoescape=select_autoescape(["html", "html.j2"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["coded"] = _coded
+    environment.globals.update(w=wording, nearest_axis=nearest_axis, zip=zip)
+    return environment.get_template(template).render(**values)
+
+
+def _coded(text: str) -> Markup:
+    """A sentence in which what stands between backticks is set as code."""
+    parts = [escape(part) for part in text.split("`")]
+    if len(parts) % 2 == 0:
+        return escape(text)
+    return Markup("").join(Markup("<code>{}</code>").format(p) if i % 2 else p for i, p in enumerate(parts))

@@ -1,0 +1,112 @@
+"""The diagnosis report: what the simulation lacks, how sure that is and what to do, as one self-contained page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+from markupsafe import Markup
+
+from mkc_torch._parallel.fork import shared
+from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability
+from mkc_torch.report.calibration.page import _render
+from mkc_torch.report.diagnosis import findings as diagnosis_wording
+from mkc_torch.report.diagnosis import pictures as pictures
+from mkc_torch.report.diagnosis import verdict as diagnosis_verdict
+from mkc_torch.report.words.markup import marked, unbroken
+from mkc_torch.report.words.typesetting import typeset
+
+__all__ = ["Bar", "Cell", "bars", "diagnosis_report", "heat_map"]
+
+_MOST_SHOWN = 12
+_FAINT, _CLEAR = (244, 196, 160), (214, 232, 244)  # inseparable, at right angles
+
+
+class Bar(NamedTuple):
+    """A candidate with its rank and the length of its bar in per cent."""
+
+    rank: int
+    candidate: Candidate
+    percent: float
+
+
+class Cell(NamedTuple):
+    """A cell of the heat map: its text and its colour."""
+
+    text: str
+    color: str
+
+
+def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
+    """The page for a diagnosis.
+
+    Args:
+        diagnosis: what was found.
+        note: a sentence at the top of the page, such as that the data are simulated.
+
+    Returns:
+        HTML with its pictures in it.
+    """
+    d = diagnosis
+    count = len(d.findings)
+    works: list[Callable[[], str | None]] = [
+        lambda: pictures.over_time(d) if len(d.traces.time) else None,
+        *(partial(pictures.of_finding, d, i) for i in range(count)),
+        *(partial(pictures.over_states, d, i) for i in range(count)),
+    ]
+    time_figure, *drawn = shared(works)
+    page = _render(
+        "diagnosis.html.j2",
+        d=d,
+        note=note,
+        say=diagnosis_wording,
+        top=diagnosis_verdict,
+        typeset=typeset,
+        marked=marked,
+        notes=diagnosis_wording.channel_notes(d.traces.channels),
+        numbered=pictures.numbered(d),
+        clock=diagnosis_wording.clock_of(d.traces),
+        time_figure=_markup(time_figure),
+        figures=[_markup(svg) for svg in drawn[:count]],
+        maps=[_markup(svg) for svg in drawn[count:]],
+        panels=[pictures.driver_panels(d, i) for i in range(len(d.findings))],
+        curve_colors=pictures.CURVE_COLORS,
+        bars=bars(d.candidates),
+        heat=heat_map(d.separability),
+        most=_MOST_SHOWN,
+    )
+    return unbroken(page)
+
+
+def _markup(svg: str | None) -> Markup | None:
+    return None if svg is None else Markup(svg)
+
+
+def bars(candidates: tuple[Candidate, ...]) -> list[Bar]:
+    """The best candidates with bars in proportion to their gain."""
+    best = max((c.log_likelihood_gain for c in candidates), default=0.0)
+    return [
+        Bar(i, c, 100.0 * max(c.log_likelihood_gain, 0.0) / best if best > 0 else 0.0)
+        for i, c in enumerate(candidates[:_MOST_SHOWN], 1)
+    ]
+
+
+def heat_map(separability: Separability) -> list[list[Cell]]:
+    """A row a candidate: what the refit leaves of it, then what each other candidate leaves."""
+    s = separability
+    shown = min(len(s.labels), _MOST_SHOWN)
+    rows = []
+    for i in range(shown):
+        others = [Cell("·", "transparent") if i == j else _cell(float(s.share[i, j])) for j in range(shown)]
+        rows.append([_cell(float(s.left[i])), *others])
+    return rows
+
+
+def _cell(share: float) -> Cell:
+    if not math.isfinite(share):
+        return Cell("–", "transparent")
+    part = min(max(share, 0.0), 1.0)
+    color = "#" + "".join(f"{round(a + part * (b - a)):02x}" for a, b in zip(_FAINT, _CLEAR, strict=True))
+    return Cell(f"{part:.2f}", color)

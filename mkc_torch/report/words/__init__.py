@@ -1,0 +1,1 @@
+"""Words that a reader sees: numbers, symbols, terms."""

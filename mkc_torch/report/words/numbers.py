@@ -1,0 +1,220 @@
+"""Results in words and figures, the same in the terminal and on a page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from mkc_torch.calibration.calibrate import Calibration, Spread
+from mkc_torch.recording.disturbance import Interval
+
+_MOST_DECIMALS = 9
+_LEAST, _MOST = 0.01, 1e6
+"""Sizes that are written without a power of ten."""
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def decimals(step: float) -> int:
+    """Decimals that show two digits of a standard error, or three where it is not known.
+
+    Example:
+        >>> decimals(0.083), decimals(12.0), decimals(0.0)
+        (3, 0, 3)
+    """
+    if not (math.isfinite(step) and step > 0):
+        return 3
+    return min(max(1 - math.floor(math.log10(step)), 0), _MOST_DECIMALS)
+
+
+def number(value: float, places: int) -> str:
+    """A number with a true minus sign, and no minus before a zero.
+
+    Example:
+        >>> number(-1.25, 1), number(-0.01, 1)
+        ('−1.2', '0.0')
+    """
+    text = f"{value:.{places}f}"
+    return text.replace("-", "−") if float(text) != 0 else text.lstrip("-")
+
+
+def power(largest: float) -> int:
+    """The power of ten, a multiple of three, that numbers of this size are written in; 0 for usual ones.
+
+    Example:
+        >>> power(46.2), power(4.6e-5), power(4.6e31)
+        (0, -6, 30)
+    """
+    if largest == 0 or _LEAST <= largest < _MOST or not math.isfinite(largest):
+        return 0
+    return 3 * math.floor(math.log10(largest) / 3.0)
+
+
+def in_power(exponent: int, unit: str) -> str:
+    """A unit of numbers that are written in a power of ten.
+
+    Example:
+        >>> in_power(-6, "T"), in_power(0, "µT")
+        ('10⁻⁶ T', 'µT')
+    """
+    return f"10{str(exponent).translate(_RAISED)} {unit}".rstrip() if exponent else unit
+
+
+def with_errors(values: Sequence[float], errors: Sequence[float], exponent: int = 0) -> list[str]:
+    """Values with their standard errors, all to the digits that the largest error leaves, in a power of ten.
+
+    Example:
+        >>> with_errors((-0.89431, 44.2), (0.085, 0.0925)), with_errors((1.5,), (math.nan,))
+        (['−0.894 ± 0.085', '44.200 ± 0.092'], ['1.500'])
+        >>> with_errors((1.1984e-05,), (1.1e-08,), -6), with_errors((1.0,), (1e-15,))
+        (['11.984 ± 0.011'], ['1.000000000 ± 1.0e-15'])
+    """
+    return matrix_with_errors([values], [errors], exponent)[0]
+
+
+def matrix_with_errors(
+    matrix: Sequence[Sequence[float]], errors: Sequence[Sequence[float]], exponent: int = 0
+) -> list[list[str]]:
+    """Rows of a matrix with their standard errors, all to the same digits, in a power of ten."""
+    scale = 10.0**exponent
+    places = decimals(max(e for row in errors for e in row) / scale)
+    return [
+        [_with_error(v / scale, e / scale, places) for v, e in zip(row, error, strict=True)]
+        for row, error in zip(matrix, errors, strict=True)
+    ]
+
+
+def _with_error(value: float, error: float, places: int) -> str:
+    if not math.isfinite(error):
+        return number(value, places)
+    told = f"{error:.{places}f}"
+    return f"{number(value, places)} ± {told if float(told) > 0 or error == 0 else f'{error:.1e}'}"
+
+
+def size(value: float) -> str:
+    """A size to three digits.
+
+    Example:
+        >>> size(28.62), size(0.2837), size(758.09), size(0.0), size(4.6e31)
+        ('28.6', '0.284', '758', '0', '4.60e+31')
+    """
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    places = max(2 - math.floor(math.log10(abs(value))), 0)
+    return number(value, places) if places <= 6 and abs(value) < 1e9 else f"{value:.2e}"
+
+
+def listed(values: Sequence[float], errors: Sequence[float], exponent: int = 0) -> str:
+    """Values side by side, to the digits their errors leave, in a power of ten.
+
+    Example:
+        >>> listed((1.234, -2.0, 0.5), (0.1, 0.1, 0.1))
+        '1.23, −2.00, 0.50'
+    """
+    scale = 10.0**exponent
+    return ", ".join(number(v / scale, decimals(max(errors) / scale)) for v in values)
+
+
+def share(value: float) -> str:
+    """A share in per cent; only what is nothing or everything is called so.
+
+    Example:
+        >>> share(0.0474), share(0.0), share(0.0004), share(0.45), share(0.9985), share(0.9999)
+        ('4.7 %', '0 %', '< 0.1 %', '45 %', '99.9 %', '> 99.9 %')
+    """
+    if 0 < value < 0.001:
+        return "< 0.1 %"
+    if 0.999 < value < 1:
+        return "> 99.9 %"
+    return f"{100 * value:.{1 if 0 < value < 0.0995 or 0.99 < value < 1 else 0}f} %"
+
+
+def change(before: Spread, after: Spread, unit: str) -> str:
+    """The robust residual before and after."""
+    return f"{size(before.robust)} → {size(after.robust)} {unit}".rstrip()
+
+
+def bandwidth(sigma: float) -> str:
+    """σ, "∞" where the density is Gaussian."""
+    return "∞" if math.isinf(sigma) else f"{sigma:.2f}"
+
+
+def noise(calibration: Calibration) -> str:
+    """The noise along the field in the recording's unit, and whether outliers stand beside it.
+
+    The algebraic residual is twice the relative error of the length, to first order.
+    """
+    c = calibration
+    kind = "Gaussian" if math.isinf(c.sigma) else f"heavy-tailed, σ = {bandwidth(c.sigma)}"
+    return f"{size(0.5 * c.radius * c.d)} {c.unit} along the field, {kind}"
+
+
+def when(intervals: Sequence[Interval]) -> str:
+    """Intervals of time as one phrase; empty where there are none.
+
+    Example:
+        >>> when([Interval(12.13, 15.3)]), when([Interval(0, 1), Interval(5, 5.5)])
+        ('between 12.1 s and 15.3 s', 'from 0.0 to 1.0 s and from 5.0 to 5.5 s')
+        >>> when([Interval(0, 1), Interval(5, 5.5), Interval(9, 9.5), Interval(20, 24)])
+        'in 4 intervals, the longest from 20.0 to 24.0 s'
+    """
+    if len(intervals) == 1:
+        return f"between {intervals[0].start:.1f} s and {intervals[0].end:.1f} s"
+    each = [f"from {i.start:.1f} to {i.end:.1f} s" for i in intervals]
+    if len(intervals) > 3:
+        longest = max(range(len(each)), key=lambda k: intervals[k].end - intervals[k].start)
+        return f"in {len(each)} intervals, the longest {each[longest]}"
+    return " and ".join(filter(None, [", ".join(each[:-1]), *each[-1:]]))
+
+
+def rejection(calibration: Calibration) -> str:
+    """What was rejected, and when, as a sentence."""
+    c = calibration
+    if c.rejected == 0:
+        return f"None of the {c.samples:,} samples was rejected."
+    told = f"{share(c.rejected_share)} of the {c.samples:,} samples {'was' if c.rejected == 1 else 'were'} rejected"
+    return f"{told}, mainly {when(c.disturbed)}." if c.disturbed else f"{told}, scattered over the recording."
+
+
+def headline(calibration: Calibration) -> list[str]:
+    """The result in three sentences."""
+    c = calibration
+    exponent = power(c.radius)
+    unit = f"× {in_power(exponent, c.unit)}" if exponent else c.unit
+    return [
+        f"Offset ({listed(c.center, c.center_se, exponent)}) {unit}, "
+        f"semi-axes ({listed(c.semi_axes, c.semi_axes_se, exponent)}) {unit}.",
+        f"The length of the field scatters by {size(c.after.robust)} {c.unit}; before, by {size(c.before.robust)} "
+        f"{c.unit}.",
+        rejection(c),
+    ]
+
+
+def python_code(calibration: Calibration) -> str:
+    """Lines that correct measurements, for pasting into a program with numpy."""
+    c = calibration
+    rows = ",\n".join(f"    [{', '.join(f'{v:.8g}' for v in row)}]" for row in c.matrix)
+    return (
+        f"import numpy as np\n\noffset = np.array([{', '.join(f'{v:.8g}' for v in c.center)}])  # {c.unit}\n"
+        f"matrix = np.array([\n{rows},\n])\n\n"
+        f"field = (measured - offset) @ matrix.T  # {c.field_unit}, |field| = {size(c.field_strength)}"
+    )
+
+
+def c_code(calibration: Calibration) -> str:
+    """The same for C."""
+    c = calibration
+    rows = ",\n".join("    {" + ", ".join(_c_number(v) for v in row) + "}" for row in c.matrix)
+    offset = ", ".join(_c_number(v) for v in c.center)
+    return (
+        f"static const float mag_offset[3] = {{{offset}}}; /* {c.unit} */\n"
+        f"static const float mag_matrix[3][3] = {{\n{rows}\n}};\n\n"
+        f"/* field[i] in {c.field_unit} */\n"
+        "for (int i = 0; i < 3; i++) {\n    field[i] = 0.0f;\n    for (int j = 0; j < 3; j++)\n"
+        "        field[i] += mag_matrix[i][j] * (measured[j] - mag_offset[j]);\n}"
+    )
+
+
+def _c_number(value: float) -> str:
+    text = f"{value:.8g}"
+    return text + ("f" if "." in text or "e" in text else ".0f")

@@ -1,0 +1,519 @@
+"""Differential equations with the recording that answers them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from itertools import combinations
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.nonlinear import GaussianPrior, fit, load_forward_mode
+from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.dynamics.between_samples import smooth_between
+from mkc_torch.simulation.dynamics.first_guess import first_guess
+from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
+from mkc_torch.simulation.dynamics.trajectory import Grid, Rate, Trajectory, defect, marched, solve, stations
+from mkc_torch.simulation.dynamics.user_functions import check_value, kinematic, namespace
+from mkc_torch.simulation.parameter import Parameter, SimulationError
+from mkc_torch.simulation.protocol import Changes, Clock, FreeChange, Port
+from mkc_torch.simulation.runs import experiment_runs
+from mkc_torch.simulation.undetermined import undetermined
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+    from mkc_torch.simulation.dynamics.definition import Dynamics
+
+__all__ = ["PreparedDynamics"]
+
+_FINEST = 8
+
+_PATIENT = 2
+"""Moments at a time of a march that has to find its way."""
+
+_MOST_KEPT = 1 << 22
+"""Numbers in all trajectories that are kept."""
+
+_ROUGH = 0.02
+_REVERSED = 0.05
+_WINDOW = 4
+_NOUGHT = 1e-3
+_RATES = ("rate", "loaded rate", "hysteretic rate", "exchange")
+_HEIGHTS = ("height", "altitude", "elevation", "heave", "z")
+
+_Mark = tuple[float, float]
+_Memory = tuple[dict[int, Trajectory], OrderedDict[_Mark, Tensor]]
+
+
+class PreparedDynamics:
+    """A system of differential equations with the recording that answers it."""
+
+    prior: GaussianPrior | None = None
+
+    def __init__(self, system: Dynamics, recording: Recording, outputs: tuple[str, ...]) -> None:
+        self.system, self.recording, self.channels = system, recording, outputs
+        self.name = system.name
+        self.time = recording["time"]
+        self.measured = recording.stack(*outputs)
+        self.unit = _common(system.units.get(name, recording.units[name]) for name in outputs)
+        self.independent = (True,) * len(outputs)
+        self.state: Mapping[str, object] = {"class": system.name, "outputs": list(outputs)}
+        self.known = {
+            name: one if isinstance(one, Parameter) else Parameter(float(one))
+            for name, one in system.parameters.items()
+        }
+        self.begins, self.labels = beginnings(recording, system)
+        self.run = experiment_runs(recording)
+        refuse_few(self.begins, system.name)
+        self._kinematic = kinematic(system, self.known)
+        self._lay_out(1)
+        starts = [f"{state} at the start{label}" for label in self.labels for state in system.states]
+        self.parameter_names = (*self.known, *starts)
+        p, n = len(self.known), len(starts)
+        low = [one.lower for one in self.known.values()]
+        high = [one.upper for one in self.known.values()]
+        self.bounds = self.time.new_tensor(low + [-torch.inf] * n), self.time.new_tensor(high + [torch.inf] * n)
+        self._p = p
+        self._check_functions()
+        self._refine()
+
+    def _lay_out(self, parts: int) -> None:
+        """Nodes and stations, each interval between samples in so many parts."""
+        N = len(self.time)
+        inside = ~self.begins[1:]
+        count = torch.where(inside, parts, 1)
+        before = torch.arange(N - 1).repeat_interleave(count)
+        part = torch.arange(len(before)) - (count.cumsum(0) - count).repeat_interleave(count)
+        step = 1.0 / count.repeat_interleave(count).double()
+        share = (part.unsqueeze(-1) + torch.tensor([0.0, 0.5, 1.0], dtype=step.dtype)) * step.unsqueeze(-1)
+        # between two runs there is nothing: time and inputs stay at the end of the first
+        share = torch.where(inside.repeat_interleave(count).unsqueeze(-1), share, 0.0)
+        node_before = torch.cat([before, before[-1:]])
+        node_share = torch.cat([share[:, 0], share[-1:, 2]])
+        time = torch.lerp(self.time[:-1][node_before], self.time[1:][node_before], node_share)
+        self.rows = torch.cat([(count.cumsum(0) - count), torch.tensor([len(before)])])
+        begins = torch.zeros(len(time), dtype=torch.bool)
+        begins[self.rows[self.begins]] = True
+        self.grid = Grid(time, begins)
+        early = before.repeat_interleave(3)
+        at = torch.lerp(self.time[early], self.time[early + 1], share.flatten())
+        self.clock = Clock(at, early, early + 1, share.flatten())
+        inputs = self.recording.stack(*self.system.inputs) if self.system.inputs else self.time.new_zeros(N, 0)
+        self.inputs = self._between(inputs)
+        self.inputs_at_rows = inputs
+        self._guess = first_guess(self, time, node_before, node_share)
+        self._last: dict[int, Trajectory] = {}
+        self._solved: OrderedDict[_Mark, Tensor] = OrderedDict()
+        self.__dict__.pop("ports", None)  # their clock is that of the stations
+
+    def _between(self, inputs: Float[Tensor, "N u"]) -> Float[Tensor, "S u"]:
+        """Inputs at the stations."""
+        if self.system.between == "held":
+            return inputs[self.clock.before]
+        if self.system.between == "linear":
+            return self.clock.at(inputs)
+        return smooth_between(inputs, self.time, self.begins, self.clock)
+
+    @cached_property
+    def ports(self) -> dict[str, Port]:
+        """The rate of each state, exchange between two of the same unit, each input, and the outputs."""
+        system = self.system
+        places = {}
+        for state in system.states:
+            if state in self._kinematic:
+                continue
+            parts = self._parts(state)
+            rate = {"rate": f"rate of {state}"} if "position" in parts else {}
+            places[f"rate of {state}"] = self._rate_port(state, "rate", {**parts, **rate})
+            if "position" in parts and system.inputs:
+                places[f"loaded rate of {state}"] = self._rate_port(state, "loaded rate", {**parts, "load": "load"})
+            # segments of one run would each begin without what the one before remembers
+            if "position" in parts and system.segment is None:
+                port = self._rate_port(state, "hysteretic rate", parts)
+                places[f"hysteretic rate of {state}"] = replace(port, memory=f"memory_of_{state}")
+        pairs = [
+            (one, other)
+            for one, other in combinations((s for s in system.states if s not in self._kinematic), 2)
+            if self._unit_of(one) == self._unit_of(other)
+        ]
+        for one, other in pairs:
+            sideways = {"sideways": other} if self._is_way(one) and self._is_way(other) else {}
+            port = self._rate_port(one, "exchange", {"own": one, "other": other, **sideways})
+            places[f"exchange of {one} and {other}"] = replace(port, channels=(one, other))
+        for name in system.inputs:
+            places[f"input {name}"] = Port(
+                (name,),
+                self._unit_of(name),
+                pointwise=False,
+                kind="input",
+                parts={"own": name},
+                part_units={"own": self._unit_of(name)},
+                sizes={"own": _sizes(self.recording[name])},
+                clock=self.clock,
+                run=self.run[self.clock.before],
+            )
+        parts = {"own": self.channels[0], **{f"output {name}": name for name in self.channels[1:]}}
+        units = {part: self._unit_of(name) for part, name in parts.items()}
+        output = Port(self.channels, self.unit, pointwise=False, parts=parts, part_units=units, run=self.run)
+        return places | {"output": output}
+
+    def _parts(self, state: str) -> dict[str, str]:
+        """What an effect on the rate of a state can refer to."""
+        positions = [i for i, j in self._kinematic.items() if j == state]
+        parts = {"own": state, **({"position": positions[0]} if positions else {})}
+        if positions and self._unit_of(positions[0]) == "rad":
+            parts["angle"] = positions[0]
+        if positions and self._reverses(positions[0]):
+            parts["deflection"] = positions[0]
+        if positions and positions[0].lower().split("_")[0] in _HEIGHTS:
+            parts["height"] = positions[0]
+        if self._reverses(state):
+            parts["reversing"] = state
+        if self._unit_of(state) in ("°C", "K"):
+            parts["temperature"] = state
+        else:
+            parts["flowing"] = state
+            if not positions:
+                parts["level"] = state
+        return parts
+
+    def _is_way(self, state: str) -> bool:
+        """Whether a state is the speed along a straight line, as far as names and units tell."""
+        positions = [i for i, j in self._kinematic.items() if j == state]
+        return self._unit_of(state) == "m/s" or (bool(positions) and self._unit_of(positions[0]) not in ("rad", "°"))
+
+    def _reverses(self, state: str) -> bool:
+        """Whether a state has either sign for a good part of the recording, as far as it is known beforehand."""
+        values = self._guess[self.rows, self.system.states.index(state)]
+        return min(float((values > 0).double().mean()), float((values < 0).double().mean())) > _REVERSED
+
+    def _rate_port(self, state: str, kind: str, parts: Mapping[str, str]) -> Port:
+        unit = self._unit_of(state)
+        return Port(
+            (state,),
+            f"{unit}/s" if unit else "1/s",
+            pointwise=False,
+            kind=kind,
+            carries=(*self.system.states, *self.system.inputs, *(parts[of] for of in ("load", "rate") if of in parts)),
+            parts=parts,
+            part_units={part: self._unit_of(name) for part, name in parts.items()},
+            sizes={
+                part: _sizes(self._guess[self.rows, self.system.states.index(name)])
+                for part, name in parts.items()
+                if name in self.system.states
+            },
+            clock=self.clock,
+            run=self.run[self.clock.before],
+        )
+
+    def _unit_of(self, name: str) -> str:
+        return self.system.units.get(name, self.recording.units[name] if name in self.recording else "")
+
+    @property
+    def beginnings(self) -> int:
+        """Number of the parameters that are states at the start of a run; they come last."""
+        return len(self.parameter_names) - self._p
+
+    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
+        return self._start.clone()
+
+    @cached_property
+    def _start(self) -> Float[Tensor, " p"]:
+        """The user's values, or those with which the measured states obey the equations, whichever simulates better."""
+        values = self.time.new_tensor([one.value for one in self.known.values()])
+        begin = self._guess[self.grid.begins].flatten()
+        starts = [torch.cat([values, begin])]
+        if self._p:
+            step = self.grid.step.unsqueeze(-1)
+            typical = self._guess.abs().median(0).values.clamp(min=1e-12)
+
+            def lacking(values: Tensor) -> Tensor:
+                left = defect(self._rate(torch.cat([values, begin]), {}), self._guess, step) / typical
+                total = torch.cat([torch.zeros_like(left[:1]), left.cumsum(0)])
+                return total[_WINDOW:] - total[:-_WINDOW]
+
+            low, high = (bound[: self._p] for bound in self.bounds)
+            try:
+                found = fit(lacking, values, lower=low, upper=high, covariance=None, max_iter=60).theta
+            except ValueError:
+                found = values  # the equations cannot be looked at there
+            starts.append(torch.cat([found, begin]))
+        spread = [robust_scale(self.residual(one, {}).nan_to_num(torch.inf, torch.inf, torch.inf)) for one in starts]
+        return starts[0] if bool((spread[0] <= spread[-1]).all()) else starts[-1]
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """What of the parameters the recording leaves undetermined, near where the fit starts."""
+        if not self._p:
+            return ()
+        load_forward_mode()
+        theta = self.start()
+        tangents = torch.func.jacfwd(lambda values: self.residual(values, {}))(theta).flatten(0, 1)
+        # a value near 0 says nothing of the size that is meant
+        meant = theta.new_tensor([one.value for one in self.known.values()])
+        typical = self._guess.abs().median(0).values.repeat(int(self.begins.sum()))
+        meant = torch.cat([meant.abs(), typical])
+        size = torch.where(theta.abs() < _NOUGHT * meant, meant, theta.abs())
+        return undetermined(tangents, size, self.parameter_names, self._p)
+
+    def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
+        return self.measured - self.simulated(theta, changes)
+
+    def simulated(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
+        """The outputs at the samples, (N, m); NaN where no trajectory is found."""
+        found = self.trajectory(theta, changes)
+        outputs = self._outputs(theta, found)
+        if "output" in changes:
+            outputs = outputs + changes["output"](outputs)
+        return outputs if found.converged else outputs * torch.nan
+
+    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Tensor]:
+        found = self.trajectory(theta, changes)
+        inputs = self._inputs(theta, changes)
+        at_stations = stations(self._rate(theta, changes), found.states, self.grid.step.unsqueeze(-1))
+        at_stations = at_stations[:, : len(self.system.states)]
+        outputs = self._outputs(theta, found)
+        rates = self._rates(theta, at_stations, inputs)
+        at = {
+            name: self._signal(port, theta, at_stations, inputs, rates)
+            for name, port in self.ports.items()
+            if port.kind in _RATES
+        }
+        at |= {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
+        return at | {"output": outputs}
+
+    def trajectory(self, theta: Float[Tensor, " p"], changes: Changes, *, patient: bool = False) -> Trajectory:
+        """The states at all moments, with what effects change; ``patient`` goes from moment to moment if it must."""
+        begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
+        rate = self._rate(theta, changes)
+        more = len(self._remembering(changes))
+        begin = torch.cat([begin, begin.new_zeros(len(begin), more)], -1)
+        last = self._last.get(begin.shape[1])
+        without = self._last.get(len(self.system.states)) if more else None
+        guess = self._guess if without is None else without.states
+        guess = torch.cat([guess, guess.new_zeros(len(guess), more)], -1)
+        transformed = torch._C._functorch.is_functorch_wrapped_tensor
+        mark = None if transformed(begin) else self._mark(rate, begin, guess)
+        known = None if mark is None else self._solved.get(mark)
+        if known is None or (last is not None and known is last.states):
+            found = solve(rate, self.grid, begin, guess, last)
+        else:
+            # what was found on the way of a fit is not always found again from elsewhere
+            found = solve(rate, self.grid, begin, known)
+        if not found.converged and last is not None:
+            found = solve(rate, self.grid, begin, guess)
+        if not found.converged and last is None:
+            nearer = marched(rate, self.grid, begin, guess)
+            found = found if nearer is None else solve(rate, self.grid, begin, nearer)
+        if not found.converged and patient:
+            nearer = marched(rate, self.grid, begin, guess, stride=_PATIENT)
+            found = found if nearer is None else solve(rate, self.grid, begin, nearer)
+        # a tensor of a transform must not outlive it
+        if found.converged and mark is not None and not transformed(found.states):
+            states = found.states.detach()
+            self._last[begin.shape[1]] = replace(found, states=states)
+            self.learn((mark, states))
+        return found
+
+    @property
+    def memory(self) -> _Memory:
+        """The trajectories found so far, by their number of states the last ones, and others."""
+        return dict(self._last), self._solved.copy()
+
+    @memory.setter
+    def memory(self, known: _Memory) -> None:
+        last, solved = known
+        self._last, self._solved = dict(last), solved.copy()
+
+    @property
+    def newest(self) -> tuple[_Mark, Tensor] | None:
+        """The last trajectory found, with its mark."""
+        return next(reversed(self._solved.items()), None)
+
+    def learn(self, newest: tuple[_Mark, Tensor] | None) -> None:
+        """Keep a trajectory; the oldest give way."""
+        if newest is None:
+            return
+        mark, states = newest
+        self._solved[mark] = states
+        self._solved.move_to_end(mark)
+        while len(self._solved) * states.numel() > _MOST_KEPT:
+            self._solved.popitem(last=False)
+
+    def _mark(self, rate: Rate, begin: Tensor, guess: Tensor) -> _Mark:
+        """Numbers by which the same equations are known again."""
+        rates = rate(self.grid.spread(guess)).detach()
+        uneven = torch.linspace(1.0, 2.0, len(rates), dtype=rates.dtype).sqrt().unsqueeze(-1)
+        return float((uneven * rates).sum()), float((uneven[: len(begin)] * begin.detach()).sum())
+
+    def since_begin(self) -> Float[Tensor, " N"]:
+        """Time since the beginning of each sample's run, in s."""
+        first = torch.where(self.begins, torch.arange(len(self.time)), 0).cummax(0).values
+        return self.time - self.time[first]
+
+    def _remembering(self, changes: Changes) -> dict[str, str]:
+        """Ports at which an effect brings an internal state, with its name: one that adds its rate when it sees it."""
+        found = {}
+        for name, port in self.ports.items():
+            # what does not see the signal remembers nothing
+            if port.memory and name in changes and not isinstance(changes[name], FreeChange):
+                seen = self._guess.new_zeros(len(self.clock.time), len(port.carries) + 1)
+                if changes[name](seen).shape[1] > len(port.channels):
+                    found[name] = port.memory
+        return found
+
+    def _rate(self, theta: Tensor, changes: Changes) -> Callable[[Tensor], Tensor]:
+        """Of the states, and of the internal states that effects bring, which come after them."""
+        inputs = self._inputs(theta, changes)
+        remembering = self._remembering(changes)
+        rows = [*self.system.states, *remembering.values()]
+        acting = [
+            (port, [rows.index(row) for row in (*port.channels, *([port.memory] if name in remembering else []))], name)
+            for name, port in self.ports.items()
+            if port.kind in _RATES and name in changes
+        ]
+
+        def rate(states: Tensor) -> Tensor:
+            own, memories = states.split([len(self.system.states), len(remembering)], -1)
+            plain = self._rates(theta, own, inputs)
+            rates = [*plain, *(torch.zeros_like(one) for one in memories.unbind(-1))]
+            for port, places, name in acting:
+                signal = self._signal(port, theta, own, inputs, plain)
+                if name in remembering:
+                    signal = torch.cat([signal, states[:, places[-1:]]], -1)
+                for k, added in zip(places, changes[name](signal).unbind(-1), strict=True):
+                    rates[k] = rates[k] + added
+            return torch.stack(rates, -1)
+
+        return rate
+
+    def _rates(self, theta: Tensor, states: Tensor, inputs: Tensor) -> list[Tensor]:
+        """Of the states, by the simulation's own equations."""
+        u = namespace(self.system.inputs, inputs)
+        return self._derivative(self.clock.time, states, u, self._parameters(theta))
+
+    def _signal(
+        self, port: Port, theta: Tensor, states: Tensor, inputs: Tensor, rates: Sequence[Tensor]
+    ) -> Float[Tensor, "S k"]:
+        """What passes through a port of rates: states and inputs, and where the port has them the load or the rate."""
+        own = self.system.states.index(port.parts["own"])
+        if "rate" in port.parts:
+            return torch.cat([states, inputs, rates[own].unsqueeze(-1)], -1)
+        if "load" not in port.parts:
+            return torch.cat([states, inputs], -1)
+        p, idle = self._parameters(theta), namespace(self.system.inputs, torch.zeros_like(inputs))
+        at_rest = torch.cat([states[:, :own], torch.zeros_like(states[:, [own]]), states[:, own + 1 :]], -1)
+        coasting, held = (self._derivative(self.clock.time, x, idle, p)[own] for x in (states, at_rest))
+        load = (rates[own] - coasting - held).abs().unsqueeze(-1)  # of the drive against what holds it
+        return torch.cat([states, inputs, load], -1)
+
+    def _derivative(self, time: Tensor, states: Tensor, u: Any, p: Any) -> list[Tensor]:
+        found = self.system.derivative(time, namespace(self.system.states, states), u, p)
+        values = [found[s] for s in self.system.states] if isinstance(found, Mapping) else list(found)
+        return [v + torch.zeros_like(states[:, 0]) for v in values]
+
+    def _inputs(self, theta: Tensor, changes: Changes) -> Tensor:
+        if not self.system.inputs:
+            return self.inputs
+        columns = {
+            name: self.inputs[:, k] + changes[f"input {name}"](self.inputs[:, [k]])[:, 0]
+            if f"input {name}" in changes
+            else self.inputs[:, k]
+            for k, name in enumerate(self.system.inputs)
+        }
+        run = self.run[self.clock.before]
+        acting = self.system.actuated(self.clock.time, SimpleNamespace(**columns), self._parameters(theta), run)
+        return torch.stack([acting[name] for name in self.system.inputs], -1)
+
+    def _outputs(self, theta: Tensor, found: Trajectory) -> Float[Tensor, "N m"]:
+        p = self._parameters(theta)
+        x = namespace(self.system.states, found.states[self.rows, : len(self.system.states)])
+        u = namespace(self.system.inputs, self.inputs_at_rows)
+        values = self.system.sensed(self.time, self.system.output(self.time, x, u, p), p, self.run)
+        return torch.stack([values[name] for name in self.channels], -1)
+
+    def _parameters(self, theta: Tensor) -> SimpleNamespace:
+        return SimpleNamespace(**dict(zip(self.known, theta[: self._p].unbind(), strict=True)))
+
+    def _check_functions(self) -> None:
+        """The user's functions at the first guess.
+
+        Raises:
+            SimulationError: a wrong shape, or values that are not finite.
+        """
+        system = self.system
+        theta = self.time.new_tensor([one.value for one in self.known.values()])
+        states = self.grid.spread(self._guess)
+        x, p = namespace(system.states, states), self._parameters(theta)
+        u = namespace(system.inputs, self.inputs)
+        found = system.derivative(self.clock.time, x, u, p)
+        if isinstance(found, Mapping):
+            if set(found) != set(system.states):
+                raise SimulationError(
+                    f"{self.name}.derivative returns rates of {', '.join(map(str, found))} but the states are "
+                    f"{', '.join(system.states)}; return one rate for each state."
+                )
+        elif len(found) != len(system.states):
+            raise SimulationError(
+                f"{self.name}.derivative returns {len(found)} rates for {len(system.states)} states "
+                f"({', '.join(system.states)}); return one rate for each state."
+            )
+        values = [found[s] for s in system.states] if isinstance(found, Mapping) else list(found)
+        for state, value in zip(system.states, values, strict=True):
+            check_value(f"{self.name}.derivative: the rate of `{state}`", value, self.clock.time, x, p)
+        run = self.run[self.clock.before]
+        acting = system.actuated(self.clock.time, u, p, run)
+        for name in system.inputs:
+            if name not in acting:
+                raise SimulationError(
+                    f"{self.name}.actuated does not return `{name}`, which is one of its inputs; it returns "
+                    f"{', '.join(map(str, acting)) or 'nothing'}."
+                )
+            check_value(f"{self.name}.actuated: `{name}`", acting[name], self.clock.time, x, p)
+        at = namespace(system.states, states[::3][:1].expand(len(self.time), -1))
+        at_rows = namespace(system.inputs, self.inputs_at_rows)
+        outputs = system.output(self.time, at, at_rows, p)
+        for name in self.channels:
+            if name not in outputs:
+                raise SimulationError(
+                    f"{self.name}.output does not return `{name}`, which is in its outputs; it returns "
+                    f"{', '.join(map(str, outputs))}."
+                )
+            check_value(f"{self.name}.output: `{name}`", outputs[name], self.time, at, p)
+
+    def _refine(self) -> None:
+        """Parts of an interval between samples: by the greatest step, or until twice as many change nothing."""
+        if self.system.step is not None:
+            inside = self.time.diff()[~self.begins[1:]]
+            self._lay_out(max(1, int(torch.ceil(inside.max() / self.system.step - 1e-9))))
+            return
+        parts = 1
+        theta = self.start()
+        before = self.simulated(theta, {})
+        spread = (self.measured - self.measured.median(0).values).abs().median(0).values.clamp(min=1e-300)
+        while parts < _FINEST:
+            self._lay_out(2 * parts)
+            after = self.simulated(theta, {})
+            # no trajectory, NaN, may be one of too long steps
+            if bool(((after - before).abs().amax(0) <= _ROUGH * spread).all()):
+                break
+            parts, before = 2 * parts, after
+        self._lay_out(parts if bool(before.isfinite().all()) else 1)
+
+
+def _sizes(values: Float[Tensor, " N"]) -> tuple[float, float]:
+    """Typical and largest absolute value."""
+    return float(values.abs().median()), float(values.abs().amax())
+
+
+def _common(units: Any) -> str:
+    """The unit that all of them are; empty where they differ."""
+    found = set(units)
+    return found.pop() if len(found) == 1 else ""

@@ -1,0 +1,67 @@
+"""Where trajectories begin: runs, and the segments of long ones."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.parameter import SimulationError
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Int
+
+    from mkc_torch.simulation.dynamics.definition import Dynamics
+
+__all__ = ["beginnings", "refuse_few"]
+
+_FEWEST = 3
+
+
+def beginnings(recording: Recording, system: Dynamics) -> tuple[Tensor, list[str]]:
+    """Where trajectories begin, and what each is called."""
+    time = recording["time"]
+    begins = torch.zeros(len(time), dtype=torch.bool)
+    begins[0] = True
+    many = "experiment" in recording
+    if many:
+        group = recording["experiment"]
+        begins[1:] |= group[1:] != group[:-1]
+    if system.segment is not None:
+        first = torch.where(begins, torch.arange(len(time)), 0).cummax(0).values
+        number = ((time - time[first]) / system.segment).floor()
+        begins[1:] |= number[1:] != number[:-1]
+        begins &= ~_short_ends(begins, first)
+    labels = []
+    for row in begins.nonzero().squeeze(-1).tolist():
+        label = ""
+        if many:
+            names = recording.labels.get("experiment")
+            value = int(recording["experiment"][row])
+            label = f" of {names[value] if names else value}"
+        if system.segment is not None:
+            label += f", {float(time[row]):.4g} s"
+        labels.append(label)
+    return begins, labels
+
+
+def _short_ends(begins: Bool[Tensor, " N"], first: Int[Tensor, " N"]) -> Bool[Tensor, " N"]:
+    """Where the last segment of a run begins, if it is too short for a trajectory of its own."""
+    short = torch.zeros_like(begins)
+    rows = begins.nonzero().squeeze(-1)
+    ends = torch.cat([rows[1:], rows.new_tensor([len(begins)])])
+    last = torch.cat([first[1:] != first[:-1], first.new_ones(1).bool()])
+    short[rows] = last[ends - 1] & (ends - rows < _FEWEST) & (rows != first[rows])
+    return short
+
+
+def refuse_few(begins: Tensor, name: str) -> None:
+    first = begins.nonzero().squeeze(-1)
+    shortest = int(torch.cat([first, first.new_tensor([len(begins)])]).diff().min())
+    if shortest < _FEWEST:
+        raise SimulationError(
+            f"{name}: a run of {shortest} samples is too short for a trajectory; it needs {_FEWEST} at least. Leave "
+            "it out, or use longer segments."
+        )

@@ -1,0 +1,83 @@
+"""What a user wrote: names that fit together, and functions whose results are of the right shape and finite."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.simulation.parameter import Parameter, SimulationError
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from mkc_torch.simulation.dynamics.definition import Dynamics
+
+__all__ = ["check_names", "check_value", "kinematic", "namespace"]
+
+
+def check_names(system: Dynamics) -> None:
+    names = [*system.states, *system.inputs, *system.parameters]
+    if system.between not in ("held", "linear", "smooth"):
+        raise SimulationError(
+            f'{system.name}: `between` should be "held", "linear" or "smooth" but is {system.between!r}.'
+        )
+    if not system.states:
+        raise SimulationError(f"{system.name} has no `states`; name them.")
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise SimulationError(f"{system.name} uses the name `{twice[0]}` twice among states, inputs and parameters.")
+    for name in names:
+        if not name.isidentifier():
+            raise SimulationError(f"{system.name}: `{name}` cannot be an attribute; use letters, digits and _.")
+
+
+def check_value(what: str, value: object, time: Tensor, x: SimpleNamespace, p: SimpleNamespace) -> None:
+    if not isinstance(value, Tensor) or value.dim() > 1 or (value.dim() == 1 and len(value) not in (1, len(time))):
+        found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        raise SimulationError(
+            f"{what} should be a tensor of shape ({len(time)},), like the states it is given, but is {found}."
+        )
+    bad = (~value.isfinite()).expand(len(time)).nonzero()
+    if len(bad):
+        row = int(bad[0])
+        told = ", ".join(f"{name} = {float(v.expand(len(time))[row]):.4g}" for name, v in vars(x).items())
+        fixed = ", ".join(f"{name} = {float(v):.4g}" for name, v in vars(p).items())
+        raise SimulationError(
+            f"{what} is {float(value.expand(len(time))[row])} at time {float(time[row]):.4g} s with {told}; "
+            f"parameters {fixed or 'none'}. Keep it finite there, or start from other parameters."
+        )
+
+
+def kinematic(system: Dynamics, known: Mapping[str, Parameter]) -> dict[str, str]:
+    """States whose rate is another state, as that of a position is the speed: no physics can be missing there."""
+    generator = torch.Generator().manual_seed(0)
+
+    def drawn(count: int) -> Tensor:
+        return torch.rand(20, count, generator=generator, dtype=torch.float64) + 0.1
+
+    states = drawn(len(system.states))
+    x, u = namespace(system.states, states), namespace(system.inputs, drawn(len(system.inputs)))
+    p = SimpleNamespace(**{name: torch.tensor(one.value).double() for name, one in known.items()})
+    found = system.derivative(drawn(1)[:, 0], x, u, p)
+    if not isinstance(found, Mapping | Sequence | Tensor):
+        raise SimulationError(
+            f"{system.name}.derivative returns {type(found).__name__}; return the rate of each state, by its name or "
+            "in their order."
+        )
+    rates = [found[s] for s in system.states] if isinstance(found, Mapping) and set(found) >= set(system.states) else []
+    if not isinstance(found, Mapping) and len(found) == len(system.states):
+        rates = list(found)
+    pairs = {}
+    for state, rate in zip(system.states, rates, strict=False):
+        for other, value in zip(system.states, states.unbind(-1), strict=True):
+            if state != other and isinstance(rate, Tensor) and rate.shape == value.shape and torch.equal(rate, value):
+                pairs[state] = other
+    return pairs
+
+
+def namespace(names: Sequence[str], values: Float[Tensor, "S n"]) -> SimpleNamespace:
+    return SimpleNamespace(**dict(zip(names, values.unbind(-1), strict=True)))

@@ -1,0 +1,162 @@
+"""Arguments that are refused: each sentence names the argument, what it should be, what it is, and what to do."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch._support.arguments import (
+    as_numbers,
+    checked_number,
+    checked_whole,
+    refuse_bad_batch,
+    refuse_bad_weight,
+    refuse_not_real,
+    refuse_other_type,
+    refuse_out_of_range,
+    refuse_text,
+    told,
+)
+
+INF, NAN = math.inf, math.nan
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.zeros(2), r"but got ndarray; make a tensor of it, torch\.as_tensor\(x\)\."),
+        ([1.0], r"but got list; make a tensor of it, torch\.as_tensor\(x\)\."),
+        (1.0, r"but got float; make a tensor of it, torch\.as_tensor\(x\)\."),
+        (torch.zeros(2, dtype=torch.int64), r"but got torch\.int64; convert it, x\.float\(\) or x\.double\(\)\."),
+        (torch.zeros(2) + 0j, r"but got torch\.complex64; pass real and imaginary parts as channels\."),
+        ("text", r"but got str; pass a tensor\."),
+        (None, r"but got NoneType; pass a tensor\."),
+    ],
+)
+def test_data_that_are_no_real_tensor_are_refused_with_how_to_make_one(value, message):
+    with pytest.raises(TypeError, match=f"^Expected argument `x` to be a real floating-point tensor {message}$"):
+        refuse_not_real("x", value)
+    refuse_not_real("x", torch.zeros(2, dtype=torch.bfloat16))
+
+
+def test_numbers_are_those_of_tensors_sequences_and_arrays():
+    given = torch.ones(2, dtype=torch.float64, requires_grad=True)
+    assert as_numbers("x", given) is given
+    for value in ([1.0, 2.0], (1, 2), np.array([1.0, 2.0])):
+        assert as_numbers("x", value, torch.float64).tolist() == [1.0, 2.0]
+    assert as_numbers("x", 2).dtype == torch.get_default_dtype()
+    for value in ("a", None, 1j, [[1.0], [1.0, 2.0]], torch.nn.Linear, 10**400):
+        with pytest.raises(TypeError, match="`x` to be a number, or a tensor of them, but got "):
+            as_numbers("x", value)
+
+
+@pytest.mark.parametrize("end", [1.0, 2.0])
+@pytest.mark.parametrize("ends", ["()", "[)", "(]", "[]"])
+@pytest.mark.parametrize("kind", [float, torch.tensor, lambda v: torch.tensor([1.5, v]), lambda v: [v]])
+def test_ends_of_a_range_count_where_they_are_closed(end, ends, kind):
+    if ends[int(end) - 1] in "[]":
+        refuse_out_of_range("x", kind(end), 1.0, 2.0, ends)
+        return
+    with pytest.raises(ValueError, match=rf"`x` to be in \{ends[0]}1, 2\{ends[1]} but got {end:g}"):
+        refuse_out_of_range("x", kind(end), 1.0, 2.0, ends)
+
+
+@pytest.mark.parametrize("value", [NAN, torch.tensor([1.0, NAN]), [1.0, NAN], torch.tensor(NAN)])
+def test_no_range_holds_a_nan(value):
+    with pytest.raises(ValueError, match=r"`x` to be in \[-inf, inf\] but got nan"):
+        refuse_out_of_range("x", value, -INF, INF, "[]")
+
+
+def test_ranges_without_an_end_are_told_in_words_with_the_first_wrong_value_and_what_to_do():
+    for ends, words in (("()", "positive and finite"), ("(]", "positive"), ("[)", ">= 0 and finite"), ("[]", ">= 0")):
+        with pytest.raises(
+            ValueError, match=f"^Expected argument `x` to be {words} but got -3 at index .0, 1.; mend.$"
+        ):
+            refuse_out_of_range("x", torch.tensor([[1.0, -3.0], [-4.0, 1.0]]), ends=ends, advice="mend")
+
+
+def test_values_under_vmap_and_in_empty_tensors_are_not_looked_at():
+    def through(x):
+        refuse_out_of_range("x", x)
+        refuse_bad_weight(x)
+        refuse_bad_batch(x, x)
+        return x
+
+    assert torch.func.vmap(through)(torch.tensor([[-1.0], [NAN]])).shape == (2, 1)
+    through(torch.empty(0))
+    with pytest.raises(ValueError, match="`x` to be positive"):
+        torch.func.grad(lambda x: through(x).sum())(torch.tensor([-1.0]))
+
+
+def test_one_number_is_no_tensor_text_or_flag():
+    assert checked_number("x", np.float32(0.5), 0.0, 1.0) == 0.5
+    assert checked_number("x", 1, 0.0, 2.0) == 1
+    with pytest.raises(ValueError, match="`x` to be positive and finite but got inf"):
+        checked_number("x", 10**400)
+    for value in ("0.5", None, True, torch.tensor(0.5), [0.5]):
+        with pytest.raises(TypeError, match=r"`x` to be a number in \(0, 1\) but got .*; half is usual\.$"):
+            checked_number("x", value, 0.0, 1.0, advice="half is usual")
+    with pytest.raises(ValueError, match=r"`x` to be in \(0, 1\) but got 1.5; half is usual\.$"):
+        checked_number("x", 1.5, 0.0, 1.0, advice="half is usual")
+
+
+def test_whole_numbers():
+    assert checked_whole("x", np.int64(3), 1) == 3
+    assert checked_whole("seed", -5) == -5
+    for value in (0, 2.0, 1.5, True, "3", None):
+        with pytest.raises(ValueError, match=r"`x` to be a whole number of at least 1 but got .*; 10 is ample\.$"):
+            checked_whole("x", value, 1, "10 is ample")
+
+
+def test_what_is_no_instance_is_refused_and_a_class_is_told_to_be_made_one():
+    refuse_other_type("x", torch.nn.ReLU(), torch.nn.Module, "a module", "write one")
+    with pytest.raises(TypeError, match=r"`x` to be a module but got 'a'; write one\.$"):
+        refuse_other_type("x", "a", torch.nn.Module, "a module", "write one")
+    with pytest.raises(TypeError, match=r"`x` to be a module but got the class ReLU; make one, ReLU\(\.\.\.\)\.$"):
+        refuse_other_type("x", torch.nn.ReLU, torch.nn.Module, "a module", "write one")
+    with pytest.raises(TypeError, match=r"got the class int; write one\.$"):
+        refuse_other_type("x", int, torch.nn.Module, "a module", "write one")
+
+
+def test_text_is_no_sequence_of_names():
+    refuse_text("x", ("a", "b"), "names")
+    with pytest.raises(TypeError, match=r"`x` to be names but got 'abc'; write \('abc',\)\."):
+        refuse_text("x", "abc", "names")
+    for value in (3, (3,), None):
+        with pytest.raises(TypeError, match="`x` to be names but got"):
+            refuse_text("x", value, "names")
+
+
+@pytest.mark.parametrize("bad", [-1.0, NAN, INF, -INF])
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
+def test_weights_that_are_negative_or_not_finite_are_refused_by_index(bad, dtype):
+    weight = torch.ones(3, 2, dtype=dtype)
+    weight[1, 0] = bad
+    message = (
+        rf"`weight` to be >= 0 and finite but got {bad:g} at index \(1, 0\) \(1 such values\); .* weight 0 or False"
+    )
+    with pytest.raises(ValueError, match=message):
+        refuse_bad_weight(weight)
+
+
+def test_weights_may_be_counts_and_masks_but_no_lists_and_not_complex():
+    for weight in (torch.tensor([0, 2]), torch.tensor([True, False]), torch.zeros(2), torch.empty(0)):
+        refuse_bad_weight(weight)
+    with pytest.raises(ValueError, match="got -2 at index"):
+        refuse_bad_weight(torch.tensor([1, -2]))
+    for weight in ([1.0], np.ones(2), 1.0):
+        with pytest.raises(
+            TypeError, match=r"`w` to be a tensor of weights or a boolean mask but got .*as_tensor\(w\)"
+        ):
+            refuse_bad_weight(weight, "w")
+    with pytest.raises(TypeError, match=r"`weight` to be real but got torch\.complex64"):
+        refuse_bad_weight(torch.ones(2) + 0j)
+
+
+def test_values_are_told_in_short():
+    assert told(torch.nn.Linear) == "the class Linear"
+    assert told("a") == "'a'"
+    assert told(told) == "a function"
+    assert told(object()) == "an object"
+    assert len(told(list(range(1000)))) < 60

@@ -1,0 +1,145 @@
+import os
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+
+from mkc_torch._support.files import claim_folder, write_atomically
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize(("data", "expected"), [("µT\r\n", "µT\r\n".encode()), (b"\x00\xff", b"\x00\xff")])
+def test_text_is_written_as_utf8_and_bytes_as_they_are(tmp_path, data, expected):
+    write_atomically(tmp_path / "a", data)
+    assert contents(tmp_path) == {"a": expected}
+
+
+def test_a_path_can_be_a_string(tmp_path):
+    write_atomically(str(tmp_path / "a"), "x")
+    assert contents(tmp_path) == {"a": b"x"}
+
+
+def test_an_existing_file_is_refused_and_untouched(tmp_path):
+    (tmp_path / "a").write_text("old")
+    with pytest.raises(FileExistsError, match=r"a exists; use `--force`"):
+        write_atomically(tmp_path / "a", "new")
+    assert contents(tmp_path) == {"a": b"old"}
+
+
+def test_an_existing_file_is_replaced_on_demand(tmp_path):
+    (tmp_path / "a").write_text("old and longer")
+    write_atomically(tmp_path / "a", "new", overwrite=True)
+    assert contents(tmp_path) == {"a": b"new"}
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+@pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
+@pytest.mark.parametrize("before", [{}, {"a": b"old"}])
+def test_a_write_that_fails_half_way_leaves_the_folder_as_it_was(tmp_path, monkeypatch, step, error, before):
+    for name, data in before.items():
+        (tmp_path / name).write_bytes(data)
+    seen = []
+
+    def fail(*_):
+        seen.append(len(contents(tmp_path)) - len(before))
+        raise error
+
+    monkeypatch.setattr(os, step, fail)
+    with pytest.raises(type(error)):
+        write_atomically(tmp_path / "a", "new", overwrite=True)
+    assert seen == [1]  # the temporary file was there, in the target's folder, when the step failed
+    assert contents(tmp_path) == before
+
+
+def test_data_reach_the_disk_before_the_name(tmp_path, monkeypatch):
+    steps = []
+    fsync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda *a: (steps.append("fsync"), fsync(*a)))
+    monkeypatch.setattr(os, "replace", lambda *a: (steps.append("replace"), replace(*a)))
+    write_atomically(tmp_path / "a", "x")
+    assert steps == ["fsync", "replace"]
+
+
+def test_text_that_has_no_utf8_leaves_nothing(tmp_path):
+    with pytest.raises(UnicodeEncodeError):
+        write_atomically(tmp_path / "a", "\ud800")
+    assert contents(tmp_path) == {}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX permissions")
+def test_the_file_has_the_permissions_of_any_new_file(tmp_path):
+    (tmp_path / "plain").write_text("")
+    write_atomically(tmp_path / "a", "x")
+    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == stat.S_IMODE((tmp_path / "plain").stat().st_mode)
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"there is no folder .*absent; create it"):
+        write_atomically(tmp_path / "absent" / "a", "x")
+
+
+@pytest.mark.parametrize("target", [".", os.devnull])
+def test_a_folder_or_device_is_never_replaced(tmp_path, target):
+    with pytest.raises(FileExistsError, match="not a regular file"):
+        write_atomically(tmp_path / target, "x", overwrite=True)
+    assert not Path(os.devnull).is_file()
+
+
+def test_claim_folder_creates_it_with_its_parents(tmp_path):
+    assert claim_folder(tmp_path / "a" / "b") == tmp_path / "a" / "b"
+    assert (tmp_path / "a" / "b").is_dir()
+
+
+def test_claim_folder_takes_an_empty_folder(tmp_path):
+    assert claim_folder(str(tmp_path)) == tmp_path
+
+
+def test_claim_folder_refuses_a_folder_with_something_in_it(tmp_path):
+    (tmp_path / "a").write_text("old")
+    with pytest.raises(FileExistsError, match=r"not empty; use `--force`"):
+        claim_folder(tmp_path)
+
+
+def test_claim_folder_on_demand_takes_a_folder_and_removes_nothing(tmp_path):
+    (tmp_path / "a").write_text("old")
+    assert claim_folder(tmp_path, overwrite=True) == tmp_path
+    assert contents(tmp_path) == {"a": b"old"}
+
+
+OWN = {
+    "report.html": "<footer>Made by mkc_torch: method</footer>",
+    "model.json": '{\n  "schema": "mkc-model/1",\n',
+    "corrected.py": '"""Tank, corrected by what `mkc diagnose` found"""',
+}
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_claim_folder_keeps_files_of_the_users_own(tmp_path, name):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(FileExistsError, match=f"{name} exists and was not written by mkc"):
+        claim_folder(tmp_path, overwrite=True, files=OWN)
+    assert contents(tmp_path) == {name: b"mine"}
+    assert claim_folder(tmp_path, overwrite=True, files=["other.html"]) == tmp_path
+    (tmp_path / name).write_text(OWN[name])
+    assert claim_folder(tmp_path, overwrite=True, files=OWN) == tmp_path
+
+
+def test_a_table_goes_with_the_files_beside_it(tmp_path):
+    names = ["recording.csv", "report.html"]
+    (tmp_path / "recording.csv").write_text("a\n1\n")
+    with pytest.raises(FileExistsError, match=r"recording\.csv exists and was not written by mkc"):
+        claim_folder(tmp_path, overwrite=True, files=names)
+    (tmp_path / "report.html").write_text(OWN["report.html"])
+    assert claim_folder(tmp_path, overwrite=True, files=names) == tmp_path
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_claim_folder_refuses_a_file(tmp_path, overwrite):
+    (tmp_path / "a").write_text("old")
+    with pytest.raises(FileExistsError, match="is a file, not a folder"):
+        claim_folder(tmp_path / "a", overwrite=overwrite)
+    assert contents(tmp_path) == {"a": b"old"}

@@ -1,0 +1,120 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch.challenge.draws import generator
+from mkc_torch.challenge.dynamics.errors import OUTLIERS, Errors, sample, spoil
+from mkc_torch.challenge.dynamics.generator import SYSTEMS, draw
+from mkc_torch.challenge.dynamics.second import ratio_to_oracle
+from mkc_torch.challenge.dynamics.subject import dynamics, simulation_class
+from mkc_torch.challenge.key import canonical, key_from
+from mkc_torch.simulation import Dynamics
+from mkc_torch.simulation.load import load_simulation
+
+FIRST_OF_EACH = {"pendulum": 0, "tanks": 2, "projectile": 4}
+
+
+@pytest.fixture(scope="module")
+def cases():
+    return {name: draw(1, index) for name, index in FIRST_OF_EACH.items()}
+
+
+def test_the_same_address_gives_the_same_case(cases):
+    again = draw(1, FIRST_OF_EACH["tanks"])
+    assert canonical([again.key]) == canonical([cases["tanks"].key])
+    for name, values in cases["tanks"].recording.columns.items():
+        torch.testing.assert_close(again.recording[name], values, rtol=0, atol=0)
+
+
+def test_names_tell_the_system_and_nothing_else(cases):
+    for name, case in cases.items():
+        assert case.recording.name == f"{name}_{FIRST_OF_EACH[name]:05d}"
+
+
+def test_keys_survive_json_and_say_how_well_it_could_be_seen(cases):
+    for case in cases.values():
+        assert key_from(case.key.numbers()) == dataclasses.replace(case.key, sensor=dict(case.key.sensor))
+        (effect,) = case.key.effects
+        assert effect.z > 2.0
+        assert effect.z_sep <= effect.z
+        assert effect.at
+        assert 0.7 < case.key.oracle_rms < 1.3
+
+
+def test_recordings_have_runs_outliers_and_columns_that_mean_nothing(cases):
+    for case in cases.values():
+        recording = case.recording
+        assert 300 <= len(recording) <= 600
+        assert "temperature" in recording.names
+        outputs = len(case.key.noise["deviation"])
+        assert len(case.key.outliers) == pytest.approx(OUTLIERS * outputs * len(recording), abs=outputs * 3)
+        assert all(bool(values.isfinite().all()) for values in recording.columns.values())
+    assert "experiment" in cases["projectile"].recording
+
+
+def test_an_empty_case_hides_nothing():
+    case = draw(1, FIRST_OF_EACH["tanks"], empty=True)
+    assert case.key.effects == ()
+    assert case.second is None
+    assert case.key.kind == "empty"
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_a_user_could_have_written_the_simulation(system, tmp_path):
+    """It is given as `mkc diagnose --simulation FILE.py:CLASS` takes it, and it is the plant without what is hidden."""
+    setting = SYSTEMS[system].draw(generator(3, system))
+    plant = setting.plant
+    name = simulation_class(tmp_path / f"{system}_00001.csv")
+    simulation = load_simulation(f"{dynamics().simulations}:{name}")
+    assert isinstance(simulation, Dynamics)
+    assert (simulation.states, simulation.inputs) == (plant.states, plant.inputs)
+    assert simulation.outputs in ((), plant.outputs)
+    assert {state: simulation.units[state] for state in plant.states} == dict(plant.units)
+    x = 0.5 + torch.rand(len(plant.states), 7, generator=generator(1), dtype=torch.float64)
+    u = torch.rand(len(plant.inputs), 7, generator=generator(2), dtype=torch.float64)
+
+    class Names:
+        def __init__(self, names, values):
+            self.__dict__.update(zip(names, values, strict=True))
+
+    values = [torch.tensor(v, dtype=torch.float64) for v in plant.values]
+    rates = simulation.derivative(
+        torch.zeros(7), Names(plant.states, x), Names(plant.inputs, u), Names(simulation.parameters, values)
+    )
+    expected = plant.rate(x.numpy(), u.numpy(), plant.values)
+    found = np.stack([(rates[state] + torch.zeros(7)).numpy() for state in plant.states])
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_the_true_run_is_as_good_as_the_oracle(cases):
+    """What the sensors added is all that the true system leaves."""
+    case = cases["tanks"]
+    key, second = case.key, case.second
+    good = np.ones(2 * len(second), dtype=bool)
+    good[list(key.second_outliers)] = False
+    measured = torch.cat([second[name] for name in key.noise["deviation"]])
+    scale = torch.cat([torch.full((len(second),), d) for d in key.noise["deviation"].values()]).double()
+    # a run that is off by half a standard deviation everywhere, and by anything at the outliers
+    off = measured + 0.5 * scale
+    off[torch.from_numpy(~good)] = 1e6
+    run = dict(zip(key.noise["deviation"], off.split(len(second)), strict=True))
+    assert ratio_to_oracle(run, second, key) == pytest.approx(0.5 / key.oracle_rms, rel=1e-6)
+    broken = {name: values * torch.nan for name, values in run.items()}
+    assert ratio_to_oracle(broken, second, key) == torch.inf
+
+
+def test_errors_have_the_size_and_correlation_they_say():
+    errors = Errors((0.5, 2.0), 0.4, "laplace")
+    noise = sample(generator(5), errors, 20000, 1)[..., 0]
+    np.testing.assert_allclose(noise.std(1), errors.deviations, rtol=0.05)
+    assert np.corrcoef(noise[0, 1:], noise[0, :-1])[0, 1] == pytest.approx(0.4, abs=0.03)
+
+
+def test_outliers_are_far_and_few():
+    errors = Errors((0.5,), 0.0, "gaussian")
+    bad, mask = spoil(generator(6), errors, 400, 2)
+    assert mask.sum() == 2 * round(OUTLIERS * 400)
+    assert (np.abs(bad[mask]) >= 2.5).all()
+    assert not bad[~mask].any()

@@ -1,0 +1,442 @@
+import json
+import os
+import re
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("typer")
+pytest.importorskip("polars")
+
+from typer.testing import CliRunner
+
+from mkc_torch._support import files as _files
+from mkc_torch.calibration.calibrate import Calibration
+from mkc_torch.cli.app import app
+from mkc_torch.recording.demonstration import FIELD_PER_AMPERE, simulated_recording
+from mkc_torch.recording.recording import Recording, write_table
+from tests.calibration.test_calibrate import noisy_ellipsoid
+from tests.shared_data import shared_data
+
+AXES = ("mag_x", "mag_y", "mag_z")
+
+
+def mkc(*arguments):
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+def refused(result, *words, code=1):
+    """A failure in one line that holds the words, without a traceback."""
+    assert result.exit_code == code, result.output
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    assert "Traceback" not in result.output
+    if code == 1:
+        assert len(result.stderr.strip().splitlines()) == 1
+    flat = " ".join(result.stderr.replace("│", " ").split())
+    for word in words:
+        assert word in flat, flat
+
+
+def table(path, points, **columns):
+    write_table(path, columns | dict(zip(AXES, points.unbind(-1), strict=True)))
+    return path
+
+
+@pytest.fixture
+def good(tmp_path):
+    points = noisy_ellipsoid(300)
+    return table(tmp_path / "good.csv", points, time=torch.arange(300) / 50.0)
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """Recording, calibration and report of the demonstration."""
+    folder = tmp_path_factory.mktemp("demo") / "out"
+    result = mkc("demo", "--output", folder)
+    assert result.exit_code == 0, result.output
+    return folder, result
+
+
+def test_the_version_is_that_of_the_package():
+    result = mkc("--version")
+    assert result.exit_code == 0
+    assert result.output == f"mkc {version('mkc-torch')}\n"
+
+
+def test_calibrate_writes_both_files_and_a_summary(good, tmp_path):
+    result = mkc("calibrate", good, "--output", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    folder = tmp_path / "out" / "good"
+    assert sorted(p.name for p in folder.iterdir()) == ["calibration.json", "report.html"]
+    c = Calibration.from_json((folder / "calibration.json").read_text(encoding="utf-8"))
+    assert c.center == pytest.approx((5.0, -9.0, 20.0), abs=0.3)
+    for words in (
+        "offset",
+        "semi-axes",
+        "residual",
+        "noise",
+        "µT along the field",
+        "rejected",
+        "coverage",
+        "report.html",
+        "±",
+    ):
+        assert words in result.stdout
+    assert result.stderr == ""
+
+
+def test_output_in_a_pipe_has_no_escape_codes(good, tmp_path):
+    result = mkc("calibrate", good, tmp_path / "absent.csv", "--output", tmp_path / "out")
+    assert "\x1b" not in result.stdout + result.stderr
+
+
+def test_one_failing_recording_does_not_stop_the_others(good, tmp_path):
+    other = table(tmp_path / "other.csv", noisy_ellipsoid(200, seed=3))
+    result = mkc("calibrate", good, tmp_path / "absent.csv", other, "--output", tmp_path / "out")
+    assert result.exit_code == 1
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["good", "other"]
+    first, second = result.stderr.strip().splitlines()
+    assert first == f"mkc: {tmp_path / 'absent.csv'}: there is no such file."
+    assert second == "mkc: 1 of 3 recordings were not calibrated."
+
+
+def test_existing_results_are_kept_without_force(good, tmp_path):
+    assert mkc("calibrate", good, "--output", tmp_path).exit_code == 0
+    before = (tmp_path / "good" / "calibration.json").read_bytes()
+    refused(mkc("calibrate", good, "--output", tmp_path), "not empty", "--force")
+    assert (tmp_path / "good" / "calibration.json").read_bytes() == before
+    forced = mkc("calibrate", good, "--output", tmp_path, "--field-strength", "50", "--force")
+    assert forced.exit_code == 0
+    assert (tmp_path / "good" / "calibration.json").read_bytes() != before
+
+
+@pytest.mark.parametrize("name", ["report.html", "calibration.json"])
+def test_force_replaces_no_file_of_the_users_own(good, tmp_path, name):
+    (tmp_path / "good").mkdir()
+    (tmp_path / "good" / name).write_text("mine")
+    refused(mkc("calibrate", good, "--output", tmp_path, "--force"), name, "not written by mkc")
+    assert (tmp_path / "good" / name).read_text() == "mine"
+
+
+def test_two_recordings_of_one_name_are_refused_before_any_work(good, tmp_path):
+    (tmp_path / "more").mkdir()
+    twin = table(tmp_path / "more" / "good.csv", noisy_ellipsoid(100))
+    result = mkc("calibrate", good, twin, "--output", tmp_path / "out")
+    refused(result, "same folder", code=2)
+    refused(mkc("calibrate", good, good, "--output", tmp_path / "out"), "same folder", code=2)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", ["the file is empty"]),
+        ("mag_x,mag_y,mag_z\n", ["header line but no rows"]),
+        ("mag_x,mag_y,mag_z\n1,2,3\n", ["1 sample is too few", "at least 9"]),
+        ("mag_x,mag_y,mag_z\n" + "1,2,3\n" * 8, ["8 samples are too few"]),
+        ("mag_x,mag_y,mag_z\n" + "1,2,3\n" * 50, ["all points are equal", "report.html"]),
+        ("mag_x,mag_y,mag_z\n" + "1,nan,3\n" * 50, ["no sample has finite values", "`mag_y` 50 NaN"]),
+        ("mag_x,mag_y,mag_z\n" + "1,inf,3\n" * 50, ["no sample has finite values", "`mag_y` 50 infinite"]),
+        ("mag_x,mag_y,mag_z\n1,2,3\n1,two,3\n", ["column `mag_y` holds text at line 3", '"two"']),
+        ("mag_x,mag_y\n1,2\n3,4\n", ["no column `mag_z`", "`mag_x`, `mag_y`", "--columns"]),
+        ("mag_x,mag_y,mag_z\n1,2\n", ["line 2 has 2 values"]),
+    ],
+)
+def test_bad_files_are_refused_in_one_sentence(tmp_path, content, words):
+    path = tmp_path / "bad.csv"
+    path.write_text(content, encoding="utf-8")
+    refused(mkc("calibrate", path, "--output", tmp_path / "out"), str(path), *words)
+    assert not (tmp_path / "out" / "bad" / "calibration.json").exists()
+
+
+def test_absent_file_unknown_kind_and_folder(tmp_path):
+    out = ("--output", tmp_path / "out")
+    refused(mkc("calibrate", tmp_path / "none.csv", *out), "none.csv: there is no such file")
+    (tmp_path / "a.xyz").write_text("1")
+    refused(mkc("calibrate", tmp_path / "a.xyz", *out), ".xyz", ".csv")
+    (tmp_path / "b.csv").mkdir()
+    refused(mkc("calibrate", tmp_path / "b.csv", *out), "this is a folder")
+    (tmp_path / "c.csv").write_bytes(b"\xff\xfe\x00\x80")
+    refused(mkc("calibrate", tmp_path / "c.csv", *out), "UTF-8")
+
+
+def test_constant_column_and_coplanar_points(tmp_path):
+    points = noisy_ellipsoid()
+    points[:, 1] = 3.0
+    path = table(tmp_path / "constant.csv", points)
+    refused(mkc("calibrate", path, "--output", tmp_path / "out"), "y never changes")
+    points[:, 1] = points[:, 0] - 2.0 * points[:, 2]
+    path = table(tmp_path / "plane.csv", points)
+    refused(mkc("calibrate", path, "--output", tmp_path / "out"), "in a plane")
+
+
+def test_unsorted_and_repeated_times_are_told(tmp_path):
+    time = torch.arange(300) / 50.0
+    time[[4, 5]] = time[[5, 4]]
+    time[50] = time[49]
+    path = table(tmp_path / "times.csv", noisy_ellipsoid(300), time=time)
+    result = mkc("calibrate", path, "--output", tmp_path / "out")
+    assert result.exit_code == 0
+    told = " ".join(result.stdout.split())
+    assert "ran backwards" in told
+    assert "repeat the time" in told
+
+
+@pytest.mark.parametrize("factor", [1e306, 1e-306])
+def test_values_beyond_all_measure_are_refused(tmp_path, factor):
+    path = table(tmp_path / "odd.csv", noisy_ellipsoid() * factor)
+    refused(mkc("calibrate", path, "--output", tmp_path / "out"), str(path), "no magnetic field")
+
+
+@pytest.mark.parametrize("factor", [1e-9, 1e9])
+def test_any_usual_unit_will_do(tmp_path, factor):
+    path = table(tmp_path / "scaled.csv", noisy_ellipsoid() * factor)
+    result = mkc("calibrate", path, "--output", tmp_path / "out", "--unit", "other")
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "out" / "scaled" / "calibration.json").read_text(encoding="utf-8")
+    assert Calibration.from_json(text).center == pytest.approx((5 * factor, -9 * factor, 20 * factor), rel=0.05)
+
+
+def test_output_that_cannot_be_written(good, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    refused(mkc("calibrate", good, "--output", tmp_path / "file"), str(tmp_path / "file"))
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="the superuser may write everywhere")
+def test_output_without_permission(good, tmp_path):
+    (tmp_path / "locked").mkdir(mode=0o555)
+    refused(mkc("calibrate", good, "--output", tmp_path / "locked"), "permission denied")
+
+
+def test_a_write_that_fails_leaves_no_half_file(good, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device", "calibration.json")
+
+    monkeypatch.setattr(_files.os, "replace", full)
+    refused(mkc("calibrate", good, "--output", tmp_path / "out"), "no space left")
+    assert not (tmp_path / "out" / "good").exists()
+
+
+def test_usage_errors_exit_with_two(good, tmp_path):
+    out = ("--output", tmp_path / "out")
+    refused(mkc("calibrate", *out), code=2)
+    refused(mkc("calibrate", good), code=2)
+    refused(mkc("calibrate", good, *out, "--columns", "mag_x"), "mag_x=mx", code=2)
+    refused(mkc("calibrate", good, *out, "--columns", "mag_x=a,mag_x=b"), "twice", code=2)
+    refused(mkc("calibrate", good, *out, "--unit", " "), "--unit", code=2)
+    for value in ("0", "-3", "nan", "inf"):
+        refused(mkc("calibrate", good, *out, "--field-strength", value), "positive", code=2)
+    assert not (tmp_path / "out").exists()
+
+
+def test_columns_and_units_of_the_users_own(tmp_path):
+    points = 20.0 * noisy_ellipsoid(300)
+    path = tmp_path / "own.csv"
+    write_table(path, dict(zip(("mx", "my", "mz"), points.unbind(-1), strict=True)))
+    refused(mkc("calibrate", path, "--output", tmp_path / "out"), "no column `mag_x`", "`mx`, `my`, `mz`")
+    names = ("--columns", "mag_x=mx, mag_y=my,mag_z=mz")
+    result = mkc("calibrate", path, "--output", tmp_path / "out", *names, "--unit", "counts", "--field-strength", 48)
+    assert result.exit_code == 0, result.output
+    assert "counts" in result.stdout
+    content = json.loads((tmp_path / "out" / "own" / "calibration.json").read_text(encoding="utf-8"))
+    assert (content["unit"], content["field_strength"]) == ("counts", {"value": 48.0, "unit": "µT"})
+    refused(mkc("calibrate", path, "--output", tmp_path / "o", "--columns", "mag_x=none"), "no column `none`")
+
+
+def test_not_identifiable_writes_a_report_and_no_calibration(tmp_path):
+    path = shared_data("magnetometer/quadrotor_compass1.csv")
+    folder = tmp_path / "quadrotor_compass1"
+    folder.mkdir()
+    (folder / "calibration.json").write_text('{"schema": "mkc-calibration/1"}')
+    result = mkc("calibrate", path, "--output", tmp_path, "--force")
+    refused(result, "Not identifiable", "+z", "report.html")
+    assert [p.name for p in folder.iterdir()] == ["report.html"]
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert "not identifiable" in page
+    assert "+z" in page
+
+
+def test_broad_28(tmp_path):
+    path = shared_data("magnetometer/broad_28_stationary_magnet.csv")
+    assert mkc("calibrate", path, "--output", tmp_path).exit_code == 0
+    text = (tmp_path / path.stem / "calibration.json").read_text(encoding="utf-8")
+    assert Calibration.from_json(text).semi_axes == pytest.approx((44.17, 44.50, 45.61), abs=0.6)
+
+
+def test_applied_field_has_the_right_length(calibrated, tmp_path):
+    folder, _ = calibrated
+    output = tmp_path / "corrected.csv"
+    result = mkc("apply", folder / "calibration.json", folder / "recording.csv", "--output", output)
+    assert result.exit_code == 0, result.output
+    field = Recording.read(output)
+    assert field.names == ("time", "field_x", "field_y", "field_z")
+    assert len(field) == 4500
+    c = Calibration.from_json((folder / "calibration.json").read_text(encoding="utf-8"))
+    norm = field.stack("field_x", "field_y", "field_z").norm(dim=-1)
+    assert float(norm.median()) == pytest.approx(c.field_strength, abs=0.1)
+
+
+def test_apply_does_not_overwrite_and_keeps_rows_without_values(calibrated, tmp_path):
+    folder, _ = calibrated
+    new = tmp_path / "new.csv"
+    new.write_text("time,a,b,c\n0,1,2,3\n1,,2,3\n", encoding="utf-8")
+    output = tmp_path / "out.csv"
+    command = ("apply", folder / "calibration.json", new, "--output", output, "--columns", "mag_x=a,mag_y=b,mag_z=c")
+    result = mkc(*command)
+    assert result.exit_code == 0
+    assert "1 of 2 rows have no finite field" in result.stdout
+    before = output.read_bytes()
+    refused(mkc(*command), str(output), "--force")
+    assert output.read_bytes() == before
+    assert mkc(*command, "--force").exit_code == 0
+
+
+def test_apply_never_overwrites_what_it_reads(calibrated, tmp_path):
+    folder, _ = calibrated
+    recording, model = tmp_path / "mine.csv", tmp_path / "model.csv"
+    recording.write_bytes((folder / "recording.csv").read_bytes())
+    model.write_bytes((folder / "calibration.json").read_bytes())
+    (tmp_path / "soft.csv").symlink_to(recording)
+    (tmp_path / "hard.csv").hardlink_to(recording)
+    (tmp_path / "folder").mkdir()
+    before = recording.read_bytes(), model.read_bytes()
+    for name in ("mine.csv", "soft.csv", "hard.csv", "folder/../mine.csv", "model.csv"):
+        refused(mkc("apply", model, recording, "--output", tmp_path / name, "--force"), "never overwritten")
+    assert (recording.read_bytes(), model.read_bytes()) == before
+    assert (tmp_path / "soft.csv").is_symlink()
+
+
+def test_apply_warns_of_a_recording_in_another_unit(calibrated, tmp_path):
+    folder, _ = calibrated
+    mine = Recording.read(folder / "recording.csv")
+    other = table(tmp_path / "other.csv", 1e3 * mine.magnetometer())
+    result = mkc("apply", folder / "calibration.json", other, "--output", tmp_path / "o.csv")
+    assert result.exit_code == 0
+    assert "times the 48.2 µT of the recording that this was made from" in result.stdout
+    assert "another unit" in result.stdout
+    result = mkc("apply", folder / "calibration.json", folder / "recording.csv", "--output", tmp_path / "p.csv")
+    assert "warning" not in result.stdout
+    assert "median length 48.2" in result.stdout
+
+
+def test_what_a_user_wrote_is_printed_as_it_is(calibrated, tmp_path):
+    """Rich would make a cross of :X: and bold of [b]."""
+    odd = tmp_path / "no:X:[b]file.csv"
+    result = mkc("apply", calibrated[0] / "calibration.json", odd, "--output", tmp_path / "o.csv")
+    assert result.stderr == f"mkc: {odd}: there is no such file.\n"
+    path = table(odd, noisy_ellipsoid(300))
+    result = mkc("calibrate", path, "--output", tmp_path / "out", "--unit", ":X:[b]")
+    assert result.exit_code == 0
+    assert "no:X:[b]file\n" in result.stdout
+    assert "± SE, :X:[b] " in result.stdout
+    assert str(tmp_path / "out" / "no:X:[b]file" / "report.html") in result.stdout
+
+
+def test_apply_refuses_what_it_cannot_use(calibrated, tmp_path):
+    folder, _ = calibrated
+    c, rec, out = folder / "calibration.json", folder / "recording.csv", ("--output", tmp_path / "o.csv")
+    refused(mkc("apply", tmp_path / "none.json", rec, *out), "none.json: there is no such file")
+    refused(mkc("apply", tmp_path, rec, *out), "this is a folder")
+    refused(mkc("apply", rec, rec, *out), "recording.csv", "not JSON")
+    refused(mkc("apply", c, tmp_path / "none.csv", *out), "none.csv: there is no such file")
+    (tmp_path / "two.csv").write_text("mag_x,mag_y\n1,2\n")
+    refused(mkc("apply", c, tmp_path / "two.csv", *out), "no column `mag_z`")
+    refused(mkc("apply", c, rec, "--output", tmp_path / "o.xyz"), ".xyz")
+    refused(mkc("apply", c, rec, "--output", tmp_path / "none" / "o.csv"), "there is no folder")
+    binary = tmp_path / "binary.json"
+    binary.write_bytes(b"\xff\xfe\x80")
+    refused(mkc("apply", binary, rec, *out), "not text")
+    assert not (tmp_path / "o.csv").exists()
+
+
+DEMO = ["calibration.json", "concealed", "concealed.csv", "corrected.csv", "recording.csv", "report.html", "second.csv"]
+
+
+def test_demo_says_that_it_is_simulated_and_shows_the_truth(calibrated):
+    folder, result = calibrated
+    assert sorted(p.name for p in folder.iterdir()) == DEMO
+    assert "SIMULATED" in result.stdout
+    for row in ("truth", "least squares", "MKC-EM"):
+        assert row in result.stdout
+    assert "SIMULATED" in (folder / "report.html").read_text(encoding="utf-8")
+    assert torch.equal(Recording.read(folder / "recording.csv").magnetometer(), simulated_recording()[0].magnetometer())
+
+
+def test_demo_finds_what_is_concealed_and_corrects_a_second_recording(calibrated):
+    folder, result = calibrated
+    place = folder / "concealed"
+    assert sorted(p.name for p in place.iterdir()) == ["diagnosis.json", "model.json", "report.html"]
+    found = json.loads((place / "diagnosis.json").read_text(encoding="utf-8"))
+    (finding,) = found["findings"]
+    assert (finding["effect"], finding["drivers"]) == ("current_field", ["current"])
+    (parameter,) = (p for p in finding["parameters"] if p["name"] == "field_per_ampere")
+    for value, error, true in zip(parameter["value"], parameter["standard_error"], FIELD_PER_AMPERE, strict=True):
+        assert abs(value - true) < 4.0 * error < 0.2
+    assert finding["held_out"]["rmse_after"] < 0.9 * finding["held_out"]["rmse_before"]
+    assert "SIMULATED: no sensor recorded this" in (place / "report.html").read_text(encoding="utf-8")
+    assert "Left out of the simulation: current field (current)." in result.stdout
+    alone, model = (float(x) for x in re.findall(r"(?:alone|found)   +(\d\.\d\d) µT", result.stdout))
+    assert model < 0.9 * alone
+    again = mkc("apply", place / "model.json", folder / "second.csv", "--output", folder.parent / "again.csv")
+    assert again.exit_code == 0
+    assert (folder.parent / "again.csv").read_bytes() == (folder / "corrected.csv").read_bytes()
+
+
+def test_demo_refuses_an_existing_folder_and_files_of_the_users_own(calibrated, tmp_path):
+    folder, _ = calibrated
+    refused(mkc("demo", "--output", folder), "not empty", "--force")
+    assert mkc("demo", "--output", folder, "--force").exit_code == 0
+    (tmp_path / "concealed").mkdir()
+    for name in ("second.csv", "concealed/report.html"):
+        (tmp_path / name).write_text("mine")
+        refused(mkc("demo", "--output", tmp_path, "--force"), name, "not written by mkc")
+        assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == [Path(name).name]
+        assert (tmp_path / name).read_text() == "mine"
+        (tmp_path / name).unlink()
+
+
+def test_recording_of_the_demo_calibrates_to_the_same_numbers(calibrated, tmp_path):
+    folder, _ = calibrated
+    assert mkc("calibrate", folder / "recording.csv", "--output", tmp_path).exit_code == 0
+    first = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
+    second = json.loads((tmp_path / "recording" / "calibration.json").read_text(encoding="utf-8"))
+    assert first | {"recording": ""} == second | {"recording": ""}
+
+
+def run(*arguments, encoding_of_pipes="utf-8"):
+    return subprocess.run(
+        [sys.executable, *arguments], capture_output=True, text=True, encoding="utf-8", check=False, timeout=300,
+        env=os.environ | {"PYTHONIOENCODING": encoding_of_pipes, "FORCE_COLOR": "1"},
+    )  # fmt: skip
+
+
+def test_real_process_in_a_pipe(good, tmp_path):
+    absent = tmp_path / "absent.csv"
+    done = run("-m", "mkc_torch.cli", "calibrate", str(good), str(absent), "--output", str(tmp_path / "out"))
+    assert done.returncode == 1
+    assert "\x1b" not in done.stdout + done.stderr
+    assert "\r" not in done.stdout + done.stderr
+    assert "offset" in done.stdout
+    assert done.stderr.splitlines()[0] == f"mkc: {absent}: there is no such file."
+
+
+def test_a_pipe_that_knows_no_greek(calibrated, tmp_path):
+    command = ("calibrate", str(calibrated[0] / "recording.csv"), "--output", str(tmp_path / "out"))
+    done = run("-m", "mkc_torch.cli", *command, encoding_of_pipes="ascii")
+    assert done.returncode == 0, done.stderr
+    assert "offset" in done.stdout
+
+
+@pytest.mark.parametrize("missing", ["typer", "rich", "polars", "matplotlib", "jinja2", "jsonschema", "threadpoolctl"])
+def test_missing_extra_is_one_line(missing):
+    code = f"import sys; sys.modules[{missing!r}] = None; from mkc_torch.cli import main; main()"
+    done = run("-c", code, "demo")
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines() == [
+        f'mkc: {missing} is not installed; install the command line with `pip install "mkc-torch[cli]"`.'
+    ]

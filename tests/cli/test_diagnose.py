@@ -1,0 +1,429 @@
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures.process import BrokenProcessPool
+
+import pytest
+import torch
+
+pytest.importorskip("typer")
+pytest.importorskip("polars")
+pytest.importorskip("jsonschema")
+
+from typer.testing import CliRunner
+
+from mkc_torch._support import files as _files
+from mkc_torch.cli import diagnosis_files
+from mkc_torch.cli.app import app
+from mkc_torch.cli.console import Look
+from mkc_torch.cli.diagnose import _waited_for
+from mkc_torch.diagnosis import DiagnosedModel
+from mkc_torch.diagnosis.files.diagnosis_json import validate
+from mkc_torch.recording.recording import Recording, write_table
+from tests.diagnosis.factory import make_diagnosis
+
+AXES = ("mag_x", "mag_y", "mag_z")
+WRITTEN = ["diagnosis.json", "model.json", "report.html"]
+QUICK = ("--simulation", "magnetometer", "--surrogates", "19")
+QUIET, STEPPED = 3, 1
+
+
+def mkc(*arguments):
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+def diagnosed(*arguments):
+    return mkc("diagnose", *arguments, *QUICK)
+
+
+def refused(result, *words, code=1, lines=1):
+    """A failure in one line that holds the words, without a traceback."""
+    assert result.exit_code == code, result.output
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    assert "Traceback" not in result.output
+    if code == 1:
+        assert len(result.stderr.strip().splitlines()) == lines
+    flat = " ".join(result.stderr.replace("│", " ").split())
+    for word in words:
+        assert word in flat, flat
+
+
+def sensor(seed, *, step=0.0, count=500, start=0.0):
+    """A magnetometer that is turned by hand for 20 s, and from the ninth on has another offset."""
+    g = torch.Generator().manual_seed(seed)
+    t = torch.arange(count, dtype=torch.float64) / 25.0
+    speed = 0.4 + 1.2 * torch.rand(4, 3, generator=g, dtype=torch.float64)
+    phase = 2.0 * math.pi * torch.rand(4, 3, generator=g, dtype=torch.float64)
+    field = 50.0 * torch.nn.functional.normalize(torch.sin(t[:, None, None] * speed + phase).sum(1), dim=-1)
+    measured = field * torch.tensor([1.04, 0.97, 1.0]) + torch.tensor([4.0, -7.0, 12.0])
+    measured = measured + 0.3 * torch.randn(count, 3, generator=g, dtype=torch.float64)
+    measured = measured + step * torch.tensor([5.0, -4.0, 3.0]) * (t + start >= 9.0)[:, None]
+    return {"time": t + start} | dict(zip(AXES, measured.unbind(-1), strict=True))
+
+
+def table(path, columns):
+    write_table(path, columns)
+    return path
+
+
+def quiet(path, **changes):
+    """A recording in which nothing is missing, with columns changed, added, or by None left out."""
+    columns = sensor(QUIET) | changes
+    return table(path, {name: values for name, values in columns.items() if values is not None})
+
+
+def content_of(folder):
+    return json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
+
+
+def warnings_of(path, output, *more):
+    """What a diagnosis warns of; the terminal says the same."""
+    result = diagnosed(path, "--output", output, *more)
+    assert result.exit_code == 0, result.output
+    warnings = content_of(output / path.stem)["warnings"]
+    assert ("warning" in result.stdout) == bool(warnings)
+    return " ".join(warnings)
+
+
+@pytest.fixture(scope="module")
+def stepped(tmp_path_factory):
+    """A recording with a step in it, the folder of its diagnosis, and what was printed."""
+    folder = tmp_path_factory.mktemp("stepped")
+    path = table(folder / "stepped.csv", sensor(STEPPED, step=1.0))
+    result = diagnosed(path, "--output", folder / "out", "--seed", "5")
+    assert result.exit_code == 0, result.output
+    return path, folder / "out" / "stepped", result
+
+
+def test_files_and_summary(stepped):
+    path, folder, result = stepped
+    assert sorted(p.name for p in folder.iterdir()) == WRITTEN
+    content = content_of(folder)
+    validate(content)
+    assert (content["recording"], content["simulation"], content["verdict"]) == (path.stem, "magnetometer", "explained")
+    assert content["search"] == {"candidates": content["search"]["candidates"], "surrogates": 19, "seed": 5}
+    first = content["findings"][0]
+    assert first["effect"] == "hard_iron_step"
+    assert first["onset"] == pytest.approx(9.0, abs=0.2)
+    for words in ("hard-iron step", "from 9.0 s on", "how sure", "held out", "to do", "report.html", "model.json"):
+        assert words in result.stdout
+    assert result.stderr == ""
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert page.startswith("<!doctype html>")
+    assert "hard-iron step" in page
+
+
+def test_the_model_corrects_a_second_recording(stepped, tmp_path):
+    _, folder, _ = stepped
+    new = table(tmp_path / "new.csv", sensor(7, step=1.0, start=100.0))
+    output = tmp_path / "corrected.csv"
+    result = mkc("apply", folder / "model.json", new, "--output", output)
+    assert result.exit_code == 0, result.output
+    assert "note: hard_iron_step is bound to the time" in result.stdout
+    corrected = Recording.read(output)
+    assert corrected.names == ("time", "field_x", "field_y", "field_z")
+    length = corrected.stack("field_x", "field_y", "field_z").norm(dim=-1)
+    assert float(length.std() / length.mean()) < 0.01
+    model = DiagnosedModel.from_json((folder / "model.json").read_text(encoding="utf-8"))
+    assert torch.equal(corrected["field_x"], model(Recording.read(new))["field_x"])
+    assert f"median length {float(length.median()):.5g} µT: {output}" in result.stdout
+    assert "warning" not in result.stdout
+
+
+def test_the_model_knows_the_unit_and_the_length_of_its_field(stepped, tmp_path):
+    _, folder, _ = stepped
+    new = sensor(7, step=1.0, start=100.0)
+    other = table(tmp_path / "other.csv", {n: 1e3 * v if n.startswith("mag_") else v for n, v in new.items()})
+    result = mkc("apply", folder / "model.json", other, "--output", tmp_path / "corrected.csv")
+    assert " µT of the recording that this was made from: is this one in another unit" in result.stdout
+    content = json.loads((folder / "model.json").read_text(encoding="utf-8"))
+    del content["state"]["unit"], content["state"]["strength"]  # of an earlier version
+    (tmp_path / "old.json").write_text(json.dumps(content), encoding="utf-8")
+    result = mkc("apply", tmp_path / "old.json", other, "--output", tmp_path / "old.csv")
+    assert result.exit_code == 0
+    assert "warning" not in result.stdout
+
+
+def test_apply_tells_models_from_other_files(stepped, tmp_path):
+    path, folder, _ = stepped
+    out = ("--output", tmp_path / "o.csv")
+    refused(mkc("apply", folder / "diagnosis.json", path, *out), "diagnosis.json", "model.json beside it")
+    refused(mkc("apply", folder, path, *out), "this is a folder", "model.json")
+    content = json.loads((folder / "model.json").read_text(encoding="utf-8"))
+    for change, words in (
+        ({"schema": "mkc-model/9"}, ['its schema is "mkc-model/9"', "mkc diagnose"]),
+        ({"schema": None}, ["its schema is missing"]),
+        ({"effects": [content["effects"][0] | {"effect": "of_my_own"}]}, ['"of_my_own" is not known']),
+        ({"parameters": "none"}, ["damaged"]),
+    ):
+        (tmp_path / "odd.json").write_text(json.dumps(content | change), encoding="utf-8")
+        refused(mkc("apply", tmp_path / "odd.json", path, *out), "odd.json", *words)
+    (tmp_path / "odd.json").write_text("[1, 2", encoding="utf-8")
+    refused(mkc("apply", tmp_path / "odd.json", path, *out), "not JSON")
+    assert not (tmp_path / "o.csv").exists()
+
+
+def test_existing_results_are_kept_without_force(stepped):
+    path, folder, _ = stepped
+    before = {p.name: p.read_bytes() for p in folder.iterdir()}
+    refused(diagnosed(path, "--output", folder.parent), "not empty", "--force")
+    assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
+
+
+def test_force_replaces_results_and_keeps_other_files(tmp_path):
+    path, folder = quiet(tmp_path / "a.csv"), tmp_path / "a"
+    folder.mkdir()
+    for name in (*WRITTEN, "notes.txt"):
+        (folder / name).write_text("mine")
+    refused(diagnosed(path, "--output", tmp_path, "--force"), "not written by mkc")
+    for name in WRITTEN:
+        (folder / name).write_text('{"schema": "mkc-diagnosis/1"} Made by mkc_torch')
+    assert diagnosed(path, "--output", tmp_path, "--force").exit_code == 0
+    assert sorted(p.name for p in folder.iterdir()) == sorted((*WRITTEN, "notes.txt"))
+    assert (folder / "notes.txt").read_text() == "mine"
+    assert content_of(folder)["verdict"] == "adequate"
+
+
+def test_no_time_column(tmp_path):
+    assert "no column `time`" in warnings_of(quiet(tmp_path / "a.csv", time=None), tmp_path / "out")
+
+
+def test_a_clock_that_jumps(tmp_path):
+    clock = sensor(QUIET)["time"]
+    clock[250:] += 5.0
+    clock[[10, 11]] = clock[[11, 10]]
+    clock[50] = clock[49]
+    told = warnings_of(quiet(tmp_path / "a.csv", time=clock), tmp_path / "out")
+    for words in ("ran backwards 1 time", "Dropped 1 of 500 samples that repeat", "1 gap of more than"):
+        assert words in told
+
+
+def test_columns_that_can_drive_nothing(tmp_path):
+    slope = torch.linspace(20.0, 30.0, 500, dtype=torch.float64)
+    slope = slope + 0.1 * torch.randn(500, generator=torch.Generator().manual_seed(0))
+    path = quiet(
+        tmp_path / "a.csv",
+        temperature=slope,
+        copy=2.0 * slope + 1.0,
+        still=torch.full((500,), 3.0),
+        empty=torch.full((500,), math.nan),
+    )
+    told = warnings_of(path, tmp_path / "out")
+    for words in ("`still` is constant", "`empty` has no finite values", "`temperature` and `copy` are copies"):
+        assert words in told
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(0.01, "gauss"), (1000.0, "nanotesla")])
+def test_other_units_are_named_not_guessed(tmp_path, factor, unit):
+    scaled = {name: factor * sensor(QUIET)[name] for name in AXES}
+    path = quiet(tmp_path / "a.csv", **scaled)
+    told = warnings_of(path, tmp_path / "out")
+    for words in (unit, "Nothing was converted", "--unit"):
+        assert words in told
+    assert warnings_of(path, tmp_path / "own", "--unit", unit) == ""
+    assert content_of(tmp_path / "own" / "a")["baseline"]["rmse"] == pytest.approx(0.3 * factor, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "rows", "words"),
+    [
+        ({}, 2, ["2 samples are too few", "Record"]),
+        ({"mag_y": None}, 500, ["no column `mag_y`", "--columns"]),
+        ({"mag_y": torch.full((500,), math.nan)}, 500, ["no sample has finite values"]),
+        (dict.fromkeys(AXES, torch.full((500,), 20.0)), 500, ["all points are equal", "Turn the sensor"]),
+        ({"time": torch.full((500,), math.nan)}, 500, ["no sample has a finite time"]),
+    ],
+)
+def test_bad_recordings_are_refused_in_one_sentence(tmp_path, changes, rows, words):
+    columns = {name: values for name, values in (sensor(QUIET) | changes).items() if values is not None}
+    path = table(tmp_path / "bad.csv", {name: values[:rows] for name, values in columns.items()})
+    refused(diagnosed(path, "--output", tmp_path / "out"), f"mkc: {path}: ", *words)
+    assert not (tmp_path / "out" / "bad").exists()
+
+
+def test_a_sensor_at_rest(tmp_path):
+    generator = torch.Generator().manual_seed(0)
+    still = {name: 20.0 + 0.3 * torch.randn(150, generator=generator, dtype=torch.float64) for name in AXES}
+    path = table(tmp_path / "a.csv", {"time": torch.arange(150) / 25.0} | still)
+    result = diagnosed(path, "--output", tmp_path / "out")
+    assert result.exit_code == 1 or "warning" in result.stdout
+    assert "Turn the sensor" in result.output
+
+
+def test_one_failing_recording_does_not_stop_the_other(tmp_path):
+    good, bad = quiet(tmp_path / "good.csv"), tmp_path / "bad.csv"
+    bad.write_text("time,mag_x,mag_y,mag_z\n0,1,two,3\n")
+    result = diagnosed(bad, good, "--output", tmp_path / "out")
+    refused(result, f"mkc: {bad}: column `mag_y` holds text", "1 of 2 recordings were not diagnosed", lines=2)
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["good"]
+    assert sorted(p.name for p in (tmp_path / "out" / "good").iterdir()) == WRITTEN
+    assert "good against magnetometer" in result.stdout
+
+
+def test_experiments_are_diagnosed_each_on_its_own(tmp_path):
+    long, short = sensor(QUIET), {name: values[:20] for name, values in sensor(QUIET).items()}
+    columns = {name: torch.cat([long[name], short[name]]) for name in long}
+    path = table(tmp_path / "a.csv", columns)
+    text = path.read_text(encoding="utf-8").splitlines()
+    labels = ["run", *["flight/1"] * 500, *["2"] * 20]
+    path.write_text("\n".join(f"{a},{b}" for a, b in zip(text, labels, strict=True)), encoding="utf-8")
+    result = diagnosed(path, "--output", tmp_path / "out", "--experiments", "run")
+    refused(result, f"{path}, experiment 2: 20 samples are too few", "1 of 2 recordings", lines=2)
+    assert [p.name for p in (tmp_path / "out" / "a").iterdir()] == ["flight_1"]
+    assert content_of(tmp_path / "out" / "a" / "flight_1")["recording"] == "a/flight/1"
+
+
+def test_columns_of_the_users_own(tmp_path):
+    columns = {name.replace("mag_", "m"): values for name, values in sensor(QUIET).items()}
+    path = table(tmp_path / "a.csv", columns)
+    refused(diagnosed(path, "--output", tmp_path / "out"), "no column `mag_x`")
+    names = ("--columns", "mag_x=mx,mag_y=my,mag_z=mz")
+    assert diagnosed(path, "--output", tmp_path / "out", *names).exit_code == 0
+
+
+def test_usage_errors_exit_with_two(tmp_path):
+    path, out = quiet(tmp_path / "a.csv"), ("--output", tmp_path / "out")
+    known = ("--simulation", "magnetometer")
+    (tmp_path / "b").mkdir()
+    twin = quiet(tmp_path / "b" / "A.csv")
+    for arguments, words in (
+        ((path, *out), "--simulation"),
+        ((path, *known), "--output"),
+        ((*known, *out), "REC"),
+        ((path, *out, "--simulation", "pendulum"), '"pendulum" is not known; known: magnetometer'),
+        ((path, *out, *known, "--level", "1"), "--level must be"),
+        ((path, *out, *known, "--level", "nan"), "--level must be"),
+        ((path, *out, *known, "--surrogates", "18"), "at least 19 at level 0.05"),
+        ((path, *out, *known, "--seed", "-1"), "--seed"),
+        ((path, *out, *known, "--unit", " "), "--unit is empty"),
+        ((path, *out, *known, "--experiments", ""), "--experiments is empty"),
+        ((path, *out, *known, "--columns", "experiment=a", "--experiments", "b"), "different columns"),
+        ((path, *out, *known, "--columns", "mag_x"), "mag_x=mx"),
+        ((path, twin, *out, *known), "same folder"),
+    ):
+        refused(mkc("diagnose", *arguments), words, code=2)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_low_level_gets_as_many_surrogates_as_it_needs(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(diagnosis_files, "diagnose", lambda *_, **given: asked.append(given) or 1 / 0)
+    path = quiet(tmp_path / "a.csv")
+    for level, surrogates in (("0.05", 99), ("0.001", 999)):
+        result = mkc("diagnose", path, "--simulation", "magnetometer", "--output", tmp_path, "--level", level)
+        assert (asked[-1]["level"], asked[-1]["surrogates"]) == (float(level), surrogates)
+    refused(result, "an error of the program's own (ZeroDivisionError in test_cli_diagnose.py", "report it")
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_write_that_fails_leaves_no_half_file(stepped, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device", "model.json")
+
+    diagnosis = make_diagnosis(1, model=None)
+    monkeypatch.setattr(diagnosis_files, "diagnose", lambda *_, **__: diagnosis)
+    monkeypatch.setattr(_files.os, "replace", full)
+    refused(diagnosed(stepped[0], "--output", tmp_path / "out"), "no space left")
+    assert not (tmp_path / "out" / "stepped").exists()
+
+
+def test_without_a_model_none_is_written_and_an_old_one_goes(tmp_path):
+    (tmp_path / "model.json").write_text("of an earlier diagnosis")
+    written = diagnosis_files.write_diagnosis(make_diagnosis(0, model=None), tmp_path, force=True)
+    assert [path.name for path in written] == ["diagnosis.json", "report.html"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["diagnosis.json", "report.html"]
+
+
+def test_text_for_a_terminal_is_set_to_its_width(stepped):
+    request = diagnosis_files.Request(surrogates=19, force=True, report=False)
+    folder = stepped[1].parent / "wide"
+    (outcome,) = diagnosis_files.diagnose_file(stepped[0], folder, request, Look(terminal=True, width=60))
+    assert "\x1b[" in outcome.text
+    assert sorted(path.name for path in folder.iterdir()) == WRITTEN[:2]
+
+
+def started(*arguments):
+    return subprocess.Popen(
+        [sys.executable, "-m", "mkc_torch.cli", *map(str, arguments)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8", start_new_session=True,
+        env=os.environ | {"PYTHONIOENCODING": "utf-8", "FORCE_COLOR": "1"},
+    )  # fmt: skip
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals are another thing there")
+def test_an_interrupt_ends_all_processes_and_leaves_nothing(tmp_path):
+    recordings = [quiet(tmp_path / f"{name}.csv") for name in "abcdef"]
+    out = tmp_path / "out"
+    process = started("diagnose", *recordings, "--output", out, *QUICK)
+    waited = time.monotonic() + 60.0
+    while not out.is_dir() and process.poll() is None and time.monotonic() < waited:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in told
+    assert [path.name for path in out.rglob("*") if path.is_file() and path.name not in WRITTEN] == []
+
+
+def test_a_process_that_dies_is_told(tmp_path):
+    def died():
+        raise BrokenProcessPool
+
+    (outcome,) = _waited_for(died, tmp_path / "a.csv")
+    assert outcome.failed
+    assert "its process ended" in outcome.text
+
+
+def test_challenge(tmp_path):
+    folder = tmp_path / "proof"
+    command = ("challenge", "--cases", 1, "--empty", 1, "--seed", 4, "--duration", 15, "--workers", 1)
+    result = mkc(*command, "--output", folder)
+    assert result.exit_code == 0, result.output
+    for words in ("Blind proof: 2 recordings, something hidden in 1", "false alarms", "asked", "holds"):
+        assert words in result.stdout
+    assert str(folder / "challenge.html") in result.stdout
+    flat = " ".join(result.stdout.split())
+    assert re.search(r"at most 7 % false alarms \d+\.0 % (yes|no) ", flat)
+    assert "Empty recordings, at least 400 at level 0.05 1 too few" in flat
+    assert "Too few recordings to tell (1 of at least 400 and" in flat
+    assert " % |" in (folder / "summary.md").read_text(encoding="utf-8")
+    assert "failed none" in " ".join(result.stdout.split())
+    record = json.loads((folder / "score.json").read_text(encoding="utf-8"))
+    assert (record["settings"]["hidden"], record["settings"]["empty"], record["settings"]["seed"]) == (1, 1, 4)
+    made = sorted(path.name for path in (folder / "diagnoses").iterdir())
+    assert made == ["case_00000", "case_00001"]
+    assert sorted(p.name for p in (folder / "diagnoses" / "case_00000").iterdir()) == ["diagnosis.json", "model.json"]
+    refused(mkc(*command, "--output", folder), "not empty", "--force")
+
+
+def test_challenge_of_nothing_is_refused(tmp_path):
+    refused(mkc("challenge", "--cases", 0, "--output", tmp_path / "a"), "both 0", code=2)
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_length_is_refused_where_each_system_has_its_own(tmp_path):
+    command = ("challenge", "--family", "dynamics", "--duration", 20, "--output", tmp_path / "a")
+    refused(mkc(*command), "each system has a length of its own", code=2)
+    refused(mkc("challenge", "--family", "weather", "--output", tmp_path / "a"), "magnetometer", "dynamics", code=2)
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_failed_diagnosis_is_not_scored_by_an_older_one(tmp_path):
+    from mkc_torch.cli.challenge import diagnose_unseen
+
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "diagnosis.json").write_text("{}")
+    path = table(tmp_path / "a.csv", {name: values[:20] for name, values in sensor(QUIET).items()})
+    diagnose_unseen([path], tmp_path)
+    assert not (tmp_path / "a" / "diagnosis.json").exists()
+    assert "too few" in (tmp_path / "a.error.txt").read_text(encoding="utf-8")
+
+
+def test_commands_that_draw_nothing_import_no_pictures():
+    code = "import sys, mkc_torch.cli.app as c; sys.exit(any(m in sys.modules for m in ('matplotlib', 'jinja2')))"
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60).returncode == 0

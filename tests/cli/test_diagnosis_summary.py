@@ -1,0 +1,123 @@
+import dataclasses
+import io
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rich")
+
+from rich.console import Console
+
+from mkc_torch.cli.diagnosis_summary import show
+from mkc_torch.diagnosis.result import Parameter, Region
+from tests.diagnosis.factory import make_diagnosis
+
+
+def shown(diagnosis, files=(), *, width=100, terminal=False):
+    stream = io.StringIO()
+    console = Console(file=stream, width=width, force_terminal=terminal, highlight=False)
+    show(console, diagnosis, [Path(file) for file in files])
+    return stream.getvalue()
+
+
+def flat(text):
+    return " ".join(text.split())
+
+
+def test_a_finding_in_a_dozen_lines():
+    text = shown(make_diagnosis(1), ["out/flight_07/diagnosis.json"])
+    assert len(text.strip().splitlines()) <= 22
+    for words in (
+        "flight_07 against magnetometer",
+        "Left out of the simulation: hard-iron step or current field (current)",
+        "size offset change (3.214 ± 0.081, −1.104 ± 0.077, 0.325 ± 0.092) µT onset 41.32 ± 0.14 s",
+        "where from 41.3 s on; acts on mag_x, mag_y, mag_z",
+        "driven by no recorded column",
+        "how sure p = 0.005, the smallest that 199 surrogates can show",
+        "held out surely better on unseen blocks: residual 0.912 → 0.521 µT (43 % less), +0.312 nats a sample (95 %: "
+        "0.281 to 0.350); 0 is no better",
+        "or current field (current): this recording cannot tell",
+        "compare a smooth correction by all recorded columns and by time reaches",
+        "noise autoregressive: noise with a memory",
+        "to do Look for what changed at that time; use the calibration from after the step.",
+        "To tell hard-iron step from current field (current), record again: a step does not come at the same moment",
+        "The model found here corrects for hard-iron step: confirm it on a second recording.",
+        "mkc apply model.json NEW.csv --output corrected.csv",
+        "warning 3 samples",
+        "written out/flight_07/diagnosis.json",
+    ):
+        assert words in flat(text)
+
+
+def test_where_in_the_states_a_finding_lies():
+    made = make_diagnosis(1)
+    region = Region("speed", "rad/s", "near zero", 0.31, 0.82, 0.2)
+    finding = dataclasses.replace(made.findings[0], region=region, experiments=(0.9, 0.1))
+    text = flat(shown(dataclasses.replace(made, findings=(finding,))))
+    assert "mostly 82 % of the gain where speed is within ±0.310 rad/s, 20 % of the time" in text
+    assert "in experiment 1: 90 %, experiment 2: 10 %" in text
+
+
+def test_nothing_found():
+    text = flat(shown(make_diagnosis(0)))
+    assert "Nothing is missing that this recording could show." in text
+    assert "how sure p = 0.37; 64 candidates tried, level 0.05" in text
+    assert "to do Use the simulation as it is" in text
+
+
+def test_several_findings_are_numbered():
+    text = shown(make_diagnosis(3))
+    for line in ("1  hard-iron step", "2  current field (current)", "3  an effect outside the catalogue (temperature)"):
+        assert line in text.splitlines()
+    assert "doubtful A curve has no size to compare." in flat(text)
+    assert "together residual" in flat(text)
+    assert "−0.0004 to 0.0046) Blocks of 4 s with gaps of 1 s." in flat(text)
+    assert text.count("0 is no better") == 1
+
+
+def test_structure_that_remains():
+    text = flat(shown(make_diagnosis(0, verdict="unexplained", p_value=0.005)))
+    assert "Structure remains that no effect in the catalogue accounts for." in text
+
+
+def test_texts_from_files_neither_style_nor_steer_the_terminal():
+    diagnosis = make_diagnosis(1, recording="[red]a[/red]\x1b[2J", warnings=("[/] \x1b]0;x\x07", "x" * 300))
+    first = dataclasses.replace(diagnosis.findings[0], drivers=("[b]\x1b[2J",))
+    text = shown(dataclasses.replace(diagnosis, findings=(first,)))
+    assert "\x1b" not in text
+    assert "\x07" not in text
+    assert "[red]a[/red]" in text
+    assert "[/]" in text
+
+
+def test_long_paths_stay_on_one_line_and_many_warnings_are_counted():
+    path = "folder/" * 20 + "report.html"
+    text = shown(make_diagnosis(0, warnings=tuple(f"warning {i}" for i in range(40))), [path], width=80)
+    assert any(line.endswith(path) for line in text.splitlines())
+    assert "34 more; see the report" in flat(text)
+
+
+@pytest.mark.parametrize("width", [40, 60, 200])
+def test_every_width(width):
+    text = shown(make_diagnosis(3), width=width, terminal=True)
+    assert "hard-iron step" in text
+
+
+def test_without_a_smooth_correction_there_is_no_line_of_it():
+    assert "smooth correction" not in shown(make_diagnosis(1, ceiling=None))
+
+
+def test_a_rare_p_value_does_not_stand_beside_nothing_is_missing():
+    text = flat(shown(make_diagnosis(0, p_value=0.04)))
+    assert "Nothing is missing" not in text
+    assert "Something is there that noise alone rarely makes" in text
+    assert "how sure p = 0.04" in text
+
+
+def test_a_list_of_many_numbers_is_told_by_its_largest():
+    made = make_diagnosis(1)
+    slopes = Parameter("gradient", (0.1, -0.6, 3.0, 0.2, 0.3, 0.4, 0.5), (0.1,) * 7, "µT/m", tuple("abcdefg"))
+    text = flat(
+        shown(dataclasses.replace(made, findings=(dataclasses.replace(made.findings[0], parameters=(slopes,)),)))
+    )
+    assert "size gradient up to c: 3.00 ± 0.10 µT/m and more, see the report" in text

@@ -1,0 +1,118 @@
+"""An interrupt is told in one line, whenever it comes, and the exit code is that of one."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib import import_module
+
+import pytest
+
+pytest.importorskip("typer")
+pytest.importorskip("polars")
+
+from mkc_torch.cli import console
+from tests.calibration.test_calibrate import noisy_ellipsoid
+from tests.cli.test_cli import mkc, table
+
+SLOW = """
+import pathlib, sys, time
+pathlib.Path(sys.argv[-1]).write_text("begun")
+try:
+    time.sleep(60.0)
+except BaseException as error:
+    raise ImportError("what an interrupt is made of") from error
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals are another thing there")
+def test_one_line_while_torch_is_imported(tmp_path):
+    (tmp_path / "torch.py").write_text(SLOW)
+    begun = tmp_path / "begun"
+    process = subprocess.Popen(
+        [sys.executable, "-c", "from mkc_torch.cli import main; main()", "demo", "--output", str(begun)],
+        stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
+    )  # fmt: skip
+    waited = time.monotonic() + 60.0
+    while not begun.exists() and process.poll() is None and time.monotonic() < waited:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert told == "mkc: interrupted; nothing was written.\n"
+    assert process.returncode == 130
+
+
+def test_the_package_itself_imports_nothing_that_takes_long():
+    code = "import sys, mkc_torch.cli; print(sorted({'torch', 'numpy', 'polars', 'rich'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_all_public_names_are_there():
+    import mkc_torch
+
+    assert all(getattr(mkc_torch, name) is not None for name in mkc_torch.__all__)
+    assert set(mkc_torch.__all__) <= set(dir(mkc_torch))
+    assert mkc_torch.density.robustness.__name__ == "mkc_torch.density.robustness"
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = mkc_torch.nothing
+
+
+def interrupting(monkeypatch, command, name, after=0):
+    """The function of that name in a command's module interrupts when it was called so many times."""
+    module = import_module(f"mkc_torch.cli.app.{command}")
+    works = getattr(module, name)
+    calls = []
+
+    def interrupted(*arguments, **options):
+        calls.append(arguments)
+        if len(calls) > after:
+            raise KeyboardInterrupt
+        return works(*arguments, **options)
+
+    monkeypatch.setattr(module, name, interrupted)
+
+
+def told(result, sentence):
+    assert result.exit_code == 130
+    assert result.stderr == f"mkc: interrupted; {sentence}\n"
+
+
+def test_calibrate_says_for_which_recordings_nothing_was_written(tmp_path, monkeypatch):
+    paths = [table(tmp_path / f"{name}.csv", noisy_ellipsoid(200)) for name in "abc"]
+    interrupting(monkeypatch, "calibrate", "fit", after=1)
+    result = mkc("calibrate", *paths, "--output", tmp_path / "out")
+    told(result, f"nothing was written for {paths[1]}, {paths[2]}.")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["a"]
+    assert "a\noffset" in result.stdout
+
+
+def test_diagnose_says_so_too(tmp_path, monkeypatch):
+    path = table(tmp_path / "a.csv", noisy_ellipsoid(200))
+    interrupting(monkeypatch, "diagnose", "diagnose_file")
+    told(
+        mkc("diagnose", path, "--simulation", "magnetometer", "--output", tmp_path / "out"),
+        f"nothing was written for {path}.",
+    )
+
+
+def test_apply_and_demo_say_so_too(tmp_path, monkeypatch):
+    path = table(tmp_path / "a.csv", noisy_ellipsoid(200))
+    assert mkc("calibrate", path, "--output", tmp_path).exit_code == 0
+    interrupting(monkeypatch, "apply", "correct")
+    output = tmp_path / "o.csv"
+    told(
+        mkc("apply", tmp_path / "a" / "calibration.json", path, "--output", output), f"nothing was written to {output}."
+    )
+    interrupting(monkeypatch, "demo", "simulated_recording")
+    told(mkc("demo", "--output", tmp_path / "demo"), f"nothing was written to {tmp_path / 'demo'}.")
+    assert not (tmp_path / "demo").exists()
+
+
+def test_what_may_be_incomplete_is_named(tmp_path):
+    a, b = tmp_path / "a.csv", tmp_path / "b.csv"
+    (tmp_path / "out" / "b").mkdir(parents=True)
+    assert console.not_written([a, b], tmp_path / "out") == (
+        f"nothing was written for {a}; {tmp_path / 'out' / 'b'} may be incomplete."
+    )
+    assert console.not_written([], tmp_path) == "all was written."

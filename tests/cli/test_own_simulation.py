@@ -1,0 +1,259 @@
+"""`mkc diagnose` and `mkc apply` with a simulation of the user's own, and with what a simulator wrote."""
+
+import importlib.util
+import json
+import sys
+
+import pytest
+import torch
+
+pytest.importorskip("typer")
+pytest.importorskip("polars")
+pytest.importorskip("jsonschema")
+
+from typer.testing import CliRunner
+
+from mkc_torch.cli.app import app
+from mkc_torch.diagnosis import DiagnosedModel
+from mkc_torch.diagnosis.files.diagnosis_json import validate
+from mkc_torch.recording.recording import Recording, write_table
+from mkc_torch.simulation import load_simulation
+
+STATIC = """
+from mkc_torch.simulation import Static
+
+class Thermistor(Static):
+    inputs = ("temperature",)
+    outputs = ("voltage",)
+    parameters = {"bottom": 0.3, "slope": 0.01}
+    units = {"voltage": "V"}
+
+    def output(self, time, u, p):
+        return {"voltage": p.bottom + p.slope * u.temperature}
+"""
+
+TANK = """
+from mkc_torch.simulation import Dynamics, Parameter
+
+class Tank(Dynamics):
+    states = ("level",)
+    inputs = ("inflow",)
+    parameters = {"drain": Parameter(0.3, lower=0.0, unit="1/s")}
+    units = {"level": "m", "inflow": "m/s"}
+
+    def derivative(self, time, x, u, p):
+        return {"level": u.inflow - p.drain * x.level}
+"""
+
+# what a reader of a report on anything but a magnetometer has to be spared
+FOREIGN = ("magnetometer", "µT", "sensor axes", "field on the axis", "corrected field")
+
+
+def mkc(*arguments):
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+def flat(text):
+    return " ".join(text.split())
+
+
+def thermistor_table(path, *, count=250):
+    g = torch.Generator().manual_seed(1)
+    time = torch.arange(count, dtype=torch.float64) / 10.0
+    temperature = 20.0 + 8.0 * torch.sin(0.4 * time) + 3.0 * torch.sin(1.7 * time)
+    current = torch.sin(0.9 * time + 1.0) + 0.3 * torch.randn(count, generator=g, dtype=torch.float64)
+    voltage = 0.5 + 0.02 * temperature + 0.05 * current + 0.01 * torch.randn(count, generator=g, dtype=torch.float64)
+    write_table(path, {"time": time, "temperature": temperature, "current": current, "voltage": voltage})
+    return path
+
+
+def tank_table(path, *, drag=0.0, seed=0):
+    """Two runs of a vessel that also loses by the square of its level."""
+    g = torch.Generator().manual_seed(seed)
+    time = torch.arange(150, dtype=torch.float64) / 10.0
+    runs = []
+    for number, start in enumerate((2.0, 0.5)):
+        inflow = 0.6 + 0.5 * torch.sin(0.7 * time + number)
+        level, values = start, []
+        for k in range(len(time)):
+            values.append(level)
+            for part in range(20):
+                flow = torch.lerp(inflow[k], inflow[min(k + 1, len(time) - 1)], part / 20.0)
+                level += (float(flow) - 0.3 * level - drag * level**2) / 200.0
+        noisy = torch.tensor(values, dtype=torch.float64)
+        noisy = noisy + 0.005 * torch.randn(len(time), generator=g, dtype=torch.float64)
+        runs.append({"time": time, "inflow": inflow, "level": noisy, "experiment": torch.full_like(time, number)})
+    write_table(path, {name: torch.cat([run[name] for run in runs]) for name in runs[0]})
+    return path
+
+
+@pytest.fixture
+def thermistor(tmp_path):
+    path = tmp_path / "bench.py"
+    path.write_text(STATIC)
+    return f"{path}:Thermistor", thermistor_table(tmp_path / "bench.csv"), tmp_path / "out"
+
+
+@pytest.fixture(scope="module")
+def tank(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tank")
+    (folder / "vessel.py").write_text(TANK)
+    table = tank_table(folder / "runs.csv", drag=0.15)
+    source = f"{folder / 'vessel.py'}:Tank"
+    result = mkc("diagnose", table, "--simulation", source, "--output", folder / "out", "--surrogates", 19, "--seed", 1)
+    assert result.exit_code == 0, result.output
+    return folder, source, result
+
+
+def test_a_dynamics_diagnosis_reads_well(tank):
+    folder, _, result = tank
+    place = folder / "out" / "runs"
+    assert sorted(p.name for p in place.iterdir()) == ["corrected.py", "diagnosis.json", "model.json", "report.html"]
+    content = json.loads((place / "diagnosis.json").read_text(encoding="utf-8"))
+    validate(content)
+    # both runs in one fit, not one diagnosis each
+    assert (content["simulation"], content["samples"], content["verdict"]) == ("Tank", 300, "explained")
+    first = content["findings"][0]
+    assert first["effect"] == "quadratic_drag"
+    assert first["channels"] == ["rate of level"]
+    assert first["intervals"] == []
+    assert first["parameters"][0]["unit"] == "1/(m·s)"
+    assert first["parameters"][0]["value"] == pytest.approx(0.15, rel=0.2)
+    page = (place / "report.html").read_text(encoding="utf-8")
+    for words in FOREIGN:
+        assert words not in result.stdout
+        assert words not in page
+    assert "acts on rate of level" in result.stdout
+    assert "Tank" in page
+
+
+def test_a_model_simulates_another_recording(tank, tmp_path):
+    folder, source, _ = tank
+    new, output = tank_table(tmp_path / "new.csv", drag=0.15, seed=5), tmp_path / "corrected.csv"
+    model = folder / "out" / "runs" / "model.json"
+    refused = mkc("apply", model, new, "--output", output)
+    assert refused.exit_code == 1
+    assert "no code is run because a model's file names it" in flat(refused.stderr)
+    assert "--simulation FILE.py:Tank" in flat(refused.stderr)
+    assert not output.exists()
+    result = mkc("apply", model, new, "--output", output, "--simulation", source)
+    assert result.exit_code == 0, result.output
+    assert "300 rows of level simulated with what was found" in result.stdout
+    corrected = Recording.read(output)
+    assert corrected.names == ("time", "experiment", "level")
+    assert torch.equal(corrected["experiment"], Recording.read(new)["experiment"])
+    assert output.read_text().splitlines()[1].startswith("0.0,0,")
+    assert float((corrected["level"] - Recording.read(new)["level"]).square().mean().sqrt()) < 0.008
+
+
+def test_the_python_that_is_written_runs_and_gives_the_same(tank, monkeypatch):
+    folder, source, _ = tank
+    place = folder / "out" / "runs"
+    text = (place / "corrected.py").read_text(encoding="utf-8")
+    assert 'rates["level"] = rates["level"] - 0.1' in text
+    assert "# quadratic_drag: δv̇ = −γ v |v|" in text
+    monkeypatch.syspath_prepend(str(folder))
+    spec = importlib.util.spec_from_file_location("corrected_tank", place / "corrected.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    sys.modules.pop("vessel")
+    recording = Recording.read(folder / "runs.csv")
+    written = module.CorrectedTank().prepare(recording)
+    model = DiagnosedModel.from_json(
+        (place / "model.json").read_text(encoding="utf-8"), simulation=load_simulation(source)
+    )
+    starts = model.theta[1:]
+    theta = torch.cat([written.start()[:1], starts])
+    expected = model(recording)["level"]
+    assert float((written.simulated(theta, {})[:, 0] - expected).abs().max()) < 2e-3
+    plain = load_simulation(source).prepare(recording)
+    assert float((plain.simulated(theta, {})[:, 0] - expected).abs().max()) > 0.02
+
+
+def test_a_function_of_inputs(thermistor):
+    source, table, output = thermistor
+    result = mkc("diagnose", table, "--simulation", source, "--output", output, "--surrogates", 19)
+    assert result.exit_code == 0, result.output
+    folder = output / "bench"
+    assert sorted(p.name for p in folder.iterdir()) == ["diagnosis.json", "model.json", "report.html"]
+    content = json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
+    assert content["simulation"] == "Thermistor"
+    assert content["findings"][0]["drivers"] == ["current"]
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert not any(words in page + result.stdout for words in FOREIGN)
+
+
+def test_columns_are_renamed_and_the_unit_is_the_magnetometers(thermistor, tmp_path):
+    source, table, output = thermistor
+    known = Recording.read(table)
+    other = tmp_path / "other.csv"
+    write_table(other, {name.replace("voltage", "adc"): values for name, values in known.columns.items()})
+    result = mkc(
+        "diagnose", other, "--simulation", source, "--output", output, "--surrogates", 19, "--columns", "voltage=adc"
+    )
+    assert result.exit_code == 0, result.output
+    result = mkc("diagnose", table, "--simulation", source, "--output", output, "--unit", "V")
+    assert result.exit_code == 2
+    assert "--unit is that of a magnetometer's columns" in flat(result.stderr.replace("│", " "))
+
+
+def test_what_a_simulator_wrote(tmp_path):
+    def signal(time):
+        return torch.sin(1.1 * time) + 0.6 * torch.sin(2.7 * time + 1.0)
+
+    g = torch.Generator().manual_seed(2)
+    time = torch.arange(300, dtype=torch.float64) / 20.0
+    dense = torch.arange(-20, 340, dtype=torch.float64) / 20.0
+    sim, table = tmp_path / "SIM.csv", tmp_path / "rec.csv"
+    write_table(sim, {"time": dense, "y": signal(dense)})
+    noise = 0.03 * torch.randn(300, generator=g, dtype=torch.float64)
+    write_table(table, {"time": time, "y": 1.1 * signal(time) + noise})
+    output = tmp_path / "out"
+    result = mkc("diagnose", table, "--simulated", sim, "--output", output, "--surrogates", 19)
+    assert result.exit_code == 0, result.output
+    model = output / "rec" / "model.json"
+    assert json.loads((output / "rec" / "diagnosis.json").read_text())["findings"][0]["effect"] == "gain"
+    corrected = tmp_path / "corrected.csv"
+    refused = mkc("apply", model, table, "--output", corrected)
+    assert "--simulated SIM.csv" in flat(refused.stderr)
+    assert mkc("apply", model, table, "--output", corrected, "--simulated", sim).exit_code == 0
+    assert float((Recording.read(corrected)["y"] / signal(time)).median()) == pytest.approx(1.1, abs=0.01)
+    write_table(tmp_path / "LATE.csv", {"time": dense + 1000.0, "y": signal(dense)})
+    result = mkc("diagnose", table, "--simulated", tmp_path / "LATE.csv", "--output", output, "--force")
+    assert result.exit_code == 1
+    assert "do not meet in time: 0 to 14.95 s was recorded, 999 to 1016.95 s simulated" in flat(result.stderr)
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "words"),
+    [
+        ("raise KeyError('gone')\n", "Thermistor", ["raised an error of its own", "line 1", "KeyError: 'gone'"]),
+        (STATIC, "Missing", ["defines no `Missing`; simulations in it: Thermistor"]),
+        (STATIC.replace("p.slope", "p.incline"), "Thermistor", ["Thermistor raised an error of its own", "p.incline"]),
+        (STATIC.replace("u.temperature", "u.temperature[:3]"), "Thermistor", ["should be a tensor of shape (250,)"]),
+    ],
+)
+def test_code_that_fails_is_told_and_nothing_is_written(tmp_path, text, name, words):
+    path = tmp_path / "own.py"
+    path.write_text(text)
+    table = thermistor_table(tmp_path / "bench.csv")
+    result = mkc("diagnose", table, "--simulation", f"{path}:{name}", "--output", tmp_path / "out")
+    assert result.exit_code == 1
+    assert isinstance(result.exception, SystemExit)
+    for word in words:
+        assert word in result.stderr
+    assert "report it" not in result.stderr
+    assert not list((tmp_path / "out").rglob("*")) if (tmp_path / "out").exists() else True
+
+
+def test_usage_errors(thermistor):
+    source, table, output = thermistor
+    for more, words in (
+        ((), "give one of --simulation and --simulated"),
+        (("--simulation", source, "--simulated", table), "give one of --simulation and --simulated"),
+        (("--simulation", "bench.py"), "or one of your own as FILE.py:CLASS"),
+    ):
+        result = mkc("diagnose", table, "--output", output, *more)
+        assert result.exit_code == 2
+        assert words in flat(result.stderr.replace("│", " "))
+    assert not output.exists()

@@ -1,0 +1,56 @@
+"""The normaliser in NumPy is that of the tensors, values and slopes, over all of its range."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mkc_torch.density._normalizer_of_few import few, log_partition_and_slopes
+from mkc_torch.density.energy import energy
+from mkc_torch.density.normalizer import _HEAD_TOLERANCE, _NODES, _WEIGHTS, _log_partition_and_slopes, log_partition
+
+
+def of_few(kappa, length):
+    return log_partition_and_slopes(kappa, length, _NODES.numpy(), _WEIGHTS.numpy(), _HEAD_TOLERANCE)
+
+
+@given(
+    kappa=st.one_of(st.just(0.0), st.floats(1e-12, 400.0), st.floats(1e-4, 1e-2)),
+    length=st.floats(1e-3, 1e7),
+)
+def test_it_is_that_of_tensors(kappa, length):
+    expected = _log_partition_and_slopes(*(torch.tensor(one, dtype=torch.float64) for one in (kappa, length)), energy)
+    for one, other in zip(of_few(np.asarray(kappa), np.asarray(length)), expected, strict=True):
+        assert float(one) == pytest.approx(float(other), rel=1e-10, abs=1e-12)
+
+
+def test_both_ways_give_the_same_gradients():
+    kappa = torch.tensor([0.0, 1e-6, 0.01, 0.5, 30.0, 400.0], dtype=torch.float64)
+    length = torch.tensor([5.0, 3.0, 50.0, 20.0, 100.0, 1000.0], dtype=torch.float64)
+
+    def gradients(repeats):
+        """Of the first six channels, beside as many copies of them."""
+        inputs = [one.repeat(repeats).requires_grad_() for one in (kappa, length)]
+        assert few(*(one.detach() for one in inputs)) == (repeats == 1)
+        value = log_partition(*inputs)
+        return [value.detach()[:6], *(g[:6] for g in torch.autograd.grad(value.sum(), inputs))]
+
+    for one, other in zip(gradients(1), gradients(20), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-13)
+
+
+def test_single_precision_keeps_its_dtype():
+    value = log_partition(torch.full((4,), 0.1), torch.full((4,), 100.0))
+    assert value.dtype == torch.float32
+    double = log_partition(torch.full((4,), 0.1).double(), torch.full((4,), 100.0).double())
+    torch.testing.assert_close(value.double(), double, rtol=1e-6, atol=1e-7)
+
+
+def test_tensors_of_a_transform_are_not_few():
+    seen = []
+    torch.vmap(lambda one: seen.append(few(one)) or one)(torch.ones(3, 2))
+    assert seen == [False]
+    assert few(torch.ones(2))
+    assert not few(torch.ones(1000))
+    assert not few(torch.nn.Parameter(torch.ones(2)))

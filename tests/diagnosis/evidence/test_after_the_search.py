@@ -1,0 +1,82 @@
+"""The evidence of a finding that is hidden by one found after it."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch import diagnose
+from mkc_torch.diagnosis.evidence import after_the_search as ending
+from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
+from mkc_torch.diagnosis.model.drivers import find_drivers
+from mkc_torch.diagnosis.model.fit import fitted, fitted_beside
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.simulation import Magnetometer
+from tests.simulation.tumbling import tumbling
+
+N = 1500
+TIME = np.arange(N) / 50.0
+SMALL = np.sin(2.0 * np.pi * TIME / 3.7)
+LARGE = np.sin(2.0 * np.pi * TIME / 11.3)
+OFFSET = next(effect for effect in CATALOGUE if effect.id == "driver_offset")
+
+
+@pytest.fixture(scope="module")
+def fits():
+    """Without an effect, with the small one, and with both."""
+    sensor = np.outer(SMALL, [0.4, -0.3, 0.4]) + np.outer(LARGE, [4.0, 3.0, -5.0])
+    recording = tumbling(N, noise=0.3, sensor=sensor, small=SMALL, large=LARGE)
+    simulation = Magnetometer("norm")
+    prepared = simulation.prepare(recording)
+    known = {driver.columns[0]: driver for driver in find_drivers(prepared.recording, simulation.columns).drivers}
+    done = [fitted(JointModel(prepared), prepared.start())]
+    for name in ("small", "large"):
+        model = done[-1].model.with_term(Term(OFFSET, known[name], OFFSET.shapes(prepared.time)[0]))
+        start = torch.cat([done[-1].parameters, done[-1].parameters.new_zeros(model.size - done[-1].model.size)])
+        done.append(fitted_beside(done[0], model, start))
+    return done
+
+
+@pytest.fixture
+def beyond(fits, monkeypatch):
+    """What is told of the small effect."""
+    for name in ("extrapolated", "shifted", "onset_interval"):
+        monkeypatch.setattr(ending, name, lambda *_: None)
+    blocks = blocks_of(N, 1)
+    none, small, both = fits
+
+    def told(evidence):
+        return ending._beyond(none, both, SimpleNamespace(fit=small), 0, evidence, blocks, 0)
+
+    return told, [held_out(fit, blocks) for fit in fits]
+
+
+def test_what_is_not_confirmed_by_itself_is_judged_beside_the_other(fits, beyond):
+    told, (none, _, both) = beyond
+    without = told([none, none, both]).without
+    blocks = blocks_of(N, 1)
+    alone = fitted_beside(
+        fits[0], fits[0].model.with_term(fits[2].model.terms[1]), torch.cat([fits[0].parameters, torch.zeros(3)])
+    )
+    torch.testing.assert_close(without.residual, held_out(alone, blocks).residual, atol=0.02, rtol=0.0)
+    assert float((both.log_likelihood - without.log_likelihood).mean()) > 0.1
+
+
+def test_what_is_confirmed_by_itself_is_not_judged_again(beyond):
+    told, (none, _, both) = beyond
+    assert told([none, both, both]).without is None
+
+
+def test_a_diagnosis_says_so(monkeypatch):
+    monkeypatch.setattr(ending, "_confirmed", lambda *_: False)
+    current = np.sign(np.sin(2.0 * np.pi * TIME / 3.7))
+    sensor = np.outer(current, [0.6, -0.5, 0.6]) + np.outer(TIME >= 14.0, [3.0, 2.0, -3.0])
+    effects = [effect for effect in CATALOGUE if effect.id in ("current_field", "hard_iron_step")]
+    recording = tumbling(N, noise=0.3, sensor=sensor, current=current)
+    first, last = diagnose(Magnetometer("norm"), recording, effects=effects, surrogates=19, max_findings=2).findings
+    assert first.held_out_note.startswith("Judged beside the other findings")
+    assert first.held_out.rmse_after == last.held_out.rmse_after < first.held_out.rmse_before
+    assert last.held_out_note == ""

@@ -1,0 +1,227 @@
+"""How far a smooth correction by all columns comes on blocks that it has not seen."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from mkc_torch import diagnose
+from mkc_torch.diagnosis.evidence.ceiling import Ceiling, ceiling
+from mkc_torch.diagnosis.evidence.held_out import Evidence, blocks_of, gain_interval, held_out
+from mkc_torch.diagnosis.evidence.remaining import remaining
+from mkc_torch.diagnosis.evidence.smooth_curves import curves_of, legendre, smooth_tangents
+from mkc_torch.diagnosis.model.drivers import Driver, find_drivers
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.simulation import Magnetometer
+from tests.diagnosis.line import Line
+from tests.simulation.tumbling import tumbling
+
+N = 1500
+TIME = np.arange(N) / 50.0
+LOAD = np.sin(2.0 * np.pi * TIME / 3.7) + 0.4 * np.sin(2.0 * np.pi * TIME / 0.83)
+GAIN = np.array([0.5, -0.4, 0.6])
+NOISE = 0.4
+
+
+def walks(count, seed=0, size=N):
+    """Columns that have nothing to do with the sensor."""
+    random = np.random.default_rng(seed)
+    return {f"column_{k}": np.cumsum(random.standard_normal(size)) for k in range(count)}
+
+
+def outliers(seed=3, share=0.1):
+    random = np.random.default_rng(seed)
+    return 15.0 * random.standard_normal((N, 3)) * (random.random((N, 1)) < share)
+
+
+def made(sensor=0.0, *, use="norm", seed=0, **columns):
+    """Fit of the simulation alone, drivers, blocks."""
+    recording = tumbling(N, noise=NOISE, sensor=sensor + outliers(seed + 3), seed=seed, attitude=True, **columns)
+    simulation = Magnetometer(use=use)
+    prepared = simulation.prepare(recording)
+    fit = fitted(JointModel(prepared), prepared.start())
+    return fit, find_drivers(prepared.recording, simulation.columns).drivers, blocks_of(N, 3)
+
+
+def gained(better, worse, blocks):
+    difference = better.log_likelihood - worse.log_likelihood
+    return gain_interval(difference, blocks.block, torch.Generator().manual_seed(0))[1][0]
+
+
+def along(trace):
+    return GAIN * trace[:, None]
+
+
+@pytest.fixture(scope="module")
+def empty():
+    fit, drivers, blocks = made(load=LOAD, **walks(4))
+    return held_out(fit, blocks), ceiling(fit.model, fit, drivers, blocks), blocks
+
+
+@pytest.mark.parametrize("curve", [lambda x: 2.0 * x, lambda x: 4.0 * x**3 - 2.0 * x, lambda x: np.sin(3.0 * x)])
+def test_a_curve_of_a_column_is_reached(curve, empty):
+    fit, drivers, blocks = made(along(curve(LOAD)), load=LOAD, **walks(4))
+    found, alone = ceiling(fit.model, fit, drivers, blocks), held_out(fit, blocks)
+    assert found.columns == ("load",)
+    assert gained(found.evidence, alone, blocks) > 0.05
+    # nearly as good as where there was nothing to find
+    nothing = float(empty[0].log_likelihood.mean())
+    assert float(found.evidence.log_likelihood.mean()) == pytest.approx(nothing, abs=0.1)
+    assert float(found.evidence.d[0]) == pytest.approx(NOISE, rel=0.15)
+
+
+def test_it_is_reached_in_a_vector_with_a_prior():
+    fit, drivers, blocks = made(along(LOAD), use="attitude", load=LOAD, **walks(4))
+    found = ceiling(fit.model, fit, drivers, blocks)
+    assert found.columns == ("load",)
+    assert found.evidence.residual.shape == (N, 3)
+    np.testing.assert_allclose(found.evidence.d, NOISE, rtol=0.15)
+
+
+def test_a_drift_is_reached_without_a_column():
+    fit, drivers, blocks = made(4.0 * along(np.tanh(TIME / 10.0)), load=LOAD)
+    found = ceiling(fit.model, fit, drivers, blocks)
+    assert found.columns == ()
+    assert gained(found.evidence, held_out(fit, blocks), blocks) > 0.1
+
+
+def test_noise_has_no_ceiling_above_it(empty):
+    alone, found, _ = empty
+    assert found.columns == ()
+    assert float(found.evidence.log_likelihood.mean()) == pytest.approx(float(alone.log_likelihood.mean()), abs=0.003)
+
+
+def test_columns_by_the_dozen_gain_nothing_on_unseen_blocks():
+    fit, drivers, blocks = made(**walks(60, seed=1))
+    found = ceiling(fit.model, fit, drivers, blocks)
+    difference = found.evidence.log_likelihood - held_out(fit, blocks).log_likelihood
+    assert float(difference.mean()) < 0.005
+
+
+def test_of_columns_by_the_dozen_the_right_one_is_taken():
+    fit, drivers, blocks = made(along(LOAD), **walks(60, seed=1), load=LOAD)
+    found = ceiling(fit.model, fit, drivers, blocks)
+    assert found.columns == ("load",)
+    tangents = smooth_tangents(
+        fit.model, fit.parameters, curves_of(drivers, N), fit.weights / fit.d.square(), blocks
+    ).tangents
+    assert tangents.shape[-1] <= 300
+
+
+def test_beside_a_model_it_is_about_what_is_left():
+    """The parameters of the model are refitted with the curves: nothing is left to gain by what it has already."""
+    fit, drivers, blocks = made(along(LOAD), load=LOAD, **walks(2))
+    effect = next(e for e in CATALOGUE if e.id == "driver_offset")
+    model = fit.model.with_term(Term(effect, next(d for d in drivers if d.columns == ("load",)), {}))
+    corrected = fitted(model, torch.cat([fit.parameters, torch.zeros(3, dtype=torch.float64)]), fit.bound)
+    assert ceiling(fit.model, corrected, drivers, blocks).columns == ("load",)
+    beside = ceiling(model, corrected, drivers, blocks)
+    assert beside.columns == ()
+    assert float(beside.evidence.log_likelihood.mean()) == pytest.approx(
+        float(held_out(corrected, blocks).log_likelihood.mean()), abs=0.003
+    )
+
+
+def line_and_drivers(count):
+    generator = torch.Generator().manual_seed(5)
+    line = Line(600)
+    columns = torch.randn(600, count, generator=generator, dtype=torch.float64)
+    columns[:, 0] = torch.sin(4.0 * line.time * line.time)
+    names = [f"column_{k}" for k in range(count)]
+    drivers = [Driver((name,), "any", c.unsqueeze(-1), torch.zeros(1), ("",)) for name, c in zip(names, columns.T)]  # noqa: B905
+    line.measured = line.measured + 8.0 * (columns[:, :1] * torch.tensor([1.0])).cumsum(0) / 600
+    return line, drivers
+
+
+@pytest.mark.parametrize("count", [2, 30])
+def test_a_port_that_is_not_pointwise(count):
+    """Both where all columns are made and where the promising ones have to be chosen by reverse mode."""
+    line, drivers = line_and_drivers(count)
+    fit, blocks = fitted(JointModel(line), line.start()), blocks_of(600, 3)
+    found = ceiling(fit.model, fit, drivers, blocks)
+    assert "column_0" in found.columns
+    level = stats.norm(0.0, 0.1).logpdf(found.evidence.residual.numpy()).sum(-1).mean()
+    assert float(found.evidence.log_likelihood.mean()) == pytest.approx(level, abs=0.1)
+    np.testing.assert_allclose(found.evidence.d, 0.1, atol=0.015)
+
+
+def test_a_fold_knows_nothing_of_its_own_samples():
+    line, spoilt, blocks = Line(300), Line(300), blocks_of(300, 1)
+    hidden = ~blocks.train[2]
+    spoilt.measured[hidden] += 0.7
+    first = fitted(JointModel(line), line.start())
+    second = fitted(JointModel(spoilt), first.parameters, first.bound, graduate=False)
+    before, after = (ceiling(fit.model, fit, (), blocks).evidence for fit in (first, second))
+    seen = blocks.fold == 2
+    torch.testing.assert_close(
+        after.residual[seen] - before.residual[seen], torch.full_like(before.residual[seen], 0.7), rtol=0.0, atol=0.1
+    )
+    assert after.left_out == pytest.approx(held_out(first, blocks).left_out)
+
+
+def test_curves_are_legendre_polynomials():
+    x = np.linspace(-3.0, 5.0, 101)
+    expected = np.stack([np.polynomial.Legendre.basis(k)((x - 1.0) / 4.0) for k in range(1, 6)], -1)
+    found = legendre(torch.as_tensor(x).unsqueeze(-1), 5)[:, 0]
+    np.testing.assert_allclose(found, expected - expected.mean(0), atol=1e-12)
+
+
+def test_the_diagnosis_has_it_on_the_same_samples_and_warns_of_what_remains():
+    recording = tumbling(N, noise=NOISE, sensor=along(LOAD) + outliers(), load=LOAD, **walks(2))
+    found = diagnose(Magnetometer(), recording, surrogates=19, max_findings=0)
+    assert found.verdict == "unexplained"
+    assert found.ceiling.rmse < 0.8 * found.corrected.rmse
+    assert found.ceiling.log_likelihood > found.corrected.log_likelihood + 0.1
+    (sentence,) = [w for w in found.warnings if "no effect of the catalogue accounts for" in w]
+    assert sentence.startswith("Something smooth remains along load that")
+
+
+@pytest.fixture(scope="module", params=range(5))
+def wandering(request):
+    """An offset that wanders, and columns that wander as it does."""
+    random = np.random.default_rng(100 + request.param)
+    offset = 2.0 * NOISE * np.cumsum(random.standard_normal((N, 3)), 0) / np.sqrt(N)
+    fit, drivers, blocks = made(offset, seed=request.param, **walks(5, seed=request.param))
+    return fit, drivers, blocks, ceiling(fit.model, fit, drivers, blocks)
+
+
+def test_noise_that_wanders_is_not_told_as_what_remains(wandering):
+    fit, drivers, blocks, alone = wandering
+    corrected = held_out(fit, blocks)
+    assert gained(alone.evidence, corrected, blocks) > 0.0
+    assert remaining(alone, corrected, fit, drivers, blocks, 0) == ()
+
+
+def test_a_wandering_column_that_matters_is_told_from_wandering_noise():
+    random = np.random.default_rng(7)
+    offset = NOISE * np.cumsum(random.standard_normal((N, 3)), 0) / np.sqrt(N)
+    fit, drivers, blocks = made(offset + along(LOAD), load=LOAD, **walks(3, seed=7))
+    alone = ceiling(fit.model, fit, drivers, blocks)
+    assert "load" in remaining(alone, held_out(fit, blocks), fit, drivers, blocks, 0)
+
+
+def scores(gain, columns=("load",)):
+    noise = 0.1 * torch.randn(N, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    nothing = torch.zeros(5, 0)
+    return Ceiling(Evidence(gain + noise, nothing, nothing, nothing, nothing, 0.2), columns)
+
+
+@pytest.mark.parametrize(
+    ("gain", "by_time", "columns", "told"),
+    [
+        (0.05, 0.0, ("load",), ("load",)),
+        (0.005, 0.0, ("load",), ()),  # too small to matter
+        (0.05, 0.05, ("load",), ()),
+        (0.05, 0.0, (), ()),
+        (-0.05, 0.0, ("load",), ()),
+    ],
+)
+def test_what_remains_gains_enough_and_more_than_time(monkeypatch, gain, by_time, columns, told):
+    monkeypatch.setattr("mkc_torch.diagnosis.evidence.remaining.ceiling", lambda *_: scores(by_time, ()))
+    fit = SimpleNamespace(model=SimpleNamespace(terms=()))
+    assert remaining(scores(gain, columns), scores(0.0).evidence, fit, (), blocks_of(N, 3), 0) == told

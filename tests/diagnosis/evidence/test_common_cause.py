@@ -1,0 +1,166 @@
+"""A wander of a sensor's axes along one direction is a cause that was not recorded; axes apart are noise."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch import diagnose
+from mkc_torch.diagnosis.evidence.common_cause import common_cause
+from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json, validate
+from mkc_torch.diagnosis.files.model import DiagnosedModel
+from mkc_torch.diagnosis.linearised.linear_search import LinearSearch
+from mkc_torch.diagnosis.linearised.tangents import Slow
+from mkc_torch.diagnosis.noise.cosine_basis import cosines
+from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
+from mkc_torch.report.diagnosis.verdict import headline
+from mkc_torch.simulation import Magnetometer
+from tests.effects.contexts import make_context
+from tests.simulation.tumbling import RATE, tumbling
+
+N = 2500
+TIME = np.arange(N) / RATE
+DIRECTION = np.array([0.48, -0.6, 0.64])
+K, C, SAMPLES = 30, 3, 400
+
+
+def walks(seed, count=1):
+    """Random walks of unit standard deviation over the recording."""
+    steps = np.random.default_rng(seed).standard_normal((N, count)).cumsum(0)
+    return (steps - steps.mean(0)) / steps.std(0)
+
+
+def course(seed=4):
+    """Goes to and fro, as a room's temperature does: no shape of a drift."""
+    return np.sin(2 * np.pi * TIME / 23.0 + seed) + 0.6 * np.sin(2 * np.pi * TIME / 11.0)
+
+
+def searching(covariance, seed, size=3.0):
+    """Series of white noise around courses whose channels have that covariance, in a search with as many courses."""
+    generator = torch.Generator().manual_seed(seed)
+    k = torch.arange(1, K + 1, dtype=torch.float64).repeat_interleave(C)
+    scales = (1.0 / k).unsqueeze(0)
+    channels = torch.randn(SAMPLES, 1, C, generator=generator, dtype=torch.float64)
+    slow = Slow("sensor", C, channels, True, scales)
+    tangents = (cosines(K, SAMPLES)[:, :, None] * channels).reshape(SAMPLES, K * C)
+    root = torch.linalg.cholesky(torch.as_tensor(covariance) + 1e-9 * torch.eye(C, dtype=torch.float64))
+    drawn = size * (torch.randn(K, C, generator=generator, dtype=torch.float64) @ root.mT).flatten() / k
+    series = tangents @ drawn + torch.randn(SAMPLES, generator=generator, dtype=torch.float64)
+    search = LinearSearch(torch.ones(SAMPLES, 1, dtype=torch.float64), [], tangents, scales)
+    linearised = SimpleNamespace(search=search, series=series, wanders=search.noise_fit(series).gain > 0)
+    return linearised, slow, tangents @ drawn
+
+
+def test_one_direction_is_found_with_its_course():
+    linearised, slow, truth = searching(np.outer(DIRECTION, DIRECTION), 1)
+    cause = common_cause(linearised, slow)
+    assert cause.p_value < 1e-6
+    cosine = cause.direction @ torch.as_tensor(DIRECTION) / cause.direction.norm()
+    assert float(cosine.abs()) > 0.98
+    amplitudes = torch.zeros(K, dtype=torch.float64)
+    for name, value in cause.shape.items():
+        amplitudes[int(name.removeprefix(COURSE)) - 1] = value / 2.0**0.5
+    predicted = slow.course((amplitudes[:, None] * cause.direction).flatten()).squeeze(-1)
+    assert float(torch.corrcoef(torch.stack([predicted, truth]))[0, 1]) > 0.95
+
+
+@pytest.mark.parametrize("variances", [(1.0, 1.0, 1.0), (2.0, 0.5, 0.5), (1.0, 0.0, 0.0)])
+def test_channels_apart_have_p_values_that_are_no_smaller_than_uniform(variances):
+    p = torch.tensor([common_cause(*searching(np.diag(variances), seed)[:2]).p_value for seed in range(60)])
+    assert float((p < 0.05).double().mean()) < 0.15
+    assert float((p < 0.5).double().mean()) < 0.7
+
+
+def test_nothing_is_asked_of_one_channel_or_of_noise_that_does_not_wander():
+    linearised, slow, _ = searching(np.eye(3), 0)
+    assert common_cause(linearised, None) is None
+    assert common_cause(SimpleNamespace(wanders=False), slow) is None
+
+
+def test_the_other_way_to_say_it():
+    linearised, slow, _ = searching(np.outer(DIRECTION, DIRECTION), 1)
+    cause = common_cause(linearised, slow)
+    other = cause.towards(-cause.direction)
+    assert torch.equal(other.direction, -cause.direction)
+    assert other.shape == {name: -value for name, value in cause.shape.items()}
+    assert cause.towards(cause.direction) is cause
+
+
+@pytest.fixture(scope="module")
+def diagnosis():
+    """An offset that follows a temperature which was not recorded."""
+    recording = tumbling(N, noise=0.5, sensor=1.2 * course()[:, None] * DIRECTION, aux=walks(8)[:, 0])
+    return diagnose(Magnetometer("norm"), recording), recording
+
+
+def test_a_cause_that_was_not_recorded_is_found(diagnosis):
+    found, _ = diagnosis
+    (finding,) = found.findings
+    assert (finding.effect, finding.drivers, found.verdict) == ("unknown", (), "unexplained")
+    assert found.p_value == finding.p_value == 0.01
+    assert "no column recorded" in headline(found)
+
+
+def test_its_size_and_course_are_those_of_the_cause(diagnosis):
+    found, _ = diagnosis
+    (finding,) = found.findings
+    (size,) = finding.parameters
+    span = 1.2 * np.ptp(course())
+    gap = np.abs(np.array(size.value)) - np.abs(span * DIRECTION)
+    assert np.abs(gap).max() < 4.0 * max(size.standard_error)
+    assert np.abs(gap).max() < 0.15 * span
+    at = np.interp(finding.curve.x, TIME, course())
+    assert abs(np.corrcoef(at, finding.curve.value[:, 0])[0, 1]) > 0.97
+
+
+def test_it_is_judged_on_blocks_that_its_course_has_not_seen(diagnosis):
+    """The noise of 0.5 µT is what the best correction leaves; a course that had seen the blocks would leave less."""
+    held = diagnosis[0].findings[0].held_out
+    assert held.log_likelihood_gain > 0.0
+    assert 0.49 < held.rmse_after < held.rmse_before
+
+
+def test_its_model_goes_through_a_file_and_leaves_the_offset_at_the_end(diagnosis):
+    found, recording = diagnosis
+    model = DiagnosedModel.from_json(found.model.to_json())
+    (term,) = model.terms
+    assert isinstance(term.effect, Unrecorded)
+    assert term.shape == found.model.terms[0].shape
+    columns, notes = model.correct(recording)
+    assert notes == (
+        "unknown is bound to the time of the diagnosed recording: its offset at the end is taken off all of this one.",
+    )
+    strength = torch.linalg.vector_norm(torch.stack([columns[f"field_{axis}"] for axis in "xyz"], -1), dim=-1)
+    truth = float(strength.median())
+    assert abs(float(strength[-100:].mean()) - truth) < 0.01 * truth
+    validate(json.loads(diagnosis_to_json(found)))
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_column_that_goes_as_the_cause_in_part_is_told_to_stand_in(whole):
+    """One that is the cause is not, and neither needs a name that says what it measures."""
+    column = course() if whole else np.sin(2 * np.pi * TIME / 23.0 + 4)
+    recording = tumbling(N, noise=0.5, sensor=1.2 * course()[:, None] * DIRECTION, aux=column)
+    found = diagnose(Magnetometer("norm"), recording)
+    assert (found.findings[0].effect, found.findings[0].drivers) == ("driver_offset", ("aux",))
+    told = [warning for warning in found.warnings if "stand in" in warning]
+    assert len(told) == (0 if whole else 1)
+    assert all(warning.startswith("What aux leaves of the offset goes on") for warning in told)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_axes_that_wander_for_themselves_are_noise(seed):
+    """One draw in two hundred would be one cause, for a tenth of the level; these are none of those."""
+    found = diagnose(Magnetometer("norm"), tumbling(N, noise=0.5, sensor=0.8 * walks(seed, 3), seed=seed))
+    assert "unknown" not in [finding.effect for finding in found.findings]
+
+
+def test_the_course_spans_one_and_ends_at_zero():
+    context = make_context(Unrecorded(), N=200)
+    course = Unrecorded().course({f"{COURSE}1": 0.3, f"{COURSE}4": -0.2}, context)
+    phase = torch.pi * (torch.arange(200, dtype=torch.float64) + 0.5) / 200
+    known = 0.3 * torch.cos(phase) - 0.2 * torch.cos(4.0 * phase)
+    torch.testing.assert_close(course, known - known[-1])
+    assert float(Unrecorded().lasting(torch.ones(3, dtype=torch.float64), context).abs().max()) == 0.0

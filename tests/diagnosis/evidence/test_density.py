@@ -1,0 +1,140 @@
+"""Whether the density of residuals is right, by their probability-integral transform and against a Student-t."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from mkc_torch import MKCDistribution
+from mkc_torch.density.fit import fit_density
+from mkc_torch.diagnosis.evidence.density import (
+    density_checks,
+    density_warnings,
+    effective_size,
+    kolmogorov,
+    student_cdf,
+    student_fit,
+)
+
+N = 4500
+
+
+def checked(*channels):
+    """Of residuals, each channel with the density that is fitted to it."""
+    residual = torch.stack([torch.as_tensor(channel) for channel in channels], -1)
+    fit = fit_density(residual)
+    return density_checks(residual, fit.sigma, fit.d, fit.bound, [f"channel_{k}" for k in range(len(channels))])
+
+
+def warned(*channels):
+    return density_warnings(checked(*channels))
+
+
+def mkc(seed):
+    torch.manual_seed(seed)
+    parameters = (torch.tensor(v, dtype=torch.float64) for v in (2.0, 0.5, 15.0))
+    return MKCDistribution(*parameters).sample((N,))
+
+
+def gaussian(seed):
+    return 0.5 * np.random.default_rng(seed).standard_normal(N)
+
+
+def student(seed, freedom=2.0):
+    return 0.5 * np.random.default_rng(seed).standard_t(freedom, N)
+
+
+def autoregressive(draws, phi):
+    out = np.empty_like(draws)
+    out[0] = draws[0] / np.sqrt(1.0 - phi**2)
+    for k in range(1, len(draws)):
+        out[k] = phi * out[k - 1] + draws[k]
+    return out
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("draw", [mkc, gaussian])
+def test_residuals_of_the_density_are_not_warned_of(draw, seed):
+    assert warned(draw(seed)) == ()
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("freedom", [1.0, 1.5, 2.0])
+def test_a_student_t_is_warned_of_with_its_freedom(freedom, seed):
+    (sentence,) = warned(student(seed, freedom))
+    assert "does not describe the residuals of channel_0" in sentence
+    assert f"a Student-t with {freedom:g} degrees of freedom" in sentence
+    assert sentence.endswith("A misfit of the tail must not be read as physics.")
+
+
+def test_distances_are_told_whether_or_not_there_is_a_warning():
+    right, wrong = checked(gaussian(0), student(1))
+    assert right.distance < right.allowed
+    assert right.student_distance < right.allowed
+    assert not right.closer
+    assert wrong.distance > wrong.allowed > wrong.student_distance
+    assert wrong.closer
+
+
+def test_residuals_that_are_all_zero_have_distances():
+    one = torch.ones(1, dtype=torch.float64)
+    (check,) = density_checks(torch.zeros(50, 1, dtype=torch.float64), one, one, 10.0 * one, ["norm"])
+    assert check.distance == pytest.approx(1.0)
+    assert check.student_distance == pytest.approx(1.0)
+
+
+def test_only_the_channels_that_are_misfit_are_named():
+    (sentence,) = warned(gaussian(0), student(1), mkc(2), student(3, 1.5))
+    assert "of channel_1, channel_3: its" in sentence
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_outliers_to_one_side_are_no_student_t(seed):
+    random = np.random.default_rng(seed)
+    spoilt = random.random(N) < 0.2
+    assert warned(gaussian(seed) + spoilt * (4.0 + 8.0 * random.random(N))) == ()
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("phi", [0.9, 0.99])
+def test_samples_that_hang_together_count_for_fewer(phi, seed):
+    assert warned(autoregressive(gaussian(seed), phi)) == ()
+
+
+def test_a_distance_that_many_samples_would_not_allow_is_allowed_to_few():
+    """The same misfit in a series of as many samples, each ten times over."""
+    misfit = student(0, 1.5)
+    assert warned(misfit) != ()
+    assert warned(np.repeat(misfit[:450], 10)) == ()
+
+
+@pytest.mark.parametrize("freedom", [1.0, 1.5, 2.0, 4.0, 10.0, 30.0])
+def test_the_distribution_function_of_a_student_t(freedom):
+    size = np.concatenate([np.linspace(0.0, 8.0, 60), [30.0, 1e4]])
+    expected = 2.0 * stats.t(freedom).cdf(size) - 1.0
+    np.testing.assert_allclose(student_cdf(torch.as_tensor(size), freedom), expected, atol=2e-4)
+
+
+@pytest.mark.parametrize("freedom", [1.0, 2.0, 4.0])
+def test_the_likeliest_student_t(freedom):
+    error = student(7, freedom)
+    found, scale, likelihood = student_fit(torch.as_tensor(error))
+    assert found == freedom
+    assert scale == pytest.approx(0.5, rel=0.06)
+    best = stats.t.fit(error, floc=0.0)
+    assert likelihood == pytest.approx(stats.t(*best).logpdf(error).mean(), abs=2e-3)
+
+
+def test_the_distance_is_kolmogorovs():
+    values = np.random.default_rng(0).random(300) ** 1.3
+    assert kolmogorov(torch.as_tensor(values)) == pytest.approx(stats.kstest(values, "uniform").statistic)
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.5, 0.9])
+def test_the_effective_size_of_an_autoregression(phi):
+    sizes = [effective_size(torch.as_tensor(autoregressive(gaussian(seed), phi))) for seed in range(20)]
+    assert np.mean(sizes) == pytest.approx(N * (1.0 - phi) / (1.0 + phi), rel=0.2)
+
+
+def test_a_constant_has_as_many_as_it_has():
+    assert effective_size(torch.ones(50, dtype=torch.float64)) == 50.0

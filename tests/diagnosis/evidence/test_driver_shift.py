@@ -1,0 +1,81 @@
+"""A driver shifted in time is no driver, unless it changes so slowly that its timing says nothing."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch import diagnose
+from mkc_torch.diagnosis.evidence.driver_shift import shift_warning, shifted
+from mkc_torch.diagnosis.model.drivers import find_drivers
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.result import DriverShift
+from mkc_torch.diagnosis.search.locate import locate
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.simulation import Magnetometer
+from tests.diagnosis.factory import make_diagnosis
+from tests.simulation.tumbling import tumbling
+
+GAIN = np.array([0.8, -0.6, 0.9])
+
+
+def load(N):
+    time = np.arange(N) / 50.0
+    return np.sin(2.0 * np.pi * time / 3.7) + 0.4 * np.sin(2.0 * np.pi * time / 0.83 + 0.02 * time**2)
+
+
+def found(N, driver, effect="current_field", *, searched=None, **columns):
+    """The shifts of the one effect that is searched, beside a sensor that follows the driver."""
+    recording = tumbling(N, noise=0.4, sensor=GAIN * driver[:, None], attitude=True, gyro=True, **columns)
+    simulation = Magnetometer("attitude")
+    prepared = simulation.prepare(recording)
+    roles = frozenset(role for one in CATALOGUE for role in one.roles)
+    drivers = find_drivers(prepared.recording, simulation.columns, roles).drivers
+    base = fitted(JointModel(prepared), prepared.start())
+    terms = candidate_terms(prepared, drivers, [one for one in CATALOGUE if one.id == (searched or effect)])
+    located = locate(base, terms, level=0.05, surrogates=19, generator=torch.Generator().manual_seed(0))
+    return shifted(base.model, located)
+
+
+def warning(shift):
+    (finding,) = make_diagnosis(1, samples=50).findings
+    return shift_warning(dataclasses.replace(finding, effect="current_field", drivers=("load",), driver_shift=shift))
+
+
+def test_no_shifted_copy_of_a_lively_driver_gains_as_much():
+    N = 2000
+    assert found(N, load(N), current=load(N) + 2.0) == DriverShift(38, 0, pytest.approx(10.0))
+
+
+def test_copies_of_a_ramp_do_as_well_as_the_ramp():
+    N = 2000
+    ramp = np.linspace(0.0, 3.0, N)
+    shift = found(N, ramp, "temperature_offset", temperature=ramp + 25.0)
+    assert shift.as_good > 4
+    (sentence,) = warning(shift)
+    assert f"{shift.as_good} of 38 copies of load, shifted by up to 10 s, gain as much for current_field" in sentence
+
+
+def test_where_there_is_nothing_to_shift_there_is_none():
+    N = 2000
+    step = np.where(np.arange(N) < 900, 0.0, 1.0)
+    assert found(N, step, searched="hard_iron_step", current=load(N) + 2.0) is None
+    short = 390
+    assert found(short, 3.0 * load(short), current=load(short) + 2.0) is None
+
+
+def test_few_copies_are_no_reason_for_a_warning():
+    assert warning(None) == warning(DriverShift(38, 3, 20.0)) == ()
+    assert len(warning(DriverShift(38, 4, 20.0))) == 1
+
+
+def test_a_finding_of_a_diagnosis_has_it():
+    N = 1500
+    recording = tumbling(N, noise=0.4, sensor=GAIN * load(N)[:, None], current=load(N) + 2.0)
+    result = diagnose(Magnetometer(), recording, surrogates=19, max_findings=1)
+    (finding,) = result.findings
+    assert finding.driver_shift.as_good == 0
+    assert not [w for w in result.warnings if "copies" in w]

@@ -1,0 +1,144 @@
+"""Fitted where a driver is low, judged where it is high."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch import diagnose
+from mkc_torch.diagnosis.evidence.extrapolation import extrapolated, extrapolation_warning
+from mkc_torch.diagnosis.model.drivers import find_drivers
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.result import Extrapolation
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.simulation import Magnetometer
+from tests.diagnosis.factory import make_diagnosis
+from tests.simulation.tumbling import FIELD, RESPONSE, tumbling, turns
+
+N = 1500
+TIME = np.arange(N) / 50.0
+LOAD = np.sin(2.0 * np.pi * TIME / 3.7) + 0.4 * np.sin(2.0 * np.pi * TIME / 0.83)
+GAIN = np.array([0.8, -0.6, 0.9])
+EDGE = np.quantile(LOAD, 0.7)  # the extrapolation begins here
+
+
+def outliers(share=0.1):
+    random = np.random.default_rng(3)
+    return 15.0 * random.standard_normal((N, 3)) * (random.random((N, 1)) < share)
+
+
+def both(trace, effect="driver_offset", **columns):
+    """Fits without and with an effect of the first column."""
+    sensor = trace if np.ndim(trace) == 2 else GAIN * trace[:, None]
+    recording = tumbling(N, noise=0.4, sensor=sensor + outliers(), **columns)
+    simulation = Magnetometer(use="norm")
+    prepared = simulation.prepare(recording)
+    driver = find_drivers(prepared.recording, simulation.columns).drivers[0]
+    without = fitted(JointModel(prepared), prepared.start())
+    physics = next(e for e in CATALOGUE if e.id == effect)
+    term = Term(physics, driver, physics.shapes(prepared.time)[0])
+    model = without.model.with_term(term)
+    start = torch.cat([without.parameters, without.parameters.new_zeros(model.size - without.model.size)])
+    return without, fitted(model, start, without.bound)
+
+
+def held_beyond(fits, seed=0):
+    without, fit = fits
+    return extrapolated(without, fit, fit.model.terms[-1], seed)
+
+
+def warning(found):
+    (finding,) = make_diagnosis(1, samples=50).findings
+    finding = dataclasses.replace(finding, effect="driver_offset", drivers=("load",), extrapolation=found)
+    return extrapolation_warning(finding)
+
+
+def test_what_is_in_proportion_throughout_holds_where_the_driver_is_high():
+    found = held_beyond(both(LOAD, load=LOAD))
+    assert found.confidence_interval[0] > 0.2
+    assert found.confidence_interval[0] < found.log_likelihood_gain < found.confidence_interval[1]
+    assert warning(found) == ()
+
+
+def test_what_turns_round_where_the_driver_is_high_does_not():
+    """In proportion to the low values alone; on all samples the effect is still a gain."""
+    trace = np.where(LOAD < EDGE, LOAD, 2.0 * EDGE - LOAD)
+    without, fit = both(trace, load=LOAD)
+    assert fit.log_likelihood > without.log_likelihood + 20.0
+    found = held_beyond((without, fit))
+    assert found.confidence_interval[1] < 0.0
+    (sentence,) = warning(found)
+    assert "driver_offset does not extrapolate" in sentence
+    assert "70 % of samples where load is lowest" in sentence
+
+
+def test_what_is_not_there_is_neither():
+    found = held_beyond(both(np.zeros(N), load=LOAD))
+    assert abs(found.log_likelihood_gain) < 0.02
+    assert warning(found) == ()
+
+
+def test_of_several_columns_what_is_far_from_the_middle_is_high():
+    columns = {f"position_{axis}": np.sin(TIME * (0.7 + 0.4 * k)) for k, axis in enumerate("xyz")}
+    stronger = 0.8 * columns["position_x"] - 0.5 * columns["position_z"]
+    direction = turns(TIME).inv().apply(FIELD / np.linalg.norm(FIELD)) @ RESPONSE.T
+    found = held_beyond(both(stronger[:, None] * direction, "field_gradient", **columns))
+    assert found.confidence_interval[0] > 0.0
+
+
+def test_a_switch_says_nothing():
+    switch = np.where(np.quantile(LOAD, 0.8) < LOAD, 1.0, 0.0)
+    assert held_beyond(both(switch, load=switch)) is None
+
+
+def test_high_values_all_in_one_place_say_nothing():
+    high = np.where(abs(TIME - 11.0) < 1.0, 4.0, 2.5 * np.minimum(np.sin(TIME), 0.0))
+    high += np.where(abs(TIME - 11.0) < 1.0, np.sin(9.0 * TIME), 0.0)
+    assert held_beyond(both(high, load=high)) is None
+
+
+def test_an_effect_without_a_recorded_driver_has_none():
+    without, _ = both(LOAD, load=LOAD)
+    effect = next(e for e in CATALOGUE if e.id == "hard_iron_step")
+    model = without.model.with_term(Term(effect, None, {"onset": 10.0}))
+    fit = fitted(model, torch.cat([without.parameters, torch.zeros(3, dtype=torch.float64)]), without.bound)
+    assert held_beyond((without, fit)) is None
+
+
+def test_it_is_drawn_by_its_seed():
+    fits = both(LOAD, load=LOAD)
+    assert held_beyond(fits, 4) == held_beyond(fits, 4)
+
+
+def test_only_a_clear_failure_is_warned_of():
+    assert warning(None) == ()
+    assert warning(Extrapolation(-0.1, (-0.3, 0.1))) == ()
+    assert len(warning(Extrapolation(-0.2, (-0.3, -0.1)))) == 1
+
+
+@pytest.fixture(scope="module")
+def diagnosis():
+    recording = tumbling(N, noise=0.4, sensor=GAIN * LOAD[:, None] + outliers(), current=LOAD + 2.0)
+    return diagnose(Magnetometer(), recording, surrogates=19, max_findings=1)
+
+
+def test_a_finding_of_a_diagnosis_has_it(diagnosis):
+    (finding,) = diagnosis.findings
+    assert finding.effect == "current_field"
+    assert finding.extrapolation.confidence_interval[0] > 0.0
+    assert not [w for w in diagnosis.warnings if "extrapolate" in w]
+
+
+def test_what_is_found_later_belongs_to_the_model_without_a_finding_too():
+    """A drift that is large where the driver is high would speak for it, or against it."""
+    drift = np.outer(np.maximum(TIME - 15.0, 0.0), [0.5, -0.3, 0.2])
+    ramp = LOAD + 0.1 * TIME
+    recording = tumbling(N, noise=0.3, sensor=GAIN * ramp[:, None] + drift, current=ramp + 2.0)
+    result = diagnose(Magnetometer(), recording, surrogates=19, max_findings=2)
+    assert {finding.effect for finding in result.findings} >= {"current_field"}
+    current = next(finding for finding in result.findings if finding.effect == "current_field")
+    assert len(result.findings) == 2
+    assert current.extrapolation.confidence_interval[0] > 0.0

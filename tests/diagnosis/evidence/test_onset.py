@@ -1,0 +1,93 @@
+"""How surely an onset is known."""
+
+import dataclasses
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mkc_torch import diagnose
+from mkc_torch.diagnosis.evidence.onset import _CRITICAL, onset_interval
+from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
+from mkc_torch.diagnosis.linearised.linearise import linearise
+from mkc_torch.diagnosis.linearised.tangents import tangents_of
+from mkc_torch.diagnosis.model.fit import fitted, fitted_beside
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.simulation import Magnetometer
+from tests.simulation.tumbling import RATE, tumbling
+
+N, PLACE = 800, 450
+TRUE = (PLACE - 0.5) / RATE
+STEP = next(effect for effect in CATALOGUE if effect.id == "hard_iron_step")
+CUBIC = next(effect for effect in CATALOGUE if effect.id == "cubic_nonlinearity")
+
+
+def interval(size, seed, *, spoilt=(0, 0), effect=STEP, shape=None):
+    """That of a step found where it is, beside noise of 0.5 µT."""
+    random = np.random.default_rng(seed)
+    sensor = size * np.array([0.8, -0.6, 0.4]) * (np.arange(N) >= PLACE)[:, None]
+    sensor[slice(*spoilt)] += 4000.0 * random.choice([-1.0, 1.0], (spoilt[1] - spoilt[0], 3))
+    recording = tumbling(N, noise=0.5, sensor=sensor, seed=seed, attitude=True)
+    prepared = Magnetometer("attitude").prepare(recording)
+    base = fitted(JointModel(prepared), prepared.start())
+    model = base.model.with_term(Term(effect, None, {"onset": TRUE} if shape is None else shape))
+    start = base.parameters.new_zeros(model.size)
+    start[: len(base.parameters)] = base.parameters
+    best = fitted_beside(base, model, start)
+    tangents = tangents_of(best.model, best.parameters, best.model.terms)
+    tangents = dataclasses.replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
+    pseudo, counts = best.pseudo
+    without = pseudo - counts * (tangents.candidates[0] @ best.parameters[base.model.size :])
+    search = linearise(base.model, best.parameters[: base.model.size], without, counts, tangents)
+    return onset_interval(
+        base.model, SimpleNamespace(fit=best, tangents=tangents, counts=counts, linearised=search)
+    )  # fmt: skip
+
+
+def test_the_interval_holds_the_onset_about_as_often_as_it_says():
+    found = [interval(0.5, seed) for seed in range(25)]
+    assert sum(low <= TRUE <= high for low, high in found) >= 22
+    width = np.median([high - low for low, high in found])
+    assert 5.0 / RATE < width < 0.25 * N / RATE
+
+
+def test_a_larger_step_is_known_better():
+    widths = [np.median([np.subtract(*interval(size, seed)[::-1]) for seed in range(3)]) for size in (0.4, 1.2, 6.0)]
+    assert widths[0] > 2.0 * widths[1] > 2.0 * widths[2]
+    assert widths[2] <= 4.0 / RATE
+
+
+def test_an_onset_in_a_burst_of_outliers_may_be_anywhere_in_it():
+    low, high = interval(3.0, 0, spoilt=(PLACE - 25, PLACE + 25))
+    assert low <= (PLACE - 24) / RATE
+    assert high >= (PLACE + 24) / RATE
+    assert high - low < 1.5
+
+
+def test_what_does_not_begin_has_none():
+    assert interval(1.0, 0, effect=CUBIC, shape={}) is None
+
+
+def test_the_critical_value_is_that_of_a_change_point():
+    random = np.random.default_rng(0)
+    draws, half, size = 4000, 3000, 0.1
+    # twice the log-likelihood ratio along the onsets to one side, of a small change in white noise
+    sides = [
+        (2.0 * size * random.standard_normal((draws, half)) - size**2).cumsum(1).max(1).clip(min=0.0)
+        for _ in range(2)
+    ]  # fmt: skip
+    assert np.mean(np.maximum(*sides) <= _CRITICAL) == pytest.approx(0.95, abs=0.01)
+
+
+def test_a_diagnosis_tells_it():
+    sensor = np.array([1.6, -1.2, 0.8]) * (np.arange(2000) >= 900)[:, None]
+    diagnosis = diagnose(Magnetometer(), tumbling(2000, noise=0.5, sensor=sensor))
+    (finding,) = diagnosis.findings
+    low, high = finding.onset_interval
+    assert low <= 899.5 / RATE <= high
+    assert low <= finding.onset <= high
+    assert high - low < 2.0
+    assert json.loads(diagnosis_to_json(diagnosis))["findings"][0]["onset_interval"] == [low, high]

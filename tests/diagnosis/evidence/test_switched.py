@@ -1,0 +1,61 @@
+"""Whether a step lasts or comes and goes."""
+
+import pytest
+import torch
+
+from mkc_torch import Recording, diagnose
+from mkc_torch.diagnosis.evidence.switched import comes_and_goes, memory_of
+from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
+from mkc_torch.simulation import Magnetometer
+
+N, ONSET = 3000, 1000
+TIME = torch.arange(N, dtype=torch.float64)
+
+
+def gain_of(course, size, phi=0.0, seed=0):
+    """Of a step of this size after the onset, in noise of one with this memory that is taken for white."""
+    generator = torch.Generator().manual_seed(seed)
+    white = torch.randn(N, generator=generator, dtype=torch.float64) * (1.0 - phi**2) ** 0.5
+    noise = white.clone()
+    for k in range(1, N):
+        noise[k] += phi * noise[k - 1]
+    step = size * (TIME >= ONSET).double()
+    error = noise + size * course
+    return 0.5 * (error.square() - (error - step).square())
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize(("size", "phi"), [(3.0, 0.0), (0.15, 0.0), (3.0, 0.9), (0.7, 0.9)])
+def test_a_step_that_lasts_does_not_come_and_go(size, phi, seed):
+    gain = gain_of((TIME >= ONSET).double(), size, phi, seed)
+    assert not comes_and_goes(gain, TIME, float(ONSET), memory_of([torch.tensor([phi], dtype=torch.float64)]))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("size", "phi"), [(3.0, 0.0), (1.0, 0.0), (3.0, 0.9)])
+def test_what_is_switched_comes_and_goes(size, phi, seed):
+    switched = (TIME >= ONSET).double() * (torch.sin((TIME - ONSET) / 100.0) >= -0.3).double()
+    gain = gain_of(switched, size, phi, seed)
+    assert comes_and_goes(gain, TIME, float(ONSET), memory_of([torch.tensor([phi], dtype=torch.float64)]))
+
+
+@pytest.mark.parametrize("lasts", [True, False])
+def test_a_diagnosis_says_which_of_the_two_its_step_is(lasts):
+    generator = torch.Generator().manual_seed(2)
+    time = 0.02 * torch.arange(2000, dtype=torch.float64)
+    turn = torch.stack([torch.sin(0.9 * time), torch.cos(1.3 * time), torch.sin(1.7 * time + 1.0)], -1)
+    field = 50.0 * turn / torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
+    on = (time >= 12.0) & (lasts | (torch.sin(0.8 * (time - 12.0)) >= -0.5))
+    offset = on.double().unsqueeze(-1) * torch.tensor([4.0, -3.0, 5.0], dtype=torch.float64)
+    readings = field + offset + 0.3 * torch.randn(2000, 3, generator=generator, dtype=torch.float64)
+    columns = dict(zip(("mag_x", "mag_y", "mag_z"), readings.unbind(-1), strict=True))
+    options = {"effects": (HardIronStep(),), "max_findings": 1, "surrogates": 19}
+    (finding,) = diagnose(Magnetometer(), Recording({"time": time, **columns}), **options).findings
+    assert finding.effect == "hard_iron_step"
+    assert finding.comes_and_goes == (not lasts)
+
+
+def test_memory_is_the_long_run_variance_over_the_variance():
+    assert memory_of([]) == 1.0
+    assert memory_of([torch.tensor([0.9], dtype=torch.float64)]) == pytest.approx(19.0, rel=1e-3)
+    assert memory_of([torch.tensor([-0.5]), torch.tensor([0.5])]) == pytest.approx(3.0, rel=1e-3)

@@ -1,0 +1,269 @@
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("jsonschema")
+
+from mkc_torch.diagnosis.files.diagnosis_json import DiagnosisFileError, diagnosis_to_json, json_schema, validate
+from mkc_torch.diagnosis.result import (
+    DensityCheck,
+    DriverShift,
+    Extrapolation,
+    HeldOut,
+    Parameter,
+    Reference,
+    Region,
+)
+from tests.diagnosis.factory import make_diagnosis
+
+
+def written(diagnosis):
+    return json.loads(diagnosis_to_json(diagnosis))
+
+
+def with_finding(diagnosis, **changes):
+    first, *rest = diagnosis.findings
+    return dataclasses.replace(diagnosis, findings=(dataclasses.replace(first, **changes), *rest))
+
+
+@pytest.fixture
+def content():
+    return written(make_diagnosis(3))
+
+
+@pytest.mark.parametrize("findings", [0, 1, 2, 3])
+@pytest.mark.parametrize("channels", [1, 4])
+def test_diagnoses_of_every_size_are_written(findings, channels):
+    content = written(make_diagnosis(findings, channels=channels, samples=300))
+    assert content["schema"] == "mkc-diagnosis/1"
+    assert len(content["findings"]) == findings
+    assert len(content["noise"]["sigma"]) == channels
+
+
+def test_keys_are_those_of_the_format(content):
+    assert set(content) == {
+        "schema", "recording", "simulation", "samples", "level", "p_value", "noise", "search", "verdict", "findings",
+        "baseline", "corrected", "ceiling", "advice", "warnings",
+    }  # fmt: skip
+    assert set(content["search"]) == {"candidates", "surrogates", "seed"}
+    assert set(content["findings"][0]) == {
+        "effect", "drivers", "channels", "intervals", "onset", "equation", "explanation", "parameters", "p_value",
+        "held_out", "held_out_note", "alternatives", "plausible", "plausibility", "advice",
+    }  # fmt: skip
+    assert set(content["baseline"]) == {"log_likelihood", "rmse", "sigma", "d"}
+
+
+def test_the_ceiling_is_written_as_the_other_models_are():
+    diagnosis = make_diagnosis(1, channels=4)
+    told = written(diagnosis)["ceiling"]
+    assert told["rmse"] == diagnosis.ceiling.rmse
+    assert told["log_likelihood"] == diagnosis.ceiling.log_likelihood
+    assert len(told["sigma"]) == len(told["d"]) == 4
+
+
+def test_what_is_for_the_report_alone_is_not_written():
+    diagnosis = with_finding(make_diagnosis(1), extrapolation=Extrapolation(0.2, (0.1, 0.3)))
+    assert written(diagnosis) == written(make_diagnosis(1))
+
+
+def test_the_region_and_the_experiments_are_written_where_there_are_any():
+    region = Region("level", "cm", "above", 14.2, 0.91, 0.1)
+    (finding,) = written(with_finding(make_diagnosis(1), region=region, experiments=(0.25, 0.75)))["findings"]
+    assert finding["region"] == dataclasses.asdict(region)
+    assert finding["experiments"] == [0.25, 0.75]
+    (without,) = written(make_diagnosis(1))["findings"]
+    assert "region" not in without
+    assert "experiments" not in without
+
+
+def test_what_shifted_copies_of_a_driver_gain_is_written():
+    (finding,) = written(with_finding(make_diagnosis(1), driver_shift=DriverShift(38, 2, 22.5)))["findings"]
+    assert finding["driver_shift"] == {"copies": 38, "as_good": 2, "reach": 22.5}
+    assert "driver_shift" not in written(make_diagnosis(1))["findings"][0]
+
+
+def test_what_an_equation_needs_is_written():
+    parameter = Parameter("gradient", (1.0, -2.0), (0.1, 0.2), "µT/m", ("∂B_x/∂y", "∂B_x/∂z"))
+    changes = {
+        "parameters": (parameter,), "moments": (61.1, 77.8), "advice": "Do it.",
+        "references": (Reference("current", 10.5, "A"),), "comes_and_goes": True,
+    }  # fmt: skip
+    (finding,) = written(with_finding(make_diagnosis(1), **changes))["findings"]
+    assert finding["parameters"][0]["components"] == ["∂B_x/∂y", "∂B_x/∂z"]
+    assert finding["moments"] == [61.1, 77.8]
+    assert finding["references"] == [{"column": "current", "value": 10.5, "unit": "A"}]
+    assert finding["advice"] == "Do it."
+    assert finding["comes_and_goes"] is True
+    bare = dict.fromkeys(("moments", "references"), ()) | {"advice": ""}
+    assert not {"moments", "references", "advice"} & set(
+        written(with_finding(make_diagnosis(1), **bare))["findings"][0]
+    )
+
+
+def test_the_noise_s_units_and_its_density_s_distances_are_written():
+    made = make_diagnosis(1)
+    check = DensityCheck("norm", 0.02, 0.03, 4.0, 0.05, False)
+    noise = dataclasses.replace(made.noise, units={"wander": "µT"}, unit="µT", checks=(check,))
+    told = written(dataclasses.replace(made, noise=noise))["noise"]
+    assert (told["unit"], told["units"]) == ("µT", {"wander": "µT"})
+    assert told["density_check"] == [
+        {
+            "channel": "norm", "distance": 0.02, "student_t_distance": 0.03, "degrees_of_freedom": 4.0,
+            "allowed": 0.05,
+        }
+    ]  # fmt: skip
+
+
+def test_components_are_as_many_as_the_numbers():
+    parameter = Parameter("gradient", (1.0, -2.0, 3.0), None, "µT/m", ("a", "b"))
+    with pytest.raises(DiagnosisFileError, match=r"parameters\.0\.components` are not as many as the numbers"):
+        diagnosis_to_json(with_finding(make_diagnosis(1), parameters=(parameter,)))
+
+
+def test_a_region_of_another_kind_is_refused(content):
+    content["findings"][0]["region"] = dataclasses.asdict(Region("level", "cm", "beside", 14.2, 0.91, 0.1))
+    with pytest.raises(DiagnosisFileError, match=r"findings\.0\.region\.kind"):
+        validate(content)
+
+
+def test_numbers_round_trip_exactly():
+    values = (0.1 + 0.2, 1e-300, -math.pi)
+    errors = ((1 / 3, 2 / 3), (1e22, 5e-324))
+    parameters = (Parameter("a", values, None, ""), Parameter("b", ((1.5, 2.5), (3.5, 4.5)), errors, "µT"))
+    content = written(with_finding(make_diagnosis(1), parameters=parameters, onset=0.1 + 0.7))
+    first, second = content["findings"][0]["parameters"]
+    assert first["value"] == list(values)
+    assert first["standard_error"] is None
+    assert second["standard_error"] == [list(row) for row in errors]
+    assert content["findings"][0]["onset"] == 0.1 + 0.7
+
+
+def test_numpy_numbers_are_numbers():
+    parameter = Parameter("a", np.float64(0.3), np.float64("nan"), "")
+    (told,) = written(with_finding(make_diagnosis(1), parameters=(parameter,)))["findings"][0]["parameters"]
+    assert told["value"] == 0.3
+    assert told["standard_error"] is None
+
+
+def test_what_is_not_known_is_null_and_a_gaussian_bandwidth_is_inf(content):
+    assert content["corrected"]["sigma"] == ["inf"]
+    assert content["findings"][1]["held_out"] is None
+    assert content["findings"][1]["held_out_note"].startswith("The event")
+    diagnosis = make_diagnosis(1, ceiling=None)
+    errors = Parameter("a", (1.0, 2.0), (math.nan, 0.1), "")
+    held_out = HeldOut(0.1, (-math.inf, 0.2), 1.0, 0.9, "µT")
+    (rival, *_) = diagnosis.findings[0].alternatives
+    gap = dataclasses.replace(rival, log_likelihood_gap=math.inf)
+    told = written(with_finding(diagnosis, parameters=(errors,), held_out=held_out, alternatives=(gap,)))
+    (finding,) = told["findings"]
+    assert told["ceiling"] is None
+    assert finding["parameters"][0]["standard_error"] == [None, 0.1]
+    assert finding["held_out"]["confidence_interval"] == [None, 0.2]
+    assert finding["alternatives"][0]["log_likelihood_gap"] is None
+
+
+def test_numbers_that_are_not_finite_are_refused_with_their_place():
+    bad = Parameter("a", (1.0, math.nan), None, "")
+    with pytest.raises(DiagnosisFileError, match=r"`findings\.0\.parameters\.0\.value\.1` is nan"):
+        diagnosis_to_json(with_finding(make_diagnosis(1), parameters=(bad,)))
+    with pytest.raises(DiagnosisFileError, match="`p_value` is nan"):
+        diagnosis_to_json(make_diagnosis(1, p_value=math.nan))
+
+
+def test_missing_evidence_needs_its_reason():
+    with pytest.raises(DiagnosisFileError, match="held_out_note"):
+        diagnosis_to_json(with_finding(make_diagnosis(1), held_out=None, held_out_note=""))
+
+
+def test_a_verdict_agrees_with_its_findings():
+    with pytest.raises(DiagnosisFileError, match="findings"):
+        diagnosis_to_json(make_diagnosis(1, verdict="adequate"))
+    with pytest.raises(DiagnosisFileError, match="findings"):
+        diagnosis_to_json(make_diagnosis(0, verdict="explained"))
+    assert written(make_diagnosis(0, verdict="unexplained"))["findings"] == []
+    assert len(written(make_diagnosis(2, verdict="unexplained"))["findings"]) == 2
+
+
+BAD = [
+    (("schema",), "mkc-diagnosis/2"),
+    (("verdict",), "perhaps"),
+    (("p_value",), 1.5),
+    (("p_value",), None),
+    (("level",), 0.0),
+    (("samples",), -1),
+    (("samples",), 3.5),
+    (("samples",), True),
+    (("noise", "model"), "pink"),
+    (("noise", "sigma"), [0.0]),
+    (("noise", "sigma"), ["infinite"]),
+    (("noise", "parameters"), {"phi": "0.3"}),
+    (("search", "seed"), "0"),
+    (("baseline", "rmse"), -1.0),
+    (("ceiling",), [0.1, 0.2]),
+    (("ceiling", "rmse"), -1.0),
+    (("warnings",), "one sentence"),
+    (("findings", 0, "effect"), "Hard iron"),
+    (("findings", 0, "drivers"), "current"),
+    (("findings", 0, "onset"), "41 s"),
+    (("findings", 0, "intervals"), [[1.0]]),
+    (("findings", 0, "intervals"), [[1.0, 2.0, 3.0]]),
+    (("findings", 0, "intervals"), [[2.0, 1.0]]),
+    (("findings", 0, "parameters", 0, "standard_error"), [0.1, 0.1]),
+    (("findings", 0, "parameters", 0, "standard_error"), 0.1),
+    (("findings", 0, "parameters", 0, "standard_error"), [0.1, 0.1, -0.1]),
+    (("findings", 0, "held_out", "confidence_interval"), [0.1]),
+    (("findings", 0, "alternatives", 0, "separable"), "yes"),
+    (("findings", 0, "plausible"), 1),
+]
+
+
+@pytest.mark.parametrize(("path", "value"), BAD, ids=[f"{'.'.join(map(str, p))}={v!r}" for p, v in BAD])
+def test_bad_content_is_refused(content, path, value):
+    *above, key = path
+    place = content
+    for step in above:
+        place = place[step]
+    place[key] = value
+    with pytest.raises(DiagnosisFileError, match="this is no diagnosis: "):
+        validate(content)
+
+
+@pytest.mark.parametrize("path", [(), ("noise",), ("search",), ("findings", 0), ("findings", 0, "parameters", 0)])
+def test_missing_and_unknown_keys_are_refused(content, path):
+    place = content
+    for step in path:
+        place = place[step]
+    place["more"] = 1
+    with pytest.raises(DiagnosisFileError, match="'more' was unexpected"):
+        validate(content)
+    del place["more"]
+    del place[next(iter(place))]
+    with pytest.raises(DiagnosisFileError, match="is a required property"):
+        validate(content)
+
+
+def test_effects_of_the_users_own_are_allowed(content):
+    content["findings"][0]["effect"] = "my_magnet2"
+    validate(content)
+
+
+def test_the_schema_is_a_schema():
+    from jsonschema import Draft202012Validator
+
+    assert json_schema()["$schema"] == Draft202012Validator.META_SCHEMA["$id"]
+    Draft202012Validator.check_schema(json_schema())
+
+
+def test_text_stays_readable():
+    text = diagnosis_to_json(make_diagnosis(1))
+    assert "µT" in text
+    assert "[3.2137, -1.1042, 0.3251]" in text
+    assert text.endswith("}\n")
+
+
+def test_texts_from_files_are_kept_as_they_are():
+    name = 'a "b" [1,\n 2] \\ <c> {d}'
+    assert written(make_diagnosis(0, recording=name, warnings=(name, "")))["recording"] == name

@@ -1,0 +1,149 @@
+"""Lines of Python that effects write are what the effects do."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from mkc_torch import Recording
+from mkc_torch.diagnosis import DiagnosedModel
+from mkc_torch.diagnosis.files.python_source import SourceError
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.effects import DYNAMICS
+from mkc_torch.effects.base import CodedEffect
+from mkc_torch.effects.context import Context
+from mkc_torch.effects.courses import lagged
+from mkc_torch.effects.dynamics.backlash import played
+from mkc_torch.effects.dynamics.rate import beyond
+from mkc_torch.effects.dynamics.thermal_loss import ThermalLoss
+from mkc_torch.effects.paired.between import shifted
+from mkc_torch.effects.share import soft_clip
+from mkc_torch.simulation import Dynamics
+
+N = 200
+NAMES = ("speed", "angle", "other", "load", "rate")
+EXPRESSIONS = {
+    "own": "x.speed", "position": "x.angle", "angle": "x.angle", "deflection": "x.angle", "other": "x.other",
+    "load": "x.load", "zero": "0.0", "rate": "x.rate", "memory": "x.memory",
+}  # fmt: skip
+PARTS = {
+    "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "other": "other", "load": "load",
+    "temperature": "speed", "reversing": "speed", "level": "speed", "rate": "rate",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("effect", DYNAMICS, ids=lambda e: e.id)
+def test_the_line_is_the_change(effect):
+    assert isinstance(effect, CodedEffect)
+    time = torch.arange(N, dtype=torch.float64) / 10.0
+    signal = torch.stack([torch.sin((k + 1) * time + k) for k in range(5)], -1)
+    outputs = effect.port == "output"
+    channels = ("speed",) if outputs or effect.port != "exchange" else ("speed", "other")
+    carried = signal[:, :1] if outputs else signal
+    if effect.port == "hysteretic rate":
+        carried = torch.cat([signal, torch.cos(time).unsqueeze(-1)], -1)  # its internal state is solved for
+    seen = Context(time, time.new_zeros(N, 0), (), carried, "", channels, () if outputs else NAMES, PARTS)
+    shape = effect.shapes(time)[-1]
+    size = sum(q.size for q in effect.quantities(shape, seen))
+    gamma = torch.linspace(0.3, 0.7, size, dtype=torch.float64)
+    names = {"speed": "x.speed"} if outputs else EXPRESSIONS
+    x = SimpleNamespace(**dict(zip(NAMES, signal.unbind(-1), strict=True)), memory=torch.cos(time))
+    known = {"x": x, "torch": torch, "time": time, "run": torch.zeros(N, dtype=torch.long)}
+    known |= {"lagged": lagged, "shifted": shifted, "played": played, "soft_clip": soft_clip, "beyond": beyond}
+    written = [eval(line, known) + torch.zeros_like(time) for line in effect.code(gamma.tolist(), shape, names)]
+    torch.testing.assert_close(torch.stack(written, -1), effect.change(gamma, shape, seen), rtol=1e-9, atol=1e-9)
+
+
+class Vessel(Dynamics):
+    states = ("level",)
+    parameters = {"drain": 0.5}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return (-p.drain * x.level,)
+
+
+def model(effect, source):
+    theta, gamma = torch.tensor([0.25, 1.0]).double(), torch.tensor([0.125]).double()
+    return DiagnosedModel("Vessel", {}, theta, [Term(effect, None, {}, "rate of level")], [gamma], source)
+
+
+def test_what_a_person_reads():
+    text = model(ThermalLoss(), Vessel()).to_python("vessels")
+    assert text.count("\n") < 30
+    for line in (
+        "from vessels import Vessel",
+        '"drain": 0.25,',
+        "# thermal_loss: δṪ",
+        "class CorrectedVessel(Vessel):",
+    ):
+        assert line in text
+    compile(text, "corrected.py", "exec")
+
+
+def test_what_cannot_be_written_out():
+    with pytest.raises(SourceError, match="give its simulation with `simulation=`"):
+        model(ThermalLoss(), None).to_python()
+
+    class Silent(ThermalLoss):
+        id = "silent"
+        code = None
+
+    with pytest.raises(SourceError, match="silent cannot be written out as Python: it has no `code` method"):
+        model(Silent(), Vessel()).to_python()
+
+
+class Cart(Dynamics):
+    """What all five effects can act on: pushed and pulled by a known force, and free to move across it."""
+
+    states = ("height", "side", "speed", "drift")
+    inputs = ("push",)
+    parameters = {"damping": 0.3}  # noqa: RUF012
+    units = {"height": "m", "side": "m", "speed": "m/s", "drift": "m/s", "push": "m/s²"}  # noqa: RUF012
+    step = 0.05
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return [x.speed, x.drift, u.push - 4.0 * x.height - p.damping * x.speed, -3.0 * x.side - 0.2 * x.drift]
+
+
+PLACES = {
+    "backlash": ("input push", {"half_gap": 0.3}),
+    "bouc_wen_hysteresis": ("hysteretic rate of speed", {"yield_deflection": 0.2}),
+    "added_mass": ("rate of speed", {}),
+    "load_dependent_friction": ("loaded rate of speed", {"width": 0.05}),
+    "buoyancy": ("rate of speed", {"surface": 0.1, "draught": 0.3}),
+    "magnus_lift": ("exchange of speed and drift", {}),
+    "input_delay": ("input push", {"delay": 0.23}),
+    "sensor_lag": ("output", {"lag": 0.17}),
+}
+
+
+def carts():
+    """Two runs on one clock that goes on, the second as if nothing had been before."""
+    time = torch.arange(120, dtype=torch.float64) * 0.05
+    half = torch.arange(2).repeat_interleave(60).double()
+    push = torch.where(half == 0, 1.5 + torch.sin(3.0 * time), torch.cos(4.0 * time) - 1.0)
+    columns = {"time": time, "push": push, "height": 0.3 * torch.sin(2.0 * time), "side": 0.2 * torch.cos(time)}
+    return Recording({**columns, "experiment": half})
+
+
+@pytest.mark.parametrize("names", [(name,) for name in PLACES] + [tuple(PLACES)], ids="+".join)
+def test_the_corrected_class_simulates_what_the_model_does(names):
+    effects = {effect.id: effect for effect in DYNAMICS}
+    recording = carts()
+    prepared = Cart().prepare(recording)
+    terms = [Term(effects[name], None, PLACES[name][1], PLACES[name][0]) for name in names]
+    joint = JointModel(prepared, terms)
+    theta = torch.tensor([0.25, 0.3, 0.2, 0.1, 0.0, -0.1, 0.2, 0.0, 0.3], dtype=torch.float64)
+    gammas = [torch.full((size,), 0.4, dtype=torch.float64) for size in joint.sizes]
+    text = DiagnosedModel("Cart", prepared.state, theta, terms, gammas, Cart()).to_python("carts")
+    compile(text, "corrected.py", "exec")
+    known = {"Cart": Cart}
+    exec(text.replace("from carts import Cart", ""), known)
+    again = known["CorrectedCart"]().prepare(recording)
+    starts = theta[1:].unflatten(0, (2, 4))
+    memory = starts.new_zeros(2, len(again.system.states) - 4)
+    whole = torch.cat([theta[:1], torch.cat([starts, memory], -1).flatten()])
+    with_it = joint.residual(torch.cat([theta, *gammas]))
+    torch.testing.assert_close(again.residual(whole, {}), with_it, rtol=0.0, atol=1e-7)
+    assert float((with_it - prepared.residual(theta, {})).abs().max()) > 1e-3

@@ -1,0 +1,114 @@
+"""What to do about a diagnosis."""
+
+import dataclasses
+
+import pytest
+
+from mkc_torch.diagnosis.findings.advice import advice_of
+from mkc_torch.diagnosis.result import Alternative
+from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
+from mkc_torch.effects.sensor.offset_drift import OffsetDrift
+from tests.diagnosis.factory import make_diagnosis
+
+
+def advised(findings=1, *, alternatives=(), **changes):
+    """The sentences for a diagnosis whose first finding has these rivals."""
+    made = make_diagnosis(findings, samples=50, **changes)
+    first, *rest = made.findings
+    first = dataclasses.replace(first, alternatives=alternatives)
+    return advice_of(dataclasses.replace(made, findings=(first, *rest)))
+
+
+def test_each_effect_s_own_advice_is_told_and_nothing_against_it():
+    step, model = advised(1)
+    assert step == "Look for what changed at that time; use the calibration from after the step."
+    assert model.startswith("The model found here corrects for hard_iron_step")
+    several = advised(2)
+    assert several[0] == (
+        "hard_iron_step: look for what changed at that time; use the calibration from after the step."
+    )
+    assert several[1] == "current_field: move the sensor away from the power wires."
+
+
+def test_what_belongs_to_the_place_is_not_for_other_recordings():
+    made = make_diagnosis(1, samples=50)
+    placed = dataclasses.replace(made.findings[0], placed=True, alternatives=())
+    (only,) = advice_of(dataclasses.replace(made, findings=(placed,)))
+    assert "model found here" not in only
+
+
+def test_what_comes_and_goes_is_to_be_looked_for_and_not_corrected():
+    made = make_diagnosis(1, samples=50)
+    switched = dataclasses.replace(made.findings[0], comes_and_goes=True, alternatives=())
+    (only,) = advice_of(dataclasses.replace(made, findings=(switched,)))
+    assert only.startswith("Look for something that is switched on and off")
+
+
+def test_a_step_and_a_drift_are_told_apart_by_another_recording():
+    drift = Alternative("offset_drift", (), 0.4, False, again=OffsetDrift.again)
+    sentence = advised(1, alternatives=(drift,))[1]
+    assert sentence == (
+        "To tell hard_iron_step from offset_drift, record again: a step does not come at the same moment again; a "
+        "warm-up comes again after a cold start."
+    )
+    assert "hold the other" not in sentence
+
+
+def test_an_event_and_a_column_are_told_apart_by_another_course_of_the_column():
+    current = Alternative("current_field", ("current",), 0.4, False)
+    assert advised(1, alternatives=(current,))[1] == (
+        "To tell hard_iron_step from current_field (current), record again: a step does not come at the same moment "
+        "again; what follows current goes along with it, so let that change at other times."
+    )
+
+
+@pytest.mark.parametrize(
+    ("rival", "how"),
+    [
+        (Alternative("temperature_offset", ("temperature",), 0.4, False), "change one and hold the other."),
+        (Alternative("driver_linear", ("current",), 0.4, False), "record again with current over a wider range."),
+        (Alternative("linear_drag", (), 0.4, False, "rate of speed"), "so let that change at other times."),
+    ],
+)
+def test_two_columns_are_told_apart_by_changing_one(rival, how):
+    made = make_diagnosis(2, samples=50)
+    current = dataclasses.replace(made.findings[1], alternatives=(rival,))
+    assert advice_of(dataclasses.replace(made, findings=(current,)))[1].endswith(how)
+
+
+def test_forces_are_told_apart_at_other_speeds():
+    made = make_diagnosis(1, samples=50)
+    rival = Alternative("stribeck_friction", (), 0.4, False, "rate of speed")
+    first = dataclasses.replace(made.findings[0], effect="coulomb_friction", again="", alternatives=(rival,))
+    assert advice_of(dataclasses.replace(made, findings=(first,)))[1] == (
+        "To tell coulomb_friction from stribeck_friction, record again at other speeds, loads and amplitudes."
+    )
+
+
+def test_what_is_not_confirmed_is_not_to_be_corrected():
+    sentences = " ".join(advised(3))
+    assert "Do not correct for the curve along temperature yet" in sentences
+    assert "with temperature over a wider range" in sentences
+
+
+def test_where_nothing_shows_the_simulation_is_to_be_used():
+    assert advice_of(make_diagnosis(0, samples=50)) == (
+        "Use the simulation as it is, within what this recording covers.",
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"p_value": 0.04}, "Record again, for longer"),
+        ({"verdict": "unexplained"}, "Record again, for longer"),
+        ({"remaining": ("load", "rpm")}, "Find out what else goes along with load, rpm"),
+    ],
+)
+def test_where_something_shows_it_is_not(changes, told):
+    (sentence,) = advice_of(make_diagnosis(0, samples=50, **changes))
+    assert sentence.startswith(told)
+
+
+def test_effects_of_the_catalogue_say_what_another_recording_shows():
+    assert HardIronStep.again != OffsetDrift.again

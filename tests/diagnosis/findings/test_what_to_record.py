@@ -1,0 +1,59 @@
+"""What to record to tell two effects apart, by the tangents of a recording in which they go along with one another."""
+
+import numpy as np
+import pytest
+
+from mkc_torch import diagnose
+from mkc_torch.diagnosis.findings.advice import advice_of
+from mkc_torch.diagnosis.findings.what_to_record import SAME
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.simulation import Magnetometer
+from tests.simulation.tumbling import tumbling
+
+N = 2000
+TIME = np.arange(N) / 50.0
+CURRENT = 1.5 * np.sin(2.0 * np.pi * TIME / 9.0)
+EFFECTS = [effect for effect in CATALOGUE if effect.id in ("current_field", "temperature_offset")]
+
+
+def diagnosed(temperature, current=CURRENT):
+    """The field of a current that the temperature goes along with; and its rival."""
+    sensor = np.outer(current, [0.15, -0.12, 0.12])
+    recording = tumbling(N, noise=0.4, sensor=sensor, current=current, temperature=20.0 + temperature)
+    result = diagnose(Magnetometer("norm"), recording, effects=EFFECTS, surrogates=19, max_findings=1)
+    (finding,) = result.findings
+    return result, finding.alternatives[0]
+
+
+def more(told):
+    return float(told.split(" times as many samples")[0].split()[-1])
+
+
+def test_the_state_in_which_they_part_is_told():
+    """The temperature follows the current but for its highest values, which are short."""
+    current = 1.5 * np.sin(2.0 * np.pi * TIME / 9.0) ** 3
+    result, rival = diagnosed(np.minimum(current, 1.1), current)
+    assert not rival.separable
+    assert "those while temperature is above 20.3" in rival.told_by
+    assert "°C do it best" in rival.told_by
+    assert more(rival.told_by) > 1.0
+    assert any(rival.told_by in sentence for sentence in advice_of(result))
+
+
+def test_what_goes_the_same_way_cannot_be_told_by_more_of_it():
+    result, rival = diagnosed(2.0 * CURRENT)
+    assert (rival.separable, rival.told_by) == (False, SAME)
+    assert any(SAME in sentence for sentence in result.advice)
+
+
+def test_the_less_they_part_the_more_it_takes():
+    far, near = (diagnosed(CURRENT + apart * np.sin(2.0 * np.pi * TIME / 4.3))[1] for apart in (0.25, 0.1))
+    assert not far.separable
+    assert not near.separable
+    # what tells them apart goes with the square of how far they part
+    assert more(near.told_by) / more(far.told_by) == pytest.approx(6.25, rel=0.35)
+
+
+def test_of_what_is_told_apart_nothing_is_to_be_recorded():
+    _, rival = diagnosed(CURRENT + 0.6 * np.sin(2.0 * np.pi * TIME / 4.3))
+    assert (rival.separable, rival.told_by) == (True, "")

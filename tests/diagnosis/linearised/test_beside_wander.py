@@ -1,0 +1,217 @@
+"""Residuals are judged by their distance from the wander: bursts are rejected, excursions of the wander are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch.diagnosis.linearised.beside_wander import beside_wander
+from mkc_torch.diagnosis.linearised.linearise import linearise
+from mkc_torch.diagnosis.linearised.tangents import tangents_of
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.noise.bursts import of_all, out_of_bursts, together
+from mkc_torch.simulation import Magnetometer
+from tests.diagnosis.line import Line
+from tests.simulation.tumbling import RATE, tumbling, turns
+
+N = 2000
+BURSTS = [(300, 12), (900, 15), (1500, 10)]
+
+
+def walk(steps, seed=5):
+    """A random walk on each axis, less its mean, in µT."""
+    course = np.cumsum(np.random.default_rng(seed).standard_normal((N, 3)), 0) * np.asarray(steps)
+    return course - course.mean(0)
+
+
+def local_of(sensor, use, noise=0.3):
+    prepared = Magnetometer(use).prepare(tumbling(N, noise=noise, sensor=sensor, attitude=True, gyro=True))
+    model = JointModel(prepared)
+    fit = fitted(model, prepared.start())
+    tangents = tangents_of(model, fit.parameters)
+    return fit, tangents, beside_wander(fit, model, fit.parameters, tangents)
+
+
+@pytest.mark.parametrize("use", ["norm", "attitude"])
+def test_excursions_of_a_wander_count(use):
+    _, _, local = local_of(walk([0.05, 0.05, 0.05]), use)
+    assert float(local.counts.mean()) > 0.98
+
+
+def test_bursts_beside_a_wander_do_not_count():
+    """They are smaller than the wander's excursions: the plain fit lets most of them through."""
+    burst = np.zeros((N, 3))
+    for start, length in BURSTS:
+        burst[start : start + length] = [3.5, 3.5, 3.5]
+    fit, _, local = local_of(walk([0.05, 0.05, 0.05]) + burst, "attitude")
+    hit = torch.zeros(N, dtype=torch.bool)
+    for start, length in BURSTS:
+        hit[start : start + length] = True
+
+    def rejected(counts):
+        return float((counts[hit] == 0).any(-1).double().mean())
+
+    assert rejected(fit.pseudo[1]) < 0.3
+    assert rejected(local.counts) > 0.7
+    assert float(local.counts[~hit].mean()) > 0.95
+
+
+def bursts_of_one_sign(seed, share=0.15):
+    """Outliers of 5 to 20 times the noise along one direction, in bursts of 15 to 60 samples, in µT; and where."""
+    draws = np.random.default_rng(seed)
+    added, hit = np.zeros((N, 3)), np.zeros(N, dtype=bool)
+    while hit.mean() < share:
+        length = int(draws.integers(15, 60))
+        start = int(draws.integers(0, N - length))
+        hit[start : start + length] = True
+        size = np.exp(draws.uniform(np.log(1.5), np.log(6.0), (length, 1)))
+        added[start : start + length] = size * [[0.7, 0.5, 0.5]]
+    return added, torch.from_numpy(hit)
+
+
+def test_the_small_ones_of_many_bursts_do_not_count_for_a_wander():
+    """Many bursts make the likeliest density a wide one, in which the smaller outliers count like samples."""
+    kept = []
+    for seed in (1, 2, 3):
+        added, hit = bursts_of_one_sign(seed)
+        _, _, local = local_of(added, "norm")
+        kept.append(float(local.counts[hit].mean()))
+        assert float(local.counts[~hit].mean()) > 0.93
+    assert sum(kept) / 3 < 0.35
+
+
+@pytest.mark.parametrize(("step", "size"), [(0.0, 0.7), (0.05, 1.5)])
+def test_the_mild_samples_of_bursts_do_not_count(step, size):
+    """Most are within three scales of the noise, and beside a wander the fit's own parameters hide them."""
+    burst, hit = np.zeros((N, 3)), torch.zeros(N, dtype=torch.bool)
+    for start, length in [(300, 25), (900, 30), (1500, 25)]:
+        burst[start : start + length] = size
+        hit[start : start + length] = True
+    kept = []
+    for seed in range(3):
+        _, _, local = local_of(walk([step] * 3, seed) + burst, "norm")
+        kept.append((float(local.counts[hit].mean()), float(local.counts[~hit].mean())))
+    of_bursts, of_others = np.mean(kept, axis=0)
+    assert of_bursts < 0.2
+    assert of_others > 0.945
+
+
+def test_neighbours_to_one_side_together_do_not_count():
+    draws = torch.from_numpy(np.random.default_rng(2).standard_normal((3000, 2)))
+    slow = draws.clone()
+    for n in range(1, 3000):
+        slow[n] += 0.98 * slow[n - 1]
+    every = torch.ones_like(draws)
+    assert float(together(draws, every).mean()) == 1.0
+    assert float(together(slow, every).mean()) > 0.99
+    draws[1000:1030, 1] += 1.5
+    draws[2000:2600, 0] *= 1.5
+    found = together(draws, every)
+    assert float(found[1002:1028, 1].sum()) == 0.0
+    assert float(found[:, 0].min()) == 1.0 == float(found[:970, 1].min()) == float(found[1060:, 1].min())
+    rejected = every.clone()
+    rejected[1000:1030, 1] = 0.0
+    assert float(together(draws, rejected)[:, 1].min()) == 1.0
+
+
+def test_what_is_in_the_midst_of_outliers_is_one():
+    near = torch.ones(100, 2, dtype=torch.float64)
+    near[40:60, 0] = 0.0
+    near[45::4, 0] = 1.0  # a course that follows the burst lets some of it through
+    near[10::7, 1] = 0.0  # single outliers, however many, take nothing with them
+    found = out_of_bursts(near)
+    assert float(found[43:57, 0].sum()) == 0.0
+    assert float(found[:35, 0].min()) == float(found[66:, 0].min()) == 1.0
+    assert torch.equal(found[:, 1], near[:, 1])
+
+
+def test_outliers_that_come_together_count_in_no_channel():
+    draws = torch.from_numpy(np.random.default_rng(4).random((2000, 3)))
+    apart = (draws > 0.15).double()
+    assert torch.equal(of_all(apart), apart)
+    together = apart.clone()
+    together[:, 1] *= apart[:, 0]
+    together[:, 2] *= (draws[:, 0] > 0.1).double()
+    assert torch.equal(of_all(together), together.amin(1, keepdim=True).expand(-1, 3))
+    assert torch.equal(of_all(apart[:, :1]), apart[:, :1])
+    assert torch.equal(of_all(torch.ones_like(apart)), torch.ones_like(apart))
+
+
+def slow_in_the_world(seed, keep=0.998, size=0.8):
+    """What an attitude that drifts by a degree adds to the body's axes, in µT."""
+    drift = np.random.default_rng(seed).standard_normal((N, 3)) * size * np.sqrt(1.0 - keep**2)
+    for n in range(1, N):
+        drift[n] += keep * drift[n - 1]
+    return turns(np.arange(N) / RATE).inv().apply(drift)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_colour_beside_a_wander_is_the_likeliest(seed):
+    """What wanders in the sensor's axes and what is slow in the world's take long to tell apart."""
+    fit, tangents, local = local_of(walk([0.05] * 3, seed) + slow_in_the_world(seed), "attitude")
+    found = local.noise
+    beside = replace(tangents.bare, slow=local.slow)
+    step = linearise(fit.model, fit.parameters, local.values, local.counts, beside, colour=found.colour_beside())
+    assert step.evidence < found.evidence + 10.0
+    slow = found.colour.root.square()
+    assert float((slow[2:6, 1:].mean(0) / slow[-200:, 1:].mean(0)).min()) > 30.0
+
+
+def test_what_counts_keeps_its_wander():
+    fit, _, local = local_of(walk([0.05, 0.05, 0.05]), "attitude")
+    counted = local.counts > 0
+    # the pseudo-residual is the wander, and beside it no more than the white noise
+    assert float((local.values - fit.residual)[counted].square().mean().sqrt()) < 0.1
+    assert float(local.values[counted].std()) > 1.0
+
+
+def test_each_axis_has_its_own_share_of_the_wander():
+    steps = np.array([0.08, 0.02, 0.02])
+    _, tangents, local = local_of(walk(steps), "attitude")
+    share = (local.slow.scales / tangents.slow.scales).square()[:, :3]
+    torch.testing.assert_close(share[0], share[1])
+    # the truth is 2.67, 0.17, 0.17; a few courses' worth of equal axes are in the estimate
+    assert float(share[0, 0]) == pytest.approx(2.67, rel=0.25)
+    assert float(share[0, 1:].max()) < 0.55
+
+
+def test_the_noise_is_that_of_what_is_left():
+    fit, tangents, local = local_of(walk([0.05, 0.05, 0.05]), "norm")
+    noise = local.noise.search.noise_fit(local.noise.series)
+    assert noise.size > 0
+    again = linearise(fit.model, fit.parameters, local.values, local.counts, tangents.bare, colour=local.noise.colour)
+    torch.testing.assert_close(again.series, local.noise.series)
+
+
+def test_another_colour_is_the_search_that_begins_with_it():
+    """Beside what stands in for rejected samples, which is that of the colour before."""
+    prepared = Magnetometer("attitude").prepare(tumbling(N, noise=0.3, sensor=walk([0.05] * 3), attitude=True))
+    model = JointModel(prepared)
+    fit = fitted(model, prepared.start())
+    tangents, values, counts = tangents_of(model, fit.parameters), fit.residual, torch.ones_like(fit.residual)
+    found = linearise(model, fit.parameters, values, counts, tangents, white=True)
+    colour = found.colour_beside()
+    built = linearise(model, fit.parameters, values, counts, tangents, colour=colour)
+    told = found.recoloured(colour)
+    torch.testing.assert_close(told.series, built.series)
+    assert told.evidence == pytest.approx(built.evidence)
+    assert told.evidence > found.evidence + 10.0
+
+
+def test_white_noise_is_left_as_it_is():
+    fit, _, local = local_of(np.zeros((N, 3)), "attitude")
+    values, counts = fit.pseudo
+    assert float((local.counts != counts).double().mean()) < 0.02
+    both = (local.counts > 0) & (counts > 0)
+    assert float((local.values - values)[both].square().mean().sqrt()) < 0.05
+
+
+def test_a_simulation_of_two_channels_is_served_alike():
+    line = Line(600)
+    model = JointModel(line)
+    fit = fitted(model, line.start())
+    local = beside_wander(fit, model, fit.parameters, tangents_of(model, fit.parameters))
+    assert local.values.shape == (600, 2)
+    assert bool(torch.isfinite(local.values).all())

@@ -1,0 +1,51 @@
+"""The last step of generalised least squares, where it can be taken."""
+
+import torch
+
+from mkc_torch.diagnosis.linearised.estimate import estimate
+from mkc_torch.diagnosis.linearised.tangents import tangents_of
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from tests.diagnosis.line import Line
+
+
+class Cliff(Line):
+    """A line that has an answer at the fitted parameters, and nowhere near."""
+
+    known = None
+
+    def residual(self, theta, changes):
+        left = super().residual(theta, changes)
+        if self.known is None or torch.equal(theta.detach(), self.known):
+            return left
+        return left * torch.nan
+
+
+def test_the_step_moves_the_parameters_by_less_than_their_errors():
+    line = Line(600)
+    fit = fitted(JointModel(line), line.start())
+    found = estimate(fit)
+    moved = (found.fit.parameters - fit.parameters).abs()
+    assert bool((moved > 0).any())
+    assert bool((moved < found.standard_error).all())
+    torch.testing.assert_close(found.fit.residual, found.fit.model.residual(found.fit.parameters))
+
+
+def test_a_step_to_where_there_is_no_answer_is_not_taken(monkeypatch):
+    line = Cliff(600)
+    fit = fitted(JointModel(line), line.start())
+    monkeypatch.setattr("mkc_torch.diagnosis.linearised.estimate.tangents_of", tangents_before(line))
+    found = estimate(fit)
+    assert torch.equal(found.fit.parameters, fit.parameters)
+    assert bool(found.fit.residual.isfinite().all())
+
+
+def tangents_before(line):
+    """The tangents of the plain line; from then on it has no answer but where it was fitted."""
+
+    def then_none(model, parameters):
+        found = tangents_of(model, parameters)
+        line.known = parameters.detach().clone()
+        return found
+
+    return then_none

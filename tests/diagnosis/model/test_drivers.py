@@ -1,0 +1,211 @@
+"""Which columns can drive an effect."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch.diagnosis.model.drivers import find_drivers, role_of
+from mkc_torch.recording.recording import Recording
+
+RAMP = torch.linspace(0.0, 1.0, 100, dtype=torch.float64)
+WAVES = {k: torch.sin((3.0 + k) * RAMP + k) for k in range(8)}
+
+
+def found(columns, units=None, taken=frozenset({"time"})):
+    return find_drivers(Recording({"time": 10.0 * RAMP} | columns, units=units), taken)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "role"),
+    [
+        ("temperature", "°C", "temperature"),
+        ("temp_imu", "", "temperature"),
+        ("Temperature_2", "", "temperature"),
+        ("chip", "°C", "temperature"),
+        ("chip", "K", "temperature"),
+        ("current", "A", "current"),
+        ("current_3", "", "current"),
+        ("esc", "A", "current"),
+        ("rpm", "", "any"),
+        ("voltage", "V", "any"),
+        ("current_temp", "A", "current"),
+        ("attempt", "", "any"),
+    ],
+)
+def test_roles_come_from_the_name_and_then_the_unit(name, unit, role):
+    assert role_of(name, unit) == role
+    (driver,) = found({name: WAVES[0]}, units={name: unit}).drivers
+    assert (driver.columns, driver.role, driver.units) == ((name,), role, (unit,))
+
+
+def test_values_are_less_their_mean():
+    (driver,) = found({"load": 5.0 + WAVES[0]}).drivers
+    assert driver.values.shape == (100, 1)
+    assert float(driver.reference) == pytest.approx(float(5.0 + WAVES[0].mean()))
+    torch.testing.assert_close(driver.values[:, 0] + driver.reference, 5.0 + WAVES[0])
+    assert abs(float(driver.values.mean())) < 1e-12
+
+
+def test_position_is_one_driver_of_three_columns():
+    columns = {f"position_{axis}": WAVES[k] for k, axis in enumerate("xyz")}
+    (driver,) = found(columns).drivers
+    assert (driver.role, driver.columns, driver.units) == ("position", tuple(columns), ("m", "m", "m"))
+    assert driver.values.shape == (100, 3)
+
+
+def test_columns_of_the_simulation_and_the_experiment_drive_nothing():
+    result = found({"mag_x": WAVES[0], "experiment": (RAMP > 0.5).double()}, taken=frozenset({"time", "mag_x"}))
+    assert result.drivers == ()
+    assert result.warnings == ()
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, -3e8])
+def test_a_constant_drives_nothing(value):
+    result = found({"state": torch.full((100,), value), "load": WAVES[0]})
+    assert [d.columns for d in result.drivers] == [("load",)]
+    assert result.warnings == ("Column `state` is constant and can drive nothing.",)
+
+
+def test_a_column_without_values_is_left_out():
+    mostly = WAVES[1].clone()
+    mostly[:60] = math.nan
+    result = found({"empty": torch.full((100,), math.nan), "mostly": mostly, "load": WAVES[0]})
+    assert [d.columns for d in result.drivers] == [("load",)]
+    assert result.warnings == (
+        "Column `empty` has no finite values and is left out.",
+        "Column `mostly` has only 40% finite values and is left out.",
+    )
+
+
+def test_missing_values_are_filled_from_their_neighbours():
+    values = 4.0 * RAMP + 1.0
+    values[[0, 1, 40, 41, 42, 99]] = torch.tensor(
+        [math.nan, math.inf, math.nan, -math.inf, math.nan, math.nan]
+    ).double()
+    result = found({"load": values})
+    (driver,) = result.drivers
+    expected = 4.0 * RAMP + 1.0
+    expected[:2], expected[99] = expected[2], expected[98].clone()
+    torch.testing.assert_close(driver.values[:, 0] + driver.reference, expected)
+    assert result.warnings == ("Column `load` lacks 6 values, filled from their neighbours in time.",)
+
+
+def test_a_constant_with_gaps_is_still_constant():
+    values = torch.ones(100, dtype=torch.float64)
+    values[3] = math.nan
+    result = found({"state": values})
+    assert result.drivers == ()
+    assert len(result.warnings) == 2
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (-2.0, 7.0), (1e-6, 300.0)])
+def test_copies_are_one_driver(gain, offset):
+    result = found({"load": WAVES[0], "rpm": WAVES[1], "power": gain * WAVES[0] + offset})
+    assert [(d.columns, d.copies) for d in result.drivers] == [(("load",), ("power",)), (("rpm",), ())]
+    (warning,) = result.warnings
+    assert warning == "Column `load` and `power` are copies of one another: this data cannot tell them apart."
+
+
+def test_of_copies_the_one_of_a_known_role_stands_for_all():
+    result = found({"x1": WAVES[0], "rpm": WAVES[1], "x2": -WAVES[0], "temperature": 20.0 + 3.0 * WAVES[0]})
+    assert [(d.columns, d.role, d.copies) for d in result.drivers] == [
+        (("rpm",), "any", ()), (("temperature",), "temperature", ("x1", "x2")),
+    ]  # fmt: skip
+
+
+def test_a_close_rival_is_no_copy():
+    near = WAVES[0] + 0.003 * WAVES[1]
+    assert float(torch.corrcoef(torch.stack([near, WAVES[0]]))[0, 1]) > 0.9999
+    assert len(found({"load": WAVES[0], "near": near}).drivers) == 2
+
+
+def test_the_order_of_columns_means_nothing():
+    columns = {"load": WAVES[0], "temperature": WAVES[1], "position_x": WAVES[2], "rpm": WAVES[3],
+               "position_y": WAVES[4], "current": WAVES[5], "position_z": WAVES[6]}  # fmt: skip
+    columns["gap"] = WAVES[7].clone()
+    columns["gap"][5] = math.nan
+    first = found(columns)
+    orders = np.random.default_rng(0)
+    for _ in range(5):
+        names = orders.permutation(list(columns)).tolist()
+        again = found({name: columns[name] for name in names})
+        assert again.warnings == first.warnings
+        by_name = {d.columns: d for d in again.drivers}
+        assert set(by_name) == {d.columns for d in first.drivers}
+        for driver in first.drivers:
+            other = by_name[driver.columns]
+            assert (other.role, other.units, other.copies) == (driver.role, driver.units, driver.copies)
+            assert torch.equal(other.values, driver.values)
+        singles = [name for name in names if not name.startswith("position")]
+        assert [d.columns[0] for d in again.drivers if len(d.columns) == 1] == singles
+
+
+def test_hundreds_of_columns_are_hundreds_of_drivers():
+    values = torch.randn(300, 100, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    result = found({f"c{k}": row for k, row in enumerate(values)})
+    assert [d.columns[0] for d in result.drivers] == [f"c{k}" for k in range(300)]
+    assert result.warnings == ()
+
+
+def test_no_columns_no_drivers():
+    assert found({}).drivers == ()
+
+
+def test_effects_can_ask_for_roles_of_their_own():
+    columns = {"voltage_bus": WAVES[0], "overvoltage": WAVES[1], "temperature": WAVES[2]}
+    recording = Recording({"time": RAMP} | columns)
+    drivers = find_drivers(recording, frozenset({"time"}), frozenset({"voltage", "any", "temperature"})).drivers
+    assert [(d.columns[0], d.role) for d in drivers] == [
+        ("voltage_bus", "voltage"), ("overvoltage", "any"), ("temperature", "temperature"),
+    ]  # fmt: skip
+
+
+def test_a_part_of_the_position_is_no_position():
+    recording = Recording({"time": RAMP, "position_x": WAVES[0], "position_y": WAVES[1], "position_z": 0.0 * RAMP})
+    drivers = find_drivers(recording, frozenset({"time"}), frozenset({"position", "any"})).drivers
+    assert [(d.columns, d.role) for d in drivers] == [(("position_x",), "any"), (("position_y",), "any")]
+
+
+@pytest.mark.parametrize("glitch", [65535.0, -999.0, 1e30])
+@pytest.mark.parametrize("places", [[700], [100, 101, 650], list(range(300, 305))])
+def test_a_few_values_far_from_all_others_count_as_missing(glitch, places):
+    time = torch.linspace(0.0, 20.0, 1000, dtype=torch.float64)
+    clean = 3.0 + torch.sin(time)
+    values = clean.clone()
+    values[places] = glitch
+    result = find_drivers(Recording({"time": time, "current": values}), frozenset({"time"}))
+    (driver,) = result.drivers
+    torch.testing.assert_close(driver.values[:, 0] + driver.reference, clean, atol=0.02, rtol=0.0)
+    (sentence,) = result.warnings
+    assert f"`current` has {len(places)} value" in sentence
+    assert f"({glitch:.6g})" in sentence
+    assert "far from all others" in sentence
+
+
+def test_pulses_of_a_driver_are_no_glitches():
+    """A motor that runs for a tenth of a second; and a switch that is rarely on."""
+    time = torch.linspace(0.0, 20.0, 1000, dtype=torch.float64)
+    noise = torch.randn(1000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    on = (time - 5.0).abs() < 0.05
+    assert int(on.sum()) == 5
+    pulses = 0.01 * noise + 5.0 * on * (1.0 + 0.1 * noise)
+    switch = on.double()
+    result = find_drivers(Recording({"time": time, "current": pulses, "switch": switch}), frozenset({"time"}))
+    assert result.warnings == ()
+    assert [float(driver.values.max()) > 0.9 for driver in result.drivers] == [True, True]
+
+
+def test_a_column_that_repeats_what_is_measured_drives_nothing():
+    time = torch.linspace(0.0, 20.0, 1000, dtype=torch.float64)
+    measured = 40.0 * torch.sin(time)
+    columns = {"time": time, "mag_x": measured, "raw_x": (6.842 * measured).round() + 17.0, "load": torch.cos(time)}
+    result = find_drivers(Recording(columns), frozenset({"time", "mag_x"}), measured=frozenset({"mag_x"}))
+    assert [driver.columns for driver in result.drivers] == [("load",)]
+    assert result.warnings == ("Column `raw_x` repeats `mag_x` and is left out: it drives nothing.",)
+
+
+def test_time_itself_is_nothing_that_is_repeated():
+    result = found({"temperature": 20.0 + 3.0 * RAMP})
+    assert [driver.columns for driver in result.drivers] == [("temperature",)]

@@ -1,0 +1,37 @@
+"""The joint fit of what the search names, from the search's own estimate, or from nothing."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.search.strongest import refitted
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.simulation import Magnetometer
+from tests.simulation.tumbling import tumbling
+
+N = 1500
+EFFECT = next(effect for effect in CATALOGUE if effect.id == "cubic_nonlinearity")
+
+
+@pytest.fixture(scope="module")
+def base():
+    prepared = Magnetometer("norm").prepare(tumbling(N, noise=0.3))
+    return fitted(JointModel(prepared), prepared.start())
+
+
+def searched(*gamma):
+    """A search that estimates these amplitudes."""
+    estimate = torch.tensor(gamma, dtype=torch.float64)
+    return SimpleNamespace(search=SimpleNamespace(estimate=lambda *_: (estimate, None)), series=None)
+
+
+@pytest.mark.parametrize("astray", [0.0, -0.3, 30.0, -1e4])
+def test_a_fit_that_goes_astray_begins_again_from_nothing(base, astray):
+    term = Term(EFFECT, None, {"terms": 2.0})
+    found = refitted(base, base, term, searched(*[astray] * 6), 0)
+    assert found.log_likelihood >= base.log_likelihood - 1e-6
+    assert found.converged

@@ -1,0 +1,175 @@
+"""Once an effect is known, the numbers of its shape are fitted with all else, and not only tried on a grid."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mkc_torch import Recording
+from mkc_torch.diagnosis.linearised.estimate import estimate
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.grid import candidate_terms, reach_of
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shaped import ShapedModel, shape_fitted
+from mkc_torch.effects import DYNAMICS
+from mkc_torch.simulation import Dynamics, Parameter
+
+OF = {effect.id: effect for effect in DYNAMICS}
+N = 400
+
+
+class Lag(Dynamics):
+    """Follows what drives it."""
+
+    states = ("level",)
+    inputs = ("drive",)
+    parameters = {"rate": Parameter(2.0, lower=0.0)}  # noqa: RUF012
+    step = 0.05
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"level": p.rate * (u.drive - x.level)}
+
+
+def driven(act, seed=0, behind=0.0):
+    """The level behind a drive that acts otherwise than it is told, by a sensor that may lag; in 20 steps a sample."""
+    generator = torch.Generator().manual_seed(seed)
+    time = 0.05 * torch.arange(N, dtype=torch.float64)
+    drive = 2.0 * torch.sin(0.9 * time) + torch.sin(2.3 * time + 1.0)
+    fine = torch.linspace(0.0, float(time[-1]), 20 * (N - 1) + 1, dtype=torch.float64)
+    seen = act(2.0 * torch.sin(0.9 * fine) + torch.sin(2.3 * fine + 1.0))
+    step = float(fine[1])
+    level = [0.0]
+    for one, other in zip(seen[:-1].tolist(), seen[1:].tolist(), strict=True):
+        level.append(level[-1] + step * 1.7 * (0.5 * (one + other) - level[-1]))
+    shown = [0.0]
+    for one in level[1:]:
+        shown.append(one if behind == 0.0 else shown[-1] + step / behind * (one - shown[-1]))
+    noise = 0.01 * torch.randn(N, generator=generator, dtype=torch.float64)
+    return Recording({"time": time, "drive": drive, "level": torch.tensor(shown[::20], dtype=torch.float64) + noise})
+
+
+def found(recording, *known):
+    """The joint fit with effects, each followed by its shape on the grid."""
+    prepared = Lag().prepare(recording)
+    terms = []
+    for effect, shape in zip(known[::2], known[1::2], strict=True):
+        (term, *_) = candidate_terms(prepared, (), (effect,))
+        terms.append(replace(term, shape={**term.shape, **shape}))
+    base = fitted(JointModel(prepared), prepared.start())
+    half = base.parameters.new_full((len(terms),), 0.5)
+    return fitted(JointModel(prepared, terms), torch.cat([base.parameters, half]), base.bound)
+
+
+def test_a_limit_between_two_of_the_grid_is_found():
+    recording = driven(lambda u: 1.37 * torch.tanh(u / 1.37))
+    before = found(recording, OF["input_saturation"], {"limit": 1.8})
+    after = shape_fitted(before)
+    assert before.model.terms[-1].shape["limit"] == 1.8
+    assert after.log_likelihood > before.log_likelihood + 100.0
+    # the limit of a hyperbolic tangent whose share is not known either, as nothing reaches it
+    shape = after.model.terms[-1].shape
+    reached = after.parameters[-1] * (shape["limit"] - 2.8) + 2.8
+    assert float(reached) == pytest.approx(1.37, abs=0.03)
+    assert shape["softness"] > 0.3
+    assert float(after.residual.square().mean().sqrt()) < 0.0115
+
+
+def test_a_hard_limit_stays_hard():
+    recording = driven(lambda u: u.clamp(-1.37, 1.37))
+    after = shape_fitted(found(recording, OF["input_saturation"], {"limit": 1.2}))
+    shape = after.model.terms[-1].shape
+    assert shape["limit"] == pytest.approx(1.37, abs=0.01)
+    assert shape["softness"] < 0.05
+    assert float(after.parameters[-1]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_delay_is_found_with_its_share():
+    late = driven(lambda u: torch.cat([u[:1].expand(123), u[:-123]]))  # 123 of 20 for each 0.05 s
+    after = shape_fitted(found(late, OF["input_delay"], {"delay": 0.2}))
+    assert after.model.terms[-1].shape["delay"] == pytest.approx(0.3075, abs=0.01)
+    assert float(after.parameters[-1]) == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_shape_of_an_earlier_effect_moves_with_that_of_a_later_one():
+    recording = driven(lambda u: u.clamp(-1.37, 1.37), behind=0.15)
+    before = found(recording, OF["input_saturation"], {"limit": 1.2}, OF["sensor_lag"], {"lag": 0.3})
+    limit, lag = (term.shape for term in shape_fitted(before).model.terms)
+    assert limit["limit"] == pytest.approx(1.37, abs=0.02)
+    assert lag["lag"] == pytest.approx(0.15, abs=0.03)
+    assert all(isinstance(value, float) for value in (*limit.values(), *lag.values()))
+
+
+def test_an_effect_without_such_numbers_stays_as_it_is():
+    prepared = Lag().prepare(driven(lambda u: u))
+    (term,) = candidate_terms(prepared, (), (OF["constant_force"],))
+    model = JointModel(prepared, (term,))
+    fit = fitted(model, torch.cat([prepared.start(), prepared.time.new_zeros(1)]))
+    assert shape_fitted(fit) is fit
+
+
+class Broken(type(OF["input_saturation"])):
+    """An effect that has no value but at the limits of its grid."""
+
+    def course(self, shape, context):
+        course = super().course(shape, context)
+        return course if isinstance(shape["limit"], float) else course * torch.nan
+
+
+def test_where_the_simulation_has_no_answer_the_grid_s_shape_stays():
+    recording = driven(lambda u: u.clamp(-1.37, 1.37))
+    fit = found(recording, Broken(), {"limit": 1.2})
+    assert shape_fitted(fit) is fit
+
+
+def test_its_parameters_are_the_joint_ones_and_the_logarithms_of_the_shape():
+    recording = driven(lambda u: u.clamp(-1.37, 1.37))
+    fit = found(recording, OF["input_saturation"], {"limit": 1.2})
+    reach = reach_of(fit.model.terms[-1], fit.model.prepared)
+    largest = float(recording["drive"].abs().max())
+    assert reach["limit"] == pytest.approx((0.2 * largest, 1.5 * largest))
+    model = ShapedModel.of(fit.model)
+    start = model.start(fit.parameters)
+    assert model.size == len(start) == fit.model.size + 2
+    low, high = model.bounds
+    assert len(low) == len(high) == model.size
+    assert bool(((low <= start) & (start <= high)).all())
+    assert float(high[-2].exp()) == pytest.approx(1.5 * largest)
+    torch.testing.assert_close(model.residual(start), fit.model.residual(fit.parameters))
+    assert model.prior is None or len(model.prior.mean) == model.size
+
+
+def test_errors_are_those_of_least_squares_with_the_shape_among_the_parameters():
+    """In white normal noise: σ² (JᵀJ)⁻¹, J by differences of parameters and limit."""
+    fit = shape_fitted(found(driven(lambda u: u.clamp(-1.37, 1.37), seed=2), OF["input_saturation"], {"limit": 1.2}))
+    final = estimate(fit)
+    shape, theta = final.fit.model.terms[-1].shape, final.fit.parameters
+    (errors,) = final.shape_errors
+    assert set(errors) == {"limit"}  # its corner is as hard as can be
+
+    def residual(values):
+        moved = final.fit.model.with_shape({**shape, "limit": float(values[-1])})
+        return moved.residual(values[:-1]).squeeze(-1)
+
+    at = torch.cat([theta, theta.new_tensor([shape["limit"]])])
+    columns = []
+    for k in range(len(at)):
+        step = torch.zeros_like(at)
+        step[k] = 1e-4 * at[k]
+        columns.append((residual(at + step) - residual(at - step)) / (2.0 * step[k]))
+    slopes = torch.stack(columns, -1)
+    covariance = float(residual(at).square().sum()) / (N - len(at)) * torch.linalg.inv(slopes.mT @ slopes)
+    known = covariance.diagonal().sqrt()
+    assert errors["limit"] == pytest.approx(float(known[-1]), rel=0.2)
+    assert float(final.standard_error[-1]) == pytest.approx(float(known[-2]), rel=0.2)
+    alone = float(torch.linalg.inv(covariance).diagonal()[-2].rsqrt())
+    assert float(final.standard_error[-1]) > 2.0 * alone  # without the limit's freedom it is far too sure
+    assert shape["limit"] == pytest.approx(1.37, abs=3.0 * errors["limit"])
+
+
+@pytest.mark.parametrize("wrong", [{"limit": (1.0, 1.0)}, {"limit": (2.0, 1.0)}, {"magic": (1.0, 2.0)}])
+def test_a_range_that_is_none_is_refused(wrong):
+    fit = found(driven(lambda u: u.clamp(-1.37, 1.37)), OF["input_saturation"], {"limit": 1.2})
+    term = fit.model.terms[-1]
+    effect = type("Mine", (type(term.effect),), {"fitted_shape": wrong})()
+    with pytest.raises(ValueError, match=r"`fitted_shape` of input_saturation .*limit, softness.* but got `\w+`"):
+        reach_of(replace(term, effect=effect), fit.model.prepared)

@@ -1,0 +1,93 @@
+"""Shapes by the noise of the search, after a joint fit that takes it for white."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mkc_torch.diagnosis.linearised.linearise import linearise
+from mkc_torch.diagnosis.linearised.tangents import tangents_of
+from mkc_torch.diagnosis.model.fit import fitted, fitted_beside
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.search import closing_in
+from mkc_torch.diagnosis.search.closing_in import coloured, middle
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.simulation import Magnetometer
+from tests.simulation.tumbling import RATE, tumbling
+
+N = 2000
+STEP = next(effect for effect in CATALOGUE if effect.id == "hard_iron_step")
+CUBIC = next(effect for effect in CATALOGUE if effect.id == "cubic_nonlinearity")
+FIRST, LAST = 990, 1040  # samples that are outliers
+TRUE = (FIRST + LAST) / 2.0 / RATE
+
+
+@pytest.fixture(scope="module")
+def burst():
+    """A step of 2 µT in the middle of a second in which all samples are far off."""
+    sensor = np.zeros((N, 3))
+    sensor[(FIRST + LAST) // 2 :] = [2.0, -1.0, 1.0]
+    sensor[FIRST:LAST] += 400.0 * np.random.default_rng(1).choice([-1.0, 1.0], (LAST - FIRST, 3))
+    prepared = Magnetometer("attitude").prepare(tumbling(N, noise=0.3, sensor=sensor, attitude=True))
+    return fitted(JointModel(prepared), prepared.start())
+
+
+def with_shape(base, effect, shape):
+    """A fit with an effect, and the search beside it."""
+    model = base.model.with_term(Term(effect, None, shape))
+    start = base.parameters.new_zeros(model.size)
+    start[: len(base.parameters)] = base.parameters
+    best = fitted_beside(base, model, start)
+    tangents = tangents_of(best.model, best.parameters, best.model.terms)
+    tangents = dataclasses.replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
+    pseudo, counts = best.pseudo
+    moved = tangents.candidates[0] @ best.parameters[base.model.size :]
+    search = linearise(base.model, best.parameters[: base.model.size], pseudo - counts * moved, counts, tangents)
+    return best, best, tangents, counts, search
+
+
+@pytest.mark.parametrize("onset", [FIRST / RATE + 0.02, LAST / RATE - 0.02])
+def test_an_onset_in_a_burst_of_outliers_is_taken_from_its_middle(burst, onset):
+    best, *search = with_shape(burst, STEP, {"onset": onset})
+    assert float(search[2][FIRST:LAST].mean()) == 0.0
+    moved = coloured(best, burst, *search)
+    assert moved.model.terms[-1].shape["onset"] == pytest.approx(TRUE, abs=0.15)
+    assert moved.converged
+
+
+def test_an_onset_that_the_search_clearly_prefers_is_taken(burst):
+    best, *_ = with_shape(burst, STEP, {"onset": TRUE - 4.0})
+    _, *search = with_shape(burst, STEP, {"onset": TRUE})
+    moved = coloured(best, burst, *search)
+    assert abs(moved.model.terms[-1].shape["onset"] - TRUE) < 1.0
+    assert moved.log_likelihood > best.log_likelihood + 10.0
+
+
+def test_what_has_no_shape_or_does_not_converge_stays(burst, monkeypatch):
+    best, *search = with_shape(burst, CUBIC, {})
+    assert coloured(best, burst, *search) is best
+    best, *search = with_shape(burst, STEP, {"onset": FIRST / RATE + 0.02})
+
+    def lost(*args, **kwargs):
+        return dataclasses.replace(fitted_beside(*args, **kwargs), converged=False)
+
+    monkeypatch.setattr(closing_in, "fitted_beside", lost)
+    assert coloured(best, burst, *search) is best
+
+
+@given(st.lists(st.floats(-5.0, 5.0), min_size=1, max_size=20), st.data())
+@settings(deadline=None)
+def test_the_middle_is_never_told_apart_from_the_place(values, data):
+    place = data.draw(st.integers(0, len(values) - 1))
+    found = middle(values, place)
+    between = values[min(found, place) : max(found, place) + 1]
+    assert all(abs(value - values[place]) < 0.5 for value in between)
+
+
+def test_the_middle_of_a_plateau_is_its_middle_from_any_place():
+    values = [0.0, 3.0, *[9.0] * 7, 2.0]
+    assert [middle(values, place) for place in range(2, 9)] == [5] * 7
+    assert middle(values, 0) == 0

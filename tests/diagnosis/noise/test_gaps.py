@@ -1,0 +1,150 @@
+"""What stands in for rejected samples, against the dense conditional expectation, and what a search makes of it."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mkc_torch.diagnosis.noise import gaps
+from mkc_torch.diagnosis.noise.colour import Colour
+from mkc_torch.diagnosis.noise.cosine_basis import dct
+from mkc_torch.diagnosis.noise.gaps import Gaps
+
+N = 60
+
+
+def basis(size, kept):
+    """(kept, size), rows of the cosine basis."""
+    return dct(torch.eye(size, dtype=torch.float64))[:kept]
+
+
+def colour(*spectra):
+    root = torch.stack(spectra, -1).sqrt()
+    return Colour(tuple(root.new_zeros(0) for _ in spectra), root)
+
+
+def falling(size, kept=None):
+    k = torch.arange(size if kept is None else kept, dtype=torch.float64)
+    return 1.0 + 40.0 / (1.0 + (k / 5.0).square())
+
+
+def mask(seed, size=N, channels=1, share=0.2):
+    generator = torch.Generator().manual_seed(seed)
+    return (torch.rand(size, channels, generator=generator) > share).double()
+
+
+def expected(values, counts, spectrum):
+    """Series with the conditional expectation at rejected samples, and the log-determinant of the precision there."""
+    rows = basis(len(values), len(values))
+    precision = rows.mT @ torch.diag(1.0 / spectrum) @ rows
+    lost = counts == 0
+    own = precision[lost][:, lost]
+    out = values.clone()
+    out[lost] = -torch.linalg.solve(own, precision[lost][:, ~lost] @ values[~lost])
+    return out, torch.logdet(own)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 1000), st.sampled_from([0.05, 0.3, 0.6]))
+def test_it_is_the_conditional_expectation(seed, share):
+    counts = mask(seed, channels=2, share=share)
+    spectra = falling(N), 0.5 + 10.0 * torch.linspace(0.0, 1.0, N, dtype=torch.float64).square()
+    values = counts * torch.randn(N, 2, generator=torch.Generator().manual_seed(seed)).double()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gaps, "_PLAIN", 0.0)
+        patch.setattr(gaps, "_END", N)  # the level of the last frequency alone
+        filling = Gaps(counts, N).filling(colour(*spectra))
+    found = filling(dct(values))
+    total = 0.0
+    for channel, spectrum in enumerate(spectra):
+        series, log_det = expected(values[:, channel], counts[:, channel], spectrum / spectrum[-1])
+        torch.testing.assert_close(found[:, channel], dct(series))
+        total += float(log_det)
+    assert filling.log_det == pytest.approx(total, abs=1e-8)
+
+
+@pytest.mark.parametrize("level", [1.0, 9.0])  # of 1, the noise is nowhere below it
+@pytest.mark.parametrize("share", [0.1, 0.7])
+def test_solving_for_samples_or_for_frequencies_is_the_same(share, level):
+    counts = mask(11, share=share)
+    known, rows = Gaps(counts, N), torch.arange(0, N, 2)
+    excess = (level / falling(N) - 1.0)[rows]
+    assert bool((excess < 0).all()) == (level == 1.0)
+    one, other = known._by_sample(0, rows, excess), known._by_frequency(0, rows, excess)
+    values = torch.randn(N, 3, generator=torch.Generator().manual_seed(12), dtype=torch.float64)
+    assert float((one(values) - values).abs().max()) > 0.01
+    torch.testing.assert_close(one(values), other(values))
+    assert one.log_det == pytest.approx(other.log_det)
+
+
+def test_frequencies_that_are_left_out_count_as_white():
+    counts = mask(1)
+    values = counts * torch.randn(N, 1, generator=torch.Generator().manual_seed(2)).double()
+    kept = 30
+    found = Gaps(counts, kept).filling(colour(falling(N, kept)))(dct(values, kept))
+    spectrum = falling(N, kept)
+    end = spectrum[-1]
+    whole = torch.cat([torch.where((end / spectrum - 1.0).abs() > 0.3, spectrum, end), end.expand(N - kept)])
+    series, _ = expected(values[:, 0], counts[:, 0], whole / end)
+    torch.testing.assert_close(found[:, 0], dct(series, kept))
+
+
+@pytest.mark.parametrize(
+    ("counts", "spectrum"), [(mask(3), torch.full((N,), 2.0).double()), (torch.ones(N, 1).double(), falling(N))]
+)
+def test_white_noise_and_a_whole_recording_are_left_as_they_are(counts, spectrum):
+    values = dct(counts * torch.randn(N, 1, generator=torch.Generator().manual_seed(4)).double())
+    filling = Gaps(counts, N).filling(colour(spectrum))
+    assert filling(values) is values
+    assert filling.log_det == 0.0
+
+
+def test_amplitudes_are_left_what_they_are():
+    counts, course = mask(5), torch.randn(N, 1, 2, generator=torch.Generator().manual_seed(6)).double()
+    gamma = torch.tensor([2.0, -3.0], dtype=torch.float64)
+    filling = Gaps(counts, N).filling(colour(falling(N)))
+    masked = counts.unsqueeze(-1) * course
+    torch.testing.assert_close(filling(dct(masked @ gamma)), filling(dct(masked)) @ gamma)
+
+
+@pytest.mark.parametrize(("limit", "value"), [("_MOST", 12), ("_CELLS", 12 * N + 5)])
+def test_many_frequencies_are_reduced_to_those_that_matter_most(limit, value, monkeypatch):
+    counts = mask(7)
+    values = counts * torch.randn(N, 1, generator=torch.Generator().manual_seed(8)).double()
+    monkeypatch.setattr(gaps, limit, value)
+    found = Gaps(counts, N).filling(colour(falling(N)))(dct(values))
+    end = falling(N)[-3:].mean()
+    series, _ = expected(values[:, 0], counts[:, 0], torch.where(torch.arange(N) < 12, falling(N), end) / end)
+    torch.testing.assert_close(found[:, 0], dct(series))
+
+
+def test_holes_in_a_walk_do_not_look_like_an_effect():
+    """Likelihood ratios of three slow courses that are not there, in a walk with white noise, 15 % of it rejected.
+
+    Both have the same holes.
+    """
+    size, draws = 1500, 60
+    generator = torch.Generator().manual_seed(0)
+    step = 0.1
+    noise = torch.randn(size, draws, generator=generator).double()
+    noise += step * torch.randn(size, draws, generator=generator).double().cumsum(0)
+    k = torch.arange(size, dtype=torch.float64)
+    spectrum = 1.0 + (0.5 * step / torch.sin(0.5 * math.pi * k.clamp(min=0.5) / size)).square()
+    known = colour(spectrum)
+    slow = torch.sin(
+        torch.linspace(0.0, 1.0, size, dtype=torch.float64).unsqueeze(-1) * torch.tensor([5.0, 11.0, 23.0])
+    )
+    counts = mask(9, size, share=0.15)
+
+    def ratio(filled):
+        filling = Gaps(counts, size).filling(known) if filled else lambda c: c
+        series = known.scaled(filling(dct((counts * noise).unsqueeze(1))))
+        columns = known.scaled(filling(dct((counts * slow).unsqueeze(1))))
+        explained = torch.linalg.qr(columns).Q.mT @ series
+        white = series.square().mean(0)
+        return float((explained.square().sum(0) / white).mean())
+
+    assert ratio(filled=True) < 4.5
+    assert ratio(filled=False) > 6.0

@@ -1,0 +1,98 @@
+"""A first look beside a finding: what is there is seen, and where nothing is, nothing is searched."""
+
+import dataclasses
+import importlib
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch.diagnosis.model.drivers import find_drivers
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.search.first_look import p_value_beside
+from mkc_torch.diagnosis.search.locate import locate
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.simulation import Magnetometer
+from tests.simulation.tumbling import RATE, tumbling
+
+diagnosis_of = importlib.import_module("mkc_torch.diagnosis.diagnose")
+
+N = 2000
+TIME = np.arange(N) / RATE
+CURRENT = np.sin(TIME) + 0.4 * np.sin(7.3 * TIME)
+ALONG_CURRENT = np.array([1.2, -0.9, 1.3]) * CURRENT[:, None]
+STEP = np.array([-0.6, 0.5, 0.4]) * (TIME >= 23.4)[:, None]
+
+
+def recording(*effects, seed=0):
+    return tumbling(N, noise=0.4, sensor=sum(effects), seed=seed, attitude=True, current=CURRENT + 2.0)
+
+
+def located(*effects, seed=0):
+    """What is found first."""
+    simulation = Magnetometer("attitude")
+    prepared = simulation.prepare(recording(*effects, seed=seed))
+    roles = frozenset(role for effect in CATALOGUE for role in effect.roles)
+    drivers = find_drivers(prepared.recording, simulation.columns, roles).drivers
+    base = fitted(JointModel(prepared), prepared.start())
+    terms = candidate_terms(prepared, drivers, CATALOGUE)
+    found = locate(base, terms, level=0.05, surrogates=99, generator=torch.Generator().manual_seed(0))
+    assert found.term.effect.id == "current_field"
+    return found
+
+
+def p_value(found, others=lambda term: term.columns != ("current",)):
+    generator = torch.Generator().manual_seed(0)
+    return p_value_beside(found, [others(term) for term in found.terms], 99, generator)
+
+
+def test_another_effect_is_seen():
+    assert p_value(located(ALONG_CURRENT, STEP)) == 0.01
+
+
+def test_beside_the_only_effect_p_values_are_those_of_chance():
+    found = [p_value(located(ALONG_CURRENT, seed=seed)) for seed in range(3)]
+    assert min(found) > 0.02
+    assert max(found) > 0.2
+
+
+def test_the_effect_itself_is_taken_out_of_everything():
+    found = located(ALONG_CURRENT)
+    beside = found.linearised.search.gains(found.linearised.series.unsqueeze(-1)).ratio
+    assert float(beside.max()) > 1000.0
+    assert p_value(found, lambda _: True) > 0.02
+
+
+def test_where_no_other_candidate_is_left_there_is_nothing():
+    assert p_value(located(ALONG_CURRENT), lambda _: False) == 1.0
+
+
+def test_trajectories_are_for_the_search_itself():
+    found = located(ALONG_CURRENT)
+    tangents = dataclasses.replace(found.tangents, pointwise=dict.fromkeys(found.tangents.pointwise))
+    assert p_value(dataclasses.replace(found, tangents=tangents)) == 0.0
+
+
+@pytest.mark.parametrize(("effects", "searches", "names"), [
+    ((ALONG_CURRENT,), 1, ["current_field"]),
+    ((ALONG_CURRENT, STEP), 2, ["current_field", "hard_iron_step"]),
+])  # fmt: skip
+def test_a_search_beside_a_finding_is_made_where_a_first_look_shows_something(monkeypatch, effects, searches, names):
+    locate, begun, seen = diagnosis_of.locate, [], []
+
+    def counted(*arguments, **options):
+        begun.append(1)
+        return locate(*arguments, **options)
+
+    def looked(*arguments):
+        seen.append(p_value_beside(*arguments))
+        return seen[-1]
+
+    monkeypatch.setattr(diagnosis_of, "locate", counted)
+    monkeypatch.setattr(diagnosis_of, "p_value_beside", looked)
+    diagnosis = diagnosis_of.diagnose(Magnetometer("attitude"), recording(*effects))
+    assert [finding.effect for finding in diagnosis.findings] == names
+    assert len(begun) == searches + (seen[-1] <= 0.1)
+    assert len(seen) == searches

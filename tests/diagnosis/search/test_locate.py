@@ -1,0 +1,146 @@
+"""Rivals are compared at their own best shapes, under one noise."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch.diagnosis.linearised.linearise import linearise
+from mkc_torch.diagnosis.linearised.tangents import candidate_tangents, tangents_of
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.search.locate import _settled, _with_tangents, locate
+from mkc_torch.diagnosis.search.strongest import _first_start
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.simulation import Magnetometer
+from tests.diagnosis.line import Line
+from tests.simulation.tumbling import tumbling
+
+N = 2000
+TIMED = tuple(effect for effect in CATALOGUE if effect.id in ("hard_iron_step", "offset_drift"))
+STEP = next(effect for effect in TIMED if effect.id == "hard_iron_step")
+STEPS = tuple(Term(STEP, None, {"onset": onset}, "mixed") for onset in (0.4, 0.9, 1.3))
+
+
+@pytest.fixture(scope="module")
+def found():
+    """A search beside a step of 0.7 µT a third of the way, between two of the onsets that are tried."""
+    sensor = np.zeros((N, 3))
+    sensor[671:] = [0.4, -0.4, 0.4]
+    prepared = Magnetometer("attitude").prepare(tumbling(N, noise=0.3, sensor=sensor, attitude=True, gyro=True))
+    base = fitted(JointModel(prepared), prepared.start())
+    terms = candidate_terms(prepared, (), TIMED)
+    generator = torch.Generator().manual_seed(0)
+    return prepared, terms, locate(base, terms, level=0.05, surrogates=19, generator=generator)
+
+
+def test_the_first_of_the_ranking_has_a_shape_between_those_tried(found):
+    prepared, terms, located = found
+    first = located.terms[located.ranking[0].number]
+    assert first.effect.id == located.term.effect.id == "hard_iron_step"
+    assert first not in terms
+    spacing = float(terms[1].shape["onset"] - terms[0].shape["onset"])
+    assert abs(first.shape["onset"] - float(prepared.time[671])) < 0.25 * spacing
+
+
+def test_its_gain_is_no_less_than_that_of_any_shape_tried(found):
+    _, _, located = found
+    gains = located.linearised.search.gains(located.linearised.series.unsqueeze(-1)).ratio[:, 0]
+    steps = [k for k, term in enumerate(located.terms) if term.effect.id == "hard_iron_step"]
+    assert float(gains[located.ranking[0].number]) == pytest.approx(float(gains[steps].max()))
+
+
+def test_a_fit_without_slopes_gives_way_to_the_next(monkeypatch):
+    line = Line(100)
+    model = JointModel(line)
+    fit = fitted(model, line.start())
+    terms = STEPS[:2]
+    fits = [dataclasses.replace(fit, model=model.with_term(term)) for term in terms]
+    known = object()
+
+    def tangents(of, _parameters, _terms):
+        if of is fits[0].model:
+            raise ValueError("no finite slope")
+        return known
+
+    monkeypatch.setattr("mkc_torch.diagnosis.search.locate.tangents_of", tangents)
+    assert _with_tangents(fits, terms) == (fits[1], terms, known)
+    with pytest.raises(ValueError, match="no finite slope"):
+        _with_tangents(fits[:1], terms)
+
+
+def test_gains_of_other_candidates_are_those_of_a_search_with_them():
+    line = Line(600)
+    model = JointModel(line)
+    fit = fitted(model, line.start())
+    values, counts = fit.residual * 1.0, torch.ones_like(fit.residual)
+    counts[100:120, 0] = 0.0
+    values = values * counts
+    tangents = tangents_of(model, fit.parameters, STEPS)
+    whole = linearise(model, fit.parameters, values, counts, tangents)
+    bare = linearise(model, fit.parameters, values, counts, tangents.bare, colour=whole.colour)
+    beside = candidate_tangents(model, fit.parameters, STEPS, tangents.pointwise)
+    assert len(beside) == 3
+    torch.testing.assert_close(
+        bare.gains_of(beside, counts).ratio, whole.search.gains(whole.series.unsqueeze(-1)).ratio
+    )
+
+
+def test_a_joint_fit_at_another_moment_gives_way_to_that_of_the_search(monkeypatch):
+    sensor = np.zeros((N, 3))
+    sensor[671:] = [0.7, -0.7, 0.7]
+    prepared = Magnetometer("attitude").prepare(tumbling(N, noise=0.3, sensor=sensor, attitude=True, gyro=True))
+    base = fitted(JointModel(prepared), prepared.start())
+    terms = candidate_terms(prepared, (), (STEP,))
+    late = max(terms, key=lambda term: term.shape["onset"])
+
+    def strongest(base, terms, prefer, *, parts):  # noqa: ARG001
+        model = base.model.with_term(late)
+        fit = fitted(model, torch.cat([base.parameters, torch.zeros(3)]), base.bound)
+        return [fit], tangents_of(base.model, base.parameters, terms)
+
+    monkeypatch.setattr("mkc_torch.diagnosis.search.locate.strongest", strongest)
+    located = locate(base, terms, level=0.05, surrogates=19, generator=torch.Generator().manual_seed(0))
+    assert located.p_value <= 0.05
+    assert located.term.shape["onset"] == pytest.approx(float(prepared.time[671]), abs=0.1)
+
+
+def test_a_fit_that_ran_out_of_steps_is_begun_anew():
+    line = Line(200)
+    base = fitted(JointModel(line), line.start())
+    settled = fitted(base.model.with_term(STEPS[0]), torch.cat([base.parameters, torch.zeros(3)]), base.bound)
+    assert settled.converged
+    assert _settled(settled, base) is settled
+    stopped = dataclasses.replace(
+        settled, parameters=settled.parameters + 0.01, log_likelihood=settled.log_likelihood - 10.0, converged=False
+    )
+    again = _settled(stopped, base)
+    assert again.log_likelihood == pytest.approx(settled.log_likelihood, abs=1e-3)
+    torch.testing.assert_close(again.parameters, settled.parameters, rtol=0.0, atol=1e-4)
+
+
+class Driven(Line):
+    """One whose last parameter is a state at the beginning."""
+
+    beginnings = 1
+
+
+@pytest.mark.parametrize(
+    ("line", "now", "starts"),
+    [
+        (Driven(), [4.1, 0.4], 1),  # more than five times its start
+        (Driven(), [0.1, 0.4], 1),  # and less than a fifth
+        (Driven(), [-0.9, 0.4], 0),
+        (Driven(), [0.9, 9.0], 0),  # a state begins wherever it does
+        (Line(), [4.1, 0.4], 0),  # its start is no guess of a user's
+    ],
+)
+def test_where_a_fit_began_is_looked_at_if_it_went_far_from_there(line, now, starts):
+    fit = fitted(JointModel(line), line.start())
+    found = _first_start(dataclasses.replace(fit, parameters=torch.tensor(now, dtype=torch.float64)))
+    assert len(found) == starts
+    for parameters, _ in found:
+        torch.testing.assert_close(parameters, line.start())

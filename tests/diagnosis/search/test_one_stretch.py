@@ -1,0 +1,106 @@
+"""An effect whose evidence is one burst of outliers among others is not named; one that comes back is."""
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch import diagnose
+from mkc_torch.diagnosis.search.one_stretch import telling_stretch
+from mkc_torch.simulation import Magnetometer
+from tests.simulation.tumbling import FIELD, RATE, tumbling, turns
+
+N = 2500
+TIME = np.arange(N) / RATE
+POSITION = {
+    f"position_{axis}": 0.4 * np.sin(2 * np.pi * TIME / period + phase)
+    + 0.1 * np.sin(2 * np.pi * TIME / (0.37 * period) + phase)
+    for axis, period, phase in zip("xyz", (7.3, 9.1, 11.7), (0.3, 1.2, 2.5), strict=True)
+}
+MILD, OTHERS = {400: -1.0}, {1200: 12.0, 1900: -9.0}
+"""Sample at which a burst begins, and how much it adds along the field, in µT."""
+
+
+def in_the_body(world):
+    return turns(TIME).inv().apply(world)
+
+
+def bursts(sizes, length=40):
+    added = np.zeros((N, 3))
+    for begin, size in sizes.items():
+        added[begin : begin + length] = size * FIELD / np.linalg.norm(FIELD)
+    return in_the_body(added)
+
+
+def pole(place, strength=0.02):
+    """Of a pole in µT·m², the field along the path."""
+    away = place - np.stack(list(POSITION.values()), -1)
+    return in_the_body(strength * away / (np.square(away).sum(-1, keepdims=True) + 0.06**2) ** 1.5)
+
+
+def diagnosis_of(sensor):
+    return diagnose(Magnetometer("norm"), tumbling(N, noise=0.3, sensor=sensor, seed=1, **POSITION))
+
+
+def told(diagnosis):
+    return [warning for warning in diagnosis.warnings if "another burst of outliers" in warning]
+
+
+def test_one_burst_among_others_is_no_effect():
+    """A pole beside the path would explain the mild one, and nothing else."""
+    diagnosis = diagnosis_of(bursts(MILD | OTHERS))
+    assert diagnosis.verdict == "adequate"
+    assert diagnosis.findings == ()
+    (warning,) = told(diagnosis)
+    assert warning.startswith("From 6.8 to 8.8 s")
+    assert "field_gradient by position_x, position_y, position_z" in warning
+
+
+def test_what_is_passed_more_than_once_is_an_effect():
+    place = np.array([values[420] for values in POSITION.values()]) + 0.05
+    diagnosis = diagnosis_of(pole(place) + bursts(OTHERS))
+    assert [finding.effect for finding in diagnosis.findings] == ["field_gradient"]
+    assert told(diagnosis) == []
+
+
+@pytest.fixture
+def stretch():
+    trace = torch.zeros(1000, 2, dtype=torch.float64)
+    trace[400:430, 0] = 1.0
+    counts = torch.ones_like(trace)
+    counts[700:730] = 0.0
+    return trace, counts, torch.ones(1000, 2, 1, dtype=torch.float64)
+
+
+def test_the_stretch_holds_the_evidence(stretch):
+    trace, counts, nuisance = stretch
+    first, end = telling_stretch(trace, counts, trace, nuisance)
+    assert first <= 400
+    assert end >= 430
+    assert end - first == 40
+
+
+def test_evidence_that_is_spread_is_in_no_stretch(stretch):
+    trace, counts, nuisance = stretch
+    for begin in (100, 250):
+        trace[begin : begin + 30, 0] = 1.0
+    assert telling_stretch(trace, counts, trace, nuisance) is None
+
+
+def test_without_other_bursts_a_stretch_is_evidence(stretch):
+    trace, _, nuisance = stretch
+    assert telling_stretch(trace, torch.ones_like(trace), trace, nuisance) is None
+    beside = torch.ones_like(trace)
+    beside[395:405] = 0.0  # its own edge
+    assert telling_stretch(trace, beside, trace, nuisance) is None
+
+
+def test_what_the_simulation_itself_explains_is_no_evidence(stretch):
+    trace, counts, nuisance = stretch
+    offset = counts * (trace + 2.0)
+    assert telling_stretch(offset, counts, offset, nuisance) is not None
+    assert telling_stretch(offset, counts, offset, nuisance[..., :0]) is None
+
+
+def test_a_trace_against_the_residual_is_no_evidence(stretch):
+    trace, counts, nuisance = stretch
+    assert telling_stretch(-trace, counts, trace, nuisance) is None

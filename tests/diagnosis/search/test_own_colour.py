@@ -1,0 +1,92 @@
+"""A slow effect in white noise, which has coloured the noise that the search goes by."""
+
+import sys
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis.linearised.linear_search import LinearSearch
+from mkc_torch.diagnosis.linearised.linearise import Linearised
+from mkc_torch.diagnosis.noise.colour import colour_of, whittle
+from mkc_torch.diagnosis.noise.gaps import Filling
+from mkc_torch.diagnosis.search.own_colour import own_colour_gains
+
+N, M = 800, 2
+
+
+def randn(*size, seed):
+    return torch.randn(*size, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def smooth(seed):
+    """A random course of some dozen slow waves, of mean square one."""
+    power = torch.zeros(N).double()
+    power[1:13] = 1.0
+    course = randn(N, M, seed=seed) * power.unsqueeze(-1)
+    return course / course.square().mean().sqrt()  # of cosine coefficients
+
+
+OFFSET = torch.zeros(N, M, M).double()
+OFFSET[0] = torch.eye(M).double()
+EFFECT, RIVAL = smooth(1), smooth(2)
+SCALE = torch.tensor([1.0, 30.0]).double()
+"""Of the channels."""
+
+
+def searching(size, seed=3):
+    values = SCALE * (randn(N, M, seed=seed) + size * EFFECT)
+    colour = colour_of(values.square())
+    nuisance, effect, rival = (
+        colour.scaled(SCALE.unsqueeze(-1) * one) for one in (OFFSET, EFFECT.unsqueeze(-1), RIVAL.unsqueeze(-1))
+    )
+    search = LinearSearch(nuisance, [rival, effect], nuisance[:, :0], nuisance.new_zeros(0, 0))
+    return Linearised(search, colour.scaled(values.unsqueeze(-1)).squeeze(-1), colour, None, Filling((None,) * M, 0.0))
+
+
+BOTH = torch.ones(2, dtype=torch.bool)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_effect_that_hides_in_the_colour_is_seen_beside_its_own(seed):
+    linearised = searching(0.25, seed)
+    drawn = linearised.search.white(400, torch.Generator().manual_seed(4))
+    series = torch.cat([linearised.series.unsqueeze(-1), drawn], -1)
+    by_search = 0.5 * linearised.search.gains(series).ratio.amax(0) - 1.0
+    by_colour = own_colour_gains(linearised, series, BOTH)
+    assert float(by_colour[0]) > 1.5 * float(by_search[0])
+    assert float(by_colour[0]) > float(by_colour[1:].max()) + 5.0
+    assert float(by_colour[1:].median()) < 3.0
+
+
+def test_the_gain_is_the_ratio_of_the_likelihoods_with_colours_of_their_own():
+    linearised = searching(0.5)
+    values = linearised.series.unflatten(0, (N, M)) * linearised.colour.root
+    level = linearised.colour.root.square().mean(0).sqrt()
+    values, columns = values / level, EFFECT * SCALE / level
+    values[0], columns[0] = 0.0, 0.0  # the offset takes the constant
+    size = (values * columns).sum() / columns.square().sum()
+    both = [sum(whittle(one.square()[:, j : j + 1]) for j in range(M)) for one in (values - size * columns, values)]
+    found = own_colour_gains(linearised, linearised.series.unsqueeze(-1), BOTH)
+    assert float(found) == pytest.approx(float(both[0] - both[1]) - 1.0, rel=1e-9)
+    assert float(found) > 10.0
+
+
+def test_a_candidate_that_is_not_possible_has_no_part():
+    linearised = searching(0.5)
+    found = own_colour_gains(linearised, linearised.series.unsqueeze(-1), torch.tensor([True, False]))
+    assert float(found) < 3.0
+
+
+def test_units_of_the_channels_do_not_matter(monkeypatch):
+    first = searching(0.3)
+    monkeypatch.setattr(sys.modules[__name__], "SCALE", torch.tensor([1e6, 1e-6]).double())
+    other = searching(0.3)
+    gains = [own_colour_gains(one, one.series.unsqueeze(-1), BOTH) for one in (first, other)]
+    torch.testing.assert_close(*gains)
+
+
+@pytest.mark.parametrize("K", [30, 400])
+def test_series_side_by_side_have_the_likelihood_that_each_has_alone(K):
+    power = (randn(K, 7, seed=5) * torch.logspace(1, -1, K).double().unsqueeze(-1) ** (0.3 * torch.arange(7))).square()
+    alone = torch.cat([whittle(one.unsqueeze(-1)) for one in power.unbind(-1)])
+    torch.testing.assert_close(whittle(power), alone)

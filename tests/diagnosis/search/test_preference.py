@@ -1,0 +1,45 @@
+"""Named physics goes before a curve that has no name, the more so where the curve is over the motion itself."""
+
+import pytest
+import torch
+
+from mkc_torch import Recording
+from mkc_torch.diagnosis.model.drivers import find_drivers
+from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.search.preference import Preference
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.effects.sensor.unknown import UNKNOWN
+from mkc_torch.simulation import Dynamics
+
+TIME = torch.arange(300, dtype=torch.float64) * 0.02
+
+
+class Swing(Dynamics):
+    states = ("angle", "speed")
+    parameters = {"stiffness": 9.0}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle)}
+
+
+@pytest.fixture(scope="module")
+def search():
+    columns = {"time": TIME, "angle": torch.cos(3.0 * TIME), "battery": torch.sin(0.7 * TIME) + 11.0}
+    prepared = Swing().prepare(Recording(columns))
+    roles = frozenset(role for effect in CATALOGUE for role in effect.roles)
+    terms = candidate_terms(prepared, find_drivers(prepared.recording, Swing().columns, roles).drivers, CATALOGUE)
+    return Preference(terms, prepared), terms
+
+
+def test_a_named_force_gives_nothing(search):
+    prefer, terms = search
+    drag = next(term for term in terms if term.effect.id == "linear_drag")
+    assert prefer.handicap(drag, 100.0) == 0.0
+
+
+def test_a_curve_over_the_motion_gives_half_of_its_gain_and_ten_nats(search):
+    prefer, terms = search
+    curves = [term for term in terms if term.effect.id == UNKNOWN and term.driver is None]
+    assert curves
+    assert all(prefer.handicap(term, 100.0) == pytest.approx(60.0) for term in curves)
+    assert all(prefer.handicap(term, -5.0) == pytest.approx(10.0) for term in curves)

@@ -1,0 +1,75 @@
+"""When a finding counts: the draws of noise have judged the first one, unseen blocks have to confirm what follows."""
+
+import importlib
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis.evidence.held_out import blocks_of
+from mkc_torch.diagnosis.noise.innovations import innovation_gain
+
+holds = importlib.import_module("mkc_torch.diagnosis.diagnose")._holds
+N = 2000
+BLOCKS = blocks_of(N, 1)
+
+
+def evidence(mean, spread):
+    noise = torch.randn(N, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return SimpleNamespace(log_likelihood=mean + spread * (noise - noise.mean()), residual=RESIDUAL)
+
+
+RESIDUAL = torch.randn(N, 1, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+NOTHING = SimpleNamespace(log_likelihood=torch.zeros(N, dtype=torch.float64), residual=RESIDUAL)
+
+
+def located(beyond):
+    return SimpleNamespace(beyond=beyond, fit=SimpleNamespace(model=SimpleNamespace(sizes=(3,))))
+
+
+@pytest.mark.parametrize(
+    ("first", "mean", "spread", "beyond", "counts"),
+    [
+        (True, 0.01, 1.0, 0.0, True),  # leans its way
+        (True, -0.01, 1.0, 0.0, False),
+        (True, -0.01, 1.0, 100.0, True),  # plain beyond all draws
+        (True, -0.5, 1.0, 100.0, False),  # plain, and clearly worse on unseen blocks
+        (False, 0.01, 1.0, 10.0, False),  # leans, and is not confirmed
+        (False, 0.01, 1.0, 100.0, True),  # leans, and is plain
+        (False, 0.5, 1.0, 0.0, True),
+        (False, -0.5, 1.0, 100.0, False),
+    ],
+)
+def test_a_finding_counts(first, mean, spread, beyond, counts):
+    assert holds(located(beyond), NOTHING, evidence(mean, spread), BLOCKS, 0, first=first) is counts
+
+
+def walks(step):
+    """Evidence a little against it, and a residual that wanders, with a fast course and without."""
+    draws = torch.randn(N, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    wander = draws[:, 0].cumsum(0) + 0.1 * draws[:, 1]
+    course = step * torch.sin(torch.arange(N, dtype=torch.float64))
+    below = torch.full((N,), -0.01, dtype=torch.float64)
+    before = SimpleNamespace(log_likelihood=torch.zeros_like(below), residual=(wander + course).unsqueeze(-1))
+    return before, SimpleNamespace(log_likelihood=below, residual=wander.unsqueeze(-1))
+
+
+def test_what_is_plain_beside_a_wander_counts_though_blocks_see_the_wander_alone():
+    before, after = walks(0.5)
+    assert innovation_gain(before.residual, after.residual) > 50.0
+    assert holds(located(0.0), before, after, BLOCKS, 0, first=True)
+    assert not holds(located(0.0), before, after, BLOCKS, 0, first=False)
+
+
+def test_what_is_worth_less_than_its_parameters_does_not():
+    before, after = walks(0.05)
+    assert innovation_gain(before.residual, after.residual) < 10.0
+    assert not holds(located(0.0), before, after, BLOCKS, 0, first=True)
+
+
+def test_the_gain_of_innovations_is_that_of_least_squares_in_white_noise():
+    draws = torch.randn(N, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    course = 0.2 * torch.sin(torch.arange(N, dtype=torch.float64)).unsqueeze(-1)
+    before, after = SimpleNamespace(residual=draws + course), SimpleNamespace(residual=draws)
+    expected = 0.5 * float(((draws + course).square() - draws.square()).sum())
+    assert innovation_gain(before.residual, after.residual) == pytest.approx(expected, rel=0.15)

@@ -1,0 +1,504 @@
+"""What every effect on differential equations promises."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mkc_torch import Recording
+from mkc_torch.diagnosis.model.drivers import find_drivers
+from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.model.term import limits
+from mkc_torch.effects import CATALOGUE, DYNAMICS, Context, ContinuousEffect
+from mkc_torch.effects.base import BoundedEffect, ChoosyEffect, PartEffect, RelativeEffect, ShapedEffect
+from mkc_torch.simulation import Dynamics
+from tests.effects.contexts import size_of
+
+IDS = (
+    "constant_force", "linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction",
+    "load_dependent_friction", "cubic_stiffness", "position_periodic_force", "coupling", "hard_stop", "overflow",
+    "thermal_loss", "input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "bouc_wen_hysteresis",
+    "added_mass", "magnus_lift", "buoyancy",
+)  # fmt: skip
+
+LOSSES = ("linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction", "load_dependent_friction")
+EITHER_SIGN = ("constant_force", "cubic_stiffness", "position_periodic_force", "magnus_lift")
+SHARES = ("input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "added_mass")
+
+N = 80
+
+
+def signal(*names, seed=0):
+    """Components that change their sign, of size 2, by their names."""
+    generator = torch.Generator().manual_seed(seed)
+    return 2.0 * torch.randn(N, len(names), generator=generator, dtype=torch.float64)
+
+
+def make_context(effect):
+    """What the effect sees at a port that has all it could need; times are uneven."""
+    generator = torch.Generator().manual_seed(1)
+    time = 0.02 + 0.05 * torch.rand(N, generator=generator, dtype=torch.float64).cumsum(0)
+    none = time.new_zeros(N, 0)
+    if effect.port in ("input", "output"):
+        parts, units = {"own": "force"}, {"own": "N"}
+        return Context(time, none, (), signal("force"), "N", ("force",), parts=parts, part_units=units)
+    names = ("angle", "speed", "other", "load", "rate")
+    parts = {
+        "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "reversing": "speed",
+        "temperature": "speed", "level": "speed", "other": "other", "load": "load",
+        "rate": "rate", "height": "angle", "sideways": "other",
+    }  # fmt: skip
+    of = {"angle": "rad", "speed": "rad/s", "other": "rad/s", "load": "rad/s/s", "rate": "rad/s/s"}
+    units = {part: of[name] for part, name in parts.items()}
+    channels = ("speed", "other") if effect.port == "exchange" else ("speed",)
+    values = signal(*names)
+    values[:, 3] = values[:, 3].abs()
+    return Context(time, none, (), values, "rad/s/s", channels, names, parts, units)
+
+
+def cases():
+    for effect in DYNAMICS:
+        context = make_context(effect)
+        shapes = effect.shapes(context.time)
+        for k, shape in enumerate(shapes if len(shapes) == 1 else (shapes[0], shapes[-1])):
+            yield pytest.param(effect, shape, context, id=f"{effect.id}-{k}")
+
+
+CASES = list(cases())
+EFFECTS = pytest.mark.parametrize("effect", DYNAMICS, ids=lambda e: e.id)
+OF = {effect.id: effect for effect in DYNAMICS}
+
+
+def change(effect, gamma, shape, context):
+    return effect.change(torch.as_tensor(gamma, dtype=torch.float64), shape, context)
+
+
+def test_ids_are_the_contract():
+    assert {effect.id for effect in DYNAMICS} >= set(IDS)
+    several = ("unknown", "field_gradient")
+    named = [effect.id for effect in CATALOGUE if effect.id not in several]
+    assert len(set(named)) == len(named)
+    assert set(DYNAMICS) < set(CATALOGUE)
+
+
+@pytest.mark.parametrize(("effect", "shape", "context"), CASES)
+def test_nothing_changes_without_an_amplitude(effect, shape, context):
+    size = size_of(effect, shape, context)
+    nothing = change(effect, [0.0] * size, shape, context)
+    assert nothing.shape == (N, len(context.channels))
+    assert nothing.dtype == torch.float64
+    assert float(nothing.abs().max()) == 0.0
+
+
+@pytest.mark.parametrize(("effect", "shape", "context"), CASES)
+def test_the_change_is_linear_in_the_amplitude(effect, shape, context):
+    generator = torch.Generator().manual_seed(0)
+    a, b = torch.randn(2, size_of(effect, shape, context), generator=generator, dtype=torch.float64)
+    together = effect.change(2.0 * a - 3.0 * b, shape, context)
+    parts = 2.0 * effect.change(a, shape, context) - 3.0 * effect.change(b, shape, context)
+    assert float(effect.change(a, shape, context).abs().max()) > 1e-3
+    torch.testing.assert_close(together, parts, rtol=1e-9, atol=1e-9 * float(parts.abs().max()))
+
+
+@pytest.mark.parametrize(("effect", "shape", "context"), CASES)
+def test_each_amplitude_has_a_tangent_of_its_own(effect, shape, context):
+    zero = torch.zeros(size_of(effect, shape, context), dtype=torch.float64)
+    tangent = torch.func.jacfwd(lambda g: effect.change(g, shape, context))(zero).flatten(0, 1)
+    assert int(torch.linalg.matrix_rank(tangent)) == len(zero)
+    torch.testing.assert_close(
+        tangent @ torch.ones_like(zero), effect.change(torch.ones_like(zero), shape, context).flatten()
+    )
+
+
+@pytest.mark.parametrize(("effect", "shape", "context"), CASES)
+def test_the_change_has_a_slope_in_what_is_fitted_of_its_shape(effect, shape, context):
+    names = list(effect.fitted_shape) if isinstance(effect, ShapedEffect) else []
+    gamma = torch.ones(size_of(effect, shape, context), dtype=torch.float64)
+
+    def changed(values):
+        return effect.change(gamma, {**shape, **dict(zip(names, values.unbind(), strict=True))}, context)
+
+    values = torch.tensor([shape[name] for name in names], dtype=torch.float64)
+    slopes = torch.func.jacfwd(changed)(values) if names else torch.zeros(1, 0)
+    for k, value in enumerate(values.tolist()):
+        step = torch.zeros_like(values)
+        step[k] = 1e-6 * value
+        numerical = (changed(values + step) - changed(values - step)) / (2.0 * step[k])
+        assert float(numerical.abs().max()) > 0.0
+        torch.testing.assert_close(slopes[..., k], numerical, rtol=1e-4, atol=1e-4 * float(numerical.abs().max()))
+
+
+@pytest.mark.parametrize(("effect", "shape", "context"), CASES)
+def test_its_slope_along_the_signal_is_finite_everywhere(effect, shape, context):
+    """Trajectories are found by Newton's method: standstill and rest must not break it."""
+    gamma = torch.ones(size_of(effect, shape, context), dtype=torch.float64)
+    for values in (context.signal, torch.zeros_like(context.signal), 1e4 * context.signal):
+        slope = torch.func.jvp(
+            lambda s: effect.change(gamma, shape, replace(context, signal=s)), (values,), (torch.ones_like(values),)
+        )[1]
+        assert bool(slope.isfinite().all())
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_what_brakes_takes_energy_out(name):
+    effect, context = OF[name], make_context(OF[name])
+    for shape in effect.shapes(context.time):
+        for gamma in torch.eye(size_of(effect, shape, context), dtype=torch.float64):
+            power = effect.change(gamma, shape, context)[:, 0] * context.part("own")
+            assert float(power.max()) <= 0.0
+            assert float(power.min()) < -1e-3
+    assert limits(effect) == (0.0, math.inf)
+
+
+def test_signs_of_amplitudes():
+    assert {e.id for e in DYNAMICS if limits(e)[0] == -math.inf} >= set(EITHER_SIGN)
+    assert {e.id for e in DYNAMICS if limits(e) == (0.0, 1.0)} >= set(SHARES)
+    for effect in DYNAMICS:
+        assert isinstance(effect, BoundedEffect)
+        assert effect.id in EITHER_SIGN or limits(effect)[0] == 0.0 or effect.id not in IDS
+
+
+class TestPhysics:
+    """Each formula at values that can be computed by hand."""
+
+    @staticmethod
+    def at(name, gamma, shape=None, **values):
+        effect = OF[name]
+        context = make_context(effect)
+        carried = context.carries or context.channels
+        row = torch.tensor([values.get(one, 0.0) for one in carried], dtype=torch.float64)
+        return change(effect, gamma, shape or {}, replace(context, signal=row.expand(N, -1)))[0].tolist()
+
+    def test_a_push(self):
+        assert self.at("constant_force", [0.3], speed=-5.0) == [0.3]
+
+    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    def test_drags(self, sign):
+        assert self.at("linear_drag", [0.3], speed=2.0 * sign) == pytest.approx([-0.6 * sign])
+        assert self.at("quadratic_drag", [0.3], speed=2.0 * sign) == pytest.approx([-1.2 * sign])
+        assert self.at("cubic_stiffness", [0.3], angle=2.0 * sign) == pytest.approx([-2.4 * sign])
+
+    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    def test_friction_is_of_one_size(self, sign):
+        for speed in (0.1, 10.0):
+            rubbed = self.at("coulomb_friction", [0.3], {"width": 0.01}, speed=speed * sign)
+            assert rubbed == pytest.approx([-0.3 * sign])
+        shape = {"width": 0.01, "stribeck_speed": 1.0}
+        assert self.at("stribeck_friction", [0.3, 0.2], shape, speed=10.0 * sign) == pytest.approx([-0.3 * sign])
+        slow = -(0.3 + 0.2 * math.exp(-0.01)) * sign
+        assert self.at("stribeck_friction", [0.3, 0.2], shape, speed=0.1 * sign) == pytest.approx([slow])
+        loaded = self.at("load_dependent_friction", [0.3, 0.1], {"width": 0.01}, speed=sign, load=5.0)
+        assert loaded == pytest.approx([-0.8 * sign])
+
+    def test_a_periodic_force(self):
+        pushed = self.at("position_periodic_force", [0.3, 0.2], {"order": 4.0}, angle=0.5)
+        assert pushed == pytest.approx([0.3 * math.sin(2.0) + 0.2 * math.cos(2.0)])
+
+    def test_exchange_evens_out(self):
+        assert self.at("coupling", [0.3, 0.2], speed=1.0, other=3.0) == pytest.approx([0.6, -0.4])
+
+    def test_stops_push_back(self):
+        shape = {"place": 1.0, "exponent": 1.0}
+        assert self.at("hard_stop", [5.0, 3.0], shape, angle=1.2) == pytest.approx([-1.0])
+        assert self.at("hard_stop", [5.0, 3.0], shape, angle=-1.2) == pytest.approx([0.6])
+        assert self.at("hard_stop", [5.0, 3.0], shape, angle=0.9) == [0.0]
+
+    def test_only_what_is_above_the_rim_runs_over(self):
+        assert self.at("overflow", [2.0], {"rim": 1.0, "exponent": 1.0}, speed=1.5) == pytest.approx([-1.0])
+        assert self.at("overflow", [2.0], {"rim": 1.0, "exponent": 1.0}, speed=0.5) == [0.0]
+
+    def test_weirs_and_balls_are_stiffer_the_farther_they_are_in(self):
+        for lost, exponent in ((0.5, 1.0), (0.5**1.5, 1.5), (0.5**2.5, 2.5)):
+            shape = {"rim": 1.0, "exponent": exponent}
+            assert self.at("overflow", [2.0], shape, speed=1.5) == pytest.approx([-2.0 * lost])
+            shape = {"place": 1.0, "exponent": exponent}
+            assert self.at("hard_stop", [2.0, 4.0], shape, angle=-1.5) == pytest.approx([4.0 * lost])
+
+    def test_radiation_in_either_unit(self):
+        effect = OF["thermal_loss"]
+        for unit, room in (("°C", 20.0), ("K", 293.15)):
+            context = replace(make_context(effect), part_units={"own": unit})
+            hot = context.signal.new_tensor([0.0, room, 0.0, 0.0, 0.0]).expand(N, -1)
+            assert float(change(effect, [1.0], {}, replace(context, signal=hot))[0]) == pytest.approx(0.0, abs=1e-9)
+            hot = hot + hot.new_tensor([0.0, 0.01, 0.0, 0.0, 0.0])  # a linear loss near room temperature
+            lost = float(change(effect, [1.0], {}, replace(context, signal=hot))[0])
+            assert lost == pytest.approx(-0.01, rel=1e-3)
+
+    def test_inputs_are_limited_and_small_ones_lost(self):
+        limit, width = {"limit": 1.0, "softness": 0.01}, {"width": 1.0, "softness": 0.01}
+        for u, limited, dead in ((3.0, 1.0, 2.0), (-3.0, -1.0, -2.0), (0.5, 0.5, 0.0)):
+            assert u + self.at("input_saturation", [1.0], limit, force=u)[0] == pytest.approx(limited)
+            assert u + self.at("dead_zone", [1.0], width, force=u)[0] == pytest.approx(dead, abs=1e-9)
+
+
+def test_a_delay_shows_what_was_also_between_the_samples():
+    effect = OF["input_delay"]
+    context = make_context(effect)
+    course = (3.0 * context.time + 1.0).unsqueeze(-1)
+    for delay in (0.003, 0.1, 0.57):
+        delayed = course + change(effect, [1.0], {"delay": delay}, replace(context, signal=course))
+        expected = 3.0 * (context.time - delay).clamp(min=float(context.time[0])) + 1.0
+        torch.testing.assert_close(delayed[:, 0], expected)
+
+
+def test_a_delay_does_not_reach_into_another_run():
+    """Where time goes back another run begins, at rest at its first value."""
+    effect = OF["input_delay"]
+    time = torch.cat([torch.linspace(0.0, 2.0, 40), torch.linspace(0.0, 1.0, 40)]).double()
+    course = torch.cat([7.0 + 0.0 * time[:40], 1.0 + time[40:]]).unsqueeze(-1)
+    context = replace(make_context(effect), time=time, signal=course)
+    delayed = (course + change(effect, [1.0], {"delay": 0.3}, context))[:, 0]
+    torch.testing.assert_close(delayed[:40], torch.full((40,), 7.0).double())
+    torch.testing.assert_close(delayed[40:], 1.0 + (time[40:] - 0.3).clamp(min=0.0))
+
+
+@pytest.mark.parametrize("name", ["input_delay", "sensor_lag", "backlash"])
+def test_runs_are_told_apart_by_their_number_whatever_their_clocks_do(name):
+    """On one clock that goes on, and on clocks that begin anew, what is remembered of a run ends with it."""
+    effect = OF[name]
+    one, other = torch.linspace(0.0, 2.0, 40).double(), torch.linspace(2.1, 3.9, 40).double()
+    course = torch.cat([7.0 + torch.sin(5.0 * one), torch.cos(5.0 * other)]).unsqueeze(-1)
+    run = torch.arange(2).repeat_interleave(40)
+    shape = effect.shapes(one)[-1]
+    for later in (other, other - 2.1):
+        both = replace(make_context(effect), time=torch.cat([one, later]), signal=course, run=run)
+        together = change(effect, [1.0], shape, both)
+        for part, time in ((slice(0, 40), one), (slice(40, 80), later)):
+            alone = replace(both, time=time, signal=course[part], run=None)
+            torch.testing.assert_close(together[part], change(effect, [1.0], shape, alone))
+
+
+def test_a_sensor_lags_by_its_time_constant():
+    effect = OF["sensor_lag"]
+    time = torch.linspace(0.0, 5.0, N, dtype=torch.float64)
+    ramp = 3.0 * time.unsqueeze(-1)
+    context = replace(make_context(effect), time=time, signal=ramp)
+    shown = (ramp + change(effect, [1.0], {"lag": 0.8}, context))[:, 0]
+    torch.testing.assert_close(shown, 3.0 * (time - 0.8 * (1.0 - torch.exp(-time / 0.8))))
+
+
+@EFFECTS
+def test_users_are_told_what_it_is(effect):
+    assert effect.equation.startswith("δ")
+    for sentence in (effect.explanation, effect.advice):
+        assert sentence.endswith(".")
+        assert sentence[0].isupper()
+    assert len(effect.source) > 10
+    assert effect.plausible > 0
+    assert effect.roles == () or effect.driver_optional
+    assert effect.follows_signal
+    words = type(effect).__doc__
+    for heading in ("Simulation:", "Drivers:", "Units:", "Plausible:", "Source:"):
+        assert heading in words
+
+
+@EFFECTS
+def test_amplitudes_have_names_and_units(effect):
+    context = make_context(effect)
+    for shape in effect.shapes(context.time):
+        quantities = effect.quantities(shape, context)
+        assert all(quantity.name.isidentifier() for quantity in quantities)
+        assert all(isinstance(quantity.unit, str) for quantity in quantities)
+        shares = effect.id in SHARES or any(q.name.startswith("share") for q in quantities)
+        assert shares or all(quantity.unit for quantity in quantities)
+
+
+@pytest.mark.parametrize(
+    ("name", "units"),
+    [
+        ("constant_force", ["m/s²"]),
+        ("coulomb_friction", ["m/s²"]),
+        ("stribeck_friction", ["m/s²", "m/s²"]),
+        ("coupling", ["1/s"]),
+        ("thermal_loss", ["1/s"]),
+        ("sensor_lag", [""]),
+    ],
+)
+def test_units_of_amplitudes(name, units):
+    effect = OF[name]
+    context = replace(make_context(effect), signal_unit="m/s²")
+    shape = effect.shapes(context.time)[0]
+    assert [quantity.unit for quantity in effect.quantities(shape, context)] == units
+
+
+@EFFECTS
+def test_what_is_said_of_shapes_is_of_shapes(effect):
+    numbers = {name for shape in effect.shapes(torch.linspace(0.0, 9.0, N).double()) for name in shape}
+    assert isinstance(effect, RelativeEffect) == hasattr(effect, "relative")
+    assert isinstance(effect, ContinuousEffect) == hasattr(effect, "continuous")
+    if isinstance(effect, RelativeEffect):
+        assert set(effect.relative) <= numbers
+        assert all(which in ("typical", "largest") for _, which in effect.relative.values())
+    if isinstance(effect, ContinuousEffect):
+        assert set(effect.continuous) <= numbers
+        assert all(low < high for low, high in effect.continuous.values())
+    assert isinstance(effect, ShapedEffect) == hasattr(effect, "fitted_shape")
+    if isinstance(effect, ShapedEffect):
+        assert set(effect.fitted_shape) <= numbers
+        for name, (low, high) in effect.fitted_shape.items():
+            grid = [shape[name] for shape in effect.shapes(torch.linspace(0.0, 1.0, N).double())]
+            assert 0.0 < low <= min(grid) <= max(grid) < high
+    if isinstance(effect, PartEffect) and effect.along:
+        assert effect.along in make_context(effect).parts
+
+
+# where they are tried
+
+
+class Pendulum(Dynamics):
+    states = ("angle", "speed")
+    parameters = {"stiffness": 9.0}  # noqa: RUF012
+    units = {"angle": "rad", "speed": "rad/s"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle)}
+
+
+class Motor(Pendulum):
+    inputs = ("torque",)
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"angle": x.speed, "speed": u.torque - p.stiffness * torch.sin(x.angle)}
+
+
+class Fall(Dynamics):
+    states = ("height", "speed")
+    units = {"height": "m", "speed": "m/s"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"height": x.speed, "speed": -9.81 + 0.0 * x.speed}
+
+
+class Ball(Dynamics):
+    states = ("x", "y", "vx", "vy")
+    units = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"x": x.vx, "y": x.vy, "vx": 0.0 * x.vx, "vy": -9.81 + 0.0 * x.vy}
+
+
+class Bodies(Dynamics):
+    states = ("inner", "outer")
+    parameters = {"loss": 0.1}  # noqa: RUF012
+    units = {"inner": "°C", "outer": "°C"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"inner": -p.loss * (x.inner - 20.0), "outer": -p.loss * (x.outer - 20.0)}
+
+
+TIME = torch.arange(0.0, 6.0, 0.05, dtype=torch.float64)
+
+
+def prepared(system, **columns):
+    return system().prepare(Recording({"time": TIME, **columns}))
+
+
+def tried(simulation):
+    """Port to ids of effects."""
+    places = {}
+    for term in candidate_terms(simulation, (), DYNAMICS):
+        places.setdefault(term.port, set()).add(term.effect.id)
+    return places
+
+
+EVERYWHERE = {"constant_force", "linear_drag", "quadratic_drag"}
+REVERSING = {"coulomb_friction", "stribeck_friction"}
+
+
+class TestNeeds:
+    """Effects are tried where they can mean something."""
+
+    def test_of_a_pendulum(self):
+        places = tried(prepared(Pendulum, angle=torch.cos(3.0 * TIME)))
+        of_speed = EVERYWHERE | REVERSING | {"cubic_stiffness", "hard_stop", "position_periodic_force", "added_mass"}
+        assert set(places) == {"rate of speed", "hysteretic rate of speed", "output"}
+        assert places["hysteretic rate of speed"] == {"bouc_wen_hysteresis"}
+        assert places["rate of speed"] & set(IDS) == of_speed
+        assert places["output"] == {"sensor_lag"}
+
+    def test_of_a_drive(self):
+        places = tried(prepared(Motor, angle=torch.cos(3.0 * TIME), torque=torch.sin(TIME)))
+        assert "load_dependent_friction" in set().union(*places.values())
+        assert places["input torque"] == {"input_delay", "input_saturation", "dead_zone", "backlash"}
+
+    def test_of_a_fall_that_does_not_reverse(self):
+        places = tried(prepared(Fall, height=100.0 - 0.5 * TIME**2))
+        assert places["rate of speed"] & set(IDS) == EVERYWHERE | {"hard_stop", "added_mass"}
+        assert "hysteretic rate of speed" not in places
+
+    def test_what_floats_has_a_height(self):
+        assert "buoyancy" in tried(prepared(Fall, height=torch.cos(TIME)))["rate of speed"]
+
+        class Sway(Fall):
+            states = ("sway", "speed")
+            units = {"sway": "m", "speed": "m/s"}  # noqa: RUF012
+
+            def derivative(self, time, x, u, p):  # noqa: ARG002
+                return {"sway": x.speed, "speed": -9.81 + 0.0 * x.speed}
+
+        places = tried(prepared(Sway, sway=torch.cos(TIME)))
+        assert "buoyancy" not in places["rate of speed"]
+
+    def test_of_a_ball_that_may_spin(self):
+        fall = {"x": 20.0 * TIME, "y": 9.0 * TIME - 4.9 * TIME**2}
+        assert tried(prepared(Ball, **fall))["exchange of vx and vy"] == {"coupling", "magnus_lift"}
+        simulation = prepared(Ball, **fall, spin_z=50.0 - TIME)
+        roles = frozenset(role for effect in DYNAMICS for role in effect.roles)
+        drivers = find_drivers(simulation.recording, simulation.system.columns, roles)
+        terms = [t for t in candidate_terms(simulation, drivers.drivers, DYNAMICS) if t.effect.id == "magnus_lift"]
+        assert [term.columns for term in terms] == [(), ("spin_z",)]
+
+    def test_what_turns_is_not_driven_sideways(self):
+        class Joints(Ball):
+            units = {"x": "rad", "y": "rad", "vx": "rad/s", "vy": "rad/s"}  # noqa: RUF012
+
+        assert tried(prepared(Joints, x=TIME, y=TIME))["exchange of vx and vy"] == {"coupling"}
+
+    def test_segments_of_a_run_remember_nothing_of_each_other(self):
+        class Pieces(Pendulum):
+            segment = 2.0
+
+        assert "hysteretic rate of speed" not in prepared(Pieces, angle=torch.cos(3.0 * TIME)).ports
+
+    def test_of_two_bodies(self):
+        decay = torch.exp(-0.1 * TIME)
+        places = tried(prepared(Bodies, inner=20.0 + 60.0 * decay, outer=20.0 + 20.0 * decay))
+        assert places["exchange of inner and outer"] == {"coupling"}
+        assert places["rate of inner"] & set(IDS) == {"constant_force", "linear_drag", "thermal_loss"}
+
+    def test_every_need_is_a_part_that_some_port_has(self):
+        known = {
+            "own", "position", "angle", "deflection", "reversing", "load", "temperature", "level", "other", "rate",
+            "height", "sideways", "flowing",
+        }  # fmt: skip
+        for effect in DYNAMICS:
+            assert set(effect.needs if isinstance(effect, ChoosyEffect) else ()) <= known
+
+
+def test_shapes_are_in_the_units_of_the_recording():
+    """A width is a share of the typical speed; a stop stands at a share of the largest deflection."""
+    ports = {}
+    for size in (1.0, 1000.0):
+        simulation = prepared(Pendulum, angle=size * torch.cos(3.0 * TIME))
+        ports[size] = {}
+        for term in candidate_terms(simulation, (), DYNAMICS):
+            ports[size].setdefault(term.effect.id, []).append(term.shape)
+    for name, number, share in (("coulomb_friction", "width", 0.3 * 3.0 * math.sqrt(0.5)), ("hard_stop", "place", 0.5)):
+        small, large = ports[1.0][name][0][number], ports[1000.0][name][0][number]
+        assert small == pytest.approx(share, rel=0.1)
+        assert large == pytest.approx(1000.0 * small, rel=1e-6)
+    assert ports[1.0]["position_periodic_force"] == ports[1000.0]["position_periodic_force"]
+
+
+@EFFECTS
+def test_a_found_effect_acts_on_a_recording_that_shows_less(effect):
+    """What was needed to tell it from others, such as a reversal, need not happen again."""
+    context = make_context(effect)
+    lasting = {"own", "position", "angle", "other", "load", "temperature", "rate"}
+    fewer = {part: name for part, name in context.parts.items() if part in lasting}
+    for shape in effect.shapes(context.time):
+        gamma = torch.ones(size_of(effect, shape, context), dtype=torch.float64)
+        again = replace(context, parts=fewer, part_units={part: context.part_units[part] for part in fewer})
+        assert size_of(effect, shape, again) == len(gamma)
+        assert torch.equal(effect.change(gamma, shape, again), effect.change(gamma, shape, context))

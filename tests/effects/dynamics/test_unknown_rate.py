@@ -1,0 +1,72 @@
+"""A force without a name: the curve itself, its line of Python, and that it is found where nothing else will do."""
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch import diagnose
+from mkc_torch.diagnosis.files.model import DiagnosedModel
+from mkc_torch.effects.context import Context
+from mkc_torch.effects.dynamics.linear_drag import LinearDrag
+from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
+from mkc_torch.effects.dynamics.unknown_rate import DEGREE, UnknownRate
+from tests.diagnosis.test_dynamics_diagnosis import NOISE, Pendulum, swung
+
+REACH = 1.5
+GAMMA = torch.tensor([0.3, -0.7, 0.2, 0.5], dtype=torch.float64)
+
+
+@pytest.fixture
+def context():
+    angle = torch.linspace(-2.0, 2.0, 41, dtype=torch.float64)
+    signal = torch.stack([angle, 3.0 * angle], -1)
+    parts = {"own": "speed", "position": "angle"}
+    return Context(
+        angle, angle.new_zeros(41, 0), (), signal, "rad/s²", ("speed",), ("angle", "speed"), parts, {"position": "rad"}
+    )
+
+
+@pytest.mark.parametrize("of", ["own", "position"])
+def test_the_curve_is_legendres_and_goes_on_as_a_constant(context, of):
+    effect = UnknownRate(of)
+    found = effect.change(GAMMA, {f"reach_of_{of}": REACH}, context)[:, 0]
+    inside = np.clip(context.part(of).numpy() / REACH, -1.0, 1.0)
+    expected = np.polynomial.legendre.legval(inside, [0.0, *GAMMA.tolist()])
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-12, atol=1e-14)
+    assert len(GAMMA) == DEGREE
+
+
+@pytest.mark.parametrize("of", ["own", "position"])
+def test_its_line_of_python_is_the_curve(context, of):
+    effect, shape = UnknownRate(of), {f"reach_of_{of}": REACH}
+    names = {part: part for part in ("own", "position")}
+    (line,) = effect.code(GAMMA.tolist(), shape, names)
+    values = {part: context.part(part) for part in names}
+    torch.testing.assert_close(eval(line, {"torch": torch}, values), effect.change(GAMMA, shape, context)[:, 0])
+
+
+@pytest.fixture(scope="module")
+def diagnosis():
+    """A push to one side that grows with the square of the speed, whichever way the pendulum swings."""
+    recording = swung(lambda _, speed: 0.12 * speed**2)
+    # a catalogue that has forces along the motion alone
+    effects = (LinearDrag(), QuadraticDrag(), UnknownRate("own"), UnknownRate("position"))
+    return diagnose(Pendulum(), recording, effects=effects, surrogates=19, max_findings=1)
+
+
+def test_a_force_that_is_in_no_catalogue_is_found_without_a_name(diagnosis):
+    assert diagnosis.verdict == "unexplained"
+    (finding,) = diagnosis.findings
+    assert finding.effect == "unknown"
+    assert finding.channels == ("rate of speed",)
+    assert finding.held_out.confidence_interval[0] > 0.0
+    assert finding.held_out.rmse_before > 1.5 * NOISE
+    assert finding.held_out.rmse_after < finding.held_out.rmse_before
+    assert [p.name for p in finding.parameters][:1] == ["legendre_1"]
+    assert "; δ(rate of speed) = " in finding.equation
+
+
+def test_its_model_comes_back_with_the_same_curve(diagnosis):
+    again = DiagnosedModel.from_json(diagnosis.model.to_json(), simulation=Pendulum())
+    assert again.terms[0].effect.of == diagnosis.model.terms[0].effect.of
+    assert again.terms[0].shape == diagnosis.model.terms[0].shape

@@ -1,0 +1,244 @@
+import dataclasses
+import math
+import re
+from html.parser import HTMLParser
+
+import pytest
+import torch
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("jinja2")
+
+from mkc_torch.calibration.calibrate import calibrate
+from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.recording.demonstration import simulated_recording
+from mkc_torch.recording.recording import Recording
+from mkc_torch.report import Comparison, calibration_report, refusal_report
+from mkc_torch.report.words import numbers as wording
+from tests.calibration.test_calibrate import noisy_ellipsoid, recorded
+
+VOID = {"meta", "link", "br", "img", "input", "hr"}
+
+
+class Tags(HTMLParser):
+    """Checks that tags close in order, and collects ids and texts."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.ids, self.words = [], [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.ids += [value for name, value in attributes if name == "id"]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, _, attributes):
+        self.ids += [value for name, value in attributes if name == "id"]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+def parsed(page):
+    tags = Tags()
+    tags.feed(page)
+    assert tags.open == []
+    return tags
+
+
+def text_of(page):
+    return " ".join(" ".join(parsed(page).words).split())
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return simulated_recording()[0]
+
+
+@pytest.fixture(scope="module")
+def calibration(recording):
+    return calibrate(recording)
+
+
+@pytest.fixture(scope="module")
+def page(calibration, recording):
+    row = Comparison("truth", (12.0, -7.5, 21.0), (44.98, 48.54, 51.45))
+    return calibration_report(calibration, recording, note="SIMULATED data", comparison=[row])
+
+
+def test_page_is_well_formed_with_four_pictures_and_unique_ids(page):
+    tags = parsed(page)
+    assert page.count("<svg ") == 4
+    assert len(tags.ids) == len(set(tags.ids))
+
+
+def test_page_loads_nothing(page):
+    assert "<script" not in page
+    assert "@import" not in page
+    sources = re.findall(r'(?:href|src)="([^"]*)"', page) + re.findall(r"url\(([^)]*)\)", page)
+    assert sources
+    assert all(source.startswith(("#", "data:")) for source in sources)
+
+
+def test_references_inside_the_pictures_resolve(page):
+    ids = set(parsed(page).ids)
+    for target in re.findall(r'href="#([^"]*)"', page) + re.findall(r"url\(#([^)]*)\)", page):
+        assert target in ids
+
+
+def test_page_begins_with_the_result_in_plain_words(page):
+    text = text_of(page)
+    assert "Calibrated. Offset (11.9" in text
+    assert "samples were rejected, mainly between 3" in text
+    assert "SIMULATED data" in text
+    assert "truth 12.00 −7.50 21.00 44.98 48.54 51.45" in text
+
+
+def test_doubtful_results_say_so_in_the_headline():
+    points = noisy_ellipsoid()
+    points[:120] += torch.tensor([0.0, 0.0, 60.0])
+    doubtful = recorded(points)
+    assert "Calibrated, but read the warnings." in text_of(calibration_report(calibrate(doubtful), doubtful))
+
+
+def test_python_code_of_the_page_corrects(calibration, recording):
+    measured = recording.magnetometer().numpy()
+    names = {"measured": measured}
+    exec(wording.python_code(calibration), names)
+    expected = calibration.corrected(recording.magnetometer())
+    torch.testing.assert_close(torch.from_numpy(names["field"]), expected, rtol=1e-6, atol=1e-5)
+
+
+def test_c_code_holds_float_literals(calibration):
+    whole = dataclasses.replace(calibration, center=(1.0, 2.5e-7, -3.0))
+    assert "{1.0f, 2.5e-07f, -3.0f}" in wording.c_code(whole)
+
+
+def test_names_and_warnings_are_escaped(calibration, recording):
+    hostile = dataclasses.replace(calibration, recording="<b>x</b>", warnings=("a < b & c",))
+    shown = calibration_report(hostile, recording)
+    assert "<b>x</b>" not in shown
+    assert "a &lt; b &amp; c" in shown
+
+
+def test_units_other_than_microtesla():
+    points = noisy_ellipsoid()
+    columns = dict(zip(("mag_x", "mag_y", "mag_z"), (20 * points).unbind(-1), strict=True))
+    counts = Recording(columns, units=dict.fromkeys(columns, "counts"))
+    text = text_of(calibration_report(calibrate(counts), counts))
+    assert "µT" not in text.replace("a field in µT", "")
+    assert "residual (counts)" in text
+    both = calibrate(counts, field_strength=48.0)
+    assert "µT per counts" in text_of(calibration_report(both, counts))
+
+
+@pytest.mark.parametrize("factor", [1e-30, 1e-6, 1e6, 1e30])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_a_recording_of_any_size_has_a_page(factor, noise):
+    huge = recorded(factor * noisy_ellipsoid(noise=noise))
+    text = text_of(calibration_report(calibrate(huge), huge))
+    assert "recorded units" in text
+    assert "nan" not in text.casefold().split()
+
+
+@pytest.mark.parametrize("count", [12, 30, 400])
+def test_small_and_exact_recordings_have_a_page(count):
+    exact = recorded(noisy_ellipsoid(count, noise=0.0))
+    assert "Calibrated" in text_of(calibration_report(calibrate(exact), exact))
+
+
+def test_recording_without_time_has_samples_on_the_axis():
+    plain = recorded(noisy_ellipsoid(100))
+    assert "Calibrated." in text_of(calibration_report(calibrate(plain), plain))
+
+
+def test_refusal_names_the_directions_and_the_motion():
+    points = noisy_ellipsoid(600)
+    cap = recorded(points[points[:, 2] < -10.0])
+    with pytest.raises(NotIdentifiableError) as refused:
+        calibrate(cap)
+    shown = refusal_report(cap, refused.value)
+    text = text_of(shown)
+    assert "not identifiable" in text
+    assert "no calibration was written" in text
+    assert "+z" in text
+    assert "figure of eight" in text
+    assert shown.count("<svg ") == 1
+
+
+def test_refusal_without_any_direction_has_no_map():
+    still = recorded(torch.ones(50, 3, dtype=torch.float64))
+    with pytest.raises(NotIdentifiableError) as refused:
+        calibrate(still)
+    assert "<svg " not in refusal_report(still, refused.value)
+
+
+def test_pages_leave_the_settings_of_matplotlib_alone(calibration, recording):
+    import matplotlib
+
+    before = dict(matplotlib.rcParams)
+    calibration_report(calibration, recording)
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_same_input_gives_the_same_page(calibration, recording):
+    assert calibration_report(calibration, recording) == calibration_report(calibration, recording)
+
+
+def test_numbers_of_any_size_are_written_in_a_power_of_ten(recording):
+    columns = {name: 1e-6 * values for name, values in recording.columns.items() if name != "time"}
+    tiny = Recording(columns | {"time": recording["time"]}, units=dict.fromkeys(columns, "T"))
+    text = text_of(calibration_report(calibrate(tiny), tiny))
+    assert "± standard error, 10⁻⁶ T" in text
+    assert re.search(r"Offset \(11\.\d+, −7\.\d+, 2\d\.\d+\) × 10⁻⁶ T", text)
+    assert not re.search(r"± 0\.0+(?!\d)", text)
+    strong = calibrate(tiny, field_strength=50.0)
+    assert "Calibration matrix, 10⁶ µT per T" in text_of(calibration_report(strong, tiny))
+
+
+def test_the_noise_is_said_in_the_units_of_the_recording(calibration, page):
+    assert wording.noise(calibration).startswith("0.47")
+    assert f"The noise is {wording.noise(calibration)}." in text_of(page)
+
+
+def test_backticks_are_set_as_code(calibration, recording):
+    shown = dataclasses.replace(calibration, warnings=("run `mkc <x>` & so on", "one ` alone"))
+    html = calibration_report(shown, recording)
+    assert "run <code>mkc &lt;x&gt;</code> &amp; so on" in html
+    assert "one ` alone" in html
+
+
+def test_what_is_said_of_the_file_is_no_doubt_about_the_result(recording):
+    time = recording["time"].clone()
+    time[2000:] += 30.0
+    gap = Recording(dict(recording.columns) | {"time": time})
+    text = text_of(calibration_report(calibrate(gap), gap))
+    assert "Calibrated. Offset" in text
+    assert "The time has 1 gap" in text
+
+
+def test_many_rejected_samples_lead_to_the_diagnosis():
+    points = noisy_ellipsoid()
+    points[:120] += torch.tensor([0.0, 0.0, 60.0])
+    doubtful = recorded(points)
+    assert "mkc diagnose RECORDING.csv" in text_of(calibration_report(calibrate(doubtful), doubtful))
+
+
+def test_a_refusal_tells_what_was_left_out():
+    points = noisy_ellipsoid(600)
+    cap = points[points[:, 2] < -10.0]
+    cap[3, 0] = 1e9
+    refused_one = recorded(cap)
+    with pytest.raises(NotIdentifiableError) as refused:
+        calibrate(refused_one)
+    assert "mag_x is 1e+09" in text_of(refusal_report(refused_one, refused.value))
+
+
+def test_sizes_read_well():
+    assert wording.size(1234.5) == "1234"
+    assert wording.size(1e-9) == "1.00e-09"
+    assert wording.size(math.inf) == "inf"
+    assert wording.number(-0.0, 2) == "0.00"

@@ -1,0 +1,509 @@
+import dataclasses
+import math
+import re
+
+import pytest
+import torch
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("jinja2")
+
+from mkc_torch.diagnosis.findings.advice import advice_of
+from mkc_torch.diagnosis.result import (
+    Candidate,
+    DensityCheck,
+    DriverShift,
+    Extrapolation,
+    HeldOut,
+    Parameter,
+    Region,
+    Separability,
+    StateMap,
+)
+from mkc_torch.report.diagnosis import findings as say
+from mkc_torch.report.diagnosis import verdict as top
+from mkc_torch.report.diagnosis.page import bars, diagnosis_report, heat_map
+from tests.diagnosis.factory import CHANNELS, make_candidates, make_diagnosis, make_separability
+from tests.report.test_calibration_report import parsed, text_of
+
+
+def page_of(findings=1, **options):
+    return diagnosis_report(make_diagnosis(findings, **({"samples": 600} | options)))
+
+
+def first_changed(diagnosis, **changes):
+    first, *rest = diagnosis.findings
+    return dataclasses.replace(diagnosis, findings=(dataclasses.replace(first, **changes), *rest))
+
+
+@pytest.fixture(scope="module")
+def three():
+    return page_of(3, channels=3)
+
+
+def test_page_is_well_formed_with_unique_ids(three):
+    tags = parsed(three)
+    assert len(tags.ids) == len(set(tags.ids))
+    assert three.count("<svg ") == 4
+
+
+def test_page_loads_nothing(three):
+    assert "<script" not in three
+    assert "@import" not in three
+    sources = re.findall(r'(?:href|src)="([^"]*)"', three) + re.findall(r"url\(([^)]*)\)", three)
+    assert sources
+    assert all(source.startswith(("#", "data:")) for source in sources)
+    addresses = re.findall(r'https?://[^"\s<]*', three)
+    vocabularies = ("http://www.w3.org/", "http://purl.org/dc/", "http://creativecommons.org/ns#")
+    assert all(address.startswith(vocabularies) for address in addresses)
+
+
+def test_references_inside_the_pictures_resolve(three):
+    ids = set(parsed(three).ids)
+    for target in re.findall(r'href="#([^"]*)"', three) + re.findall(r"url\(#([^)]*)\)", three):
+        assert target in ids
+
+
+@pytest.mark.parametrize("findings", [0, 1, 2, 3])
+@pytest.mark.parametrize("channels", [1, 2, 4])
+@pytest.mark.parametrize("has_time", [True, False])
+def test_every_shape_has_a_page(findings, channels, has_time):
+    page = page_of(findings, channels=channels, has_time=has_time, samples=240)
+    text = text_of(page)
+    assert page.count("<svg ") == 1 + findings
+    assert "nan" not in text.lower()
+    assert "None" not in text
+    for name in CHANNELS[:channels]:
+        assert f"{'Before' if findings else 'Residual'}, {name}" in text
+    assert ("time (s)" in text) == has_time
+
+
+@pytest.mark.parametrize("samples", [1, 2, 9])
+@pytest.mark.parametrize("findings", [0, 2])
+def test_few_samples_have_a_page(samples, findings):
+    assert "samples" in text_of(page_of(findings, samples=samples))
+
+
+def test_adequate_says_so_with_its_noise():
+    text = text_of(page_of(0))
+    assert "Nothing is missing that this recording could show." in text
+    assert "would find as much in 37 % of recordings (p = 0.37; the level asked for is 0.05)" in text
+    assert "memory of 2 samples and 11 % outliers" in text
+    assert "mkc apply" not in text
+    assert "with the findings" not in text
+
+
+def test_explained_answers_what_where_how_sure_and_how_much_better():
+    diagnosis = make_diagnosis(1, samples=4500)
+    text = text_of(diagnosis_report(first_changed(diagnosis, alternatives=diagnosis.findings[0].alternatives[:1])))
+    assert "Left out of the simulation: hard-iron step." in text
+    assert "offset change (3.214 ± 0.081, −1.104 ± 0.077, 0.325 ± 0.092) µT; onset 41.32 ± 0.14 s" in text
+    assert "From 41.3 s on; acts on mag_x, mag_y, mag_z." in text
+    assert "p = 0.005, the smallest that 199 surrogates can show" in text
+    assert "On data the fit had not seen, the residual is" in text
+    assert "What to do Look for what changed at that time; use the calibration from after the step." in text
+    assert "+0.312 nats a sample (95 %: 0.281 to 0.350); residual 0.912 → 0.521 µT (43 % less)" in text
+    assert "offset drift 41.2 yes" in text
+
+
+def test_rivals_that_cannot_be_told_apart_stand_in_the_headline():
+    text = text_of(page_of(1))
+    assert "hard-iron step or current field (current), which this recording cannot tell apart." in text
+    assert "current field (current) 1.30 no" in text
+    assert "not to be told from finding 1" in text
+    assert "Left out of the simulation: hard-iron step, or a rival; current field (current)." in text_of(page_of(3))
+
+
+def test_unexplained_says_so():
+    text = text_of(page_of(0, verdict="unexplained", p_value=0.005))
+    assert "Structure remains that no effect in the catalogue accounts for." in text
+    assert "Record again, for longer, with more columns" in text
+    both = text_of(page_of(2, verdict="unexplained"))
+    assert "Yet structure remains that no effect in the catalogue accounts for." in both
+
+
+def test_findings_that_are_not_plausible_or_not_held_out_say_so(three):
+    text = text_of(three)
+    assert "Not plausible: an effect outside the catalogue (temperature). A curve has no size to compare." in text
+    assert "not measured: The event has no second occurrence to be held out." in text
+    assert "(4.02 ± 0.11) × 10⁻⁶ 1/µT²" in text
+    assert "mainly from 12.1 to 18.4 s and from 60.0 to 71.5 s" in text_of(page_of(2, samples=4500))
+
+
+def test_names_and_texts_from_files_are_escaped_everywhere():
+    bad = "<b>x</b> & $a$ \x1b[31m"
+    diagnosis = make_diagnosis(2, samples=300, channels=2)
+    traces = dataclasses.replace(
+        diagnosis.traces, channels=(bad, "_y"), unit=bad, drivers={bad: diagnosis.traces.time},
+        driver_units={bad: bad},
+    )  # fmt: skip
+    hostile = dataclasses.replace(
+        diagnosis, recording=bad, simulation=bad, warnings=(bad,), advice=(bad,), traces=traces,
+        noise=dataclasses.replace(diagnosis.noise, description=bad, parameters={bad: 1.0}),
+        candidates=(Candidate("driver_offset", (bad,), bad, 3.0, 2.4),),
+        separability=Separability((bad,), torch.zeros(1, 1), torch.ones(1)),
+    )  # fmt: skip
+    first = hostile.findings[0]
+    (parameter, *_) = first.parameters
+    (rival, *_) = first.alternatives
+    hostile = first_changed(
+        hostile, drivers=(bad,), channels=(bad,), equation=bad, explanation=bad, held_out_note=bad, plausibility=bad,
+        parameters=(dataclasses.replace(parameter, name=bad, unit=bad),),
+        alternatives=(dataclasses.replace(rival, drivers=(bad,), separable=False),),
+        curve=dataclasses.replace(first.curve, driver=bad, unit=bad, channels=(bad, "_y"), value_unit=bad),
+    )  # fmt: skip
+    page = diagnosis_report(hostile, note=bad)
+    assert "<b>" not in page
+    assert "&lt;b&gt;x&lt;/b&gt; &amp; $a$" in page
+    parsed(page)
+
+
+def test_names_in_letters_that_the_font_lacks():
+    diagnosis = make_diagnosis(2, samples=300)
+    assert "温度" in text_of(diagnosis_report(dataclasses.replace(
+        diagnosis, traces=dataclasses.replace(diagnosis.traces, channels=("温度",)),
+    )))  # fmt: skip
+
+
+def test_of_many_candidates_the_best_twelve_are_shown():
+    page = page_of(1, candidates=300, candidates_tried=300, separability=make_separability(20))
+    text = text_of(page)
+    assert "The best 12 of 300 that were tried." in text
+    assert "The first 12 of 20." in text
+    assert len(bars(make_candidates(300))) == 12
+    assert len(page) < 400_000
+
+
+def test_bars_are_in_proportion_and_never_negative():
+    shown = bars((Candidate("a", (), "", 10.0, 4.5), Candidate("b", (), "", -1.0, 0.0)))
+    assert [b.percent for b in shown] == [100.0, 0.0]
+    assert [b.percent for b in bars((Candidate("a", (), "", 0.0, 0.0),))] == [0.0]
+
+
+def test_heat_map_colours_run_from_inseparable_to_clear():
+    share = torch.tensor([[0.0, 1.0], [0.02, math.nan]])
+    first, second = heat_map(Separability(("a", "b"), share, torch.tensor([0.5, 1.2])))
+    assert [c.text for c in first] == ["0.50", "·", "1.00"]
+    assert [c.text for c in second] == ["1.00", "0.02", "·"]
+    assert first[2].color == second[0].color == "#d6e8f4"
+    assert heat_map(Separability((), torch.zeros(0, 0), torch.zeros(0))) == []
+
+
+def test_pages_without_candidates_curves_and_separability():
+    empty = Separability((), torch.zeros(0, 0), torch.zeros(0))
+    diagnosis = make_diagnosis(1, samples=300, candidates=0, separability=empty, ceiling=None, advice=(), warnings=())
+    page = diagnosis_report(first_changed(diagnosis, curve=None))
+    assert page.count("<svg ") == 1
+    text = text_of(page)
+    assert "The candidates" not in text
+    assert "What this recording can tell apart" not in text
+    assert "smooth correction" not in text
+
+
+SMOOTH = "with a smooth correction by all recorded columns"
+
+
+@pytest.mark.parametrize("findings", [0, 2])
+def test_a_smooth_correction_that_is_better_stands_beside_the_models_compared(findings):
+    diagnosis = make_diagnosis(findings, samples=300, channels=2)
+    rows = dict(say.held_out_rows(diagnosis))
+    assert list(rows)[-1] == SMOOTH
+    assert rows[SMOOTH] == [f"{diagnosis.ceiling.rmse:.3f}", "−0.895", "1.40, 1.40", "0.300, 0.300"]
+    text = text_of(diagnosis_report(diagnosis))
+    assert f"{SMOOTH} {diagnosis.ceiling.rmse:.3f} −0.895" in text
+    assert "It is no bound: a step or a sharp corner goes beyond it." in text
+    present = f"{'with the findings it is' if findings else 'the residual is'} {diagnosis.corrected.rmse:.3f} µT"
+    assert say.smooth_fit(diagnosis).endswith(f"reaches {diagnosis.ceiling.rmse:.3f} µT; {present}")
+
+
+def test_a_smooth_correction_that_findings_beat_is_not_told_of():
+    diagnosis = make_diagnosis(2, samples=300)
+    worse = dataclasses.replace(diagnosis.ceiling, rmse=1.2 * diagnosis.corrected.rmse)
+    beaten = dataclasses.replace(diagnosis, ceiling=worse)
+    assert say.smooth_fit(beaten) == ""
+    assert list(dict(say.held_out_rows(beaten))) == ["the simulation as it is", "with the findings"]
+    text = text_of(diagnosis_report(beaten))
+    assert "smooth correction" not in text
+    assert "no bound" not in text
+    # where nothing was found it is no judgement on anything
+    adequate = dataclasses.replace(make_diagnosis(0, samples=300), ceiling=worse)
+    assert "smooth correction" in text_of(diagnosis_report(adequate))
+
+
+def graded(gain, interval, before, after):
+    """A step whose held-out evidence this is, and what the page says first."""
+    held_out = HeldOut(gain, interval, before, after, "µT")
+    diagnosis = first_changed(make_diagnosis(1, samples=240), held_out=held_out, alternatives=())
+    diagnosis = dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
+    return top.headline(diagnosis), top.tone(diagnosis), " ".join(top.to_do(diagnosis)), diagnosis
+
+
+def test_a_finding_that_unseen_blocks_do_not_confirm_is_not_to_be_used():
+    headline, tone, doing, diagnosis = graded(0.134, (-0.019, 0.276), 1.74, 1.73)
+    assert headline == (
+        "Found, but not confirmed on unseen blocks and too small to be worth correcting: hard-iron step."
+    )
+    assert tone == "faint"
+    assert "Do not correct for hard-iron step yet" in doing
+    assert "use the calibration" not in doing
+    assert top.apply_command(diagnosis) == ""
+    text = text_of(diagnosis_report(diagnosis))
+    assert "probably better on unseen blocks, not surely" in text
+    assert "mkc apply" not in text
+    assert '<h1 class="faint">' in diagnosis_report(diagnosis)
+    larger, *_ = graded(0.16, (-0.01, 0.40), 0.269, 0.231)
+    assert larger == "Found, but not confirmed on unseen blocks: hard-iron step."
+
+
+def test_a_finding_that_hardly_changes_the_residual_is_small():
+    headline, tone, doing, diagnosis = graded(0.05, (0.03, 0.07), 1.74, 1.70)
+    assert headline == "Real, but small beside the noise: hard-iron step."
+    assert tone == "faint"
+    assert "Leave hard-iron step alone" in doing
+    assert "by 2.3 % only" in doing
+    assert top.apply_command(diagnosis) == ""
+
+
+def test_a_finding_that_is_clear_is_left_out_of_the_simulation():
+    headline, tone, doing, diagnosis = graded(0.31, (0.28, 0.35), 0.9, 0.5)
+    assert headline == "Left out of the simulation: hard-iron step."
+    assert tone == "found"
+    assert doing.startswith("Look for what changed at that time; use the calibration from after the step.")
+    assert "The model found here corrects for hard-iron step" in doing
+    assert "surely better on unseen blocks" in text_of(diagnosis_report(diagnosis))
+
+
+def test_structure_without_a_finding_is_not_called_nothing():
+    quiet = make_diagnosis(0, samples=240)
+    assert top.tone(quiet) == "good"
+    rare = make_diagnosis(0, samples=240, p_value=0.04)
+    assert top.headline(rare).startswith("Something is there that noise alone rarely makes, but no effect")
+    smooth = make_diagnosis(0, samples=240, remaining=("temperature",))
+    assert top.headline(smooth).startswith("Something smooth remains along temperature that no effect")
+    for diagnosis in (rare, smooth):
+        assert top.tone(diagnosis) == "open"
+        text = text_of(diagnosis_report(diagnosis))
+        assert "Nothing is missing" not in text
+        assert "Use the simulation as it is" not in text
+    beside = make_diagnosis(1, samples=240, remaining=("load",))
+    assert top.headline(beside).endswith(
+        "Yet something smooth remains along load that no effect in the catalogue accounts for."
+    )
+
+
+@pytest.mark.parametrize(
+    ("simulation", "command"),
+    [
+        ("magnetometer", "mkc apply model.json NEW.csv --output corrected.csv"),
+        ("simulated", "mkc apply model.json NEW.csv --simulated NEW_SIM.csv --output corrected.csv"),
+        ("Pendulum", "mkc apply model.json NEW.csv --simulation FILE.py:Pendulum --output simulated.csv"),
+    ],
+)
+def test_the_command_is_that_of_the_simulation(simulation, command):
+    assert top.apply_command(make_diagnosis(1, samples=50, simulation=simulation)) == command
+    placed = first_changed(make_diagnosis(1, samples=50, simulation=simulation), placed=True)
+    assert top.apply_command(placed) == ""
+
+
+def test_moments_and_what_each_number_is_are_told():
+    jumps = Parameter("heading_change", (11.2, 5.8, -1.2), (4.4, 3.9, 0.6), "°", ("jump at 61.1 s", "at 77.8 s", "c"))
+    changed = first_changed(
+        make_diagnosis(1, samples=4500), onset=61.1, moments=(61.1, 77.8), parameters=(jumps,), channels=("heading",)
+    )
+    page = diagnosis_report(changed)
+    text = text_of(page)
+    assert "Anew at 61.1 s and 77.8 s; acts on heading." in text
+    assert "jump at 61.1 s: 11.2 ± 4.4 ° at 77.8 s: 5.8 ± 3.9 ° c: −1.2 ± 0.6 °" in text
+
+
+def test_a_step_that_comes_and_goes_says_so():
+    intervals = ((8.0, 9.0), (20.0, 22.0), (34.0, 37.3), (50.0, 51.0))
+    diagnosis = first_changed(
+        make_diagnosis(1, samples=4500),
+        onset=6.2, onset_interval=(5.9, 6.3), intervals=intervals, alternatives=(), comes_and_goes=True,
+    )  # fmt: skip
+    diagnosis = dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
+    text = text_of(diagnosis_report(diagnosis))
+    told = "irst at 6.2 s (95 %: 5.9 to 6.3 s), then it comes and goes, mainly in 4 intervals, the longest from 34.0"
+    assert text.count(told) == 2
+    assert top.headline(diagnosis) == "Left out of the simulation: hard-iron step that comes and goes."
+    assert "from 6.2 s on" not in text
+    assert "switched on and off, and that no column recorded, would look like this" in text
+    assert "Look for something that is switched" in text
+    assert "use the calibration from after the step" not in text
+
+
+def test_what_an_equation_counts_from_stands_with_it():
+    assert "δB = k (I − Ī) Ī: the mean of current over this recording, 15.0 A." in text_of(page_of(2))
+
+
+def test_numbers_without_an_error_say_so():
+    lag = (Parameter("lag", 1.5, None, "s"),)
+    text = text_of(diagnosis_report(first_changed(make_diagnosis(1, samples=240), parameters=lag)))
+    assert "lag 1.50 s, standard error not estimated" in text
+
+
+def test_the_noise_has_units_and_its_density_is_compared():
+    made = make_diagnosis(1, samples=240, channels=2)
+    noise = dataclasses.replace(
+        made.noise,
+        parameters={"wander": 0.379, "wander_period": 7.21, "autoregression": ((0.26, 0.1), ())},
+        units={"wander": "µT", "wander_period": "s"},
+        unit="µT",
+        checks=(
+            DensityCheck("norm", 0.021, 0.034, 4.0, 0.05, False),
+            DensityCheck("turn_x", 0.2, 0.01, 2.0, 0.05, True),
+        ),
+    )
+    text = text_of(diagnosis_report(dataclasses.replace(made, noise=noise)))
+    assert "slow wander of the offset 0.379 µT, its standard deviation over the recording" in text
+    assert "the wander falls off below a period of 7.21 s" in text
+    assert "memory of norm 0.260, 0.100 times the samples before it" in text
+    assert "memory of turn_x" not in text
+    assert "d = 0.310 µT, within ±12.0 µT" in text
+    assert "norm 0.021 0.034 (4 degrees of freedom) 0.05 no more than chance" in text
+    assert "turn_x 0.2 0.01 (2 degrees of freedom) 0.05 a Student-t is closer" in text
+
+
+def test_warnings_name_effects_and_set_their_numbers():
+    warning = "hard_iron_step by load (onset -6.1 s): p = 4e-05 at (-0.2, +0.9)."
+    text = text_of(page_of(1, warnings=(warning,)))
+    assert "Hard-iron step by load (onset −6.1 s): p = 4 × 10⁻⁵ at (−0.2, +0.9)." in text
+
+
+def test_candidates_are_in_the_order_that_is_told():
+    weak = Candidate("current_field", ("current",), "", 253.0, 22.5, behind=0.0)
+    strong = Candidate("driver_offset", ("motor_1",), "", 294.0, 24.2, behind=31.5)
+    never = Candidate("cubic_nonlinearity", (), "", 1.0, 1.4, behind=math.inf)
+    text = text_of(diagnosis_report(dataclasses.replace(
+        make_diagnosis(1, samples=240), candidates=(weak, strong, never),
+    )))  # fmt: skip
+    assert "behind the first, nats" in text
+    assert "offset dependence (motor_1) 294 24.2 31.5" in text
+    assert "not possible" in text
+    assert "ordered by how far each is behind the first one" in text
+
+
+def test_channels_of_a_compared_vector_are_explained():
+    diagnosis = make_diagnosis(0, samples=240, channels=2)
+    traces = dataclasses.replace(diagnosis.traces, channels=("along", "across_1"))
+    text = text_of(diagnosis_report(dataclasses.replace(diagnosis, traces=traces)))
+    assert "along: the part of the residual along the ambient field" in text
+    assert "across_1 and across_2: the two parts at right angles" in text
+
+
+def test_figures_above_are_told_of_only_where_they_are():
+    assert "Figures above" in text_of(page_of(2, samples=4500))
+    bare = make_diagnosis(2, samples=240)
+    findings = tuple(dataclasses.replace(f, onset=None, intervals=()) for f in bare.findings)
+    assert "Figures above" not in text_of(diagnosis_report(dataclasses.replace(bare, findings=findings)))
+
+
+def test_a_long_name_is_whole_where_there_is_room():
+    made = make_diagnosis(1, samples=240)
+    curve = dataclasses.replace(made.findings[0].curve, driver="position along its longest direction", unit="m")
+    names = ("position_x", "position_y")
+    drivers = dict.fromkeys(names, made.traces.time)
+    wide = first_changed(made, curve=curve, drivers=names)
+    wide = dataclasses.replace(wide, traces=dataclasses.replace(wide.traces, drivers=drivers))
+    assert "position along its longest direction (m)" in text_of(diagnosis_report(wide))
+
+
+def test_whether_a_finding_extrapolates_is_said():
+    diagnosis = make_diagnosis(2, samples=300)
+    assert "beyond its range" not in text_of(diagnosis_report(diagnosis))
+    for gain, interval, told in (
+        (0.31, (0.28, 0.35), "it predicts where that is high: +0.310 nats a sample (95 %: 0.280 to 0.350)"),
+        (-0.02, (-0.12, 0.09), "it says nothing where that is high: −0.020"),
+        (-0.3, (-0.4, -0.2), "it misleads where that is high: −0.300"),
+    ):
+        text = text_of(diagnosis_report(first_changed(diagnosis, extrapolation=Extrapolation(gain, interval))))
+        assert f"beyond its range fitted where its driver is low, {told}" in text
+
+
+def test_what_shifted_copies_of_the_driver_gain_is_said():
+    for as_good, told in ((0, "none of 38 copies"), (1, "one of 38 copies"), (12, "12 of 38 copies")):
+        changed = first_changed(
+            make_diagnosis(1, samples=240), drivers=("load",), driver_shift=DriverShift(38, as_good, 22.5)
+        )
+        verb = "gain" if as_good > 1 else "gains"
+        assert f"driven by load; {told} shifted by up to 22.5 s {verb} as much" in text_of(diagnosis_report(changed))
+
+
+def test_where_in_the_states_and_in_which_experiment_is_told_and_drawn():
+    edges = tuple(torch.linspace(-1.0, 1.0, 5, dtype=torch.float64) for _ in range(2))
+    nats = torch.arange(-3.0, 13.0, dtype=torch.float64).reshape(4, 4)
+    nats[0, 0] = torch.nan
+    page = diagnosis_report(
+        first_changed(
+            make_diagnosis(1, samples=240),
+            region=Region("angle", "rad", "far from zero", 0.8, 0.91, 0.2),
+            experiments=(0.25, 0.75),
+            map=StateMap(("angle", "speed"), ("rad", "rad/s"), edges, nats),
+        )
+    )
+    text = text_of(page)
+    assert "91 % of the gain where angle is beyond ±0.800 rad, 20 % of the time" in text
+    assert "experiment 2: 75 %, experiment 1: 25 %" in text
+    assert page.count("<svg ") == page_of(1, samples=240).count("<svg ") + 1
+    assert "speed (rad/s)" in page
+    assert "Gain of finding 1 over the states" in page
+
+
+def test_drivers_that_switch_are_constant_or_missing():
+    diagnosis = make_diagnosis(2, samples=400)
+    time = diagnosis.traces.time
+    for column in ((time > 4.0).double(), torch.ones_like(time), torch.full_like(time, math.nan)):
+        traces = dataclasses.replace(diagnosis.traces, drivers={"current": column})
+        assert "current (A)" in text_of(diagnosis_report(dataclasses.replace(diagnosis, traces=traces)))
+    traces = dataclasses.replace(diagnosis.traces, drivers={})
+    assert "current (A)" in text_of(diagnosis_report(dataclasses.replace(diagnosis, traces=traces)))
+
+
+def test_residuals_of_zero_and_of_nothing_in_use():
+    diagnosis = make_diagnosis(2, samples=300)
+    for before, weight in ((0.0, 1.0), (1.0, 0.0)):
+        traces = dataclasses.replace(
+            diagnosis.traces,
+            before=torch.full_like(diagnosis.traces.before, before),
+            after=torch.zeros_like(diagnosis.traces.before),
+            weight=torch.full_like(diagnosis.traces.weight, weight),
+        )
+        parsed(diagnosis_report(dataclasses.replace(diagnosis, traces=traces)))
+
+
+def test_single_precision_and_tensors_with_gradients():
+    diagnosis = make_diagnosis(2, samples=300)
+    t = diagnosis.traces
+    traces = dataclasses.replace(t, before=t.before.float().requires_grad_(), after=t.after.float())
+    parsed(diagnosis_report(dataclasses.replace(diagnosis, traces=traces)))
+
+
+def test_same_input_gives_the_same_page_and_leaves_matplotlib_alone():
+    import matplotlib
+
+    before = dict(matplotlib.rcParams)
+    assert page_of(2) == page_of(2)
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_parameters_read_well():
+    assert say.measured(0.0, 0.0, "µT") == ["0 µT"]
+    assert say.measured(1234.5, 12.0, "") == ["1234 ± 12"]
+    assert say.measured(2.5e7, 1.2e6, "counts") == ["(2.50 ± 0.12) × 10⁷ counts"]
+    assert say.measured((1e-9, -2e-9), None, "T") == ["(1.00, −2.00) × 10⁻⁹ T"]
+    assert say.measured(((1.0, 2.0), (3.0, 4.0)), ((0.1, 0.1), (0.1, None)), "") == [
+        "(1.00 ± 0.10, 2.00 ± 0.10)",
+        "(3.00 ± 0.10, 4.00)",
+    ]
+    assert say.measured((), None, "µT") == ["() µT"]
+    assert say.measured(math.nan, None, "") == ["not known"]
+
+
+def test_moments_have_the_digits_of_the_recording():
+    def onset(seconds):
+        traces = make_diagnosis(1, samples=50).traces
+        clock = say.clock_of(dataclasses.replace(traces, time=torch.linspace(0.0, seconds, 50)))
+        return clock.moment(1.23456789)
+
+    assert (onset(0.5), onset(90.0), onset(5000.0)) == ("1.235 s", "1.2 s", "1 s")

@@ -1,0 +1,759 @@
+"""A user's differential equations fitted to recordings whose truth is known, by scipy's integrator."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from mkc_torch import Recording, diagnose
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.recording.recording import MissingColumnError
+from mkc_torch.simulation import Dynamics, Parameter, SimulationError
+from mkc_torch.simulation.dynamics import correction as dynamics_correction
+from mkc_torch.simulation.dynamics import prepared as prepared_dynamics
+from mkc_torch.simulation.dynamics import trajectory
+from mkc_torch.simulation.dynamics.correction import DynamicsCorrection
+
+STIFFNESS, DAMPING = 9.0, 0.15
+FIRST = (1.2, 0.4)
+
+
+class Pendulum(Dynamics):
+    states = ("angle", "speed")
+    parameters = {"stiffness": Parameter(7.0, lower=0.0), "damping": Parameter(0.5, lower=0.0, unit="1/s")}  # noqa: RUF012
+    units = {"angle": "rad", "speed": "rad/s"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle) - p.damping * x.speed}
+
+
+def made(system, **attributes):
+    """An instance of a system with other attributes."""
+    return type(system.__name__, (system,), attributes)()
+
+
+def swings(time, first=FIRST, stiffness=STIFFNESS, damping=DAMPING, push=lambda _: 0.0):
+    """Angle and speed of a damped pendulum, (2, N)."""
+
+    def rate(t, y):
+        return [y[1], -stiffness * math.sin(y[0]) - damping * y[1] + push(t)]
+
+    return solve_ivp(rate, (time[0], time[-1]), first, t_eval=time, rtol=1e-9, atol=1e-10, max_step=0.05).y
+
+
+def table(units=None, **columns):
+    return Recording({name: torch.as_tensor(values) for name, values in columns.items()}, units=units)
+
+
+def noisy(values, noise=0.01, outliers=0.0, seed=0):
+    random = np.random.default_rng(seed)
+    bad = random.random(values.shape) < outliers
+    return values + noise * random.standard_normal(values.shape) + bad * random.standard_normal(values.shape)
+
+
+def found(system, recording):
+    """Fitted parameters by their names."""
+    prepared = system.prepare(recording)
+    fit = fitted(JointModel(prepared), prepared.start())
+    return dict(zip(prepared.parameter_names, fit.parameters.tolist(), strict=True)), fit
+
+
+TIME = np.arange(500) * 0.02
+TRUTH = swings(TIME)
+
+
+class TestFit:
+    """What is fitted to a recording."""
+
+    def test_a_half_observed_pendulum_among_outliers(self):
+        values, fit = found(Pendulum(), table(time=TIME, angle=noisy(TRUTH[0], outliers=0.1)))
+        assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.02)
+        assert values["damping"] == pytest.approx(DAMPING, abs=0.01)
+        assert values["angle at the start"] == pytest.approx(FIRST[0], abs=0.01)
+        assert values["speed at the start"] == pytest.approx(FIRST[1], abs=0.03)
+        assert float(fit.d) == pytest.approx(0.01, rel=0.2)
+
+    def test_the_position_where_the_speed_alone_is_measured(self):
+        values, _ = found(Pendulum(), table(time=TIME, speed=noisy(TRUTH[1], 0.02)))
+        assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.03)
+        assert values["angle at the start"] == pytest.approx(FIRST[0], abs=0.03)
+
+    def test_both_states_are_two_channels(self):
+        recording = table(time=TIME, angle=noisy(TRUTH[0]), speed=noisy(TRUTH[1], 0.05))
+        prepared = Pendulum().prepare(recording)
+        assert prepared.channels == ("angle", "speed")
+        assert prepared.unit == ""
+        values, fit = found(Pendulum(), recording)
+        assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.02)
+        assert fit.d.tolist() == pytest.approx([0.01, 0.05], rel=0.2)
+
+    def test_irregular_samples(self):
+        time = np.sort(np.random.default_rng(3).uniform(0.0, 10.0, 400))
+        values, _ = found(Pendulum(), table(time=time, angle=noisy(swings(time)[0])))
+        assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.02)
+        assert values["damping"] == pytest.approx(DAMPING, abs=0.01)
+
+    def test_few_samples_a_period_are_refined(self):
+        """Four samples a period: with one step for each the stiffness would be off by a tenth."""
+        time = np.arange(60) * 0.5
+        prepared = Pendulum().prepare(table(time=time, angle=swings(time)[0]))
+        assert len(prepared.grid.time) > 60
+        assert prepared.grid.time[prepared.rows].tolist() == pytest.approx(time.tolist())
+        values, fit = found(Pendulum(), table(time=time, angle=swings(time)[0]))
+        assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.01)
+        assert float(fit.residual.abs().max()) < 0.01
+        coarse, _ = found(made(Pendulum, step=0.5), table(time=time, angle=swings(time)[0]))
+        assert abs(coarse["stiffness"] - STIFFNESS) > 0.1
+
+    def test_a_step_of_the_user_s_own(self):
+        recording = table(time=TIME, angle=TRUTH[0])
+        assert len(made(Pendulum, step=0.02).prepare(recording).grid.time) == 500
+        assert len(made(Pendulum, step=0.005).prepare(recording).grid.time) == 4 * 499 + 1
+
+    def test_experiments_share_parameters_and_begin_anew(self):
+        firsts = ((1.2, 0.4), (-0.6, 0.0), (0.3, 2.0))
+        time = np.arange(150) * 0.02
+        angle = np.concatenate([noisy(swings(time, first)[0], seed=k) for k, first in enumerate(firsts)])
+        recording = table(time=np.tile(time, 3), angle=angle, experiment=np.repeat([0.0, 1.0, 2.0], 150))
+        prepared = Pendulum().prepare(recording)
+        assert prepared.parameter_names[2::2] == tuple(f"angle at the start of {k}" for k in range(3))
+        assert float(prepared.since_begin().max()) == pytest.approx(time[-1])
+        values, _ = found(Pendulum(), recording)
+        assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.05)
+        for k, (angle_first, speed_first) in enumerate(firsts):
+            assert values[f"angle at the start of {k}"] == pytest.approx(angle_first, abs=0.02)
+            assert values[f"speed at the start of {k}"] == pytest.approx(speed_first, abs=0.06)
+
+    def test_experiments_go_by_their_labels(self):
+        recording = Recording(
+            {
+                "time": torch.arange(6.0),
+                "angle": torch.tensor([0.1, 0.0, -0.1, 0.1, 0.0, -0.1]),
+                "experiment": torch.tensor([0, 0, 0, 1, 1, 1]),
+            },
+            labels={"experiment": ("slow", "fast")},
+        )
+        assert Pendulum().prepare(recording).parameter_names[2] == "angle at the start of slow"
+
+    def test_a_bound_is_kept(self):
+        held = made(Pendulum, parameters={"stiffness": Parameter(7.0, upper=8.5), "damping": Parameter(0.5, lower=0.2)})
+        values, _ = found(held, table(time=TIME, angle=TRUTH[0]))
+        assert values["stiffness"] <= 8.5
+        assert values["damping"] >= 0.2
+
+    def test_what_is_not_measured_starts_where_the_user_says(self):
+        other = made(Pendulum, initial={"angle": 0.7})
+        start = other.prepare(table(time=TIME, speed=TRUTH[1])).start()
+        assert float(start[2]) == 0.7
+        assert float(start[3]) == pytest.approx(FIRST[1], abs=0.2)
+
+    def test_rates_in_the_order_of_the_states(self):
+        def derivative(self, time, x, u, p):  # noqa: ARG001
+            return [x.speed, -p.stiffness * torch.sin(x.angle) - p.damping * x.speed]
+
+        recording = table(time=TIME, angle=TRUTH[0])
+        by_order, by_name = made(Pendulum, derivative=derivative).prepare(recording), Pendulum().prepare(recording)
+        torch.testing.assert_close(by_order.residual(by_name.start(), {}), by_name.residual(by_name.start(), {}))
+
+    def test_an_output_that_is_no_state(self):
+        def output(self, time, x, u, p):  # noqa: ARG001
+            return {"tip": p.length * torch.sin(x.angle)}
+
+        parameters = {**Pendulum.parameters, "length": Parameter(1.0, lower=0.0)}
+        system = made(Pendulum, outputs=("tip",), output=output, parameters=parameters, initial={"angle": 1.0})
+        values, _ = found(system, table(time=TIME, tip=noisy(0.7 * np.sin(TRUTH[0]))))
+        assert values["length"] == pytest.approx(0.7, abs=0.01)
+        assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.05)
+
+    def test_derivatives_by_the_parameters_are_finite_differences(self):
+        prepared = Pendulum().prepare(table(time=TIME, angle=TRUTH[0]))
+        theta = torch.tensor([STIFFNESS, DAMPING, *FIRST], dtype=torch.float64)
+        slope = torch.func.jacfwd(lambda t: prepared.residual(t, {}))(theta)
+        for k, direction in enumerate(1e-5 * torch.eye(4, dtype=torch.float64)):
+            difference = prepared.residual(theta + direction, {}) - prepared.residual(theta - direction, {})
+            torch.testing.assert_close(slope[..., k], difference / 2e-5, rtol=1e-4, atol=1e-5)
+
+    def test_what_was_computed_before_changes_nothing(self):
+        recording = table(time=TIME, angle=TRUTH[0])
+        theta = torch.tensor([STIFFNESS, DAMPING, *FIRST], dtype=torch.float64)
+        fresh, used = Pendulum().prepare(recording), Pendulum().prepare(recording)
+        for factor in (1.3, 0.8, 1.001):
+            used.residual(theta * factor, {})
+        torch.func.jacfwd(lambda t: used.residual(t, {}))(theta * 1.01)
+        torch.testing.assert_close(used.residual(theta, {}), fresh.residual(theta, {}), rtol=0.0, atol=1e-8)
+
+    def test_where_there_is_no_trajectory_the_residual_is_nan(self):
+        def derivative(self, time, x, u, p):  # noqa: ARG001
+            return {"level": p.rate * x.level.square()}
+
+        exploding = type("Exploding", (Dynamics,), {"states": ("level",), "parameters": {"rate": 0.1}})
+        time = np.arange(100) * 0.02
+        prepared = made(exploding, derivative=derivative).prepare(table(time=time, level=1.0 / (1.0 - 0.1 * time)))
+        assert bool(prepared.residual(torch.tensor([0.1, 1.0]).double(), {}).isfinite().all())
+        assert bool(prepared.residual(torch.tensor([2.0, 1.0]).double(), {}).isnan().all())
+        assert bool(prepared.residual(torch.tensor([0.1, 1.0]).double(), {}).isfinite().all())
+
+
+# inputs
+
+
+class Driven(Pendulum):
+    inputs = ("torque",)
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"angle": x.speed, "speed": u.torque - p.stiffness * torch.sin(x.angle) - p.damping * x.speed}
+
+
+class TestInputs:
+    """What an input does between two samples."""
+
+    # two thirds of a second a period, six samples each
+    time = np.arange(120) / 9.0
+
+    @staticmethod
+    def held(t):
+        return 3.0 * math.copysign(1.0, math.sin(2.1 * math.floor(9.0 * t + 1e-9)))
+
+    @staticmethod
+    def smooth(t):
+        return 3.0 * math.sin(3.0 * math.pi * t)
+
+    def linear(self, t):
+        return float(np.interp(t, self.time, [self.held(s) for s in self.time]))
+
+    @pytest.mark.parametrize("course", ["held", "linear", "smooth"])
+    def test_the_right_one_fits_and_the_others_do_not(self, course):
+        push = getattr(self, course)
+        angle = swings(self.time, (0.2, 0.0), push=push)[0]
+        recording = table(time=self.time, angle=angle, torque=np.array([push(t) for t in self.time]))
+        theta = torch.tensor([STIFFNESS, DAMPING, 0.2, 0.0], dtype=torch.float64)
+        sizes = {}
+        for between in ("held", "linear", "smooth"):
+            prepared = made(Driven, between=between, step=0.02).prepare(recording)
+            sizes[between] = float(prepared.residual(theta, {}).abs().max())
+        assert min(sizes, key=sizes.get) == course
+        assert sizes[course] < 0.004
+        assert sorted(sizes.values())[1] > 3.0 * sizes[course]
+
+    def test_experiments_on_one_clock_do_not_see_each_other_s_inputs(self):
+        """The polynomial through the end of one must not run on to the beginning of the next."""
+
+        def derivative(self, time, x, u, p):  # noqa: ARG001
+            return {"charge": p.gain * torch.exp(u.power) - p.loss * x.charge}
+
+        time = np.linspace(0.0, 10.0, 101)
+        exact = solve_ivp(
+            lambda t, y: 2.0 * np.exp(np.sin(1.7 * t)) - 0.5 * y, (0.0, 10.0), [0.5], t_eval=time, rtol=1e-9
+        )
+        attributes = {"states": ("charge",), "inputs": ("power",), "parameters": {"gain": 1.5, "loss": 0.3}}
+        heated = type("Heated", (Dynamics,), {**attributes, "between": "smooth", "derivative": derivative})
+        recording = table(
+            time=np.tile(time, 2),
+            power=np.tile(np.sin(1.7 * time), 2),
+            charge=np.tile(exact.y[0], 2),
+            experiment=np.repeat([0.0, 1.0], 101),
+        )
+        values, _ = found(heated(), recording)
+        assert values["gain"] == pytest.approx(2.0, abs=1e-3)
+        assert values["loss"] == pytest.approx(0.5, abs=1e-3)
+
+    def test_short_runs_are_interpolated_by_straight_lines(self):
+        time, torque = np.arange(5) * 0.1, np.array([0.0, 1.0, 0.0, 2.0, 0.0])
+        prepared = made(Driven, between="smooth", step=0.1).prepare(table(time=time, angle=0.1 * time, torque=torque))
+        torch.testing.assert_close(prepared.inputs[1::3, 0], torch.tensor([0.5, 0.5, 1.0, 1.0]).double())
+
+
+# what a start does not determine
+
+
+def lorenz(time):
+    def rate(_, y):
+        return [10.0 * (y[1] - y[0]), y[0] * (28.0 - y[2]) - y[1], y[0] * y[1] - 8.0 / 3.0 * y[2]]
+
+    return solve_ivp(rate, (time[0], time[-1]), [1.0, 1.0, 20.0], t_eval=time, rtol=1e-10, atol=1e-10).y
+
+
+class Lorenz(Dynamics):
+    states = ("x", "y", "z")
+    parameters = {"sigma": 9.0, "rho": 26.0, "beta": 3.0}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"x": p.sigma * (x.y - x.x), "y": x.x * (p.rho - x.z) - x.y, "z": x.x * x.y - p.beta * x.z}
+
+
+class TestSegments:
+    """Trajectories that begin anew."""
+
+    time = np.arange(1500) * 0.01
+
+    def test_a_chaotic_record_is_fitted_in_segments_and_not_as_a_whole(self):
+        recording = table(time=self.time, **dict(zip("xyz", noisy(lorenz(self.time), 0.1), strict=True)))
+        values, fit = found(made(Lorenz, segment=1.0), recording)
+        assert [values[name] for name in ("sigma", "rho", "beta")] == pytest.approx([10.0, 28.0, 8.0 / 3.0], rel=0.01)
+        assert fit.d.tolist() == pytest.approx([0.1] * 3, rel=0.2)
+        whole = made(Lorenz).prepare(recording)
+        theta = torch.tensor([10.0, 28.0, 8.0 / 3.0, *whole.measured[0].tolist()], dtype=torch.float64)
+        left = whole.residual(theta, {})
+        assert not bool(left.isfinite().all()) or float(left.abs().max()) > 5.0
+
+    def test_each_is_named_by_its_time(self):
+        names = made(Pendulum, segment=2.0).prepare(table(time=TIME, angle=TRUTH[0])).parameter_names
+        assert names[2::2] == tuple(f"angle at the start, {k} s" for k in (0, 2, 4, 6, 8))
+
+    @pytest.mark.parametrize("more", [0, 1, 2, 3])
+    def test_a_short_rest_belongs_to_the_segment_before(self, more):
+        time = np.arange(100 + more) * 0.02
+        prepared = made(Pendulum, segment=1.0).prepare(table(time=time, angle=swings(time)[0]))
+        assert int(prepared.begins.sum()) == (3 if more == 3 else 2)
+
+    def test_in_every_experiment(self):
+        time = np.arange(101) * 0.02
+        recording = table(
+            time=np.tile(time, 2), angle=np.tile(swings(time)[0], 2), experiment=np.repeat([0.0, 1.0], 101)
+        )
+        prepared = made(Pendulum, segment=1.0).prepare(recording)
+        assert prepared.begins.nonzero().squeeze(-1).tolist() == [0, 50, 101, 151]
+        assert prepared.labels == [" of 0, 0 s", " of 0, 1 s", " of 1, 0 s", " of 1, 1 s"]
+
+
+# ports
+
+
+class Tanks(Dynamics):
+    states = ("upper", "lower")
+    inputs = ("pump",)
+    parameters = {"inflow": 1.0, "drain": Parameter(0.3, lower=0.0)}  # noqa: RUF012
+    units = {"upper": "m", "lower": "m", "pump": "V"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"upper": p.inflow * u.pump - p.drain * x.upper, "lower": -p.drain * x.lower}
+
+
+class TestPorts:
+    """Where effects can act, and what they can refer to."""
+
+    def pendulum(self, **attributes):
+        return made(Pendulum, **attributes).prepare(table(time=TIME, angle=TRUTH[0])).ports
+
+    def test_of_a_pendulum(self):
+        ports = self.pendulum()
+        # that of the angle is the speed, by what the words mean
+        assert list(ports) == ["rate of speed", "hysteretic rate of speed", "output"]
+        port = ports["rate of speed"]
+        assert (port.kind, port.channels, port.unit, port.pointwise) == ("rate", ("speed",), "rad/s/s", False)
+        assert port.carries == ("angle", "speed", "rate of speed")
+        assert {part: port.parts[part] for part in ("own", "position", "angle", "deflection", "reversing")} == {
+            "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "reversing": "speed",
+        }  # fmt: skip
+        assert port.part_units["position"] == "rad"
+        typical, largest = port.sizes["own"]
+        assert typical == pytest.approx(np.median(np.abs(TRUTH[1])), rel=0.1)
+        assert largest == pytest.approx(np.abs(TRUTH[1]).max(), rel=0.1)
+
+    def test_an_angle_is_one_in_rad(self):
+        assert "angle" not in self.pendulum(units={"angle": "m"})["rate of speed"].parts
+
+    def test_what_never_changes_its_sign_is_no_deflection_and_does_not_reverse(self):
+        time = np.arange(100) * 0.02
+        recording = table(time=time, angle=1.0 + time, speed=np.ones(100))
+        parts = Pendulum().prepare(recording).ports["rate of speed"].parts
+        assert "position" in parts
+        assert not {"deflection", "reversing"} & set(parts)
+
+    def test_of_two_tanks(self):
+        time = np.arange(50) * 0.1
+        recording = table(time=time, upper=1.0 + 0 * time, lower=np.exp(-0.3 * time), pump=0.3 + 0.1 * np.sin(time))
+        ports = Tanks().prepare(recording).ports
+        names = ["rate of upper", "rate of lower", "exchange of upper and lower", "input pump", "output"]
+        assert list(ports) == names
+        both = ports["exchange of upper and lower"]
+        assert (both.channels, both.kind, dict(both.parts)) == (
+            ("upper", "lower"), "exchange", {"own": "upper", "other": "lower"},
+        )  # fmt: skip
+        assert ports["rate of upper"].parts["level"] == "upper"
+        assert ports["rate of upper"].unit == "m/s"
+        pump = ports["input pump"]
+        assert (pump.kind, pump.channels, pump.unit) == ("input", ("pump",), "V")
+        assert pump.sizes["own"] == pytest.approx((0.3, 0.4), rel=0.1)
+        assert ports["output"].channels == ("upper", "lower")
+        assert ports["output"].unit == "m"
+        units = {name: ports["output"].part_units[part] for part, name in ports["output"].parts.items()}
+        assert units == {"upper": "m", "lower": "m"}
+
+    def test_states_of_different_units_exchange_nothing(self):
+        time = np.arange(50) * 0.1
+        recording = table(time=time, upper=np.exp(-time), lower=np.exp(-time), pump=0 * time)
+        ports = made(Tanks, units={"upper": "m", "lower": "°C"}).prepare(recording).ports
+        assert not [name for name in ports if name.startswith("exchange")]
+        assert ports["rate of lower"].parts["temperature"] == "lower"
+
+    def test_effects_act_where_their_port_is(self):
+        time = np.arange(50) * 0.1
+        recording = table(time=time, upper=np.exp(-0.3 * time), lower=np.exp(-0.3 * time), pump=0 * time)
+        prepared = Tanks().prepare(recording)
+        theta = torch.tensor([1.0, 0.3, 1.0, 1.0], dtype=torch.float64)
+        before = prepared.simulated(theta, {})
+        torch.testing.assert_close(before, prepared.measured, rtol=0.0, atol=1e-5)
+
+        def moved(port, change):
+            return prepared.simulated(theta, {port: change}) - before
+
+        rate = moved("rate of lower", lambda s: 0.3 * s[:, [1]])  # stops the drain
+        torch.testing.assert_close(rate[:, 1], 1.0 - before[:, 1], rtol=0.0, atol=1e-6)
+        assert float(rate[:, 0].abs().max()) == pytest.approx(0.0, abs=1e-9)
+        exact = torch.from_numpy((1.0 - np.exp(-0.3 * time)) / 0.3)
+        pumped = moved("input pump", lambda s: torch.ones_like(s))
+        torch.testing.assert_close(pumped[:, 0], exact, rtol=0.0, atol=1e-5)
+        even = moved("exchange of upper and lower", lambda s: torch.stack([s[:, 0], -s[:, 0]], -1) * 0.0 + 1.0)
+        torch.testing.assert_close(even, torch.stack([exact, exact], -1), rtol=0.0, atol=1e-5)
+        shown = moved("output", lambda s: 0.5 * s)
+        torch.testing.assert_close(shown, 0.5 * before)
+
+    def test_signals_are_what_the_effects_see(self):
+        prepared = made(Driven, step=0.02).prepare(table(time=TIME, angle=TRUTH[0], torque=np.sin(TIME)))
+        theta = torch.tensor([STIFFNESS, DAMPING, *FIRST], dtype=torch.float64)
+        seen = {}
+
+        def look(name):
+            def change(signal):
+                seen[name] = signal.detach().clone()
+                return torch.zeros_like(signal[:, :1])
+
+            return change
+
+        prepared.residual(theta, {name: look(name) for name in prepared.ports})
+        told = prepared.signals(theta, {})
+        for name, port in prepared.ports.items():
+            assert told[name].shape[1] == len(port.carries or port.channels)
+            torch.testing.assert_close(told[name], seen[name], rtol=0.0, atol=1e-4)
+        assert prepared.ports["rate of speed"].clock.time.shape == told["rate of speed"][:, 0].shape
+
+    def test_the_load_is_the_drive_at_this_speed_against_what_acts_at_standstill(self):
+        """A motor brakes itself by the field of its own turning, while it is switched on."""
+
+        def derivative(self, time, x, u, p):  # noqa: ARG001
+            braking = (p.damping + 2.0 * u.enabled) * x.speed
+            return {"angle": x.speed, "speed": 5.0 * u.drive - braking - p.stiffness * x.angle}
+
+        system = made(Pendulum, inputs=("drive", "enabled"), derivative=derivative)
+        inputs = {"drive": np.sin(TIME), "enabled": (TIME > 2.0).astype(float)}
+        prepared = system.prepare(table(time=TIME, angle=TRUTH[0], **inputs))
+        told = prepared.signals(torch.tensor([STIFFNESS, DAMPING, *FIRST], dtype=torch.float64), {})
+        angle, speed, drive, enabled, load = told["loaded rate of speed"].unbind(-1)
+        torch.testing.assert_close(load, (5.0 * drive - 2.0 * enabled * speed + STIFFNESS * angle).abs())
+        assert float((2.0 * enabled * speed).abs().max()) > 0.1
+
+
+# a model on a new recording
+
+
+class TestCorrection:
+    """A fitted model goes on from what it sees first."""
+
+    def test_it_predicts_a_new_recording_from_its_first_second(self):
+        theta = torch.tensor([STIFFNESS, DAMPING, 0.0, 0.0], dtype=torch.float64)
+        truth = swings(TIME, (-0.9, 1.5))[0]
+        measured = noisy(truth, 0.01, outliers=0.1)
+        measured[TIME > 1.0] = 0.0  # whatever comes later is not looked at
+        columns = DynamicsCorrection(Pendulum(), table(time=TIME, angle=measured), first=1.0).corrected(theta, {})
+        assert list(columns) == ["time", "angle"]
+        assert float((columns["angle"] - torch.from_numpy(truth)).abs().max()) < 0.03
+
+    def test_each_experiment_from_its_own_first_second(self):
+        theta = torch.tensor([STIFFNESS, DAMPING], dtype=torch.float64)
+        truths = np.concatenate([swings(TIME, first)[0] for first in ((-0.9, 1.5), (0.3, 0.0))])
+        recording = table(time=np.tile(TIME, 2), angle=noisy(truths), experiment=np.repeat([0.0, 1.0], 500))
+        columns = DynamicsCorrection(Pendulum(), recording, first=1.0).corrected(theta, {})
+        assert float((columns["angle"] - torch.from_numpy(truths)).abs().max()) < 0.04
+
+    def test_effects_go_on_too(self):
+        theta = torch.tensor([STIFFNESS, DAMPING], dtype=torch.float64)
+        recording = table(time=TIME, angle=swings(TIME, damping=DAMPING + 0.2)[0])
+        correction = DynamicsCorrection(Pendulum(), recording, first=1.0)
+        with_it = correction.corrected(theta, {"rate of speed": lambda s: -0.2 * s[:, [1]]})
+        without = correction.corrected(theta, {})
+        assert float((with_it["angle"] - recording["angle"]).abs().max()) < 1e-3
+        assert float((without["angle"] - recording["angle"]).abs().max()) > 0.1
+
+
+@pytest.mark.parametrize(("first", "seconds"), [(None, [1.0, 3.0, 10.0]), (2.0, [2.0])])
+def test_first_states_are_estimated_from_what_comes_soon_and_then_from_more(monkeypatch, first, seconds):
+    """A pendulum that seems a little too fast goes over the top, and no fit to all of it leads back."""
+    correction = DynamicsCorrection(Pendulum(), table(time=TIME, angle=TRUTH[0]), first=first)
+    theta, asked = correction.prepared.start(), []
+
+    def watched(_, start, *, weight, **__):
+        asked.append((start, weight))
+        return SimpleNamespace(theta=start + 0.01)
+
+    monkeypatch.setattr(dynamics_correction, "fit", watched)
+    correction.corrected(theta, {})
+    starts, weights = zip(*asked, strict=True)
+    length = float(TIME[-1] - TIME[0])
+    for weight, until in zip(weights, seconds, strict=True):
+        until = until * length / 10.0 if first is None else until
+        assert torch.equal(weight, torch.as_tensor(TIME - TIME[0] <= until + 1e-9).double())
+    for k, start in enumerate(starts):
+        torch.testing.assert_close(start, theta[2:] + 0.01 * k)
+
+
+class Block(Dynamics):
+    """Pulled by a spring over a table to which it sticks, but for a creep of 0.5 mm/s."""
+
+    states = ("place", "speed")
+    inputs = ("pull",)
+    outputs = ("place",)
+    parameters = {"friction": Parameter(20.0, lower=0.0)}  # noqa: RUF012
+    step = 0.02
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        spring = 200.0 * torch.clamp(u.pull - x.place, -0.3, 0.3)
+        return {"place": x.speed, "speed": spring - x.speed - p.friction * torch.tanh(x.speed / 0.0005)}
+
+
+def dragged(pull):
+    """Its place if it sticks altogether, by short steps; the last pull holds on."""
+    place, speed, places = 0.0, 0.0, []
+    for now in pull:
+        places.append(place)
+        for _ in range(200):
+            free = speed + 1e-4 * (200.0 * np.clip(now - place, -0.3, 0.3) - speed)
+            speed = math.copysign(max(abs(free) - 20.0 * 1e-4, 0.0), free)
+            place += 1e-4 * speed
+    return np.array(places)
+
+
+def test_a_simulation_that_sticks_is_gone_through_moment_by_moment(monkeypatch):
+    """Friction that is nearly a jump: no trajectory is found at once, and a corrected simulation must have one."""
+    time = np.arange(80) * 0.02
+    pull = 0.6 * np.sin(1.1 * time) + 0.3 * np.sign(np.sin(0.7 * time))
+    truth = dragged(pull)
+    correction = DynamicsCorrection(Block(), table(time=time, pull=pull, place=noisy(truth, 0.003)), first=0.3)
+    theta = correction.prepared.start()
+    assert not correction.prepared.trajectory(theta, {}).converged
+    with monkeypatch.context() as without:
+        without.setattr(prepared_dynamics, "marched", lambda *_, **__: None)
+        with pytest.raises(SimulationError, match=r"no trajectory was found.*`step`"):
+            correction.corrected(theta, {})
+    # the first states as they are measured
+    monkeypatch.setattr(dynamics_correction, "fit", lambda _, start, **__: SimpleNamespace(theta=start))
+    place = correction.corrected(theta, {})["place"]
+    # the pull goes linearly between the samples here, and in steps there
+    assert float((place - torch.from_numpy(truth)).abs().max()) < 0.1
+    assert float((place - torch.from_numpy(truth)).abs().median()) < 0.03
+
+
+# what a recording leaves open
+
+
+class Oscillator(Dynamics):
+    """A mass on a spring, of which only the quotient moves anything."""
+
+    states = ("place", "speed")
+    parameters = {"mass": Parameter(2.0, lower=0.0), "spring": Parameter(15.0, lower=0.0), "damping": 0.1}  # noqa: RUF012
+    units = {"place": "m", "speed": "m/s"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"place": x.speed, "speed": -p.spring / p.mass * x.place - p.damping * x.speed}
+
+
+class TestUndetermined:
+    """What the recording cannot tell of the parameters is said, with the direction along which nothing moves."""
+
+    recording = table(time=TIME[:200], place=np.cos(3.0 * TIME[:200]))
+
+    def test_a_mass_and_a_spring_that_are_only_a_quotient(self):
+        (told,) = Oscillator().prepare(self.recording).warnings
+        assert told.startswith("The recording does not determine `mass` and `spring`, but only what they are together")
+        assert "direction 0.71 mass + 0.71 spring, relative" in told
+
+    def test_it_is_a_warning_of_the_diagnosis(self):
+        diagnosis = diagnose(made(Oscillator, step=0.02), self.recording, effects=(), surrogates=19)
+        assert sum("does not determine `mass` and `spring`" in warning for warning in diagnosis.warnings) == 1
+
+    def test_a_parameter_that_nothing_depends_on(self):
+        idle = made(Oscillator, parameters={**Oscillator.parameters, "mass": 1.0, "colour": 5.0})
+        assert "The recording does not determine `colour`: whatever it is, the residual is the same." in (
+            idle.prepare(self.recording).warnings
+        )
+
+    def test_what_is_determined_is_not_told(self):
+        assert Pendulum().prepare(table(time=TIME, angle=TRUTH[0])).warnings == ()
+        at_rest = table(time=TIME, angle=swings(TIME, (0.5, 0.0), damping=0.0)[0])
+        assert made(Pendulum, parameters={"stiffness": 9.0, "damping": 0.0}).prepare(at_rest).warnings == ()
+
+    def test_a_first_state_alone_is_not_told(self):
+        """Of a state that nothing is seen of there is nothing to know."""
+
+        def derivative(self, time, x, u, p):  # noqa: ARG001
+            return {"place": x.speed, "speed": -p.rate * x.place, "heat": -0.1 * x.heat}
+
+        system = type(
+            "Warm",
+            (Dynamics,),
+            {"states": ("place", "speed", "heat"), "parameters": {"rate": 8.0}, "derivative": derivative},
+        )
+        assert system().prepare(self.recording).warnings == ()
+
+
+# what becomes of inputs and outputs on their way
+
+
+class TestOnTheWay:
+    """A user's own actuator and sensor."""
+
+    def test_they_see_the_runs(self):
+        seen = {}
+
+        def actuated(self, time, u, p, run):  # noqa: ARG001
+            seen["run"] = run
+            return {"torque": 2.0 * u.torque}
+
+        def sensed(self, time, y, p, run):  # noqa: ARG001
+            assert run.tolist() == [0] * 50 + [1] * 50
+            return {"angle": y["angle"] + 0.5}
+
+        time = np.arange(100) * 0.02
+        recording = table(time=time, angle=0.0 * time, torque=np.sin(time), experiment=np.repeat([3.0, 5.0], 50))
+        theta = torch.tensor([STIFFNESS, DAMPING, 0.1, 0.0, 0.2, 0.0], dtype=torch.float64)
+        plain = made(Driven, step=0.02).prepare(recording)
+        own = made(Driven, step=0.02, actuated=actuated, sensed=sensed).prepare(recording)
+        doubled = plain.simulated(theta, {"input torque": lambda s: s})
+        torch.testing.assert_close(own.simulated(theta, {}), doubled + 0.5)
+        assert set(seen["run"].tolist()) == {0, 1}
+
+    def test_an_actuator_that_forgets_an_input_is_refused(self):
+        with pytest.raises(SimulationError, match=r"actuated does not return `torque`, which is one of its inputs"):
+            made(Driven, actuated=lambda *_: {}).prepare(table(**GOOD, torque=0.0 * TIME))
+
+
+# what cannot be simulated
+
+
+def returning(value):
+    def derivative(self, time, x, u, p):  # noqa: ARG001
+        return value(x, p)
+
+    return derivative
+
+
+GOOD = {"time": TIME, "angle": TRUTH[0]}
+
+BAD = {
+    "a shape": (
+        {"derivative": returning(lambda x, _: {"angle": x.speed, "speed": torch.ones(7)})},
+        GOOD,
+        r"Pendulum.derivative: the rate of `speed` should be a tensor of shape \(1497,\), .* but is \(7,\)",
+    ),
+    "a matrix": (
+        {"derivative": returning(lambda x, _: {"angle": x.speed, "speed": x.angle.unsqueeze(-1)})},
+        GOOD,
+        r"rate of `speed` should be .* but is \(1497, 1\)",
+    ),
+    "no tensor": (
+        {"derivative": returning(lambda x, _: {"angle": x.speed, "speed": "fast"})},
+        GOOD,
+        r"rate of `speed` should be .* but is str",
+    ),
+    "other names": (
+        {"derivative": returning(lambda x, _: {"angle": x.speed, "velocity": x.angle})},
+        GOOD,
+        r"returns rates of angle, velocity but the states are angle, speed; return one rate for each",
+    ),
+    "too few by name": (
+        {"derivative": returning(lambda x, _: {"angle": x.speed})},
+        GOOD,
+        r"returns rates of angle but the states are angle, speed",
+    ),
+    "too few in order": (
+        {"derivative": returning(lambda x, _: [x.speed])},
+        GOOD,
+        r"returns 1 rates for 2 states \(angle, speed\)",
+    ),
+    "nothing": ({"derivative": returning(lambda *_: None)}, GOOD, r"derivative returns NoneType; return the rate"),
+    "NaN": (
+        {"derivative": returning(lambda x, p: {"angle": x.speed, "speed": p.stiffness * (x.angle - 1.1).sqrt()})},
+        GOOD,
+        r"the rate of `speed` is nan at time 0\.\d+ s with angle = 1\.[01]\d*, speed = -\d.*; "
+        r"parameters stiffness = 7, damping = 0\.5\. Keep it finite",
+    ),
+    "nothing measured": (
+        {},
+        {"time": TIME, "height": TRUTH[0]},
+        r"none of its states \(angle, speed\) is a column of the recording, which has time, height\. Name what",
+    ),
+    "short": ({}, {"time": TIME[:2], "angle": TRUTH[0, :2]}, r"a run of 2 samples is too short .* needs 3 at least"),
+    "a short run": (
+        {},
+        {**GOOD, "experiment": np.array([1.0, 1.0] + 498 * [2.0])},
+        r"a run of 2 samples is too short",
+    ),
+    "short segments": ({"segment": 0.03}, GOOD, r"too short .* or use longer segments"),
+    "between": ({"between": "cubic"}, GOOD, r"`between` should be \"held\", \"linear\" or \"smooth\" but is 'cubic'"),
+    "twice": (
+        {"parameters": {"angle": 1.0}},
+        GOOD,
+        r"uses the name `angle` twice among states, inputs and parameters",
+    ),
+    "no states": ({"states": ()}, GOOD, r"has no `states`; name them"),
+    "no attribute": ({"parameters": {"spring rate": 1.0}}, GOOD, r"`spring rate` cannot be an attribute"),
+    "another output": (
+        {"outputs": ("tip",), "output": lambda *_: {"top": torch.ones(1)}},
+        {"time": TIME, "tip": TRUTH[0]},
+        r"output does not return `tip`, which is in its outputs; it returns top",
+    ),
+    "an output's shape": (
+        {"outputs": ("tip",), "output": lambda *_: {"tip": torch.ones(3)}},
+        {"time": TIME, "tip": TRUTH[0]},
+        r"Pendulum.output: `tip` should be a tensor of shape \(500,\)",
+    ),
+}
+
+
+@pytest.mark.parametrize(("attributes", "columns", "said"), BAD.values(), ids=BAD)
+def test_what_cannot_be_simulated_is_refused_with_its_place(attributes, columns, said):
+    with pytest.raises(SimulationError, match=said):
+        made(Pendulum, **attributes).prepare(table(**columns))
+
+
+def test_a_missing_input_is_named():
+    with pytest.raises(MissingColumnError, match=r"there is no column `torque`; there are `time`, `angle`"):
+        Driven().prepare(table(**GOOD))
+
+
+def test_a_system_without_a_derivative():
+    with pytest.raises(NotImplementedError, match=r"Empty has no `derivative\(self, time, x, u, p\)`"):
+        type("Empty", (Dynamics,), {"states": ("angle",)})().prepare(table(**GOOD))
+
+
+def test_rows_that_are_not_finite_are_left_out():
+    angle = TRUTH[0].copy()
+    angle[[3, 40]] = np.nan
+    prepared = Pendulum().prepare(table(time=TIME, angle=angle))
+    assert len(prepared.time) == 498
+    assert "Dropped 2 of 500" in prepared.recording.warnings[0]
+
+
+def test_a_trajectory_that_was_found_is_gone_on_from(monkeypatch):
+    """What a fit reached step by step is not always reached again from another model's states."""
+    started = []
+    real = trajectory.solve
+
+    def watched(rate, grid, begin, guess, known=None):
+        started.append((guess, known))
+        return real(rate, grid, begin, guess, known)
+
+    prepared = Pendulum().prepare(table(time=TIME, angle=TRUTH[0]))
+    first, other = torch.tensor([9.0, 0.1, 0.5, 0.0]).double(), torch.tensor([4.0, 0.3, 0.2, 0.1]).double()
+    states = prepared.trajectory(first, {}).states
+    prepared.trajectory(other, {})
+    monkeypatch.setattr(prepared_dynamics, "solve", watched)
+    again = prepared.trajectory(first, {}).states
+    (guess, known), *_ = started
+    assert known is None
+    assert torch.equal(guess, states)
+    assert torch.allclose(again, states, rtol=0.0, atol=1e-9)
