@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from mkc_torch import functional, linear
     from mkc_torch.calibration import EllipsoidFit, NotIdentifiableError
     from mkc_torch.density import DensityFit, MKCDistribution, fit_density
-    from mkc_torch.diagnosis import Diagnosis, diagnose
+    from mkc_torch.diagnosis.diagnose import diagnose
+    from mkc_torch.diagnosis.result import Diagnosis
     from mkc_torch.losses import (
         GeneralizedCrossEntropyLoss,
         HeteroscedasticMKCLoss,
