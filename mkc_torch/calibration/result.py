@@ -147,7 +147,7 @@ class Calibration:
         Example:
             >>> Calibration.from_json('{"schema": "mkc-model/1"}')
             Traceback (most recent call last):
-            mkc_torch.calibration.result.CalibrationFileError: this is no calibration: its schema is "mkc-model/1", ...
+            mkc_torch.calibration.file.CalibrationFileError: this is no calibration: its schema is "mkc-model/1", ...
         """
         return calibration_from_json(text)
 

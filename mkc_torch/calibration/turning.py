@@ -141,7 +141,7 @@ def refuse_at_rest(points: Float[Tensor, "N 3"], turns: Bool[Tensor, " N"] | Non
         >>> rest = 40.0 + torch.randn(300, 3, generator=torch.Generator().manual_seed(0))
         >>> refuse_at_rest(rest, turning(rest), "µT")
         Traceback (most recent call last):
-        mkc_torch.calibration.ellipsoid_fit.NotIdentifiableError: Not identifiable: the sensor is at rest, ...
+        mkc_torch.calibration.not_identifiable.NotIdentifiableError: Not identifiable: the sensor is at rest, ...
     """
     middle = points.median(0).values
     spread = (points - middle).square().sum(-1).median()

@@ -36,6 +36,7 @@ class Context:
         run: number of each sample's run, where the simulation knows of runs.
 
     Example:
+        >>> import torch
         >>> time = torch.tensor([0.0, 1.0, 2.0, 0.0, 1.0])
         >>> context = Context(time, torch.zeros(5, 1), ("A",), torch.zeros(5, 2), "µT", ("x", "y"))
         >>> context.runs  # one begins where time goes back

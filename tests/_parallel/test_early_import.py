@@ -10,7 +10,7 @@ from mkc_torch._parallel.early_import import load_early
 
 SLOW = """
 import sys, time
-from mkc_torch._load_early import load_early
+from mkc_torch._parallel.early_import import load_early
 sys.path.insert(0, sys.argv[1])
 usual = sys.getswitchinterval()
 load_early("slow_to_load")

@@ -200,12 +200,12 @@ def test_a_copy_that_is_not_waited_for_is_ended(copies):
 CODE = """
     import os, sys, torch
     from mkc_torch import Recording, diagnose
-    from mkc_torch._forked import allow_copies
-    from mkc_torch._processes import one_thread
-    from mkc_torch.demo import simulated_recording
-    from mkc_torch.diagnosis.diagnosis_file import diagnosis_to_json
+    from mkc_torch._parallel.fork import allow_copies
+    from mkc_torch._parallel.processes import one_thread
+    from mkc_torch.recording.demonstration import simulated_recording
+    from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
     from mkc_torch.simulation import Dynamics, Magnetometer
-    from mkc_torch.diagnosis import side_by_side
+    from mkc_torch.diagnosis.model import side_by_side
 
     one_thread()
 

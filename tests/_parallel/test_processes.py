@@ -45,7 +45,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from threading import Thread
 
-from mkc_torch import _processes
+from mkc_torch._parallel import processes as _processes
 
 
 def interrupt_and_end():

@@ -317,7 +317,7 @@ def test_a_low_level_gets_as_many_surrogates_as_it_needs(tmp_path, monkeypatch):
     for level, surrogates in (("0.05", 99), ("0.001", 999)):
         result = mkc("diagnose", path, "--simulation", "magnetometer", "--output", tmp_path, "--level", level)
         assert (asked[-1]["level"], asked[-1]["surrogates"]) == (float(level), surrogates)
-    refused(result, "an error of the program's own (ZeroDivisionError in test_cli_diagnose.py", "report it")
+    refused(result, "an error of the program's own (ZeroDivisionError in test_diagnose.py", "report it")
     assert not (tmp_path / "a").exists()
 
 

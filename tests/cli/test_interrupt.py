@@ -60,7 +60,7 @@ def test_all_public_names_are_there():
 
 def interrupting(monkeypatch, command, name, after=0):
     """The function of that name in a command's module interrupts when it was called so many times."""
-    module = import_module(f"mkc_torch.cli.app.{command}")
+    module = import_module(f"mkc_torch.cli.{command}")
     works = getattr(module, name)
     calls = []
 

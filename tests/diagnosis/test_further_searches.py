@@ -6,11 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from mkc_torch import Recording, diagnose
 from mkc_torch.effects import CATALOGUE
-from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation import Dynamics
 
-diagnosis_of = importlib.import_module("mkc_torch.diagnosis.diagnose")
+rounds = importlib.import_module("mkc_torch.diagnosis.rounds")
 ending_of = importlib.import_module("mkc_torch.diagnosis.evidence.after_the_search")
 
 
@@ -47,7 +47,7 @@ def diagnosed(recording, monkeypatch):
 
     def run(beside):
         searches, begun, first = [], [], []
-        locate, estimate = diagnosis_of.locate, ending_of.estimate
+        locate, estimate = rounds.locate, ending_of.estimate
 
         def search(base, terms, **options):
             searches.append(base)
@@ -56,11 +56,11 @@ def diagnosed(recording, monkeypatch):
                 return first[0]
             return beside(base, first[0])
 
-        monkeypatch.setattr(diagnosis_of, "locate", search)
+        monkeypatch.setattr(rounds, "locate", search)
         monkeypatch.setattr(
             ending_of, "estimate", lambda fit: begun.append(fit.model.prepared.newest[1]) or estimate(fit)
         )
-        return diagnosis_of.diagnose(Sled(), recording, effects=EFFECTS), searches, begun
+        return diagnose(Sled(), recording, effects=EFFECTS), searches, begun
 
     return run
 
@@ -87,14 +87,14 @@ def test_the_simulation_goes_on_with_the_trajectory_of_what_was_found(diagnosed)
 
 
 def test_a_search_without_an_effect_of_a_possible_sign_finds_nothing(recording):
-    diagnosis = diagnosis_of.diagnose(Sled(), recording, effects=EFFECTS)
+    diagnosis = diagnose(Sled(), recording, effects=EFFECTS)
     assert len(diagnosis.findings) == 1  # beside it only a drag that drives would fit
     assert not any("given up" in warning for warning in diagnosis.warnings)
 
 
 def test_what_drives_the_simulation_away_is_found_from_where_it_began(recording):
     """Without its spring the sled is fitted with a damping of thousands, and beside that no spring has its size."""
-    diagnosis = diagnosis_of.diagnose(Sled(), recording, effects=EFFECTS)
+    diagnosis = diagnose(Sled(), recording, effects=EFFECTS)
     assert float(diagnosis.baseline.d[0]) > 0.3
     (finding,) = diagnosis.findings
     assert finding.effect == "cubic_stiffness"

@@ -11,8 +11,8 @@ import sys
 
 import torch
 
-from mkc_torch.diagnosis.findings import _curve
-from mkc_torch.diagnosis.model import Term
+from mkc_torch.diagnosis.findings.finding import _curve
+from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects import CATALOGUE, Context
 from mkc_torch.nonlinear import load_forward_mode
 

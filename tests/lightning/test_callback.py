@@ -963,14 +963,14 @@ def test_nothing_else_imports_lightning():
         for node in ast.walk(ast.parse(path.read_text())):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-            if any(n.split(".")[0] == "lightning" or n == "mkc_torch.lightning.callback" for n in names):
-                importers.add(path.name)
-    assert importers == {"lightning.py"}
+            if any(n.split(".")[0] == "lightning" or n.startswith("mkc_torch.lightning") for n in names):
+                importers.add(path.relative_to(root).parts[0])
+    assert importers == {"lightning"}
 
 
 def test_without_lightning_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "lightning.pytorch", None)
-    path = Path(mkc_torch.__file__).parent / "lightning.py"
+    monkeypatch.setitem(sys.modules, "lightning", None)
+    path = Path(mkc_torch.__file__).parent / "lightning" / "__init__.py"
     spec = importlib.util.spec_from_file_location("without_lightning", path)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'mkc-torch\[lightning\]'"):
         spec.loader.exec_module(importlib.util.module_from_spec(spec))

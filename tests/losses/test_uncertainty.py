@@ -235,6 +235,7 @@ def fields(function, loss, x):
     return vars(found).values() if hasattr(found, "__dict__") and not isinstance(found, torch.Tensor) else found
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
 @pytest.mark.parametrize(
     "function", [inlier_weight, outliers, beyond_bound, lambda loss, x, _: predictive_interval(loss, x)]
 )

@@ -20,11 +20,11 @@ __all__ = ["SourceError", "python_source"]
 
 _DIGITS = 9
 _FROM_HERE: Mapping[str, str] = {
-    "lagged(": "from mkc_torch.effects.base import lagged",
-    "played(": "from mkc_torch.effects.dynamics.backlash import played",
-    "shifted(": "from mkc_torch.effects.paired.between import shifted",
-    "soft_clip(": "from mkc_torch.effects.share import soft_clip",
-    "beyond(": "from mkc_torch.effects.dynamics.rate import beyond",
+    "lagged(": "from mkc_torch.effects import lagged",
+    "played(": "from mkc_torch.effects import played",
+    "shifted(": "from mkc_torch.effects import shifted",
+    "soft_clip(": "from mkc_torch.effects import soft_clip",
+    "beyond(": "from mkc_torch.effects import beyond",
     "SimpleNamespace(": "from types import SimpleNamespace",
     "Parameter(": "from mkc_torch.simulation import Parameter",
 }

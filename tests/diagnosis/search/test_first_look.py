@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from mkc_torch import diagnose
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms
@@ -17,7 +18,7 @@ from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import RATE, tumbling
 
-diagnosis_of = importlib.import_module("mkc_torch.diagnosis.diagnose")
+rounds = importlib.import_module("mkc_torch.diagnosis.rounds")
 
 N = 2000
 TIME = np.arange(N) / RATE
@@ -80,7 +81,7 @@ def test_trajectories_are_for_the_search_itself():
     ((ALONG_CURRENT, STEP), 2, ["current_field", "hard_iron_step"]),
 ])  # fmt: skip
 def test_a_search_beside_a_finding_is_made_where_a_first_look_shows_something(monkeypatch, effects, searches, names):
-    locate, begun, seen = diagnosis_of.locate, [], []
+    locate, begun, seen = rounds.locate, [], []
 
     def counted(*arguments, **options):
         begun.append(1)
@@ -90,9 +91,9 @@ def test_a_search_beside_a_finding_is_made_where_a_first_look_shows_something(mo
         seen.append(p_value_beside(*arguments))
         return seen[-1]
 
-    monkeypatch.setattr(diagnosis_of, "locate", counted)
-    monkeypatch.setattr(diagnosis_of, "p_value_beside", looked)
-    diagnosis = diagnosis_of.diagnose(Magnetometer("attitude"), recording(*effects))
+    monkeypatch.setattr(rounds, "locate", counted)
+    monkeypatch.setattr(rounds, "p_value_beside", looked)
+    diagnosis = diagnose(Magnetometer("attitude"), recording(*effects))
     assert [finding.effect for finding in diagnosis.findings] == names
     assert len(begun) == searches + (seen[-1] <= 0.1)
     assert len(seen) == searches
