@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.dynamics.equations import Equations
+
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
-
-    from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 __all__ = ["first_guess"]
 
@@ -19,22 +21,32 @@ _FAR = 6.0
 
 
 def first_guess(
-    prepared: PreparedDynamics, time: Float[Tensor, " G"], before: Int[Tensor, " G"], share: Float[Tensor, " G"]
+    system: Equations,
+    recording: Recording,
+    channels: tuple[str, ...],
+    begins: Bool[Tensor, " N"],
+    kinematic: Mapping[str, str],
+    time: Float[Tensor, " G"],
+    before: Int[Tensor, " G"],
+    share: Float[Tensor, " G"],
 ) -> Float[Tensor, "G n"]:
     """Of the states at moments between samples.
 
     Args:
-        prepared: the system; a state that is an output is as it was measured, outliers smoothed away, and one that is
-            the rate of such a state is its slope.
+        system: a state of it that is an output is as it was measured, outliers smoothed away, and one that is the rate
+            of such a state is its slope.
+        recording, channels: what was measured, and which columns of it are outputs.
+        begins: where a trajectory begins.
+        kinematic: states whose rate is another state.
         time, before, share: the moments, the sample before each, and how far it is from that one to the next.
     """
-    system, known = prepared.system, {}
+    known, at = {}, recording["time"]
     for name in system.states:
-        if name in prepared.channels:
-            known[name] = _despiked(prepared.recording[name], prepared.time, prepared.begins)
-    for name, rate in prepared._kinematic.items():
+        if name in channels:
+            known[name] = _despiked(recording[name], at, begins)
+    for name, rate in kinematic.items():
         if name in known and rate not in known:
-            known[rate] = _slope(known[name], prepared.time, prepared.begins)
+            known[rate] = _slope(known[name], at, begins)
     columns = []
     for name in system.states:
         if name in known:

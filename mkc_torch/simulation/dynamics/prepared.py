@@ -6,7 +6,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import combinations
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -17,19 +16,20 @@ from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.nonlinear import GaussianPrior, fit, load_forward_mode
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.between_samples import smooth_between
+from mkc_torch.simulation.dynamics.checks import Moments, check_functions
+from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.first_guess import first_guess
+from mkc_torch.simulation.dynamics.ports import RATES, Places, common_unit
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
 from mkc_torch.simulation.dynamics.trajectory import Grid, Rate, Trajectory, defect, marched, solve, stations
-from mkc_torch.simulation.dynamics.user_functions import check_value, kinematic, namespace
-from mkc_torch.simulation.parameter import Parameter, SimulationError
+from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
+from mkc_torch.simulation.parameter import Parameter
 from mkc_torch.simulation.protocol import Changes, Clock, FreeChange, Port
 from mkc_torch.simulation.runs import experiment_runs
 from mkc_torch.simulation.undetermined import undetermined
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
-
-    from mkc_torch.simulation.dynamics.definition import Dynamics
 
 __all__ = ["PreparedDynamics"]
 
@@ -42,11 +42,8 @@ _MOST_KEPT = 1 << 22
 """Numbers in all trajectories that are kept."""
 
 _ROUGH = 0.02
-_REVERSED = 0.05
 _WINDOW = 4
 _NOUGHT = 1e-3
-_RATES = ("rate", "loaded rate", "hysteretic rate", "exchange")
-_HEIGHTS = ("height", "altitude", "elevation", "heave", "z")
 
 _Mark = tuple[float, float]
 _Memory = tuple[dict[int, Trajectory], OrderedDict[_Mark, Tensor]]
@@ -57,12 +54,12 @@ class PreparedDynamics:
 
     prior: GaussianPrior | None = None
 
-    def __init__(self, system: Dynamics, recording: Recording, outputs: tuple[str, ...]) -> None:
+    def __init__(self, system: Equations, recording: Recording, outputs: tuple[str, ...]) -> None:
         self.system, self.recording, self.channels = system, recording, outputs
         self.name = system.name
         self.time = recording["time"]
         self.measured = recording.stack(*outputs)
-        self.unit = _common(system.units.get(name, recording.units[name]) for name in outputs)
+        self.unit = common_unit(system.units.get(name, recording.units[name]) for name in outputs)
         self.independent = (True,) * len(outputs)
         self.state: Mapping[str, object] = {"class": system.name, "outputs": list(outputs)}
         self.known = {
@@ -108,7 +105,9 @@ class PreparedDynamics:
         inputs = self.recording.stack(*self.system.inputs) if self.system.inputs else self.time.new_zeros(N, 0)
         self.inputs = self._between(inputs)
         self.inputs_at_rows = inputs
-        self._guess = first_guess(self, time, node_before, node_share)
+        self._guess = first_guess(
+            self.system, self.recording, self.channels, self.begins, self._kinematic, time, node_before, node_share
+        )
         self._last: dict[int, Trajectory] = {}
         self._solved: OrderedDict[_Mark, Tensor] = OrderedDict()
         self.__dict__.pop("ports", None)  # their clock is that of the stations
@@ -124,97 +123,10 @@ class PreparedDynamics:
     @cached_property
     def ports(self) -> dict[str, Port]:
         """The rate of each state, exchange between two of the same unit, each input, and the outputs."""
-        system = self.system
-        places = {}
-        for state in system.states:
-            if state in self._kinematic:
-                continue
-            parts = self._parts(state)
-            rate = {"rate": f"rate of {state}"} if "position" in parts else {}
-            places[f"rate of {state}"] = self._rate_port(state, "rate", {**parts, **rate})
-            if "position" in parts and system.inputs:
-                places[f"loaded rate of {state}"] = self._rate_port(state, "loaded rate", {**parts, "load": "load"})
-            # segments of one run would each begin without what the one before remembers
-            if "position" in parts and system.segment is None:
-                port = self._rate_port(state, "hysteretic rate", parts)
-                places[f"hysteretic rate of {state}"] = replace(port, memory=f"memory_of_{state}")
-        pairs = [
-            (one, other)
-            for one, other in combinations((s for s in system.states if s not in self._kinematic), 2)
-            if self._unit_of(one) == self._unit_of(other)
-        ]
-        for one, other in pairs:
-            sideways = {"sideways": other} if self._is_way(one) and self._is_way(other) else {}
-            port = self._rate_port(one, "exchange", {"own": one, "other": other, **sideways})
-            places[f"exchange of {one} and {other}"] = replace(port, channels=(one, other))
-        for name in system.inputs:
-            places[f"input {name}"] = Port(
-                (name,),
-                self._unit_of(name),
-                pointwise=False,
-                kind="input",
-                parts={"own": name},
-                part_units={"own": self._unit_of(name)},
-                sizes={"own": _sizes(self.recording[name])},
-                clock=self.clock,
-                run=self.run[self.clock.before],
-            )
-        parts = {"own": self.channels[0], **{f"output {name}": name for name in self.channels[1:]}}
-        units = {part: self._unit_of(name) for part, name in parts.items()}
-        output = Port(self.channels, self.unit, pointwise=False, parts=parts, part_units=units, run=self.run)
-        return places | {"output": output}
-
-    def _parts(self, state: str) -> dict[str, str]:
-        """What an effect on the rate of a state can refer to."""
-        positions = [i for i, j in self._kinematic.items() if j == state]
-        parts = {"own": state, **({"position": positions[0]} if positions else {})}
-        if positions and self._unit_of(positions[0]) == "rad":
-            parts["angle"] = positions[0]
-        if positions and self._reverses(positions[0]):
-            parts["deflection"] = positions[0]
-        if positions and positions[0].lower().split("_")[0] in _HEIGHTS:
-            parts["height"] = positions[0]
-        if self._reverses(state):
-            parts["reversing"] = state
-        if self._unit_of(state) in ("°C", "K"):
-            parts["temperature"] = state
-        else:
-            parts["flowing"] = state
-            if not positions:
-                parts["level"] = state
-        return parts
-
-    def _is_way(self, state: str) -> bool:
-        """Whether a state is the speed along a straight line, as far as names and units tell."""
-        positions = [i for i, j in self._kinematic.items() if j == state]
-        return self._unit_of(state) == "m/s" or (bool(positions) and self._unit_of(positions[0]) not in ("rad", "°"))
-
-    def _reverses(self, state: str) -> bool:
-        """Whether a state has either sign for a good part of the recording, as far as it is known beforehand."""
-        values = self._guess[self.rows, self.system.states.index(state)]
-        return min(float((values > 0).double().mean()), float((values < 0).double().mean())) > _REVERSED
-
-    def _rate_port(self, state: str, kind: str, parts: Mapping[str, str]) -> Port:
-        unit = self._unit_of(state)
-        return Port(
-            (state,),
-            f"{unit}/s" if unit else "1/s",
-            pointwise=False,
-            kind=kind,
-            carries=(*self.system.states, *self.system.inputs, *(parts[of] for of in ("load", "rate") if of in parts)),
-            parts=parts,
-            part_units={part: self._unit_of(name) for part, name in parts.items()},
-            sizes={
-                part: _sizes(self._guess[self.rows, self.system.states.index(name)])
-                for part, name in parts.items()
-                if name in self.system.states
-            },
-            clock=self.clock,
-            run=self.run[self.clock.before],
+        places = Places(
+            self.system, self.recording, self.channels, self._kinematic, self._guess[self.rows], self.clock, self.run
         )
-
-    def _unit_of(self, name: str) -> str:
-        return self.system.units.get(name, self.recording.units[name] if name in self.recording else "")
+        return places.ports()
 
     @property
     def beginnings(self) -> int:
@@ -284,7 +196,7 @@ class PreparedDynamics:
         at = {
             name: self._signal(port, theta, at_stations, inputs, rates)
             for name, port in self.ports.items()
-            if port.kind in _RATES
+            if port.kind in RATES
         }
         at |= {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
         return at | {"output": outputs}
@@ -377,7 +289,7 @@ class PreparedDynamics:
         acting = [
             (port, [rows.index(row) for row in (*port.channels, *([port.memory] if name in remembering else []))], name)
             for name, port in self.ports.items()
-            if port.kind in _RATES and name in changes
+            if port.kind in RATES and name in changes
         ]
 
         def rate(states: Tensor) -> Tensor:
@@ -443,50 +355,12 @@ class PreparedDynamics:
         return SimpleNamespace(**dict(zip(self.known, theta[: self._p].unbind(), strict=True)))
 
     def _check_functions(self) -> None:
-        """The user's functions at the first guess.
-
-        Raises:
-            SimulationError: a wrong shape, or values that are not finite.
-        """
-        system = self.system
         theta = self.time.new_tensor([one.value for one in self.known.values()])
-        states = self.grid.spread(self._guess)
-        x, p = namespace(system.states, states), self._parameters(theta)
-        u = namespace(system.inputs, self.inputs)
-        found = system.derivative(self.clock.time, x, u, p)
-        if isinstance(found, Mapping):
-            if set(found) != set(system.states):
-                raise SimulationError(
-                    f"{self.name}.derivative returns rates of {', '.join(map(str, found))} but the states are "
-                    f"{', '.join(system.states)}; return one rate for each state."
-                )
-        elif len(found) != len(system.states):
-            raise SimulationError(
-                f"{self.name}.derivative returns {len(found)} rates for {len(system.states)} states "
-                f"({', '.join(system.states)}); return one rate for each state."
-            )
-        values = [found[s] for s in system.states] if isinstance(found, Mapping) else list(found)
-        for state, value in zip(system.states, values, strict=True):
-            check_value(f"{self.name}.derivative: the rate of `{state}`", value, self.clock.time, x, p)
-        run = self.run[self.clock.before]
-        acting = system.actuated(self.clock.time, u, p, run)
-        for name in system.inputs:
-            if name not in acting:
-                raise SimulationError(
-                    f"{self.name}.actuated does not return `{name}`, which is one of its inputs; it returns "
-                    f"{', '.join(map(str, acting)) or 'nothing'}."
-                )
-            check_value(f"{self.name}.actuated: `{name}`", acting[name], self.clock.time, x, p)
-        at = namespace(system.states, states[::3][:1].expand(len(self.time), -1))
-        at_rows = namespace(system.inputs, self.inputs_at_rows)
-        outputs = system.output(self.time, at, at_rows, p)
-        for name in self.channels:
-            if name not in outputs:
-                raise SimulationError(
-                    f"{self.name}.output does not return `{name}`, which is in its outputs; it returns "
-                    f"{', '.join(map(str, outputs))}."
-                )
-            check_value(f"{self.name}.output: `{name}`", outputs[name], self.time, at, p)
+        at = self.grid.spread(self._guess)
+        first = at[::3][:1].expand(len(self.time), -1)
+        stations = Moments(self.clock.time, at, self.inputs, self.run[self.clock.before])
+        samples = Moments(self.time, first, self.inputs_at_rows, self.run)
+        check_functions(self.system, self._parameters(theta), stations, samples, self.channels)
 
     def _refine(self) -> None:
         """Parts of an interval between samples: by the greatest step, or until twice as many change nothing."""
@@ -506,14 +380,3 @@ class PreparedDynamics:
                 break
             parts, before = 2 * parts, after
         self._lay_out(parts if bool(before.isfinite().all()) else 1)
-
-
-def _sizes(values: Float[Tensor, " N"]) -> tuple[float, float]:
-    """Typical and largest absolute value."""
-    return float(values.abs().median()), float(values.abs().amax())
-
-
-def _common(units: Any) -> str:
-    """The unit that all of them are; empty where they differ."""
-    found = set(units)
-    return found.pop() if len(found) == 1 else ""

@@ -8,19 +8,18 @@ import torch
 from torch import Tensor
 
 from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.parameter import SimulationError
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Int
-
-    from mkc_torch.simulation.dynamics.definition import Dynamics
 
 __all__ = ["beginnings", "refuse_few"]
 
 _FEWEST = 3
 
 
-def beginnings(recording: Recording, system: Dynamics) -> tuple[Tensor, list[str]]:
+def beginnings(recording: Recording, system: Equations) -> tuple[Tensor, list[str]]:
     """Where trajectories begin, and what each is called."""
     time = recording["time"]
     begins = torch.zeros(len(time), dtype=torch.bool)

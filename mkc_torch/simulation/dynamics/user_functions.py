@@ -9,17 +9,16 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.parameter import Parameter, SimulationError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    from mkc_torch.simulation.dynamics.definition import Dynamics
-
 __all__ = ["check_names", "check_value", "kinematic", "namespace"]
 
 
-def check_names(system: Dynamics) -> None:
+def check_names(system: Equations) -> None:
     names = [*system.states, *system.inputs, *system.parameters]
     if system.between not in ("held", "linear", "smooth"):
         raise SimulationError(
@@ -52,7 +51,7 @@ def check_value(what: str, value: object, time: Tensor, x: SimpleNamespace, p: S
         )
 
 
-def kinematic(system: Dynamics, known: Mapping[str, Parameter]) -> dict[str, str]:
+def kinematic(system: Equations, known: Mapping[str, Parameter]) -> dict[str, str]:
     """States whose rate is another state, as that of a position is the speed: no physics can be missing there."""
     generator = torch.Generator().manual_seed(0)
 

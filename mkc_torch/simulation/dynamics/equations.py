@@ -1,0 +1,49 @@
+"""What a system of differential equations is to the rest of this folder, whoever defines it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+from torch import Tensor
+
+from mkc_torch.simulation.parameter import Parameter
+
+__all__ = ["Equations"]
+
+
+class Equations(Protocol):
+    """Names, parameters and functions of a system; :class:`mkc_torch.simulation.Dynamics` explains each.
+
+    Attributes:
+        name: as ``diagnosis.json`` gives it.
+        states, inputs, outputs, parameters, initial, units, between, segment, step, starts_from: of the system.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def states(self) -> tuple[str, ...]: ...
+    @property
+    def inputs(self) -> tuple[str, ...]: ...
+    @property
+    def outputs(self) -> tuple[str, ...]: ...
+    @property
+    def parameters(self) -> Mapping[str, float | Parameter]: ...
+    @property
+    def initial(self) -> Mapping[str, float]: ...
+    @property
+    def units(self) -> Mapping[str, str]: ...
+    @property
+    def between(self) -> str: ...
+    @property
+    def segment(self) -> float | None: ...
+    @property
+    def step(self) -> float | None: ...
+    @property
+    def starts_from(self) -> float | None: ...
+
+    def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor] | Sequence[Tensor]: ...
+    def output(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor]: ...
+    def actuated(self, time: Tensor, u: Any, p: Any, run: Tensor) -> Mapping[str, Tensor]: ...
+    def sensed(self, time: Tensor, y: Mapping[str, Tensor], p: Any, run: Tensor) -> Mapping[str, Tensor]: ...

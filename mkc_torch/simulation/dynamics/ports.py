@@ -1,0 +1,154 @@
+"""Where effects can act on a system of differential equations: rates, exchanges, inputs and outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.dynamics.equations import Equations
+from mkc_torch.simulation.protocol import Clock, Port
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+__all__ = ["RATES", "Places", "common_unit"]
+
+RATES = ("rate", "loaded rate", "hysteretic rate", "exchange")
+"""Kinds of ports at which an effect adds to rates of change."""
+
+_REVERSED = 0.05
+"""Share of a recording that a state has to be of either sign to be one that reverses."""
+
+_HEIGHTS = ("height", "altitude", "elevation", "heave", "z")
+
+
+@dataclass(frozen=True)
+class Places:
+    """A system on a recording, as far as its ports depend on it.
+
+    Attributes:
+        system, recording, channels: the equations, the recording, and the columns that answer them.
+        kinematic: states whose rate is another state.
+        guess: (N, n), a first guess of the states at the samples.
+        clock: the moments at which rates and inputs are computed.
+        run: (N,), number of each sample's run.
+    """
+
+    system: Equations
+    recording: Recording
+    channels: tuple[str, ...]
+    kinematic: Mapping[str, str]
+    guess: Float[Tensor, "N n"]
+    clock: Clock
+    run: Int[Tensor, " N"]
+
+    def ports(self) -> dict[str, Port]:
+        """The rate of each state, exchange between two of the same unit, each input, and the outputs."""
+        system = self.system
+        places = {}
+        for state in system.states:
+            if state in self.kinematic:
+                continue
+            parts = self._parts(state)
+            rate = {"rate": f"rate of {state}"} if "position" in parts else {}
+            places[f"rate of {state}"] = self._rate_port(state, "rate", {**parts, **rate})
+            if "position" in parts and system.inputs:
+                places[f"loaded rate of {state}"] = self._rate_port(state, "loaded rate", {**parts, "load": "load"})
+            # segments of one run would each begin without what the one before remembers
+            if "position" in parts and system.segment is None:
+                port = self._rate_port(state, "hysteretic rate", parts)
+                places[f"hysteretic rate of {state}"] = replace(port, memory=f"memory_of_{state}")
+        pairs = [
+            (one, other)
+            for one, other in combinations((s for s in system.states if s not in self.kinematic), 2)
+            if self._unit_of(one) == self._unit_of(other)
+        ]
+        for one, other in pairs:
+            sideways = {"sideways": other} if self._is_way(one) and self._is_way(other) else {}
+            port = self._rate_port(one, "exchange", {"own": one, "other": other, **sideways})
+            places[f"exchange of {one} and {other}"] = replace(port, channels=(one, other))
+        for name in system.inputs:
+            places[f"input {name}"] = Port(
+                (name,),
+                self._unit_of(name),
+                pointwise=False,
+                kind="input",
+                parts={"own": name},
+                part_units={"own": self._unit_of(name)},
+                sizes={"own": _sizes(self.recording[name])},
+                clock=self.clock,
+                run=self.run[self.clock.before],
+            )
+        parts = {"own": self.channels[0], **{f"output {name}": name for name in self.channels[1:]}}
+        units = {part: self._unit_of(name) for part, name in parts.items()}
+        unit = common_unit(self._unit_of(name) for name in self.channels)
+        output = Port(self.channels, unit, pointwise=False, parts=parts, part_units=units, run=self.run)
+        return places | {"output": output}
+
+    def _parts(self, state: str) -> dict[str, str]:
+        """What an effect on the rate of a state can refer to."""
+        positions = [i for i, j in self.kinematic.items() if j == state]
+        parts = {"own": state, **({"position": positions[0]} if positions else {})}
+        if positions and self._unit_of(positions[0]) == "rad":
+            parts["angle"] = positions[0]
+        if positions and self._reverses(positions[0]):
+            parts["deflection"] = positions[0]
+        if positions and positions[0].lower().split("_")[0] in _HEIGHTS:
+            parts["height"] = positions[0]
+        if self._reverses(state):
+            parts["reversing"] = state
+        if self._unit_of(state) in ("°C", "K"):
+            parts["temperature"] = state
+        else:
+            parts["flowing"] = state
+            if not positions:
+                parts["level"] = state
+        return parts
+
+    def _is_way(self, state: str) -> bool:
+        """Whether a state is the speed along a straight line, as far as names and units tell."""
+        positions = [i for i, j in self.kinematic.items() if j == state]
+        return self._unit_of(state) == "m/s" or (bool(positions) and self._unit_of(positions[0]) not in ("rad", "°"))
+
+    def _reverses(self, state: str) -> bool:
+        """Whether a state has either sign for a good part of the recording, as far as it is known beforehand."""
+        values = self.guess[:, self.system.states.index(state)]
+        return min(float((values > 0).double().mean()), float((values < 0).double().mean())) > _REVERSED
+
+    def _rate_port(self, state: str, kind: str, parts: Mapping[str, str]) -> Port:
+        unit = self._unit_of(state)
+        return Port(
+            (state,),
+            f"{unit}/s" if unit else "1/s",
+            pointwise=False,
+            kind=kind,
+            carries=(*self.system.states, *self.system.inputs, *(parts[of] for of in ("load", "rate") if of in parts)),
+            parts=parts,
+            part_units={part: self._unit_of(name) for part, name in parts.items()},
+            sizes={
+                part: _sizes(self.guess[:, self.system.states.index(name)])
+                for part, name in parts.items()
+                if name in self.system.states
+            },
+            clock=self.clock,
+            run=self.run[self.clock.before],
+        )
+
+    def _unit_of(self, name: str) -> str:
+        return self.system.units.get(name, self.recording.units[name] if name in self.recording else "")
+
+
+def common_unit(units: Iterable[str]) -> str:
+    """The unit that all of them are; empty where they differ."""
+    found = set(units)
+    return found.pop() if len(found) == 1 else ""
+
+
+def _sizes(values: Float[Tensor, " N"]) -> tuple[float, float]:
+    """Typical and largest absolute value."""
+    return float(values.abs().median()), float(values.abs().amax())
