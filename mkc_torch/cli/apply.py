@@ -18,10 +18,10 @@ from mkc_torch.cli.diagnosis_files import SIMULATIONS, named_simulation, paired_
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.files import diagnosis_json as diagnosis_file
 from mkc_torch.diagnosis.files import model as diagnosed_model
+from mkc_torch.diagnosis.files.model import refuse_unknown
 from mkc_torch.recording.recording import Recording, write_table
 from mkc_torch.report.words.numbers import size
 from mkc_torch.simulation.load import raised_in
-from mkc_torch.simulation.registry import refuse_unknown
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -103,6 +103,10 @@ class Paired:
         table = recording.finite("time", *shared).sorted_by_time()
         table, curve = _met(self.simulated.finite(*shared), table, shared)
         return PreparedPaired(self, table, shared, curve)
+
+    def correction(self, state: Mapping[str, Any], recording: Recording) -> PairedCorrection:
+        """What was simulated for a new recording; see :class:`mkc_torch.simulation.Correction`."""
+        return PairedCorrection(self, state["channels"], recording)
 
     def _shared(self, recording: Recording) -> tuple[str, ...]:
         recording["time"]

@@ -22,6 +22,7 @@ __all__ = [
     "Change",
     "Changes",
     "Clock",
+    "Correcting",
     "Correction",
     "FreeChange",
     "Port",
@@ -220,6 +221,23 @@ class Correction(Protocol):
 
     def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
         """The corrected columns, with ``changes`` taken off."""
+        ...
+
+
+@runtime_checkable
+class Correcting(Protocol):
+    """A simulation whose effects can be taken off new recordings."""
+
+    def correction(self, state: Mapping[str, Any], recording: Recording) -> Correction:
+        """The measuring side on a new recording.
+
+        Args:
+            state: :attr:`PreparedSimulation.state` of the one that was fitted.
+            recording: to correct.
+
+        Raises:
+            MissingColumnError: the recording lacks a column.
+        """
         ...
 
 

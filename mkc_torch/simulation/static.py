@@ -190,6 +190,10 @@ class Static:
         table = recording.finite(*self.inputs, *self.outputs)
         return PreparedStatic(self, table if table.time is None else table.sorted_by_time())
 
+    def correction(self, state: Mapping[str, Any], recording: Recording) -> StaticCorrection:
+        """The same with known parameters on a new recording; see :class:`mkc_torch.simulation.Correction`."""
+        return StaticCorrection(self, state.get("fixed", ()), recording)
+
 
 class PreparedStatic:
     """A function of inputs with the recording that answers it."""

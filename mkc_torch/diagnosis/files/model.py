@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from mkc_torch.diagnosis.files.python_source import python_source
+from mkc_torch.diagnosis.files.python_source import SourceError, python_source
 from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.joint import summed
@@ -21,13 +21,15 @@ from mkc_torch.effects.base import AnchoredEffect, Effect, LastingEffect, Relati
 from mkc_torch.effects.context import Context
 from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
 from mkc_torch.recording.recording import MissingColumnError, Recording
-from mkc_torch.simulation.protocol import Change, Correction, Simulation
-from mkc_torch.simulation.registry import correction_of
+from mkc_torch.simulation.dynamics import Dynamics
+from mkc_torch.simulation.magnetometer import Magnetometer
+from mkc_torch.simulation.paired import Paired
+from mkc_torch.simulation.protocol import Change, Correcting, Correction, Simulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["SCHEMA", "DiagnosedModel", "ModelFileError", "model_of"]
+__all__ = ["SCHEMA", "DiagnosedModel", "ModelFileError", "correction_of", "model_of", "refuse_unknown"]
 
 SCHEMA = "mkc-model/1"
 
@@ -160,7 +162,14 @@ class DiagnosedModel(nn.Module):
         Raises:
             SourceError: no differential equations, or an effect that has no line of its own.
         """
-        return python_source(self, module)
+        system = self.source
+        if not isinstance(system, Dynamics):
+            raise SourceError(
+                f'Only differential equations are written out as Python, but the model is of "{self.simulation}"'
+                f"{'' if system else '; give its simulation with `simulation=`'}."
+            )
+        measured = tuple(map(str, self.state.get("outputs", system.outputs or system.states)))
+        return python_source(system, self.theta.tolist(), self.terms, tuple(self.gammas), measured, module)
 
     @staticmethod
     def from_json(
@@ -293,3 +302,56 @@ def missing_driver(column: str, effect: str) -> MissingColumnError:
         f"The model corrects {effect} by the column `{column}`, which the recording does not have; "
         f"rename it with `--columns {column}=NAME`, or record it."
     )
+
+
+def correction_of(
+    name: str, state: Mapping[str, Any], recording: Recording, simulation: Simulation | None = None
+) -> Correction:
+    """How a simulation corrects a recording.
+
+    Args:
+        name: of the simulation.
+        state: of the one that was fitted.
+        recording: to correct.
+        simulation: a user's own.
+
+    Raises:
+        ValueError: no simulation of this name corrects recordings, or the one that is given has another.
+        MissingColumnError: the recording lacks a column.
+    """
+    refuse_unknown(name, simulation)
+    known = Magnetometer() if simulation is None else simulation
+    if not isinstance(known, Correcting):
+        raise ValueError(
+            f'The simulation "{name}" corrects no recordings; derive it from mkc_torch.simulation.Dynamics or Static.'
+        )
+    return known.correction(state, recording)
+
+
+def refuse_unknown(name: str, simulation: Simulation | None) -> None:
+    """Refuses a model whose simulation is not at hand: a file of a model never says what code is run.
+
+    Args:
+        name: of the model's simulation.
+        simulation: what was given.
+
+    Raises:
+        ValueError: nothing was given for a simulation of the user's own, or another one.
+
+    Example:
+        >>> refuse_unknown("Pendulum", None)
+        Traceback (most recent call last):
+        ValueError: the model is of the simulation "Pendulum", which is not this package's own: ...
+    """
+    if simulation is None and name == Paired.name:
+        raise ValueError(
+            "the model is of a simulator's output: give what it wrote for this recording with `--simulated SIM.csv` "
+            "(in Python `simulation=Paired(...)`)."
+        )
+    if simulation is None and name != Magnetometer.name:
+        raise ValueError(
+            f'the model is of the simulation "{name}", which is not this package\'s own: no code is run because a '
+            f"model's file names it. Give it with `--simulation FILE.py:{name}` (in Python `simulation=`)."
+        )
+    if simulation is not None and simulation.name != name:
+        raise ValueError(f'the model is of the simulation "{name}" but "{simulation.name}" was given.')

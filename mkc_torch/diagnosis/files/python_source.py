@@ -13,7 +13,8 @@ from mkc_torch.simulation.dynamics.user_functions import kinematic
 from mkc_torch.simulation.parameter import Parameter
 
 if TYPE_CHECKING:
-    from mkc_torch.diagnosis.files.model import DiagnosedModel
+    from torch import Tensor
+
     from mkc_torch.diagnosis.model.term import Term
 
 __all__ = ["SourceError", "python_source"]
@@ -34,31 +35,39 @@ class SourceError(ValueError):
     """A model that cannot be written out; the sentence says why."""
 
 
-def python_source(model: DiagnosedModel, module: str | None = None) -> str:
-    """The text of a module with a class derived from the diagnosed one, see :meth:`DiagnosedModel.to_python`."""
-    system = model.source
-    if not isinstance(system, Dynamics):
-        raise SourceError(
-            f'Only differential equations are written out as Python, but the model is of "{model.simulation}"'
-            f"{'' if system else '; give its simulation with `simulation=`'}."
-        )
+def python_source(
+    system: Dynamics,
+    theta: Sequence[float],
+    terms: Sequence[Term],
+    gammas: Sequence[Tensor],
+    measured: Sequence[str],
+    module: str | None = None,
+) -> str:
+    """The text of a module with a class derived from the diagnosed one, see :meth:`DiagnosedModel.to_python`.
+
+    Args:
+        system: the diagnosed one.
+        theta: its parameters, then the first states, which are left out.
+        terms, gammas: the effects.
+        measured: the outputs that were compared.
+        module: to import the diagnosed class from.
+    """
     kind = type(system)
-    measured = tuple(map(str, model.state.get("outputs", system.outputs or system.states)))
     rates: list[str] = []
-    memories = tuple(_memory(state) for term in model.terms if (state := _remembering(term)))
+    memories = tuple(_memory(state) for term in terms if (state := _remembering(term)))
     inputs: list[str] = []
     outputs: list[str] = []
-    for term, gamma in zip(model.terms, model.gammas, strict=True):
+    for term, gamma in zip(terms, gammas, strict=True):
         lines = _lines(term, [_rounded(float(one)) for one in gamma], system, measured)
         place = outputs if term.port == "output" else inputs if term.port.startswith("input ") else rates
         place += [f"# {term.effect.id}: {term.effect.equation}", *lines]
-    told = ", ".join(term.effect.id.replace("_", " ") for term in model.terms) or "nothing more"
+    told = ", ".join(term.effect.id.replace("_", " ") for term in terms) or "nothing more"
     body = [
         f"class Corrected{kind.__name__}({kind.__name__}):",
         f'    """{kind.__name__} with the parameters that a recording gave it, and {told}."""',
         "",
         "    parameters = {",
-        *(f"        {line}" for line in _parameters(system, model.theta.tolist())),
+        *(f"        {line}" for line in _parameters(system, theta)),
         "    }",
         *_states(kind.__name__, memories),
         *_actuated(inputs),

@@ -8,14 +8,12 @@ import torch
 from torch import Tensor
 
 from mkc_torch.nonlinear import fit
-from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.parameter import SimulationError
 from mkc_torch.simulation.protocol import Changes
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
-
-    from mkc_torch.simulation.dynamics.definition import Dynamics
 
 __all__ = ["DynamicsCorrection"]
 
@@ -27,14 +25,14 @@ class DynamicsCorrection:
     """A simulation with its parameters and effects on a new recording: only the first states are estimated anew.
 
     Args:
-        system: the differential equations.
-        recording: with the inputs, and with outputs from which the first states are estimated.
+        prepared: the differential equations with the new recording: its inputs, and outputs from which the first
+            states are estimated.
         first: in s, how much of each run they are estimated from; None for what the system says.
     """
 
-    def __init__(self, system: Dynamics, recording: Recording, first: float | None = None) -> None:
-        self.prepared = system.prepare(recording)
-        self.first = system.starts_from if first is None else first
+    def __init__(self, prepared: PreparedDynamics, first: float | None = None) -> None:
+        self.prepared = prepared
+        self.first = prepared.system.starts_from if first is None else first
         self.time = self.prepared.time
         self.ports = self.prepared.ports
 

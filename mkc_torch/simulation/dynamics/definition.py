@@ -8,6 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.dynamics.correction import DynamicsCorrection
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.dynamics.user_functions import check_names
 from mkc_torch.simulation.parameter import Parameter, SimulationError
@@ -130,3 +131,7 @@ class Dynamics:
                 f"{', '.join(recording.names)}. Name what is measured in `outputs`."
             )
         return PreparedDynamics(self, recording.finite("time", *self.inputs, *outputs).sorted_by_time(), outputs)
+
+    def correction(self, _state: Mapping[str, Any], recording: Recording) -> DynamicsCorrection:
+        """The same with known parameters on a new recording; see :class:`mkc_torch.simulation.Correction`."""
+        return DynamicsCorrection(self.prepare(recording))

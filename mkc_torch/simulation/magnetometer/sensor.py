@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from mkc_torch.calibration.calibrate import prepared
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.attitude import AttitudeView, with_attitude
+from mkc_torch.simulation.magnetometer.correction import MagnetometerCorrection
 from mkc_torch.simulation.magnetometer.gyro import GyroView
 from mkc_torch.simulation.magnetometer.norm import NormView
 from mkc_torch.simulation.magnetometer.view import ACCEL, AXES, GYRO, QUATERNION
@@ -74,3 +77,7 @@ class Magnetometer:
             if self.use == "norm" or not has_gyro:
                 raise
         return GyroView(prepared(recording.finite(*GYRO)))
+
+    def correction(self, state: Mapping[str, Any], recording: Recording) -> MagnetometerCorrection:
+        """The calibrated sensor on a new recording; see :class:`mkc_torch.simulation.Correction`."""
+        return MagnetometerCorrection(state, recording)

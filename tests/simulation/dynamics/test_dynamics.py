@@ -459,7 +459,9 @@ class TestCorrection:
         truth = swings(TIME, (-0.9, 1.5))[0]
         measured = noisy(truth, 0.01, outliers=0.1)
         measured[TIME > 1.0] = 0.0  # whatever comes later is not looked at
-        columns = DynamicsCorrection(Pendulum(), table(time=TIME, angle=measured), first=1.0).corrected(theta, {})
+        columns = DynamicsCorrection(Pendulum().prepare(table(time=TIME, angle=measured)), first=1.0).corrected(
+            theta, {}
+        )
         assert list(columns) == ["time", "angle"]
         assert float((columns["angle"] - torch.from_numpy(truth)).abs().max()) < 0.03
 
@@ -467,13 +469,13 @@ class TestCorrection:
         theta = torch.tensor([STIFFNESS, DAMPING], dtype=torch.float64)
         truths = np.concatenate([swings(TIME, first)[0] for first in ((-0.9, 1.5), (0.3, 0.0))])
         recording = table(time=np.tile(TIME, 2), angle=noisy(truths), experiment=np.repeat([0.0, 1.0], 500))
-        columns = DynamicsCorrection(Pendulum(), recording, first=1.0).corrected(theta, {})
+        columns = DynamicsCorrection(Pendulum().prepare(recording), first=1.0).corrected(theta, {})
         assert float((columns["angle"] - torch.from_numpy(truths)).abs().max()) < 0.04
 
     def test_effects_go_on_too(self):
         theta = torch.tensor([STIFFNESS, DAMPING], dtype=torch.float64)
         recording = table(time=TIME, angle=swings(TIME, damping=DAMPING + 0.2)[0])
-        correction = DynamicsCorrection(Pendulum(), recording, first=1.0)
+        correction = DynamicsCorrection(Pendulum().prepare(recording), first=1.0)
         with_it = correction.corrected(theta, {"rate of speed": lambda s: -0.2 * s[:, [1]]})
         without = correction.corrected(theta, {})
         assert float((with_it["angle"] - recording["angle"]).abs().max()) < 1e-3
@@ -483,7 +485,7 @@ class TestCorrection:
 @pytest.mark.parametrize(("first", "seconds"), [(None, [1.0, 3.0, 10.0]), (2.0, [2.0])])
 def test_first_states_are_estimated_from_what_comes_soon_and_then_from_more(monkeypatch, first, seconds):
     """A pendulum that seems a little too fast goes over the top, and no fit to all of it leads back."""
-    correction = DynamicsCorrection(Pendulum(), table(time=TIME, angle=TRUTH[0]), first=first)
+    correction = DynamicsCorrection(Pendulum().prepare(table(time=TIME, angle=TRUTH[0])), first=first)
     theta, asked = correction.prepared.start(), []
 
     def watched(_, start, *, weight, **__):
@@ -532,7 +534,7 @@ def test_a_simulation_that_sticks_is_gone_through_moment_by_moment(monkeypatch):
     time = np.arange(80) * 0.02
     pull = 0.6 * np.sin(1.1 * time) + 0.3 * np.sign(np.sin(0.7 * time))
     truth = dragged(pull)
-    correction = DynamicsCorrection(Block(), table(time=time, pull=pull, place=noisy(truth, 0.003)), first=0.3)
+    correction = DynamicsCorrection(Block().prepare(table(time=time, pull=pull, place=noisy(truth, 0.003))), first=0.3)
     theta = correction.prepared.start()
     assert not correction.prepared.trajectory(theta, {}).converged
     with monkeypatch.context() as without:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from mkc_torch.diagnosis.files.model import correction_of
 from mkc_torch.recording.recording import MissingColumnError, RecordingError
 from mkc_torch.simulation import Magnetometer
 from mkc_torch.simulation.magnetometer import MagnetometerCorrection
-from mkc_torch.simulation.registry import correction_of
 from tests.simulation.tumbling import FIELD, OFFSET, changed, full_truth, symmetric_truth, true_matrix, tumbling, turns
 
 STRENGTH = float(np.linalg.norm(FIELD))
