@@ -12,11 +12,11 @@ from mkc_torch._parallel.fork import meanwhile, shared
 from mkc_torch.diagnosis.arguments import check_numbers, checked_effects, refuse_no_simulation
 from mkc_torch.diagnosis.assemble import assembled, with_rest
 from mkc_torch.diagnosis.evidence.after_the_search import Ending, ending_parts
+from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.side_by_side import known_of, learn, with_memory
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.rounds import Asked, Search, begun, continued
 from mkc_torch.effects import CATALOGUE
@@ -104,13 +104,7 @@ def diagnose(
     def told(search: Search, parts: Sequence[Any]) -> Diagnosis:
         return assembled(simulation, prepared, drivers, len(terms), base, search, Ending(*parts), asked)
 
-    def following() -> Search:
-        after = continued(search, asked, generator)
-        fit = after.found[-1].fit
-        fit.model.residual(fit.parameters)
-        return after
-
-    known = [simulation, base, base.model, *known_of(prepared, terms)]
+    known = [simulation, base, base.model, *common_parts(prepared, terms)]
 
     def ending(search: Search) -> list[Callable[[], Any]]:
         return ending_parts(base, search.found, search.evidence, search.blocks, drivers.drivers, seed)
@@ -118,10 +112,9 @@ def diagnose(
     while search.left:
         # most often there is nothing more
         with meanwhile(ending(search), [*known, *search.parts]) as ended:
-            after, newest = with_memory(prepared, following)()
+            after = continued(search, asked, generator)
             if after.found == search.found:
                 return with_rest(told(replace(search, cut=after.cut), ended()), after)
-        learn(prepared, newest)
         search = after
     return with_rest(told(search, shared(ending(search), [*known, *search.parts])), search)
 

@@ -12,8 +12,8 @@ from mkc_torch._parallel.fork import meanwhile
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
 from mkc_torch.diagnosis.evidence.simpler_form import simplified
 from mkc_torch.diagnosis.evidence.unrecorded_cause import course_without, located_cause
+from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.side_by_side import known_of, learn, with_memory
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.colour import correlation_time
 from mkc_torch.diagnosis.noise.innovations import innovation_gain
@@ -21,6 +21,7 @@ from mkc_torch.diagnosis.search.first_look import p_value_beside
 from mkc_torch.diagnosis.search.locate import Located, locate
 from mkc_torch.diagnosis.search.preference import ALIKE_COLUMNS, alike
 from mkc_torch.effects.sensor.unknown import UNKNOWN
+from mkc_torch.nonlinear import NoFitError
 
 _NEAR = 0.05
 
@@ -92,21 +93,14 @@ def begun(base: FittedModel, terms: tuple[Term, ...], asked: Asked, generator: t
     prepared = base.model.prepared
     correlation = max(correlation_time(one) for one in base.pseudo[0].unbind(1))
     blocks = blocks_of(len(base.residual), math.ceil(correlation))
-    alone = with_memory(prepared, partial(held_out, base, blocks))
-
-    def searched() -> Located:
-        located = locate(base, terms, level=asked.level, surrogates=asked.surrogates, generator=generator)
-        located.fit.model.residual(located.fit.parameters)  # to be the newest that a simulation remembers
-        return located
-
-    with meanwhile([alone], known_of(prepared, ())) as judged:
-        first, newest = with_memory(prepared, searched)() if terms else (None, None)
-        [(evidence, newest_alone)] = judged()
-    learn(prepared, newest_alone)
+    first = None
+    with meanwhile([partial(held_out, base, blocks)], common_parts(prepared, ())) as judged:
+        if terms:
+            first = locate(base, terms, level=asked.level, surrogates=asked.surrogates, generator=generator)
+        [evidence] = judged()
     begun = Search(first, (), None, blocks, (evidence,), terms)
     if first is None:
         return begun
-    learn(prepared, newest)
     taken = _taken_up(begun, first, asked)
     if taken.found:
         return taken
@@ -128,7 +122,7 @@ def continued(search: Search, asked: Asked, generator: torch.Generator) -> Searc
             fit, search.left, level=asked.level, surrogates=asked.surrogates, generator=generator, parts=False
         )
         return _taken_up(search, located, asked)
-    except ValueError as error:
+    except NoFitError as error:
         return replace(search, left=(), given_up=str(error))  # what was found before is not to be lost
 
 

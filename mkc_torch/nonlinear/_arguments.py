@@ -19,6 +19,10 @@ from mkc_torch.nonlinear.prior import GaussianPrior
 __all__ = ["per_channel", "prepared"]
 
 
+class NoFitError(ValueError):
+    """A residual that cannot be fitted from there: it is not finite, has no slope, or is out of the domain's reach."""
+
+
 def prepared(
     residual: Residual,
     start: Tensor,
@@ -96,7 +100,7 @@ def prepared(
         )
     wrong = ~torch.isfinite(first) if used is None else ~torch.isfinite(first) & used
     if bool(wrong.any()):
-        raise ValueError(
+        raise NoFitError(
             f"Expected `residual` to be finite at `start` but got {int(wrong.sum())} of {first.numel()} values that "
             "are not; start elsewhere, or leave those samples out by a weight of 0."
         )
@@ -109,7 +113,7 @@ def prepared(
     point = problem.at(theta)
     broken = int((~torch.isfinite(point.tangents)).sum())
     if broken:
-        raise ValueError(
+        raise NoFitError(
             f"Expected `residual` to have finite derivatives at `start` but got {broken} values that are not; "
             "start elsewhere."
         )

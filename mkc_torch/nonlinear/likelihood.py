@@ -15,7 +15,7 @@ from mkc_torch.density.energy import SIGMA_LEAST
 from mkc_torch.density.fit import DensityState, domain_rule, initial_state, refuse_narrow_bound
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 from mkc_torch.nonlinear._alternate import alternated, gaussian_candidate, likelihood_of
-from mkc_torch.nonlinear._arguments import per_channel, prepared
+from mkc_torch.nonlinear._arguments import NoFitError, per_channel, prepared
 from mkc_torch.nonlinear._covariance import parameter_covariance
 from mkc_torch.nonlinear._graduated import LEAST_SCALE, graduated, residual_scale
 from mkc_torch.nonlinear._problem import Constraint, Point, kernel_weights, shaped_jacobian
@@ -123,7 +123,9 @@ def fit(
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
 
     Raises:
-        TypeError, ValueError: as :func:`minimise`, or a domain that the head of the density does not fit in.
+        TypeError, ValueError: as :func:`minimise`.
+        NoFitError: the residual or its slope is not finite at ``start``, or the head of the density does not fit in the
+            domain.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (17), (29)-(31), Algorithm 2.
@@ -195,7 +197,10 @@ def fit(
         state = begun(point, size, domain, (rough.state.kappa,))
         penalty = rough.penalty
     else:
-        refuse_narrow_bound(fixed_bound, scale)
+        try:
+            refuse_narrow_bound(fixed_bound, scale)
+        except ValueError as error:
+            raise NoFitError(str(error)) from None
         state = begun(point, scale, fixed_bound, (0.1, 0.4, 1.5))
         penalty = None
     maximum = alternated(problem, likelihood, point, state, max_iter=max_iter, tol=tol, penalty=penalty)

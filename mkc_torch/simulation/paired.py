@@ -14,7 +14,7 @@ from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
 from mkc_torch.simulation.parameter import SimulationError
-from mkc_torch.simulation.protocol import Changes, refuse_no_recording
+from mkc_torch.simulation.protocol import Changes, ClosedForm, Nearby, refuse_no_recording
 from mkc_torch.simulation.runs import successive_runs
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ class Paired:
         return shared
 
 
-class PreparedPaired:
+class PreparedPaired(ClosedForm):
     """The columns of a simulator with the recording that answers them."""
 
     def __init__(self, system: Paired, recording: Recording, shared: tuple[str, ...], curve: _Curve) -> None:
@@ -177,7 +177,12 @@ class PreparedPaired:
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
         return self.measured - changed_outputs(self._outputs(theta), self.channels, changes)
 
-    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Float[Tensor, "N k"]]:
+    def signals(
+        self,
+        theta: Float[Tensor, " p"],
+        changes: Changes,
+        near: Nearby | None = None,  # noqa: ARG002
+    ) -> Mapping[str, Float[Tensor, "N k"]]:
         return output_signals(self._outputs(theta), self.channels, changes)
 
     def _outputs(self, theta: Tensor) -> Float[Tensor, "N m"]:

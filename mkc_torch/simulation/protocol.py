@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -18,16 +19,18 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 __all__ = [
+    "Answer",
     "Beginning",
     "Change",
     "Changes",
     "Clock",
+    "ClosedForm",
     "Correcting",
     "Correction",
     "FreeChange",
+    "Nearby",
     "Port",
     "PreparedSimulation",
-    "Remembering",
     "Simulation",
     "refuse_no_recording",
 ]
@@ -114,6 +117,42 @@ class Port:
         return values if self.clock is None else self.clock.at(values)
 
 
+class Nearby(Protocol):
+    """What a simulation begins an answer with that is near one it has found, such as a trajectory.
+
+    Attributes:
+        bare: the same without what can be computed from it again.
+    """
+
+    @property
+    def bare(self) -> Nearby: ...
+
+
+class Answer(NamedTuple):
+    """The residual of a simulation, and what one at parameters nearby can begin with.
+
+    Attributes:
+        residual: (N, m), recording less prediction; NaN where the simulation has no answer.
+        nearby: what :meth:`PreparedSimulation.answer` takes as ``near``; None where there is nothing, as inside of a
+            transform, or for a simulation in closed form.
+    """
+
+    residual: Float[Tensor, "N m"]
+    nearby: Nearby | None = None
+
+
+class ClosedForm(ABC):
+    """A prepared simulation that is a formula: it needs nothing to begin with."""
+
+    @abstractmethod
+    def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
+        """Recording less prediction."""
+
+    def answer(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Answer:  # noqa: ARG002
+        """The residual; see :meth:`PreparedSimulation.answer`."""
+        return Answer(self.residual(theta, changes))
+
+
 class PreparedSimulation(Protocol):
     """A simulation together with the recording that answers it: N samples, m residual channels, p parameters.
 
@@ -161,36 +200,26 @@ class PreparedSimulation(Protocol):
         """A robust guess of the parameters, from the samples in ``rows`` (all, if None).
 
         Raises:
-            ValueError: those samples do not determine them.
+            NoFitError: those samples do not determine them.
         """
         ...
 
-    def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
-        """Recording less prediction, with ``changes[port](signal)`` added to what passes through the ports."""
+    def answer(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Answer:
+        """Recording less prediction, with ``changes[port](signal)`` added to what passes through the ports.
+
+        It depends on its arguments alone.
+
+        Args:
+            theta: the parameters.
+            changes: what effects add at each port.
+            near: of an answer to parameters and changes nearby, from which this one is found; None for none.
+        """
         ...
 
-    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Float[Tensor, "G k"]]:
+    def signals(
+        self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
+    ) -> Mapping[str, Float[Tensor, "G k"]]:
         """What passes through each port: what an effect that depends on the signal is a function of."""
-        ...
-
-
-@runtime_checkable
-class Remembering(Protocol):
-    """A prepared simulation that begins with what it solved before: its answer depends on what it was asked, as far as
-    rounding goes, or as there are several.
-
-    Attributes:
-        memory: all of that, to be put back.
-        newest: the newest of it, that of the last answer, which can be pickled.
-    """
-
-    memory: Any
-
-    @property
-    def newest(self) -> Any: ...
-
-    def learn(self, newest: Any) -> None:
-        """Add what was solved in another copy."""
         ...
 
 

@@ -15,7 +15,7 @@ from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
 from mkc_torch.simulation.parameter import Parameter, SimulationError, known_parameters
-from mkc_torch.simulation.protocol import Changes, Port, refuse_no_recording
+from mkc_torch.simulation.protocol import Changes, ClosedForm, Nearby, Port, refuse_no_recording
 from mkc_torch.simulation.undetermined import undetermined
 
 if TYPE_CHECKING:
@@ -195,7 +195,7 @@ class Static:
         return StaticCorrection(self, state.get("fixed", ()), recording)
 
 
-class PreparedStatic:
+class PreparedStatic(ClosedForm):
     """A function of inputs with the recording that answers it."""
 
     prior: GaussianPrior | None = None
@@ -229,7 +229,12 @@ class PreparedStatic:
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
         return self.measured - changed_outputs(self._outputs(theta, changes), self.channels, changes)
 
-    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Float[Tensor, "N k"]]:
+    def signals(
+        self,
+        theta: Float[Tensor, " p"],
+        changes: Changes,
+        near: Nearby | None = None,  # noqa: ARG002
+    ) -> Mapping[str, Float[Tensor, "N k"]]:
         inputs = {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
         return inputs | output_signals(self._outputs(theta, changes), self.channels, changes)
 

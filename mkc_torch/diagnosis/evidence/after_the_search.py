@@ -19,7 +19,6 @@ from mkc_torch.diagnosis.evidence.stand_in import stand_in_warning
 from mkc_torch.diagnosis.linearised.estimate import Estimate, estimate
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.fit import FittedModel, without_term
-from mkc_torch.diagnosis.model.side_by_side import memory_kept
 from mkc_torch.diagnosis.result import DriverShift, Extrapolation
 from mkc_torch.diagnosis.search.locate import Located
 from mkc_torch.effects.sensor.unknown import UNKNOWN
@@ -100,12 +99,7 @@ def ending_parts(
     def final() -> Estimate:
         return estimate(fit).at_least(evidence[-1].jackknife)
 
-    def begun(work: Callable[[], Any]) -> Any:
-        with memory_kept(base.model.prepared):
-            fit.model.residual(fit.parameters)  # to be the newest that a simulation remembers
-            return work()
-
-    return [partial(begun, work) for work in (partial(stand_in_warning, fit), beyond, within_reach, final)]
+    return [partial(stand_in_warning, fit), beyond, within_reach, final]
 
 
 def _beyond(

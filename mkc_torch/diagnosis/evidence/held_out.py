@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.side_by_side import each
 from mkc_torch.functional import mkc_nll
 
 if TYPE_CHECKING:
@@ -103,9 +103,9 @@ def held_out(
         rows = train.to(fit.residual.dtype)
         model, start = (fit.model, fit.parameters) if reread is None else reread(train)
         found = fitted(model, start, fit.bound, rows=rows, graduate=False)
-        return model.residual(found.parameters).detach(), found.sigma, found.d, found.bound, found.parameters
+        return found.residual, found.sigma, found.d, found.bound, found.parameters
 
-    folds = each(fit, [partial(without, train) for train in blocks.train])
+    folds = at_once([partial(without, train) for train in blocks.train], fit.model.prepared)
     for number, (out, *density, _) in enumerate(folds):
         seen = blocks.fold == number
         residual[seen] = out[seen]

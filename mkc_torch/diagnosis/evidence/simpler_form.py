@@ -7,12 +7,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_out
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted, repeats
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.noise.innovations import either_way
 from mkc_torch.diagnosis.search.ranking import SEPARABLE
 from mkc_torch.effects.base import NestedEffect
+from mkc_torch.nonlinear import NoFitError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -46,9 +47,7 @@ def simplified(
             continue
         try:
             other = shape_fitted(fitted(*start, fit.bound, graduate=False))
-        except ValueError:
-            continue
-        if not repeats(other):
+        except NoFitError:
             continue
         after = held_out(other, blocks)
         lost = float((evidence.log_likelihood - after.log_likelihood).sum())
@@ -65,7 +64,7 @@ def _simpler(fit: FittedModel, number: int) -> tuple[JointModel, Float[Tensor, "
     if not isinstance(effect, NestedEffect):
         return None
     terms[number] = replace(terms[number], effect=effect.simpler)
-    model = JointModel(fit.model.prepared, terms)
+    model = JointModel(fit.model.prepared, terms, fit.model.near)
     size = model.sizes[number]
     if size >= fit.model.sizes[number]:
         return None

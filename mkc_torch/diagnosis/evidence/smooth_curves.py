@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.held_out import HeldOutBlocks
 from mkc_torch.diagnosis.model.drivers import Driver
-from mkc_torch.diagnosis.model.joint import JointModel, port_jacobian, through_port, with_constant
+from mkc_torch.diagnosis.model.joint import JointModel, port_jacobian, through_port
 from mkc_torch.diagnosis.noise.cosine_basis import cosines
 from mkc_torch.simulation.protocol import Port
 
@@ -98,6 +98,7 @@ class _Around:
 
     @classmethod
     def of(cls, model: JointModel, parameters: Tensor) -> _Around:
+        model = model.around(parameters)
         pointwise = {
             name: port_jacobian(model, parameters, name) if port.pointwise else None
             for name, port in model.prepared.ports.items()
@@ -117,12 +118,11 @@ class _Around:
         known = self.pointwise[port]
         if known is not None:
             return torch.einsum("nmc,nm->nc", known, left)
-        changes, prepared = self.model.changes(self.parameters), self.model.prepared
-        zero = left.new_zeros(len(left), len(prepared.ports[port].channels))
+        entrance = self.model.prepared.ports[port]
+        zero = left.new_zeros(len(left), len(entrance.channels))
 
         def residual(change: Tensor) -> Tensor:
-            held = with_constant(changes, port, prepared.ports[port].at(change))
-            return prepared.residual(self.parameters[: self.model.base], held)
+            return self.model.pushed(self.parameters, port, entrance.at(change))
 
         pulled: Tensor = torch.func.vjp(residual, zero)[1](left)[0]
         return pulled

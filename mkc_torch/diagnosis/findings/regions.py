@@ -17,9 +17,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.held_out import scored
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.joint import with_constant
 from mkc_torch.diagnosis.result import Region, StateMap
-from mkc_torch.simulation.protocol import Changes
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -82,12 +80,10 @@ def attributed(fit: FittedModel, number: int) -> Attribution | None:
     for node, weight in zip(0.5 * (nodes + 1.0), 0.5 * weights, strict=True):
         parameters = fit.parameters.clone()
         parameters[mine] = node * gamma
-        changes = model.changes(parameters)
         there = model.signals(parameters)[term.port]
 
-        def likelihood(change: Tensor, theta: Tensor = parameters[: model.base], changes: Changes = changes) -> Tensor:
-            residual = prepared.residual(theta, with_constant(changes, term.port, change))
-            return scored(residual, fit.sigma, fit.d, fit.bound).sum()
+        def likelihood(change: Tensor, parameters: Tensor = parameters) -> Tensor:
+            return scored(model.pushed(parameters, term.port, change), fit.sigma, fit.d, fit.bound).sum()
 
         slope = torch.func.grad(likelihood)(there.new_zeros(len(there), width))
         added = term.effect.change(gamma, term.shape, term.context(prepared, there))[:, :width]

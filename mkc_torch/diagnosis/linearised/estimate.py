@@ -85,10 +85,11 @@ def estimate(fit: FittedModel) -> Estimate:
         parameters = parameters - step
         if model.bounds is not None:
             parameters = parameters.clamp(*model.bounds)
-        residual = model.residual(parameters).detach()
+        residual, nearby = model.answer(parameters)
         # there may be no trajectory a step away
         if bool(residual.isfinite().all()):
-            fit = replace(fit, parameters=parameters, residual=residual)
+            moved = model if nearby is None else model.begun_with(nearby.bare)
+            fit = replace(fit, model=moved, parameters=parameters, residual=residual.detach())
     noise = found.search.noise_fit(found.series)
     spread = found.search.wander_spread(noise) if noise.size > 0 else 0.0
     plain = Estimate(fit, covariance, noise, found.colour, spread, tuple({} for _ in fit.model.terms))
@@ -102,7 +103,7 @@ def _shapes_free(plain: Estimate, tangents: Tangents, local: Local) -> Estimate:
     """
     model, parameters = plain.fit.model, plain.fit.parameters
     inside = [_inside(term, reach_of(term, model.prepared)) for term in model.terms]
-    shaped = ShapedModel(model, inside)
+    shaped = ShapedModel(model.around(parameters), inside)
     start = shaped.start(parameters)
     if shaped.size == shaped.joint:
         return plain
@@ -110,7 +111,6 @@ def _shapes_free(plain: Estimate, tangents: Tangents, local: Local) -> Estimate:
     def residual(numbers: Tensor) -> Tensor:
         return shaped.residual(torch.cat([beside(parameters, numbers[0]), numbers]))
 
-    model.residual(parameters)  # forward mode starts from the trajectory that was found last
     columns = torch.func.jacfwd(residual)(start[shaped.joint :])
     if not bool(columns.isfinite().all()):
         return plain

@@ -12,6 +12,7 @@ from torch import Tensor
 from mkc_torch.diagnosis.model.joint import JointModel, directions, port_jacobian, through_port
 from mkc_torch.diagnosis.model.term import Term, follows_signal
 from mkc_torch.diagnosis.noise.cosine_basis import cosines, dct, dct_of_courses
+from mkc_torch.nonlinear import NoFitError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -99,15 +100,17 @@ class Slow:
 
 
 def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Sequence[Term] = ()) -> Tangents:
-    """The tangents at these parameters, by forward mode."""
-    prepared = model.prepared
+    """The tangents at these parameters, by forward mode.
+
+    Raises:
+        NoFitError: the residual has no finite slope by a parameter there.
+    """
+    prepared, model = model.prepared, model.around(parameters)
     pointwise = {
         name: port_jacobian(model, parameters, name) if port.pointwise else None
         for name, port in prepared.ports.items()
     }
     independent = parameters.new_tensor([float(one) for one in prepared.independent])
-    # forward mode starts from the trajectory that was found last, and has to find it again
-    model.residual(parameters)
     nuisance = torch.func.jacfwd(model.residual)(parameters)
     if not bool(nuisance.isfinite().all()):
         effects = [
@@ -116,7 +119,7 @@ def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Seque
         finite = nuisance.isfinite().flatten(0, 1).all(0).tolist()
         names = zip((*prepared.parameter_names, *effects), finite, strict=True)
         lost = dict.fromkeys(name for name, known in names if not known)
-        raise ValueError(
+        raise NoFitError(
             f"The simulation's outputs have no finite slope by {', '.join(lost)} at the fitted values. Bound "
             "these parameters, or start them elsewhere."
         )
@@ -139,7 +142,7 @@ def candidate_tangents(
         terms: the candidates.
         pointwise: as :class:`Tangents` has it.
     """
-    prepared = model.prepared
+    prepared, model = model.prepared, model.around(parameters)
     signals = model.signals(parameters)
     independent = parameters.new_tensor([float(one) for one in prepared.independent])
     courses = [directions(t, t.context(prepared, signals.get(t.port))) for t in terms]

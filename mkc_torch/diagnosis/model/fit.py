@@ -16,7 +16,7 @@ from mkc_torch.diagnosis.noise.pseudo_residual import pseudo_residual
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_beside", "repeats", "without_term"]
+__all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_beside", "without_term"]
 
 _CLIP = 2.0
 _SHARES = (1.0, 0.3, 0.1, 0.01, 0.0)
@@ -27,7 +27,7 @@ class FittedModel:
     """A joint model at its most likely parameters.
 
     Attributes:
-        model, parameters: what was fitted.
+        model, parameters: what was fitted; the model begins with the answer at these parameters.
         sigma, d, bound: (m,) of the MKC density.
         residual, weights: (N, m).
         log_likelihood: in nats, of all samples and channels.
@@ -60,6 +60,9 @@ def fitted(
 ) -> FittedModel:
     """The most likely parameters of a joint model.
 
+    Raises:
+        NoFitError: the simulation has no finite answer where the fit begins, or none where it ends.
+
     Args:
         model: a simulation with effects.
         start: where to begin.
@@ -67,8 +70,9 @@ def fitted(
         rows: weights of the samples; 0 leaves one out.
         graduate: False for a start near the answer.
     """
+    way = model.continuation()
     found = nonlinear.fit(
-        model.residual,
+        way,
         _usable(model, start),
         bound=bound,
         weight=rows,
@@ -80,13 +84,17 @@ def fitted(
         max_iter=60,
         tol=1e-7,
     )
+    there = model.begun_with(way.near(found.theta))
+    residual = there.residual(found.theta).detach()
+    if not bool((residual if rows is None else residual[rows > 0]).isfinite().all()):
+        raise nonlinear.NoFitError("A trajectory that was found on the way of the fit is lost again in its end.")
     return FittedModel(
-        model,
+        there,
         found.theta,
         found.sigma,
         found.d,
         found.bound,
-        model.residual(found.theta).detach(),
+        residual,
         found.weights,
         float(found.log_likelihood) * len(model.prepared.time),
         bool(found.converged),
@@ -99,7 +107,7 @@ def fitted_beside(
     """A model with one more effect on the domain of a fit without it; that fit, where the effect has no answer."""
     try:
         return fitted(model, start, base.bound, graduate=graduate)
-    except ValueError:
+    except nonlinear.NoFitError:
         none = base.parameters.new_zeros(model.size - base.model.size)
         return replace(base, model=model, parameters=torch.cat([base.parameters, none]))
 
@@ -107,7 +115,7 @@ def fitted_beside(
 def without_term(fit: FittedModel, number: int) -> FittedModel:
     """The simulation with all effects of a fit but one, as a start for fits: at its parameters, not fitted anew."""
     model, place = fit.model, fit.model.base + sum(fit.model.sizes[:number])
-    left = JointModel(model.prepared, (*model.terms[:number], *model.terms[number + 1 :]))
+    left = JointModel(model.prepared, (*model.terms[:number], *model.terms[number + 1 :]), model.near)
     parameters = torch.cat([fit.parameters[:place], fit.parameters[place + model.sizes[number] :]])
     return replace(fit, model=left, parameters=parameters)
 
@@ -132,8 +140,3 @@ def clipped_residual(residual: Float[Tensor, "N m"]) -> tuple[Float[Tensor, "N m
     z = residual / scale.clamp(min=1e-300)
     slope = (z.abs() < _CLIP).to(z.dtype).mean(0).clamp(min=0.2)
     return scale * z.clamp(-_CLIP, _CLIP) / slope, torch.ones_like(residual)
-
-
-def repeats(fit: FittedModel) -> bool:
-    """Whether the simulation is finite there once more: a trajectory found on the way of a fit may be lost again."""
-    return bool(fit.model.residual(fit.parameters).isfinite().all())

@@ -15,12 +15,13 @@ from mkc_torch.effects.base import GainEffect, LinearEffect
 from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.courses import combined, gained
 from mkc_torch.nonlinear import GaussianPrior, beside
-from mkc_torch.simulation.protocol import Change, Changes, FreeChange, PreparedSimulation
+from mkc_torch.simulation.continuation import Continuation
+from mkc_torch.simulation.protocol import Answer, Change, FreeChange, Nearby, PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["JointModel", "directions", "port_jacobian", "summed", "through_port", "with_constant"]
+__all__ = ["JointModel", "directions", "port_jacobian", "summed", "through_port"]
 
 _CHUNK = 64
 
@@ -31,10 +32,12 @@ class JointModel:
     Args:
         prepared: the simulation of the recording.
         terms: the effects in it.
+        near: an answer of the simulation that its answers here are near; what is computed begins with it.
     """
 
-    def __init__(self, prepared: PreparedSimulation, terms: Sequence[Term] = ()) -> None:
+    def __init__(self, prepared: PreparedSimulation, terms: Sequence[Term] = (), near: Nearby | None = None) -> None:
         self.prepared = prepared
+        self.near = near
         self.terms = tuple(terms)
         self.base = len(prepared.parameter_names)
         self._follow = tuple(follows_signal(t.effect) for t in self.terms)
@@ -100,18 +103,45 @@ class JointModel:
 
     def signals(self, parameters: Float[Tensor, " p"]) -> Mapping[str, Tensor]:
         """What passes through each port, with the effects in it."""
-        return self.prepared.signals(parameters[: self.base], self.changes(parameters))
+        return self.prepared.signals(parameters[: self.base], self.changes(parameters), self.near)
 
     def residual(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, "N m"]:
         """Recording less prediction."""
-        return self.prepared.residual(parameters[: self.base], self.changes(parameters))
+        return self.answer(parameters).residual
+
+    def answer(self, parameters: Float[Tensor, " p"]) -> Answer:
+        """The residual, and what one nearby begins with."""
+        return self.prepared.answer(parameters[: self.base], self.changes(parameters), self.near)
+
+    def pushed(self, parameters: Float[Tensor, " p"], port: str, change: Float[Tensor, "N c"]) -> Float[Tensor, "N m"]:
+        """The residual with a change at a port that does not depend on its signal."""
+        changes = self.changes(parameters)
+        added = {**changes, port: summed(changes.get(port), FreeChange(_constant(change)))}
+        return self.prepared.answer(parameters[: self.base], added, self.near).residual
+
+    def around(self, parameters: Float[Tensor, " p"]) -> JointModel:
+        """The same, for derivatives at these parameters: with the answer there, linearised, to begin with."""
+        nearby = self.answer(parameters).nearby
+        return self if nearby is None else self.begun_with(nearby)
+
+    def begun_with(self, near: Nearby | None) -> JointModel:
+        """The same with another answer to begin with."""
+        return JointModel(self.prepared, self.terms, near)
+
+    def continuation(self) -> Continuation:
+        """The residual for one fit, on whose way each answer begins with the one before."""
+        return Continuation(self.prepared, lambda p: (p[: self.base], self.changes(p)), self.near)
 
     def with_term(self, term: Term) -> JointModel:
-        return JointModel(self.prepared, (*self.terms, term))
+        return JointModel(self.prepared, (*self.terms, term), self.near)
+
+    def with_last(self, term: Term) -> JointModel:
+        """The same with another term in the place of the last one."""
+        return JointModel(self.prepared, (*self.terms[:-1], term), self.near)
 
     def with_shape(self, shape: Shape) -> JointModel:
         """The same with another shape of the last effect."""
-        return JointModel(self.prepared, (*self.terms[:-1], replace(self.terms[-1], shape=shape)))
+        return self.with_last(replace(self.terms[-1], shape=shape))
 
 
 def port_jacobian(model: JointModel, parameters: Float[Tensor, " p"], port: str) -> Float[Tensor, "N m c"]:
@@ -121,8 +151,7 @@ def port_jacobian(model: JointModel, parameters: Float[Tensor, " p"], port: str)
     zero = parameters.new_zeros(N, len(known.channels))
 
     def residual(change: Tensor) -> Tensor:
-        moving = beside(parameters, change[0, 0])
-        return model.prepared.residual(moving[: model.base], with_constant(model.changes(moving), port, change))
+        return model.pushed(beside(parameters, change[0, 0]), port, change)
 
     columns = []
     for k in range(len(known.channels)):
@@ -167,11 +196,6 @@ def _widened(added: Float[Tensor, "N c"], width: int) -> Float[Tensor, "N w"]:
     return torch.cat([added, added.new_zeros(len(added), width - added.shape[1])], -1)
 
 
-def with_constant(changes: Changes, port: str, change: Float[Tensor, "N c"]) -> Changes:
-    """The same with a change at a port that does not depend on its signal."""
-    return {**changes, port: summed(changes.get(port), FreeChange(_constant(change)))}
-
-
 def directions(term: Term, context: Context) -> Float[Tensor, "N c q"]:
     """How an effect's change at its port grows with γ at γ = 0, by forward mode where the effect does not say."""
     if isinstance(term.effect, LinearEffect):
@@ -197,13 +221,9 @@ def through_port(
     """Residual tangents of changes at a port; by the pointwise Jacobian where there is one, else by forward mode."""
     if pointwise is not None:
         return torch.einsum("nmc,ncq->nmq", pointwise, courses)
-    changes = model.changes(parameters)
     zero = torch.zeros_like(courses[..., 0])
 
-    def residual(change: Tensor) -> Tensor:
-        return model.prepared.residual(parameters[: model.base], with_constant(changes, port, change))
-
     def push(direction: Tensor) -> Tensor:
-        return torch.func.jvp(residual, (zero,), (direction,))[1]
+        return torch.func.jvp(lambda change: model.pushed(parameters, port, change), (zero,), (direction,))[1]
 
     return torch.vmap(push, in_dims=-1, out_dims=-1, chunk_size=_CHUNK)(courses)

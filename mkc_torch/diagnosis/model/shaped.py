@@ -13,7 +13,8 @@ from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.grid import reach_of
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.simulation.protocol import Change
+from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation.protocol import Change, Nearby
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -30,7 +31,7 @@ class ShapedModel(JointModel):
     """
 
     def __init__(self, model: JointModel, reach: Sequence[Mapping[str, tuple[float, float]]]) -> None:
-        super().__init__(model.prepared, model.terms)
+        super().__init__(model.prepared, model.terms, model.near)
         self._reach = tuple(reach)
         least = [low for one in reach for low, _ in one.values()]
         self._positive = torch.tensor([low > 0.0 for low in least], dtype=torch.bool)
@@ -86,6 +87,9 @@ class ShapedModel(JointModel):
     def changes(self, parameters: Float[Tensor, " p"]) -> dict[str, Change]:
         return JointModel(self.prepared, self.shaped(parameters)).changes(parameters[: self.joint])
 
+    def begun_with(self, near: Nearby | None) -> ShapedModel:
+        return ShapedModel(JointModel(self.prepared, self.terms, near), self._reach)
+
 
 def shape_fitted(fit: FittedModel) -> FittedModel:
     """The fit with its effects' shapes at the likeliest values of the numbers that can be fitted.
@@ -102,9 +106,10 @@ def shape_fitted(fit: FittedModel) -> FittedModel:
         return fit
     try:
         both = fitted(model, model.start(fit.parameters), fit.bound, graduate=False)
-        moved = JointModel(model.prepared, [_told(term) for term in model.shaped(both.parameters)])
+        terms = [_told(term) for term in model.shaped(both.parameters)]
+        moved = JointModel(model.prepared, terms, both.model.near)
         again = fitted(moved, both.parameters[: model.joint], fit.bound, graduate=False)
-    except ValueError:
+    except NoFitError:
         return fit
     return again if again.log_likelihood > fit.log_likelihood else fit
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.linearised.linearise import Linearised
 from mkc_torch.diagnosis.linearised.tangents import Tangents, candidate_tangents
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside, repeats
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
 from mkc_torch.diagnosis.model.grid import finer
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term, continuous
@@ -44,10 +44,10 @@ def refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> Fit
     for count in range(_ROUNDS):
         for name in names:
             shapes = finer(term, name, base.model.prepared.time, count)
-            value = [_energy(best, base.model.with_term(shape)) for shape in shapes]
+            value = [_energy(best, best.model.with_last(shape)) for shape in shapes]
             term = shapes[min(range(len(shapes)), key=value.__getitem__)]
-    moved = fitted_beside(base, base.model.with_term(term), best.parameters, graduate=False)
-    if not (moved.log_likelihood > best.log_likelihood and repeats(moved)):
+    moved = fitted_beside(base, best.model.with_last(term), best.parameters, graduate=False)
+    if not moved.log_likelihood > best.log_likelihood:
         return best
     return refined(moved, base) if again else moved
 
@@ -114,7 +114,7 @@ def coloured(
     if moved.shape == own.shape:
         return best
     fit = fitted_beside(base, best.model.with_shape(moved.shape), best.parameters, graduate=False)
-    return fit if fit.converged and repeats(fit) else best
+    return fit if fit.converged else best
 
 
 def middle(values: Sequence[float], place: int) -> int:

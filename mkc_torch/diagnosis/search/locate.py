@@ -15,9 +15,9 @@ from mkc_torch.diagnosis.linearised.beside_wander import beside_wander
 from mkc_torch.diagnosis.linearised.linearise import Linearised, linearise
 from mkc_torch.diagnosis.linearised.tangents import Tangents, candidate_tangents, tangents_of
 from mkc_torch.diagnosis.linearised.wander import NoiseFit
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside, repeats
+from mkc_torch.diagnosis.model.at_once import common_parts
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
 from mkc_torch.diagnosis.model.shaped import shape_fitted
-from mkc_torch.diagnosis.model.side_by_side import known_of, learn, with_memory
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.colour import Colour
 from mkc_torch.diagnosis.noise.pseudo_residual import REJECTED_BELOW
@@ -28,6 +28,7 @@ from mkc_torch.diagnosis.search.preference import Preference
 from mkc_torch.diagnosis.search.ranking import SEPARABLE, Ranked, own_p, possible_of, ranked
 from mkc_torch.diagnosis.search.rivals import KEPT, by_joint_fits
 from mkc_torch.diagnosis.search.strongest import refitted, strongest
+from mkc_torch.nonlinear import NoFitError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -117,11 +118,10 @@ def locate(
         added = torch.einsum("nmq,q->nm", tangents.candidates[number], gamma)
     pseudo = left.values - counts * added
     prepared = base.model.prepared
-    naming = with_memory(
-        prepared, partial(_named, best, base, around, terms, tangents, pseudo, counts, left.noise.colour, prefer, level)
-    )
+    colour = left.noise.colour
+    naming = partial(_named, best, base, around, terms, tangents, pseudo, counts, colour, prefer, level)
     # a copy names it already, while this process asks whether there is anything to be named
-    with meanwhile([naming], [base, best, *terms, *tangents.parts, *known_of(prepared, terms)]) as answer:
+    with meanwhile([naming], [base, best, *terms, *tangents.parts, *common_parts(prepared, terms)]) as answer:
         linearised = linearise(base.model, parameters, pseudo, counts, tangents)
         noise = linearised.search.noise_fit(linearised.series)
         found = linearised.search.gains(linearised.series.unsqueeze(-1))
@@ -146,8 +146,7 @@ def locate(
             beside_nothing = beside
         ranking = ranked(terms, found, prefer, possible)
         if p_value <= level:
-            [(named, newest)] = answer()
-            learn(prepared, newest)
+            [named] = answer()
             best, ranking, linearised = named.fit, named.ranking, named.linearised
             terms, tangents = named.terms, named.tangents
             # it was another candidate that no draw came up to, if this one by itself is nothing out of the ordinary
@@ -156,8 +155,7 @@ def locate(
         best, ranking = by_joint_fits(best, base, ranking, terms, linearised, tangents, prefer, fits)
         best = _settled(refined(best, base, again=True), base)
         best = coloured(best, base, around, tangents, counts, linearised)
-        shaped = shape_fitted(best)
-        best = shaped if repeats(shaped) else best
+        best = shape_fitted(best)
     return Located(
         best.model.terms[-1],
         best,
@@ -261,9 +259,8 @@ def _named(
         least = 0.0 if clear else KEPT * max(prefer.score(best, base), 0.0)
         gain = other.log_likelihood - base.log_likelihood if clear else prefer.score(other, base)
         kept = gain > least or (bends and prefer.by_innovations(best, other) > 0.0)
-        if kept and repeats(other):
+        if kept:
             best = other
-    best.model.residual(best.parameters)  # to be the newest that a simulation remembers
     return _Named(best, ranking, linearised, tangents, terms, own_p(found, terms, best))
 
 
@@ -276,7 +273,7 @@ def _with_tangents(
         tried = terms if own in terms else (*terms, own)
         try:
             return fit, tried, tangents_of(fit.model, fit.parameters, tried)
-        except ValueError:
+        except NoFitError:
             if fit is fits[-1]:
                 raise
     raise AssertionError
@@ -287,4 +284,4 @@ def _settled(fit: FittedModel, base: FittedModel) -> FittedModel:
     if fit.converged:
         return fit
     again = fitted_beside(base, fit.model, fit.parameters, graduate=False)
-    return again if again.log_likelihood > fit.log_likelihood and repeats(again) else fit
+    return again if again.log_likelihood > fit.log_likelihood else fit

@@ -8,8 +8,8 @@ from functools import partial
 
 from mkc_torch.diagnosis.linearised.linearise import Linearised
 from mkc_torch.diagnosis.linearised.tangents import Tangents
-from mkc_torch.diagnosis.model.fit import FittedModel, repeats
-from mkc_torch.diagnosis.model.side_by_side import fitted_each, memory_kept
+from mkc_torch.diagnosis.model.at_once import at_once
+from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.search.closing_in import refined
 from mkc_torch.diagnosis.search.preference import Preference, schwarz
@@ -49,9 +49,8 @@ def by_joint_fits(
     fitted = {fit.model.terms[-1].key: fit for fit in reversed(known) if prefer.score(fit, base) >= KEPT * won}
     new = [one for one in near if terms[one.number].key not in fitted]
     works = [partial(_tried, best, base, terms[one.number], linearised, one.number) for one in new]
-    with memory_kept(base.model.prepared):
-        for fit in fitted_each(best, works, [terms[one.number] for one in new]) if new else ():
-            fitted[fit.model.terms[-1].key] = fit
+    for fit in at_once(works, base.model.prepared, [terms[one.number] for one in new]):
+        fitted[fit.model.terms[-1].key] = fit
     fits = [fitted[terms[one.number].key] for one in near]
     scores = [prefer.score(fit, base) for fit in fits]
     behind = {one.number: won - score for one, score in zip(near, scores, strict=True) if score < KEPT * won}
@@ -63,7 +62,6 @@ def by_joint_fits(
         if fit.model.sizes[-1] < best.model.sizes[-1]
         and score >= won
         and prefer.by_innovations(best, fit, schwarz(best)) >= 0.0
-        and repeats(fit)
     ]
     if simpler:
         return max(simpler, key=lambda one: one[0])[1], tuple(told)
@@ -88,7 +86,7 @@ def _by_innovations(
     fits = [best, *fits]
     for fit in fits:
         another = fit.model.terms[-1].key != best.model.terms[-1].key
-        if another and prefer.by_innovations(best, fit) > SEPARABLE and repeats(fit):
+        if another and prefer.by_innovations(best, fit) > SEPARABLE:
             best = fit
     own = best.model.terms[-1].key
     behind: dict[Key, float] = {}

@@ -14,11 +14,12 @@ from torch import Tensor
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.linearised.linearise import Linearised, linearise
 from mkc_torch.diagnosis.linearised.tangents import Tangents, tangents_of
-from mkc_torch.diagnosis.model.fit import FittedModel, clipped_residual, fitted_beside, repeats
-from mkc_torch.diagnosis.model.side_by_side import each, ending_at_fit, fitted_each
+from mkc_torch.diagnosis.model.at_once import at_once
+from mkc_torch.diagnosis.model.fit import FittedModel, clipped_residual, fitted_beside
 from mkc_torch.diagnosis.model.term import Key, Term, one_sided
 from mkc_torch.diagnosis.search.closing_in import refined
 from mkc_torch.diagnosis.search.preference import Preference
+from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.protocol import Beginning
 
 if TYPE_CHECKING:
@@ -59,7 +60,8 @@ def strongest(
     around = base.parameters
     tangents = tangents_of(base.model, around, terms)
     looks = [((around, base.pseudo), _SHORT_LIST), ((around, clipped_residual(base.residual)), 2)]
-    lists = each(base, [partial(_short_list, base, terms, start, tangents, most) for start, most in looks], terms)
+    works = [partial(_short_list, base, terms, start, tangents, most) for start, most in looks]
+    lists = at_once(works, base.model.prepared, terms)
     fits: dict[Key, FittedModel] = {}
     fitted_parts = _part_fits(base) if parts else []
     listed: dict[Key, Listed] = {}
@@ -78,13 +80,7 @@ def strongest(
     likeliest = torch.stack([log_p for _, log_p in lists]).amin(0)
     order = [terms[number] for number in likeliest.argsort().tolist()]
     leading = _at_best_shapes(_leading(list(fits.values()), base, prefer), base, order, prefer)
-    shaped = fitted_each(base, [partial(refined, fit, base) for fit in leading], terms)
-    shaped = [fit for fit in shaped if repeats(fit)] or [fit for fit in fits.values() if repeats(fit)]
-    if not shaped:
-        raise ValueError(
-            f"The simulation gave finite outputs while {len(fits)} effects were fitted, and gives none now at the same "
-            "parameters: it is at the edge of what can be solved. Shorten the experiments, or give a `segment`."
-        )
+    shaped = at_once([partial(refined, fit, base) for fit in leading], base.model.prepared, terms)
     keys = {fit.model.terms[-1].key for fit in shaped}
     parted = shaped, [fit for key, fit in fits.items() if key not in keys]
     fitted = [fit for part in parted for fit in sorted(part, key=lambda fit: prefer.score(fit, base), reverse=True)]
@@ -132,7 +128,7 @@ def _part_fits(base: FittedModel) -> list[Callable[[], _Part | None]]:
     def fit_to(rows: Bool[Tensor, " N"]) -> _Part | None:
         try:
             theta = base.model.prepared.start(rows)
-        except ValueError:
+        except NoFitError:
             return None
         parameters = torch.cat([theta, base.parameters[base.model.base :]])
         residual = base.model.residual(parameters)
@@ -164,8 +160,8 @@ def _refit_all(
     beside: Sequence[Callable[[], T]] = (),
 ) -> list[T]:
     """Put the joint refit of each into ``fits``, where it is the better one of its physics; others go on beside."""
-    works = [ending_at_fit(partial(fitted_beside, base, base.model.with_term(term), start)) for term, start in listed]
-    done: list[Any] = each(base, [*works, *beside], [term for term, _ in listed])
+    works = [partial(fitted_beside, base, base.model.with_term(term), start) for term, start in listed]
+    done: list[Any] = at_once([*works, *beside], base.model.prepared, [term for term, _ in listed])
     for (term, _), fit in zip(listed, done, strict=False):
         if term.key not in fits or prefer.score(fit, base) > prefer.score(fits[term.key], base):
             fits[term.key] = fit
@@ -191,7 +187,8 @@ def _at_best_shapes(
         own = fit.model.terms[-1]
         others = [t for t in terms if t.key == own.key and t.shape != own.shape]
         tried += [(place, other) for other in others[:_SHAPES] if "onset" not in own.shape]
-    refits = fitted_each(base, [partial(_reshaped, fits[k], base, other) for k, other in tried], terms)
+    works = [partial(_reshaped, fits[k], base, other) for k, other in tried]
+    refits = at_once(works, base.model.prepared, terms)
     best = list(fits)
     for (place, _), refit in zip(tried, refits, strict=True):
         best[place] = max(best[place], refit, key=lambda fit: prefer.score(fit, base))
@@ -199,8 +196,7 @@ def _at_best_shapes(
 
 
 def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
-    fit.model.residual(fit.parameters)  # what other shapes of it begin with, where a simulation remembers
-    model = base.model.with_term(term)
+    model = fit.model.with_last(term)
     kept = fit.parameters[: model.size]
     more = kept.new_zeros(model.size - len(kept))
     return fitted_beside(base, model, torch.cat([kept, more]), graduate=False)
@@ -209,9 +205,10 @@ def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
 def refitted(best: FittedModel, base: FittedModel, term: Term, linearised: Linearised, number: int) -> FittedModel:
     gamma, _ = linearised.search.estimate(number, linearised.series)
     gamma = gamma.clamp(max=0.0) if one_sided(term.effect) else gamma
-    model = base.model.with_term(term)
-    found = fitted_beside(base, model, torch.cat([best.parameters[: base.model.size], -gamma]))
-    if found.log_likelihood >= base.log_likelihood and repeats(found):
+    beside = best.model.with_last(term) if len(best.model.terms) > len(base.model.terms) else best.model.with_term(term)
+    found = fitted_beside(base, beside, torch.cat([best.parameters[: base.model.size], -gamma]))
+    if found.log_likelihood >= base.log_likelihood:
         return found
     # it went astray from there: from nothing it only climbs
+    model = base.model.with_term(term)
     return fitted_beside(base, model, torch.cat([base.parameters, torch.zeros_like(gamma)]), graduate=False)

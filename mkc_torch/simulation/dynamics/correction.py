@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from mkc_torch.nonlinear import fit
+from mkc_torch.simulation.continuation import Continuation
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.parameter import SimulationError
-from mkc_torch.simulation.protocol import Changes
+from mkc_torch.simulation.protocol import Changes, Nearby
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -41,9 +42,6 @@ class DynamicsCorrection:
         prepared = self.prepared
         p = len(prepared.known)
 
-        def residual(begin: Tensor) -> Tensor:
-            return prepared.residual(torch.cat([theta[:p], begin]), changes)
-
         first = prepared.start()[p:]
         # friction that sticks at once leaves Newton's method far behind; a fit then begins with what was found
         found = prepared.trajectory(torch.cat([theta[:p], first]), changes, patient=True)
@@ -53,11 +51,14 @@ class DynamicsCorrection:
                 "as this recording does. Give a smaller `step`, or split the recording into shorter experiments."
             )
         begin = first
+        near: Nearby | None = found
         for seen in self._horizons():
             if int(seen.sum()) > _ENOUGH * len(begin) or bool(seen.all()) or self.first is not None:
                 weight = seen.to(theta.dtype)
-                begin = fit(residual, begin, weight=weight, covariance=None, graduate=True, max_iter=60).theta
-        outputs = prepared.simulated(torch.cat([theta[:p], begin]), changes)
+                way = Continuation(prepared, lambda begin: (torch.cat([theta[:p], begin]), changes), near)
+                begin = fit(way, begin, weight=weight, covariance=None, graduate=True, max_iter=60).theta
+                near = way.near(begin)
+        outputs = prepared.simulated(torch.cat([theta[:p], begin]), changes, near)
         table = prepared.recording
         runs = {"experiment": table["experiment"]} if "experiment" in table else {}
         return {"time": self.time} | runs | dict(zip(prepared.channels, outputs.unbind(-1), strict=True))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
-from mkc_torch.nonlinear import GaussianPrior, fit, load_forward_mode
+from mkc_torch.nonlinear import GaussianPrior, NoFitError, fit, load_forward_mode
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.between_samples import smooth_between
 from mkc_torch.simulation.dynamics.checks import Moments, check_functions
@@ -21,10 +20,10 @@ from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.first_guess import first_guess
 from mkc_torch.simulation.dynamics.ports import RATES, Places, common_unit
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
-from mkc_torch.simulation.dynamics.trajectory import Grid, Rate, Trajectory, defect, marched, solve, stations
+from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, defect, marched, solve, stations
 from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
 from mkc_torch.simulation.parameter import Parameter
-from mkc_torch.simulation.protocol import Changes, Clock, FreeChange, Port
+from mkc_torch.simulation.protocol import Answer, Changes, Clock, FreeChange, Nearby, Port
 from mkc_torch.simulation.runs import experiment_runs
 from mkc_torch.simulation.undetermined import undetermined
 
@@ -38,15 +37,9 @@ _FINEST = 8
 _PATIENT = 2
 """Moments at a time of a march that has to find its way."""
 
-_MOST_KEPT = 1 << 22
-"""Numbers in all trajectories that are kept."""
-
 _ROUGH = 0.02
 _WINDOW = 4
 _NOUGHT = 1e-3
-
-_Mark = tuple[float, float]
-_Memory = tuple[dict[int, Trajectory], OrderedDict[_Mark, Tensor]]
 
 
 class PreparedDynamics:
@@ -108,8 +101,6 @@ class PreparedDynamics:
         self._guess = first_guess(
             self.system, self.recording, self.channels, self.begins, self._kinematic, time, node_before, node_share
         )
-        self._last: dict[int, Trajectory] = {}
-        self._solved: OrderedDict[_Mark, Tensor] = OrderedDict()
         self.__dict__.pop("ports", None)  # their clock is that of the stations
 
     def _between(self, inputs: Float[Tensor, "N u"]) -> Float[Tensor, "S u"]:
@@ -154,7 +145,7 @@ class PreparedDynamics:
             low, high = (bound[: self._p] for bound in self.bounds)
             try:
                 found = fit(lacking, values, lower=low, upper=high, covariance=None, max_iter=60).theta
-            except ValueError:
+            except NoFitError:
                 found = values  # the equations cannot be looked at there
             starts.append(torch.cat([found, begin]))
         spread = [robust_scale(self.residual(one, {}).nan_to_num(torch.inf, torch.inf, torch.inf)) for one in starts]
@@ -167,7 +158,8 @@ class PreparedDynamics:
             return ()
         load_forward_mode()
         theta = self.start()
-        tangents = torch.func.jacfwd(lambda values: self.residual(values, {}))(theta).flatten(0, 1)
+        near = self.trajectory(theta, {})
+        tangents = torch.func.jacfwd(lambda values: self.residual(values, {}, near))(theta).flatten(0, 1)
         # a value near 0 says nothing of the size that is meant
         meant = theta.new_tensor([one.value for one in self.known.values()])
         typical = self._guess.abs().median(0).values.repeat(int(self.begins.sum()))
@@ -175,19 +167,34 @@ class PreparedDynamics:
         size = torch.where(theta.abs() < _NOUGHT * meant, meant, theta.abs())
         return undetermined(tangents, size, self.parameter_names, self._p)
 
-    def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
-        return self.measured - self.simulated(theta, changes)
+    def answer(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Answer:
+        """Recording less prediction, and the trajectory; see :meth:`mkc_torch.simulation.PreparedSimulation.answer`."""
+        found = self.trajectory(theta, changes, near)
+        # a tensor of a transform must not outlive it
+        lasting = found.converged and not torch._C._functorch.is_functorch_wrapped_tensor(found.states)
+        nearby = replace(found, states=found.states.detach()) if lasting else None
+        return Answer(self.measured - self._simulated(theta, changes, found), nearby)
 
-    def simulated(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N m"]:
+    def residual(
+        self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
+    ) -> Float[Tensor, "N m"]:
+        """That of the answer."""
+        return self.measured - self.simulated(theta, changes, near)
+
+    def simulated(
+        self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
+    ) -> Float[Tensor, "N m"]:
         """The outputs at the samples, (N, m); NaN where no trajectory is found."""
-        found = self.trajectory(theta, changes)
+        return self._simulated(theta, changes, self.trajectory(theta, changes, near))
+
+    def _simulated(self, theta: Tensor, changes: Changes, found: Trajectory) -> Float[Tensor, "N m"]:
         outputs = self._outputs(theta, found)
         if "output" in changes:
             outputs = outputs + changes["output"](outputs)
         return outputs if found.converged else outputs * torch.nan
 
-    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Tensor]:
-        found = self.trajectory(theta, changes)
+    def signals(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Mapping[str, Tensor]:
+        found = self.trajectory(theta, changes, near)
         inputs = self._inputs(theta, changes)
         at_stations = stations(self._rate(theta, changes), found.states, self.grid.step.unsqueeze(-1))
         at_stations = at_stations[:, : len(self.system.states)]
@@ -201,69 +208,39 @@ class PreparedDynamics:
         at |= {f"input {name}": self.inputs[:, [k]] for k, name in enumerate(self.system.inputs)}
         return at | {"output": outputs}
 
-    def trajectory(self, theta: Float[Tensor, " p"], changes: Changes, *, patient: bool = False) -> Trajectory:
-        """The states at all moments, with what effects change; ``patient`` goes from moment to moment if it must."""
+    def trajectory(
+        self,
+        theta: Float[Tensor, " p"],
+        changes: Changes,
+        near: Nearby | None = None,
+        *,
+        patient: bool = False,
+    ) -> Trajectory:
+        """The states at all moments, with what effects change.
+
+        Args:
+            theta: the parameters.
+            changes: what effects change.
+            near: a trajectory at parameters nearby, to begin with; None to find the way alone.
+            patient: go from moment to moment if it must.
+        """
         begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
         rate = self._rate(theta, changes)
-        more = len(self._remembering(changes))
-        begin = torch.cat([begin, begin.new_zeros(len(begin), more)], -1)
-        last = self._last.get(begin.shape[1])
-        without = self._last.get(len(self.system.states)) if more else None
-        guess = self._guess if without is None else without.states
-        guess = torch.cat([guess, guess.new_zeros(len(guess), more)], -1)
-        transformed = torch._C._functorch.is_functorch_wrapped_tensor
-        mark = None if transformed(begin) else self._mark(rate, begin, guess)
-        known = None if mark is None else self._solved.get(mark)
-        if known is None or (last is not None and known is last.states):
-            found = solve(rate, self.grid, begin, guess, last)
-        else:
-            # what was found on the way of a fit is not always found again from elsewhere
-            found = solve(rate, self.grid, begin, known)
-        if not found.converged and last is not None:
-            found = solve(rate, self.grid, begin, guess)
-        if not found.converged and last is None:
+        begin = _of_width(begin, begin.shape[1] + len(self._remembering(changes)))
+        width = begin.shape[1]
+        known = near if isinstance(near, Trajectory) else None
+        guess = _of_width(self._guess if known is None else known.states, width)
+        linear = known is not None and known.linear is not None and known.states.shape[1] == width
+        found = solve(rate, self.grid, begin, guess, known if linear else None)
+        if not found.converged and known is not None:
+            found = solve(rate, self.grid, begin, _of_width(self._guess, width))
+        if not found.converged and known is None:
             nearer = marched(rate, self.grid, begin, guess)
             found = found if nearer is None else solve(rate, self.grid, begin, nearer)
         if not found.converged and patient:
             nearer = marched(rate, self.grid, begin, guess, stride=_PATIENT)
             found = found if nearer is None else solve(rate, self.grid, begin, nearer)
-        # a tensor of a transform must not outlive it
-        if found.converged and mark is not None and not transformed(found.states):
-            states = found.states.detach()
-            self._last[begin.shape[1]] = replace(found, states=states)
-            self.learn((mark, states))
         return found
-
-    @property
-    def memory(self) -> _Memory:
-        """The trajectories found so far, by their number of states the last ones, and others."""
-        return dict(self._last), self._solved.copy()
-
-    @memory.setter
-    def memory(self, known: _Memory) -> None:
-        last, solved = known
-        self._last, self._solved = dict(last), solved.copy()
-
-    @property
-    def newest(self) -> tuple[_Mark, Tensor] | None:
-        """The last trajectory found, with its mark."""
-        return next(reversed(self._solved.items()), None)
-
-    def learn(self, newest: tuple[_Mark, Tensor] | None) -> None:
-        """Keep a trajectory; the oldest give way."""
-        if newest is None:
-            return
-        mark, states = newest
-        self._solved[mark] = states
-        self._solved.move_to_end(mark)
-        while len(self._solved) * states.numel() > _MOST_KEPT:
-            self._solved.popitem(last=False)
-
-    def _mark(self, rate: Rate, begin: Tensor, guess: Tensor) -> _Mark:
-        """Numbers by which the same equations are known again."""
-        rates = rate(self.grid.spread(guess)).detach()
-        uneven = torch.linspace(1.0, 2.0, len(rates), dtype=rates.dtype).sqrt().unsqueeze(-1)
-        return float((uneven * rates).sum()), float((uneven[: len(begin)] * begin.detach()).sum())
 
     def since_begin(self) -> Float[Tensor, " N"]:
         """Time since the beginning of each sample's run, in s."""
@@ -380,3 +357,9 @@ class PreparedDynamics:
                 break
             parts, before = 2 * parts, after
         self._lay_out(parts if bool(before.isfinite().all()) else 1)
+
+
+def _of_width(states: Float[Tensor, "G n"], width: int) -> Float[Tensor, "G w"]:
+    """The first states, and zeros for internal ones that are not among them."""
+    more = max(width - states.shape[1], 0)
+    return torch.cat([states[:, :width], states.new_zeros(len(states), more)], -1)

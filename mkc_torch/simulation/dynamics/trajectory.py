@@ -23,7 +23,7 @@ from mkc_torch.nonlinear import load_forward_mode
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Grid", "Rate", "Recurrence", "Trajectory", "defect", "marched", "solve", "stations"]
+__all__ = ["Grid", "Linear", "Rate", "Recurrence", "Trajectory", "defect", "marched", "solve", "stations"]
 
 Rate = Callable[[Tensor], Tensor]
 """Of change of the states, (S, n) → (S, n), at the stations of a grid."""
@@ -86,12 +86,26 @@ class Trajectory:
     Attributes:
         states: (G, n).
         converged: whether they solve the equations.
-        recurrence: the equations, linearised nearby.
-        renewed: gives the equations linearised at the states themselves.
+        linear: the equations, linearised; None where that is not kept.
     """
 
     states: Float[Tensor, "G n"]
     converged: bool
+    linear: Linear | None = None
+
+    @property
+    def bare(self) -> Trajectory:
+        """The states alone: small, and the same in whichever process they were found."""
+        return Trajectory(self.states, self.converged)
+
+    def __reduce__(self) -> tuple[type[Trajectory], tuple[Tensor, bool]]:
+        return Trajectory, (self.states, self.converged)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Equations linearised near a trajectory; ``renewed`` linearises them at its states themselves."""
+
     recurrence: Recurrence
     renewed: Callable[[], Recurrence]
 
@@ -113,8 +127,8 @@ def solve(
         grid: its K trajectories.
         begin: their first states.
         guess: of all states.
-        known: a trajectory nearby, instead of the guess; how its equations were linearised serves as long as it brings
-            these to rest quickly.
+        known: a trajectory nearby, instead of the guess, with its equations linearised: they serve as long as they
+            bring these to rest quickly.
 
     Example:
         A decay at a rate of 2/s:
@@ -131,8 +145,9 @@ def solve(
     places = grid.begins.long().cumsum(0) - 1
     states = torch.where(origin, begin.detach()[places], (guess if known is None else known.states).detach())
     at = _Point.of(rate, states, step)
-    fresh, moved_on = known is None, False
-    recurrence = _recurrence(rate, states, step, grid) if known is None else known.recurrence
+    linear = None if known is None else known.linear
+    fresh, moved_on = linear is None, False
+    recurrence = _recurrence(rate, states, step, grid) if linear is None else linear.recurrence
     converged = False
     settled = max(_SETTLED, _DIGITS * torch.finfo(states.dtype).eps)
     norms = [at.norm]
@@ -168,10 +183,10 @@ def solve(
 
     if transformed or any(one.requires_grad for one in (left, begin)):
         # outside of the transform it is the same, and cheaper
-        recurrence = renewed() if known is None or moved_on else known.renewed()
+        recurrence = renewed() if linear is None or moved_on else linear.renewed()
     # one more step, whose value is that of rounding and whose derivative is that of the solution
     start = torch.where(origin, begin[places] - states, 0.0)
-    return Trajectory(states + recurrence.solved(start, left), converged, recurrence, renewed)
+    return Trajectory(states + recurrence.solved(start, left), converged, Linear(recurrence, renewed))
 
 
 def marched(

@@ -13,13 +13,13 @@ from mkc_torch.calibration.ellipsoid_fit import MIN_INFORMATION
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.linear import LeastTrimmedSquares
 from mkc_torch.linear._problem import RankDeficientError
-from mkc_torch.nonlinear import GaussianPrior, beside
+from mkc_torch.nonlinear import GaussianPrior, NoFitError, beside
 from mkc_torch.recording.recording import Recording, RecordingError
 from mkc_torch.simulation.magnetometer.heading import HeadingJump, heading_jumps
 from mkc_torch.simulation.magnetometer.matrix import SOFT_IRON
 from mkc_torch.simulation.magnetometer.rotation import from_quaternion, rotated
 from mkc_torch.simulation.magnetometer.view import AXES, GYRO, INDEPENDENT, QUATERNION, VECTOR, View, thinned
-from mkc_torch.simulation.protocol import Changes, Port
+from mkc_torch.simulation.protocol import Changes, Nearby, Port
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -89,7 +89,7 @@ class AttitudeView(View):
         if rows is None:
             return self._full.clone()
         if int(rows.sum()) < _MIN_ROWS:
-            raise ValueError(f"{int(rows.sum())} samples are too few for the offset and the response.")
+            raise NoFitError(f"{int(rows.sum())} samples are too few for the offset and the response.")
         turned = torch.einsum("kij,i->kj", self.to_world[rows], self.strength * self._ahead)
         offset = (self.measured[rows] - turned).median(0).values
         offset, response = _response(self.measured[rows], turned, offset)
@@ -142,10 +142,12 @@ class AttitudeView(View):
         added = self._field_change(changes)
         return residual if added is None else residual - added @ self._frame.mT
 
-    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Float[Tensor, "N k"]]:
+    def signals(
+        self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
+    ) -> Mapping[str, Float[Tensor, "N k"]]:
         """Beside the others, at the port "heading", 1 from each of the heading's jumps on."""
         since = {} if self._since is None else {"heading": self._since}
-        return {**super().signals(theta, changes), **since}
+        return {**super().signals(theta, changes, near), **since}
 
     def simulated(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "N 3"]:
         return self._sensed(self._seen(theta, {}), theta)

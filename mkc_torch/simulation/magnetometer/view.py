@@ -13,10 +13,10 @@ from torch import Tensor
 from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
 from mkc_torch.calibration.turning import refuse_at_rest, thin_at_rest, turning
 from mkc_torch.linear import LeastTrimmedSquares
-from mkc_torch.nonlinear import beside
+from mkc_torch.nonlinear import NoFitError, beside
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.matrix import MATRIX_OF_VIEW
-from mkc_torch.simulation.protocol import Changes, FreeChange, Port
+from mkc_torch.simulation.protocol import Changes, ClosedForm, FreeChange, Nearby, Port
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -38,7 +38,7 @@ _MOSTLY = 0.5
 _ENOUGH = 1500
 
 
-class View:
+class View(ClosedForm):
     """The measured field, the sensor's model, and what is compared."""
 
     name = "magnetometer"
@@ -66,7 +66,12 @@ class View:
         known = self.recording.time
         return torch.arange(len(self.recording), dtype=torch.float64) if known is None else known
 
-    def signals(self, theta: Float[Tensor, " p"], changes: Changes) -> Mapping[str, Float[Tensor, "N 3"]]:  # noqa: ARG002
+    def signals(
+        self,
+        theta: Float[Tensor, " p"],
+        changes: Changes,  # noqa: ARG002
+        near: Nearby | None = None,  # noqa: ARG002
+    ) -> Mapping[str, Float[Tensor, "N 3"]]:
         """At the port "sensor", the simulated field as the sensor's own axes and gains show it."""
         # not the measured one: its noise is the residual's too, and would pass for a nonlinearity
         return {"sensor": self.simulated(theta)}
@@ -104,7 +109,13 @@ class View:
     def _ellipsoid(self, rows: Bool[Tensor, " N"] | None) -> EllipsoidFit:
         chosen = thinned(self.thin if rows is None else self.thin & rows)
         # what is sought may scatter the samples as widely as noise does
-        return EllipsoidFit(LeastTrimmedSquares(), max_scatter=math.inf).fit(self.measured[chosen])
+        ellipsoid = EllipsoidFit(LeastTrimmedSquares(), max_scatter=math.inf)
+        if rows is None:
+            return ellipsoid.fit(self.measured[chosen])
+        try:
+            return ellipsoid.fit(self.measured[chosen])
+        except ValueError as error:
+            raise NoFitError(f"These samples alone determine no ellipsoid. {error}") from error
 
 
 def length_of(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:

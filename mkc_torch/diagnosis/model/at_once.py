@@ -1,0 +1,29 @@
+"""Works near a simulation, on all cores that may be used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+from mkc_torch._parallel.fork import shared
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.simulation.protocol import PreparedSimulation
+
+__all__ = ["at_once", "common_parts"]
+
+T = TypeVar("T")
+
+
+def at_once(works: Sequence[Callable[[], T]], prepared: PreparedSimulation, terms: Sequence[Term] = ()) -> list[T]:
+    """The results of works, in their order.
+
+    Args:
+        works: none needs what another one leaves behind.
+        prepared, terms: a simulation and effects that results may hold.
+    """
+    return shared(works, common_parts(prepared, terms))
+
+
+def common_parts(prepared: PreparedSimulation, terms: Sequence[Term]) -> list[object]:
+    """What every process has of a simulation and its effects, and need not be sent."""
+    return [prepared, *(part for term in terms for part in (term.effect, term.driver) if part is not None)]
