@@ -205,7 +205,6 @@ CODE = """
     from mkc_torch.recording.demonstration import simulated_recording
     from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
     from mkc_torch.simulation import Dynamics, Magnetometer
-    from mkc_torch.diagnosis.model import side_by_side
 
     one_thread()
 

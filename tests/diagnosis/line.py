@@ -5,9 +5,10 @@ import torch
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation import Port
+from mkc_torch.simulation.protocol import ClosedForm
 
 
-class Line:
+class Line(ClosedForm):
     """``y = θ₀ + θ₁ t`` in both channels; what enters at "mixed" is seen through ``mixing``, at "summed" as its sum."""
 
     name = "line"
@@ -43,7 +44,7 @@ class Line:
             left = left - changes["summed"](self.time.new_zeros(len(self.time), 1)).cumsum(0) / len(self.time)
         return left
 
-    def signals(self, theta, changes=None):  # noqa: ARG002
+    def signals(self, theta, changes=None, near=None):  # noqa: ARG002
         level = theta[0] + theta[1] * self.time
         return {"mixed": torch.stack([level, 2.0 * level, level.square()], -1)}
 

@@ -8,6 +8,7 @@ import torch
 
 from mkc_torch import Recording, diagnose
 from mkc_torch.effects import CATALOGUE
+from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation import Dynamics
 
 rounds = importlib.import_module("mkc_torch.diagnosis.rounds")
@@ -57,9 +58,7 @@ def diagnosed(recording, monkeypatch):
             return beside(base, first[0])
 
         monkeypatch.setattr(rounds, "locate", search)
-        monkeypatch.setattr(
-            ending_of, "estimate", lambda fit: begun.append(fit.model.prepared.newest[1]) or estimate(fit)
-        )
+        monkeypatch.setattr(ending_of, "estimate", lambda fit: begun.append(fit.model.near.states) or estimate(fit))
         return diagnose(Sled(), recording, effects=EFFECTS), searches, begun
 
     return run
@@ -67,7 +66,7 @@ def diagnosed(recording, monkeypatch):
 
 def test_a_search_that_fails_leaves_what_was_found(diagnosed):
     def fails(*_):
-        raise ValueError("No slope by damping.")
+        raise NoFitError("No slope by damping.")
 
     diagnosis, searches, _ = diagnosed(fails)
     assert len(searches) == 2
@@ -75,15 +74,21 @@ def test_a_search_that_fails_leaves_what_was_found(diagnosed):
     assert "The search beside what was found was given up. No slope by damping." in diagnosis.warnings
 
 
-def test_the_simulation_goes_on_with_the_trajectory_of_what_was_found(diagnosed):
+def test_a_bug_in_an_effect_is_no_search_that_fails(diagnosed):
+    def broken(*_):
+        raise ValueError("the effect's own")
+
+    with pytest.raises(ValueError, match="the effect's own"):
+        diagnosed(broken)
+
+
+def test_what_comes_after_begins_with_the_trajectory_of_what_was_found(diagnosed):
     def wanders_off(base, first):
         base.model.residual(1.01 * base.parameters)
         return replace(first, p_value=1.0)
 
     _, searches, (begun,) = diagnosed(wanders_off)
-    fit = searches[1]
-    fit.model.residual(fit.parameters)
-    torch.testing.assert_close(fit.model.prepared.newest[1], begun)
+    assert torch.equal(searches[1].model.near.states, begun)
 
 
 def test_a_search_without_an_effect_of_a_possible_sign_finds_nothing(recording):

@@ -15,6 +15,7 @@ from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.locate import _settled, _with_tangents, locate
 from mkc_torch.diagnosis.search.strongest import _first_start
 from mkc_torch.effects import CATALOGUE
+from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.line import Line
 from tests.simulation.tumbling import tumbling
@@ -63,12 +64,12 @@ def test_a_fit_without_slopes_gives_way_to_the_next(monkeypatch):
 
     def tangents(of, _parameters, _terms):
         if of is fits[0].model:
-            raise ValueError("no finite slope")
+            raise NoFitError("no finite slope")
         return known
 
     monkeypatch.setattr("mkc_torch.diagnosis.search.locate.tangents_of", tangents)
     assert _with_tangents(fits, terms) == (fits[1], terms, known)
-    with pytest.raises(ValueError, match="no finite slope"):
+    with pytest.raises(NoFitError, match="no finite slope"):
         _with_tangents(fits[:1], terms)
 
 

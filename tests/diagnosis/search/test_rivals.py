@@ -1,6 +1,5 @@
 """Rivals that follow the trajectory an effect has made are fitted before they count as not told apart."""
 
-from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -53,8 +52,7 @@ def judged(monkeypatch):
             return fits[one.key]
 
         monkeypatch.setattr(rivals, "_tried", tried)
-        monkeypatch.setattr(rivals, "fitted_each", lambda _base, works, _terms: [work() for work in works])
-        monkeypatch.setattr(rivals, "memory_kept", lambda _prepared: nullcontext())
+        monkeypatch.setattr(rivals, "at_once", lambda works, *_: [work() for work in works])
         best = fit_of(FRICTION, 100.0, size)
         tangents = SimpleNamespace(pointwise={BENT: None, POINTWISE: torch.ones(1)})
         found, told = by_joint_fits(best, fit_of(None, 0.0), ranking, TERMS, None, tangents, Indifferent(**new), known)

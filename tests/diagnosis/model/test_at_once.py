@@ -1,0 +1,71 @@
+"""Fits that copies of the process make come back whole."""
+
+import io
+
+import torch
+
+from mkc_torch._parallel.fork import _Receiver, _Sender
+from mkc_torch.diagnosis.model.at_once import common_parts
+from mkc_torch.diagnosis.model.drivers import Driver
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.effects import GainEffect
+from mkc_torch.recording import Recording
+from mkc_torch.simulation import Dynamics
+from tests.diagnosis.line import Line
+
+
+class Along(GainEffect):
+    """One of several effects of the same name, which differ in the number that their shape has."""
+
+    id = "along"
+    port = "mixed"
+    roles = ("any",)
+
+    def __init__(self, number):
+        self.number = number
+
+    def course(self, shape, context):
+        return shape[self.number] * context.drivers[:, 0]
+
+
+class Decay(Dynamics):
+    states = ("level",)
+    parameters = {"rate": 1.0}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"level": -p.rate * x.level}
+
+
+def sent(fits, known):
+    known = {id(one): one for one in known}
+    _Sender(there := io.BytesIO(), known).dump(fits)
+    return _Receiver(io.BytesIO(there.getvalue()), known).load()
+
+
+def test_a_fit_comes_back_with_its_own_effect_and_driver():
+    line = Line()
+    driver = Driver(("load",), "any", torch.sin(3.0 * line.time).unsqueeze(-1), torch.tensor([7.0]).double(), ("kg",))
+    terms = [Term(Along("one"), driver, {"one": 1.0}), Term(Along("other"), driver, {"other": 2.0})]
+    fits = []
+    for term in terms:
+        model = JointModel(line, [term])
+        fits.append(fitted(model, torch.cat([line.start(), torch.zeros(3)])))
+    for fit, back in zip(fits, sent(fits, common_parts(line, terms)), strict=True):
+        assert back.model.prepared is line
+        assert back.model.terms[0].effect is fit.model.terms[0].effect
+        assert back.model.terms[0].driver is driver
+        assert back.model.terms[0].shape == fit.model.terms[0].shape
+        assert torch.equal(back.parameters, fit.parameters)
+        assert torch.equal(back.model.residual(back.parameters), fit.residual)
+
+
+def test_a_fit_comes_back_with_its_trajectory():
+    time = torch.linspace(0.0, 3.0, 61, dtype=torch.float64)
+    noise = 0.01 * torch.randn(61, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    prepared = Decay().prepare(Recording({"time": time, "level": torch.exp(-1.5 * time) + noise}))
+    fit = fitted(JointModel(prepared), prepared.start())
+    (back,) = sent([fit], common_parts(prepared, ()))
+    assert torch.equal(back.model.near.states, fit.model.near.states)
+    assert torch.equal(back.model.residual(back.parameters), fit.residual)
