@@ -182,12 +182,12 @@ def _candidates(first: Located | None) -> tuple[Candidate, ...]:
         return ()
     return tuple(
         Candidate(
-            first.terms[r.number].effect.id,
-            first.terms[r.number].columns,
-            _shape(first.terms[r.number]),
+            first.scene.terms[r.number].effect.id,
+            first.scene.terms[r.number].columns,
+            _shape(first.scene.terms[r.number]),
             r.gain,
             math.sqrt(2.0 * max(r.gain, 0.0)),
-            first.terms[r.number].at,
+            first.scene.terms[r.number].at,
             r.gap,
         )
         for r in first.ranking

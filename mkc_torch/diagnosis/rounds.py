@@ -134,7 +134,7 @@ def _quiet(search: Search, asked: Asked) -> bool:
 def _beside(search: Search, asked: Asked) -> float:
     """The p-value of a first look beside the last finding."""
     last, near = search.found[-1], _near(search.found[-1].fit)
-    others = [all(not _same(term, one.term, near) for one in search.found) for term in last.terms]
+    others = [all(not _same(term, one.term, near) for one in search.found) for term in last.scene.terms]
     return p_value_beside(last, others, _GLANCE, torch.Generator().manual_seed(asked.seed))
 
 

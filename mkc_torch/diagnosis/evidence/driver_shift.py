@@ -58,8 +58,8 @@ def shifted(model: JointModel, located: Located) -> DriverShift | None:
         recording is short.
     """
     term = located.term
-    pointwise = located.tangents.pointwise[term.port]
-    N = len(located.values)
+    pointwise = located.scene.tangents.pointwise[term.port]
+    N = len(located.scene.values)
     most = int(_SHARE * N)
     if term.driver is None or pointwise is None or model.prepared.ports[term.port].clock is not None:
         return None
@@ -67,13 +67,13 @@ def shifted(model: JointModel, located: Located) -> DriverShift | None:
         return None
     middle = slice(most, N - most)
     parameters = located.fit.parameters[: model.size]
-    counts = located.counts[middle]
-    bare = _cut(located.tangents, middle)
-    search = linearise(model, parameters, located.values[middle], counts, bare)
+    counts = located.scene.counts[middle]
+    bare = _cut(located.scene.tangents, middle)
+    search = linearise(model, parameters, located.scene.values[middle], counts, bare)
 
     def gains(steps: Sequence[int]) -> Float[Tensor, " steps"]:
         copies = [_moved(term, by) for by in steps]
-        moved = candidate_tangents(model, parameters, copies, located.tangents.pointwise)
+        moved = candidate_tangents(model, parameters, copies, located.scene.tangents.pointwise)
         return search.gains_of([one[middle] for one in moved], counts).ratio[:, 0]
 
     steps = [most * k // _COPIES for k in range(-_COPIES, _COPIES + 1) if k]

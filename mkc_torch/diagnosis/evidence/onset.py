@@ -47,7 +47,7 @@ def onset_interval(model: JointModel, located: Located) -> tuple[float, float] |
     Returns:
         None where it has no onset, or acts where each onset would take a trajectory of its own.
     """
-    term, pointwise = located.fit.model.terms[-1], located.tangents.pointwise
+    term, pointwise = located.fit.model.terms[-1], located.scene.tangents.pointwise
     if "onset" not in term.shape or pointwise[term.port] is None:
         return None
     time = model.prepared.time
@@ -58,7 +58,7 @@ def onset_interval(model: JointModel, located: Located) -> tuple[float, float] |
         """Of a change that comes with the sample of each number."""
         shapes = [replace(term, shape={**term.shape, "onset": float(time[number])}) for number in numbers]
         tangents = candidate_tangents(model, parameters, shapes, pointwise)
-        return located.linearised.gains_of(tangents, located.counts).ratio[:, 0]
+        return located.look.linearised.gains_of(tangents, located.scene.counts).ratio[:, 0]
 
     tried = _spread(place, len(time))
     found = ratios(tried)

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.common_cause import common_cause
 from mkc_torch.diagnosis.linearised.linearise import linearise
-from mkc_torch.diagnosis.linearised.tangents import candidate_tangents
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
@@ -37,14 +36,13 @@ def located_cause(base: FittedModel, located: Located, level: float, surrogates:
         level: of false alarms.
         surrogates: draws of noise that other p-values are from, than which none can be smaller.
     """
-    slow = located.tangents.slow
+    slow = located.scene.tangents.slow
     cause = common_cause(located.beside_nothing, slow)
     if cause is None or slow is None or slow.port != Unrecorded.port or cause.p_value > _SHARE * level:
         return None
     model, start = _with_cause(base, cause.direction, cause.shape)
     term = model.terms[-1]
     fit = fitted_beside(base, model, start, graduate=False)
-    tangents = candidate_tangents(base.model, base.parameters, [term], located.tangents.pointwise)
     others = [replace(one, gap=max(cause.gain - one.gain, 0.0)) for one in located.ranking]
     return replace(
         located,
@@ -53,10 +51,8 @@ def located_cause(base: FittedModel, located: Located, level: float, surrogates:
         p_value=max(cause.p_value / _SHARE, 1.0 / (1 + surrogates)),
         beyond=0.0,
         stretch=None,
-        ranking=(Ranked(len(located.terms), cause.gain, 0.0), *others),
-        linearised=located.linearised.with_more(tangents, located.counts),
-        tangents=replace(located.tangents, candidates=(*located.tangents.candidates, *tangents)),
-        terms=(*located.terms, term),
+        ranking=(Ranked(len(located.scene.terms), cause.gain, 0.0), *others),
+        look=located.look.with_more([term]),
     )
 
 
@@ -70,17 +66,17 @@ def course_without(
         located: what :func:`located_cause` found.
         train: the samples.
     """
-    counts = located.counts * train.unsqueeze(-1)
+    counts = located.scene.counts * train.unsqueeze(-1)
     known = linearise(
         base.model,
         base.parameters,
-        counts * located.values,
+        counts * located.scene.values,
         counts,
-        located.tangents.bare,
-        colour=located.linearised.colour,
+        located.scene.tangents.bare,
+        colour=located.look.linearised.colour,
     )
     direction = -located.fit.model.gammas(located.fit.parameters)[-1]
-    cause = common_cause(known, located.tangents.slow)
+    cause = common_cause(known, located.scene.tangents.slow)
     if cause is None:
         return _with_cause(base, torch.zeros_like(direction), located.term.shape)
     cause = cause.towards(direction)

@@ -211,9 +211,9 @@ def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
         found += [
             Alternative(term.effect.id, (copy,), 0.0, False, term.at, told_by=SAME) for copy in term.driver.copies
         ]
-    own = [ranked.number for ranked in located.ranking if located.terms[ranked.number].key == term.key]
+    own = [ranked.number for ranked in located.ranking if located.scene.terms[ranked.number].key == term.key]
     for ranked in located.ranking:
-        rival = located.terms[ranked.number]
+        rival = located.scene.terms[ranked.number]
         if rival.key == term.key or ranked.gap > _FARTHEST:
             continue
         gap = max(ranked.gap, 0.0)

@@ -22,7 +22,7 @@ def separability(located: Located) -> Separability:
     numbers = [ranked.number for ranked in located.ranking[:_MOST]]
     traces, spaces, left = [], [], []
     for number in numbers:
-        trace, space, kept = located.linearised.search.trace(number, located.linearised.series)
+        trace, space, kept = located.look.linearised.search.trace(number, located.look.linearised.series)
         traces.append(trace)
         spaces.append(space)
         left.append(kept)
@@ -32,4 +32,6 @@ def separability(located: Located) -> Separability:
         for j, space in enumerate(spaces):
             taken = float((space.mT @ trace).square().sum())
             share[i, j] = max(0.0, 1.0 - taken / length) if i != j and length > 0 else 0.0
-    return Separability(labels([located.terms[n] for n in numbers]), share, torch.tensor(left, dtype=torch.float64))
+    return Separability(
+        labels([located.scene.terms[n] for n in numbers]), share, torch.tensor(left, dtype=torch.float64)
+    )

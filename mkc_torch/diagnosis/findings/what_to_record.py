@@ -43,7 +43,7 @@ def told_by(located: Located, own: int, rival: int) -> str:
         own: number of the effect among its candidates.
         rival: number of the rival.
     """
-    search, series = located.linearised.search, located.linearised.series
+    search, series = located.look.linearised.search, located.look.linearised.series
     trace, _, _ = search.trace(own, series)
     _, space, _ = search.trace(rival, series)
     nats = 0.5 * float((trace - space @ (space.mT @ trace)).square().sum())
@@ -77,23 +77,23 @@ class _State:
 
 def _left(located: Located, own: int, rival: int) -> Float[Tensor, " N"]:
     """Of each sample, the square of what a rival does not follow, over the noise."""
-    gamma = located.linearised.search.estimate(own, located.linearised.series)[0]
-    weight = (located.counts / located.fit.d).unsqueeze(-1)
-    candidates = located.tangents.candidates
+    gamma = located.look.linearised.search.estimate(own, located.look.linearised.series)[0]
+    weight = (located.scene.counts / located.fit.d).unsqueeze(-1)
+    candidates = located.scene.tangents.candidates
     target = (weight.squeeze(-1) * (candidates[own] @ gamma)).flatten()
-    columns = (weight * torch.cat([located.tangents.nuisance, candidates[rival]], -1)).flatten(0, 1)
+    columns = (weight * torch.cat([located.scene.tangents.nuisance, candidates[rival]], -1)).flatten(0, 1)
     size = torch.linalg.vector_norm(columns, dim=0).clamp(min=1e-300)
     basis = torch.linalg.qr(columns / size).Q
     left = target - basis @ (basis.mT @ target)
-    return left.square().unflatten(0, located.counts.shape).sum(-1)
+    return left.square().unflatten(0, located.scene.counts.shape).sum(-1)
 
 
 def _states(located: Located) -> Iterator[_State]:
     """Low and high values of each recorded driver, and what passes through the port mainly along one of its axes."""
-    drivers = {t.driver.columns[0]: t.driver for t in located.terms if t.driver and len(t.driver.columns) == 1}
+    drivers = {t.driver.columns[0]: t.driver for t in located.scene.terms if t.driver and len(t.driver.columns) == 1}
     for name, driver in drivers.items():
         values = driver.values[:, 0]
-        if len(values) != len(located.counts):
+        if len(values) != len(located.scene.counts):
             continue
         low, high = (float(v) for v in torch.quantile(values, values.new_tensor([1.0 / 3.0, 2.0 / 3.0])))
         for word, edge, inside in (("below", low, values < low), ("above", high, values > high)):
@@ -105,7 +105,7 @@ def _along(located: Located) -> Iterator[_State]:
     model = located.fit.model
     name = model.terms[-1].port
     port, signals = model.prepared.ports[name], _signals(located)
-    if name not in signals or port.carries or len(signals[name]) != len(located.counts):
+    if name not in signals or port.carries or len(signals[name]) != len(located.scene.counts):
         return
     signal = signals[name]
     share = signal / torch.linalg.vector_norm(signal, dim=-1, keepdim=True).clamp(min=1e-300)

@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-from torch import Tensor
-
-from mkc_torch.diagnosis.linearised.linearise import Linearised
-from mkc_torch.diagnosis.linearised.tangents import Tangents, candidate_tangents
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
 from mkc_torch.diagnosis.model.grid import finer
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term, continuous
+from mkc_torch.diagnosis.search.look import Look
 from mkc_torch.functional import mkc_energy
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 __all__ = ["closer", "coloured", "middle", "refined"]
 
@@ -52,14 +45,7 @@ def refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> Fit
     return refined(moved, base) if again else moved
 
 
-def closer(
-    terms: Sequence[Term],
-    model: JointModel,
-    parameters: Tensor,
-    tangents: Tangents,
-    counts: Float[Tensor, "N m"],
-    linearised: Linearised,
-) -> tuple[Term, ...]:
+def closer(terms: Sequence[Term], look: Look) -> tuple[Term, ...]:
     """Candidates with the continuous numbers of their shapes closed in on under the noise of the search.
 
     Only where a port is pointwise: elsewhere each shape takes a trajectory of its own.
@@ -67,42 +53,33 @@ def closer(
     closer = []
     for term in terms:
         names = continuous(term)
-        if not names or tangents.pointwise[term.port] is None:
+        if not names or look.scene.bends(term):
             continue
         found = term
         for count in range(_ROUNDS):
             for name in names:
-                shapes = finer(found, name, model.prepared.time, count)
-                gains = linearised.gains_of(candidate_tangents(model, parameters, shapes, tangents.pointwise), counts)
-                found = shapes[int(gains.ratio[:, 0].argmax())]
+                shapes = finer(found, name, look.scene.base.model.prepared.time, count)
+                found = shapes[int(look.gains_of(shapes).ratio[:, 0].argmax())]
         if found.shape != term.shape:
             closer.append(found)
     return tuple(closer)
 
 
-def coloured(
-    best: FittedModel,
-    base: FittedModel,
-    around: FittedModel,
-    tangents: Tangents,
-    counts: Float[Tensor, "N m"],
-    linearised: Linearised,
-) -> FittedModel:
+def coloured(best: FittedModel, look: Look) -> FittedModel:
     """The fit with the shape that the noise of the search makes of its own: a joint fit takes the noise for white.
 
     That is another one where it is clearly better, else the middle one of those that are not told apart, as all onsets
-    within a burst of rejected samples are. ``around`` is the fit that the search is linear around.
+    within a burst of rejected samples are.
     """
-    own = best.model.terms[-1]
+    own, base = best.model.terms[-1], look.scene.base
     names = continuous(own)
-    if not names or tangents.pointwise[own.port] is None:
+    if not names or look.scene.bends(own):
         return best
 
     def gains(terms: Sequence[Term]) -> list[float]:
-        beside = candidate_tangents(around.model, around.parameters, terms, tangents.pointwise)
-        return linearised.gains_of(beside, counts).ratio[:, 0].tolist()
+        return look.gains_of(terms).ratio[:, 0].tolist()
 
-    others = closer([own], around.model, around.parameters, tangents, counts, linearised)
+    others = closer([own], look)
     here, *there = gains([own, *others])
     if there and there[0] > here + _CLEAR:
         moved = others[0]

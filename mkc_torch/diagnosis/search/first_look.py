@@ -6,10 +6,8 @@ from collections.abc import Sequence
 
 import torch
 
-from mkc_torch.diagnosis.linearised.tangents import candidate_tangents
 from mkc_torch.diagnosis.search.locate import Located
 from mkc_torch.diagnosis.search.p_value import judged
-from mkc_torch.diagnosis.search.ranking import possible_of
 
 __all__ = ["p_value_beside"]
 
@@ -29,14 +27,11 @@ def p_value_beside(located: Located, possible: Sequence[bool], surrogates: int, 
     Returns:
         0 where an effect may bend a trajectory: there refits find what straight lines do not.
     """
-    model, pointwise = located.fit.model, located.tangents.pointwise
-    if any(pointwise[term.port] is None for term in (*located.terms, model.terms[-1])):
+    scene, own = located.scene, located.fit.model.terms[-1]
+    if any(scene.bends(term) for term in (*scene.terms, own)):
         return 0.0
-    own = candidate_tangents(model, located.fit.parameters, model.terms[-1:], pointwise)
-    beside = located.linearised.without(own, located.counts)
-    mask = torch.tensor(list(possible)) & possible_of(located.terms, beside)
+    beside = located.look.beside(own, located.fit)
+    mask = torch.tensor(list(possible)) & beside.possible
     if not bool(mask.any()):
         return 1.0
-    noise = beside.search.noise_fit(beside.series)
-    found = beside.search.gains(beside.series.unsqueeze(-1))
-    return judged(beside, noise, found, mask, surrogates, generator)[0]
+    return judged(beside.linearised, beside.noise, beside.gains, mask, surrogates, generator)[0]

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from mkc_torch._parallel.fork import meanwhile
 from mkc_torch.diagnosis.linearised.beside_wander import beside_wander
-from mkc_torch.diagnosis.linearised.linearise import Linearised, linearise
+from mkc_torch.diagnosis.linearised.linearise import Linearised
 from mkc_torch.diagnosis.linearised.tangents import Tangents, candidate_tangents, tangents_of
 from mkc_torch.diagnosis.linearised.wander import NoiseFit
 from mkc_torch.diagnosis.model.at_once import common_parts
@@ -22,10 +22,11 @@ from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.colour import Colour
 from mkc_torch.diagnosis.noise.pseudo_residual import REJECTED_BELOW
 from mkc_torch.diagnosis.search.closing_in import closer, coloured, refined
+from mkc_torch.diagnosis.search.look import Look, Scene
 from mkc_torch.diagnosis.search.one_stretch import telling_stretch
 from mkc_torch.diagnosis.search.p_value import judged
 from mkc_torch.diagnosis.search.preference import Preference
-from mkc_torch.diagnosis.search.ranking import SEPARABLE, Ranked, own_p, possible_of, ranked
+from mkc_torch.diagnosis.search.ranking import SEPARABLE, Ranked, ranked
 from mkc_torch.diagnosis.search.rivals import KEPT, by_joint_fits
 from mkc_torch.diagnosis.search.strongest import refitted, strongest
 from mkc_torch.nonlinear import NoFitError
@@ -54,10 +55,9 @@ class Located:
         beyond: nats by which it is rarer, by itself, than the strongest of the draws.
         ranking: for each candidate physics its best shape, gain in nats, and nats behind the first; best first.
         noise: the wander of the noise without the candidate.
-        values, counts: (N, m), the pseudo-residual without the candidate, and what counts of it.
-        linearised: the search that told candidates apart; ``tangents`` and ``terms`` are its candidates.
+        look: the search that told candidates apart.
+        beside_nothing: the search that the p-value is from; that of ``look`` is another one where an effect was named.
         stretch: samples without which there is nothing, first and the one after the last, if they are few.
-        beside_nothing: the search that the p-value is from; ``linearised`` is another one where an effect was named.
     """
 
     term: Term
@@ -66,13 +66,14 @@ class Located:
     beyond: float
     ranking: tuple[Ranked, ...]
     noise: NoiseFit
-    values: Float[Tensor, "N m"]
-    counts: Float[Tensor, "N m"]
-    linearised: Linearised
-    tangents: Tangents
-    terms: tuple[Term, ...]
+    look: Look
     beside_nothing: Linearised
     stretch: tuple[int, int] | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """The candidates, and the residuals that they would have to explain."""
+        return self.look.scene
 
 
 def locate(
@@ -98,63 +99,47 @@ def locate(
     prefer = Preference(terms, base.model.prepared)
     tried = len(terms)
     fits, tangents = strongest(base, terms, prefer, parts=parts)
-    if _shows(base, fits[0]):
-        around, best = base, fits[0]
-        last = best.model.terms[-1]
-        if last not in terms:
-            terms, tangents = (*terms, last), _with_own(tangents, base, last)
-    else:
-        best, terms, tangents = _with_tangents(fits, terms)
-        around = best
-    parameters = around.parameters[: base.model.size]
-    tangents = replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
+    best, scene = _scene(base, fits, terms, tangents)
     # without the effect, as what is left beside it weighs the samples
-    left = beside_wander(best, base.model, parameters, tangents)
-    counts, tangents = left.counts, replace(tangents, slow=left.slow)
-    if around is base:
-        added = best.residual - base.residual
-    else:
-        number, gamma = terms.index(best.model.terms[-1]), best.parameters[base.model.size :]
-        added = torch.einsum("nmq,q->nm", tangents.candidates[number], gamma)
-    pseudo = left.values - counts * added
-    prepared = base.model.prepared
-    colour = left.noise.colour
-    naming = partial(_named, best, base, around, terms, tangents, pseudo, counts, colour, prefer, level)
+    left = beside_wander(best, base.model, scene.around.parameters[: base.model.size], scene.tangents)
+    added = _added(best, scene)
+    scene = replace(
+        scene,
+        tangents=replace(scene.tangents, slow=left.slow),
+        values=left.values - left.counts * added,
+        counts=left.counts,
+    )
+    naming = partial(_named, best, scene, left.noise.colour, prefer, level)
+    known = [base, best, *terms, *scene.parts, *common_parts(base.model.prepared, scene.terms)]
     # a copy names it already, while this process asks whether there is anything to be named
-    with meanwhile([naming], [base, best, *terms, *tangents.parts, *common_parts(prepared, terms)]) as answer:
-        linearised = linearise(base.model, parameters, pseudo, counts, tangents)
-        noise = linearised.search.noise_fit(linearised.series)
-        found = linearised.search.gains(linearised.series.unsqueeze(-1))
-        possible = possible_of(terms, linearised)
-        p_value, beyond = judged(linearised, noise, found, possible[:tried], surrogates, generator)
-        beside_nothing = linearised
+    with meanwhile([naming], known) as answer:
+        look = seen = scene.under()
+        p_value, beyond = _judged(look, tried, surrogates, generator)
+        noise, beside_nothing = look.noise, look.linearised
         if p_value <= level and beyond < _DOUBTED:
-            for colour in linearised.plausible():
-                other = linearise(base.model, parameters, pseudo, counts, tangents, colour=colour)
-                p_other, beyond_other = _judged(other, terms, tried, surrogates, generator)
+            for colour in look.linearised.plausible():
+                p_other, beyond_other = _judged(scene.under(colour), tried, surrogates, generator)
                 p_value, beyond = max(p_value, p_other), min(beyond, beyond_other)
         stretch = None
         if p_value <= level:
-            own = int(torch.where(possible, found.log_p[:, 0], 0.0).argmin())
-            trace = counts * (tangents.candidates[own] @ linearised.search.estimate(own, linearised.series)[0])
-            stretch = telling_stretch(pseudo, counts, trace, tangents.nuisance)
+            own = int(torch.where(look.possible, look.gains.log_p[:, 0], 0.0).argmin())
+            trace = scene.counts * (scene.tangents.candidates[own] @ look.estimate(own))
+            stretch = telling_stretch(scene.values, scene.counts, trace, scene.tangents.nuisance)
         if stretch is not None:
-            rest = _without(counts, stretch)
-            beside = linearise(base.model, parameters, rest * pseudo, rest, tangents)
-            others = _judged(beside, terms, tried, surrogates, generator)
-            p_value, beyond = max(p_value, others[0]), min(beyond, others[1])
-            beside_nothing = beside
-        ranking = ranked(terms, found, prefer, possible)
+            rest = scene.without(stretch).under()
+            p_other, beyond_other = _judged(rest, tried, surrogates, generator)
+            p_value, beyond = max(p_value, p_other), min(beyond, beyond_other)
+            beside_nothing = rest.linearised
+        ranking = ranked(look, prefer)
         if p_value <= level:
             [named] = answer()
-            best, ranking, linearised = named.fit, named.ranking, named.linearised
-            terms, tangents = named.terms, named.tangents
+            best, ranking, seen = named.fit, named.ranking, named.look
             # it was another candidate that no draw came up to, if this one by itself is nothing out of the ordinary
-            p_value = max(p_value, named.own_p)
+            p_value = max(p_value, seen.own_p(best.model.terms[-1]))
     if p_value <= level:
-        best, ranking = by_joint_fits(best, base, ranking, terms, linearised, tangents, prefer, fits)
+        best, ranking = by_joint_fits(best, ranking, seen, prefer, fits)
         best = _settled(refined(best, base, again=True), base)
-        best = coloured(best, base, around, tangents, counts, linearised)
+        best = coloured(best, seen)
         best = shape_fitted(best)
     return Located(
         best.model.terms[-1],
@@ -163,14 +148,35 @@ def locate(
         beyond,
         ranking,
         noise,
-        pseudo,
-        counts,
-        linearised,
-        tangents,
-        terms,
+        seen,
         beside_nothing,
         stretch if p_value > level else None,
     )
+
+
+def _scene(
+    base: FittedModel, fits: Sequence[FittedModel], terms: tuple[Term, ...], tangents: Tangents
+) -> tuple[FittedModel, Scene]:
+    """The first fit that can be looked at, and the candidates where they are linear, its own shape included."""
+    if _shows(base, fits[0]):
+        best = around = fits[0]
+        around, own = base, best.model.terms[-1]
+        if own not in terms:
+            more = candidate_tangents(base.model, base.parameters, [own], tangents.pointwise)
+            terms, tangents = (*terms, own), replace(tangents, candidates=(*tangents.candidates, *more))
+    else:
+        best, terms, tangents = _with_tangents(fits, terms)
+        around = best
+    tangents = replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
+    return best, Scene(base, around, terms, tangents, around.residual, torch.ones_like(around.residual))
+
+
+def _added(best: FittedModel, scene: Scene) -> Float[Tensor, "N m"]:
+    """What the effect of a fit adds to the residual."""
+    if scene.around is scene.base:
+        return best.residual - scene.base.residual
+    number, gamma = scene.terms.index(best.model.terms[-1]), best.parameters[scene.base.model.size :]
+    return torch.einsum("nmq,q->nm", scene.tangents.candidates[number], gamma)
 
 
 def _shows(base: FittedModel, fit: FittedModel) -> bool:
@@ -186,82 +192,38 @@ def _shows(base: FittedModel, fit: FittedModel) -> bool:
     return float(rejected.double().mean()) < _HIDDEN and bool((fit.d > _SMALLER * base.d).all())
 
 
-def _with_own(tangents: Tangents, base: FittedModel, own: Term) -> Tangents:
-    """The same with those of one candidate more."""
-    more = candidate_tangents(base.model, base.parameters, [own], tangents.pointwise)
-    return replace(tangents, candidates=(*tangents.candidates, *more))
+def _judged(look: Look, tried: int, surrogates: int, generator: torch.Generator) -> tuple[float, float]:
+    """As :func:`judged` says, of the strongest of the first candidates."""
+    return judged(look.linearised, look.noise, look.gains, look.possible[:tried], surrogates, generator)
 
 
-def _without(counts: Float[Tensor, "N m"], stretch: tuple[int, int]) -> Float[Tensor, "N m"]:
-    """With nothing that counts in a stretch."""
-    rest = counts.clone()
-    rest[slice(*stretch)] = 0.0
-    return rest
-
-
-def _judged(
-    linearised: Linearised, terms: tuple[Term, ...], tried: int, surrogates: int, generator: torch.Generator
-) -> tuple[float, float]:
-    """As :func:`judged` says, of the strongest of the first candidates in a search."""
-    noise = linearised.search.noise_fit(linearised.series)
-    found = linearised.search.gains(linearised.series.unsqueeze(-1))
-    possible = possible_of(terms, linearised)[:tried]
-    return judged(linearised, noise, found, possible, surrogates, generator)
-
-
-@dataclass(frozen=True)
-class _Named:
-    """What an effect is, if there is one: the fit with it, and the search that told it from others.
-
-    ``own_p`` is the p-value of its candidate, as if it were the only one.
-    """
+class _Named(NamedTuple):
+    """What an effect is, if there is one: the fit with it, and the look that told it from others."""
 
     fit: FittedModel
     ranking: tuple[Ranked, ...]
-    linearised: Linearised
-    tangents: Tangents
-    terms: tuple[Term, ...]
-    own_p: float
+    look: Look
 
 
-def _named(
-    best: FittedModel,
-    base: FittedModel,
-    around: FittedModel,
-    terms: tuple[Term, ...],
-    tangents: Tangents,
-    pseudo: Float[Tensor, "N m"],
-    counts: Float[Tensor, "N m"],
-    colour: Colour,
-    prefer: Preference,
-    level: float,
-) -> _Named:
+def _named(best: FittedModel, scene: Scene, colour: Colour, prefer: Preference, level: float) -> _Named:
     """Whether there is an effect is asked of the noise that has it in; which one it is, of the noise beside it."""
-    linearised = linearise(base.model, around.parameters[: base.model.size], pseudo, counts, tangents, colour=colour)
-    found = linearised.search.gains(linearised.series.unsqueeze(-1))
-    close = ranked(terms, found, prefer, possible_of(terms, linearised))
-    near = [terms[one.number] for one in close if one.gap < 2.0 * SEPARABLE]
-    more = closer(near, around.model, around.parameters, tangents, counts, linearised)
-    terms = (*terms, *more)
-    beside = candidate_tangents(around.model, around.parameters, more, tangents.pointwise)
-    tangents = replace(tangents, candidates=(*tangents.candidates, *beside))
-    linearised = linearised.with_more(beside, counts)
-    found = linearised.search.gains(linearised.series.unsqueeze(-1))
-    ranking = ranked(terms, found, prefer, possible_of(terms, linearised))
+    look, base = scene.under(colour), scene.base
+    near = [scene.terms[one.number] for one in ranked(look, prefer) if one.gap < 2.0 * SEPARABLE]
+    look = look.with_more(closer(near, look))
+    terms, ranking = look.scene.terms, ranked(look, prefer)
     first, own = terms[ranking[0].number], best.model.terms[-1]
-    bends = any(tangents.pointwise[term.port] is None for term in (first, own))
-    if first.key != own.key or own_p(found, terms, best) > level:
-        other = refitted(best, base, first, linearised, ranking[0].number)
+    bends = any(scene.bends(term) for term in (first, own))
+    if first.key != own.key or look.own_p(own) > level:
+        other = refitted(best, first, look, ranking[0].number)
         # the search is linear: where the joint fit loses much of the gain, it went too far; but where noise may wander,
         # what follows the wander gains most in joint fits, and the search knows better if it tells the two apart
         behind = [one.gap for one in ranking if terms[one.number].key == own.key]
-        clear = tangents.slow is not None and not (behind and behind[0] < SEPARABLE)
+        clear = scene.tangents.slow is not None and not (behind and behind[0] < SEPARABLE)
         least = 0.0 if clear else KEPT * max(prefer.score(best, base), 0.0)
         gain = other.log_likelihood - base.log_likelihood if clear else prefer.score(other, base)
-        kept = gain > least or (bends and prefer.by_innovations(best, other) > 0.0)
-        if kept:
+        if gain > least or (bends and prefer.by_innovations(best, other) > 0.0):
             best = other
-    return _Named(best, ranking, linearised, tangents, terms, own_p(found, terms, best))
+    return _Named(best, ranking, look)
 
 
 def _with_tangents(

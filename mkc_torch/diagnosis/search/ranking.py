@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
-from mkc_torch.diagnosis.linearised.linear_search import Gains
-from mkc_torch.diagnosis.linearised.linearise import Linearised
-from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.term import Key, Term, continuous, one_sided
+from mkc_torch.diagnosis.model.term import Key, continuous
+from mkc_torch.diagnosis.search.look import Look
 from mkc_torch.diagnosis.search.preference import Preference
 
-if TYPE_CHECKING:
-    from jaxtyping import Bool
-
-__all__ = ["SEPARABLE", "Ranked", "own_p", "possible_of", "ranked"]
+__all__ = ["SEPARABLE", "Ranked", "ranked"]
 
 SEPARABLE = 4.5
 """Nats by which a rival must be less likely to count as told apart: three standard errors of what sets them apart."""
@@ -32,31 +25,16 @@ class Ranked:
     gap: float
 
 
-def ranked(
-    terms: tuple[Term, ...], found: Gains, prefer: Preference, possible: Bool[Tensor, " C"]
-) -> tuple[Ranked, ...]:
+def ranked(look: Look, prefer: Preference) -> tuple[Ranked, ...]:
     """By gain in nats less one for each parameter and each number of the shape (Akaike's criterion), each physics at
     its best possible shape."""
+    terms, found = look.scene.terms, look.gains
     gain = 0.5 * found.ratio[:, 0]
     numbers = gain.new_tensor([float(len(continuous(term))) for term in terms])
     handicap = [prefer.handicap(term, float(one)) for term, one in zip(terms, gain, strict=True)]
     score = gain - found.dof - numbers - gain.new_tensor(handicap)
-    score = torch.where((found.dof > 0) & possible, score, -torch.inf)
+    score = torch.where((found.dof > 0) & look.possible, score, -torch.inf)
     best: dict[Key, int] = {}
     for number in score.argsort(descending=True).tolist():
         best.setdefault(terms[number].key, number)
     return tuple(Ranked(number, float(gain[number]), float(score.max() - score[number])) for number in best.values())
-
-
-def possible_of(terms: tuple[Term, ...], linearised: Linearised) -> Bool[Tensor, " C"]:
-    """Whether the amplitudes that fit have a sign that the physics allows."""
-    possible = torch.ones(len(terms), dtype=torch.bool)
-    for number, term in enumerate(terms):
-        if one_sided(term.effect):
-            possible[number] = bool((linearised.search.estimate(number, linearised.series)[0] < 0).any())
-    return possible
-
-
-def own_p(found: Gains, terms: tuple[Term, ...], fit: FittedModel) -> float:
-    """The p-value of a fit's candidate, as if it were the only one."""
-    return float(found.log_p[terms.index(fit.model.terms[-1]), 0].exp())

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
-from mkc_torch.diagnosis.linearised.linearise import Linearised
-from mkc_torch.diagnosis.linearised.tangents import Tangents
 from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.search.closing_in import refined
+from mkc_torch.diagnosis.search.look import Look
 from mkc_torch.diagnosis.search.preference import Preference, schwarz
 from mkc_torch.diagnosis.search.ranking import SEPARABLE, Ranked
 from mkc_torch.diagnosis.search.strongest import refitted
@@ -24,11 +23,8 @@ KEPT = 0.8
 
 def by_joint_fits(
     best: FittedModel,
-    base: FittedModel,
     ranking: tuple[Ranked, ...],
-    terms: tuple[Term, ...],
-    linearised: Linearised,
-    tangents: Tangents,
+    look: Look,
     prefer: Preference,
     known: Sequence[FittedModel],
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
@@ -38,17 +34,17 @@ def by_joint_fits(
     made, and yet not make one like it. So those that the search has as near as the effect are fitted, unless a
     ``known`` fit keeps the gain.
     """
-    own = best.model.terms[-1].key
+    base, terms, own = look.scene.base, look.scene.terms, best.model.terms[-1].key
     reach = SEPARABLE + max([one.gap for one in ranking if terms[one.number].key == own], default=0.0)
     near = [
         one
         for one in ranking
-        if one.gap < reach and terms[one.number].key != own and tangents.pointwise[terms[one.number].port] is None
+        if one.gap < reach and terms[one.number].key != own and look.scene.bends(terms[one.number])
     ]
     won = prefer.score(best, base)
     fitted = {fit.model.terms[-1].key: fit for fit in reversed(known) if prefer.score(fit, base) >= KEPT * won}
     new = [one for one in near if terms[one.number].key not in fitted]
-    works = [partial(_tried, best, base, terms[one.number], linearised, one.number) for one in new]
+    works = [partial(_tried, best, terms[one.number], look, one.number) for one in new]
     for fit in at_once(works, base.model.prepared, [terms[one.number] for one in new]):
         fitted[fit.model.terms[-1].key] = fit
     fits = [fitted[terms[one.number].key] for one in near]
@@ -65,7 +61,7 @@ def by_joint_fits(
     ]
     if simpler:
         return max(simpler, key=lambda one: one[0])[1], tuple(told)
-    bent = [fit for fit in known if tangents.pointwise[fit.model.terms[-1].port] is None]
+    bent = [fit for fit in known if look.scene.bends(fit.model.terms[-1])]
     return _by_innovations(best, tuple(told), terms, prefer, [*fits, *bent])
 
 
@@ -100,8 +96,8 @@ def _by_innovations(
     return best, tuple(sorted(told, key=_gap))
 
 
-def _tried(best: FittedModel, base: FittedModel, term: Term, linearised: Linearised, number: int) -> FittedModel:
-    return refined(refitted(best, base, term, linearised, number), base)
+def _tried(best: FittedModel, term: Term, look: Look, number: int) -> FittedModel:
+    return refined(refitted(best, term, look, number), look.scene.base)
 
 
 def _gap(one: Ranked) -> float:

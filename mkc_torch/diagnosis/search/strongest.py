@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
-from mkc_torch.diagnosis.linearised.linearise import Linearised, linearise
+from mkc_torch.diagnosis.linearised.linearise import linearise
 from mkc_torch.diagnosis.linearised.tangents import Tangents, tangents_of
 from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, clipped_residual, fitted_beside
 from mkc_torch.diagnosis.model.term import Key, Term, one_sided
 from mkc_torch.diagnosis.search.closing_in import refined
+from mkc_torch.diagnosis.search.look import Look
 from mkc_torch.diagnosis.search.preference import Preference
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.protocol import Beginning
@@ -202,8 +203,9 @@ def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
     return fitted_beside(base, model, torch.cat([kept, more]), graduate=False)
 
 
-def refitted(best: FittedModel, base: FittedModel, term: Term, linearised: Linearised, number: int) -> FittedModel:
-    gamma, _ = linearised.search.estimate(number, linearised.series)
+def refitted(best: FittedModel, term: Term, look: Look, number: int) -> FittedModel:
+    """The joint fit of a candidate in the place of another one's, from the size that the search has for it."""
+    base, gamma = look.scene.base, look.estimate(number)
     gamma = gamma.clamp(max=0.0) if one_sided(term.effect) else gamma
     beside = best.model.with_last(term) if len(best.model.terms) > len(base.model.terms) else best.model.with_term(term)
     found = fitted_beside(base, beside, torch.cat([best.parameters[: base.model.size], -gamma]))

@@ -10,11 +10,11 @@ import pytest
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.evidence.onset import _CRITICAL, onset_interval
 from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
-from mkc_torch.diagnosis.linearised.linearise import linearise
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import fitted, fitted_beside
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.search.look import Scene
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import RATE, tumbling
@@ -41,10 +41,8 @@ def interval(size, seed, *, spoilt=(0, 0), effect=STEP, shape=None):
     tangents = dataclasses.replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
     pseudo, counts = best.pseudo
     without = pseudo - counts * (tangents.candidates[0] @ best.parameters[base.model.size :])
-    search = linearise(base.model, best.parameters[: base.model.size], without, counts, tangents)
-    return onset_interval(
-        base.model, SimpleNamespace(fit=best, tangents=tangents, counts=counts, linearised=search)
-    )  # fmt: skip
+    scene = Scene(base, best, best.model.terms, tangents, without, counts)
+    return onset_interval(base.model, SimpleNamespace(fit=best, scene=scene, look=scene.under()))
 
 
 def test_the_interval_holds_the_onset_about_as_often_as_it_says():

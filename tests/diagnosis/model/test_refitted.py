@@ -23,15 +23,15 @@ def base():
     return fitted(JointModel(prepared), prepared.start())
 
 
-def searched(*gamma):
-    """A search that estimates these amplitudes."""
+def looked(base, *gamma):
+    """A look that estimates these amplitudes."""
     estimate = torch.tensor(gamma, dtype=torch.float64)
-    return SimpleNamespace(search=SimpleNamespace(estimate=lambda *_: (estimate, None)), series=None)
+    return SimpleNamespace(scene=SimpleNamespace(base=base), estimate=lambda _: estimate)
 
 
 @pytest.mark.parametrize("astray", [0.0, -0.3, 30.0, -1e4])
 def test_a_fit_that_goes_astray_begins_again_from_nothing(base, astray):
     term = Term(EFFECT, None, {"terms": 2.0})
-    found = refitted(base, base, term, searched(*[astray] * 6), 0)
+    found = refitted(base, term, looked(base, *[astray] * 6), 0)
     assert found.log_likelihood >= base.log_likelihood - 1e-6
     assert found.converged

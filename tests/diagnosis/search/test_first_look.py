@@ -46,7 +46,7 @@ def located(*effects, seed=0):
 
 def p_value(found, others=lambda term: term.columns != ("current",)):
     generator = torch.Generator().manual_seed(0)
-    return p_value_beside(found, [others(term) for term in found.terms], 99, generator)
+    return p_value_beside(found, [others(term) for term in found.scene.terms], 99, generator)
 
 
 def test_another_effect_is_seen():
@@ -61,7 +61,7 @@ def test_beside_the_only_effect_p_values_are_those_of_chance():
 
 def test_the_effect_itself_is_taken_out_of_everything():
     found = located(ALONG_CURRENT)
-    beside = found.linearised.search.gains(found.linearised.series.unsqueeze(-1)).ratio
+    beside = found.look.gains.ratio
     assert float(beside.max()) > 1000.0
     assert p_value(found, lambda _: True) > 0.02
 
@@ -72,8 +72,9 @@ def test_where_no_other_candidate_is_left_there_is_nothing():
 
 def test_trajectories_are_for_the_search_itself():
     found = located(ALONG_CURRENT)
-    tangents = dataclasses.replace(found.tangents, pointwise=dict.fromkeys(found.tangents.pointwise))
-    assert p_value(dataclasses.replace(found, tangents=tangents)) == 0.0
+    tangents = dataclasses.replace(found.scene.tangents, pointwise=dict.fromkeys(found.scene.tangents.pointwise))
+    look = dataclasses.replace(found.look, scene=dataclasses.replace(found.scene, tangents=tangents))
+    assert p_value(dataclasses.replace(found, look=look)) == 0.0
 
 
 @pytest.mark.parametrize(("effects", "searches", "names"), [

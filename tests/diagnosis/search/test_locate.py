@@ -40,7 +40,7 @@ def found():
 
 def test_the_first_of_the_ranking_has_a_shape_between_those_tried(found):
     prepared, terms, located = found
-    first = located.terms[located.ranking[0].number]
+    first = located.scene.terms[located.ranking[0].number]
     assert first.effect.id == located.term.effect.id == "hard_iron_step"
     assert first not in terms
     spacing = float(terms[1].shape["onset"] - terms[0].shape["onset"])
@@ -49,8 +49,8 @@ def test_the_first_of_the_ranking_has_a_shape_between_those_tried(found):
 
 def test_its_gain_is_no_less_than_that_of_any_shape_tried(found):
     _, _, located = found
-    gains = located.linearised.search.gains(located.linearised.series.unsqueeze(-1)).ratio[:, 0]
-    steps = [k for k, term in enumerate(located.terms) if term.effect.id == "hard_iron_step"]
+    gains = located.look.gains.ratio[:, 0]
+    steps = [k for k, term in enumerate(located.scene.terms) if term.effect.id == "hard_iron_step"]
     assert float(gains[located.ranking[0].number]) == pytest.approx(float(gains[steps].max()))
 
 

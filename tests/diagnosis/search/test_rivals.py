@@ -47,15 +47,15 @@ def judged(monkeypatch):
     def run(ranking, fits, size=2, known=(), **new):
         asked = []
 
-        def tried(_best, _base, one, _linearised, _number):
+        def tried(_best, one, _look, _number):
             asked.append(one.key)
             return fits[one.key]
 
         monkeypatch.setattr(rivals, "_tried", tried)
         monkeypatch.setattr(rivals, "at_once", lambda works, *_: [work() for work in works])
         best = fit_of(FRICTION, 100.0, size)
-        tangents = SimpleNamespace(pointwise={BENT: None, POINTWISE: torch.ones(1)})
-        found, told = by_joint_fits(best, fit_of(None, 0.0), ranking, TERMS, None, tangents, Indifferent(**new), known)
+        scene = SimpleNamespace(base=fit_of(None, 0.0), terms=TERMS, bends=lambda term: term.port == BENT)
+        found, told = by_joint_fits(best, ranking, SimpleNamespace(scene=scene), Indifferent(**new), known)
         return found.model.terms[-1].key, {TERMS[one.number].key: one.gap for one in told}, asked
 
     return run
