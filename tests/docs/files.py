@@ -49,7 +49,7 @@ def supplied() -> dict[str, Tensor]:
     return columns | {"mag_x": columns["mag_x"] + 0.9 * voltage, "voltage": voltage}
 
 
-def pendulum(number: int, samples: int = 200, rate: float = 20.0) -> dict[str, Tensor]:
+def pendulum(number: int, samples: int = 150, rate: float = 20.0) -> dict[str, Tensor]:
     """A driven pendulum with air drag, by twenty steps a sample; its angle has a noise of 5 mrad."""
     noise = torch.randn(samples, generator=torch.Generator().manual_seed(number), dtype=torch.float64)
     time = torch.arange(samples, dtype=torch.float64) / rate

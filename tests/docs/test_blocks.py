@@ -19,6 +19,12 @@ pytestmark = [
 
 WITH_BLOCKS = [page for page in PAGES if any(block.language in RUN for block in blocks(page))]
 
+FOUND = {
+    "diagnose": {"result": "current_field"},
+    "own_simulation": {"result": "quadratic_drag", "paired": "gain", "supplied": "supply_offset"},
+}
+"""What the diagnoses of a page find first in the tables that were made for it, by the name that the page gives them."""
+
 
 @pytest.fixture(scope="module")
 def examples(tmp_path_factory):
@@ -61,6 +67,8 @@ def test_every_block_of_a_page_runs(page, folder):
             run_python(block, names, folder)
         elif block.language == "sh":
             run_shell(block, folder)
+    found = {name: names[name].findings[0].effect for name in FOUND.get(page.stem, {})}
+    assert found == FOUND.get(page.stem, {})
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
