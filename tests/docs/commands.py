@@ -1,0 +1,161 @@
+"""Runs the commands that the README and the manual show; slow ones by a small variant that stands here."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import shlex
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from mkc_torch._commands import app
+from tests.docs.pages import ROOT
+
+MKC = typer.main.get_command(app).commands
+
+SMALL = {
+    "mkc challenge --output proof": "--cases 1 --empty 1 --duration 10 --workers 1",
+    "mkc challenge --family dynamics --output proof_of_dynamics": "--cases 0 --empty 1 --workers 1",
+    "mkc challenge --seed 9421 --workers 2 --output proof": "--seed 1 --cases 0 --empty 1 --duration 10 --workers 1",
+    "mkc challenge --family dynamics --seed 5521 --workers 2 --output proof_of_dynamics": (
+        "--seed 1 --cases 0 --empty 1 --workers 1"
+    ),
+}
+"""Commands that take minutes and more: what is added to them here."""
+
+EXAMPLES = {
+    "examples/paper/density.py": "",
+    "examples/calibration/passing_magnet.py": "RECORDING.csv --output picture.png",
+    "examples/calibration/least_squares_beside.py": "RECORDING.csv ANOTHER.csv",
+    # minutes each, on recordings that are not part of the project
+    "examples/concealed_physics/dynamics/heaters.py": "--help",
+    "examples/concealed_physics/dynamics/silverbox.py": "--help",
+    "examples/concealed_physics/dynamics/servo.py": "--help",
+}
+"""Scripts that are run here, with these arguments instead of those shown."""
+
+TESTED = {
+    "examples/paper/example_2.py": "test_example_2.py",
+    "examples/paper/table_1.py": "test_mkc_examples.py",
+    "examples/paper/table_2.py": "test_mkc_examples.py",
+    "examples/paper/all.py": "test_mkc_examples.py",
+    "examples/paper/error_bound.py": "test_mkc_examples.py",
+    "examples/paper/comparison.py": "test_mkc_examples.py",
+    "examples/paper/lel_table_5.py": "test_lel_examples.py",
+    "examples/paper/lel_tables_1_to_4.py": "test_lel_examples.py",
+    "examples/paper/lel_figures.py": "test_lel_examples.py",
+    "examples/paper/lel_range_image.py": "test_lel_examples.py",
+    "examples/lightning/heavy_tailed_channel.py": "test_lightning_examples.py",
+    "examples/lightning/corrupted_tabular.py": "test_lightning_examples.py",
+    "examples/lightning/bursty_series.py": "test_lightning_examples.py",
+    "examples/lightning/speed.py": "test_lightning_examples.py",
+    "examples/lightning/noisy_labels.py": "test_noisy_labels.py",
+    "examples/concealed_physics/magnetometer/real_recordings.py": "test_real_recordings.py",
+    "examples/concealed_physics/dynamics/falling_balls.py": "test_concealed_dynamics.py",
+    "examples/concealed_physics/dynamics/baselines.py": "test_dynamics_baselines.py",
+}
+"""Scripts that tests/examples runs at a small size: here only their options are looked at."""
+
+
+def commands(line: str) -> list[list[str]]:
+    """The commands of a line, each in words; a comment is none.
+
+    Example:
+        >>> commands("cp a b && mkc demo  # all of it")
+        [['cp', 'a', 'b'], ['mkc', 'demo']]
+    """
+    parts: list[list[str]] = [[]]
+    for word in shlex.split(line, comments=True):
+        if word == "&&":
+            parts.append([])
+        else:
+            parts[-1].append(word)
+    return [part for part in parts if part]
+
+
+def run(words: list[str], folder: Path) -> None:
+    """Run a command in the folder, or its small variant.
+
+    Raises:
+        AssertionError: it fails, or it is of no kind that is known here.
+    """
+    match [words[0].removeprefix(".venv/bin/"), *words[1:]]:
+        case ["python3", "-m", "venv", ".venv"]:
+            pass  # .ci/run makes one
+        case ["pip", "install", *arguments]:
+            check_install(arguments)
+        case ["python", "-m", "pytest", "-q", "-n", "auto"]:
+            pass  # .ci/run runs them
+        case ["mkc", *arguments]:
+            run_mkc(arguments)
+        case ["python", script, *arguments] if script.startswith("examples/"):
+            run_example(script, arguments, folder)
+        case ["cp", source, target]:
+            shutil.copy(folder / source, folder / target)
+        case _:
+            raise AssertionError(f"no test knows how to run `{shlex.join(words)}`")
+
+
+def run_mkc(arguments: list[str]) -> None:
+    """In this process, as `mkc` itself does."""
+    small = SMALL.get(shlex.join(["mkc", *arguments]), "").split()
+    result = CliRunner().invoke(app, [*arguments, *small])
+    assert result.exit_code == 0, f"mkc {shlex.join(arguments)}:\n{result.output}\n{result.exception!r}"
+    if arguments[0] == "challenge":  # a recording that could not be diagnosed only counts against the proof
+        assert re.search(r"^failed +none", result.output, re.MULTILINE), result.output
+
+
+def run_example(script: str, arguments: list[str], folder: Path) -> None:
+    """The script with few draws, or a look at its options where another test runs it."""
+    unknown = [word for word in arguments if word.startswith("--") and word not in example_options(script)]
+    assert not unknown, f"{script} has no {', '.join(unknown)}"
+    if script in TESTED:
+        test = ROOT / "tests" / "examples" / TESTED[script]
+        named = rf'"{Path(script).stem}(\.py)?"'
+        assert re.search(named, test.read_text(encoding="utf-8")), f"{test.name} does not run {script}"
+        return
+    assert script in EXAMPLES, f"no test runs {script}; name it in EXAMPLES or in TESTED"
+    before, code = set(sys.modules), None
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(sys, "path", [str((ROOT / script).parent), *sys.path])
+        patch.setattr(sys, "argv", [script, *EXAMPLES[script].split()])
+        try:
+            runpy.run_path(str(ROOT / script), run_name="__main__")
+        except SystemExit as end:
+            code = end.code
+        finally:  # two scripts may have a module of one name beside them
+            for name in set(sys.modules) - before:
+                if Path(getattr(sys.modules[name], "__file__", None) or "").parent == (ROOT / script).parent:
+                    del sys.modules[name]
+    assert not code, f"{script} ended with {code}"
+
+
+def example_options(script: str) -> set[str]:
+    """The options of a script, its own and those of what it imports from beside it."""
+    own = (ROOT / script).read_text(encoding="utf-8")
+    beside = [(ROOT / script).with_name(f"{name}.py") for name in re.findall(r"^from (\w+) import", own, re.MULTILINE)]
+    texts = [own, *(path.read_text(encoding="utf-8") for path in beside if path.exists())]
+    return {option for text in texts for option in re.findall(r"add_argument\(\s*\"(--[\w-]+)\"", text)}
+
+
+def mkc_options(command: str) -> set[str]:
+    """The options of a command of mkc."""
+    return {option for parameter in MKC[command].params for option in parameter.opts if option.startswith("--")}
+
+
+def check_install(arguments: list[str]) -> None:
+    """That pip is asked for this package, by extras that it has, or for a release of torch that it takes."""
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    section = text.partition("[project.optional-dependencies]")[2].partition("\n[")[0]
+    extras = set(re.findall(r"^(\w+) = \[", section, re.MULTILINE))
+    for word in arguments:
+        if found := re.fullmatch(r"\.\[([\w,]+)\]", word):
+            assert set(found[1].split(",")) <= extras, f"{word}: the extras are {', '.join(sorted(extras))}"
+        else:
+            assert word in ("-q", "-e") or re.fullmatch(r"torch==\d+\.\d+\.\d+", word), f"pip install {word}"

@@ -1,0 +1,80 @@
+"""The tables that the README and the manual name, small and with something to find in them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+# the only place of these tests that knows where the simulated sensors live
+from mkc_torch.demo import concealed_recording, simulated_recording
+from mkc_torch.recording import write_table
+
+DRAG = 0.35  # 1/rad, of a pendulum that is told to have none
+
+
+def write_examples(folder: Path) -> None:
+    """All of them, under the names that the pages use."""
+    recording, another = (simulated_recording(seed)[0].columns for seed in (0, 1))
+    renamed = {{"mag_x": "mx", "mag_y": "my", "mag_z": "mz"}.get(name, name): v for name, v in recording.items()}
+    simulated, recorded = paired(0)
+    new_simulated, new_recorded = paired(1)
+    for name, columns in {
+        "RECORDING": recording,
+        "ANOTHER": another,
+        "RENAMED": renamed,
+        "broad_28_stationary_magnet": recording,
+        "FLIGHT": concealed_recording(0).columns,
+        "BENCH": concealed_recording(2).columns,
+        "NEW": concealed_recording(1).columns,
+        "SUPPLY": supplied(),
+        "RUNS": joined(pendulum(0), pendulum(1)),
+        "NEW_RUN": pendulum(2),
+        "SIM": simulated,
+        "REC": recorded,
+        "NEW_SIM": new_simulated,
+        "NEW_REC": new_recorded,
+    }.items():
+        write_table(folder / f"{name}.csv", columns)
+
+
+def supplied() -> dict[str, Tensor]:
+    """A sensor whose offset follows a voltage."""
+    columns = dict(concealed_recording(3).columns)
+    voltage = 12.0 + torch.sin(0.23 * columns["time"]) + 0.5 * torch.sin(1.1 * columns["time"])
+    del columns["current"]
+    return columns | {"mag_x": columns["mag_x"] + 0.9 * voltage, "voltage": voltage}
+
+
+def pendulum(number: int, samples: int = 150, rate: float = 20.0) -> dict[str, Tensor]:
+    """A driven pendulum with air drag, by twenty steps a sample; its angle has a noise of 5 mrad."""
+    noise = torch.randn(samples, generator=torch.Generator().manual_seed(number), dtype=torch.float64)
+    time = torch.arange(samples, dtype=torch.float64) / rate
+    torque = 1.2 * torch.sin(0.9 * time + number) + torch.sin(2.7 * time + 2 * number)
+    angle, speed, angles, step = 0.3 + 0.5 * number, 0.0, [], 1.0 / (20.0 * rate)
+    for k in range(samples):
+        angles.append(angle)
+        for part in range(20):
+            u = float(torch.lerp(torque[k], torque[min(k + 1, samples - 1)], part / 20.0))
+            speed += step * (u - 9.0 * math.sin(angle) - 0.1 * speed - DRAG * speed * abs(speed))
+            angle += step * speed
+    return {"time": time, "torque": torque, "angle": torch.tensor(angles, dtype=torch.float64) + 0.005 * noise}
+
+
+def joined(*runs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Runs in one table, told apart by ``experiment``."""
+    number = torch.cat([torch.full_like(run["time"], k) for k, run in enumerate(runs)])
+    return {name: torch.cat([run[name] for run in runs]) for name in runs[0]} | {"experiment": number}
+
+
+def paired(number: int, samples: int = 300) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """What a simulator wrote, and what was recorded: eight per cent more, and a little with temperature."""
+    noise = torch.randn(samples, generator=torch.Generator().manual_seed(number), dtype=torch.float64)
+    time = torch.arange(samples, dtype=torch.float64) / 20.0
+    temperature = 20.0 + 5.0 * torch.sin(0.3 * time + number) + 0.2 * time
+    angle = torch.sin(1.3 * time + number) + 0.3 * torch.sin(3.1 * time)
+    recorded = 1.08 * angle + 0.004 * (temperature - 20.0) + 0.01 * noise
+    return {"time": time, "angle": angle}, {"time": time, "angle": recorded, "temperature": temperature}

@@ -1,0 +1,64 @@
+"""The README and the manual, cut into their fenced blocks and what is written inline."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+README = ROOT / "README.md"
+PAGES = (README, *sorted((ROOT / "docs").glob("*.md")))
+
+RUN, SHOWN = frozenset({"python", "sh"}), frozenset({"text", "json"})
+"""Languages of blocks that the tests run, and of those that show what something prints."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block; ``line`` is that of its first line in the page, from 1."""
+
+    page: Path
+    line: int
+    language: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.page.name}, line {self.line}"
+
+
+def blocks(page: Path) -> Iterator[Block]:
+    """The fenced blocks of a page, in order."""
+    language, lines, start = None, [], 0
+    for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), start=1):
+        if not line.startswith("```"):
+            lines.append(line)
+        elif language is None:
+            language, lines, start = line.removeprefix("```"), [], number + 1
+        else:
+            yield Block(page, start, language, "\n".join(lines))
+            language = None
+    assert language is None, f"{page.name}: the block at line {start} is never closed"
+
+
+def prose(page: Path) -> str:
+    """The page without its fenced blocks."""
+    return re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+
+
+def inline(page: Path) -> list[str]:
+    """What stands between backticks in the prose, on one line each."""
+    return [" ".join(found.replace(r"\|", "|").split()) for found in re.findall(r"`([^`]+)`", prose(page))]
+
+
+def links(page: Path) -> list[str]:
+    """Targets of links and pictures that lie in the repository."""
+    found = re.findall(r"\]\(([^)\s]+)\)", prose(page))
+    return [target for target in found if "://" not in target]
+
+
+def anchors(page: Path) -> set[str]:
+    """What a link to a heading of the page can end with, as GitHub makes it."""
+    headings = re.findall(r"^#+ (.+)$", prose(page), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}

@@ -1,0 +1,94 @@
+"""Every fenced block of the README and of the manual runs, in the order in which a reader meets it."""
+
+import pytest
+
+pytest.importorskip("lightning")
+pytest.importorskip("typer")
+pytest.importorskip("polars")
+
+from tests.docs.commands import EXAMPLES, SMALL, TESTED, commands, run
+from tests.docs.files import write_examples
+from tests.docs.pages import PAGES, ROOT, RUN, SHOWN, blocks
+
+pytestmark = [
+    # advice such as more workers for the loader
+    pytest.mark.filterwarnings("ignore::lightning.fabric.utilities.warnings.PossibleUserWarning"),
+    pytest.mark.filterwarnings(r"ignore:.*LeafSpec.* is deprecated"),
+    pytest.mark.filterwarnings("ignore:Starting from v1.9.0, `tensorboardX`"),
+]
+
+WITH_BLOCKS = [page for page in PAGES if any(block.language in RUN for block in blocks(page))]
+
+FOUND = {
+    "diagnose": {"result": "current_field"},
+    "own_simulation": {"result": "quadratic_drag", "paired": "gain", "supplied": "supply_offset"},
+}
+"""What the diagnoses of a page find first in the tables that were made for it, by the name that the page gives them."""
+
+
+@pytest.fixture(scope="module")
+def examples(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tables")
+    write_examples(folder)
+    return folder
+
+
+@pytest.fixture
+def folder(examples, tmp_path, monkeypatch):
+    """Where a reader stands: the tables, and nothing else."""
+    for table in examples.iterdir():
+        (tmp_path / table.name).symlink_to(table)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run_python(block, names, folder):
+    first, _, _ = block.text.partition("\n")
+    if first.startswith("# ") and first.endswith(".py"):  # "save this as"
+        (folder / first.removeprefix("# ")).write_text(block.text, encoding="utf-8")
+    # as many lines before it as in the page, so that a traceback says where to look
+    code = compile("\n" * (block.line - 1) + block.text, str(block.page), "exec")
+    exec(code, names)
+
+
+def run_shell(block, folder):
+    for line in block.text.splitlines():
+        assert not line.endswith("\\"), f"{block}: write a command on one line"
+        for words in commands(line):
+            run(words, folder)
+
+
+@pytest.mark.parametrize("page", WITH_BLOCKS, ids=lambda page: page.stem)
+def test_every_block_of_a_page_runs(page, folder):
+    names = {"__name__": page.stem}
+    for block in blocks(page):
+        print(f"{block}:")  # shown where it fails
+        if block.language == "python":
+            run_python(block, names, folder)
+        elif block.language == "sh":
+            run_shell(block, folder)
+    found = {name: names[name].findings[0].effect for name in FOUND.get(page.stem, {})}
+    assert found == FOUND.get(page.stem, {})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_block_says_what_it_is(page):
+    for block in blocks(page):
+        assert block.language in RUN | SHOWN, f"{block}: its language is {block.language!r}"
+        if block.language in SHOWN:
+            assert "import " not in block.text, f"{block} looks like code that should run"
+
+
+def test_small_variants_are_of_commands_that_are_shown():
+    shown = [words for page in PAGES for b in blocks(page) if b.language == "sh" for line in b.text.splitlines()
+             for words in commands(line)]  # fmt: skip
+    assert set(SMALL) <= {" ".join(words) for words in shown}
+    scripts = {words[1] for words in shown if words[0] == "python" and words[1].startswith("examples/")}
+    assert set(EXAMPLES) | set(TESTED) == scripts
+    assert all((ROOT / script).is_file() for script in scripts)
+
+
+def test_an_unknown_command_is_no_silent_success(tmp_path):
+    for line in ("rm -rf results", "python other.py", "mkc nothing", "pip install -e .[none]"):
+        with pytest.raises(AssertionError):
+            run(commands(line)[0], tmp_path)

@@ -1,0 +1,97 @@
+"""What the README and the manual say: lengths, links, and names and options that exist."""
+
+import pydoc
+import re
+import subprocess
+
+import pytest
+
+pytest.importorskip("lightning")
+pytest.importorskip("typer")
+
+from mkc_torch.effects import CATALOGUE
+from tests.docs.commands import MKC, check_install, example_options, mkc_options
+from tests.docs.pages import PAGES, README, ROOT, anchors, blocks, inline, links, prose
+
+MANUAL = {
+    "architecture.md",
+    "calibrate.md",
+    "diagnose.md",
+    "estimators.md",
+    "how_it_decides.md",
+    "loss.md",
+    "measured.md",
+    "own_simulation.md",
+}
+COMMON = {"--version", "--help"}
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+
+
+def test_the_readme_is_short():
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 200
+
+
+def test_the_second_command_of_the_readme_is_the_one_that_tests():
+    """`.ci/run` takes it from there."""
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    program = re.search(r"awk '(.+?)' README.md", script)[1]
+    found = subprocess.run(["awk", program, README], capture_output=True, text=True, check=True).stdout
+    assert found.strip() == [block.text for block in blocks(README) if block.language == "sh"][1]
+    assert found.strip().endswith(".venv/bin/python -m pytest -q -n auto")
+
+
+def test_the_readme_leads_to_every_page():
+    assert {page.name for page in PAGES[1:]} == MANUAL
+    assert {target.removeprefix("docs/") for target in links(README) if target.startswith("docs/")} == MANUAL
+
+
+@each_page
+def test_links_lead_somewhere(page):
+    for target in links(page):
+        path, _, heading = target.partition("#")
+        place = (page.parent / path).resolve() if path else page
+        assert place.exists(), f"{page.name}: {target}"
+        assert not heading or heading in anchors(place), f"{page.name}: {target}"
+
+
+@each_page
+def test_lines_have_a_normal_width(page):
+    """Of a table a row is a line, and a command is to be copied whole."""
+    for line in prose(page).splitlines():
+        assert len(line) <= 120 or line.startswith("|"), f"{page.name}: {line}"
+
+
+@each_page
+def test_names_exist(page):
+    for text in inline(page):
+        for name in re.findall(r"\bmkc_torch(?:\.\w+)+", text):
+            assert pydoc.locate(name) is not None, f"{page.name}: {name}"
+
+
+@each_page
+def test_commands_named_in_a_sentence_exist(page):
+    known = COMMON.union(*(mkc_options(command) for command in MKC))
+    scripts = {word for block in blocks(page) for word in re.findall(r"examples/\S+\.py", block.text)}
+    known = known.union(*(example_options(script) for script in scripts))
+    for text in inline(page):
+        words = text.split()
+        assert words[0] != "python", f"{page.name}: `{text}` belongs into a block, which is run"
+        options = {word for word in words if re.fullmatch(r"--[\w-]+", word)}
+        if words[:2] == ["pip", "install"]:
+            check_install([word.strip('"') for word in words[2:]])
+        elif words[0] == "mkc" and len(words) > 1 and not words[1].startswith("-"):
+            assert words[1] in MKC, f"{page.name}: `{text}`"
+            assert options <= mkc_options(words[1]), f"{page.name}: `{text}`"
+        else:
+            assert options <= known, f"{page.name}: `{text}`"
+
+
+@pytest.mark.parametrize("command", ["calibrate", "diagnose"])
+def test_every_option_is_explained(command):
+    told = " ".join(inline(ROOT / "docs" / f"{command}.md"))
+    assert {option for option in mkc_options(command) if option not in told} == set()
+
+
+def test_every_effect_of_the_catalogue_is_explained():
+    told = {*inline(ROOT / "docs" / "diagnose.md"), *inline(ROOT / "docs" / "own_simulation.md")}
+    assert {effect.id for effect in CATALOGUE} <= told
