@@ -26,7 +26,7 @@ from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.linear import LeastSquares
 from mkc_torch.recording.demonstration import FIELD_PER_AMPERE, Truth, concealed_recording, simulated_recording
 from mkc_torch.recording.recording import Recording, write_table
-from mkc_torch.report.diagnosis.findings import measured
+from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.words.numbers import number
 from mkc_torch.simulation import Magnetometer
 

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.report.diagnosis import findings as say
+from mkc_torch.report.diagnosis import noise, numbers
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.words.typesetting import plain, typeset
 
@@ -39,27 +40,27 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path]) -> None:
 
 def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Iterator[tuple[str, str]]:
     f = finding
-    lines = [line for p in f.parameters for line in say.named_lines(p, f.channels)]
+    lines = [line for p in f.parameters for line in numbers.named_lines(p, f.channels)]
     if len(lines) > _MOST_LINES:
-        lines = [say.largest(p) for p in f.parameters[:_MOST_LINES]]
+        lines = [numbers.largest(p) for p in f.parameters[:_MOST_LINES]]
         lines.append("and more, see the report")
     if lines:
         yield "size", "\n".join(lines)
     acts = f"; {say.acts_on(f)}" if f.channels else ""
-    yield "where", say.where(f, say.clock_of(diagnosis.traces)) + acts
+    yield "where", say.where(f, numbers.clock_of(diagnosis.traces)) + acts
     if f.region is not None:
         yield "mostly", say.region(f.region)
     if f.experiments:
         yield "in", say.experiments(f.experiments)
     yield "driven by", say.driven_by(f)
-    yield "how sure", f"{say.evidence(f.p_value, diagnosis.surrogates)}, after the whole search"
+    yield "how sure", f"{numbers.evidence(f.p_value, diagnosis.surrogates)}, after the whole search"
     if f.held_out is None:
         yield "held out", f"not measured: {plain(f.held_out_note)}"
     else:
-        residual = say.improvement(f.held_out.rmse_before, f.held_out.rmse_after, f.held_out.unit)
+        residual = numbers.improvement(f.held_out.rmse_before, f.held_out.rmse_after, f.held_out.unit)
         note = f"\n{plain(f.held_out_note)}" if f.held_out_note else ""
         zero = "; 0 is no better" if first else ""
-        yield "held out", f"{say.better(f.held_out)}: residual {residual}, {say.gain(f.held_out)}{zero}{note}"
+        yield "held out", f"{say.better(f.held_out)}: residual {residual}, {numbers.gain(f.held_out)}{zero}{note}"
     if say.inseparable(f):
         yield "!or", f"{say.rivals(f)}: this recording cannot tell"
     if not f.plausible:
@@ -69,14 +70,14 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
 def _of_all(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     d = diagnosis
     if len(d.findings) > 1:
-        yield "together", f"residual {say.residual_sizes(d)} on held-out data"
+        yield "together", f"residual {numbers.residual_sizes(d)} on held-out data"
     if not d.findings:
         searched = f"{d.candidates_tried:,} candidates tried, level {d.level:g}"
-        yield "how sure", f"{say.evidence(d.p_value, d.surrogates)}; {searched}"
-    beside = say.smooth_fit(d)
+        yield "how sure", f"{numbers.evidence(d.p_value, d.surrogates)}; {searched}"
+    beside = noise.smooth_fit(d)
     if beside:
         yield "compare", beside
-    yield "noise", say.noise_model(d.noise)
+    yield "noise", noise.noise_model(d.noise)
     for sentence in top.to_do(d):
         yield "to do", sentence
     command = top.apply_command(d)

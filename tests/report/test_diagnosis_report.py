@@ -20,7 +20,7 @@ from mkc_torch.diagnosis.result import (
     Separability,
     StateMap,
 )
-from mkc_torch.report.diagnosis import findings as say
+from mkc_torch.report.diagnosis import noise, numbers
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.page import bars, diagnosis_report, heat_map
 from tests.diagnosis.factory import CHANNELS, make_candidates, make_diagnosis, make_separability
@@ -206,22 +206,22 @@ SMOOTH = "with a smooth correction by all recorded columns"
 @pytest.mark.parametrize("findings", [0, 2])
 def test_a_smooth_correction_that_is_better_stands_beside_the_models_compared(findings):
     diagnosis = make_diagnosis(findings, samples=300, channels=2)
-    rows = dict(say.held_out_rows(diagnosis))
+    rows = dict(noise.held_out_rows(diagnosis))
     assert list(rows)[-1] == SMOOTH
     assert rows[SMOOTH] == [f"{diagnosis.ceiling.rmse:.3f}", "−0.895", "1.40, 1.40", "0.300, 0.300"]
     text = text_of(diagnosis_report(diagnosis))
     assert f"{SMOOTH} {diagnosis.ceiling.rmse:.3f} −0.895" in text
     assert "It is no bound: a step or a sharp corner goes beyond it." in text
     present = f"{'with the findings it is' if findings else 'the residual is'} {diagnosis.corrected.rmse:.3f} µT"
-    assert say.smooth_fit(diagnosis).endswith(f"reaches {diagnosis.ceiling.rmse:.3f} µT; {present}")
+    assert noise.smooth_fit(diagnosis).endswith(f"reaches {diagnosis.ceiling.rmse:.3f} µT; {present}")
 
 
 def test_a_smooth_correction_that_findings_beat_is_not_told_of():
     diagnosis = make_diagnosis(2, samples=300)
     worse = dataclasses.replace(diagnosis.ceiling, rmse=1.2 * diagnosis.corrected.rmse)
     beaten = dataclasses.replace(diagnosis, ceiling=worse)
-    assert say.smooth_fit(beaten) == ""
-    assert list(dict(say.held_out_rows(beaten))) == ["the simulation as it is", "with the findings"]
+    assert noise.smooth_fit(beaten) == ""
+    assert list(dict(noise.held_out_rows(beaten))) == ["the simulation as it is", "with the findings"]
     text = text_of(diagnosis_report(beaten))
     assert "smooth correction" not in text
     assert "no bound" not in text
@@ -488,22 +488,22 @@ def test_same_input_gives_the_same_page_and_leaves_matplotlib_alone():
 
 
 def test_parameters_read_well():
-    assert say.measured(0.0, 0.0, "µT") == ["0 µT"]
-    assert say.measured(1234.5, 12.0, "") == ["1234 ± 12"]
-    assert say.measured(2.5e7, 1.2e6, "counts") == ["(2.50 ± 0.12) × 10⁷ counts"]
-    assert say.measured((1e-9, -2e-9), None, "T") == ["(1.00, −2.00) × 10⁻⁹ T"]
-    assert say.measured(((1.0, 2.0), (3.0, 4.0)), ((0.1, 0.1), (0.1, None)), "") == [
+    assert numbers.measured(0.0, 0.0, "µT") == ["0 µT"]
+    assert numbers.measured(1234.5, 12.0, "") == ["1234 ± 12"]
+    assert numbers.measured(2.5e7, 1.2e6, "counts") == ["(2.50 ± 0.12) × 10⁷ counts"]
+    assert numbers.measured((1e-9, -2e-9), None, "T") == ["(1.00, −2.00) × 10⁻⁹ T"]
+    assert numbers.measured(((1.0, 2.0), (3.0, 4.0)), ((0.1, 0.1), (0.1, None)), "") == [
         "(1.00 ± 0.10, 2.00 ± 0.10)",
         "(3.00 ± 0.10, 4.00)",
     ]
-    assert say.measured((), None, "µT") == ["() µT"]
-    assert say.measured(math.nan, None, "") == ["not known"]
+    assert numbers.measured((), None, "µT") == ["() µT"]
+    assert numbers.measured(math.nan, None, "") == ["not known"]
 
 
 def test_moments_have_the_digits_of_the_recording():
     def onset(seconds):
         traces = make_diagnosis(1, samples=50).traces
-        clock = say.clock_of(dataclasses.replace(traces, time=torch.linspace(0.0, seconds, 50)))
+        clock = numbers.clock_of(dataclasses.replace(traces, time=torch.linspace(0.0, seconds, 50)))
         return clock.moment(1.23456789)
 
     assert (onset(0.5), onset(90.0), onset(5000.0)) == ("1.235 s", "1.2 s", "1 s")

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from mkc_torch.diagnosis.result import Curve, Diagnosis, Finding, Traces
-from mkc_torch.report.calibration.pictures import _SHADE, _STYLE, BLUE, GREY, INK, ORANGE, _svg
+from mkc_torch.report.drawing import BLUE, GREY, INK, ORANGE, SHADE, STYLE, svg
 from mkc_torch.report.words.typesetting import plain
 
 __all__ = ["CURVE_COLORS", "Panel", "driver_panels", "numbered", "of_finding", "over_states", "over_time"]
@@ -80,7 +80,7 @@ def over_time(diagnosis: Diagnosis) -> str:
                     ax.set_xlabel("time (s)" if t.has_time else "sample")
                 else:
                     ax.tick_params(labelbottom=False)
-        return _svg(figure, "time", "Residual over time before and after the findings were added to the simulation")
+        return svg(figure, "time", "Residual over time before and after the findings were added to the simulation")
 
 
 def numbered(diagnosis: Diagnosis) -> bool:
@@ -109,7 +109,7 @@ def of_finding(diagnosis: Diagnosis, index: int) -> str | None:
         if curve is not None:
             ax = grid.axes(figure, 0, 2) if beside else grid.axes(figure, 0, 0, wide=True)
             _draw_curve(ax, curve, t.has_time, most=_MOST_LETTERS if beside else 3 * _MOST_LETTERS)
-        return _svg(figure, f"finding{index + 1}", f"What finding {index + 1} is, and the residual over its drivers")
+        return svg(figure, f"finding{index + 1}", f"What finding {index + 1} is, and the residual over its drivers")
 
 
 def over_states(diagnosis: Diagnosis, index: int) -> str | None:
@@ -134,7 +134,7 @@ def over_states(diagnosis: Diagnosis, index: int) -> str | None:
         ticks = [tick for tick in bar.get_ticks() if beside.get_ylim()[0] <= tick <= limit]
         bar.set_ticks(ticks, labels=[f"{np.sign(tick) * tick**2:.3g}".replace("-", "−") for tick in ticks])
         beside.set_ylabel("nats")
-        return _svg(figure, f"map{index + 1}", f"Gain of finding {index + 1} over the states")
+        return svg(figure, f"map{index + 1}", f"Gain of finding {index + 1} over the states")
 
 
 def driver_panels(diagnosis: Diagnosis, index: int) -> list[Panel]:
@@ -153,7 +153,7 @@ def driver_panels(diagnosis: Diagnosis, index: int) -> list[Panel]:
 
 @contextmanager
 def _style() -> Iterator[None]:
-    with matplotlib.rc_context(_STYLE | _OWN_STYLE), warnings.catch_warnings():
+    with matplotlib.rc_context(STYLE | _OWN_STYLE), warnings.catch_warnings():
         # names in letters that the font for measuring lacks; the reader's browser has them
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         yield
@@ -256,7 +256,7 @@ def _binned(x: np.ndarray, e: np.ndarray) -> _Bins:
 def _mark(ax: Any, findings: Sequence[Finding]) -> None:
     for finding in findings:
         for start, end in finding.intervals:
-            ax.axvspan(start, end, color=_SHADE, lw=0, zorder=0)
+            ax.axvspan(start, end, color=SHADE, lw=0, zorder=0)
         for moment in _onsets(finding):
             ax.axvline(moment, color=ORANGE, lw=1.2, zorder=3)
         if finding.onset_interval is not None:

@@ -11,23 +11,17 @@ from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.report.diagnosis.findings import (
     acts_on,
     better,
-    clock_of,
-    evidence,
     finding_name,
-    gain,
     inseparable,
-    largest,
-    noise_model,
-    residual_sizes,
     rivals,
-    several,
-    smooth_fit,
     unrecorded,
     where,
     with_names,
 )
+from mkc_torch.report.diagnosis.noise import noise_model, smooth_fit
+from mkc_torch.report.diagnosis.numbers import clock_of, evidence, gain, largest, residual_sizes
 from mkc_torch.report.words.numbers import share, size
-from mkc_torch.report.words.typesetting import capital, plain
+from mkc_torch.report.words.typesetting import capital, plain, several
 
 __all__ = ["Tone", "apply_command", "chance", "headline", "lead", "to_do", "tone", "warned"]
 
