@@ -11,7 +11,7 @@ from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling
 
-module = importlib.import_module("mkc_torch.diagnosis.diagnose")
+module = importlib.import_module("mkc_torch.diagnosis.assemble")
 ASKED = SimpleNamespace(level=0.05)
 FINAL = SimpleNamespace(model=SimpleNamespace(terms=(SimpleNamespace(effect=SimpleNamespace(id="current_field")),)))
 CURVE = SimpleNamespace(model=SimpleNamespace(terms=(SimpleNamespace(effect=SimpleNamespace(id="unknown")),)))

@@ -11,6 +11,7 @@ from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation import Dynamics
 
 diagnosis_of = importlib.import_module("mkc_torch.diagnosis.diagnose")
+rounds_of = importlib.import_module("mkc_torch.diagnosis.rounds")
 ending_of = importlib.import_module("mkc_torch.diagnosis.evidence.after_the_search")
 
 
@@ -47,7 +48,7 @@ def diagnosed(recording, monkeypatch):
 
     def run(beside):
         searches, begun, first = [], [], []
-        locate, estimate = diagnosis_of.locate, ending_of.estimate
+        locate, estimate = rounds_of.locate, ending_of.estimate
 
         def search(base, terms, **options):
             searches.append(base)
@@ -56,7 +57,7 @@ def diagnosed(recording, monkeypatch):
                 return first[0]
             return beside(base, first[0])
 
-        monkeypatch.setattr(diagnosis_of, "locate", search)
+        monkeypatch.setattr(rounds_of, "locate", search)
         monkeypatch.setattr(
             ending_of, "estimate", lambda fit: begun.append(fit.model.prepared.newest[1]) or estimate(fit)
         )

@@ -9,7 +9,7 @@ import torch
 from mkc_torch.diagnosis.evidence.held_out import blocks_of
 from mkc_torch.diagnosis.noise.innovations import innovation_gain
 
-holds = importlib.import_module("mkc_torch.diagnosis.diagnose")._holds
+holds = importlib.import_module("mkc_torch.diagnosis.rounds")._holds
 N = 2000
 BLOCKS = blocks_of(N, 1)
 
