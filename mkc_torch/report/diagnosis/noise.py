@@ -61,7 +61,8 @@ def noise_parameters(noise: Noise, channels: Sequence[str]) -> list[tuple[str, s
         name = term("noise.density")
         if len(noise.sigma) > 1 and i < len(channels):
             name = term("noise.of_channel", name=name, channel=plain(channels[i]))
-        rows.append((name, f"σ = {bandwidth(sigma)}, d = {size(d)}{unit}, within ±{size(bound)}{unit}"))
+        within = term("where.near_zero", bound=f"{size(bound)}{unit}")
+        rows.append((name, f"σ = {bandwidth(sigma)}, d = {size(d)}{unit}, {within}"))
     return rows
 
 
