@@ -9,6 +9,8 @@ from markupsafe import Markup, escape
 
 from mkc_torch.calibration.coverage import nearest_axis
 from mkc_torch.report.words import numbers as wording
+from mkc_torch.report.words.terms import term
+from mkc_torch.report.words.typesetting import capital
 
 __all__ = ["render"]
 
@@ -23,7 +25,7 @@ def render(template: str, **values: Any) -> str:
         lstrip_blocks=True,
     )
     environment.filters["coded"] = _coded
-    environment.globals.update(w=wording, nearest_axis=nearest_axis, zip=zip)
+    environment.globals.update(w=wording, term=term, capital=capital, nearest_axis=nearest_axis, zip=zip)
     return environment.get_template(template).render(**values)
 
 

@@ -14,6 +14,7 @@ from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.coverage import NEAR_DEGREES, Coverage, nearest_axis
 from mkc_torch.functional import mkc_nll
 from mkc_torch.report.drawing import BLUE, GREY, INK, ORANGE, PALE, SHADE, STYLE, svg
+from mkc_torch.report.words.terms import term
 
 _MOST_POINTS = 20_000
 _BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.9}
@@ -48,8 +49,8 @@ def sphere(calibration: Calibration, points: Tensor) -> str:
                 _square(ax, outline[:, i], outline[:, j], include_origin=row == 0)
                 ax.set_xlabel(f"{name[i]} ({unit})")
                 ax.set_ylabel(f"{name[j]} ({unit})")
-                ax.set_title(f"{'Measured' if row == 0 else 'Corrected'}, {name[i]}{name[j]} plane")
-        return svg(figure, "sphere", "Samples before and after calibration in three planes, with the fitted outline")
+                ax.set_title(term("picture.measured" if row == 0 else "picture.corrected", plane=name[i] + name[j]))
+        return svg(figure, "sphere", term("picture.about_sphere"))
 
 
 def residual(calibration: Calibration, points: Tensor, time: Tensor | None) -> str:
@@ -65,19 +66,19 @@ def residual(calibration: Calibration, points: Tensor, time: Tensor | None) -> s
             for start, end in c.disturbed:
                 ax.axvspan(start, end, color=SHADE, lw=0)
             ax.axhline(0.0, color=GREY, lw=0.7)
-            for mask, color, label in ((~rejected, BLUE, "in use"), (rejected, ORANGE, "rejected")):
+            for mask, color, label in ((~rejected, BLUE, "picture.in_use"), (rejected, ORANGE, "label.rejected")):
                 if mask.any():
-                    ax.plot(x[mask], r[mask], ".", ms=2.2, color=color, label=label, rasterized=True)
-            ax.set_ylabel(f"residual ({c.unit})")
+                    ax.plot(x[mask], r[mask], ".", ms=2.2, color=color, label=term(label), rasterized=True)
+            ax.set_ylabel(f"{term('label.residual')} ({c.unit})")
         limit = 5.0 * c.after.robust
         if limit > 0:
             close.set_ylim(-limit, limit)
-        top.set_title("Length of the corrected field less its nominal length: all samples")
-        close.set_title(f"Close up: within ±{limit:.3g} {c.unit}, five times its robust scatter")
-        close.set_xlabel("sample" if time is None else "time (s)")
+        top.set_title(term("picture.all_samples"))
+        close.set_title(term("picture.close_up", limit=f"{limit:.3g}", unit=c.unit))
+        close.set_xlabel(term("unit.sample" if time is None else "picture.time"))
         close.margins(x=0.01)
         _legend_above(top)
-        return svg(figure, "residual", "Residual over time with rejected samples and disturbed intervals")
+        return svg(figure, "residual", term("picture.about_residual"))
 
 
 def density(calibration: Calibration, points: Tensor) -> str:
@@ -96,24 +97,24 @@ def density(calibration: Calibration, points: Tensor) -> str:
             edges = np.linspace(start, end, 61 if ax is left else 81)
             count, _ = np.histogram(e.numpy(), edges)
             value = count / (len(e) * np.diff(edges))
-            ax.stairs(value, edges, fill=True, color=PALE, label="samples")
+            ax.stairs(value, edges, fill=True, color=PALE, label=term("picture.samples"))
             grid = torch.linspace(start, end, 1201, dtype=torch.float64)
             fitted = torch.exp(-mkc_nll(grid, c.sigma, d, bound))
             normal = torch.exp(-0.5 * (grid / gauss).square()) / (gauss * (2 * np.pi) ** 0.5) if gauss > 0 else 0 * grid
-            ax.plot(grid, fitted, color=BLUE, lw=1.6, label="MKC, fitted")
-            ax.plot(grid, normal, color=ORANGE, lw=1.4, ls=(0, (5, 2)), label="Gaussian of the same samples")
-            ax.set_xlabel(f"residual, algebraic × radius/2 ({c.unit})")
+            ax.plot(grid, fitted, color=BLUE, lw=1.6, label=term("picture.fitted"))
+            ax.plot(grid, normal, color=ORANGE, lw=1.4, ls=(0, (5, 2)), label=term("picture.normal"))
+            ax.set_xlabel(term("picture.algebraic", unit=c.unit))
             ax.margins(x=0)
             if ax is right:
                 least = 1.0 / (len(e) * (edges[1] - edges[0]))
                 ax.set_ylim(0.3 * least, 3.0 * max(float(fitted.max()), float(value.max())))
                 ax.set_yscale("log")
-        left.set_ylabel(f"density (1/{c.unit})" if c.unit else "density")
-        left.set_title("Head, linear scale")
-        right.set_title("Head and tail, logarithmic scale")
+        left.set_ylabel(term("picture.density", unit=c.unit) if c.unit else term("noise.density"))
+        left.set_title(term("picture.head"))
+        right.set_title(term("picture.tail"))
         left.legend(loc="upper left", fontsize=9, borderaxespad=0.2, handlelength=1.6)
         left.set_ylim(0.0, 1.45 * left.get_ylim()[1])
-        return svg(figure, "density", "Histogram of residuals with the MKC density and a Gaussian")
+        return svg(figure, "density", term("picture.about_density"))
 
 
 def coverage_map(found: Coverage, directions: Tensor) -> str:
@@ -140,14 +141,14 @@ def coverage_map(found: Coverage, directions: Tensor) -> str:
             lon_gap, lat_gap = _lon_lat(np.array([gap.direction]))
             ax.plot(lon_gap, lat_gap, "x", color=ORANGE, ms=9, mew=2)
             ax.annotate(
-                f"gap {nearest_axis(gap.direction).replace('-', '−')}, {gap.degrees:.0f}°",
+                term("picture.gap", axis=nearest_axis(gap.direction).replace("-", "−"), degrees=f"{gap.degrees:.0f}"),
                 (float(lon_gap[0]), float(lat_gap[0])),
                 xytext=(0, -9), textcoords="offset points", ha="center", va="top",
                 color="#9A4300", weight="bold", bbox=_BOX,
             )  # fmt: skip
         ax.set_xticks([])
         ax.set_yticks([])
-        return svg(figure, "coverage", "Map of the directions covered and not covered, in the sensor's axes")
+        return svg(figure, "coverage", term("picture.about_coverage"))
 
 
 def _ring(i: int, j: int) -> np.ndarray:

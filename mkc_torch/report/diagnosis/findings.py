@@ -10,6 +10,7 @@ from mkc_torch.diagnosis.findings.worth import confirmation
 from mkc_torch.diagnosis.result import Alternative, Candidate, Extrapolation, Finding, HeldOut, Region
 from mkc_torch.report.diagnosis.numbers import Clock, gain_told
 from mkc_torch.report.words.numbers import number, size
+from mkc_torch.report.words.terms import term
 from mkc_torch.report.words.typesetting import plain, several, typeset
 
 __all__ = [
@@ -41,14 +42,20 @@ _WORDS = {
     "unknown": "an effect outside the catalogue",
 }
 _AXES: dict[tuple[str, ...], str] = {
-    ("x", "y", "z"): ", the sensor's axes",
-    ("east", "north", "up"): ", the axes of the world that the attitude turns into, its x, y, z",
+    ("x", "y", "z"): "finding.acts_on_axes",
+    ("east", "north", "up"): "finding.acts_on_world",
 }
 _BETTER = {
-    "surely": "surely better on unseen blocks",
-    "probably": "probably better on unseen blocks, not surely",
-    "not shown": "not shown to be better on unseen blocks",
-    "worse": "worse on unseen blocks",
+    "surely": "evidence.surely",
+    "probably": "evidence.probably",
+    "not shown": "evidence.not_shown",
+    "worse": "evidence.worse",
+}
+_BOUNDS = {
+    "below": "where.below",
+    "above": "where.above",
+    "near zero": "where.near_zero",
+    "far from zero": "where.far_from_zero",
 }
 
 
@@ -78,8 +85,11 @@ def with_drivers(effect: str, drivers: Sequence[str], at: str = "") -> str:
         >>> with_drivers("field_gradient", ["position_x", "position_y", "position_z"])
         'field gradient (position)'
     """
-    place = f" on {'' if at.startswith('all ') else 'the '}{plain(at.removeprefix('loaded '))}" if at else ""
-    return effect_name(effect) + (f" ({_together(drivers)})" if drivers else "") + place
+    driven = effect_name(effect) + (f" ({_together(drivers)})" if drivers else "")
+    if not at:
+        return driven
+    key = "finding.on" if at.startswith("all ") else "finding.on_the"
+    return term(key, effect=driven, place=plain(at.removeprefix("loaded ")))
 
 
 def _together(names: Sequence[str]) -> str:
@@ -91,8 +101,9 @@ def _together(names: Sequence[str]) -> str:
 def finding_name(finding: Finding) -> str:
     """A finding by its effect and what drives it; one that goes along time alone and has no name is told as a cause."""
     if unrecorded(finding):
-        return "a cause that no column recorded"
-    return with_drivers(finding.effect, finding.drivers) + (" that comes and goes" if finding.comes_and_goes else "")
+        return term("finding.unrecorded")
+    told = with_drivers(finding.effect, finding.drivers)
+    return term("finding.comes_and_goes", finding=told) if finding.comes_and_goes else told
 
 
 def unrecorded(finding: Finding) -> bool:
@@ -138,11 +149,11 @@ def counted_from(finding: Finding) -> str:
     if not finding.references:
         return ""
     marked = re.search("[A-Za-z]\u0304", unicodedata.normalize("NFD", finding.equation))
-    symbol = unicodedata.normalize("NFC", marked[0]) if marked else "Counted from"
+    symbol = unicodedata.normalize("NFC", marked[0]) if marked else term("finding.counted_from")
     names = several([one.column for one in finding.references])
     values = ", ".join(f"{size(one.value)} {plain(one.unit)}".rstrip() for one in finding.references)
-    means = "the means" if len(finding.references) > 1 else "the mean"
-    return f"{symbol}: {means} of {names} over this recording, {values}."
+    key = "finding.means" if len(finding.references) > 1 else "finding.mean"
+    return term(key, symbol=symbol, columns=names, values=values)
 
 
 def where(finding: Finding, clock: Clock) -> str:
@@ -165,21 +176,21 @@ def where(finding: Finding, clock: Clock) -> str:
     """
     begins = ""
     if finding.moments:
-        begins = f"anew at {_and([clock.moment(moment) for moment in finding.moments])}"
+        begins = term("where.anew", moments=_and([clock.moment(moment) for moment in finding.moments]))
     elif finding.onset is not None:
-        moment = clock.moment(finding.onset)
-        begins = f"first at {moment}" if finding.comes_and_goes else f"from {moment} on"
+        key = "where.first" if finding.comes_and_goes else "where.from_on"
+        begins = term(key, moment=clock.moment(finding.onset))
     if finding.onset_interval is not None:
-        begins += f" (95 %: {clock.interval(*finding.onset_interval)})"
+        begins = term("where.band", onset=begins, interval=clock.interval(*finding.onset_interval))
     if finding.comes_and_goes:
-        begins += ", then it comes and goes"
-    each = [f"from {clock.interval(start, end)}" for start, end in finding.intervals]
+        begins = term("where.then_goes", onset=begins)
+    each = [term("where.from", interval=clock.interval(start, end)) for start, end in finding.intervals]
     spans = [end - start for start, end in finding.intervals]
     if len(each) > 3:
-        mainly = f"mainly in {len(each)} intervals, the longest {each[spans.index(max(spans))]}"
+        mainly = term("where.mainly_many", count=len(each), longest=each[spans.index(max(spans))])
     else:
-        mainly = f"mainly {_and(each)}" if each else ""
-    return ", ".join(filter(None, [begins, mainly])) or "throughout the recording"
+        mainly = term("where.mainly", intervals=_and(each)) if each else ""
+    return ", ".join(filter(None, [begins, mainly])) or term("where.throughout")
 
 
 def acts_on(finding: Finding) -> str:
@@ -190,12 +201,13 @@ def acts_on(finding: Finding) -> str:
         >>> acts_on(finding)
         "acts on x, y, z, the sensor's axes"
     """
-    whose = _AXES.get(finding.channels, "")
-    return f"acts on {several(finding.channels)}{whose}" if finding.channels else ""
+    if not finding.channels:
+        return ""
+    return term(_AXES.get(finding.channels, "finding.acts_on"), channels=several(finding.channels))
 
 
 def _and(each: Sequence[str]) -> str:
-    return " and ".join(filter(None, [", ".join(each[:-1]), *each[-1:]]))
+    return term("number.and").join(filter(None, [", ".join(each[:-1]), *each[-1:]]))
 
 
 def region(found: Region) -> str:
@@ -208,14 +220,9 @@ def region(found: Region) -> str:
         '91 % of the gain where level is above 14.2 cm, 10 % of the time'
     """
     unit = f" {found.unit}" if found.unit else ""
-    told = {
-        "below": f"below {size(found.bound)}{unit}",
-        "above": f"above {size(found.bound)}{unit}",
-        "near zero": f"within ±{size(found.bound)}{unit}",
-        "far from zero": f"beyond ±{size(found.bound)}{unit}",
-    }[found.kind]
+    bounds = term(_BOUNDS[found.kind], bound=f"{size(found.bound)}{unit}")
     gain, time = (f"{100.0 * one:.0f} %" for one in (found.share_of_gain, found.share_of_time))
-    return f"{gain} of the gain where {plain(found.state)} is {told}, {time} of the time"
+    return term("where.region", gain=gain, state=plain(found.state), bounds=bounds, time=time)
 
 
 def experiments(shares: Sequence[float]) -> str:
@@ -226,9 +233,12 @@ def experiments(shares: Sequence[float]) -> str:
         'experiment 2: 70 %, experiment 3: 20 %, experiment 1: 10 %'
     """
     order = sorted(range(len(shares)), key=lambda k: -shares[k])
-    told = [f"experiment {k + 1}: {number(100.0 * shares[k], 0)} %" for k in order[:_MOST_EXPERIMENTS]]
+    told = [
+        term("where.experiment", number=k + 1, share=number(100.0 * shares[k], 0)) for k in order[:_MOST_EXPERIMENTS]
+    ]
     more = len(shares) - len(told)
-    return ", ".join(told) + (f", and {more} more" if more else "")
+    each = ", ".join(told)
+    return term("where.more_experiments", experiments=each, count=more) if more else each
 
 
 def better(held_out: HeldOut) -> str:
@@ -238,7 +248,7 @@ def better(held_out: HeldOut) -> str:
         >>> better(HeldOut(0.3, (0.2, 0.4), 1.0, 0.8, "µT")), better(HeldOut(0.13, (-0.02, 0.28), 1.0, 0.9, "µT"))
         ('surely better on unseen blocks', 'probably better on unseen blocks, not surely')
     """
-    return _BETTER[confirmation(held_out.log_likelihood_gain, held_out.confidence_interval)]
+    return term(_BETTER[confirmation(held_out.log_likelihood_gain, held_out.confidence_interval)])
 
 
 def inseparable(finding: Finding) -> tuple[Alternative, ...]:
@@ -250,7 +260,7 @@ def rivals(finding: Finding, most: int = 3) -> str:
     """The names of those, one after the other; empty where there are none."""
     each = list(dict.fromkeys(with_drivers(a.effect, a.drivers, _elsewhere(a, finding)) for a in inseparable(finding)))
     told = ", ".join(each[:most])
-    return f"{told} and {len(each) - most} more" if len(each) > most else told
+    return term("number.and_more", first=told, count=len(each) - most) if len(each) > most else told
 
 
 def _elsewhere(alternative: Alternative, finding: Finding) -> str:
@@ -270,11 +280,11 @@ def role(candidate: Candidate, findings: Sequence[Finding]) -> str:
     own = candidate.effect, candidate.drivers
     for i, finding in enumerate(findings, 1):
         if own == (finding.effect, finding.drivers) and _at(candidate.at, finding):
-            return f"finding {i}"
+            return term("evidence.is_finding", number=i)
     for i, finding in enumerate(findings, 1):
         for a in finding.alternatives:
             if (*own, candidate.at) == (a.effect, a.drivers, a.at):
-                return f"told from finding {i}" if a.separable else f"not to be told from finding {i}"
+                return term("evidence.told_apart" if a.separable else "evidence.not_told_apart", number=i)
     return ""
 
 
@@ -292,13 +302,13 @@ def with_names(sentence: str, ids: Collection[str]) -> str:
 def driven_by(finding: Finding) -> str:
     """The driver, and how it compares with copies of it shifted in time."""
     if not finding.drivers:
-        return "no recorded column"
+        return term("finding.no_driver")
     named, found = several(finding.drivers), finding.driver_shift
     if found is None:
         return named
-    some = {0: "none", 1: "one"}.get(found.as_good, str(found.as_good))
-    gain = "gain" if found.as_good > 1 else "gains"
-    return f"{named}; {some} of {found.copies} copies shifted by up to {size(found.reach)} s {gain} as much"
+    some = {0: term("evidence.none"), 1: term("evidence.one")}.get(found.as_good, str(found.as_good))
+    key = "evidence.copies" if found.as_good > 1 else "evidence.copies_one"
+    return term(key, columns=named, some=some, copies=found.copies, reach=size(found.reach))
 
 
 def extrapolation(found: Extrapolation) -> str:
@@ -311,6 +321,5 @@ def extrapolation(found: Extrapolation) -> str:
         'fitted where its driver is low, it says nothing where that is high'
     """
     low, high = found.confidence_interval
-    told = "predicts" if low > 0.0 else "misleads" if high < 0.0 else "says nothing"
-    told_gain = gain_told(found.log_likelihood_gain, found.confidence_interval)
-    return f"fitted where its driver is low, it {told} where that is high: {told_gain}"
+    key = "evidence.predicts" if low > 0.0 else "evidence.misleads" if high < 0.0 else "evidence.says_nothing"
+    return term(key, gain=gain_told(found.log_likelihood_gain, found.confidence_interval))

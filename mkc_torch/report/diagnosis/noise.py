@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from mkc_torch.diagnosis.result import DensityCheck, Diagnosis, Noise, Number
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.words.numbers import bandwidth, number, size
+from mkc_torch.report.words.terms import term
 from mkc_torch.report.words.typesetting import plain, several
 
 __all__ = [
@@ -19,21 +20,27 @@ __all__ = [
 ]
 
 _CLEARLY = 0.99  # of a residual, below which another one is smaller
+_KINDS = {"white": "noise.white", "ar": "noise.autoregressive", "random_walk": "noise.random_walk"}
 _NOISE = {
-    "wander": ("slow wander of the offset", "{}, its standard deviation over the recording"),
-    "wander_period": ("the wander falls off", "below a period of {}"),
+    "wander": "noise.wander",
+    "wander_period": "noise.wander_period",
 }
 _CHANNELS = {
-    "norm": "norm: the length of the field, less what the simulation has for it",
-    "along": "along: the part of the residual along the ambient field, which its length shows too",
-    "across_1": "across_1 and across_2: the two parts at right angles to it, which errors of the attitude enter",
+    "norm": "noise.norm",
+    "along": "noise.along",
+    "across_1": "noise.across",
 }
 
 
 def noise_model(noise: Noise) -> str:
     """The noise in words."""
-    kind = {"white": "white", "ar": "autoregressive", "random_walk": "random walk"}[noise.model]
-    return f"{kind}: {plain(noise.description)}" if noise.description.strip() else f"{kind} noise"
+    kind = term(_KINDS[noise.model])
+    described = noise.description.strip()
+    return (
+        term("noise.described", kind=kind, description=plain(described))
+        if described
+        else term("noise.plain", kind=kind)
+    )
 
 
 def noise_parameters(noise: Noise, channels: Sequence[str]) -> list[tuple[str, str]]:
@@ -44,15 +51,25 @@ def noise_parameters(noise: Noise, channels: Sequence[str]) -> list[tuple[str, s
         if name == "autoregression":
             rows += _memory(value, channels)
         elif name in _NOISE:
-            rows.append((_NOISE[name][0], _NOISE[name][1].format(" ".join(measured(value, None, unit)))))
+            told = " ".join(measured(value, None, unit))
+            rows.append((term(_NOISE[name]), _of_wander(name, told)))
         else:
             rows.append((plain(name), " ".join(measured(value, None, unit))))
     unit = f" {plain(noise.unit)}" if noise.unit else ""
     density = zip(noise.sigma, noise.d, noise.bound, strict=True)
     for i, (sigma, d, bound) in enumerate(density):
-        named = f" of {plain(channels[i])}" if len(noise.sigma) > 1 and i < len(channels) else ""
-        rows.append((f"density{named}", f"σ = {bandwidth(sigma)}, d = {size(d)}{unit}, within ±{size(bound)}{unit}"))
+        name = term("noise.density")
+        if len(noise.sigma) > 1 and i < len(channels):
+            name = term("noise.of_channel", name=name, channel=plain(channels[i]))
+        within = term("where.near_zero", bound=f"{size(bound)}{unit}")
+        rows.append((name, f"σ = {bandwidth(sigma)}, d = {size(d)}{unit}, {within}"))
     return rows
+
+
+def _of_wander(name: str, told: str) -> str:
+    if name == "wander":
+        return term("noise.wander_size", size=told)
+    return term("noise.wander_below", period=told)
 
 
 def _memory(value: Number, channels: Sequence[str]) -> Iterator[tuple[str, str]]:
@@ -60,9 +77,11 @@ def _memory(value: Number, channels: Sequence[str]) -> Iterator[tuple[str, str]]
     each = list(value) if isinstance(value, Sequence) else [value]
     for i, one in enumerate(each):
         if not isinstance(one, Sequence) or one:
-            named = f" of {plain(channels[i])}" if len(each) > 1 and i < len(channels) else ""
+            name = term("noise.memory")
+            if len(each) > 1 and i < len(channels):
+                name = term("noise.of_channel", name=name, channel=plain(channels[i]))
             told = measured(one, None, "")[0].removeprefix("(").removesuffix(")")
-            yield f"memory{named}", f"{told} times the samples before it"
+            yield name, term("noise.coefficients", coefficients=told)
 
 
 def density_check(check: DensityCheck) -> tuple[str, str, str]:
@@ -72,25 +91,29 @@ def density_check(check: DensityCheck) -> tuple[str, str, str]:
         >>> density_check(DensityCheck("norm", 0.021, 0.034, 4.0, 0.05, False))
         ('0.021', '0.034 (4 degrees of freedom)', 'no more than chance')
     """
-    said = "a Student-t is closer" if check.closer else "no more than chance"
+    said = "noise.student_closer" if check.closer else "noise.chance"
     if not check.closer and check.distance > check.allowed:
-        said = "the density is off, and a Student-t clearly no better"
-    freedom = f"{check.degrees_of_freedom:g} degree{'' if check.degrees_of_freedom == 1 else 's'} of freedom"
-    return f"{check.distance:.2g}", f"{check.student_distance:.2g} ({freedom})", said
+        said = "noise.density_off"
+    student = term(
+        "noise.student_one" if check.degrees_of_freedom == 1 else "noise.student",
+        distance=f"{check.student_distance:.2g}",
+        freedom=f"{check.degrees_of_freedom:g}",
+    )
+    return f"{check.distance:.2g}", student, term(said)
 
 
 def channel_notes(channels: Sequence[str]) -> str:
     """What a magnetometer's channels are called; empty for others."""
-    return "; ".join(note for name, note in _CHANNELS.items() if name in channels)
+    return "; ".join(term(note) for name, note in _CHANNELS.items() if name in channels)
 
 
 def held_out_rows(diagnosis: Diagnosis) -> list[tuple[str, list[str]]]:
     """The models compared on held-out blocks: root mean square, log-likelihood, and σ and d of each channel."""
-    rows = [("the simulation as it is", diagnosis.baseline)]
+    rows = [(term("table.as_it_is"), diagnosis.baseline)]
     if diagnosis.findings:
-        rows.append(("with the findings", diagnosis.corrected))
+        rows.append((term("table.with_findings"), diagnosis.corrected))
     if diagnosis.ceiling is not None and _shown(diagnosis):
-        rows.append(("with a smooth correction by all recorded columns", diagnosis.ceiling))
+        rows.append((term("table.with_smooth"), diagnosis.ceiling))
     return [
         (
             name,
@@ -111,9 +134,9 @@ def smooth_fit(diagnosis: Diagnosis) -> str:
     if d.ceiling is None or not _shown(d):
         return ""
     unit = plain(d.traces.unit)
-    reached = f"a smooth correction by all recorded columns and by time reaches {size(d.ceiling.rmse)} {unit}".rstrip()
-    with_it = "with the findings it is" if d.findings else "the residual is"
-    return f"{reached}; {with_it} {size(d.corrected.rmse)} {unit}".rstrip()
+    smooth = term("noise.smooth_reaches", residual=f"{size(d.ceiling.rmse)} {unit}".rstrip())
+    residual = f"{size(d.corrected.rmse)} {unit}".rstrip()
+    return term("noise.smooth" if d.findings else "noise.smooth_alone", smooth=smooth, residual=residual)
 
 
 def _shown(diagnosis: Diagnosis) -> bool:

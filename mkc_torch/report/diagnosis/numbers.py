@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, HeldOut, Number, Parameter, Traces
 from mkc_torch.report.words.numbers import decimals, number, share, size
+from mkc_torch.report.words.terms import term
 from mkc_torch.report.words.typesetting import plain, superscript
 
 __all__ = [
@@ -31,7 +32,6 @@ __all__ = [
 _FEWEST_LARGE, _MOST_SMALL = 1e6, 1e-3  # beyond these a number is written with a power of ten
 _MOST_NUMBERS = 12
 _LONG = 4  # numbers from which a list is told by its largest
-_NOT_ESTIMATED = "standard error not estimated"
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,9 @@ class Clock:
             >>> Clock(1, has_time=True).moment(41.32), Clock(0, has_time=False).moment(812.0)
             ('41.3 s', 'sample 812')
         """
-        return f"{number(value, self.places)} s" if self.has_time else f"sample {number(value, 0)}"
+        if self.has_time:
+            return term("where.moment", moment=number(value, self.places))
+        return term("where.moment_of_samples", moment=number(value, 0))
 
     def interval(self, start: float, end: float) -> str:
         """From one moment to another.
@@ -58,8 +60,8 @@ class Clock:
             ('12.0 to 18.4 s', 'sample 3 to 9')
         """
         if self.has_time:
-            return f"{number(start, self.places)} to {number(end, self.places)} s"
-        return f"sample {number(start, 0)} to {number(end, 0)}"
+            return term("where.interval", start=number(start, self.places), end=number(end, self.places))
+        return term("where.interval_of_samples", start=number(start, 0), end=number(end, 0))
 
 
 def clock_of(traces: Traces) -> Clock:
@@ -87,10 +89,13 @@ def measured(value: Number, error: Number | None, unit: str) -> list[str]:
         beside = errors[i] if i < len(errors) and len(errors[i]) == len(row) else [math.nan] * len(row)
         cells = [digits.cell(v, e) for v, e in zip(row, beside, strict=True)]
         rest = len(cells) - _MOST_NUMBERS
-        text = ", ".join(cells[:_MOST_NUMBERS]) + (f", … {rest} more" if rest > 0 else "")
+        text = ", ".join(cells[:_MOST_NUMBERS])
+        if rest > 0:
+            text = term("number.more", first=text, count=rest)
         bare = isinstance(value, (int, float)) and not (digits.power and "±" in text)
         lines.append((text if bare else f"({text})") + digits.factor + (f" {plain(unit)}" if unit else ""))
-    return [*lines, f"… {len(rows) - _MOST_NUMBERS} more rows"] if len(rows) > _MOST_NUMBERS else lines
+    more = len(rows) - _MOST_NUMBERS
+    return [*lines, term("number.more_rows", count=more)] if more > 0 else lines
 
 
 @dataclass(frozen=True)
@@ -116,7 +121,7 @@ class _Digits:
     def cell(self, value: float, error: float) -> str:
         """A number with its error, without the power of ten."""
         if not math.isfinite(value):
-            return "not known"
+            return term("number.not_known")
         told, scale = number(value / 10.0**self.power, self.places), 10.0**self.power
         return f"{told} ± {error / scale:.{self.places}f}" if math.isfinite(error) and error > 0 else told
 
@@ -147,7 +152,7 @@ def parameter_name(parameter: Parameter) -> str:
     """
     name = plain(parameter.name)
     curve = re.fullmatch(r"legendre_(\d+)", name)
-    return f"amplitude of P{_lowered(curve[1])}" if curve else name.replace("_", " ")
+    return term("finding.amplitude", degree=_lowered(curve[1])) if curve else name.replace("_", " ")
 
 
 def _lowered(digits: str) -> str:
@@ -170,9 +175,9 @@ def parameter_lines(parameter: Parameter, channels: Sequence[str]) -> list[str]:
     p = parameter
     if not p.components or tuple(p.components) == tuple(channels):
         lines = measured(p.value, p.standard_error, p.unit)
-        return lines if _known(p.standard_error) else [*lines[:-1], f"{lines[-1]}, {_NOT_ESTIMATED}"]
+        return lines if _known(p.standard_error) else [*lines[:-1], f"{lines[-1]}, {term('number.no_error')}"]
     each = _listed(p)
-    return each if _known(p.standard_error) else [*each, _NOT_ESTIMATED]
+    return each if _known(p.standard_error) else [*each, term("number.no_error")]
 
 
 def _listed(parameter: Parameter) -> list[str]:
@@ -211,7 +216,7 @@ def largest(parameter: Parameter) -> str:
     if len(p.components) < _LONG:
         return f"{parameter_name(p)} {' '.join(measured(p.value, p.standard_error, p.unit))}"
     (sizes,) = ([abs(v) for v in row] for row in _rows(p.value))
-    return f"{parameter_name(p)} up to {_listed(p)[sizes.index(max(sizes))]}"
+    return term("finding.largest", parameter=parameter_name(p), largest=_listed(p)[sizes.index(max(sizes))])
 
 
 def probability(value: float) -> str:
@@ -231,8 +236,9 @@ def evidence(value: float, surrogates: int) -> str:
         >>> evidence(0.005, 199), evidence(0.02, 199)
         ('p = 0.005, the smallest that 199 surrogates can show', 'p = 0.02')
     """
-    told = f", the smallest that {surrogates:,} surrogates can show" if _least(value, surrogates) else ""
-    return probability(value) + told
+    if not _least(value, surrogates):
+        return probability(value)
+    return term("evidence.smallest", p=probability(value), surrogates=f"{surrogates:,}")
 
 
 def _least(value: float, surrogates: int) -> bool:
@@ -260,8 +266,8 @@ def gain_told(value: float, interval: tuple[float, float], *, short: bool = Fals
     if short:
         return f"{signed} [{number(low, places)}, {number(high, places)}]" if known else signed
     if not known:
-        return f"{signed} nats a sample (interval not known)"
-    return f"{signed} nats a sample (95 %: {number(low, places)} to {number(high, places)})"
+        return term("evidence.gain_alone", gain=signed)
+    return term("evidence.gain", gain=signed, low=number(low, places), high=number(high, places))
 
 
 def improvement(before: float, after: float, unit: str) -> str:
@@ -276,8 +282,9 @@ def improvement(before: float, after: float, unit: str) -> str:
         return sizes
     less = 1.0 - after / before
     if abs(less) < 5e-4:
-        return f"{sizes} (no change)"
-    return f"{sizes} ({share(abs(less))} {'less' if less > 0 else 'more'})"
+        return f"{sizes} ({term('evidence.no_change')})"
+    told = term("evidence.less" if less > 0 else "evidence.more", change=share(abs(less)))
+    return f"{sizes} ({told})"
 
 
 def residual_sizes(diagnosis: Diagnosis) -> str:
@@ -292,4 +299,4 @@ def behind(candidate: Candidate) -> str:
         >>> behind(Candidate("hard_iron_step", (), "", 72.3, 12.0, behind=30.25))
         '30.2'
     """
-    return size(candidate.behind) if math.isfinite(candidate.behind) else "not possible"
+    return size(candidate.behind) if math.isfinite(candidate.behind) else term("evidence.not_possible")

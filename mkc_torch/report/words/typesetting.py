@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from mkc_torch.report.words.terms import term
+
 __all__ = ["capital", "plain", "several", "superscript", "typeset"]
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -30,7 +32,7 @@ def several(names: Sequence[str], most: int = 6) -> str:
         ('x, y', 'a, b, c and 5 more')
     """
     told = ", ".join(plain(name) for name in names[:most])
-    return f"{told} and {len(names) - most} more" if len(names) > most else told
+    return term("number.and_more", first=told, count=len(names) - most) if len(names) > most else told
 
 
 def superscript(power: int) -> str:
