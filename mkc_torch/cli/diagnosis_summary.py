@@ -13,6 +13,7 @@ from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.report.diagnosis import findings as say
 from mkc_torch.report.diagnosis import noise, numbers
 from mkc_torch.report.diagnosis import verdict as top
+from mkc_torch.report.diagnosis.evidence import rows
 from mkc_torch.report.words.terms import term
 from mkc_torch.report.words.typesetting import plain, typeset
 
@@ -66,6 +67,7 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
         note = f"\n{plain(f.held_out_note)}" if f.held_out_note else ""
         zero = f"; {term('evidence.zero')}" if first else ""
         yield term("label.held_out"), f"{say.better(f.held_out)}: {residual}, {numbers.gain(f.held_out)}{zero}{note}"
+    yield from rows(f.evidence, terminal=True)
     if say.inseparable(f):
         yield _striking("label.or"), term("evidence.cannot_tell", rivals=say.rivals(f))
     if not f.plausible:
@@ -87,6 +89,7 @@ def _of_all(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     if beside:
         yield term("label.compare"), beside
     yield term("label.noise"), noise.noise_model(d.noise)
+    yield from rows(d.evidence, terminal=True)
     for sentence in top.to_do(d):
         yield term("label.to_do"), sentence
     command = top.apply_command(d)
@@ -104,13 +107,13 @@ def _striking(key: str) -> str:
     return f"!{term(key)}"
 
 
-def _facts(rows: Iterator[tuple[str, str]]) -> Table:
+def _facts(lines: Iterator[tuple[str, str]]) -> Table:
     """Names and values; a name that begins with an exclamation mark stands out."""
     table = Table.grid(padding=(0, 3, 0, 0))
     table.add_column(no_wrap=True, min_width=_LABEL)
     table.add_column(overflow="fold")
     last = ""
-    for name, value in rows:
+    for name, value in lines:
         label = Text("" if name == last else name.removeprefix("!"), style="bold yellow" if name[0] == "!" else "")
         table.add_row(label, Text(value))
         last = name

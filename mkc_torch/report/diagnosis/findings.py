@@ -7,8 +7,9 @@ import unicodedata
 from collections.abc import Collection, Sequence
 
 from mkc_torch.diagnosis.findings.worth import confirmation
-from mkc_torch.diagnosis.result import Alternative, Candidate, Extrapolation, Finding, HeldOut, Region
-from mkc_torch.report.diagnosis.numbers import Clock, gain_told
+from mkc_torch.diagnosis.result import Alternative, Candidate, Finding, HeldOut, Region
+from mkc_torch.report.diagnosis.evidence import of_driver
+from mkc_torch.report.diagnosis.numbers import Clock
 from mkc_torch.report.words.numbers import number, size
 from mkc_torch.report.words.terms import term
 from mkc_torch.report.words.typesetting import plain, several, typeset
@@ -20,7 +21,6 @@ __all__ = [
     "driven_by",
     "effect_name",
     "experiments",
-    "extrapolation",
     "finding_name",
     "inseparable",
     "label_name",
@@ -136,8 +136,6 @@ def counted_from(finding: Finding) -> str:
         ...     "",
         ...     (),
         ...     0.01,
-        ...     None,
-        ...     "",
         ...     (),
         ...     True,
         ...     "",
@@ -161,17 +159,19 @@ def where(finding: Finding, clock: Clock) -> str:
 
     Example:
         >>> from dataclasses import replace
-        >>> finding = Finding("offset_drift", (), ("mag_x",), (), None, "", "", (), 0.01, None, "", (), True, "")
+        >>> from mkc_torch.diagnosis.result import Told
+        >>> finding = Finding("offset_drift", (), ("mag_x",), (), None, "", "", (), 0.01, (), True, "")
         >>> clock = Clock(1, has_time=True)
         >>> where(finding, clock), where(replace(finding, onset=41.32), clock)
         ('throughout the recording', 'from 41.3 s on')
-        >>> where(replace(finding, onset=41.32, onset_interval=(41.24, 41.5)), clock)
+        >>> where(replace(finding, onset=41.32, evidence=(Told("onset", (41.24, 41.5)),)), clock)
         'from 41.3 s on (95 %: 41.2 to 41.5 s)'
         >>> where(replace(finding, intervals=((1.0, 2.0), (7.0, 9.5))), clock)
         'mainly from 1.0 to 2.0 s and from 7.0 to 9.5 s'
         >>> where(replace(finding, onset=61.1, moments=(61.1, 77.8)), clock)
         'anew at 61.1 s and 77.8 s'
-        >>> where(replace(finding, onset=6.2, intervals=((8.0, 9.0), (34.0, 37.3)), comes_and_goes=True), clock)
+        >>> switched = replace(finding, intervals=((8.0, 9.0), (34.0, 37.3)), evidence=(Told("switched", True),))
+        >>> where(replace(switched, onset=6.2), clock)
         'first at 6.2 s, then it comes and goes, mainly from 8.0 to 9.0 s and from 34.0 to 37.3 s'
     """
     begins = ""
@@ -197,7 +197,7 @@ def acts_on(finding: Finding) -> str:
     """The channels that a finding acts on, and whose axes they are; empty where it has none.
 
     Example:
-        >>> finding = Finding("offset_drift", (), ("x", "y", "z"), (), None, "", "", (), 0.01, None, "", (), True, "")
+        >>> finding = Finding("offset_drift", (), ("x", "y", "z"), (), None, "", "", (), 0.01, (), True, "")
         >>> acts_on(finding)
         "acts on x, y, z, the sensor's axes"
     """
@@ -300,26 +300,7 @@ def with_names(sentence: str, ids: Collection[str]) -> str:
 
 
 def driven_by(finding: Finding) -> str:
-    """The driver, and how it compares with copies of it shifted in time."""
+    """The driver, and what tests say of it."""
     if not finding.drivers:
         return term("finding.no_driver")
-    named, found = several(finding.drivers), finding.driver_shift
-    if found is None:
-        return named
-    some = {0: term("evidence.none"), 1: term("evidence.one")}.get(found.as_good, str(found.as_good))
-    key = "evidence.copies" if found.as_good > 1 else "evidence.copies_one"
-    return term(key, columns=named, some=some, copies=found.copies, reach=size(found.reach))
-
-
-def extrapolation(found: Extrapolation) -> str:
-    """What a fit to low values of a driver says of high ones.
-
-    Example:
-        >>> extrapolation(Extrapolation(0.3124, (0.2811, 0.3502)))
-        'fitted where its driver is low, it predicts where that is high: +0.312 nats a sample (95 %: 0.281 to 0.350)'
-        >>> extrapolation(Extrapolation(-0.02, (-0.12, 0.09))).partition(":")[0]
-        'fitted where its driver is low, it says nothing where that is high'
-    """
-    low, high = found.confidence_interval
-    key = "evidence.predicts" if low > 0.0 else "evidence.misleads" if high < 0.0 else "evidence.says_nothing"
-    return term(key, gain=gain_told(found.log_likelihood_gain, found.confidence_interval))
+    return "; ".join([several(finding.drivers), *of_driver(finding.evidence)])

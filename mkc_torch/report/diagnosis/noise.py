@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from mkc_torch.diagnosis.result import DensityCheck, Diagnosis, Noise, Number
+from mkc_torch.diagnosis.result import Diagnosis, Noise, Number
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.words.numbers import bandwidth, number, size
 from mkc_torch.report.words.terms import term
@@ -12,7 +12,6 @@ from mkc_torch.report.words.typesetting import plain, several
 
 __all__ = [
     "channel_notes",
-    "density_check",
     "held_out_rows",
     "noise_model",
     "noise_parameters",
@@ -82,24 +81,6 @@ def _memory(value: Number, channels: Sequence[str]) -> Iterator[tuple[str, str]]
                 name = term("noise.of_channel", name=name, channel=plain(channels[i]))
             told = measured(one, None, "")[0].removeprefix("(").removesuffix(")")
             yield name, term("noise.coefficients", coefficients=told)
-
-
-def density_check(check: DensityCheck) -> tuple[str, str, str]:
-    """How far a channel's density is off, how far a Student-t is, and what that says.
-
-    Example:
-        >>> density_check(DensityCheck("norm", 0.021, 0.034, 4.0, 0.05, False))
-        ('0.021', '0.034 (4 degrees of freedom)', 'no more than chance')
-    """
-    said = "noise.student_closer" if check.closer else "noise.chance"
-    if not check.closer and check.distance > check.allowed:
-        said = "noise.density_off"
-    student = term(
-        "noise.student_one" if check.degrees_of_freedom == 1 else "noise.student",
-        distance=f"{check.student_distance:.2g}",
-        freedom=f"{check.degrees_of_freedom:g}",
-    )
-    return f"{check.distance:.2g}", student, term(said)
 
 
 def channel_notes(channels: Sequence[str]) -> str:

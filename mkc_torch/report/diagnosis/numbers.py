@@ -18,7 +18,6 @@ __all__ = [
     "clock_of",
     "evidence",
     "gain",
-    "gain_told",
     "improvement",
     "largest",
     "measured",
@@ -246,19 +245,14 @@ def _least(value: float, surrogates: int) -> bool:
 
 
 def gain(held_out: HeldOut, *, short: bool = False) -> str:
-    """The gain on data the fit has not seen, with its interval; in short without words.
+    """The gain on data the fit has not seen, with its interval and to its digits; in short without words.
 
     Example:
         >>> held_out = HeldOut(0.3124, (0.2811, 0.3502), 0.9, 0.5, "µT")
         >>> gain(held_out), gain(held_out, short=True)
         ('+0.312 nats a sample (95 %: 0.281 to 0.350)', '+0.312 [0.281, 0.350]')
     """
-    return gain_told(held_out.log_likelihood_gain, held_out.confidence_interval, short=short)
-
-
-def gain_told(value: float, interval: tuple[float, float], *, short: bool = False) -> str:
-    """A gain with its interval, to the digits that the interval leaves."""
-    low, high = interval
+    value, (low, high) = held_out.log_likelihood_gain, held_out.confidence_interval
     known = math.isfinite(low) and math.isfinite(high)
     places = decimals(0.25 * (high - low)) if known and high > low else 3
     told = number(value, places)

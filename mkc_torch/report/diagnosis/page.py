@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from mkc_torch._parallel.fork import shared
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability
-from mkc_torch.report.diagnosis import findings, noise, numbers, pictures, verdict
+from mkc_torch.report.diagnosis import evidence, findings, noise, numbers, pictures, verdict
 from mkc_torch.report.rendering import render
 from mkc_torch.report.words.markup import marked, unbroken
 from mkc_torch.report.words.typesetting import several, typeset
@@ -60,6 +60,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
         d=d,
         note=note,
         say=findings,
+        evidence=evidence,
         numbers=numbers,
         noise=noise,
         top=verdict,
