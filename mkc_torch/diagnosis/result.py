@@ -43,10 +43,7 @@ Number = float | tuple["Number", ...]
 
 @dataclass(frozen=True)
 class Row:
-    """A line of facts; one whose label the facts have already goes on in that line.
-
-    ``in_terminal`` says whether the terminal has it too, beside the report.
-    """
+    """A line of facts, on the terminal too or not; one labelled "driven by" goes on where the driver is named."""
 
     label: str
     text: str
@@ -67,7 +64,7 @@ class Table:
 class Told:
     """What a test of evidence says of a finding or of the whole diagnosis: report, terminal and JSON loop over it.
 
-    Texts are plain sentences, with effects by their ids and numbers as Python prints them.
+    Its texts have effects by their ids, and numbers as Python prints them.
 
     Attributes:
         test: its id.
