@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from mkc_torch.recording.recording import Recording
+from mkc_torch.report.words.terms import term
 from mkc_torch.simulation.load import SimulationFileError
 
 FAILURES = (ValueError, OSError, ImportError, RuntimeError)
@@ -68,7 +69,7 @@ def complain(subject: str | Path, error: BaseException) -> None:
     sentence = sentence_of(error)
     if not sentence.startswith(str(subject)):
         sentence = f"{subject}: {sentence}"
-    err().print(f"mkc: {sentence}", soft_wrap=True)
+    err().print(term("command.failed", sentence=sentence), soft_wrap=True)
 
 
 def sentence_of(error: BaseException) -> str:
@@ -82,7 +83,7 @@ def sentence_of(error: BaseException) -> str:
     """
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename} " if error.filename else ""
-        return f"{where}cannot be written or read: {error.strerror.lower()}; choose another place."
+        return term("command.no_file", file=where, reason=error.strerror.lower())
     if isinstance(error, SimulationFileError):
         return str(error)
     return " ".join(str(error).split())
@@ -104,9 +105,9 @@ def parsed_columns(text: str | None) -> dict[str, str]:
         if not part.strip() and not text:
             continue
         if not (name and equals and source):
-            raise typer.BadParameter(f'"{part}" is no pair; write name=column, such as mag_x=mx,mag_y=my,mag_z=mz.')
+            raise typer.BadParameter(term("command.no_pair", part=part))
         if name in pairs:
-            raise typer.BadParameter(f'"{name}" is given twice.')
+            raise typer.BadParameter(term("command.twice", name=name))
         pairs[name] = source
     return pairs
 
@@ -133,10 +134,7 @@ def refuse_same_names(recordings: Sequence[Path]) -> None:
     for path in recordings:
         other = taken.setdefault(path.stem.casefold(), path)
         if other is not path:
-            raise typer.BadParameter(
-                f"{other} and {path} would write into the same folder, {path.stem}; "
-                "rename one, or give them in two calls with different --output."
-            )
+            raise typer.BadParameter(term("command.same_folder", one=other, other=path, folder=path.stem))
 
 
 class Steps:
@@ -225,7 +223,7 @@ def interrupts_told(left: Callable[[], str]) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        err().print(f"mkc: interrupted; {left()}", soft_wrap=True)
+        err().print(term("command.interrupted", left=left()), soft_wrap=True)
         raise
 
 
@@ -239,9 +237,10 @@ def not_written(recordings: Iterable[Path], output: Path) -> str:
     paths = list(recordings)
     there = [path for path in paths if (output / path.stem).is_dir()]
     absent = ", ".join(str(path) for path in paths if path not in there)
-    told = [f"nothing was written for {absent}"] if absent else []
-    told += [f"{', '.join(str(output / path.stem) for path in there)} may be incomplete"] if there else []
-    return f"{'; '.join(told)}." if told else "all was written."
+    told = [term("command.nothing_written", recordings=absent)] if absent else []
+    folders = ", ".join(str(output / path.stem) for path in there)
+    told += [term("command.incomplete", folders=folders)] if there else []
+    return f"{'; '.join(told)}." if told else term("command.all_written")
 
 
 @contextmanager

@@ -26,8 +26,9 @@ from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.linear import LeastSquares
 from mkc_torch.recording.demonstration import FIELD_PER_AMPERE, Truth, concealed_recording, simulated_recording
 from mkc_torch.recording.recording import Recording, write_table
-from mkc_torch.report.diagnosis.findings import measured
+from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.words.numbers import number
+from mkc_torch.report.words.terms import term
 from mkc_torch.simulation import Magnetometer
 
 if TYPE_CHECKING:
@@ -164,9 +165,9 @@ def _show_calibration(console: Console, calibration: Calibration, rows: list[Com
 def _table(rows: list[Comparison]) -> Table:
     table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
     table.add_column("µT, SIMULATED")
-    for what in ("offset", "semi-axis"):
-        for axis in "xyz" if what == "offset" else "123":
-            table.add_column(f"{what} {axis}", justify="right")
+    offsets = [term("table.offset_of", axis=axis) for axis in "xyz"]
+    for name in (*offsets, *(term("table.semi_axis", number=i) for i in (1, 2, 3))):
+        table.add_column(name, justify="right")
     table.add_column("largest error", justify="right")
     truth = (*rows[0].center, *rows[0].semi_axes)
     for row in rows:
@@ -191,4 +192,4 @@ def _show_diagnosis(console: Console, diagnosis: Diagnosis, files: list[Path], s
     console.print(f"by a calibration alone             {second.calibrated:.2f} µT")
     console.print(f"by the model with what was found   {second.corrected:.2f} µT")
     for file in second.files:
-        console.print(Text.assemble("written     ", (str(file), "cyan")), soft_wrap=True)
+        console.print(Text.assemble(f"{term('label.written'):<12}", (str(file), "cyan")), soft_wrap=True)

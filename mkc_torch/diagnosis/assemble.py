@@ -5,17 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
-from mkc_torch.diagnosis.evidence.after_the_search import Ending, nameless
-from mkc_torch.diagnosis.evidence.density import density_warnings
-from mkc_torch.diagnosis.evidence.driver_shift import shift_warning
-from mkc_torch.diagnosis.evidence.extrapolation import extrapolation_warning
-from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, gain_interval
-from mkc_torch.diagnosis.evidence.remaining import remaining_warning
+from mkc_torch.diagnosis.evidence.after_the_search import Answers
+from mkc_torch.diagnosis.evidence.one_stretch import called
+from mkc_torch.diagnosis.evidence.remaining import nameless
 from mkc_torch.diagnosis.files.model import model_of
 from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.findings.finding import finding_of
@@ -26,72 +21,55 @@ from mkc_torch.diagnosis.model.drivers import Drivers
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.grid import described
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.noise.rejected import rejected_warning
-from mkc_torch.diagnosis.result import Candidate, Diagnosis, HeldOut, Separability, Spread, Traces, Verdict
+from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability, Traces, Verdict
 from mkc_torch.diagnosis.rounds import Asked, Search
 from mkc_torch.diagnosis.search.locate import Located
 from mkc_torch.effects.base import FormedEffect
-from mkc_torch.effects.sensor.unknown import UNKNOWN
-from mkc_torch.effects.sensor.unrecorded import Unrecorded
 from mkc_torch.recording.unit_warnings import unit_warnings
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-
-
-_BESIDE = "Judged beside the other findings: while those are left out, they hide it."
-
-_IN_USE = 0.5
-"""Weight from which a sample is one that the fit believes."""
+__all__ = ["assembled", "with_rest"]
 
 
 def assembled(
     simulation: Simulation,
-    prepared: PreparedSimulation,
     drivers: Drivers,
     tried: int,
-    base: FittedModel,
-    search: Search,
-    ending: Ending,
+    answers: Answers,
     asked: Asked,
+    *,
+    cut: bool,
 ) -> Diagnosis:
-    generator = torch.Generator().manual_seed(asked.seed)
-    found, blocks, evidence, first = search.found, search.blocks, search.evidence, search.first
-    final = ending.final
-    inliers = (evidence[-1].residual.abs() <= 3.0 * evidence[-1].d) & (final.fit.weights > _IN_USE)
+    """The diagnosis, with advice.
 
-    def judged(k: int, term: Term, without: Evidence | None) -> tuple[HeldOut | None, str]:
-        if without is None:
-            return _held(evidence[k], evidence[k + 1], blocks, inliers, term, prepared, generator)
-        held, note = _held(without, evidence[-1], blocks, inliers, term, prepared, generator)
-        return held, note if held is None else _BESIDE
-
-    findings = [
-        replace(
-            finding_of(s, final, k, *judged(k, s.term, more.without)),
-            extrapolation=more.extrapolation,
-            driver_shift=more.driver_shift,
-            onset_interval=more.onset_interval,
-        )
-        for k, (s, more) in enumerate(zip(found, ending.beyond, strict=True))
-    ]
-    noise = noise_summary(final)
+    Args:
+        simulation: as it was given.
+        drivers: the recorded columns, and what is to be said of them.
+        tried: number of candidates.
+        answers: what the tests of evidence say, of what case.
+        asked: for.
+        cut: whether there was more to be found than was asked for.
+    """
+    case, prepared = answers.case, answers.case.prepared
+    first, final = case.first, case.final
+    findings = tuple(
+        replace(finding_of(located, final, number), evidence=answers.of_findings[number])
+        for number, located in enumerate(case.found)
+    )
     diagnosis = Diagnosis(
         recording=prepared.recording.name,
         simulation=prepared.name,
         samples=len(prepared.time),
         level=asked.level,
-        noise=noise,
+        noise=noise_summary(final),
         candidates_tried=tried,
         surrogates=asked.surrogates,
         seed=asked.seed,
         p_value=first.p_value if first else 1.0,
-        verdict=_verdict(first, found, final.fit, ending.left, search.cut, asked),
-        findings=tuple(findings),
-        baseline=_spread(evidence[0], inliers),
-        corrected=_spread(evidence[-1], inliers),
-        ceiling=_spread(ending.reach.evidence, inliers),
+        verdict="adequate",
+        findings=findings,
+        baseline=case.spread(case.held_out[0]),
+        corrected=case.spread(case.held_out[-1]),
         advice=(),
         warnings=(
             *prepared.recording.warnings,
@@ -99,20 +77,16 @@ def assembled(
             *prepared.warnings,
             *drivers.warnings,
             *_time_warnings(prepared),
-            *remaining_warning(ending.left),
-            *_in_one_stretch(first, prepared.time),
-            *(() if prepared.recording.time is None else rejected_warning(prepared.time, final.fit.weights)),
-            *ending.stand_in,
-            *(sentence for finding in findings for sentence in shift_warning(finding)),
-            *(sentence for finding in findings for sentence in extrapolation_warning(finding)),
-            *density_warnings(noise.checks),
+            *answers.warnings,
         ),
         candidates=_candidates(first),
         separability=separability(first) if first else _nothing_to_separate(),
-        traces=_traces(prepared, drivers, base, final),
-        remaining=ending.left,
+        traces=_traces(prepared, drivers, case.base, final),
         model=model_of(final, simulation),
+        evidence=answers.of_all,
     )
+    verdict = _verdict(first, case.found, final.fit, diagnosis.remaining, cut, asked)
+    diagnosis = replace(diagnosis, verdict=verdict)
     return replace(diagnosis, advice=advice_of(diagnosis))
 
 
@@ -144,39 +118,6 @@ def with_rest(diagnosis: Diagnosis, search: Search) -> Diagnosis:
     return replace(diagnosis, warnings=(*diagnosis.warnings, *more))
 
 
-def _held(
-    before: Evidence,
-    after: Evidence,
-    blocks: HeldOutBlocks,
-    inliers: Bool[Tensor, "N m"],
-    term: Term,
-    prepared: PreparedSimulation,
-    generator: torch.Generator,
-) -> tuple[HeldOut | None, str]:
-    """The held-out evidence of one effect, or why there is none."""
-    onset, time = term.shape.get("onset"), prepared.time
-    if onset is not None:
-        shorter = min(int((time < onset).sum()), int((time >= onset).sum()))
-        if shorter < 2 * len(time) // (int(blocks.block.max()) + 1):
-            return None, "one side of the step is shorter than two of the held-out blocks"
-    difference = after.log_likelihood - before.log_likelihood
-    gain, interval = gain_interval(difference, blocks.block, generator)
-    return HeldOut(gain, interval, _rms(before, inliers), _rms(after, inliers), prepared.unit), ""
-
-
-def _rms(evidence: Evidence, inliers: Bool[Tensor, "N m"]) -> float:
-    return float(evidence.residual[inliers].square().mean().sqrt())
-
-
-def _spread(evidence: Evidence, inliers: Bool[Tensor, "N m"]) -> Spread:
-    return Spread(
-        float(evidence.log_likelihood.mean()),
-        _rms(evidence, inliers),
-        tuple(evidence.sigma.tolist()),
-        tuple(evidence.d.tolist()),
-    )
-
-
 def _candidates(first: Located | None) -> tuple[Candidate, ...]:
     if first is None:
         return ()
@@ -206,31 +147,11 @@ def _nothing_to_separate() -> Separability:
 
 def _not_confirmed(located: Located) -> str:
     shape = _shape(located.term)
-    what = f"{_called(located.term)} ({shape})" if shape else _called(located.term)
+    what = f"{called(located.term)} ({shape})" if shape else called(located.term)
     return (
         f"{what}: p = {located.p_value:.2g} after the whole search, but it does not predict blocks better that the fit "
         "has not seen, so it does not count as a finding."
     )
-
-
-def _in_one_stretch(located: Located | None, time: Float[Tensor, " N"]) -> tuple[str, ...]:
-    if located is None or located.stretch is None:
-        return ()
-    begin, end = (float(time[n]) for n in (located.stretch[0], located.stretch[1] - 1))
-    return (
-        f"From {begin:.1f} to {end:.1f} s the recording is off as {_called(located.term)} would have it, but hardly "
-        "elsewhere. Other stretches are off too and no effect explains them, so this one counts as another burst of "
-        "outliers. Record again, for longer.",
-    )
-
-
-def _called(term: Term) -> str:
-    if isinstance(term.effect, Unrecorded):
-        return "a cause that no column recorded"
-    along = "a curve along" if term.effect.id == UNKNOWN else f"{term.effect.id} by"
-    if term.columns:
-        return f"{along} {', '.join(term.columns)}"
-    return "a curve without a name" if term.effect.id == UNKNOWN else term.effect.id
 
 
 def _time_warnings(prepared: PreparedSimulation) -> tuple[str, ...]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,7 +10,8 @@ import torch
 from mkc_torch._parallel.fork import meanwhile, shared
 from mkc_torch.diagnosis.arguments import check_numbers, checked_effects, refuse_no_simulation
 from mkc_torch.diagnosis.assemble import assembled, with_rest
-from mkc_torch.diagnosis.evidence.after_the_search import Ending, ending_parts
+from mkc_torch.diagnosis.evidence.after_the_search import answers_of, parts_ahead
+from mkc_torch.diagnosis.evidence.base import Case
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
@@ -101,22 +101,23 @@ def diagnose(
     base = _base(prepared)
     search = begun(base, terms, asked, generator)
 
-    def told(search: Search, parts: Sequence[Any]) -> Diagnosis:
-        return assembled(simulation, prepared, drivers, len(terms), base, search, Ending(*parts), asked)
+    def case(search: Search) -> Case:
+        return Case(base, search.first, search.found, search.evidence, search.blocks, drivers.drivers, seed)
+
+    def diagnosis(search: Search, done: Sequence[Any]) -> Diagnosis:
+        answers = answers_of(case(search), done)
+        return with_rest(assembled(simulation, drivers, len(terms), answers, asked, cut=search.cut), search)
 
     known = [simulation, base, base.model, *common_parts(prepared, terms)]
 
-    def ending(search: Search) -> list[Callable[[], Any]]:
-        return ending_parts(base, search.found, search.evidence, search.blocks, drivers.drivers, seed)
-
     while search.left:
         # most often there is nothing more
-        with meanwhile(ending(search), [*known, *search.parts]) as ended:
+        with meanwhile(parts_ahead(case(search)), [*known, *search.parts]) as done:
             after = continued(search, asked, generator)
             if after.found == search.found:
-                return with_rest(told(replace(search, cut=after.cut), ended()), after)
+                return diagnosis(after, done())
         search = after
-    return with_rest(told(search, shared(ending(search), [*known, *search.parts])), search)
+    return diagnosis(search, shared(parts_ahead(case(search)), [*known, *search.parts]))
 
 
 def _base(prepared: PreparedSimulation) -> FittedModel:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from torch import Tensor
 
@@ -27,14 +27,68 @@ __all__ = [
     "Parameter",
     "Reference",
     "Region",
+    "Row",
     "Separability",
+    "SmoothCorrection",
     "Spread",
     "StateMap",
+    "Table",
+    "Told",
     "Traces",
 ]
 
 Verdict = Literal["adequate", "explained", "unexplained"]
 Number = float | tuple["Number", ...]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of facts, on the terminal too or not; one labelled "driven by" goes on where the driver is named."""
+
+    label: str
+    text: str
+    in_terminal: bool = True
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the report, its first column a heading of each row; ``note`` says how to read it."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a test of evidence says of a finding or of the whole diagnosis: report, terminal and JSON loop over it.
+
+    Its texts have effects by their ids, and numbers as Python prints them.
+
+    Attributes:
+        test: its id.
+        value: the result, for what goes on with it in Python.
+        content: what ``diagnosis.json`` has of it, as ``evidence.<test>``: JSON, or results of this file.
+        keys: the same for a test that is older than ``evidence``, whose keys have places of their own in the finding
+            or the diagnosis; a mapping is added to the object that is there.
+        warnings: sentences.
+        rows: facts.
+        table: of the report.
+    """
+
+    test: str
+    value: Any = None
+    content: Mapping[str, Any] = field(default_factory=dict)
+    keys: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    rows: tuple[Row, ...] = ()
+    table: Table | None = None
+
+
+def _value(evidence: Sequence[Told], test: str, default: Any = None) -> Any:
+    """The result of a test; the default where it was not asked."""
+    return next((said.value for said in evidence if said.test == test), default)
 
 
 @dataclass(frozen=True)
@@ -150,14 +204,13 @@ class StateMap:
 class Finding:
     """A piece of physics that the simulation lacks, or the effect "unknown"; see ``diagnosis.json``.
 
-    ``extrapolation`` and ``map`` are for the report; None where they were not asked for or cannot be told, as is
-    ``driver_shift`` of an effect without a recorded driver. ``region``
+    ``map`` is for the report; None where it cannot be drawn. ``region``
     is None where the gain arises all over the states, or where the simulation has none; ``experiments`` has each run's
-    share of the gain, and is empty for a single run. ``onset_interval`` holds the onset with 95 % confidence.
+    share of the gain, and is empty for a single run.
     ``moments`` are those at which an effect sets in that does so several times, the first of them its onset.
     ``references`` are what the equation counts its drivers from, ``advice`` what to do about it, ``again`` what becomes
-    of it in another recording; one that is ``placed`` belongs to the place or the attitude of this recording. A step
-    ``comes_and_goes`` where it is as if something was switched on and off.
+    of it in another recording; one that is ``placed`` belongs to the place or the attitude of this recording.
+    ``evidence`` is what the tests say that are asked of each finding.
     """
 
     effect: str
@@ -169,24 +222,49 @@ class Finding:
     explanation: str
     parameters: tuple[Parameter, ...]
     p_value: float
-    held_out: HeldOut | None
-    held_out_note: str
     alternatives: tuple[Alternative, ...]
     plausible: bool
     plausibility: str
     curve: Curve | None = None
-    extrapolation: Extrapolation | None = None
-    driver_shift: DriverShift | None = None
     region: Region | None = None
     experiments: tuple[float, ...] = ()
     map: StateMap | None = None
-    onset_interval: tuple[float, float] | None = None
     moments: tuple[float, ...] = ()
     references: tuple[Reference, ...] = ()
     advice: str = ""
     again: str = ""
     placed: bool = False
-    comes_and_goes: bool = False
+    evidence: tuple[Told, ...] = ()
+
+    @property
+    def held_out(self) -> HeldOut | None:
+        """The gain on blocks that the fit has not seen; None where it cannot be measured."""
+        return _value(self.evidence, "held_out", (None, ""))[0]
+
+    @property
+    def held_out_note(self) -> str:
+        """Why ``held_out`` is None, or what to know about it."""
+        return _value(self.evidence, "held_out", (None, ""))[1]
+
+    @property
+    def extrapolation(self) -> Extrapolation | None:
+        """How well it holds where its driver is high; None where that cannot be told."""
+        return _value(self.evidence, "extrapolation")
+
+    @property
+    def driver_shift(self) -> DriverShift | None:
+        """How many shifted copies of its driver gain as much; None where no driver was recorded."""
+        return _value(self.evidence, "driver_shift")
+
+    @property
+    def onset_interval(self) -> tuple[float, float] | None:
+        """What holds the onset with 95 % confidence; None where there is none."""
+        return _value(self.evidence, "onset")
+
+    @property
+    def comes_and_goes(self) -> bool:
+        """Whether a step is as if something was switched on and off."""
+        return bool(_value(self.evidence, "switched"))
 
 
 @dataclass(frozen=True)
@@ -211,7 +289,7 @@ class Noise:
 
     ``model`` is one of "white", "ar" and "random_walk"; ``parameters`` names its numbers, ``units`` those that have
     a unit; ``bound`` is the half-width of the density's domain, one for all models compared. ``unit`` is that of d and
-    the bound, ``checks`` say how well the density describes each channel.
+    the bound.
     """
 
     model: Literal["white", "ar", "random_walk"]
@@ -222,7 +300,6 @@ class Noise:
     description: str
     units: Mapping[str, str] = field(default_factory=dict)
     unit: str = ""
-    checks: tuple[DensityCheck, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -233,6 +310,17 @@ class Spread:
     rmse: float
     sigma: tuple[float, ...]
     d: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class SmoothCorrection:
+    """What a smooth correction reaches on held-out blocks, and the columns along which it shows that something remains.
+
+    The correction is by all columns and by time, instead of the findings; a step, say, goes beyond it.
+    """
+
+    reached: Spread
+    columns: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -296,15 +384,13 @@ class Diagnosis:
         verdict: "adequate", "explained" or "unexplained".
         findings: strongest first.
         baseline, corrected: the simulation without and with the findings, on held-out blocks.
-        ceiling: the simulation with a smooth correction by all columns and by time instead of the findings, on the
-            same held-out blocks, for comparison; a step, say, goes beyond it. None where it was not asked for.
         advice: what to do or to record next, in sentences, effects by their ids.
         warnings: what was noticed, likewise.
         candidates: the candidates of the search, best first.
         separability: of the leading candidates.
         traces: the residuals.
-        remaining: columns along which something smooth remains beside the findings.
         model: the simulation's sensor or system with the findings in it; None where there is none to apply.
+        evidence: what the tests say that are asked of the whole diagnosis.
 
     Example:
         >>> import torch
@@ -333,11 +419,27 @@ class Diagnosis:
     findings: tuple[Finding, ...]
     baseline: Spread
     corrected: Spread
-    ceiling: Spread | None
     advice: tuple[str, ...]
     warnings: tuple[str, ...]
     candidates: tuple[Candidate, ...]
     separability: Separability
     traces: Traces
-    remaining: tuple[str, ...] = ()
     model: DiagnosedModel | None = field(default=None, repr=False, compare=False)
+    evidence: tuple[Told, ...] = ()
+
+    @property
+    def ceiling(self) -> Spread | None:
+        """What a smooth correction reaches instead of the findings, for comparison; None where it was not asked for."""
+        smooth: SmoothCorrection | None = _value(self.evidence, "remaining")
+        return None if smooth is None else smooth.reached
+
+    @property
+    def remaining(self) -> tuple[str, ...]:
+        """Columns along which something smooth remains beside the findings."""
+        smooth: SmoothCorrection | None = _value(self.evidence, "remaining")
+        return () if smooth is None else smooth.columns
+
+    @property
+    def density_checks(self) -> tuple[DensityCheck, ...]:
+        """How well the density describes each channel."""
+        return _value(self.evidence, "density", ())

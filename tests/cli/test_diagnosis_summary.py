@@ -9,8 +9,8 @@ pytest.importorskip("rich")
 from rich.console import Console
 
 from mkc_torch.cli.diagnosis_summary import show
-from mkc_torch.diagnosis.result import Parameter, Region
-from tests.diagnosis.factory import make_diagnosis
+from mkc_torch.diagnosis.result import Parameter, Region, Row, Told
+from tests.diagnosis.factory import make_diagnosis, with_evidence
 
 
 def shown(diagnosis, files=(), *, width=100, terminal=False):
@@ -101,6 +101,16 @@ def test_long_paths_stay_on_one_line_and_many_warnings_are_counted():
 def test_every_width(width):
     text = shown(make_diagnosis(3), width=width, terminal=True)
     assert "hard-iron step" in text
+
+
+def test_what_any_test_of_evidence_says_has_a_line():
+    said = Told("my_test", rows=(Row("left over", "white"), Row("in print", "more", in_terminal=False)))
+    made = make_diagnosis(1)
+    of_finding = dataclasses.replace(made, findings=(with_evidence(made.findings[0], said),))
+    for diagnosis in (with_evidence(made, said), of_finding):
+        text = shown(diagnosis)
+        assert "left over   white" in text
+        assert "in print" not in text
 
 
 def test_without_a_smooth_correction_there_is_no_line_of_it():

@@ -5,6 +5,7 @@ import math
 
 import torch
 
+from mkc_torch.diagnosis.evidence import held_out_gain, remaining
 from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.result import (
     Alternative,
@@ -17,6 +18,7 @@ from mkc_torch.diagnosis.result import (
     Parameter,
     Reference,
     Separability,
+    SmoothCorrection,
     Spread,
     Traces,
 )
@@ -29,7 +31,11 @@ CATALOGUE = (
 
 
 def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candidates=12, **changes):
-    """A diagnosis of a simulated magnetometer; any field can be replaced by name, and advice follows from the rest."""
+    """A diagnosis of a simulated magnetometer; any field can be replaced by name, and advice follows from the rest.
+
+    So can the smooth correction: what it reaches is the ``ceiling``, None for none, along columns that are
+    ``remaining``.
+    """
     found = (_step, _current, _unknown)[:findings]
     names = CHANNELS[:channels]
     traces = make_traces(findings, names, samples, has_time)
@@ -56,15 +62,23 @@ def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candi
         "findings": tuple(f(names, has_time) for f in found),
         "baseline": Spread(-1.2345, before, (1.1,) * channels, (0.52,) * channels),
         "corrected": Spread(-0.9012, after, (math.inf,) * channels, (0.31,) * channels),
-        "ceiling": Spread(-0.8951, 0.97 * after, (1.4,) * channels, (0.3,) * channels),
         "advice": (),
         "warnings": ("3 samples without a finite value were left out.",),
         "candidates": make_candidates(candidates),
         "separability": make_separability(min(candidates, 8)),
         "traces": traces,
     }
+    ceiling = changes.pop("ceiling", Spread(-0.8951, 0.97 * after, (1.4,) * channels, (0.3,) * channels))
+    smooth = SmoothCorrection(ceiling, changes.pop("remaining", ()))
+    content["evidence"] = () if ceiling is None else (remaining.said(smooth),)
     diagnosis = Diagnosis(**content | changes)
     return diagnosis if "advice" in changes else dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
+
+
+def with_evidence(thing, *said):
+    """A finding or a diagnosis of which these tests say that, and the others what they did."""
+    new = {told.test for told in said}
+    return dataclasses.replace(thing, evidence=(*(told for told in thing.evidence if told.test not in new), *said))
 
 
 def make_traces(findings, channels, samples, has_time):
@@ -136,8 +150,7 @@ def _step(channels, has_time):
             Parameter("onset", 41.32, 0.14, "s"),
         ),
         p_value=0.005,
-        held_out=HeldOut(0.3124, (0.2811, 0.3502), 0.912, 0.521, "µT"),
-        held_out_note="",
+        evidence=(held_out_gain.said(HeldOut(0.3124, (0.2811, 0.3502), 0.912, 0.521, "µT"), ""),),
         alternatives=(
             Alternative("offset_drift", (), 41.2, True),
             Alternative("current_field", ("current",), 1.3, False),
@@ -164,8 +177,7 @@ def _current(channels, has_time):
             Parameter("α", 4.02e-6, 1.1e-7, "1/µT²"),
         ),
         p_value=0.01,
-        held_out=None,
-        held_out_note="The event has no second occurrence to be held out.",
+        evidence=(held_out_gain.said(None, "The event has no second occurrence to be held out."),),
         alternatives=(),
         plausible=True,
         plausibility="0.37 µT/A; up to 1 µT/A occurs.",
@@ -186,8 +198,11 @@ def _unknown(channels, _has_time):
         explanation="The residual depends on this column in a way that no effect in the catalogue has.",
         parameters=(Parameter("knots", tuple(0.1 * i for i in range(20)), None, "µT"),),
         p_value=0.045,
-        held_out=HeldOut(0.0021, (-0.0004, 0.0046), 0.5214, 0.5198, "µT"),
-        held_out_note="Blocks of 4 s with gaps of 1 s.",
+        evidence=(
+            held_out_gain.said(
+                HeldOut(0.0021, (-0.0004, 0.0046), 0.5214, 0.5198, "µT"), "Blocks of 4 s with gaps of 1 s."
+            ),
+        ),
         alternatives=(Alternative("temperature_offset", ("temperature",), 7.9, True),),
         plausible=False,
         plausibility="A curve has no size to compare.",

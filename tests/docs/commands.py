@@ -13,7 +13,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from mkc_torch._commands import app
+from mkc_torch.cli.app import app
 from tests.docs.pages import ROOT
 
 MKC = typer.main.get_command(app).commands

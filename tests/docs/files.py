@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 # the only place of these tests that knows where the simulated sensors live
-from mkc_torch.demo import concealed_recording, simulated_recording
+from mkc_torch.recording.demonstration import concealed_recording, simulated_recording
+from torch import Tensor
+
 from mkc_torch.recording import write_table
 
 DRAG = 0.35  # 1/rad, of a pendulum that is told to have none

@@ -8,7 +8,10 @@ import torch
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
+from mkc_torch.diagnosis.evidence import density, driver_shift, extrapolation, held_out_gain, onset, remaining, switched
 from mkc_torch.diagnosis.findings.advice import advice_of
+from mkc_torch.diagnosis.model.drivers import Driver
+from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import (
     Candidate,
     DensityCheck,
@@ -17,22 +20,30 @@ from mkc_torch.diagnosis.result import (
     HeldOut,
     Parameter,
     Region,
+    Row,
     Separability,
+    SmoothCorrection,
     StateMap,
+    Table,
+    Told,
 )
-from mkc_torch.report.diagnosis import findings as say
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.report.diagnosis import noise, numbers
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.page import bars, diagnosis_report, heat_map
-from tests.diagnosis.factory import CHANNELS, make_candidates, make_diagnosis, make_separability
+from tests.diagnosis.factory import CHANNELS, make_candidates, make_diagnosis, make_separability, with_evidence
 from tests.report.test_calibration_report import parsed, text_of
+
+BY_LOAD = Term(CATALOGUE[0], Driver(("load",), "any", torch.zeros(5, 1), torch.zeros(1), ("A",)), {})
 
 
 def page_of(findings=1, **options):
     return diagnosis_report(make_diagnosis(findings, **({"samples": 600} | options)))
 
 
-def first_changed(diagnosis, **changes):
+def first_changed(diagnosis, *said, **changes):
     first, *rest = diagnosis.findings
+    first = with_evidence(first, *said)
     return dataclasses.replace(diagnosis, findings=(dataclasses.replace(first, **changes), *rest))
 
 
@@ -147,7 +158,9 @@ def test_names_and_texts_from_files_are_escaped_everywhere():
     (parameter, *_) = first.parameters
     (rival, *_) = first.alternatives
     hostile = first_changed(
-        hostile, drivers=(bad,), channels=(bad,), equation=bad, explanation=bad, held_out_note=bad, plausibility=bad,
+        hostile, held_out_gain.said(None, bad),
+        Told("bad", rows=(Row(bad, bad),), table=Table(bad, (bad,), ((bad,),), bad)),
+        drivers=(bad,), channels=(bad,), equation=bad, explanation=bad, plausibility=bad,
         parameters=(dataclasses.replace(parameter, name=bad, unit=bad),),
         alternatives=(dataclasses.replace(rival, drivers=(bad,), separable=False),),
         curve=dataclasses.replace(first.curve, driver=bad, unit=bad, channels=(bad, "_y"), value_unit=bad),
@@ -206,34 +219,34 @@ SMOOTH = "with a smooth correction by all recorded columns"
 @pytest.mark.parametrize("findings", [0, 2])
 def test_a_smooth_correction_that_is_better_stands_beside_the_models_compared(findings):
     diagnosis = make_diagnosis(findings, samples=300, channels=2)
-    rows = dict(say.held_out_rows(diagnosis))
+    rows = dict(noise.held_out_rows(diagnosis))
     assert list(rows)[-1] == SMOOTH
     assert rows[SMOOTH] == [f"{diagnosis.ceiling.rmse:.3f}", "−0.895", "1.40, 1.40", "0.300, 0.300"]
     text = text_of(diagnosis_report(diagnosis))
     assert f"{SMOOTH} {diagnosis.ceiling.rmse:.3f} −0.895" in text
     assert "It is no bound: a step or a sharp corner goes beyond it." in text
     present = f"{'with the findings it is' if findings else 'the residual is'} {diagnosis.corrected.rmse:.3f} µT"
-    assert say.smooth_fit(diagnosis).endswith(f"reaches {diagnosis.ceiling.rmse:.3f} µT; {present}")
+    assert noise.smooth_fit(diagnosis).endswith(f"reaches {diagnosis.ceiling.rmse:.3f} µT; {present}")
 
 
 def test_a_smooth_correction_that_findings_beat_is_not_told_of():
     diagnosis = make_diagnosis(2, samples=300)
     worse = dataclasses.replace(diagnosis.ceiling, rmse=1.2 * diagnosis.corrected.rmse)
-    beaten = dataclasses.replace(diagnosis, ceiling=worse)
-    assert say.smooth_fit(beaten) == ""
-    assert list(dict(say.held_out_rows(beaten))) == ["the simulation as it is", "with the findings"]
+    beaten = with_evidence(diagnosis, remaining.said(SmoothCorrection(worse, ())))
+    assert noise.smooth_fit(beaten) == ""
+    assert list(dict(noise.held_out_rows(beaten))) == ["the simulation as it is", "with the findings"]
     text = text_of(diagnosis_report(beaten))
     assert "smooth correction" not in text
     assert "no bound" not in text
     # where nothing was found it is no judgement on anything
-    adequate = dataclasses.replace(make_diagnosis(0, samples=300), ceiling=worse)
+    adequate = make_diagnosis(0, samples=300, ceiling=worse)
     assert "smooth correction" in text_of(diagnosis_report(adequate))
 
 
 def graded(gain, interval, before, after):
     """A step whose held-out evidence this is, and what the page says first."""
     held_out = HeldOut(gain, interval, before, after, "µT")
-    diagnosis = first_changed(make_diagnosis(1, samples=240), held_out=held_out, alternatives=())
+    diagnosis = first_changed(make_diagnosis(1, samples=240), held_out_gain.said(held_out, ""), alternatives=())
     diagnosis = dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
     return top.headline(diagnosis), top.tone(diagnosis), " ".join(top.to_do(diagnosis)), diagnosis
 
@@ -319,8 +332,8 @@ def test_moments_and_what_each_number_is_are_told():
 def test_a_step_that_comes_and_goes_says_so():
     intervals = ((8.0, 9.0), (20.0, 22.0), (34.0, 37.3), (50.0, 51.0))
     diagnosis = first_changed(
-        make_diagnosis(1, samples=4500),
-        onset=6.2, onset_interval=(5.9, 6.3), intervals=intervals, alternatives=(), comes_and_goes=True,
+        make_diagnosis(1, samples=4500), onset.said((5.9, 6.3)), switched.said(True),
+        onset=6.2, intervals=intervals, alternatives=(),
     )  # fmt: skip
     diagnosis = dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
     text = text_of(diagnosis_report(diagnosis))
@@ -350,12 +363,14 @@ def test_the_noise_has_units_and_its_density_is_compared():
         parameters={"wander": 0.379, "wander_period": 7.21, "autoregression": ((0.26, 0.1), ())},
         units={"wander": "µT", "wander_period": "s"},
         unit="µT",
-        checks=(
-            DensityCheck("norm", 0.021, 0.034, 4.0, 0.05, False),
-            DensityCheck("turn_x", 0.2, 0.01, 2.0, 0.05, True),
-        ),
     )
-    text = text_of(diagnosis_report(dataclasses.replace(made, noise=noise)))
+    checks = [
+        DensityCheck("norm", 0.021, 0.034, 4.0, 0.05, False),
+        DensityCheck("turn_x", 0.2, 0.01, 2.0, 0.05, True),
+    ]
+    changed = with_evidence(dataclasses.replace(made, noise=noise), density.said(checks))
+    text = text_of(diagnosis_report(changed))
+    assert "Is the density right? channel distance of the density" in text
     assert "slow wander of the offset 0.379 µT, its standard deviation over the recording" in text
     assert "the wander falls off below a period of 7.21 s" in text
     assert "memory of norm 0.260, 0.100 times the samples before it" in text
@@ -417,14 +432,17 @@ def test_whether_a_finding_extrapolates_is_said():
         (-0.02, (-0.12, 0.09), "it says nothing where that is high: −0.020"),
         (-0.3, (-0.4, -0.2), "it misleads where that is high: −0.300"),
     ):
-        text = text_of(diagnosis_report(first_changed(diagnosis, extrapolation=Extrapolation(gain, interval))))
+        said = extrapolation.said(Extrapolation(gain, interval), BY_LOAD)
+        text = text_of(diagnosis_report(first_changed(diagnosis, said)))
         assert f"beyond its range fitted where its driver is low, {told}" in text
 
 
 def test_what_shifted_copies_of_the_driver_gain_is_said():
     for as_good, told in ((0, "none of 38 copies"), (1, "one of 38 copies"), (12, "12 of 38 copies")):
         changed = first_changed(
-            make_diagnosis(1, samples=240), drivers=("load",), driver_shift=DriverShift(38, as_good, 22.5)
+            make_diagnosis(1, samples=240),
+            driver_shift.said(DriverShift(38, as_good, 22.5), BY_LOAD),
+            drivers=("load",),
         )
         verb = "gain" if as_good > 1 else "gains"
         assert f"driven by load; {told} shifted by up to 22.5 s {verb} as much" in text_of(diagnosis_report(changed))
@@ -448,6 +466,21 @@ def test_where_in_the_states_and_in_which_experiment_is_told_and_drawn():
     assert page.count("<svg ") == page_of(1, samples=240).count("<svg ") + 1
     assert "speed (rad/s)" in page
     assert "Gain of finding 1 over the states" in page
+
+
+def test_what_any_test_of_evidence_says_is_shown():
+    said = Told(
+        "my_test",
+        rows=(Row("left over", "correlated up to -0.4 s"), Row("in print", "more", in_terminal=False)),
+        table=Table("By channel", ("channel", "lag"), (("norm", "0.4 s"),), "As far as -2 errors."),
+    )
+    made = make_diagnosis(1, samples=240)
+    for changed in (with_evidence(made, said), first_changed(made, said)):
+        text = text_of(diagnosis_report(changed))
+        assert "left over correlated up to −0.4 s in print more" in text
+        assert "By channel channel lag norm 0.4 s As far as −2 errors." in text
+    assert "Further evidence" in text_of(diagnosis_report(with_evidence(made, said)))
+    assert "Further evidence" not in text_of(diagnosis_report(made))
 
 
 def test_drivers_that_switch_are_constant_or_missing():
@@ -488,22 +521,22 @@ def test_same_input_gives_the_same_page_and_leaves_matplotlib_alone():
 
 
 def test_parameters_read_well():
-    assert say.measured(0.0, 0.0, "µT") == ["0 µT"]
-    assert say.measured(1234.5, 12.0, "") == ["1234 ± 12"]
-    assert say.measured(2.5e7, 1.2e6, "counts") == ["(2.50 ± 0.12) × 10⁷ counts"]
-    assert say.measured((1e-9, -2e-9), None, "T") == ["(1.00, −2.00) × 10⁻⁹ T"]
-    assert say.measured(((1.0, 2.0), (3.0, 4.0)), ((0.1, 0.1), (0.1, None)), "") == [
+    assert numbers.measured(0.0, 0.0, "µT") == ["0 µT"]
+    assert numbers.measured(1234.5, 12.0, "") == ["1234 ± 12"]
+    assert numbers.measured(2.5e7, 1.2e6, "counts") == ["(2.50 ± 0.12) × 10⁷ counts"]
+    assert numbers.measured((1e-9, -2e-9), None, "T") == ["(1.00, −2.00) × 10⁻⁹ T"]
+    assert numbers.measured(((1.0, 2.0), (3.0, 4.0)), ((0.1, 0.1), (0.1, None)), "") == [
         "(1.00 ± 0.10, 2.00 ± 0.10)",
         "(3.00 ± 0.10, 4.00)",
     ]
-    assert say.measured((), None, "µT") == ["() µT"]
-    assert say.measured(math.nan, None, "") == ["not known"]
+    assert numbers.measured((), None, "µT") == ["() µT"]
+    assert numbers.measured(math.nan, None, "") == ["not known"]
 
 
 def test_moments_have_the_digits_of_the_recording():
     def onset(seconds):
         traces = make_diagnosis(1, samples=50).traces
-        clock = say.clock_of(dataclasses.replace(traces, time=torch.linspace(0.0, seconds, 50)))
+        clock = numbers.clock_of(dataclasses.replace(traces, time=torch.linspace(0.0, seconds, 50)))
         return clock.moment(1.23456789)
 
     assert (onset(0.5), onset(90.0), onset(5000.0)) == ("1.235 s", "1.2 s", "1 s")

@@ -1,138 +1,68 @@
-"""What is told of findings once they are known, in parts that need nothing of one another."""
+"""What all tests of evidence say, once nothing more is searched; what takes long of them goes ahead, in parts."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import torch
-
-from mkc_torch.diagnosis.evidence.ceiling import Ceiling, ceiling
-from mkc_torch.diagnosis.evidence.driver_shift import shifted
-from mkc_torch.diagnosis.evidence.extrapolation import extrapolated
-from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, gain_interval, held_out
-from mkc_torch.diagnosis.evidence.onset import onset_interval
-from mkc_torch.diagnosis.evidence.remaining import remaining
-from mkc_torch.diagnosis.evidence.stand_in import stand_in_warning
+from mkc_torch.diagnosis.evidence import TESTS
+from mkc_torch.diagnosis.evidence.base import Case, EvidenceTest, Told
 from mkc_torch.diagnosis.linearised.estimate import Estimate, estimate
-from mkc_torch.diagnosis.model.drivers import Driver
-from mkc_torch.diagnosis.model.fit import FittedModel, without_term
-from mkc_torch.diagnosis.result import DriverShift, Extrapolation
-from mkc_torch.diagnosis.search.locate import Located
-from mkc_torch.effects.sensor.unknown import UNKNOWN
 
-__all__ = ["Beyond", "Ending", "ending_parts", "nameless"]
+__all__ = ["Answers", "answers_of", "parts_ahead"]
 
 
 @dataclass(frozen=True)
-class Beyond:
-    """What a finding is worth where its driver is high, and when it is moved; and how sure its onset is.
+class Answers:
+    """What the tests say of the whole diagnosis and of each finding, and the case with the final parameters."""
 
-    ``without`` is the evidence of the final model without it, where what was found later may have hidden its gain.
+    case: Case
+    of_all: tuple[Told, ...]
+    of_findings: tuple[tuple[Told, ...], ...]
+    warnings: tuple[str, ...]
+
+
+def parts_ahead(case: Case, tests: Sequence[EvidenceTest] = TESTS) -> list[Callable[[], Any]]:
+    """Works that need nothing of one another: what goes ahead of each test, and the final parameters.
+
+    The last one takes longest.
     """
-
-    extrapolation: Extrapolation | None
-    driver_shift: DriverShift | None
-    onset_interval: tuple[float, float] | None
-    without: Evidence | None
+    return [*(partial(_ahead, test, case) for test in _long(case, tests)), partial(_final, case)]
 
 
-@dataclass(frozen=True)
-class Ending:
-    """The parts, in the order of :func:`ending_parts`.
-
-    Attributes:
-        stand_in: a warning of a column that only goes much as the cause does.
-        beyond: of each finding.
-        within_reach: the ceiling of any fit, and the columns along which something smooth remains.
-        final: the final parameters.
-    """
-
-    stand_in: tuple[str, ...]
-    beyond: tuple[Beyond, ...]
-    within_reach: tuple[Ceiling, tuple[str, ...]]
-    final: Estimate
-
-    @property
-    def reach(self) -> Ceiling:
-        return self.within_reach[0]
-
-    @property
-    def left(self) -> tuple[str, ...]:
-        return self.within_reach[1]
+def answers_of(case: Case, done: Sequence[Any], tests: Sequence[EvidenceTest] = TESTS) -> Answers:
+    """What the tests say, in their order, once the parts are done."""
+    *ahead, final = done
+    case = replace(case, estimate=final)
+    known = dict(zip(_long(case, tests), ahead, strict=True))
+    of_all: list[Told] = []
+    of_findings: list[list[Told]] = [[] for _ in case.found]
+    warnings: list[str] = []
+    for test in tests:
+        cases = _cases(test, case)
+        for one, done_ahead in zip(cases, known.get(test, [None] * len(cases)), strict=True):
+            said = test.test(replace(one, ahead=done_ahead))
+            (of_findings[one.number] if test.each_finding else of_all).append(said)
+            warnings += said.warnings
+    return Answers(case, tuple(of_all), tuple(tuple(said) for said in of_findings), tuple(warnings))
 
 
-def ending_parts(
-    base: FittedModel,
-    found: Sequence[Located],
-    evidence: Sequence[Evidence],
-    blocks: HeldOutBlocks,
-    drivers: Sequence[Driver],
-    seed: int,
-) -> list[Callable[[], Any]]:
-    """Works that give the parts of an :class:`Ending`; the last one takes longest.
-
-    Args:
-        base: the simulation alone.
-        found: what was found.
-        evidence: of the simulation alone, and with one finding more each.
-        blocks: of the evidence.
-        drivers: the columns.
-        seed: of the bootstraps.
-    """
-    fits = [base, *(one.fit for one in found)]
-    fit = fits[-1]
-
-    def beyond() -> tuple[Beyond, ...]:
-        return tuple(
-            _beyond(without, fit, one, k, evidence, blocks, seed)
-            for k, (without, one) in enumerate(zip(fits, found, strict=False))
-        )
-
-    def within_reach() -> tuple[Ceiling, tuple[str, ...]]:
-        reach = ceiling(base.model, _answerable(base, fit), drivers, blocks)
-        left = () if nameless(fit) else remaining(reach, evidence[-1], fit, drivers, blocks, seed)
-        return reach, left
-
-    def final() -> Estimate:
-        return estimate(fit).at_least(evidence[-1].jackknife)
-
-    return [partial(stand_in_warning, fit), beyond, within_reach, final]
+def _long(case: Case, tests: Sequence[EvidenceTest]) -> list[EvidenceTest]:
+    """Those with something to go ahead; what is asked of the whole diagnosis takes longer than what is of a finding."""
+    asked = [test for test in tests if test.ahead is not None and _cases(test, case)]
+    return sorted(asked, key=lambda test: not test.each_finding)
 
 
-def _beyond(
-    without: FittedModel,
-    final: FittedModel,
-    found: Located,
-    number: int,
-    evidence: Sequence[Evidence],
-    blocks: HeldOutBlocks,
-    seed: int,
-) -> Beyond:
-    model, term, fit = without.model, final.model.terms[number], found.fit
-    beside = None
-    if number < len(final.model.terms) - 1 and model.prepared.ports[term.port].clock is None:
-        # what was found later belongs to both
-        without, fit = without_term(final, number), final
-        if not _confirmed(evidence[number], evidence[number + 1], blocks, seed):
-            beside = held_out(without, blocks)
-    return Beyond(extrapolated(without, fit, term, seed), shifted(model, found), onset_interval(model, found), beside)
+def _cases(test: EvidenceTest, case: Case) -> list[Case]:
+    return [replace(case, number=k) for k in range(len(case.found))] if test.each_finding else [case]
 
 
-def _confirmed(before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int) -> bool:
-    """Whether unseen blocks are surely better."""
-    difference = after.log_likelihood - before.log_likelihood
-    return gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))[1][0] > 0.0
+def _ahead(test: EvidenceTest, case: Case) -> list[Any]:
+    assert test.ahead is not None
+    return [test.ahead(one) for one in _cases(test, case)]
 
 
-def nameless(fit: FittedModel) -> bool:
-    """Whether an effect is a curve over a driver that no physics of the catalogue accounts for."""
-    return any(term.effect.id == UNKNOWN for term in fit.model.terms)
-
-
-def _answerable(base: FittedModel, final: FittedModel) -> FittedModel:
-    """The final fit; that of the simulation alone, if it has no answer at the other's parameters."""
-    alone = base.model.residual(final.parameters[: base.model.size])
-    return final if bool(alone.isfinite().all()) else base
+def _final(case: Case) -> Estimate:
+    return estimate(case.fit).at_least(case.held_out[-1].jackknife)

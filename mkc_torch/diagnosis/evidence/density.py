@@ -10,12 +10,22 @@ import torch
 from torch import Tensor
 
 from mkc_torch.density.distribution import MKCDistribution
+from mkc_torch.diagnosis.evidence.base import Case, Table, Told
 from mkc_torch.diagnosis.result import DensityCheck
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["density_checks", "density_warnings", "effective_size", "kolmogorov", "student_cdf", "student_fit"]
+__all__ = [
+    "density_checks",
+    "density_warnings",
+    "effective_size",
+    "kolmogorov",
+    "said",
+    "student_cdf",
+    "student_fit",
+    "test",
+]
 
 _FREEDOM = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 """Degrees of freedom that are tried."""
@@ -28,6 +38,54 @@ _CLOSER = 0.5
 """Share of the density's distance that a Student-t's has to be below."""
 
 _ROUNDS, _NODES = 30, 2001
+
+_COLUMNS = ("channel", "distance of the density", "distance of a Student-t", "by chance up to", "")
+_NOTE = (
+    "The largest distance between the distribution function of the residuals and that of the density fitted to them, "
+    "and of the likeliest Student-t; 0 is a perfect fit. One recording in a thousand is beyond what is given as chance."
+)
+
+
+def test(case: Case) -> Told:
+    """How far the density of each channel is off, and a warning where a Student-t is clearly closer."""
+    fit = case.final.fit
+    return said(density_checks(fit.residual, fit.sigma, fit.d, fit.bound, case.prepared.channels))
+
+
+def said(checks: Sequence[DensityCheck]) -> Told:
+    table = Table("Is the density right?", _COLUMNS, tuple(_in_words(check) for check in checks), _NOTE)
+    content = [
+        {
+            "channel": check.channel,
+            "distance": check.distance,
+            "student_t_distance": check.student_distance,
+            "degrees_of_freedom": check.degrees_of_freedom,
+            "allowed": check.allowed,
+        }
+        for check in checks
+    ]
+    return Told(
+        "density",
+        tuple(checks),
+        keys={"noise": {"density_check": content}},
+        warnings=density_warnings(checks),
+        table=table,
+    )
+
+
+def _in_words(check: DensityCheck) -> tuple[str, ...]:
+    """How far a channel's density is off, how far a Student-t is, and what that says.
+
+    Example:
+        >>> _in_words(DensityCheck("norm", 0.021, 0.034, 4.0, 0.05, False))
+        ('norm', '0.021', '0.034 (4 degrees of freedom)', '0.05', 'no more than chance')
+    """
+    verdict = "a Student-t is closer" if check.closer else "no more than chance"
+    if not check.closer and check.distance > check.allowed:
+        verdict = "the density is off, and a Student-t clearly no better"
+    freedom = f"{check.degrees_of_freedom:g} degree{'' if check.degrees_of_freedom == 1 else 's'} of freedom"
+    student = f"{check.student_distance:.2g} ({freedom})"
+    return check.channel, f"{check.distance:.2g}", student, f"{check.allowed:.2g}", verdict
 
 
 def density_checks(

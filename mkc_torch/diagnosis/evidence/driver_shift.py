@@ -9,17 +9,18 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.diagnosis.evidence.base import Case, Row, Told
 from mkc_torch.diagnosis.linearised.linearise import linearise
 from mkc_torch.diagnosis.linearised.tangents import Tangents, candidate_tangents
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.result import DriverShift, Finding
+from mkc_torch.diagnosis.result import DriverShift
 from mkc_torch.diagnosis.search.locate import Located
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["shift_warning", "shifted"]
+__all__ = ["of_finding", "said", "shifted", "test"]
 
 _SHARE = 0.25
 """Of the recording, by which a driver is shifted at most, and which is left out at both ends whatever the shift."""
@@ -38,6 +39,31 @@ _MANY = 0.1
 
 _AS_MUCH = 0.999
 """Share of the gain that a copy has to have: those of a ramp are the ramp again, to rounding."""
+
+
+def of_finding(case: Case) -> DriverShift | None:
+    return shifted(case.fits[case.number].model, case.located)
+
+
+def test(case: Case) -> Told:
+    """How many shifted copies of the finding's driver gain as much, and a warning where many do."""
+    return said(case.ahead, case.term)
+
+
+def said(shift: DriverShift | None, term: Term) -> Told:
+    if shift is None:
+        return Told("driver_shift")
+    some = {0: "none", 1: "one"}.get(shift.as_good, str(shift.as_good))
+    gain = "gain" if shift.as_good > 1 else "gains"
+    row = Row("driven by", f"{some} of {shift.copies} copies shifted by up to {shift.reach:.3g} s {gain} as much")
+    columns = ", ".join(term.columns)
+    sentence = (
+        f"{shift.as_good} of {shift.copies} copies of {columns}, shifted by up to {shift.reach:.3g} s, gain as much "
+        f"for {term.effect.id} as the column itself: its timing does not show that it is the driver, rather than "
+        "something else that changes as slowly."
+    )
+    many = shift.as_good > _MANY * shift.copies
+    return Told("driver_shift", shift, keys={"driver_shift": shift}, warnings=(sentence,) if many else (), rows=(row,))
 
 
 def shifted(model: JointModel, located: Located) -> DriverShift | None:
@@ -99,17 +125,4 @@ def _cut(tangents: Tangents, rows: slice) -> Tangents:
         (),
         {name: None if one is None else one[rows] for name, one in tangents.pointwise.items()},
         None if slow is None else replace(slow, tangents=slow.tangents[rows]),
-    )
-
-
-def shift_warning(finding: Finding) -> tuple[str, ...]:
-    """A sentence where many shifted copies of the driver do as well."""
-    found = finding.driver_shift
-    if found is None or found.as_good <= _MANY * found.copies:
-        return ()
-    columns = ", ".join(finding.drivers)
-    return (
-        f"{found.as_good} of {found.copies} copies of {columns}, shifted by up to {found.reach:.3g} s, gain as much "
-        f"for {finding.effect} as the column itself: its timing does not show that it is the driver, rather than "
-        "something else that changes as slowly.",
     )

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
+from mkc_torch.diagnosis.evidence.base import Case, Row, Told
 from mkc_torch.diagnosis.evidence.held_out import gain_interval, scored
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.result import Extrapolation, Finding
+from mkc_torch.diagnosis.result import Extrapolation
 
-__all__ = ["extrapolated", "extrapolation_warning"]
+__all__ = ["extrapolated", "of_finding", "said", "test"]
 
 SHARE = 0.7
 """Of the samples, those with the lowest values of the driver, that the fits are to."""
@@ -18,6 +21,43 @@ SHARE = 0.7
 _BLOCKS, _FEWEST = 25, 5
 _SPREAD = 0.25
 """Share of the driver's range that the lowest values must cover for a fit to them to say anything."""
+
+
+def of_finding(case: Case) -> Extrapolation | None:
+    return extrapolated(*case.without_and_with, case.term, case.seed)
+
+
+def test(case: Case) -> Told:
+    """What the finding is worth where its driver is high, and a warning where it makes it clearly worse."""
+    return said(case.ahead, case.term)
+
+
+def said(extrapolation: Extrapolation | None, term: Term) -> Told:
+    if extrapolation is None:
+        return Told("extrapolation")
+    low, high = extrapolation.confidence_interval
+    verb = "predicts" if low > 0.0 else "misleads" if high < 0.0 else "says nothing"
+    gain = _in_words(extrapolation)
+    row = Row("beyond its range", f"fitted where its driver is low, it {verb} where that is high: {gain}", False)
+    sentence = (
+        f"{term.effect.id} does not extrapolate: fitted to the {100.0 * SHARE:.0f} % of samples where "
+        f"{', '.join(term.columns)} is lowest, it predicts the others worse than the model without it. Do not use it "
+        "beyond the range recorded."
+    )
+    return Told("extrapolation", extrapolation, warnings=(sentence,) if high < 0.0 else (), rows=(row,))
+
+
+def _in_words(extrapolation: Extrapolation) -> str:
+    """The gain with its interval, to two digits of its standard error.
+
+    Example:
+        >>> _in_words(Extrapolation(-0.0212, (-0.12, 0.09)))
+        '-0.021 nats a sample (95 %: -0.120 to 0.090)'
+    """
+    low, high = extrapolation.confidence_interval
+    places = max(1 - math.floor(math.log10(0.25 * (high - low))), 0) if high > low else 3
+    gain, low, high = (round(value, places) + 0.0 for value in (extrapolation.log_likelihood_gain, low, high))
+    return f"{gain:+.{places}f} nats a sample (95 %: {low:.{places}f} to {high:.{places}f})"
 
 
 def extrapolated(without: FittedModel, fit: FittedModel, term: Term, seed: int) -> Extrapolation | None:
@@ -61,15 +101,3 @@ def _reach(term: Term) -> Tensor | None:
 def _score(fit: FittedModel, rows: Tensor) -> Tensor:
     found = fitted(fit.model, fit.parameters, fit.bound, rows=rows.to(fit.residual.dtype), graduate=False)
     return scored(found.residual, found.sigma, found.d, found.bound)
-
-
-def extrapolation_warning(finding: Finding) -> tuple[str, ...]:
-    """A sentence where the effect makes it clearly worse."""
-    found = finding.extrapolation
-    if found is None or found.confidence_interval[1] >= 0.0:
-        return ()
-    columns = ", ".join(finding.drivers)
-    return (
-        f"{finding.effect} does not extrapolate: fitted to the {100.0 * SHARE:.0f} % of samples where {columns} is "
-        "lowest, it predicts the others worse than the model without it. Do not use it beyond the range recorded.",
-    )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.diagnosis.evidence.base import Case, Told
 from mkc_torch.diagnosis.linearised.tangents import candidate_tangents
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.search.locate import Located
@@ -17,7 +18,7 @@ from mkc_torch.diagnosis.search.locate import Located
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["onset_interval"]
+__all__ = ["of_finding", "onset_interval", "said", "test"]
 
 _CRITICAL = -2.0 * math.log(1.0 - math.sqrt(0.95))
 """Twice the nats by which the true onset falls short of the likeliest one in no more than 5 % of recordings."""
@@ -30,6 +31,19 @@ _GROWTH = 1.3
 
 _BETWEEN = 12
 """Samples that are tried between the last one within and the first one beyond."""
+
+
+def of_finding(case: Case) -> tuple[float, float] | None:
+    return onset_interval(case.fits[case.number].model, case.located)
+
+
+def test(case: Case) -> Told:
+    """The interval of the finding's onset."""
+    return said(case.ahead)
+
+
+def said(interval: tuple[float, float] | None) -> Told:
+    return Told("onset", interval, keys={} if interval is None else {"onset_interval": interval})
 
 
 def onset_interval(model: JointModel, located: Located) -> tuple[float, float] | None:

@@ -6,18 +6,50 @@ from collections.abc import Sequence
 
 import torch
 
+from mkc_torch.diagnosis.evidence.base import Case, SmoothCorrection, Told
 from mkc_torch.diagnosis.evidence.ceiling import Ceiling, ceiling
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, gain_interval
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.effects.sensor.unknown import UNKNOWN
 
-__all__ = ["remaining", "remaining_warning"]
+__all__ = ["nameless", "remaining", "remaining_warning", "said", "test", "within_reach"]
 
 _SURE = 0.99
 """Coverage of the intervals on what columns add: a warning is to be rarer than a finding that is none."""
 
 _WORTH = 0.01
 """Nats per sample that the correction has to gain, which makes residuals smaller by about a hundredth."""
+
+
+def within_reach(case: Case) -> tuple[Ceiling, tuple[str, ...]]:
+    """The ceiling of any fit, and the columns along which something smooth remains."""
+    base, fit = case.base, case.fit
+    reach = ceiling(base.model, _answerable(base, fit), case.drivers, case.blocks)
+    if nameless(fit):
+        return reach, ()
+    return reach, remaining(reach, case.held_out[-1], fit, case.drivers, case.blocks, case.seed)
+
+
+def test(case: Case) -> Told:
+    """How far a smooth correction comes, and a warning of the columns along which something remains."""
+    reach, columns = case.ahead
+    return said(SmoothCorrection(case.spread(reach.evidence), columns))
+
+
+def said(smooth: SmoothCorrection) -> Told:
+    return Told("remaining", smooth, keys={"ceiling": smooth.reached}, warnings=remaining_warning(smooth.columns))
+
+
+def nameless(fit: FittedModel) -> bool:
+    """Whether an effect is a curve over a driver that no physics of the catalogue accounts for."""
+    return any(term.effect.id == UNKNOWN for term in fit.model.terms)
+
+
+def _answerable(base: FittedModel, final: FittedModel) -> FittedModel:
+    """The final fit; that of the simulation alone, if it has no answer at the other's parameters."""
+    alone = base.model.residual(final.parameters[: base.model.size])
+    return final if bool(alone.isfinite().all()) else base
 
 
 def remaining(

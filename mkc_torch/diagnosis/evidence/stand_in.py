@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import torch
 
+from mkc_torch.diagnosis.evidence.base import Case, Told
 from mkc_torch.diagnosis.evidence.common_cause import common_cause
 from mkc_torch.diagnosis.linearised.beside_wander import beside_wander
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.drivers import ANY
-from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.effects.sensor.unrecorded import Unrecorded
 
-__all__ = ["stand_in_warning"]
+__all__ = ["goes_on", "test"]
 
 _SURE = 0.01
 """p-value of what the axes of the wander have in common: a warning is to be rarer than a finding that is none."""
@@ -20,26 +20,29 @@ _SAME_WAY = 0.9
 """Cosine between its direction and that of the effect."""
 
 
-def stand_in_warning(fit: FittedModel) -> tuple[str, ...]:
-    """A sentence, where the last finding's column follows its cause in part: it may stand in for one not recorded.
+def test(case: Case) -> Told:
+    """A warning, where the last finding's column follows its cause in part: it may stand in for one not recorded."""
+    if not case.ahead:
+        return Told("stand_in", False)
+    name = ", ".join(case.fit.model.terms[-1].columns)
+    sentence = (
+        f"What {name} leaves of the offset goes on along the same direction: {name} follows the cause in part, and may "
+        "only stand in for one that was not recorded. Look for it, and record it."
+    )
+    return Told("stand_in", True, warnings=(sentence,))
 
-    Args:
-        fit: the final one.
-    """
+
+def goes_on(case: Case) -> bool:
+    """Whether what the last finding leaves wanders along its own direction."""
+    fit = case.fit
     last = fit.model.terms[-1] if fit.model.terms else None
     if last is None or last.driver is None or last.driver.role != ANY or last.port != Unrecorded.port:
-        return ()
+        return False
     tangents = tangents_of(fit.model, fit.parameters)
     left = beside_wander(fit, fit.model, fit.parameters, tangents)
     cause = common_cause(left.noise, left.slow)
     gamma = fit.model.gammas(fit.parameters)[-1]
     if cause is None or cause.p_value > _SURE or len(gamma) != len(cause.direction):
-        return ()
+        return False
     cosine = torch.nn.functional.cosine_similarity(gamma, cause.direction, dim=0)
-    if float(cosine.abs()) < _SAME_WAY:
-        return ()
-    name = ", ".join(last.columns)
-    return (
-        f"What {name} leaves of the offset goes on along the same direction: {name} follows the cause in part, and may "
-        "only stand in for one that was not recorded. Look for it, and record it.",
-    )
+    return float(cosine.abs()) >= _SAME_WAY

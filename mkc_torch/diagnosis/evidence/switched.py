@@ -1,4 +1,4 @@
-"""Whether a step comes and goes, as what is switched does."""
+"""Whether a step comes and goes after its onset, as what is switched does."""
 
 from __future__ import annotations
 
@@ -8,14 +8,29 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.diagnosis.evidence.base import Case, Told, gain_of
+
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["comes_and_goes", "memory_of"]
+__all__ = ["comes_and_goes", "memory_of", "said", "test"]
 
 _FREQUENCIES = 4001
 _NATS, _SHARE = 7.0, 0.05
 """What a step has to lose in a stretch after its onset: nats, and the share of all that it gains."""
+
+
+def test(case: Case) -> Told:
+    """Whether the finding is such a step."""
+    onset = case.term.shape.get("onset")
+    if onset is None:
+        return said(False)
+    memory = memory_of(case.final.colour.coefficients)
+    return said(comes_and_goes(gain_of(case.final, case.number), case.prepared.time, onset, memory))
+
+
+def said(switched: bool) -> Told:
+    return Told("switched", switched, keys={"comes_and_goes": True} if switched else {})
 
 
 def comes_and_goes(gain: Float[Tensor, " N"], time: Float[Tensor, " N"], onset: float, memory: float = 1.0) -> bool:

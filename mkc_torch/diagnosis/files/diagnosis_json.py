@@ -6,12 +6,12 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, is_dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from mkc_torch.diagnosis.result import DensityCheck, Diagnosis, Finding, HeldOut, Noise, Number, Parameter, Spread
+from mkc_torch.diagnosis.result import Diagnosis, Finding, HeldOut, Noise, Number, Parameter, Spread, Told
 
 __all__ = ["SCHEMA", "DiagnosisFileError", "diagnosis_to_json", "json_schema", "validate"]
 
@@ -48,10 +48,11 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "findings": [_finding(f) for f in d.findings],
         "baseline": _spread(d.baseline),
         "corrected": _spread(d.corrected),
-        "ceiling": None if d.ceiling is None else _spread(d.ceiling),
+        "ceiling": None,
         "advice": d.advice,
         "warnings": d.warnings,
     }
+    content = _with_evidence(content, d.evidence, json_schema())
     _refuse_not_finite(content)
     text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
     validate(json.loads(text))
@@ -115,17 +116,6 @@ def _noise(noise: Noise) -> dict[str, Any]:
         "description": noise.description,
         **({"units": dict(noise.units)} if noise.units else {}),
         **({"unit": noise.unit} if noise.unit else {}),
-        **({"density_check": [_density_check(check) for check in noise.checks]} if noise.checks else {}),
-    }
-
-
-def _density_check(check: DensityCheck) -> dict[str, Any]:
-    return {
-        "channel": check.channel,
-        "distance": check.distance,
-        "student_t_distance": check.student_distance,
-        "degrees_of_freedom": check.degrees_of_freedom,
-        "allowed": check.allowed,
     }
 
 
@@ -140,7 +130,7 @@ def _spread(spread: Spread) -> dict[str, Any]:
 
 def _finding(finding: Finding) -> dict[str, Any]:
     f = finding
-    return {
+    content = {
         "effect": f.effect,
         "drivers": f.drivers,
         "channels": f.channels,
@@ -150,8 +140,6 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "explanation": f.explanation,
         "parameters": [_parameter(p) for p in f.parameters],
         "p_value": f.p_value,
-        "held_out": None if f.held_out is None else _held_out(f.held_out),
-        "held_out_note": f.held_out_note,
         "alternatives": [
             {
                 "effect": a.effect,
@@ -165,15 +153,40 @@ def _finding(finding: Finding) -> dict[str, Any]:
         ],
         "plausible": f.plausible,
         "plausibility": f.plausibility,
-        **({} if f.onset_interval is None else {"onset_interval": f.onset_interval}),
-        **({} if f.driver_shift is None else {"driver_shift": asdict(f.driver_shift)}),
         **({} if f.region is None else {"region": asdict(f.region)}),
         **({"experiments": f.experiments} if f.experiments else {}),
         **({"moments": f.moments} if f.moments else {}),
         **({"references": [asdict(one) for one in f.references]} if f.references else {}),
         **({"advice": f.advice} if f.advice else {}),
-        **({"comes_and_goes": True} if f.comes_and_goes else {}),
     }
+    return _with_evidence(content, f.evidence, json_schema()["$defs"]["finding"])
+
+
+def _with_evidence(content: Mapping[str, Any], evidence: Sequence[Told], schema: Mapping[str, Any]) -> dict[str, Any]:
+    """With what the tests say of it, its keys in the order in which the schema has them."""
+    whole = dict(content)
+    for told in evidence:
+        for key, value in told.keys.items():
+            known = whole.get(key)
+            whole[key] = {**known, **_json(value)} if isinstance(known, Mapping) else _json(value)
+    more = {told.test: _json(told.content) for told in evidence if told.content}
+    if more:
+        whole["evidence"] = more
+    order = {key: place for place, key in enumerate(schema["properties"])}
+    return dict(sorted(whole.items(), key=lambda item: order.get(item[0], len(order))))
+
+
+def _json(value: Any) -> Any:
+    """A value of JSON as it is, and results as this file writes them."""
+    if isinstance(value, Spread):
+        return _spread(value)
+    if isinstance(value, HeldOut):
+        return _held_out(value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return _json(asdict(value))
+    if isinstance(value, Mapping):
+        return {key: _json(child) for key, child in value.items()}
+    return [_json(child) for child in value] if isinstance(value, (list, tuple)) else value
 
 
 def _parameter(parameter: Parameter) -> dict[str, Any]:

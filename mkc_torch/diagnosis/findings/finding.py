@@ -11,14 +11,13 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.unit_text import ratio, tidy
-from mkc_torch.diagnosis.evidence.held_out import scored
-from mkc_torch.diagnosis.evidence.switched import comes_and_goes, memory_of
+from mkc_torch.diagnosis.evidence.base import gain_of
 from mkc_torch.diagnosis.findings.formula import formulas
 from mkc_torch.diagnosis.findings.regions import attributed, map_of, region_of, shares_of_runs
 from mkc_torch.diagnosis.findings.what_to_record import SAME, told_by
 from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.model.term import Term, follows_signal
-from mkc_torch.diagnosis.result import Alternative, Curve, Finding, HeldOut, Number, Parameter, Reference
+from mkc_torch.diagnosis.result import Alternative, Curve, Finding, Number, Parameter, Reference
 from mkc_torch.diagnosis.search.locate import Located
 from mkc_torch.diagnosis.search.ranking import SEPARABLE
 from mkc_torch.effects.base import (
@@ -40,7 +39,7 @@ from mkc_torch.nonlinear import beside
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["finding_of", "gain_of", "intervals_of", "labels", "parameters_of", "places_of"]
+__all__ = ["finding_of", "intervals_of", "labels", "parameters_of", "places_of"]
 
 _MOST_ALTERNATIVES = 5
 _FARTHEST = 30.0
@@ -50,14 +49,13 @@ _NORMAL_95 = 1.959964
 _SECONDS = ("lag", "time_constant", "middle", "width", "delay")
 
 
-def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | None, note: str) -> Finding:
-    """The finding for the effect ``number`` of the final model.
+def finding_of(located: Located, final: Estimate, number: int) -> Finding:
+    """The finding for the effect ``number`` of the final model, without its evidence.
 
     Args:
         located: the search that named it.
         final: the final parameters.
         number: of the effect among the model's terms.
-        held, note: its held-out evidence, or why there is none.
     """
     term = final.fit.model.terms[number]
     gamma, covariance = _own(final, number)
@@ -70,19 +68,16 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
     of_time = isinstance(term.effect, Unrecorded)
     told_as = formulas(curve) if term.effect.id == UNKNOWN and not of_time and curve is not None else ()
     moments = term.effect.moments(context) if isinstance(term.effect, MomentsEffect) else ()
-    gain, time, onset = gain_of(final, number), final.fit.model.prepared.time, term.shape.get("onset")
     return Finding(
         effect=term.effect.id,
         drivers=term.columns,
         channels=channels,
-        intervals=intervals_of(gain, time),
-        onset=moments[0] if moments else onset,
+        intervals=intervals_of(gain_of(final, number), final.fit.model.prepared.time),
+        onset=moments[0] if moments else term.shape.get("onset"),
         equation="; ".join([_equation(term, context), *told_as]),
         explanation=term.effect.explanation,
         parameters=(*parameters_of(term, gamma, covariance, context), *shape),
         p_value=located.p_value,
-        held_out=held,
-        held_out_note=note,
         alternatives=_alternatives(located, term),
         plausible=plausible,
         plausibility=told,
@@ -95,7 +90,6 @@ def finding_of(located: Located, final: Estimate, number: int, held: HeldOut | N
         advice=term.effect.advice,
         again=_again(term.effect),
         placed=isinstance(term.effect, PlacedEffect) and term.effect.placed,
-        comes_and_goes=onset is not None and comes_and_goes(gain, time, onset, memory_of(final.colour.coefficients)),
     )
 
 
@@ -223,16 +217,6 @@ def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
         found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= SEPARABLE, rival.at, again, told))
     near = [a for a in found if not a.separable]
     return tuple(near + [a for a in found if a.separable][: max(0, _MOST_ALTERNATIVES - len(near))])
-
-
-def gain_of(final: Estimate, number: int) -> Float[Tensor, " N"]:
-    """What one effect gains at each sample, in nats, all else as it is."""
-    fit = final.fit
-    model, parameters = fit.model, fit.parameters.clone()
-    start = model.base + sum(model.sizes[:number])
-    with_it = scored(model.residual(parameters), fit.sigma, fit.d, fit.bound)
-    parameters[start : start + model.sizes[number]] = 0.0
-    return (with_it - scored(model.residual(parameters), fit.sigma, fit.d, fit.bound)).detach()
 
 
 def intervals_of(gain: Float[Tensor, " N"], time: Float[Tensor, " N"]) -> tuple[tuple[float, float], ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 
-from mkc_torch.diagnosis.evidence.density import density_checks
 from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.linearised.tangents import CORNERS
 from mkc_torch.diagnosis.result import Noise, Number
@@ -19,7 +18,7 @@ _COLOURED = 0.05
 
 
 def noise_summary(final: Estimate) -> Noise:
-    """White, autoregressive, or wandering like a random walk, with its numbers, and how well its density fits."""
+    """White, autoregressive, or wandering like a random walk, with its numbers."""
     fit, wander = final.fit, final.noise
     prepared = fit.model.prepared
     orders = final.colour.coefficients
@@ -54,5 +53,4 @@ def noise_summary(final: Estimate) -> Noise:
         f"{tail} {told}",
         units,
         prepared.unit,
-        density_checks(fit.residual, fit.sigma, fit.d, fit.bound, prepared.channels),
     )

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from mkc_torch.calibration.calibrate import ENOUGH_INFORMATION, MAX_REJECTED, Calibration, Vector, prepared
-from mkc_torch.calibration.coverage import nearest_axis
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.recording.recording import Recording
 from mkc_torch.report.calibration import pictures
-from mkc_torch.report.words import numbers as wording
+from mkc_torch.report.rendering import render
 
 __all__ = ["Comparison", "calibration_report", "refusal_report"]
 
@@ -52,7 +49,7 @@ def calibration_report(
     usable = prepared(recording)
     points = usable.magnetometer()
     in_use = calibration.corrected(points)[calibration.weight(points) >= 0.5]
-    return _render(
+    return render(
         "calibration.html.j2",
         c=calibration,
         # what is said of the file, such as a gap in time, is no doubt about the result
@@ -92,31 +89,10 @@ def refusal_report(recording: Recording, error: NotIdentifiableError) -> str:
     picture = None
     if error.coverage is not None and error.directions is not None:
         picture = Markup(pictures.coverage_map(error.coverage, error.directions))
-    return _render(
+    return render(
         "not_identifiable.html.j2",
         recording=prepared(recording),
         reason=str(error).removeprefix("Not identifiable: "),
         coverage=error.coverage,
         picture=picture,
     )
-
-
-def _render(template: str, **values: Any) -> str:
-    environment = Environment(
-        loader=PackageLoader("mkc_torch.report"),
-        autoescape=select_autoescape(["html", "html.j2"]),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["coded"] = _coded
-    environment.globals.update(w=wording, nearest_axis=nearest_axis, zip=zip)
-    return environment.get_template(template).render(**values)
-
-
-def _coded(text: str) -> Markup:
-    """A sentence in which what stands between backticks is set as code."""
-    parts = [escape(part) for part in text.split("`")]
-    if len(parts) % 2 == 0:
-        return escape(text)
-    return Markup("").join(Markup("<code>{}</code>").format(p) if i % 2 else p for i, p in enumerate(parts))

@@ -2,54 +2,28 @@
 
 from __future__ import annotations
 
-import io
-import re
 from typing import Any
 
 import matplotlib
 import numpy as np
 import torch
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.coverage import NEAR_DEGREES, Coverage, nearest_axis
 from mkc_torch.functional import mkc_nll
+from mkc_torch.report.drawing import BLUE, GREY, INK, ORANGE, PALE, SHADE, STYLE, svg
+from mkc_torch.report.words.terms import term
 
-# Okabe and Ito's colours, told apart with any colour vision
-BLUE, ORANGE, INK, GREY, PALE = "#0072B2", "#D55E00", "#222222", "#8A8A8A", "#D7DEE4"
-_SHADE = "#F3D9C6"
 _MOST_POINTS = 20_000
 _BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.9}
-_STYLE = {
-    "font.family": "sans-serif",
-    "font.size": 10.0,
-    "axes.edgecolor": GREY,
-    "axes.labelcolor": INK,
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlesize": 10.5,
-    "axes.titlelocation": "left",
-    "axes.unicode_minus": True,
-    "xtick.color": GREY,
-    "ytick.color": GREY,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "hatch.color": "#D9B79D",
-    "hatch.linewidth": 0.7,
-    "legend.frameon": False,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "mkc",
-    "savefig.transparent": True,
-}
 
 
 def sphere(calibration: Calibration, points: Tensor) -> str:
     """Samples near each plane through the centre, measured and corrected, with the outline they should lie on."""
     c = calibration
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 6.9), layout="constrained")
         axes = figure.subplots(2, 3)
         rejected = c.weight(points) < 0.5
@@ -75,8 +49,8 @@ def sphere(calibration: Calibration, points: Tensor) -> str:
                 _square(ax, outline[:, i], outline[:, j], include_origin=row == 0)
                 ax.set_xlabel(f"{name[i]} ({unit})")
                 ax.set_ylabel(f"{name[j]} ({unit})")
-                ax.set_title(f"{'Measured' if row == 0 else 'Corrected'}, {name[i]}{name[j]} plane")
-        return _svg(figure, "sphere", "Samples before and after calibration in three planes, with the fitted outline")
+                ax.set_title(term("picture.measured" if row == 0 else "picture.corrected", plane=name[i] + name[j]))
+        return svg(figure, "sphere", term("picture.about_sphere"))
 
 
 def residual(calibration: Calibration, points: Tensor, time: Tensor | None) -> str:
@@ -85,26 +59,26 @@ def residual(calibration: Calibration, points: Tensor, time: Tensor | None) -> s
     r = c.norm_residual(points).numpy()
     rejected = (c.weight(points) < 0.5).numpy()
     x = np.arange(len(r)) if time is None else time.numpy()
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 4.8), layout="constrained")
         top, close = figure.subplots(2, 1, sharex=True)
         for ax in (top, close):
             for start, end in c.disturbed:
-                ax.axvspan(start, end, color=_SHADE, lw=0)
+                ax.axvspan(start, end, color=SHADE, lw=0)
             ax.axhline(0.0, color=GREY, lw=0.7)
-            for mask, color, label in ((~rejected, BLUE, "in use"), (rejected, ORANGE, "rejected")):
+            for mask, color, label in ((~rejected, BLUE, "picture.in_use"), (rejected, ORANGE, "label.rejected")):
                 if mask.any():
-                    ax.plot(x[mask], r[mask], ".", ms=2.2, color=color, label=label, rasterized=True)
-            ax.set_ylabel(f"residual ({c.unit})")
+                    ax.plot(x[mask], r[mask], ".", ms=2.2, color=color, label=term(label), rasterized=True)
+            ax.set_ylabel(f"{term('label.residual')} ({c.unit})")
         limit = 5.0 * c.after.robust
         if limit > 0:
             close.set_ylim(-limit, limit)
-        top.set_title("Length of the corrected field less its nominal length: all samples")
-        close.set_title(f"Close up: within ±{limit:.3g} {c.unit}, five times its robust scatter")
-        close.set_xlabel("sample" if time is None else "time (s)")
+        top.set_title(term("picture.all_samples"))
+        close.set_title(term("picture.close_up", limit=f"{limit:.3g}", unit=c.unit))
+        close.set_xlabel(term("unit.sample" if time is None else "picture.time"))
         close.margins(x=0.01)
         _legend_above(top)
-        return _svg(figure, "residual", "Residual over time with rejected samples and disturbed intervals")
+        return svg(figure, "residual", term("picture.about_residual"))
 
 
 def density(calibration: Calibration, points: Tensor) -> str:
@@ -115,7 +89,7 @@ def density(calibration: Calibration, points: Tensor) -> str:
     d, bound = half_radius * c.d, half_radius * c.bound
     gauss = float(e.std())
     low, high = float(e.min()), float(e.max())
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 3.9), layout="constrained")
         left, right = figure.subplots(1, 2)
         head = 6.0 * d
@@ -123,29 +97,29 @@ def density(calibration: Calibration, points: Tensor) -> str:
             edges = np.linspace(start, end, 61 if ax is left else 81)
             count, _ = np.histogram(e.numpy(), edges)
             value = count / (len(e) * np.diff(edges))
-            ax.stairs(value, edges, fill=True, color=PALE, label="samples")
+            ax.stairs(value, edges, fill=True, color=PALE, label=term("picture.samples"))
             grid = torch.linspace(start, end, 1201, dtype=torch.float64)
             fitted = torch.exp(-mkc_nll(grid, c.sigma, d, bound))
             normal = torch.exp(-0.5 * (grid / gauss).square()) / (gauss * (2 * np.pi) ** 0.5) if gauss > 0 else 0 * grid
-            ax.plot(grid, fitted, color=BLUE, lw=1.6, label="MKC, fitted")
-            ax.plot(grid, normal, color=ORANGE, lw=1.4, ls=(0, (5, 2)), label="Gaussian of the same samples")
-            ax.set_xlabel(f"residual, algebraic × radius/2 ({c.unit})")
+            ax.plot(grid, fitted, color=BLUE, lw=1.6, label=term("picture.fitted"))
+            ax.plot(grid, normal, color=ORANGE, lw=1.4, ls=(0, (5, 2)), label=term("picture.normal"))
+            ax.set_xlabel(term("picture.algebraic", unit=c.unit))
             ax.margins(x=0)
             if ax is right:
                 least = 1.0 / (len(e) * (edges[1] - edges[0]))
                 ax.set_ylim(0.3 * least, 3.0 * max(float(fitted.max()), float(value.max())))
                 ax.set_yscale("log")
-        left.set_ylabel(f"density (1/{c.unit})" if c.unit else "density")
-        left.set_title("Head, linear scale")
-        right.set_title("Head and tail, logarithmic scale")
+        left.set_ylabel(term("picture.density", unit=c.unit) if c.unit else term("noise.density"))
+        left.set_title(term("picture.head"))
+        right.set_title(term("picture.tail"))
         left.legend(loc="upper left", fontsize=9, borderaxespad=0.2, handlelength=1.6)
         left.set_ylim(0.0, 1.45 * left.get_ylim()[1])
-        return _svg(figure, "density", "Histogram of residuals with the MKC density and a Gaussian")
+        return svg(figure, "density", term("picture.about_density"))
 
 
 def coverage_map(found: Coverage, directions: Tensor) -> str:
     """The sphere of directions in the sensor's axes, Mollweide: covered, not covered, samples, axes and gaps."""
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 4.6), layout="constrained")
         ax = figure.add_subplot(projection="mollweide")
         lon, lat = np.meshgrid(np.radians(np.linspace(-180, 180, 121)), np.radians(np.linspace(-90, 90, 61)))
@@ -167,14 +141,14 @@ def coverage_map(found: Coverage, directions: Tensor) -> str:
             lon_gap, lat_gap = _lon_lat(np.array([gap.direction]))
             ax.plot(lon_gap, lat_gap, "x", color=ORANGE, ms=9, mew=2)
             ax.annotate(
-                f"gap {nearest_axis(gap.direction).replace('-', '−')}, {gap.degrees:.0f}°",
+                term("picture.gap", axis=nearest_axis(gap.direction).replace("-", "−"), degrees=f"{gap.degrees:.0f}"),
                 (float(lon_gap[0]), float(lat_gap[0])),
                 xytext=(0, -9), textcoords="offset points", ha="center", va="top",
                 color="#9A4300", weight="bold", bbox=_BOX,
             )  # fmt: skip
         ax.set_xticks([])
         ax.set_yticks([])
-        return _svg(figure, "coverage", "Map of the directions covered and not covered, in the sensor's axes")
+        return svg(figure, "coverage", term("picture.about_coverage"))
 
 
 def _ring(i: int, j: int) -> np.ndarray:
@@ -231,17 +205,3 @@ def _covered(lon: np.ndarray, lat: np.ndarray, directions: Tensor) -> np.ndarray
 
 def _label(ax: Any, lon: np.ndarray, lat: np.ndarray, text: str) -> None:
     ax.text(float(lon[0]), float(lat[0]), text, ha="center", va="center", fontsize=10, weight="bold", bbox=_BOX)
-
-
-def _svg(figure: Figure, name: str, description: str) -> str:
-    """The figure as an SVG element; its ids get a prefix, so that several can stand on one page."""
-    FigureCanvasSVG(figure)
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", dpi=150, metadata={"Date": None, "Creator": None})
-    text = buffer.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r'(?<= )id="', f'id="{name}-', text)
-    text = text.replace("url(#", f"url(#{name}-").replace('href="#', f'href="#{name}-')
-    text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
-    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
-    return text.replace("<svg", f'<svg role="img" aria-label="{description}"', 1)

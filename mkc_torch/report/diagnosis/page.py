@@ -11,12 +11,10 @@ from markupsafe import Markup
 
 from mkc_torch._parallel.fork import shared
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability
-from mkc_torch.report.calibration.page import _render
-from mkc_torch.report.diagnosis import findings as diagnosis_wording
-from mkc_torch.report.diagnosis import pictures as pictures
-from mkc_torch.report.diagnosis import verdict as diagnosis_verdict
+from mkc_torch.report.diagnosis import evidence, findings, noise, numbers, pictures, verdict
+from mkc_torch.report.rendering import render
 from mkc_torch.report.words.markup import marked, unbroken
-from mkc_torch.report.words.typesetting import typeset
+from mkc_torch.report.words.typesetting import several, typeset
 
 __all__ = ["Bar", "Cell", "bars", "diagnosis_report", "heat_map"]
 
@@ -57,17 +55,21 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
         *(partial(pictures.over_states, d, i) for i in range(count)),
     ]
     time_figure, *drawn = shared(works)
-    page = _render(
+    page = render(
         "diagnosis.html.j2",
         d=d,
         note=note,
-        say=diagnosis_wording,
-        top=diagnosis_verdict,
+        say=findings,
+        evidence=evidence,
+        numbers=numbers,
+        noise=noise,
+        top=verdict,
+        several=several,
         typeset=typeset,
         marked=marked,
-        notes=diagnosis_wording.channel_notes(d.traces.channels),
+        notes=noise.channel_notes(d.traces.channels),
         numbered=pictures.numbered(d),
-        clock=diagnosis_wording.clock_of(d.traces),
+        clock=numbers.clock_of(d.traces),
         time_figure=_markup(time_figure),
         figures=[_markup(svg) for svg in drawn[:count]],
         maps=[_markup(svg) for svg in drawn[count:]],

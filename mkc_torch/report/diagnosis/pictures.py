@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from mkc_torch.diagnosis.result import Curve, Diagnosis, Finding, Traces
-from mkc_torch.report.calibration.pictures import _SHADE, _STYLE, BLUE, GREY, INK, ORANGE, _svg
-from mkc_torch.report.words.typesetting import plain
+from mkc_torch.report.drawing import BLUE, GREY, INK, ORANGE, SHADE, STYLE, svg
+from mkc_torch.report.words.terms import term
+from mkc_torch.report.words.typesetting import capital, plain
 
 __all__ = ["CURVE_COLORS", "Panel", "driver_panels", "numbered", "of_finding", "over_states", "over_time"]
 
@@ -28,6 +29,7 @@ _MOST_ROWS, _MOST_ROWS_OF_ONE = 4, 3
 _MOST_BINS, _FEWEST_IN_A_BIN = 60, 12
 _MOST_LEVELS = 24  # of a driver that takes few values, such as a switch
 _MOST_LETTERS = 26
+_MOMENTS = ("table.before", "table.after")
 _CLOSE = 0.03  # of the axis: numbers nearer than this would overlap
 _MAP, _MAP_HEIGHT = 5.6, 3.4  # inches
 _NEVER = "#E3E3E3"
@@ -74,13 +76,13 @@ def over_time(diagnosis: Diagnosis) -> str:
             if above and row == 0:
                 for ax in axes:
                     _number(ax, findings)
-            for ax, moment in zip(axes, ("Before", "After") if findings else ("Residual",), strict=True):
-                _title(ax, f"{moment}, {_short(t.channels[row])}", above=above and row == 0)
+            for ax, moment in zip(axes, _MOMENTS if findings else ("label.residual",), strict=True):
+                _title(ax, _of_channel(moment, t.channels[row]), above=above and row == 0)
                 if row == rows - 1:
-                    ax.set_xlabel("time (s)" if t.has_time else "sample")
+                    ax.set_xlabel(term("picture.time" if t.has_time else "unit.sample"))
                 else:
                     ax.tick_params(labelbottom=False)
-        return _svg(figure, "time", "Residual over time before and after the findings were added to the simulation")
+        return svg(figure, "time", term("picture.about_time"))
 
 
 def numbered(diagnosis: Diagnosis) -> bool:
@@ -103,13 +105,13 @@ def of_finding(diagnosis: Diagnosis, index: int) -> str | None:
         for row, panel in enumerate(panels, above):
             axes = [grid.axes(figure, row, column) for column in range(2)]
             _residual(axes, t, _array(t.drivers[panel.driver]), panel.channel)
-            for ax, moment in zip(axes, ("Before", "After"), strict=True):
-                _title(ax, f"{moment}, {_short(t.channels[panel.channel])}")
+            for ax, moment in zip(axes, _MOMENTS, strict=True):
+                _title(ax, _of_channel(moment, t.channels[panel.channel]))
                 ax.set_xlabel(_with_unit(panel.driver, t.driver_units.get(panel.driver, "")))
         if curve is not None:
             ax = grid.axes(figure, 0, 2) if beside else grid.axes(figure, 0, 0, wide=True)
             _draw_curve(ax, curve, t.has_time, most=_MOST_LETTERS if beside else 3 * _MOST_LETTERS)
-        return _svg(figure, f"finding{index + 1}", f"What finding {index + 1} is, and the residual over its drivers")
+        return svg(figure, f"finding{index + 1}", term("picture.about_finding", number=index + 1))
 
 
 def over_states(diagnosis: Diagnosis, index: int) -> str | None:
@@ -127,14 +129,14 @@ def over_states(diagnosis: Diagnosis, index: int) -> str | None:
         drawn = ax.pcolormesh(x, y, shown.T, cmap=_GAIN, vmin=-limit, vmax=limit, rasterized=True)
         for axis, name, unit in zip((ax.xaxis, ax.yaxis), found.states, found.units, strict=True):
             axis.set_label_text(_with_unit(name, unit))
-        _title(ax, "Where the gain arises")
+        _title(ax, term("picture.map"))
         beside = figure.add_axes((0.86, 0.5 / _MAP_HEIGHT, 0.025, 1.0 - 0.85 / _MAP_HEIGHT))
         bar = figure.colorbar(drawn, cax=beside)
         beside.set_ylim(min(0.0, float(np.nanmin(shown))), limit)
         ticks = [tick for tick in bar.get_ticks() if beside.get_ylim()[0] <= tick <= limit]
         bar.set_ticks(ticks, labels=[f"{np.sign(tick) * tick**2:.3g}".replace("-", "−") for tick in ticks])
-        beside.set_ylabel("nats")
-        return _svg(figure, f"map{index + 1}", f"Gain of finding {index + 1} over the states")
+        beside.set_ylabel(term("unit.nats"))
+        return svg(figure, f"map{index + 1}", term("picture.about_map", number=index + 1))
 
 
 def driver_panels(diagnosis: Diagnosis, index: int) -> list[Panel]:
@@ -153,7 +155,7 @@ def driver_panels(diagnosis: Diagnosis, index: int) -> list[Panel]:
 
 @contextmanager
 def _style() -> Iterator[None]:
-    with matplotlib.rc_context(_STYLE | _OWN_STYLE), warnings.catch_warnings():
+    with matplotlib.rc_context(STYLE | _OWN_STYLE), warnings.catch_warnings():
         # names in letters that the font for measuring lacks; the reader's browser has them
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
         yield
@@ -206,7 +208,7 @@ def _residual(axes: Sequence[Any], t: Traces, x: np.ndarray, channel: int) -> No
         ax.margins(x=0.01)
         ax.locator_params(axis="y", nbins=5)
         ax.locator_params(axis="x", nbins=6)
-    axes[0].set_ylabel(_with_unit("residual", t.unit))
+    axes[0].set_ylabel(_with_unit(term("label.residual"), t.unit))
     for ax in axes[1:]:
         ax.tick_params(labelleft=False)
 
@@ -256,7 +258,7 @@ def _binned(x: np.ndarray, e: np.ndarray) -> _Bins:
 def _mark(ax: Any, findings: Sequence[Finding]) -> None:
     for finding in findings:
         for start, end in finding.intervals:
-            ax.axvspan(start, end, color=_SHADE, lw=0, zorder=0)
+            ax.axvspan(start, end, color=SHADE, lw=0, zorder=0)
         for moment in _onsets(finding):
             ax.axvline(moment, color=ORANGE, lw=1.2, zorder=3)
         if finding.onset_interval is not None:
@@ -293,6 +295,10 @@ def _onsets(finding: Finding) -> tuple[float, ...]:
     return finding.moments or (() if finding.onset is None else (finding.onset,))
 
 
+def _of_channel(key: str, channel: str) -> str:
+    return term("picture.of_channel", name=capital(term(key)), channel=_short(channel))
+
+
 def _title(ax: Any, text: str, *, above: bool = False) -> None:
     ax.set_title(text, pad=18.0 if above else None)
 
@@ -306,9 +312,9 @@ def _draw_curve(ax: Any, curve: Curve, has_time: bool, most: int) -> None:
         ax.plot(x, value[:, i], color=color, lw=1.6)
     ax.margins(x=0.01)
     sampled = curve.driver == "time" and not has_time
-    ax.set_xlabel("sample" if sampled else _with_unit(curve.driver, curve.unit, most))
-    ax.set_ylabel(_with_unit("effect", curve.value_unit))
-    _title(ax, "What was found, 95 % band")
+    ax.set_xlabel(term("unit.sample") if sampled else _with_unit(curve.driver, curve.unit, most))
+    ax.set_ylabel(_with_unit(term("finding.effect"), curve.value_unit))
+    _title(ax, term("picture.curve"))
     ax.locator_params(axis="x", nbins=6)
     ax.locator_params(axis="y", nbins=5)
 

@@ -11,23 +11,18 @@ from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.report.diagnosis.findings import (
     acts_on,
     better,
-    clock_of,
-    evidence,
     finding_name,
-    gain,
     inseparable,
-    largest,
-    noise_model,
-    residual_sizes,
     rivals,
-    several,
-    smooth_fit,
     unrecorded,
     where,
     with_names,
 )
+from mkc_torch.report.diagnosis.noise import noise_model, smooth_fit
+from mkc_torch.report.diagnosis.numbers import clock_of, evidence, gain, largest, residual_sizes
 from mkc_torch.report.words.numbers import share, size
-from mkc_torch.report.words.typesetting import capital, plain
+from mkc_torch.report.words.terms import term
+from mkc_torch.report.words.typesetting import capital, plain, several
 
 __all__ = ["Tone", "apply_command", "chance", "headline", "lead", "to_do", "tone", "warned"]
 
@@ -49,23 +44,21 @@ def headline(diagnosis: Diagnosis) -> str:
     """The verdict in a sentence or two, graded by what the findings are worth."""
     d = diagnosis
     if nothing_shows(d):
-        return "Nothing is missing that this recording could show."
+        return term("verdict.nothing")
     return " ".join(filter(None, [_found(d.findings), _open(d)]))
 
 
 def _found(findings: Sequence[Finding]) -> str:
     worth = [f for f in findings if worth_correcting(f)]
-    told = [f"Left out of the simulation: {_names(worth, findings)}."] if worth else []
+    told = [term("verdict.left_out", findings=_names(worth, findings))] if worth else []
     for reason in (_SMALL, _UNCONFIRMED, _BOTH):
         of_it = [f for f in findings if f not in worth and _why(f) == reason]
         if of_it:
-            told.append(f"{reason}: {_names(of_it, findings)}.")
+            told.append(term(reason, findings=_names(of_it, findings)))
     return " ".join(told)
 
 
-_SMALL = "Real, but small beside the noise"
-_UNCONFIRMED = "Found, but not confirmed on unseen blocks"
-_BOTH = "Found, but not confirmed on unseen blocks and too small to be worth correcting"
+_SMALL, _UNCONFIRMED, _BOTH = "verdict.small", "verdict.unconfirmed", "verdict.unconfirmed_and_small"
 
 
 def _why(finding: Finding) -> str:
@@ -84,63 +77,69 @@ def _or_a_rival(finding: Finding, *, alone: bool) -> str:
     if not others:
         return name
     if not alone:
-        return f"{name}, or a rival"
+        return term("verdict.or_a_rival", finding=name)
     if len(others) == 1:
-        return f"{name} or {rivals(finding)}, which this recording cannot tell apart"
-    return f"{name} or one of {len(others)} others that this recording cannot tell from it"
+        return term("verdict.or_one", finding=name, rival=rivals(finding))
+    return term("verdict.or_many", finding=name, count=len(others))
 
 
 def _open(diagnosis: Diagnosis) -> str:
     """What no finding accounts for."""
     d = diagnosis
-    yet = "Yet something" if d.findings else "Something"
     if d.remaining:
-        return f"{yet} smooth remains along {several(d.remaining)} that no effect in the catalogue accounts for."
+        return term("verdict.yet_smooth" if d.findings else "verdict.smooth", columns=several(d.remaining))
     if not d.findings and d.p_value <= d.level and d.verdict == "adequate":
-        return (
-            "Something is there that noise alone rarely makes, but no effect that also predicts unseen blocks: nothing "
-            "is named."
-        )
+        return term("verdict.unnamed")
     if d.verdict != "unexplained":
         return ""
     if any(unrecorded(f) for f in d.findings):
-        return "Its course over time is all that is known of it."
-    return f"{'Yet structure' if d.findings else 'Structure'} remains that no effect in the catalogue accounts for."
+        return term("verdict.course_alone")
+    return term("verdict.yet_structure" if d.findings else "verdict.structure")
 
 
 def lead(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """How large, where, how sure, how much better: questions with their answers."""
     d = diagnosis
-    sure = ("How sure", chance(d.findings[0].p_value if d.findings else d.p_value, d))
+    sure = (_label("label.how_sure"), chance(d.findings[0].p_value if d.findings else d.p_value, d))
     if not d.findings:
         unit = f" {plain(d.traces.unit)}" if d.traces.unit else ""
-        left = f"{size(d.baseline.rmse)}{unit}, root mean square on data the fit had not seen."
+        left = term("verdict.residual", residual=f"{size(d.baseline.rmse)}{unit}")
         beside = smooth_fit(d)
-        rows = [sure, ("Residual", left), ("Noise", f"{capital(noise_model(d.noise))}.")]
-        return [*rows, ("For comparison", f"{capital(beside)}.")] if beside else rows
-    improved = f"On data the fit had not seen, the residual is {residual_sizes(d)}"
+        rows = [sure, (_label("label.residual"), left), (_label("label.noise"), f"{capital(noise_model(d.noise))}.")]
+        return [*rows, (_label("label.for_comparison"), f"{capital(beside)}.")] if beside else rows
+    improved = term("verdict.improved", change=residual_sizes(d))
     if len(d.findings) > 1:
-        return [sure, ("How much better", f"{improved}.")]
+        return [sure, (_label("label.how_much_better"), f"{improved}.")]
     f = d.findings[0]
     told = [largest(p) for p in f.parameters[:2]]
-    large = [("How large", "; ".join(told) + ".")] if told else []
+    large = [(_label("label.how_large"), "; ".join(told) + ".")] if told else []
     acts = f"; {acts_on(f)}" if f.channels else ""
-    confirms = f": {better(f.held_out)}, {gain(f.held_out)}." if f.held_out else f"; not measured: {f.held_out_note}."
+    if f.held_out:
+        confirms = f": {better(f.held_out)}, {gain(f.held_out)}."
+    else:
+        confirms = f"; {term('evidence.not_measured')}: {f.held_out_note}."
     return [
         *large,
-        ("Where", f"{capital(where(f, clock_of(d.traces)))}{acts}."),
+        (_label("label.where"), f"{capital(where(f, clock_of(d.traces)))}{acts}."),
         sure,
-        ("How much better", f"{improved}{confirms}"),
+        (_label("label.how_much_better"), f"{improved}{confirms}"),
     ]
+
+
+def _label(key: str) -> str:
+    return capital(term(key))
 
 
 def chance(p_value: float, diagnosis: Diagnosis) -> str:
     """What a p-value means, in a sentence."""
     d = diagnosis
-    most = "at most " if p_value <= (1.0 + 1e-9) / (1 + d.surrogates) else ""
-    return (
-        f"If nothing were missing, a search like this, of {d.candidates_tried:,} candidates, would find as much in "
-        f"{most}{share(p_value)} of recordings ({evidence(p_value, d.surrogates)}; the level asked for is {d.level:g})."
+    told = share(p_value)
+    return term(
+        "verdict.chance",
+        candidates=f"{d.candidates_tried:,}",
+        share=term("verdict.at_most", share=told) if p_value <= (1.0 + 1e-9) / (1 + d.surrogates) else told,
+        evidence=evidence(p_value, d.surrogates),
+        level=f"{d.level:g}",
     )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from mkc_torch.calibration.calibrate import Calibration, Spread
 from mkc_torch.recording.disturbance import Interval
+from mkc_torch.report.words.terms import term
 
 _MOST_DECIMALS = 9
 _LEAST, _MOST = 0.01, 1e6
@@ -145,8 +146,9 @@ def noise(calibration: Calibration) -> str:
     The algebraic residual is twice the relative error of the length, to first order.
     """
     c = calibration
-    kind = "Gaussian" if math.isinf(c.sigma) else f"heavy-tailed, σ = {bandwidth(c.sigma)}"
-    return f"{size(0.5 * c.radius * c.d)} {c.unit} along the field, {kind}"
+    tailed = not math.isinf(c.sigma)
+    kind = term("noise.heavy_tailed", sigma=bandwidth(c.sigma)) if tailed else term("noise.gaussian")
+    return term("noise.along_the_field", size=f"{size(0.5 * c.radius * c.d)} {c.unit}", kind=kind)
 
 
 def when(intervals: Sequence[Interval]) -> str:
@@ -159,21 +161,25 @@ def when(intervals: Sequence[Interval]) -> str:
         'in 4 intervals, the longest from 20.0 to 24.0 s'
     """
     if len(intervals) == 1:
-        return f"between {intervals[0].start:.1f} s and {intervals[0].end:.1f} s"
-    each = [f"from {i.start:.1f} to {i.end:.1f} s" for i in intervals]
+        return term("where.between", start=f"{intervals[0].start:.1f}", end=f"{intervals[0].end:.1f}")
+    spans = [term("where.interval", start=f"{i.start:.1f}", end=f"{i.end:.1f}") for i in intervals]
+    each = [term("where.from", interval=span) for span in spans]
     if len(intervals) > 3:
         longest = max(range(len(each)), key=lambda k: intervals[k].end - intervals[k].start)
-        return f"in {len(each)} intervals, the longest {each[longest]}"
-    return " and ".join(filter(None, [", ".join(each[:-1]), *each[-1:]]))
+        return term("where.in_intervals", count=len(each), longest=each[longest])
+    return term("number.and").join(filter(None, [", ".join(each[:-1]), *each[-1:]]))
 
 
 def rejection(calibration: Calibration) -> str:
     """What was rejected, and when, as a sentence."""
     c = calibration
     if c.rejected == 0:
-        return f"None of the {c.samples:,} samples was rejected."
-    told = f"{share(c.rejected_share)} of the {c.samples:,} samples {'was' if c.rejected == 1 else 'were'} rejected"
-    return f"{told}, mainly {when(c.disturbed)}." if c.disturbed else f"{told}, scattered over the recording."
+        return term("calibration.none_rejected", samples=f"{c.samples:,}")
+    key = "calibration.one_rejected" if c.rejected == 1 else "calibration.rejected"
+    told = term(key, share=share(c.rejected_share), samples=f"{c.samples:,}")
+    if c.disturbed:
+        return term("calibration.mainly", rejected=told, when=when(c.disturbed))
+    return term("calibration.scattered", rejected=told)
 
 
 def headline(calibration: Calibration) -> list[str]:
@@ -182,10 +188,17 @@ def headline(calibration: Calibration) -> list[str]:
     exponent = power(c.radius)
     unit = f"× {in_power(exponent, c.unit)}" if exponent else c.unit
     return [
-        f"Offset ({listed(c.center, c.center_se, exponent)}) {unit}, "
-        f"semi-axes ({listed(c.semi_axes, c.semi_axes_se, exponent)}) {unit}.",
-        f"The length of the field scatters by {size(c.after.robust)} {c.unit}; before, by {size(c.before.robust)} "
-        f"{c.unit}.",
+        term(
+            "calibration.result",
+            center=listed(c.center, c.center_se, exponent),
+            axes=listed(c.semi_axes, c.semi_axes_se, exponent),
+            unit=unit,
+        ),
+        term(
+            "calibration.scatter",
+            after=f"{size(c.after.robust)} {c.unit}",
+            before=f"{size(c.before.robust)} {c.unit}",
+        ),
         rejection(c),
     ]
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
-__all__ = ["capital", "plain", "superscript", "typeset"]
+from mkc_torch.report.words.terms import term
+
+__all__ = ["capital", "plain", "several", "superscript", "typeset"]
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _POWER_OF_TEN = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]\d+)(?!\w)")
@@ -19,6 +22,17 @@ def plain(text: str) -> str:
         'coil �[31m temperature'
     """
     return "".join(c if c.isprintable() else "�" for c in " ".join(text.split()))
+
+
+def several(names: Sequence[str], most: int = 6) -> str:
+    """Names one after the other; of many, the first ones.
+
+    Example:
+        >>> several(["x", "y"]), several("abcdefgh", 3)
+        ('x, y', 'a, b, c and 5 more')
+    """
+    told = ", ".join(plain(name) for name in names[:most])
+    return term("number.and_more", first=told, count=len(names) - most) if len(names) > most else told
 
 
 def superscript(power: int) -> str:

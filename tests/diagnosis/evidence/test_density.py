@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy import stats
 
-from mkc_torch import MKCDistribution
+from mkc_torch import MKCDistribution, diagnose
 from mkc_torch.density.fit import fit_density
 from mkc_torch.diagnosis.evidence.density import (
     density_checks,
@@ -15,6 +15,8 @@ from mkc_torch.diagnosis.evidence.density import (
     student_cdf,
     student_fit,
 )
+from mkc_torch.simulation import Magnetometer
+from tests.simulation.tumbling import tumbling
 
 N = 4500
 
@@ -138,3 +140,12 @@ def test_the_effective_size_of_an_autoregression(phi):
 
 def test_a_constant_has_as_many_as_it_has():
     assert effective_size(torch.ones(50, dtype=torch.float64)) == 50.0
+
+
+def test_a_diagnosis_has_the_distances_of_each_channel():
+    result = diagnose(Magnetometer("norm"), tumbling(1000, noise=0.3), effects=(), max_findings=0, surrogates=19)
+    (check,) = result.density_checks
+    assert check.channel == "norm"
+    assert 0.0 < check.distance < check.allowed
+    assert 0.0 < check.student_distance < 0.1
+    assert not check.closer

@@ -1,22 +1,20 @@
 """A driver shifted in time is no driver, unless it changes so slowly that its timing says nothing."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence.driver_shift import shift_warning, shifted
-from mkc_torch.diagnosis.model.drivers import find_drivers
+from mkc_torch.diagnosis.evidence.driver_shift import said, shifted
+from mkc_torch.diagnosis.model.drivers import Driver, find_drivers
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import DriverShift
 from mkc_torch.diagnosis.search.locate import locate
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
-from tests.diagnosis.factory import make_diagnosis
 from tests.simulation.tumbling import tumbling
 
 GAIN = np.array([0.8, -0.6, 0.9])
@@ -41,8 +39,9 @@ def found(N, driver, effect="current_field", *, searched=None, **columns):
 
 
 def warning(shift):
-    (finding,) = make_diagnosis(1, samples=50).findings
-    return shift_warning(dataclasses.replace(finding, effect="current_field", drivers=("load",), driver_shift=shift))
+    effect = next(e for e in CATALOGUE if e.id == "current_field")
+    column = Driver(("load",), "current", torch.zeros(5, 1), torch.zeros(1), ("A",))
+    return said(shift, Term(effect, column, {})).warnings
 
 
 def test_no_shifted_copy_of_a_lively_driver_gains_as_much():

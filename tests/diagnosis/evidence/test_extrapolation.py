@@ -1,21 +1,18 @@
 """Fitted where a driver is low, judged where it is high."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence.extrapolation import extrapolated, extrapolation_warning
-from mkc_torch.diagnosis.model.drivers import find_drivers
+from mkc_torch.diagnosis.evidence.extrapolation import extrapolated, said
+from mkc_torch.diagnosis.model.drivers import Driver, find_drivers
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import Extrapolation
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
-from tests.diagnosis.factory import make_diagnosis
 from tests.simulation.tumbling import FIELD, RESPONSE, tumbling, turns
 
 N = 1500
@@ -51,9 +48,9 @@ def held_beyond(fits, seed=0):
 
 
 def warning(found):
-    (finding,) = make_diagnosis(1, samples=50).findings
-    finding = dataclasses.replace(finding, effect="driver_offset", drivers=("load",), extrapolation=found)
-    return extrapolation_warning(finding)
+    effect = next(e for e in CATALOGUE if e.id == "driver_offset")
+    load = Driver(("load",), "any", torch.zeros(5, 1), torch.zeros(1), ("A",))
+    return said(found, Term(effect, load, {})).warnings
 
 
 def test_what_is_in_proportion_throughout_holds_where_the_driver_is_high():

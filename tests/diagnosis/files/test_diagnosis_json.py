@@ -4,10 +4,14 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("jsonschema")
 
+from mkc_torch.diagnosis.evidence import density, driver_shift, extrapolation, held_out_gain, onset, switched
 from mkc_torch.diagnosis.files.diagnosis_json import DiagnosisFileError, diagnosis_to_json, json_schema, validate
+from mkc_torch.diagnosis.model.drivers import Driver
+from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import (
     DensityCheck,
     DriverShift,
@@ -16,17 +20,22 @@ from mkc_torch.diagnosis.result import (
     Parameter,
     Reference,
     Region,
+    Told,
 )
-from tests.diagnosis.factory import make_diagnosis
+from mkc_torch.effects import CATALOGUE
+from tests.diagnosis.factory import make_diagnosis, with_evidence
+
+BY_LOAD = Term(CATALOGUE[0], Driver(("load",), "any", torch.zeros(5, 1), torch.zeros(1), ("A",)), {})
 
 
 def written(diagnosis):
     return json.loads(diagnosis_to_json(diagnosis))
 
 
-def with_finding(diagnosis, **changes):
+def with_finding(diagnosis, *said, **changes):
     first, *rest = diagnosis.findings
-    return dataclasses.replace(diagnosis, findings=(dataclasses.replace(first, **changes), *rest))
+    first = with_evidence(dataclasses.replace(first, **changes), *said)
+    return dataclasses.replace(diagnosis, findings=(first, *rest))
 
 
 @pytest.fixture
@@ -65,7 +74,7 @@ def test_the_ceiling_is_written_as_the_other_models_are():
 
 
 def test_what_is_for_the_report_alone_is_not_written():
-    diagnosis = with_finding(make_diagnosis(1), extrapolation=Extrapolation(0.2, (0.1, 0.3)))
+    diagnosis = with_finding(make_diagnosis(1), extrapolation.said(Extrapolation(0.2, (0.1, 0.3)), BY_LOAD))
     assert written(diagnosis) == written(make_diagnosis(1))
 
 
@@ -80,7 +89,9 @@ def test_the_region_and_the_experiments_are_written_where_there_are_any():
 
 
 def test_what_shifted_copies_of_a_driver_gain_is_written():
-    (finding,) = written(with_finding(make_diagnosis(1), driver_shift=DriverShift(38, 2, 22.5)))["findings"]
+    (finding,) = written(with_finding(make_diagnosis(1), driver_shift.said(DriverShift(38, 2, 22.5), BY_LOAD)))[
+        "findings"
+    ]
     assert finding["driver_shift"] == {"copies": 38, "as_good": 2, "reach": 22.5}
     assert "driver_shift" not in written(make_diagnosis(1))["findings"][0]
 
@@ -89,14 +100,16 @@ def test_what_an_equation_needs_is_written():
     parameter = Parameter("gradient", (1.0, -2.0), (0.1, 0.2), "µT/m", ("∂B_x/∂y", "∂B_x/∂z"))
     changes = {
         "parameters": (parameter,), "moments": (61.1, 77.8), "advice": "Do it.",
-        "references": (Reference("current", 10.5, "A"),), "comes_and_goes": True,
+        "references": (Reference("current", 10.5, "A"),),
     }  # fmt: skip
-    (finding,) = written(with_finding(make_diagnosis(1), **changes))["findings"]
+    said = switched.said(True), onset.said((60.9, 61.2))
+    (finding,) = written(with_finding(make_diagnosis(1), *said, **changes))["findings"]
     assert finding["parameters"][0]["components"] == ["∂B_x/∂y", "∂B_x/∂z"]
     assert finding["moments"] == [61.1, 77.8]
     assert finding["references"] == [{"column": "current", "value": 10.5, "unit": "A"}]
     assert finding["advice"] == "Do it."
     assert finding["comes_and_goes"] is True
+    assert finding["onset_interval"] == [60.9, 61.2]
     bare = dict.fromkeys(("moments", "references"), ()) | {"advice": ""}
     assert not {"moments", "references", "advice"} & set(
         written(with_finding(make_diagnosis(1), **bare))["findings"][0]
@@ -106,8 +119,8 @@ def test_what_an_equation_needs_is_written():
 def test_the_noise_s_units_and_its_density_s_distances_are_written():
     made = make_diagnosis(1)
     check = DensityCheck("norm", 0.02, 0.03, 4.0, 0.05, False)
-    noise = dataclasses.replace(made.noise, units={"wander": "µT"}, unit="µT", checks=(check,))
-    told = written(dataclasses.replace(made, noise=noise))["noise"]
+    noise = dataclasses.replace(made.noise, units={"wander": "µT"}, unit="µT")
+    told = written(with_evidence(dataclasses.replace(made, noise=noise), density.said([check])))["noise"]
     assert (told["unit"], told["units"]) == ("µT", {"wander": "µT"})
     assert told["density_check"] == [
         {
@@ -115,6 +128,34 @@ def test_the_noise_s_units_and_its_density_s_distances_are_written():
             "allowed": 0.05,
         }
     ]  # fmt: skip
+
+
+def test_what_a_new_test_says_stands_under_its_id_and_the_keys_keep_their_order():
+    said = Told(
+        "my_test",
+        content={"lag": 0.4, "by": ({"channel": "norm", "held_out": HeldOut(0.1, (0.0, 0.2), 1.0, 0.9, "µT")},)},
+    )
+    made = with_evidence(with_finding(make_diagnosis(1), said, onset.said((1.0, 2.0)), switched.said(True)), said)
+    content = written(made)
+    held_out = {
+        "log_likelihood_gain": 0.1,
+        "confidence_interval": [0.0, 0.2],
+        "rmse_before": 1.0,
+        "rmse_after": 0.9,
+        "unit": "µT",
+    }
+    expected = {"my_test": {"lag": 0.4, "by": [{"channel": "norm", "held_out": held_out}]}}
+    assert content["evidence"] == content["findings"][0]["evidence"] == expected
+    for place, schema in ((content, json_schema()), (content["findings"][0], json_schema()["$defs"]["finding"])):
+        assert list(place) == [key for key in schema["properties"] if key in place]
+    assert "evidence" not in written(make_diagnosis(1))
+
+
+@pytest.mark.parametrize("evidence", [{}, {"My test": {"lag": 1}}, {"my_test": {}}, {"my_test": 0.4}, []])
+def test_evidence_of_another_form_is_refused(content, evidence):
+    content["evidence"] = evidence
+    with pytest.raises(DiagnosisFileError, match="evidence"):
+        validate(content)
 
 
 def test_components_are_as_many_as_the_numbers():
@@ -157,7 +198,8 @@ def test_what_is_not_known_is_null_and_a_gaussian_bandwidth_is_inf(content):
     held_out = HeldOut(0.1, (-math.inf, 0.2), 1.0, 0.9, "µT")
     (rival, *_) = diagnosis.findings[0].alternatives
     gap = dataclasses.replace(rival, log_likelihood_gap=math.inf)
-    told = written(with_finding(diagnosis, parameters=(errors,), held_out=held_out, alternatives=(gap,)))
+    said = held_out_gain.said(held_out, "")
+    told = written(with_finding(diagnosis, said, parameters=(errors,), alternatives=(gap,)))
     (finding,) = told["findings"]
     assert told["ceiling"] is None
     assert finding["parameters"][0]["standard_error"] == [None, 0.1]
@@ -175,7 +217,7 @@ def test_numbers_that_are_not_finite_are_refused_with_their_place():
 
 def test_missing_evidence_needs_its_reason():
     with pytest.raises(DiagnosisFileError, match="held_out_note"):
-        diagnosis_to_json(with_finding(make_diagnosis(1), held_out=None, held_out_note=""))
+        diagnosis_to_json(with_finding(make_diagnosis(1), held_out_gain.said(None, "")))
 
 
 def test_a_verdict_agrees_with_its_findings():

@@ -4,11 +4,12 @@ import dataclasses
 
 import pytest
 
+from mkc_torch.diagnosis.evidence import switched
 from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.result import Alternative
 from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
 from mkc_torch.effects.sensor.offset_drift import OffsetDrift
-from tests.diagnosis.factory import make_diagnosis
+from tests.diagnosis.factory import make_diagnosis, with_evidence
 
 
 def advised(findings=1, *, alternatives=(), **changes):
@@ -39,8 +40,8 @@ def test_what_belongs_to_the_place_is_not_for_other_recordings():
 
 def test_what_comes_and_goes_is_to_be_looked_for_and_not_corrected():
     made = make_diagnosis(1, samples=50)
-    switched = dataclasses.replace(made.findings[0], comes_and_goes=True, alternatives=())
-    (only,) = advice_of(dataclasses.replace(made, findings=(switched,)))
+    step = dataclasses.replace(with_evidence(made.findings[0], switched.said(True)), alternatives=())
+    (only,) = advice_of(dataclasses.replace(made, findings=(step,)))
     assert only.startswith("Look for something that is switched on and off")
 
 

@@ -38,11 +38,3 @@ def test_noise_with_a_memory_is_coloured_and_without_one_white():
     assert (coloured.model, white.model) == ("ar", "white")
     assert "coloured noise" in coloured.description
     assert white.description.endswith("white noise")
-
-
-def test_how_well_the_density_fits_is_always_told():
-    (check,) = told(0.0, 0.0).checks
-    assert check.channel == "norm"
-    assert 0.0 < check.distance < check.allowed
-    assert 0.0 < check.student_distance < 0.1
-    assert not check.closer

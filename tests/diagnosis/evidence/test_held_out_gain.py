@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.evidence import after_the_search as ending
+from mkc_torch.diagnosis.evidence import held_out_gain
+from mkc_torch.diagnosis.evidence.base import Case
 from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import fitted, fitted_beside
@@ -41,22 +42,21 @@ def fits():
 
 
 @pytest.fixture
-def beyond(fits, monkeypatch):
-    """What is told of the small effect."""
-    for name in ("extrapolated", "shifted", "onset_interval"):
-        monkeypatch.setattr(ending, name, lambda *_: None)
+def beside(fits):
+    """The evidence without the small effect, if that is asked for."""
     blocks = blocks_of(N, 1)
     none, small, both = fits
+    found = SimpleNamespace(fit=small), SimpleNamespace(fit=both)
 
-    def told(evidence):
-        return ending._beyond(none, both, SimpleNamespace(fit=small), 0, evidence, blocks, 0)
+    def without(*evidence):
+        return held_out_gain.beside_the_others(Case(none, None, found, evidence, blocks, (), 0))
 
-    return told, [held_out(fit, blocks) for fit in fits]
+    return without, [held_out(fit, blocks) for fit in fits]
 
 
-def test_what_is_not_confirmed_by_itself_is_judged_beside_the_other(fits, beyond):
-    told, (none, _, both) = beyond
-    without = told([none, none, both]).without
+def test_what_is_not_confirmed_by_itself_is_judged_beside_the_other(fits, beside):
+    without_small, (none, _, both) = beside
+    without = without_small(none, none, both)
     blocks = blocks_of(N, 1)
     alone = fitted_beside(
         fits[0], fits[0].model.with_term(fits[2].model.terms[1]), torch.cat([fits[0].parameters, torch.zeros(3)])
@@ -65,13 +65,13 @@ def test_what_is_not_confirmed_by_itself_is_judged_beside_the_other(fits, beyond
     assert float((both.log_likelihood - without.log_likelihood).mean()) > 0.1
 
 
-def test_what_is_confirmed_by_itself_is_not_judged_again(beyond):
-    told, (none, _, both) = beyond
-    assert told([none, both, both]).without is None
+def test_what_is_confirmed_by_itself_is_not_judged_again(beside):
+    without_small, (none, _, both) = beside
+    assert without_small(none, both, both) is None
 
 
 def test_a_diagnosis_says_so(monkeypatch):
-    monkeypatch.setattr(ending, "_confirmed", lambda *_: False)
+    monkeypatch.setattr(held_out_gain, "_confirmed", lambda *_: False)
     current = np.sign(np.sin(2.0 * np.pi * TIME / 3.7))
     sensor = np.outer(current, [0.6, -0.5, 0.6]) + np.outer(TIME >= 14.0, [3.0, 2.0, -3.0])
     effects = [effect for effect in CATALOGUE if effect.id in ("current_field", "hard_iron_step")]

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.noise.rejected import rejected_warning
+from mkc_torch.diagnosis.evidence.rejected import rejected_warning
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling
 

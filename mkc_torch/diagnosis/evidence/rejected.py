@@ -6,18 +6,26 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from mkc_torch.diagnosis.evidence.base import Case, Told
 from mkc_torch.diagnosis.noise.pseudo_residual import REJECTED_BELOW
 from mkc_torch.recording.disturbance import Interval, disturbed_intervals
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["rejected_warning"]
+__all__ = ["rejected_warning", "test"]
 
 _SHORTEST = 0.5
 """Seconds; shorter stretches are bursts of outliers."""
 
 _TOLD = 3
+
+
+def test(case: Case) -> Told:
+    """A warning that names them; of a recording without times there is none."""
+    if case.prepared.recording.time is None:
+        return Told("rejected")
+    return Told("rejected", warnings=rejected_warning(case.prepared.time, case.final.fit.weights))
 
 
 def rejected_warning(time: Float[Tensor, " N"], weights: Float[Tensor, "N m"]) -> tuple[str, ...]:

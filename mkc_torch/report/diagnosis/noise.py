@@ -1,0 +1,126 @@
+"""The noise of a diagnosis in words: its model, how well its density fits, and what smooth curves reach beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from mkc_torch.diagnosis.result import Diagnosis, Noise, Number
+from mkc_torch.report.diagnosis.numbers import measured
+from mkc_torch.report.words.numbers import bandwidth, number, size
+from mkc_torch.report.words.terms import term
+from mkc_torch.report.words.typesetting import plain, several
+
+__all__ = [
+    "channel_notes",
+    "held_out_rows",
+    "noise_model",
+    "noise_parameters",
+    "smooth_fit",
+]
+
+_CLEARLY = 0.99  # of a residual, below which another one is smaller
+_KINDS = {"white": "noise.white", "ar": "noise.autoregressive", "random_walk": "noise.random_walk"}
+_NOISE = {
+    "wander": "noise.wander",
+    "wander_period": "noise.wander_period",
+}
+_CHANNELS = {
+    "norm": "noise.norm",
+    "along": "noise.along",
+    "across_1": "noise.across",
+}
+
+
+def noise_model(noise: Noise) -> str:
+    """The noise in words."""
+    kind = term(_KINDS[noise.model])
+    described = noise.description.strip()
+    return (
+        term("noise.described", kind=kind, description=plain(described))
+        if described
+        else term("noise.plain", kind=kind)
+    )
+
+
+def noise_parameters(noise: Noise, channels: Sequence[str]) -> list[tuple[str, str]]:
+    """The numbers of the noise model in words, those of the density once a channel."""
+    rows: list[tuple[str, str]] = []
+    for name, value in noise.parameters.items():
+        unit = noise.units.get(name, "")
+        if name == "autoregression":
+            rows += _memory(value, channels)
+        elif name in _NOISE:
+            told = " ".join(measured(value, None, unit))
+            rows.append((term(_NOISE[name]), _of_wander(name, told)))
+        else:
+            rows.append((plain(name), " ".join(measured(value, None, unit))))
+    unit = f" {plain(noise.unit)}" if noise.unit else ""
+    density = zip(noise.sigma, noise.d, noise.bound, strict=True)
+    for i, (sigma, d, bound) in enumerate(density):
+        name = term("noise.density")
+        if len(noise.sigma) > 1 and i < len(channels):
+            name = term("noise.of_channel", name=name, channel=plain(channels[i]))
+        within = term("where.near_zero", bound=f"{size(bound)}{unit}")
+        rows.append((name, f"σ = {bandwidth(sigma)}, d = {size(d)}{unit}, {within}"))
+    return rows
+
+
+def _of_wander(name: str, told: str) -> str:
+    if name == "wander":
+        return term("noise.wander_size", size=told)
+    return term("noise.wander_below", period=told)
+
+
+def _memory(value: Number, channels: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Autoregression coefficients, a row a channel that has some."""
+    each = list(value) if isinstance(value, Sequence) else [value]
+    for i, one in enumerate(each):
+        if not isinstance(one, Sequence) or one:
+            name = term("noise.memory")
+            if len(each) > 1 and i < len(channels):
+                name = term("noise.of_channel", name=name, channel=plain(channels[i]))
+            told = measured(one, None, "")[0].removeprefix("(").removesuffix(")")
+            yield name, term("noise.coefficients", coefficients=told)
+
+
+def channel_notes(channels: Sequence[str]) -> str:
+    """What a magnetometer's channels are called; empty for others."""
+    return "; ".join(term(note) for name, note in _CHANNELS.items() if name in channels)
+
+
+def held_out_rows(diagnosis: Diagnosis) -> list[tuple[str, list[str]]]:
+    """The models compared on held-out blocks: root mean square, log-likelihood, and σ and d of each channel."""
+    rows = [(term("table.as_it_is"), diagnosis.baseline)]
+    if diagnosis.findings:
+        rows.append((term("table.with_findings"), diagnosis.corrected))
+    if diagnosis.ceiling is not None and _shown(diagnosis):
+        rows.append((term("table.with_smooth"), diagnosis.ceiling))
+    return [
+        (
+            name,
+            [
+                size(s.rmse),
+                number(s.log_likelihood, 3),
+                several([bandwidth(v) for v in s.sigma]),
+                several([size(v) for v in s.d]),
+            ],
+        )
+        for name, s in rows
+    ]
+
+
+def smooth_fit(diagnosis: Diagnosis) -> str:
+    """How far a smooth correction by all columns comes, beside the residual; empty where what was found is better."""
+    d = diagnosis
+    if d.ceiling is None or not _shown(d):
+        return ""
+    unit = plain(d.traces.unit)
+    smooth = term("noise.smooth_reaches", residual=f"{size(d.ceiling.rmse)} {unit}".rstrip())
+    residual = f"{size(d.corrected.rmse)} {unit}".rstrip()
+    return term("noise.smooth" if d.findings else "noise.smooth_alone", smooth=smooth, residual=residual)
+
+
+def _shown(diagnosis: Diagnosis) -> bool:
+    """Whether the smooth correction says something that the findings do not."""
+    d = diagnosis
+    return d.ceiling is not None and (not d.findings or d.ceiling.rmse < _CLEARLY * d.corrected.rmse)

@@ -1,0 +1,296 @@
+"""Numbers of a diagnosis as a reader sees them: moments, parameters with standard errors, p-values and gains."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from mkc_torch.diagnosis.result import Candidate, Diagnosis, HeldOut, Number, Parameter, Traces
+from mkc_torch.report.words.numbers import decimals, number, share, size
+from mkc_torch.report.words.terms import term
+from mkc_torch.report.words.typesetting import plain, superscript
+
+__all__ = [
+    "Clock",
+    "behind",
+    "clock_of",
+    "evidence",
+    "gain",
+    "improvement",
+    "largest",
+    "measured",
+    "named_lines",
+    "parameter_lines",
+    "parameter_name",
+    "probability",
+    "residual_sizes",
+]
+
+_FEWEST_LARGE, _MOST_SMALL = 1e6, 1e-3  # beyond these a number is written with a power of ten
+_MOST_NUMBERS = 12
+_LONG = 4  # numbers from which a list is told by its largest
+
+
+@dataclass(frozen=True)
+class Clock:
+    """How moments are written: to so many decimals, in s, or as numbers of samples."""
+
+    places: int
+    has_time: bool
+
+    def moment(self, value: float) -> str:
+        """One moment.
+
+        Example:
+            >>> Clock(1, has_time=True).moment(41.32), Clock(0, has_time=False).moment(812.0)
+            ('41.3 s', 'sample 812')
+        """
+        if self.has_time:
+            return term("where.moment", moment=number(value, self.places))
+        return term("where.moment_of_samples", moment=number(value, 0))
+
+    def interval(self, start: float, end: float) -> str:
+        """From one moment to another.
+
+        Example:
+            >>> Clock(1, has_time=True).interval(12.0, 18.44), Clock(0, has_time=False).interval(3.0, 9.0)
+            ('12.0 to 18.4 s', 'sample 3 to 9')
+        """
+        if self.has_time:
+            return term("where.interval", start=number(start, self.places), end=number(end, self.places))
+        return term("where.interval_of_samples", start=number(start, 0), end=number(end, 0))
+
+
+def clock_of(traces: Traces) -> Clock:
+    """A clock that tells moments apart to about a thousandth of the recording."""
+    known = traces.time[traces.time.isfinite()]
+    span = float(known.max() - known.min()) if traces.has_time and len(known) else 0.0
+    digits = max(2 - math.floor(math.log10(span)), int(span < 1000.0)) if span > 0 else 1
+    return Clock(min(max(digits, 0), 6), traces.has_time)
+
+
+def measured(value: Number, error: Number | None, unit: str) -> list[str]:
+    """A parameter with its standard error, to the digits that the error leaves, one line a row of a matrix.
+
+    Example:
+        >>> measured((-0.1702, 0.33), (0.0123, 0.0119), "µT/A")
+        ['(−0.170 ± 0.012, 0.330 ± 0.012) µT/A']
+        >>> measured(4.02e-6, 1.1e-7, "1/µT²"), measured(3.21987, None, "")
+        (['(4.02 ± 0.11) × 10⁻⁶ 1/µT²'], ['3.22'])
+    """
+    rows = list(_rows(value))
+    errors = list(_rows(error)) if error is not None else []
+    digits = _Digits.of(rows, errors)
+    lines = []
+    for i, row in enumerate(rows[:_MOST_NUMBERS]):
+        beside = errors[i] if i < len(errors) and len(errors[i]) == len(row) else [math.nan] * len(row)
+        cells = [digits.cell(v, e) for v, e in zip(row, beside, strict=True)]
+        rest = len(cells) - _MOST_NUMBERS
+        text = ", ".join(cells[:_MOST_NUMBERS])
+        if rest > 0:
+            text = term("number.more", first=text, count=rest)
+        bare = isinstance(value, (int, float)) and not (digits.power and "±" in text)
+        lines.append((text if bare else f"({text})") + digits.factor + (f" {plain(unit)}" if unit else ""))
+    more = len(rows) - _MOST_NUMBERS
+    return [*lines, term("number.more_rows", count=more)] if more > 0 else lines
+
+
+@dataclass(frozen=True)
+class _Digits:
+    """How numbers of one list are written: the power of ten that they share, and the decimals that errors leave."""
+
+    power: int
+    places: int
+
+    @classmethod
+    def of(cls, rows: Sequence[Sequence[float]], errors: Sequence[Sequence[float]]) -> _Digits:
+        values = [v for row in rows for v in row if math.isfinite(v)]
+        known = [e for row in errors for e in row if math.isfinite(e) and e > 0]
+        largest = max((abs(v) for v in [*values, *known]), default=0.0)
+        power = 0 if largest == 0 or _MOST_SMALL <= largest < _FEWEST_LARGE else math.floor(math.log10(largest))
+        scale = 10.0**power
+        return cls(power, decimals(max(known) / scale) if known else _three_digits(largest / scale))
+
+    @property
+    def factor(self) -> str:
+        return f" × 10{superscript(self.power)}" if self.power else ""
+
+    def cell(self, value: float, error: float) -> str:
+        """A number with its error, without the power of ten."""
+        if not math.isfinite(value):
+            return term("number.not_known")
+        told, scale = number(value / 10.0**self.power, self.places), 10.0**self.power
+        return f"{told} ± {error / scale:.{self.places}f}" if math.isfinite(error) and error > 0 else told
+
+
+def _three_digits(value: float) -> int:
+    return max(2 - math.floor(math.log10(value)), 0) if value > 0 else 0
+
+
+def _rows(value: Number | None) -> Iterator[list[float]]:
+    """Rows of numbers: of a vector one, of a matrix its own; None is a number that is not known."""
+    if value is None:
+        yield [math.nan]
+    elif isinstance(value, (int, float)):
+        yield [float(value)]
+    elif any(isinstance(v, Sequence) for v in value):
+        for v in value:
+            yield from _rows(v)
+    else:
+        yield [cell for v in value for row in _rows(v) for cell in row]
+
+
+def parameter_name(parameter: Parameter) -> str:
+    """A parameter's name in words.
+
+    Example:
+        >>> parameter_name(Parameter("field_per_ampere", 1.0, None, "µT/A"))
+        'field per ampere'
+    """
+    name = plain(parameter.name)
+    curve = re.fullmatch(r"legendre_(\d+)", name)
+    return term("finding.amplitude", degree=_lowered(curve[1])) if curve else name.replace("_", " ")
+
+
+def _lowered(digits: str) -> str:
+    return digits.translate(str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉"))
+
+
+def parameter_lines(parameter: Parameter, channels: Sequence[str]) -> list[str]:
+    """A parameter as :func:`measured` has it; of one whose numbers are not one for each channel, one line a number.
+
+    Example:
+        >>> parameter_lines(Parameter("k", (1.0, 2.0), (0.1, 0.1), "µT", ("x", "y")), ("x", "y"))
+        ['(1.00 ± 0.10, 2.00 ± 0.10) µT']
+        >>> parameter_lines(
+        ...     Parameter("jumps", (11.2, -1.2), (4.4, 0.6), "°", ("at 61.1 s", "at 103.2 s")), ("heading",)
+        ... )
+        ['at 61.1 s: 11.2 ± 4.4 °', 'at 103.2 s: −1.2 ± 0.6 °']
+        >>> parameter_lines(Parameter("lag", 1.5, None, "s"), ("x",))
+        ['1.50 s, standard error not estimated']
+    """
+    p = parameter
+    if not p.components or tuple(p.components) == tuple(channels):
+        lines = measured(p.value, p.standard_error, p.unit)
+        return lines if _known(p.standard_error) else [*lines[:-1], f"{lines[-1]}, {term('number.no_error')}"]
+    each = _listed(p)
+    return each if _known(p.standard_error) else [*each, term("number.no_error")]
+
+
+def _listed(parameter: Parameter) -> list[str]:
+    """What each number of a list is, and the number, with the digits and the power of ten of all."""
+    p = parameter
+    (values,) = _rows(p.value)
+    errors = next(_rows(p.standard_error)) if isinstance(p.standard_error, Sequence) else [math.nan] * len(values)
+    digits = _Digits.of([values], [errors])
+    cells = [digits.cell(v, e) for v, e in zip(values, errors, strict=True)]
+    tail = digits.factor + (f" {plain(p.unit)}" if p.unit else "")
+    told = [f"({cell}){tail}" if digits.power and "±" in cell else f"{cell}{tail}" for cell in cells]
+    return [f"{plain(one)}: {cell}" for one, cell in zip(p.components, told, strict=True)]
+
+
+def _known(error: Number | None) -> bool:
+    """Whether any of it is."""
+    return any(math.isfinite(e) for row in _rows(error) for e in row)
+
+
+def named_lines(parameter: Parameter, channels: Sequence[str]) -> list[str]:
+    """The same with the parameter's name before the first."""
+    first, *rest = parameter_lines(parameter, channels)
+    own = parameter.components and tuple(parameter.components) != tuple(channels)
+    return [f"{parameter_name(parameter)}{',' if own else ''} {first}", *rest]
+
+
+def largest(parameter: Parameter) -> str:
+    """How large a parameter is, in short: of a long list its largest number.
+
+    Example:
+        >>> names = ("∂B_x/∂x", "∂B_x/∂y", "∂B_x/∂z", "∂B_z/∂z")
+        >>> largest(Parameter("gradient", (0.1, 0.2, 0.3, -1.06), (0.6, 0.3, 0.3, 0.25), "µT/m", names))
+        'gradient up to ∂B_z/∂z: −1.06 ± 0.25 µT/m'
+    """
+    p = parameter
+    if len(p.components) < _LONG:
+        return f"{parameter_name(p)} {' '.join(measured(p.value, p.standard_error, p.unit))}"
+    (sizes,) = ([abs(v) for v in row] for row in _rows(p.value))
+    return term("finding.largest", parameter=parameter_name(p), largest=_listed(p)[sizes.index(max(sizes))])
+
+
+def probability(value: float) -> str:
+    """A p-value to two digits.
+
+    Example:
+        >>> probability(0.005), probability(0.3712), probability(2e-7)
+        ('p = 0.005', 'p = 0.37', 'p < 0.0001')
+    """
+    return f"p = {value:.2g}" if value >= 1e-4 else "p < 0.0001"
+
+
+def evidence(value: float, surrogates: int) -> str:
+    """A p-value, and whether more surrogates could have made it smaller.
+
+    Example:
+        >>> evidence(0.005, 199), evidence(0.02, 199)
+        ('p = 0.005, the smallest that 199 surrogates can show', 'p = 0.02')
+    """
+    if not _least(value, surrogates):
+        return probability(value)
+    return term("evidence.smallest", p=probability(value), surrogates=f"{surrogates:,}")
+
+
+def _least(value: float, surrogates: int) -> bool:
+    return surrogates > 0 and value <= (1.0 + 1e-9) / (1 + surrogates)
+
+
+def gain(held_out: HeldOut, *, short: bool = False) -> str:
+    """The gain on data the fit has not seen, with its interval and to its digits; in short without words.
+
+    Example:
+        >>> held_out = HeldOut(0.3124, (0.2811, 0.3502), 0.9, 0.5, "µT")
+        >>> gain(held_out), gain(held_out, short=True)
+        ('+0.312 nats a sample (95 %: 0.281 to 0.350)', '+0.312 [0.281, 0.350]')
+    """
+    value, (low, high) = held_out.log_likelihood_gain, held_out.confidence_interval
+    known = math.isfinite(low) and math.isfinite(high)
+    places = decimals(0.25 * (high - low)) if known and high > low else 3
+    told = number(value, places)
+    signed = told if told.startswith("−") else f"+{told}"
+    if short:
+        return f"{signed} [{number(low, places)}, {number(high, places)}]" if known else signed
+    if not known:
+        return term("evidence.gain_alone", gain=signed)
+    return term("evidence.gain", gain=signed, low=number(low, places), high=number(high, places))
+
+
+def improvement(before: float, after: float, unit: str) -> str:
+    """A residual before and after.
+
+    Example:
+        >>> improvement(0.912, 0.521, "µT"), improvement(0.5, 0.5, "")
+        ('0.912 → 0.521 µT (43 % less)', '0.500 → 0.500 (no change)')
+    """
+    sizes = f"{size(before)} → {size(after)} {plain(unit)}".rstrip()
+    if not (before > 0 and math.isfinite(before) and math.isfinite(after)):
+        return sizes
+    less = 1.0 - after / before
+    if abs(less) < 5e-4:
+        return f"{sizes} ({term('evidence.no_change')})"
+    told = term("evidence.less" if less > 0 else "evidence.more", change=share(abs(less)))
+    return f"{sizes} ({told})"
+
+
+def residual_sizes(diagnosis: Diagnosis) -> str:
+    """The root mean square of the residual on held-out blocks, before and after all findings."""
+    return improvement(diagnosis.baseline.rmse, diagnosis.corrected.rmse, diagnosis.traces.unit)
+
+
+def behind(candidate: Candidate) -> str:
+    """How far a candidate is behind the first one, in nats.
+
+    Example:
+        >>> behind(Candidate("hard_iron_step", (), "", 72.3, 12.0, behind=30.25))
+        '30.2'
+    """
+    return size(candidate.behind) if math.isfinite(candidate.behind) else term("evidence.not_possible")

@@ -1,0 +1,37 @@
+"""How every report becomes a page: its template, and the words that all templates have."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup, escape
+
+from mkc_torch.calibration.coverage import nearest_axis
+from mkc_torch.report.words import numbers as wording
+from mkc_torch.report.words.terms import term
+from mkc_torch.report.words.typesetting import capital
+
+__all__ = ["render"]
+
+
+def render(template: str, **values: Any) -> str:
+    """A page from a template of this package; what a value holds is escaped unless it is markup."""
+    environment = Environment(
+        loader=PackageLoader("mkc_torch.report"),
+        autoescape=select_autoescape(["html", "html.j2"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["coded"] = _coded
+    environment.globals.update(w=wording, term=term, capital=capital, nearest_axis=nearest_axis, zip=zip)
+    return environment.get_template(template).render(**values)
+
+
+def _coded(text: str) -> Markup:
+    """A sentence in which what stands between backticks is set as code."""
+    parts = [escape(part) for part in text.split("`")]
+    if len(parts) % 2 == 0:
+        return escape(text)
+    return Markup("").join(Markup("<code>{}</code>").format(p) if i % 2 else p for i, p in enumerate(parts))

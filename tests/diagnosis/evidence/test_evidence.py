@@ -1,0 +1,169 @@
+"""What every test of evidence keeps to, the listed ones and those to come."""
+
+import json
+import re
+from dataclasses import fields, is_dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch.diagnosis.evidence import TESTS
+from mkc_torch.diagnosis.evidence.after_the_search import answers_of, parts_ahead
+from mkc_torch.diagnosis.evidence.base import Case, EvidenceTest, Told
+from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
+from mkc_torch.diagnosis.files.diagnosis_json import _json, json_schema
+from mkc_torch.diagnosis.model.drivers import find_drivers
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.rounds import Asked, begun, continued
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.simulation import Magnetometer
+from tests.diagnosis.line import Line
+from tests.simulation.tumbling import tumbling
+
+N = 1500
+TIME = np.arange(N) / 50.0
+
+
+def without_findings():
+    line = Line(300)
+    base = fitted(JointModel(line), line.start())
+    blocks = blocks_of(300, 1)
+    return Case(base, None, (), (held_out(base, blocks),), blocks, (), 0)
+
+
+def with_findings():
+    """A column that drives, and a step."""
+    current = np.sin(2.0 * np.pi * TIME / 3.7) + 0.4 * np.sin(2.0 * np.pi * TIME / 0.83)
+    sensor = np.outer(current, [0.9, -0.8, 0.9]) + np.outer(TIME >= 14.0, [3.0, 2.0, -3.0])
+    simulation = Magnetometer("norm")
+    prepared = simulation.prepare(tumbling(N, noise=0.3, sensor=sensor, current=current))
+    effects = [effect for effect in CATALOGUE if effect.id in ("current_field", "hard_iron_step")]
+    roles = frozenset(role for effect in effects for role in effect.roles)
+    drivers = find_drivers(prepared.recording, simulation.columns, roles).drivers
+    base = fitted(JointModel(prepared), prepared.start())
+    asked, generator = Asked(0.05, 19, 2, 0), torch.Generator().manual_seed(0)
+    search = begun(base, candidate_terms(prepared, drivers, effects), asked, generator)
+    search = continued(search, asked, generator)
+    assert len(search.found) == 2
+    return Case(base, search.first, search.found, search.evidence, search.blocks, drivers, 0)
+
+
+@pytest.fixture(scope="module", params=[without_findings, with_findings])
+def case(request):
+    return request.param()
+
+
+@pytest.fixture(scope="module")
+def done(case):
+    return [work() for work in parts_ahead(case)]
+
+
+@pytest.fixture(scope="module")
+def answers(case, done):
+    return answers_of(case, done)
+
+
+def everything(answers):
+    return [*answers.of_all, *(said for each in answers.of_findings for said in each)]
+
+
+def tensors(value, seen):
+    """All that can be reached."""
+    if id(value) in seen:
+        return
+    seen[id(value)] = value
+    if isinstance(value, torch.Tensor):
+        yield value
+    elif is_dataclass(value):
+        for field in fields(value):
+            yield from tensors(getattr(value, field.name), seen)
+    elif isinstance(value, dict):
+        yield from tensors(list(value.values()), seen)
+    elif isinstance(value, (list, tuple)):
+        for child in value:
+            yield from tensors(child, seen)
+    elif hasattr(value, "__dict__"):
+        yield from tensors(vars(value), seen)
+
+
+def test_each_is_asked_of_what_it_is_for(answers):
+    for_findings = sum(test.each_finding for test in TESTS)
+    assert len(answers.of_all) == len(TESTS) - for_findings
+    assert all(len(said) == for_findings for said in answers.of_findings)
+    assert len(answers.of_findings) == len(answers.case.found)
+
+
+def test_each_has_an_id_of_its_own(answers):
+    for said in (answers.of_all, *answers.of_findings):
+        ids = [told.test for told in said]
+        assert len(set(ids)) == len(ids)
+        assert all(re.fullmatch("[a-z][a-z0-9_]*", one) for one in ids)
+
+
+def test_what_is_said_is_json_under_names_that_the_schema_knows(answers):
+    for told in everything(answers):
+        json.dumps(_json([told.content, told.keys]), allow_nan=False)
+    schema = json_schema()
+    assert {key for told in answers.of_all for key in told.keys} <= set(schema["properties"])
+    of_findings = {key for said in answers.of_findings for told in said for key in told.keys}
+    assert of_findings <= set(schema["$defs"]["finding"]["properties"])
+
+
+def test_texts_are_sentences_and_lines(answers):
+    for told in everything(answers):
+        assert all(
+            sentence[0].isupper() and sentence.endswith(".") for sentence in told.warnings if "_" not in sentence
+        )
+        assert all(row.label and row.text and not row.text.endswith(".") for row in told.rows)
+        if told.table is not None:
+            assert all(len(cells) == len(told.table.columns) for cells in told.table.rows)
+            assert not told.table.note or told.table.note.endswith(".")
+
+
+def test_warnings_are_in_the_order_of_the_tests(answers):
+    of_all, of_findings = iter(answers.of_all), [iter(said) for said in answers.of_findings]
+    expected = []
+    for test in TESTS:
+        for said in of_findings if test.each_finding else [of_all]:
+            expected += next(said).warnings
+    assert list(answers.warnings) == expected
+
+
+def test_nothing_is_changed_and_nothing_else_is_drawn(case, done, answers):
+    before = [(one, one.clone()) for one in tensors((case, done), {})]
+    random = torch.random.get_rng_state()
+    again = answers_of(case, done)
+    assert [told.rows for told in everything(again)] == [told.rows for told in everything(answers)]
+    assert [_json(told.keys) for told in everything(again)] == [_json(told.keys) for told in everything(answers)]
+    assert again.warnings == answers.warnings
+    assert torch.equal(torch.random.get_rng_state(), random)
+    assert before
+    assert all(torch.equal(one, copy) for one, copy in before)
+
+
+def test_the_order_of_the_parts_makes_no_difference(case, answers):
+    works = parts_ahead(case)
+    backwards = [work() for work in reversed(works)][::-1]
+    again = answers_of(case, backwards)
+    assert [_json([told.content, told.keys]) for told in everything(again)] == [
+        _json([told.content, told.keys]) for told in everything(answers)
+    ]
+
+
+def test_a_test_has_what_went_ahead_of_it_and_the_final_parameters(case):
+    def ahead(case):
+        with pytest.raises(AssertionError):
+            case.final  # noqa: B018
+        return case.seed, case.number
+
+    def test(case):
+        return Told("mine", (case.ahead, case.number, float(case.final.fit.residual.sum())))
+
+    mine = [EvidenceTest(test, ahead), EvidenceTest(test, ahead, each_finding=True), EvidenceTest(test)]
+    works = parts_ahead(replace(case, seed=3), mine)
+    answers = answers_of(replace(case, seed=3), [work() for work in works], mine)
+    assert [told.value[:2] for told in answers.of_all] == [((3, 0), 0), (None, 0)]
+    assert [told.value[:2] for (told,) in answers.of_findings] == [((3, k), k) for k in range(len(case.found))]

@@ -1,0 +1,37 @@
+"""A candidate that is there in one stretch alone is told of with its times."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis.evidence import one_stretch
+from mkc_torch.diagnosis.evidence.base import Case
+from mkc_torch.diagnosis.model.drivers import Driver
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.effects import CATALOGUE
+
+EFFECTS = {effect.id: effect for effect in CATALOGUE}
+LOAD = Driver(("load",), "any", torch.zeros(5, 1), torch.zeros(1), ("A",))
+PREPARED = SimpleNamespace(time=torch.arange(100) / 10.0)
+CASE = Case(SimpleNamespace(model=SimpleNamespace(prepared=PREPARED)), None, (), (), None, (), 0)
+
+
+def said(term, stretch):
+    return one_stretch.test(replace(CASE, first=SimpleNamespace(term=term, stretch=stretch)))
+
+
+@pytest.mark.parametrize(
+    ("effect", "driver", "name"),
+    [("offset_drift", None, "offset_drift"), ("current_field", LOAD, "current_field by load")],
+)
+def test_it_is_named_with_its_times(effect, driver, name):
+    told = said(Term(EFFECTS[effect], driver, {}), (20, 40))
+    assert told.value == pytest.approx((2.0, 3.9))
+    assert told.warnings[0].startswith(f"From 2.0 to 3.9 s the recording is off as {name} would have it")
+
+
+def test_of_what_is_everywhere_and_of_nothing_there_is_no_warning():
+    assert said(Term(EFFECTS["offset_drift"], None, {}), None).warnings == ()
+    assert one_stretch.test(CASE).warnings == ()
