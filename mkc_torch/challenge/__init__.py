@@ -4,8 +4,9 @@ The generator shares no code with the catalogue of effects and uses other functi
 """
 
 from mkc_torch.challenge.key import Key
-from mkc_torch.challenge.magnetometer.generator import Case, draw
+from mkc_torch.challenge.magnetometer.generator import draw
 from mkc_torch.challenge.run import run_challenge
 from mkc_torch.challenge.score import Score, score
+from mkc_torch.challenge.subject import Case
 
 __all__ = ["Case", "Key", "Score", "draw", "run_challenge", "score"]

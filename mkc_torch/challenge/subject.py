@@ -10,7 +10,6 @@ from typing import Any
 from torch import Tensor
 
 from mkc_torch.challenge.key import Key
-from mkc_torch.challenge.magnetometer.generator import Case
 from mkc_torch.challenge.thresholds import Threshold
 from mkc_torch.recording.recording import Recording
 
@@ -19,6 +18,15 @@ Ratio = Callable[[Mapping[str, Tensor], Recording, Key], float]
 
 Naive = Callable[[Path], Mapping[str, Any] | None]
 """What a naive competitor would write into ``diagnosis.json`` of a recording's file; None where it fails."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """``second`` is of the same sensor in another motion, with the effect still acting; None for an empty case."""
+
+    recording: Recording
+    second: Recording | None
+    key: Key
 
 
 @dataclass(frozen=True)

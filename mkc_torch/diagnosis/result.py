@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from torch import Tensor
 
+from mkc_torch.diagnosis.correcting_model import CorrectingModel
+
 if TYPE_CHECKING:
     from jaxtyping import Float
-
-    from mkc_torch.diagnosis.files.model import DiagnosedModel
 
 __all__ = [
     "Alternative",
@@ -424,7 +424,7 @@ class Diagnosis:
     candidates: tuple[Candidate, ...]
     separability: Separability
     traces: Traces
-    model: DiagnosedModel | None = field(default=None, repr=False, compare=False)
+    model: CorrectingModel | None = field(default=None, repr=False, compare=False)
     evidence: tuple[Told, ...] = ()
 
     @property

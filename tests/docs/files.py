@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import torch
-
-# the only place of these tests that knows where the simulated sensors live
-from mkc_torch.recording.demonstration import concealed_recording, simulated_recording
 from torch import Tensor
 
 from mkc_torch.recording import write_table
+
+# the only place of these tests that knows where the simulated sensors live
+from mkc_torch.recording.demonstration import concealed_recording, simulated_recording
 
 DRAG = 0.35  # 1/rad, of a pendulum that is told to have none
 

@@ -1,0 +1,1 @@
+"""The blind proof of differential equations: systems that share no code with the catalogue."""

@@ -22,7 +22,7 @@ from mkc_torch.challenge.dynamics.second import oracle_rms
 from mkc_torch.challenge.dynamics.sizes import draw_size
 from mkc_torch.challenge.key import Key, KeyEffect, KeyRival
 from mkc_torch.challenge.magnetometer.decoys import plain
-from mkc_torch.challenge.magnetometer.generator import Case
+from mkc_torch.challenge.subject import Case
 from mkc_torch.challenge.thresholds import INSEPARABLE_BELOW
 from mkc_torch.recording.recording import Recording
 

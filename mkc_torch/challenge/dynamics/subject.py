@@ -7,8 +7,7 @@ from pathlib import Path
 from mkc_torch.challenge.dynamics import generator
 from mkc_torch.challenge.dynamics.second import ratio_to_oracle
 from mkc_torch.challenge.dynamics.thresholds import THRESHOLDS
-from mkc_torch.challenge.magnetometer.generator import Case
-from mkc_torch.challenge.subject import Subject
+from mkc_torch.challenge.subject import Case, Subject
 
 
 def dynamics() -> Subject:

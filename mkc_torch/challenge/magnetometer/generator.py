@@ -36,8 +36,9 @@ from mkc_torch.challenge.magnetometer.noise import (
     spoil,
 )
 from mkc_torch.challenge.magnetometer.oracle import second_residual
+from mkc_torch.challenge.magnetometer.power import Metric, Power, Question, powers
 from mkc_torch.challenge.magnetometer.scene import Scene, draw_field, draw_sensor
-from mkc_torch.challenge.power import Metric, Power, Question, powers
+from mkc_torch.challenge.subject import Case
 from mkc_torch.challenge.thresholds import INSEPARABLE_BELOW
 from mkc_torch.recording.recording import Recording
 
@@ -69,15 +70,6 @@ PAUSE = 10.0
 """Seconds between the first recording and the second."""
 
 _TINY = 1e-12
-
-
-@dataclass(frozen=True)
-class Case:
-    """``second`` is of the same sensor in another motion, with the effect still acting; None for an empty case."""
-
-    recording: Recording
-    second: Recording | None
-    key: Key
 
 
 @dataclass(frozen=True)

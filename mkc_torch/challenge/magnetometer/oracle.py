@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.challenge.power import Metric
+from mkc_torch.challenge.magnetometer.power import Metric
 
 if TYPE_CHECKING:
     from jaxtyping import Float

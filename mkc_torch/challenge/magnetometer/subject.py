@@ -11,10 +11,10 @@ from torch import Tensor
 
 from mkc_torch.challenge.key import Key
 from mkc_torch.challenge.magnetometer.baselines import stepwise_bic
-from mkc_torch.challenge.magnetometer.generator import Case, draw
+from mkc_torch.challenge.magnetometer.generator import draw
 from mkc_torch.challenge.magnetometer.motion import DURATION
 from mkc_torch.challenge.magnetometer.second import ratio_to_oracle
-from mkc_torch.challenge.subject import Subject
+from mkc_torch.challenge.subject import Case, Subject
 from mkc_torch.challenge.thresholds import THRESHOLDS
 from mkc_torch.recording.recording import Recording
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from mkc_torch.diagnosis.correcting_model import CorrectingModel
 from mkc_torch.diagnosis.files.python_source import SourceError, python_source
 from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.model.drivers import Driver
@@ -38,7 +39,7 @@ class ModelFileError(ValueError):
     """A text that is no model; the sentence says why."""
 
 
-class DiagnosedModel(nn.Module):
+class DiagnosedModel(CorrectingModel):
     """What a diagnosis found, ready for other recordings of the same sensor or system.
 
     Args:

@@ -9,9 +9,9 @@ from mkc_torch.challenge.magnetometer.families import column_family, cubic_famil
 from mkc_torch.challenge.magnetometer.generator import draw_scene
 from mkc_torch.challenge.magnetometer.hidden import CATALOGUE
 from mkc_torch.challenge.magnetometer.noise import KINDS, draw_noise
+from mkc_torch.challenge.magnetometer.power import Metric, Question, attitude_gains, powers, range_of
 from mkc_torch.challenge.magnetometer.rotation import from_vector, product
 from mkc_torch.challenge.magnetometer.state_space import dense_covariance
-from mkc_torch.challenge.power import Metric, Question, attitude_gains, powers, range_of
 
 SHARE = 0.1
 

@@ -1,0 +1,128 @@
+"""The house: rooms import only downwards, no file is too long to read, and the face shows public names alone."""
+
+import ast
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+import mkc_torch
+
+ROOT = Path(mkc_torch.__file__).parent
+MOST_LINES = 450
+
+FLOORS = (
+    {"_parallel", "_support"},
+    {"density", "recording"},
+    {"functional"},
+    {"losses"},
+    {"lightning", "linear", "metrics"},
+    {"nonlinear"},
+    {"calibration", "effects"},
+    {"simulation"},
+    {"challenge", "diagnosis"},
+    {"report"},
+    {"cli"},
+)
+"""Rooms from the ground up; a room imports from floors below it alone."""
+
+
+def module_of(path):
+    parts = ("mkc_torch", *path.relative_to(ROOT).with_suffix("").parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_of(path): path for path in sorted(ROOT.rglob("*.py"))}
+PACKAGES = sorted(name for name, path in MODULES.items() if path.name == "__init__.py")
+
+
+def imported(path):
+    """The modules of the package that a file imports anywhere in it, in functions and for types too."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path} imports relatively"
+            for name in node.names:
+                whole = f"{node.module}.{name.name}"
+                yield whole if whole in MODULES else node.module
+        elif isinstance(node, ast.Import):
+            yield from (name.name for name in node.names)
+
+
+IMPORTS = {name: {one for one in imported(path) if one in MODULES} - {name} for name, path in MODULES.items()}
+
+
+def circle(graph):
+    """Nodes that reach one another, empty if there are none."""
+    reach = {node: set(ends) for node, ends in graph.items()}
+    grown = True
+    while grown:
+        grown = False
+        for ends in reach.values():
+            more = set().union(*(reach.get(end, ()) for end in ends)) - ends
+            ends |= more
+            grown |= bool(more)
+    return sorted(node for node, ends in reach.items() if node in ends)
+
+
+def between_children(package):
+    """Which of the files and folders of a package import which others of them."""
+    graph = defaultdict(set)
+    for name, ends in IMPORTS.items():
+        if name.startswith(f"{package}."):
+            own = name[len(package) + 1 :].split(".")[0]
+            others = {end[len(package) + 1 :].split(".")[0] for end in ends if end.startswith(f"{package}.")}
+            graph[own] |= others - {own}
+    return graph
+
+
+def test_no_file_imports_in_a_circle():
+    assert circle(IMPORTS) == []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_neither_files_nor_folders_of_a_room_import_in_a_circle(package):
+    assert circle(between_children(package)) == []
+
+
+def test_every_room_has_its_floor():
+    rooms = {
+        path.stem for path in ROOT.iterdir() if (path.is_dir() and list(path.glob("*.py"))) or path.suffix == ".py"
+    }
+    assert rooms - {"__init__"} == set().union(*FLOORS)
+
+
+@pytest.mark.parametrize("floor", range(len(FLOORS)))
+def test_rooms_import_only_downwards(floor):
+    below = set().union(*FLOORS[:floor])
+    for room in FLOORS[floor]:
+        assert between_children("mkc_torch")[room] <= below, room
+
+
+def test_at_the_top_are_folders_and_the_public_functions():
+    files = {path.name for path in ROOT.iterdir() if path.is_file()}
+    assert files == {"__init__.py", "functional.py", "metrics.py", "py.typed"}
+
+
+@pytest.mark.parametrize("path", MODULES.values(), ids=MODULES)
+def test_no_file_is_too_long(path):
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= MOST_LINES
+
+
+def test_the_face_shows_public_names_alone():
+    shown = dir(mkc_torch)
+    assert not [name for name in shown if name.startswith("_")]
+    rooms = {name.split(".")[1] for name in MODULES if name.count(".") == 1}
+    assert set(shown) == set(mkc_torch.__all__) | {room for room in rooms if not room.startswith("_")}
+    assert all(getattr(mkc_torch, name) is not None for name in shown)
+
+
+def test_every_room_says_what_it_is():
+    for name in PACKAGES:
+        assert ast.get_docstring(ast.parse(MODULES[name].read_text(encoding="utf-8"))), name
+
+
+def test_every_public_name_of_a_room_is_there():
+    for name in PACKAGES:
+        module = __import__(name, fromlist=["__all__"])
+        assert [one for one in getattr(module, "__all__", ()) if not hasattr(sys.modules[name], one)] == []
