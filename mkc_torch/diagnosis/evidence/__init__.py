@@ -15,6 +15,7 @@ from mkc_torch.diagnosis.evidence import (
     remaining,
     stand_in,
     switched,
+    whiteness,
 )
 from mkc_torch.diagnosis.evidence.base import EvidenceTest
 
@@ -31,5 +32,6 @@ TESTS: tuple[EvidenceTest, ...] = (
     EvidenceTest(driver_shift.test, ahead=driver_shift.of_finding, each_finding=True),
     EvidenceTest(extrapolation.test, ahead=extrapolation.of_finding, each_finding=True),
     EvidenceTest(density.test),
+    EvidenceTest(whiteness.test),
 )
 """In the order of their warnings."""
