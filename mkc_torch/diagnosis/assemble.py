@@ -30,9 +30,6 @@ from mkc_torch.diagnosis.noise.rejected import rejected_warning
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, HeldOut, Separability, Spread, Traces, Verdict
 from mkc_torch.diagnosis.rounds import Asked, Search
 from mkc_torch.diagnosis.search.locate import Located
-from mkc_torch.effects.base import FormedEffect
-from mkc_torch.effects.sensor.unknown import UNKNOWN
-from mkc_torch.effects.sensor.unrecorded import Unrecorded
 from mkc_torch.recording.unit_warnings import unit_warnings
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
@@ -184,7 +181,7 @@ def _candidates(first: Located | None) -> tuple[Candidate, ...]:
         Candidate(
             first.terms[r.number].effect.id,
             first.terms[r.number].columns,
-            _shape(first.terms[r.number]),
+            described(first.terms[r.number].effect, first.terms[r.number].shape),
             r.gain,
             math.sqrt(2.0 * max(r.gain, 0.0)),
             first.terms[r.number].at,
@@ -194,18 +191,12 @@ def _candidates(first: Located | None) -> tuple[Candidate, ...]:
     )
 
 
-def _shape(term: Term) -> str:
-    """What of an effect's shape is told: not what chooses its form."""
-    chosen = term.effect.choices if isinstance(term.effect, FormedEffect) else ()
-    return described({name: value for name, value in term.shape.items() if name not in chosen})
-
-
 def _nothing_to_separate() -> Separability:
     return Separability((), torch.zeros(0, 0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
 
 
 def _not_confirmed(located: Located) -> str:
-    shape = _shape(located.term)
+    shape = described(located.term.effect, located.term.shape)
     what = f"{_called(located.term)} ({shape})" if shape else _called(located.term)
     return (
         f"{what}: p = {located.p_value:.2g} after the whole search, but it does not predict blocks better that the fit "
@@ -225,12 +216,12 @@ def _in_one_stretch(located: Located | None, time: Float[Tensor, " N"]) -> tuple
 
 
 def _called(term: Term) -> str:
-    if isinstance(term.effect, Unrecorded):
+    if term.effect.unrecorded:
         return "a cause that no column recorded"
-    along = "a curve along" if term.effect.id == UNKNOWN else f"{term.effect.id} by"
+    along = "a curve along" if term.effect.is_curve else f"{term.effect.id} by"
     if term.columns:
         return f"{along} {', '.join(term.columns)}"
-    return "a curve without a name" if term.effect.id == UNKNOWN else term.effect.id
+    return "a curve without a name" if term.effect.is_curve else term.effect.id
 
 
 def _time_warnings(prepared: PreparedSimulation) -> tuple[str, ...]:

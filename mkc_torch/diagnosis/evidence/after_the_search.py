@@ -22,7 +22,6 @@ from mkc_torch.diagnosis.model.fit import FittedModel, without_term
 from mkc_torch.diagnosis.model.side_by_side import memory_kept
 from mkc_torch.diagnosis.result import DriverShift, Extrapolation
 from mkc_torch.diagnosis.search.locate import Located
-from mkc_torch.effects.sensor.unknown import UNKNOWN
 
 __all__ = ["Beyond", "Ending", "ending_parts", "nameless"]
 
@@ -135,7 +134,7 @@ def _confirmed(before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: i
 
 def nameless(fit: FittedModel) -> bool:
     """Whether an effect is a curve over a driver that no physics of the catalogue accounts for."""
-    return any(term.effect.id == UNKNOWN for term in fit.model.terms)
+    return any(term.effect.is_curve for term in fit.model.terms)
 
 
 def _answerable(base: FittedModel, final: FittedModel) -> FittedModel:

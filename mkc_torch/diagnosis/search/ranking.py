@@ -11,7 +11,7 @@ from torch import Tensor
 from mkc_torch.diagnosis.linearised.linear_search import Gains
 from mkc_torch.diagnosis.linearised.linearise import Linearised
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.term import Key, Term, continuous, one_sided
+from mkc_torch.diagnosis.model.term import Key, Term, continuous
 from mkc_torch.diagnosis.search.preference import Preference
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def possible_of(terms: tuple[Term, ...], linearised: Linearised) -> Bool[Tensor,
     """Whether the amplitudes that fit have a sign that the physics allows."""
     possible = torch.ones(len(terms), dtype=torch.bool)
     for number, term in enumerate(terms):
-        if one_sided(term.effect):
+        if term.effect.one_sided:
             possible[number] = bool((linearised.search.estimate(number, linearised.series)[0] < 0).any())
     return possible
 

@@ -16,7 +16,7 @@ from mkc_torch.diagnosis.linearised.linearise import Linearised, linearise
 from mkc_torch.diagnosis.linearised.tangents import Tangents, tangents_of
 from mkc_torch.diagnosis.model.fit import FittedModel, clipped_residual, fitted_beside, repeats
 from mkc_torch.diagnosis.model.side_by_side import each, ending_at_fit, fitted_each
-from mkc_torch.diagnosis.model.term import Key, Term, one_sided
+from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.search.closing_in import refined
 from mkc_torch.diagnosis.search.preference import Preference
 from mkc_torch.simulation.protocol import Beginning
@@ -103,7 +103,7 @@ def _short_list(
         term = terms[number]
         if term.key not in chosen:
             gamma, _ = plain.search.estimate(number, plain.series)
-            if one_sided(term.effect):
+            if term.effect.one_sided:
                 gamma = gamma.clamp(max=0.0)
                 if not bool(gamma.any()):
                     continue
@@ -208,7 +208,7 @@ def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
 
 def refitted(best: FittedModel, base: FittedModel, term: Term, linearised: Linearised, number: int) -> FittedModel:
     gamma, _ = linearised.search.estimate(number, linearised.series)
-    gamma = gamma.clamp(max=0.0) if one_sided(term.effect) else gamma
+    gamma = gamma.clamp(max=0.0) if term.effect.one_sided else gamma
     model = base.model.with_term(term)
     found = fitted_beside(base, model, torch.cat([best.parameters[: base.model.size], -gamma]))
     if found.log_likelihood >= base.log_likelihood and repeats(found):

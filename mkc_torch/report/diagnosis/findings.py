@@ -23,6 +23,7 @@ from mkc_torch.diagnosis.result import (
     Region,
     Traces,
 )
+from mkc_torch.effects import is_curve, words_of
 from mkc_torch.report.words.numbers import bandwidth, decimals, number, share, size
 from mkc_torch.report.words.typesetting import plain, superscript, typeset
 
@@ -36,7 +37,6 @@ __all__ = [
     "counted_from",
     "density_check",
     "driven_by",
-    "effect_name",
     "evidence",
     "experiments",
     "extrapolation",
@@ -71,13 +71,6 @@ _MOST_NUMBERS = 12
 _CLEARLY = 0.99  # of a residual, below which another one is smaller
 _LONG = 4  # numbers from which a list is told by its largest
 _MOST_EXPERIMENTS = 6
-_NAMES = {"coulomb": "Coulomb", "stribeck": "Stribeck", "bouc": "Bouc", "wen": "Wen", "magnus": "Magnus"}
-_WORDS = {
-    "driver_linear": "linear dependence",
-    "driver_quadratic": "quadratic dependence",
-    "driver_offset": "offset dependence",
-    "unknown": "an effect outside the catalogue",
-}
 
 
 @dataclass(frozen=True)
@@ -116,19 +109,6 @@ def clock_of(traces: Traces) -> Clock:
     return Clock(min(max(digits, 0), 6), traces.has_time)
 
 
-def effect_name(effect: str) -> str:
-    """The name of an effect in words.
-
-    Example:
-        >>> effect_name("hard_iron_step"), effect_name("coulomb_friction"), effect_name("unknown")
-        ('hard-iron step', 'Coulomb friction', 'an effect outside the catalogue')
-    """
-    if effect in _WORDS:
-        return _WORDS[effect]
-    words = effect.replace("_", " ").replace("hard iron", "hard-iron").replace("soft iron", "soft-iron")
-    return " ".join(_NAMES.get(word, word) for word in words.split(" "))
-
-
 def with_drivers(effect: str, drivers: Sequence[str], at: str = "") -> str:
     """An effect with what drives it, and where it acts.
 
@@ -143,7 +123,7 @@ def with_drivers(effect: str, drivers: Sequence[str], at: str = "") -> str:
         'field gradient (position)'
     """
     place = f" on {'' if at.startswith('all ') else 'the '}{plain(at.removeprefix('loaded '))}" if at else ""
-    return effect_name(effect) + (f" ({_together(drivers)})" if drivers else "") + place
+    return words_of(effect) + (f" ({_together(drivers)})" if drivers else "") + place
 
 
 def _together(names: Sequence[str]) -> str:
@@ -160,7 +140,7 @@ def finding_name(finding: Finding) -> str:
 
 
 def unrecorded(finding: Finding) -> bool:
-    return finding.effect == "unknown" and finding.curve is not None and finding.curve.driver == "time"
+    return is_curve(finding.effect) and finding.curve is not None and finding.curve.driver == "time"
 
 
 def label_name(label: str) -> str:
@@ -171,7 +151,7 @@ def label_name(label: str) -> str:
         'current field (battery_A)'
     """
     effect, space, rest = label.partition(" ")
-    return effect_name(plain(effect)) + space + plain(rest)
+    return words_of(plain(effect)) + space + plain(rest)
 
 
 def several(names: Sequence[str], most: int = 6) -> str:
@@ -620,7 +600,7 @@ def with_names(sentence: str, ids: Collection[str]) -> str:
         >>> with_names("hard_iron_step: p = 4e-05, by -6.1 µT.", {"hard_iron_step"})
         'hard-iron step: p = 4 × 10⁻⁵, by −6.1 µT.'
     """
-    named = re.sub(r"[a-z]\w*", lambda word: effect_name(word[0]) if word[0] in ids else word[0], sentence)
+    named = re.sub(r"[a-z]\w*", lambda word: words_of(word[0]) if word[0] in ids else word[0], sentence)
     return typeset(named)
 
 
