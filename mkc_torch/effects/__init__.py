@@ -52,7 +52,13 @@ __all__ = [
 ]
 
 # users' own files import these; what each of them asked for has a default in every effect
-AnchoredEffect = ContinuousEffect = LastingEffect = LinearEffect = NestedEffect = ShapedEffect = SignalEffect = Effect
+AnchoredEffect = Effect
+ContinuousEffect = Effect
+LastingEffect = Effect
+LinearEffect = Effect
+NestedEffect = Effect
+ShapedEffect = Effect
+SignalEffect = Effect
 
 CATALOGUE: tuple[Effect, ...] = (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED)
 """All effects; each is tried where a simulation has its port."""

@@ -40,7 +40,8 @@ class Effect(ABC):
 
     Attributes:
         id: its name in ``diagnosis.json`` and ``model.json``; every effect needs one.
-        words: its name in a sentence; default the id in words, see :func:`in_words`.
+        words: its name in a sentence; default the id in words, see :func:`in_words`. A report knows the id alone, and
+            tells an effect that is not in the catalogue by its id in words.
         equation: what it adds, in symbols; :meth:`equation_of` where the shape chooses its form.
         explanation: a sentence on what happens.
         advice: a sentence on what to do about it.
@@ -221,7 +222,7 @@ class Effect(ABC):
 
     @property
     def has_code(self) -> bool:
-        """Whether it can be written out as :meth:`code`, for a simulation that a person keeps."""
+        """Whether it can be written out as :meth:`code`; ``code = Effect.code`` gives that up in a derived one."""
         return type(self).code is not Effect.code
 
     def _refuse(self, method: str) -> NoReturn:

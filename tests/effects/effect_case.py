@@ -85,6 +85,7 @@ class OfEveryEffect:
     def test_a_simpler_form_is_the_same_physics(self, effect):
         simpler = effect.simpler
         if simpler is None:
+            assert type(effect).simpler is Effect.simpler
             return
         assert (simpler.id, simpler.words, simpler.port) == (effect.id, effect.words, effect.port)
         for context in contexts_of(effect):
@@ -145,6 +146,7 @@ class OfEveryShape:
 
     def test_the_change_has_a_slope_in_what_is_fitted_of_its_shape(self, effect, shape, context):
         gamma = torch.ones(size_of(effect, shape, context), dtype=torch.float64)
+        assert set(effect.fitted_shape) <= set(shape)
         for name in effect.fitted_shape:
             value = torch.tensor(float(shape[name]), dtype=torch.float64)
 
@@ -168,6 +170,7 @@ class OfEveryShape:
             assert len(effect.components(quantity.name, shape, context)) in (0, quantity.size)
 
     def test_its_numbers_have_their_units(self, effect, shape, context):
+        assert effect.unit_of_shape("none of its numbers", context) == ""
         for name in shape:
             unit = effect.unit_of_shape(name, context)
             if name in effect.relative:
@@ -224,8 +227,9 @@ class OfEveryShape:
             with pytest.raises(NotImplementedError, match="`code`"):
                 effect.code(gamma.tolist(), shape, {})
             return
-        if context.units:
-            return  # what a column drives is not written out
+        if context.units:  # what a column drives is not written out
+            assert effect.driver_optional
+            return
         carried = context.carries or context.channels
         if effect.port == "hysteretic rate":  # its internal state is solved for
             context = replace(context, signal=torch.cat([context.signal, context.time.cos().unsqueeze(-1)], -1))

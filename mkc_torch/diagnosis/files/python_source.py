@@ -51,7 +51,7 @@ def python_source(model: DiagnosedModel, module: str | None = None) -> str:
         lines = _lines(term, [_rounded(float(one)) for one in gamma], system, measured)
         place = outputs if term.port == "output" else inputs if term.port.startswith("input ") else rates
         place += [f"# {term.effect.id}: {term.effect.equation}", *lines]
-    told = ", ".join(term.effect.id.replace("_", " ") for term in model.terms) or "nothing more"
+    told = ", ".join(term.effect.words for term in model.terms) or "nothing more"
     body = [
         f"class Corrected{kind.__name__}({kind.__name__}):",
         f'    """{kind.__name__} with the parameters that a recording gave it, and {told}."""',

@@ -42,11 +42,10 @@ class HeadingReset(Effect):
     advice = "Use an attitude that this sensor does not steer, or the samples from between two of the jumps."
     again = "an attitude that this sensor does not steer is not set anew"
     placed = True
+    follows_signal = False  # what passes here is known and has no noise
     plausible = 180.0
     plausible_unit = "°"
     source = "filters align their heading by the compass again at arming and after take-off"
-
-    # not one that follows the signal: what passes here is known and has no noise
 
     def moments(self, context: Context) -> tuple[float, ...]:
         # the last sample before each jump, as the simulation tells them
