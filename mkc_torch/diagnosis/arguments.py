@@ -37,14 +37,15 @@ def checked_effects(effects: object) -> tuple[Effect, ...]:
 
 
 def _refuse_no_effect(effect: object) -> None:
-    lacking = [name for name in ("id", "port", "roles", "quantities", "shapes", "change") if not hasattr(effect, name)]
-    roles = getattr(effect, "roles", ())
+    roles: object = effect.roles if isinstance(effect, Effect) else ()
     if isinstance(effect, type):
         mend = f"make one, {effect.__name__}()"
     elif isinstance(effect, str):
         mend = f"mkc_torch.effects.CATALOGUE holds them, [e for e in CATALOGUE if e.id == {effect!r}]"
-    elif lacking:
-        mend = f"it lacks {', '.join(lacking)}, which mkc_torch.effects.Effect explains"
+    elif not isinstance(effect, Effect):
+        mend = "derive it from mkc_torch.effects.Effect, which has defaults for the rest"
+    elif not effect.id:
+        mend = "give it an `id`, its name in diagnosis.json"
     elif isinstance(roles, str):
         mend = f"its roles are names, ({roles!r},)"
     else:

@@ -20,11 +20,9 @@ from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.model.drivers import Drivers
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.grid import described
-from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability, Traces, Verdict
 from mkc_torch.diagnosis.rounds import Asked, Search
 from mkc_torch.diagnosis.search.locate import Located
-from mkc_torch.effects.base import FormedEffect
 from mkc_torch.recording.unit_warnings import unit_warnings
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
@@ -125,7 +123,7 @@ def _candidates(first: Located | None) -> tuple[Candidate, ...]:
         Candidate(
             first.scene.terms[r.number].effect.id,
             first.scene.terms[r.number].columns,
-            _shape(first.scene.terms[r.number]),
+            described(first.scene.terms[r.number].effect, first.scene.terms[r.number].shape),
             r.gain,
             math.sqrt(2.0 * max(r.gain, 0.0)),
             first.scene.terms[r.number].at,
@@ -135,18 +133,12 @@ def _candidates(first: Located | None) -> tuple[Candidate, ...]:
     )
 
 
-def _shape(term: Term) -> str:
-    """What of an effect's shape is told: not what chooses its form."""
-    chosen = term.effect.choices if isinstance(term.effect, FormedEffect) else ()
-    return described({name: value for name, value in term.shape.items() if name not in chosen})
-
-
 def _nothing_to_separate() -> Separability:
     return Separability((), torch.zeros(0, 0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
 
 
 def _not_confirmed(located: Located) -> str:
-    shape = _shape(located.term)
+    shape = described(located.term.effect, located.term.shape)
     what = f"{called(located.term)} ({shape})" if shape else called(located.term)
     return (
         f"{what}: p = {located.p_value:.2g} after the whole search, but it does not predict blocks better that the fit "

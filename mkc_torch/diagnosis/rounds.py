@@ -20,7 +20,6 @@ from mkc_torch.diagnosis.noise.innovations import innovation_gain
 from mkc_torch.diagnosis.search.first_look import p_value_beside
 from mkc_torch.diagnosis.search.locate import Located, locate
 from mkc_torch.diagnosis.search.preference import ALIKE_COLUMNS, alike
-from mkc_torch.effects.sensor.unknown import UNKNOWN
 from mkc_torch.nonlinear import NoFitError
 
 _NEAR = 0.05
@@ -178,7 +177,7 @@ def _same(term: Term, found: Term, near: float) -> bool:
     """
     if "onset" in term.shape and "onset" in found.shape:
         return abs(term.shape["onset"] - found.shape["onset"]) < near
-    if term.key == found.key or (term.effect.id == UNKNOWN and term.columns == found.columns):
+    if term.key == found.key or (term.effect.is_curve and term.columns == found.columns):
         return True
     # beside a driver that was found, a column that goes the same way would only share its amplitude
     return term.driver is not None and found.driver is not None and alike(term.driver, found.driver) > ALIKE_COLUMNS

@@ -1,23 +1,19 @@
 """The catalogue of effects: one piece of physics a file, with its drivers, units, size and source.
 
-A user's own effect is a class with the attributes of :class:`Effect`; :class:`GainEffect` makes it a dozen lines.
-Each class says what the physics is, how it changes the simulation, what drives it, its units, the size that is
-plausible, and where that is from.
+A user's own effect is a class derived from :class:`Effect`; :class:`GainEffect` makes it a dozen lines. Each class says
+what the physics is, how it changes the simulation, what drives it, its units, the size that is plausible, and where
+that is from.
+
+To add an effect to the catalogue, write it into a file of its own and enter it in the list of that folder's
+``__init__``: ``sensor/`` and ``SENSOR`` for a vector sensor and the field around it (``ATTITUDE`` for a recorded
+attitude), ``dynamics/`` and ``DYNAMICS`` for rates, inputs and outputs of differential equations, ``paired/`` and
+``PAIRED`` for outputs of simulations without a state. What all effects share has defaults in :class:`Effect`; give what
+differs. The tests ask every effect of the catalogue the same questions, and so the new one.
 """
 
 from __future__ import annotations
 
-from mkc_torch.effects.base import (
-    AnchoredEffect,
-    ContinuousEffect,
-    Effect,
-    GainEffect,
-    LastingEffect,
-    LinearEffect,
-    NestedEffect,
-    ShapedEffect,
-    SignalEffect,
-)
+from mkc_torch.effects.base import Effect, GainEffect, in_words
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.courses import lagged
 from mkc_torch.effects.dynamics import DYNAMICS
@@ -47,11 +43,45 @@ __all__ = [
     "ShapedEffect",
     "SignalEffect",
     "beyond",
+    "is_curve",
     "lagged",
     "played",
     "shifted",
     "soft_clip",
+    "words_of",
 ]
+
+# users' own files import these; what each of them asked for has a default in every effect
+AnchoredEffect = Effect
+ContinuousEffect = Effect
+LastingEffect = Effect
+LinearEffect = Effect
+NestedEffect = Effect
+ShapedEffect = Effect
+SignalEffect = Effect
 
 CATALOGUE: tuple[Effect, ...] = (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED)
 """All effects; each is tried where a simulation has its port."""
+
+_WORDS = {effect.id: effect.words for effect in CATALOGUE}
+_CURVES = frozenset(effect.id for effect in CATALOGUE if effect.is_curve)
+
+
+def words_of(effect_id: str) -> str:
+    """The name of an effect in words, as a report tells it; of a user's own, its id in words.
+
+    Example:
+        >>> words_of("hard_iron_step"), words_of("coulomb_friction"), words_of("unknown"), words_of("supply_offset")
+        ('hard-iron step', 'Coulomb friction', 'an effect outside the catalogue', 'supply offset')
+    """
+    return _WORDS.get(effect_id) or in_words(effect_id)
+
+
+def is_curve(effect_id: str) -> bool:
+    """Whether an effect of the catalogue with this id is a curve that follows the data and no physics.
+
+    Example:
+        >>> is_curve("unknown"), is_curve("linear_drag")
+        (True, False)
+    """
+    return effect_id in _CURVES

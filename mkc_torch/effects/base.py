@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, NoReturn
 
 from torch import Tensor
 
@@ -13,226 +15,187 @@ from mkc_torch.effects.courses import gained, per
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = [
-    "AnchoredEffect",
-    "BoundedEffect",
-    "ChoosyEffect",
-    "CodedEffect",
-    "ComponentsEffect",
-    "ContinuousEffect",
-    "Effect",
-    "FormedEffect",
-    "GainEffect",
-    "LastingEffect",
-    "LinearEffect",
-    "MomentsEffect",
-    "NestedEffect",
-    "OptionalDriverEffect",
-    "PartEffect",
-    "PlacedEffect",
-    "RelativeEffect",
-    "ShapeUnitsEffect",
-    "ShapedEffect",
-    "SignalEffect",
-    "TellingEffect",
-]
+__all__ = ["Effect", "GainEffect", "in_words"]
+
+_WRITTEN = {
+    "hard iron": "hard-iron",
+    "soft iron": "soft-iron",
+    "coulomb": "Coulomb",
+    "stribeck": "Stribeck",
+    "bouc": "Bouc",
+    "wen": "Wen",
+    "magnus": "Magnus",
+}
+"""Names of people, and words that are written as one."""
 
 
-class Effect(Protocol):
-    """A piece of physics. At γ = 0 it changes nothing.
+class Effect(ABC):
+    """A piece of physics with an amplitude γ of q numbers. At γ = 0 it changes nothing.
 
-    An effect may have a ``plausible_unit``, the unit that ``plausible`` is in, where it is one of its own and not that
-    of the recording. Some effects can do more: :class:`SignalEffect`, :class:`ContinuousEffect`, :class:`LinearEffect`,
-    :class:`LastingEffect`, :class:`ShapedEffect`, :class:`AnchoredEffect`.
+    Derive from it, set ``id`` and what a user reads, and give :meth:`quantities` and :meth:`change`. All else has a
+    default, and is for an effect that is, or can do, more. :class:`GainEffect` has these two methods as well, for a
+    gain per channel times one course.
+
+    What a user reads:
 
     Attributes:
-        id: its name in ``diagnosis.json``.
-        port: where it acts; an effect is tried where a simulation has that port.
-        roles: the roles of the columns that drive it, as :mod:`mkc_torch.diagnosis.model.drivers` gives them; empty
-            for an effect of time or of the signal alone.
-        equation: in symbols.
-        explanation: a sentence a user reads.
-        advice: what to do about it.
-        plausible: largest plausible size of each number of the first quantity of γ, in its unit; infinite where
-            nothing is known.
+        id: its name in ``diagnosis.json`` and ``model.json``; every effect needs one.
+        words: its name in a sentence; default the id in words, see :func:`in_words`. A report knows the id alone, and
+            tells an effect that is not in the catalogue by its id in words.
+        equation: what it adds, in symbols; :meth:`equation_of` where the shape chooses its form.
+        explanation: a sentence on what happens.
+        advice: a sentence on what to do about it.
+        again: what becomes of it in another recording, a clause such as "a warm-up comes again after a cold start";
+            default empty, nothing is said of it.
         source: where the physics and its size are from.
+        plausible: largest plausible size of each number of the first quantity of γ; default infinite, nothing is known.
+        plausible_unit: the unit of ``plausible``; default empty, the quantity's own.
+
+    Where it is tried:
+
+    Attributes:
+        port: name or kind of the ports where it acts; default "sensor".
+        needs: parts that such a port must have; default none.
+        roles: of the columns that drive it, as :mod:`mkc_torch.diagnosis.model.drivers` gives them; default empty, it
+            follows time or the signal alone.
+        driver_optional: whether one with roles is tried without a driver too; default False.
+        follows_signal: whether its change depends on the signal at its port; default False.
+        placed: whether it is of the place or the attitude of its recording, which another one does not have; default
+            False.
+        is_curve: whether it is a curve that follows the data and no physics; default False. Named physics goes first.
+        unrecorded: whether it is a course along time that stands for a cause in no column; default False.
+
+    Of its amplitude and its shape:
+
+    Attributes:
+        least, most: bounds of each number of γ; default −∞ and ∞.
+        relative: name of a number of its shapes to the part of the signal it is a share of, or "driver", and whether
+            of its "typical" or its "largest" size; such numbers are in that part's unit once a recording is known.
+        continuous: name of a number that can take any value, and is closed in on after the search of the grid, to its
+            least and largest value as shares of the recording's length; such a number is in s.
+        fitted_shape: name of a number that is fitted together with γ once the effect is known to be there, to its
+            least and greatest value, in the same shares where it is relative or continuous. ``change`` and
+            ``quantities`` have to take it as a tensor, and ``change`` to have a slope in it. One that is always
+            positive is fitted as its logarithm.
+        choices: names of the numbers that choose a form and are not measured; the equation tells them.
+        shape_units: name of a number of the shape to its unit, of those that have one whatever is recorded; default
+            times that are called onset, lag, delay or time_constant.
+        along: the part of the signal that it mainly follows, along which its curve is drawn; default none.
+        simpler: the same physics with fewer numbers in γ, each of which stands for several of this one's, one after
+            the other; its shapes are the same. It is taken where it predicts unseen blocks as well. Default None.
+
+    Example:
+        >>> import torch
+        >>> class Square(Effect):
+        ...     id = "squared_response"
+        ...     follows_signal = True
+        ...     equation = "δB = γ B²"
+        ...
+        ...     def quantities(self, shape, context):
+        ...         return (Quantity("coefficient", len(context.channels), f"1/{context.signal_unit}"),)
+        ...
+        ...     def change(self, gamma, shape, context):
+        ...         return gamma * context.signal.square()
+        >>> Square().words, Square().port, Square().shapes(torch.arange(3.0)), Square().lasts
+        ('squared response', 'sensor', ({},), False)
     """
 
-    @property
-    def id(self) -> str: ...
-    @property
-    def port(self) -> str: ...
-    @property
-    def roles(self) -> tuple[str, ...]: ...
-    @property
-    def equation(self) -> str: ...
-    @property
-    def explanation(self) -> str: ...
-    @property
-    def advice(self) -> str: ...
-    @property
-    def plausible(self) -> float: ...
-    @property
-    def source(self) -> str: ...
+    id: str = ""
+    equation: str = ""
+    explanation: str = ""
+    advice: str = ""
+    again: str = ""
+    source: str = ""
+    plausible: float = math.inf
+    plausible_unit: str = ""
 
+    port: str = "sensor"
+    needs: tuple[str, ...] = ()
+    roles: tuple[str, ...] = ()
+    driver_optional: bool = False
+    follows_signal: bool = False
+    placed: bool = False
+    is_curve: bool = False
+    unrecorded: bool = False
+
+    least: float = -math.inf
+    most: float = math.inf
+    relative: Mapping[str, tuple[str, str]] = {}
+    continuous: Mapping[str, tuple[float, float]] = {}
+    fitted_shape: Mapping[str, tuple[float, float]] = {}
+    choices: tuple[str, ...] = ()
+    shape_units: Mapping[str, str] = dict.fromkeys(("onset", "lag", "delay", "time_constant"), "s")
+    along: str = ""
+
+    @abstractmethod
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
-        """The parameters that γ holds, in its order."""
-        ...
+        """The parameters that γ holds, in its order; their sizes add up to q."""
 
-    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
-        """The grid of shapes that is searched."""
-        ...
-
+    @abstractmethod
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        """What the effect adds to the signal."""
-        ...
+        """What the effect adds to the c channels of its port."""
 
-
-@runtime_checkable
-class SignalEffect(Effect, Protocol):
-    """An effect that can depend on the signal at its port; one without this attribute does not.
-
-    Attributes:
-        follows_signal: whether it does.
-    """
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
+        """The grid of shapes that is searched, for a recording at these times in s; default one without numbers."""
+        return ({},)
 
     @property
-    def follows_signal(self) -> bool: ...
-
-
-@runtime_checkable
-class BoundedEffect(Effect, Protocol):
-    """An effect whose γ is bounded, as that of a drag, which cannot be negative; one without these attributes is free.
-
-    Attributes:
-        least, most: of each number of γ.
-    """
+    def words(self) -> str:
+        return in_words(self.id)
 
     @property
-    def least(self) -> float: ...
-    @property
-    def most(self) -> float: ...
-
-
-@runtime_checkable
-class ChoosyEffect(Effect, Protocol):
-    """An effect that is not tried at every port of its kind.
-
-    Attributes:
-        needs: parts that the port must have.
-    """
+    def simpler(self) -> Effect | None:
+        return None
 
     @property
-    def needs(self) -> tuple[str, ...]: ...
+    def one_sided(self) -> bool:
+        """Whether no number of γ can be negative."""
+        return self.least >= 0.0
 
+    def reports(self, name: str) -> bool:
+        """Whether a number of the shape is told as a parameter; default all that choose no form."""
+        return name not in self.choices
 
-@runtime_checkable
-class OptionalDriverEffect(Effect, Protocol):
-    """An effect with roles that is tried without a driver too.
+    def unit_of_shape(self, name: str, context: Context) -> str:
+        """The unit of a number of the shape; empty where it has none.
 
-    Attributes:
-        driver_optional: whether it is.
-    """
+        Default that of what it is ``relative`` to, else the one in ``shape_units``.
+        """
+        if name in self.relative:
+            part = self.relative[name][0]
+            return context.units[0] if part == "driver" else context.unit_of(part)
+        return self.shape_units.get(name, "")
 
-    @property
-    def driver_optional(self) -> bool: ...
+    def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
+        """The equation in the form that the shape chose; default ``equation``."""
+        return self.equation
 
+    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:  # noqa: ARG002
+        """What each number of a quantity is, in their order; default empty, they are one for each channel."""
+        return ()
 
-@runtime_checkable
-class RelativeEffect(Effect, Protocol):
-    """An effect whose grid of shapes is in shares of how large a part of the signal is, or what drives it.
+    def moments(self, context: Context) -> tuple[float, ...]:  # noqa: ARG002
+        """When it sets in, in s and ascending, where that is several moments known beforehand; default none."""
+        return ()
 
-    Attributes:
-        relative: name of a number in its shapes to the part, or "driver", and "typical" or "largest".
-    """
+    def anchored(self, shape: Shape, context: Context) -> Shape:  # noqa: ARG002
+        """The shape with what it needs to know of this recording to act on another one; default as it is."""
+        return shape
 
-    @property
-    def relative(self) -> Mapping[str, tuple[str, str]]: ...
+    def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]:  # noqa: ARG002
+        """Of an effect that is ``basis @ γ``: many of its shapes are tried in no time. Ask ``has_basis`` before."""
+        self._refuse("basis")
 
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+        """Of an effect that is ``gain ⊗ course``: the course at a gain of one. Ask ``has_course`` before."""
+        self._refuse("course")
 
-@runtime_checkable
-class PartEffect(Effect, Protocol):
-    """An effect that mainly follows one part of the signal, along which its curve is drawn.
+    def lasting(self, gamma: Float[Tensor, " q"], context: Context) -> Float[Tensor, "N c"]:  # noqa: ARG002
+        """Of an effect that is bound to the time of its recording: what a later one has of it. Ask ``lasts`` before."""
+        self._refuse("lasting")
 
-    Attributes:
-        along: the part.
-    """
-
-    @property
-    def along(self) -> str: ...
-
-
-@runtime_checkable
-class ContinuousEffect(Effect, Protocol):
-    """An effect with numbers in its shape that can take any value, and are closed in on after the search of the grid.
-
-    Attributes:
-        continuous: their names, each with its least and largest value as shares of the recording's length in s.
-    """
-
-    @property
-    def continuous(self) -> Mapping[str, tuple[float, float]]: ...
-
-
-@runtime_checkable
-class ShapedEffect(Effect, Protocol):
-    """An effect with numbers in its shape that are fitted together with γ once it is known to be there.
-
-    Its ``change`` and ``quantities`` have to take such a number as a tensor, and ``change`` to have a slope in it.
-
-    Attributes:
-        fitted_shape: their names, each with its least and greatest value, in the same shares as ``relative`` and
-            ``continuous`` where it is one of those. A number that is always positive is fitted as its logarithm.
-    """
-
-    @property
-    def fitted_shape(self) -> Mapping[str, tuple[float, float]]: ...
-
-
-@runtime_checkable
-class NestedEffect(Effect, Protocol):
-    """An effect of which a simpler one is a special case.
-
-    Attributes:
-        simpler: the same physics with fewer numbers in γ, of which each stands for several of this one's, one after the
-            other; its shapes are the same. It is taken where it predicts unseen blocks as well.
-    """
-
-    @property
-    def simpler(self) -> Effect: ...
-
-
-@runtime_checkable
-class LinearEffect(Effect, Protocol):
-    """An effect that is ``basis @ γ`` and gives its basis: many shapes of it are tried in no time."""
-
-    def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]: ...
-
-
-@runtime_checkable
-class LastingEffect(Effect, Protocol):
-    """An effect that is bound to the time of its recording, of which something lasts."""
-
-    def lasting(self, gamma: Float[Tensor, " q"], context: Context) -> Float[Tensor, "N c"]:
-        """What is left of it in a later recording of the same sensor."""
-        ...
-
-
-@runtime_checkable
-class AnchoredEffect(Effect, Protocol):
-    """An effect whose shape has to be told something of the diagnosed recording before it can act on another one."""
-
-    def anchored(self, shape: Shape, context: Context) -> Shape:
-        """The shape with what it needs of this recording."""
-        ...
-
-
-@runtime_checkable
-class CodedEffect(Effect, Protocol):
-    """An effect that can be written out as a line of Python with torch, for a simulation that a person keeps."""
-
-    def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:
-        """An expression for each channel of the port: what is added to it.
+    def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
+        """An expression of Python with torch for each channel: what is added to it. Ask ``has_code`` before.
 
         Args:
             gamma: the effect's numbers.
@@ -240,78 +203,37 @@ class CodedEffect(Effect, Protocol):
             names: expression of each part of the port's signal, such as ``{"own": "x.speed"}``; "zero" is what makes a
                 temperature "own" absolute.
         """
-        ...
-
-
-@runtime_checkable
-class FormedEffect(Effect, Protocol):
-    """An effect whose shape says which of several forms its equation has.
-
-    Attributes:
-        choices: the numbers of its shape that are chosen and not measured; the equation tells them, and no parameter.
-    """
+        self._refuse("code")
 
     @property
-    def choices(self) -> tuple[str, ...]: ...
-
-    def equation_of(self, shape: Shape, context: Context) -> str:
-        """The equation in this form."""
-        ...
-
-
-@runtime_checkable
-class ShapeUnitsEffect(Effect, Protocol):
-    """An effect with numbers in its shape whose units are its own."""
-
-    def unit_of_shape(self, name: str, context: Context) -> str:
-        """The unit of a number of its shape; empty where it is no such one."""
-        ...
-
-
-@runtime_checkable
-class ComponentsEffect(Effect, Protocol):
-    """An effect with quantities of several numbers that are not one for each channel."""
-
-    def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:
-        """What each number of a quantity is, in their order; empty where they are one for each channel."""
-        ...
-
-
-@runtime_checkable
-class MomentsEffect(Effect, Protocol):
-    """An effect that sets in at several moments, which are known beforehand."""
-
-    def moments(self, context: Context) -> tuple[float, ...]:
-        """In s, ascending."""
-        ...
-
-
-@runtime_checkable
-class PlacedEffect(Effect, Protocol):
-    """An effect of the place or the attitude of its recording, which another recording does not have.
-
-    Attributes:
-        placed: whether it is one.
-    """
+    def has_basis(self) -> bool:
+        """Whether it gives a :meth:`basis`."""
+        return type(self).basis is not Effect.basis
 
     @property
-    def placed(self) -> bool: ...
-
-
-@runtime_checkable
-class TellingEffect(Effect, Protocol):
-    """An effect that says how another recording tells it from a rival.
-
-    Attributes:
-        again: what becomes of it in another recording, a clause such as "a warm-up comes again after a cold start".
-    """
+    def has_course(self) -> bool:
+        """Whether its change is a gain per channel times its :meth:`course`."""
+        return type(self).change is GainEffect.change
 
     @property
-    def again(self) -> str: ...
+    def lasts(self) -> bool:
+        """Whether it says what is :meth:`lasting`."""
+        return type(self).lasting is not Effect.lasting
+
+    @property
+    def has_code(self) -> bool:
+        """Whether it can be written out as :meth:`code`; ``code = Effect.code`` gives that up in a derived one."""
+        return type(self).code is not Effect.code
+
+    def _refuse(self, method: str) -> NoReturn:
+        raise NotImplementedError(f"Expected the effect {self.id} to have a method `{method}`; give it one.")
 
 
-class GainEffect:
+class GainEffect(Effect):
     """An effect that adds a gain per channel times one course: ``gain ⊗ course``. Give it a ``course``.
+
+    Attributes:
+        gain: what a user reads the gain as.
 
     Example:
         A user's own effect, a bus voltage that shifts the offset:
@@ -330,23 +252,7 @@ class GainEffect:
         'sensor'
     """
 
-    id: str
-    port: str = "sensor"
-    roles: tuple[str, ...] = ()
-    equation: str = ""
-    explanation: str = ""
-    advice: str = ""
-    plausible: float = float("inf")
-    plausible_unit: str = ""
-    source: str = ""
     gain: str = "gain"
-
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
-        """How the effect goes along the recording, at a gain of one."""
-        raise NotImplementedError
-
-    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
-        return ({},)
 
     def unit(self, context: Context) -> str:
         """Of the gain: the signal's unit, for each unit of the driver."""
@@ -357,3 +263,16 @@ class GainEffect:
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
         return gained(self.course(shape, context), gamma)
+
+
+def in_words(effect_id: str) -> str:
+    """An id in words: blanks for underscores, people's names with a capital.
+
+    Example:
+        >>> in_words("soft_iron_step"), in_words("coulomb_friction"), in_words("supply_offset")
+        ('soft-iron step', 'Coulomb friction', 'supply offset')
+    """
+    told = f" {effect_id.replace('_', ' ')} "
+    for plain, written in _WRITTEN.items():
+        told = told.replace(f" {plain} ", f" {written} ")
+    return told[1:-1]

@@ -73,7 +73,7 @@ class Context:
         """The component of the signal that is this part.
 
         Raises:
-            KeyError: the port has no such part; :class:`ChoosyEffect` says which an effect needs.
+            KeyError: the port has no such part; ``needs`` says which an effect cannot do without.
         """
         return self.component(self.parts[name])
 

@@ -13,8 +13,8 @@ from tests.simulation.tumbling import tumbling
 
 module = importlib.import_module("mkc_torch.diagnosis.assemble")
 ASKED = SimpleNamespace(level=0.05)
-FINAL = SimpleNamespace(model=SimpleNamespace(terms=(SimpleNamespace(effect=SimpleNamespace(id="current_field")),)))
-CURVE = SimpleNamespace(model=SimpleNamespace(terms=(SimpleNamespace(effect=SimpleNamespace(id="unknown")),)))
+FINAL = SimpleNamespace(model=SimpleNamespace(terms=(SimpleNamespace(effect=SimpleNamespace(is_curve=False)),)))
+CURVE = SimpleNamespace(model=SimpleNamespace(terms=(SimpleNamespace(effect=SimpleNamespace(is_curve=True)),)))
 
 
 def in_units(recording, **units):

@@ -10,6 +10,7 @@ from mkc_torch import diagnose
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
 from mkc_torch.diagnosis.files.model import ModelFileError
+from mkc_torch.effects import GainEffect
 from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
 from mkc_torch.recording.recording import MissingColumnError, Recording
 from mkc_torch.simulation import Magnetometer
@@ -177,6 +178,10 @@ class Lacking:
     id = "lacking"
 
 
+class Nameless(GainEffect):
+    """It has defaults for all but its id."""
+
+
 class Letters(HardIronStep):
     roles = "temperature"
 
@@ -200,7 +205,11 @@ class Letters(HardIronStep):
         ({"effects": HardIronStep()}, "`effects` to be a sequence of Effects but got a HardIronStep; it is a tuple"),
         ({"effects": None}, r"`effects` to be a sequence of Effects but got None; .* and \(\) for none"),
         ({"effects": (HardIronStep,)}, r"got the class HardIronStep; make one, HardIronStep\(\)"),
-        ({"effects": (Lacking(),)}, "it lacks port, roles, quantities, shapes, change, which .*Effect explains"),
+        (
+            {"effects": (Lacking(),)},
+            "got a Lacking; derive it from mkc_torch.effects.Effect, which has defaults",
+        ),
+        ({"effects": (Nameless(),)}, "got a Nameless; give it an `id`"),
         ({"effects": (Letters(),)}, r"its roles are names, \('temperature',\)"),
         ({"level": "a"}, r"`level` to be a number in \(0, 1\) but got 'a'"),
     ],

@@ -2,19 +2,85 @@
 
 import torch
 
-from mkc_torch.effects import Context
+from mkc_torch.effects import DYNAMICS, PAIRED, Context
+from mkc_torch.simulation.outputs import ALL, output_ports
 
-UNITS = {"temperature": ("°C",), "current": ("A",), "position": ("m", "m", "m"), "any": ("V",)}
+UNITS = {"temperature": ("°C",), "current": ("A",), "position": ("m", "m", "m"), "any": ("V",), "spin": ("rad/s",)}
 
 
 def make_context(effect, N=60, channels=("x", "y", "z")):
     """A context with random drivers of the effect's first role, and a random signal of 30 µT; times are uneven."""
     generator = torch.Generator().manual_seed(3)
-    units = UNITS[effect.roles[0]] if effect.roles else ()
+    units = UNITS.get(effect.roles[0], ("V",)) if effect.roles else ()
     time = 5.0 + 0.5 * torch.rand(N, generator=generator, dtype=torch.float64).cumsum(0)
     drivers = torch.randn(N, len(units), generator=generator, dtype=torch.float64)
     signal = 30.0 * torch.randn(N, len(channels), generator=generator, dtype=torch.float64)
     return Context(time, drivers - drivers.mean(0), units, signal, "µT", channels)
+
+
+def heading_context(N=60):
+    """Of a recorded heading that was set anew twice."""
+    time = 0.1 * torch.arange(N, dtype=torch.float64)
+    since = torch.stack([time > 1.0, time > 4.0], -1).double()
+    return Context(time, time.new_zeros(N, 0), (), since, "°", ("heading",), ("since_1", "since_2"))
+
+
+def dynamic_context(effect, N=80, driven=False):
+    """What the effect sees at a port of a system that has all it could need; times are uneven."""
+    generator = torch.Generator().manual_seed(1)
+    time = 0.02 + 0.05 * torch.rand(N, generator=generator, dtype=torch.float64).cumsum(0)
+    drivers, driver_units = time.new_zeros(N, 0), ()
+    if driven:
+        drivers, driver_units = torch.cos(3.0 * time).unsqueeze(-1), UNITS[effect.roles[0]]
+    if effect.port in ("input", "output"):
+        parts, units = {"own": "force"}, {"own": "N"}
+        signal = oscillating(N, 1)
+        return Context(time, drivers, driver_units, signal, "N", ("force",), parts=parts, part_units=units)
+    names = ("angle", "speed", "other", "load", "rate")
+    parts = {
+        "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "reversing": "speed",
+        "temperature": "speed", "level": "speed", "other": "other", "load": "load",
+        "rate": "rate", "height": "angle", "sideways": "other",
+    }  # fmt: skip
+    of = {"angle": "rad", "speed": "rad/s", "other": "rad/s", "load": "rad/s/s", "rate": "rad/s/s"}
+    units = {part: of[name] for part, name in parts.items()}
+    channels = ("speed", "other") if effect.port == "exchange" else ("speed",)
+    signal = oscillating(N, len(names))
+    signal[:, 3] = signal[:, 3].abs()
+    return Context(time, drivers, driver_units, signal, "rad/s/s", channels, names, parts, units)
+
+
+def oscillating(N, count):
+    """Components that change their sign, of size 2."""
+    return 2.0 * torch.randn(N, count, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+def paired_context(effect, N=120):
+    """What the effect sees of an output in V that is compared with a simulated one."""
+    time = torch.arange(N, dtype=torch.float64) / 10.0
+    signal = (2.0 * torch.sin(1.3 * time) + 0.2).unsqueeze(-1)
+    port = output_ports(("y",), {"y": "V"}, "V", signal, ("y",))[ALL if effect.port == "outputs" else "output y"]
+    drivers = torch.cos(0.7 * time).unsqueeze(-1) if effect.roles else time.new_zeros(N, 0)
+    return Context(time, drivers, ("A",) if effect.roles else (), signal, "V", ("y",), (), port.parts, port.part_units)
+
+
+def contexts_of(effect):
+    """Every kind of context that an effect of the catalogue, or a sensor effect of a user's own, can be in."""
+    if effect.port == "heading":
+        return (heading_context(),)
+    if effect in PAIRED:
+        return (paired_context(effect),)
+    if effect in DYNAMICS or any(type(one.simpler) is type(effect) for one in DYNAMICS if one.simpler):
+        return (dynamic_context(effect), *([dynamic_context(effect, driven=True)] if effect.roles else []))
+    return make_context(effect), make_context(effect, channels=("strength",))
+
+
+def kinds_of_shapes(effect, context):
+    """Every kind of shape of an effect, of those that differ in their numbers alone the first and the last."""
+    kinds = {}
+    for shape in effect.shapes(context.time):
+        kinds.setdefault(tuple(sorted(shape)), []).append(shape)
+    return [shape for alike in kinds.values() for shape in (alike[0], *alike[1:][-1:])]
 
 
 def size_of(effect, shape, context):

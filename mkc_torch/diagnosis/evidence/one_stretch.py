@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from mkc_torch.diagnosis.evidence.base import Case, Told
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.effects.sensor.unknown import UNKNOWN
-from mkc_torch.effects.sensor.unrecorded import Unrecorded
 
 __all__ = ["called", "test"]
 
@@ -26,9 +24,9 @@ def test(case: Case) -> Told:
 
 def called(term: Term) -> str:
     """A candidate in a sentence."""
-    if isinstance(term.effect, Unrecorded):
+    if term.effect.unrecorded:
         return "a cause that no column recorded"
-    along = "a curve along" if term.effect.id == UNKNOWN else f"{term.effect.id} by"
+    along = "a curve along" if term.effect.is_curve else f"{term.effect.id} by"
     if term.columns:
         return f"{along} {', '.join(term.columns)}"
-    return "a curve without a name" if term.effect.id == UNKNOWN else term.effect.id
+    return "a curve without a name" if term.effect.is_curve else term.effect.id

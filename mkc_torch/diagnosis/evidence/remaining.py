@@ -11,7 +11,6 @@ from mkc_torch.diagnosis.evidence.ceiling import Ceiling, ceiling
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, gain_interval
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.effects.sensor.unknown import UNKNOWN
 
 __all__ = ["nameless", "remaining", "remaining_warning", "said", "test", "within_reach"]
 
@@ -43,7 +42,7 @@ def said(smooth: SmoothCorrection) -> Told:
 
 def nameless(fit: FittedModel) -> bool:
     """Whether an effect is a curve over a driver that no physics of the catalogue accounts for."""
-    return any(term.effect.id == UNKNOWN for term in fit.model.terms)
+    return any(term.effect.is_curve for term in fit.model.terms)
 
 
 def _answerable(base: FittedModel, final: FittedModel) -> FittedModel:

@@ -12,7 +12,6 @@ from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.noise.innovations import either_way
 from mkc_torch.diagnosis.search.ranking import SEPARABLE
-from mkc_torch.effects.base import NestedEffect
 from mkc_torch.nonlinear import NoFitError
 
 if TYPE_CHECKING:
@@ -60,10 +59,10 @@ def simplified(
 def _simpler(fit: FittedModel, number: int) -> tuple[JointModel, Float[Tensor, " p"]] | None:
     """The model with the simpler form of one effect, and where to start; None where there is none."""
     terms = list(fit.model.terms)
-    effect = terms[number].effect
-    if not isinstance(effect, NestedEffect):
+    simpler = terms[number].effect.simpler
+    if simpler is None:
         return None
-    terms[number] = replace(terms[number], effect=effect.simpler)
+    terms[number] = replace(terms[number], effect=simpler)
     model = JointModel(fit.model.prepared, terms, fit.model.near)
     size = model.sizes[number]
     if size >= fit.model.sizes[number]:

@@ -18,7 +18,7 @@ from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.joint import summed
 from mkc_torch.diagnosis.model.term import Term, context_at
 from mkc_torch.effects import CATALOGUE
-from mkc_torch.effects.base import AnchoredEffect, Effect, LastingEffect, RelativeEffect, ShapedEffect
+from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context
 from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
 from mkc_torch.recording.recording import MissingColumnError, Recording
@@ -100,7 +100,7 @@ class DiagnosedModel(CorrectingModel):
                 notes.append(f"{term.effect.id} belongs to the place of the diagnosed recording and is left out.")
                 continue
             changes[port] = summed(changes.get(port), self._change(term, gamma, correction, recording))
-            if isinstance(term.effect, LastingEffect):
+            if term.effect.lasts:
                 notes.append(
                     f"{term.effect.id} is bound to the time of the diagnosed recording: its offset at the end is taken "
                     "off all of this one."
@@ -117,11 +117,7 @@ class DiagnosedModel(CorrectingModel):
 
         def change(signal: Tensor) -> Tensor:
             context = replace(bare, signal=signal)
-            return (
-                effect.lasting(gamma, context)
-                if isinstance(effect, LastingEffect)
-                else effect.change(gamma, shape, context)
-            )
+            return effect.lasting(gamma, context) if effect.lasts else effect.change(gamma, shape, context)
 
         return change
 
@@ -214,8 +210,7 @@ def model_of(final: Estimate, simulation: Simulation) -> DiagnosedModel:
     terms = []
     for term in model.terms:
         context = term.context(model.prepared, signals.get(term.port))
-        shape = term.effect.anchored(term.shape, context) if isinstance(term.effect, AnchoredEffect) else term.shape
-        terms.append(Term(term.effect, term.driver, shape, term.at))
+        terms.append(replace(term, shape=term.effect.anchored(term.shape, context)))
     parameters = final.fit.parameters
     return DiagnosedModel(
         model.prepared.name,
@@ -261,9 +256,9 @@ def _effect(entry: Mapping[str, Any], known: Sequence[Effect]) -> Effect:
             f'its effect "{entry["effect"]}" is not known; register it with `effects=` (known: {names}).'
         )
     numbers = set(entry["shape"])
-    of_shape = [one for one in same if not isinstance(one, RelativeEffect) or set(one.relative) <= numbers]
+    of_shape = [one for one in same if set(one.relative) <= numbers]
     effect = (of_shape or same)[0]
-    lost = sorted(set(effect.fitted_shape) - numbers) if isinstance(effect, ShapedEffect) else []
+    lost = sorted(set(effect.fitted_shape) - numbers)
     if lost:
         raise ModelFileError(
             f'the shape of its effect "{effect.id}" lacks {", ".join(lost)}; it may be of another version: diagnose '

@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from mkc_torch.effects.base import CodedEffect
 from mkc_torch.recording.recording import DEFAULT_UNITS
 from mkc_torch.simulation.dynamics.definition import Dynamics
 from mkc_torch.simulation.dynamics.user_functions import kinematic
@@ -61,7 +60,7 @@ def python_source(
         lines = _lines(term, [_rounded(float(one)) for one in gamma], system, measured)
         place = outputs if term.port == "output" else inputs if term.port.startswith("input ") else rates
         place += [f"# {term.effect.id}: {term.effect.equation}", *lines]
-    told = ", ".join(term.effect.id.replace("_", " ") for term in terms) or "nothing more"
+    told = ", ".join(term.effect.words for term in terms) or "nothing more"
     body = [
         f"class Corrected{kind.__name__}({kind.__name__}):",
         f'    """{kind.__name__} with the parameters that a recording gave it, and {told}."""',
@@ -155,7 +154,7 @@ def _memory(state: str) -> str:
 
 def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Sequence[str]) -> list[str]:
     """Assignments that add an effect to what it acts on."""
-    if term.driver is not None or not isinstance(term.effect, CodedEffect):
+    if term.driver is not None or not term.effect.has_code:
         raise SourceError(
             f"{term.effect.id} cannot be written out as Python: "
             + ("it is driven by a recorded column." if term.driver else "it has no `code` method.")

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from mkc_torch.diagnosis.findings.worth import carries_over, change, confirmed, worth_correcting
 from mkc_torch.diagnosis.result import Alternative, Diagnosis, Finding
+from mkc_torch.effects import is_curve
 
 __all__ = ["advice_of", "nothing_shows"]
 
@@ -71,7 +72,7 @@ _SWITCHED = (
 
 
 def _called(finding: Finding) -> str:
-    if finding.effect != "unknown":
+    if not is_curve(finding.effect):
         return finding.effect
     return f"the curve along {', '.join(finding.drivers)}" if finding.drivers else "the course without a recorded cause"
 

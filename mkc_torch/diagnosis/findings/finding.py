@@ -16,24 +16,11 @@ from mkc_torch.diagnosis.findings.formula import formulas
 from mkc_torch.diagnosis.findings.regions import attributed, map_of, region_of, shares_of_runs
 from mkc_torch.diagnosis.findings.what_to_record import SAME, told_by
 from mkc_torch.diagnosis.linearised.estimate import Estimate
-from mkc_torch.diagnosis.model.term import Term, follows_signal
+from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import Alternative, Curve, Finding, Number, Parameter, Reference
 from mkc_torch.diagnosis.search.locate import Located
 from mkc_torch.diagnosis.search.ranking import SEPARABLE
-from mkc_torch.effects.base import (
-    ComponentsEffect,
-    Effect,
-    FormedEffect,
-    MomentsEffect,
-    PartEffect,
-    PlacedEffect,
-    RelativeEffect,
-    ShapeUnitsEffect,
-    TellingEffect,
-)
 from mkc_torch.effects.context import Context
-from mkc_torch.effects.sensor.unknown import UNKNOWN
-from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
 from mkc_torch.nonlinear import beside
 
 if TYPE_CHECKING:
@@ -46,7 +33,6 @@ _FARTHEST = 30.0
 _BLOCKS, _MOST_GAIN, _CONCENTRATED = 60, 0.9, 0.35
 _POINTS = 80
 _NORMAL_95 = 1.959964
-_SECONDS = ("lag", "time_constant", "middle", "width", "delay")
 
 
 def finding_of(located: Located, final: Estimate, number: int) -> Finding:
@@ -65,16 +51,16 @@ def finding_of(located: Located, final: Estimate, number: int) -> Finding:
     where = attributed(final.fit, number)
     curve = _curve(term, gamma, covariance, context)
     shape = _shape_parameters(term, context, final.shape_errors[number])
-    of_time = isinstance(term.effect, Unrecorded)
-    told_as = formulas(curve) if term.effect.id == UNKNOWN and not of_time and curve is not None else ()
-    moments = term.effect.moments(context) if isinstance(term.effect, MomentsEffect) else ()
+    of_motion_or_driver = term.effect.is_curve and not term.effect.unrecorded
+    told_as = formulas(curve) if of_motion_or_driver and curve is not None else ()
+    moments = term.effect.moments(context)
     return Finding(
         effect=term.effect.id,
         drivers=term.columns,
         channels=channels,
         intervals=intervals_of(gain_of(final, number), final.fit.model.prepared.time),
         onset=moments[0] if moments else term.shape.get("onset"),
-        equation="; ".join([_equation(term, context), *told_as]),
+        equation="; ".join([term.effect.equation_of(term.shape, context), *told_as]),
         explanation=term.effect.explanation,
         parameters=(*parameters_of(term, gamma, covariance, context), *shape),
         p_value=located.p_value,
@@ -88,15 +74,9 @@ def finding_of(located: Located, final: Estimate, number: int) -> Finding:
         moments=moments,
         references=_references(term),
         advice=term.effect.advice,
-        again=_again(term.effect),
-        placed=isinstance(term.effect, PlacedEffect) and term.effect.placed,
+        again=term.effect.again,
+        placed=term.effect.placed,
     )
-
-
-def _equation(term: Term, context: Context) -> str:
-    """In the form that the shape chose."""
-    effect = term.effect
-    return effect.equation_of(term.shape, context) if isinstance(effect, FormedEffect) else effect.equation
 
 
 def _references(term: Term) -> tuple[Reference, ...]:
@@ -104,10 +84,6 @@ def _references(term: Term) -> tuple[Reference, ...]:
         return ()
     values = term.driver.reference.tolist()
     return tuple(Reference(*one) for one in zip(term.columns, values, term.driver.units, strict=True))
-
-
-def _again(effect: Effect) -> str:
-    return effect.again if isinstance(effect, TellingEffect) else ""
 
 
 def places_of(term: Term, channels: Sequence[str]) -> tuple[str, ...]:
@@ -135,14 +111,11 @@ def parameters_of(
 ) -> tuple[Parameter, ...]:
     """γ as named quantities with units and standard errors."""
     error = covariance.diagonal().clamp(min=0.0).sqrt()
-    readings = getattr(term.effect, "readings", None)
     parameters, start = [], 0
     for quantity in term.effect.quantities(term.shape, context):
         mine = slice(start, start + quantity.size)
         value, spread = gamma[mine], error[mine]
         start += quantity.size
-        if readings is not None:
-            value, spread = readings(quantity.name, value, covariance[mine, mine])
         components = _components(term, quantity.name, quantity.size, context)
         parameters.append(Parameter(quantity.name, _numbers(value), _numbers(spread), tidy(quantity.unit), components))
     return tuple(parameters)
@@ -152,26 +125,16 @@ def _components(term: Term, quantity: str, size: int, context: Context) -> tuple
     """What the numbers of a quantity are: as the effect says, or one for each channel."""
     if size < 2:
         return ()
-    own = term.effect.components(quantity, term.shape, context) if isinstance(term.effect, ComponentsEffect) else ()
+    own = term.effect.components(quantity, term.shape, context)
     return own or (tuple(context.channels) if size == len(context.channels) else ())
 
 
 def _shape_parameters(term: Term, context: Context, errors: Mapping[str, float]) -> tuple[Parameter, ...]:
-    chosen = term.effect.choices if isinstance(term.effect, FormedEffect) else ()
     return tuple(
-        Parameter(name, value, errors.get(name), _unit_of_shape(term, name, context))
+        Parameter(name, value, errors.get(name), term.effect.unit_of_shape(name, context))
         for name, value in term.shape.items()
-        if name != "onset" and not name.startswith(COURSE) and name not in chosen
+        if name != "onset" and term.effect.reports(name)
     )
-
-
-def _unit_of_shape(term: Term, name: str, context: Context) -> str:
-    if isinstance(term.effect, RelativeEffect) and name in term.effect.relative:
-        part = term.effect.relative[name][0]
-        return context.units[0] if part == "driver" else context.unit_of(part)
-    if isinstance(term.effect, ShapeUnitsEffect) and (own := term.effect.unit_of_shape(name, context)):
-        return own
-    return "s" if name in _SECONDS else ""
 
 
 def _numbers(values: Tensor) -> Number:
@@ -186,7 +149,7 @@ def _plausibility(term: Term, gamma: Tensor, context: Context) -> tuple[bool, st
     largest = float(gamma[: first.size].abs().max())
     if not math.isfinite(limit):
         return True, "No plausible size is known for this effect; judge it by its equation."
-    known = getattr(term.effect, "plausible_unit", "") or first.unit
+    known = term.effect.plausible_unit or first.unit
     times = ratio(known, first.unit)
     if times is None:
         return True, f"Its size is in {first.unit or 'no unit'}; what is plausible is known in {known} alone."
@@ -211,7 +174,7 @@ def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
         if rival.key == term.key or ranked.gap > _FARTHEST:
             continue
         gap = max(ranked.gap, 0.0)
-        again, told = _again(rival.effect), ""
+        again, told = rival.effect.again, ""
         if own and gap < SEPARABLE:
             told = told_by(located, own[0], ranked.number)
         found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= SEPARABLE, rival.at, again, told))
@@ -282,7 +245,7 @@ def _along(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | N
             name = f"{term.columns[0].rpartition('_')[0]}, main direction"
         time = torch.arange(_POINTS, dtype=values.dtype)
         return name, unit, shown, replace(context, time=time, drivers=drivers, signal=flat)
-    if follows_signal(term.effect):
+    if term.effect.follows_signal:
         reach = float(context.signal.abs().max())
         x = torch.linspace(-reach, reach, _POINTS, dtype=context.signal.dtype)
         signal = x.unsqueeze(-1).expand(-1, context.signal.shape[1])
@@ -297,7 +260,7 @@ def _along(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | N
 
 def _along_part(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | None:
     """Over the range of the part of the signal that the effect mainly follows, the others at their medians."""
-    part = term.effect.along if isinstance(term.effect, PartEffect) else ""
+    part = term.effect.along
     if part not in context.parts:
         return None
     name = context.parts[part]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.model.joint import JointModel, directions, port_jacobian, through_port
-from mkc_torch.diagnosis.model.term import Term, follows_signal
+from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.cosine_basis import cosines, dct, dct_of_courses
 from mkc_torch.nonlinear import NoFitError
 
@@ -125,7 +125,7 @@ def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Seque
         )
     start = model.base
     for term, size in zip(model.terms, model.sizes, strict=True):
-        if follows_signal(term.effect):
+        if term.effect.follows_signal:
             nuisance[..., start : start + size] *= independent[:, None]
         start += size
     slow = _slow_courses(model, parameters, pointwise)
@@ -157,7 +157,7 @@ def candidate_tangents(
             moved = through_port(model, parameters, name, joined, known)
             finite = bool(moved.isfinite().all())
             for i, part in zip(block, moved.split([courses[i].shape[-1] for i in block], -1), strict=True):
-                part = independent[:, None] * part if follows_signal(terms[i].effect) else part
+                part = independent[:, None] * part if terms[i].effect.follows_signal else part
                 # one that has no slope here is none that could be named
                 found[i] = part if finite or bool(part.isfinite().all()) else torch.zeros_like(part)
     return tuple(t for t in found if t is not None)

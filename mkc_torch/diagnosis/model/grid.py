@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,17 +11,8 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.effects.base import (
-    ChoosyEffect,
-    ContinuousEffect,
-    Effect,
-    OptionalDriverEffect,
-    RelativeEffect,
-    ShapedEffect,
-)
+from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Shape
-from mkc_torch.effects.sensor.unknown import UNKNOWN
-from mkc_torch.effects.sensor.unrecorded import COURSE
 from mkc_torch.simulation.protocol import Port, PreparedSimulation
 
 if TYPE_CHECKING:
@@ -40,7 +31,7 @@ def candidate_terms(
     for effect in effects:
         places = [name for name, port in prepared.ports.items() if _fits(effect, name, port)]
         # a role that is known says what the column does; an effect of unknown roles takes what is left over
-        alone = not effect.roles or (isinstance(effect, OptionalDriverEffect) and effect.driver_optional)
+        alone = not effect.roles or effect.driver_optional
         fitting = [*([None] if alone else []), *(d for d in drivers if _drives(d, effect))]
         shapes = effect.shapes(prepared.time)
         terms += [
@@ -54,13 +45,12 @@ def candidate_terms(
 
 def _fits(effect: Effect, name: str, port: Port) -> bool:
     """Whether an effect acts at a port."""
-    needs = effect.needs if isinstance(effect, ChoosyEffect) else ()
-    return effect.port in (name, port.kind) and set(needs) <= set(port.parts)
+    return effect.port in (name, port.kind) and set(effect.needs) <= set(port.parts)
 
 
 def absolute(effect: Effect, shape: Shape, port: Port, driver: Driver | None = None) -> Shape:
     """A shape in units, of one in shares of what passes through the port or of what drives the effect."""
-    if not isinstance(effect, RelativeEffect):
+    if not effect.relative:
         return shape
     known = dict(port.sizes)
     if driver is not None:
@@ -76,7 +66,7 @@ def reach_of(term: Term, prepared: PreparedSimulation) -> dict[str, tuple[float,
     Raises:
         ValueError: the effect names a number that its shape does not have, or a range with nothing in it.
     """
-    if not isinstance(term.effect, ShapedEffect):
+    if not term.effect.fitted_shape:
         return {}
     port, reach = prepared.ports[term.port], term.effect.fitted_shape
     for name, (low, high) in reach.items():
@@ -86,8 +76,7 @@ def reach_of(term: Term, prepared: PreparedSimulation) -> dict[str, tuple[float,
                 f"with a least and a greater value but got `{name}`: ({low}, {high}); mend it or "
                 "leave it out."
             )
-    of_length = term.effect.continuous if isinstance(term.effect, ContinuousEffect) else {}
-    length = float(prepared.time[-1] - prepared.time[0])
+    of_length, length = term.effect.continuous, float(prepared.time[-1] - prepared.time[0])
     ends = [
         absolute(term.effect, {**term.shape, **{n: r[k] for n, r in reach.items()}}, port, term.driver) for k in (0, 1)
     ]
@@ -97,7 +86,7 @@ def reach_of(term: Term, prepared: PreparedSimulation) -> dict[str, tuple[float,
 
 def _drives(driver: Driver, effect: Effect) -> bool:
     """Whether a driver has one of an effect's roles; a curve without a name follows any one column."""
-    return driver.role in effect.roles or (bool(effect.roles) and effect.id == UNKNOWN and len(driver.columns) == 1)
+    return driver.role in effect.roles or (bool(effect.roles) and effect.is_curve and len(driver.columns) == 1)
 
 
 def finer(term: Term, name: str, time: Float[Tensor, " N"], rounds: int) -> tuple[Term, ...]:
@@ -109,7 +98,6 @@ def finer(term: Term, name: str, time: Float[Tensor, " N"], rounds: int) -> tupl
         time: of the recording.
         rounds: how often the range was narrowed before.
     """
-    assert isinstance(term.effect, ContinuousEffect)
     low, high = (share * float(time[-1] - time[0]) for share in term.effect.continuous[name])
     offset = float(time[0]) if name == "onset" else 0.0
     value = term.shape[name]
@@ -118,13 +106,14 @@ def finer(term: Term, name: str, time: Float[Tensor, " N"], rounds: int) -> tupl
     return tuple(replace(term, shape={**term.shape, name: v}) for v in sorted(values))
 
 
-def described(shape: Shape) -> str:
-    """A shape as a user reads it.
+def described(effect: Effect, shape: Shape) -> str:
+    """The numbers of a shape that are told, as a user reads them.
 
     Example:
-        >>> described({"onset": 12.345, "lag": 0.5})
-        'onset 12.35 s, lag 0.5 s'
+        >>> from mkc_torch.effects.sensor.offset_drift import OffsetDrift
+        >>> described(OffsetDrift(), {"middle": 12.345, "width": 0.5})
+        'middle 12.35 s, width 0.5 s'
     """
-    units: Mapping[str, str] = {"onset": " s", "lag": " s", "time_constant": " s", "delay": " s"}
-    told = {name: value for name, value in shape.items() if not name.startswith(COURSE)}
-    return ", ".join(f"{name.replace('_', ' ')} {value:.4g}{units.get(name, '')}" for name, value in told.items())
+    told = {name: value for name, value in shape.items() if effect.reports(name)}
+    units = {name: effect.shape_units.get(name, "") for name in told}
+    return ", ".join(f"{name.replace('_', ' ')} {value:.4g} {units[name]}".rstrip() for name, value in told.items())

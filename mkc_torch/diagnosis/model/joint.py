@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.model.term import Term, follows_signal, limits
-from mkc_torch.effects.base import GainEffect, LinearEffect
+from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.courses import combined, gained
 from mkc_torch.nonlinear import GaussianPrior, beside
@@ -40,7 +39,7 @@ class JointModel:
         self.near = near
         self.terms = tuple(terms)
         self.base = len(prepared.parameter_names)
-        self._follow = tuple(follows_signal(t.effect) for t in self.terms)
+        self._follow = tuple(t.effect.follows_signal for t in self.terms)
         self.sizes = tuple(t.size(t.context(prepared, None)) for t in self.terms)
 
     @property
@@ -68,7 +67,7 @@ class JointModel:
     def bounds(self) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"]] | None:
         """Least and greatest values; None if all are free."""
         known = self.prepared.bounds
-        reach = [limits(term.effect) for term in self.terms]
+        reach = [(term.effect.least, term.effect.most) for term in self.terms]
         if known is None and all(one == (-torch.inf, torch.inf) for one in reach):
             return None
         free = self.prepared.time.new_full((self.base,), torch.inf)
@@ -163,9 +162,9 @@ def port_jacobian(model: JointModel, parameters: Float[Tensor, " p"], port: str)
 
 def courses_of(term: Term, context: Context) -> Callable[[Tensor], Tensor] | None:
     """A function of γ that is an effect's change, for one that adds courses of its own; None of any other."""
-    if isinstance(term.effect, LinearEffect):
+    if term.effect.has_basis:
         return partial(combined, term.effect.basis(term.shape, context))
-    if isinstance(term.effect, GainEffect) and type(term.effect).change is GainEffect.change:
+    if term.effect.has_course:
         return partial(gained, term.effect.course(term.shape, context))
     return None
 
@@ -198,9 +197,9 @@ def _widened(added: Float[Tensor, "N c"], width: int) -> Float[Tensor, "N w"]:
 
 def directions(term: Term, context: Context) -> Float[Tensor, "N c q"]:
     """How an effect's change at its port grows with γ at γ = 0, by forward mode where the effect does not say."""
-    if isinstance(term.effect, LinearEffect):
+    if term.effect.has_basis:
         return term.effect.basis(term.shape, context)
-    if isinstance(term.effect, GainEffect) and type(term.effect).change is GainEffect.change:
+    if term.effect.has_course:
         # a gain on a course: the derivative is the course, channel by channel
         eye = torch.eye(len(context.channels), dtype=context.signal.dtype)
         return term.effect.course(term.shape, context)[:, None, None] * eye

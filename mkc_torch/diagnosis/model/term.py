@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.model.drivers import Driver
@@ -12,7 +11,7 @@ from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Shape
 from mkc_torch.simulation.protocol import Port, PreparedSimulation
 
-__all__ = ["Key", "Term", "context_at", "continuous", "follows_signal", "one_sided"]
+__all__ = ["Key", "Term", "context_at", "continuous"]
 
 Key = tuple[str, tuple[str, ...], str]
 """Of a candidate, whatever its shape: the effect's id, its columns and its port."""
@@ -74,23 +73,6 @@ def context_at(port: Port, time: Tensor, drivers: Tensor, units: tuple[str, ...]
     )
 
 
-def limits(effect: Effect) -> tuple[float, float]:
-    """Least and greatest value of an effect's γ."""
-    return getattr(effect, "least", -torch.inf), getattr(effect, "most", torch.inf)
-
-
-def one_sided(effect: Effect) -> bool:
-    """Whether an effect's γ cannot be negative."""
-    return limits(effect)[0] >= 0.0
-
-
 def continuous(term: Term) -> list[str]:
     """The numbers of a candidate's shape that are closed in on."""
-    free = getattr(term.effect, "continuous", ())
-    return [name for name in term.shape if name in free]
-
-
-def follows_signal(effect: Effect) -> bool:
-    """Whether an effect is a function of the signal at its port."""
-    # asked thousands of times, and a protocol is asked for in 20 microseconds
-    return getattr(effect, "follows_signal", False)
+    return [name for name in term.shape if name in term.effect.continuous]

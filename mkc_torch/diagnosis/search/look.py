@@ -15,7 +15,7 @@ from mkc_torch.diagnosis.linearised.linearise import Linearised, linearise
 from mkc_torch.diagnosis.linearised.tangents import Tangents, candidate_tangents
 from mkc_torch.diagnosis.linearised.wander import NoiseFit
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.term import Term, one_sided
+from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.colour import Colour
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class Look:
         """Whether the amplitudes that fit have a sign that the physics allows."""
         possible = torch.ones(len(self.scene.terms), dtype=torch.bool)
         for number, term in enumerate(self.scene.terms):
-            if one_sided(term.effect):
+            if term.effect.one_sided:
                 possible[number] = bool((self.estimate(number) < 0).any())
         return possible
 

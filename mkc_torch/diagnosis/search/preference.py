@@ -11,10 +11,8 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.model.drivers import ANY, Driver
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.term import Term, continuous, follows_signal
+from mkc_torch.diagnosis.model.term import Term, continuous
 from mkc_torch.diagnosis.noise.innovations import either_way
-from mkc_torch.effects.base import GainEffect, ShapedEffect
-from mkc_torch.effects.sensor.unknown import UNKNOWN
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
@@ -58,11 +56,11 @@ class Preference:
     def handicap(self, term: Term, gain: float) -> float:
         """What a candidate's gain is lessened by before it is compared with others."""
         fixed = share = 0.0
-        if term.effect.id == UNKNOWN:
+        if term.effect.is_curve:
             fixed, share = NAMELESS, OVER_MOTION if term.driver is None else OVER_DRIVER
         if term.driver is not None and term.driver.role == ANY:
             share += FOLLOWER if self._alike(term.driver.values[:, 0]) > ALIKE_COLUMNS else ROLELESS
-        elif term.driver is None and isinstance(term.effect, GainEffect) and not follows_signal(term.effect):
+        elif term.driver is None and term.effect.has_course and not term.effect.follows_signal:
             course = term.effect.course(term.shape, term.context(self._prepared, None))
             share += EVENT if self._alike(course) > ALIKE_EVENT else 0.0
         return fixed + share * max(gain, 0.0)
@@ -91,8 +89,7 @@ class Preference:
 
 def _fitted_numbers(term: Term) -> int:
     """Of its shape."""
-    shaped = term.effect.fitted_shape if isinstance(term.effect, ShapedEffect) else {}
-    return len({*continuous(term), *shaped})
+    return len({*continuous(term), *term.effect.fitted_shape})
 
 
 def schwarz(fit: FittedModel) -> float:

@@ -16,7 +16,7 @@ from mkc_torch.diagnosis.linearised.linearise import linearise
 from mkc_torch.diagnosis.linearised.tangents import Tangents, tangents_of
 from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, clipped_residual, fitted_beside
-from mkc_torch.diagnosis.model.term import Key, Term, one_sided
+from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.search.closing_in import refined
 from mkc_torch.diagnosis.search.look import Look
 from mkc_torch.diagnosis.search.preference import Preference
@@ -100,7 +100,7 @@ def _short_list(
         term = terms[number]
         if term.key not in chosen:
             gamma, _ = plain.search.estimate(number, plain.series)
-            if one_sided(term.effect):
+            if term.effect.one_sided:
                 gamma = gamma.clamp(max=0.0)
                 if not bool(gamma.any()):
                     continue
@@ -206,7 +206,7 @@ def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
 def refitted(best: FittedModel, term: Term, look: Look, number: int) -> FittedModel:
     """The joint fit of a candidate in the place of another one's, from the size that the search has for it."""
     base, gamma = look.scene.base, look.estimate(number)
-    gamma = gamma.clamp(max=0.0) if one_sided(term.effect) else gamma
+    gamma = gamma.clamp(max=0.0) if term.effect.one_sided else gamma
     beside = best.model.with_last(term) if len(best.model.terms) > len(base.model.terms) else best.model.with_term(term)
     found = fitted_beside(base, beside, torch.cat([best.parameters[: base.model.size], -gamma]))
     if found.log_likelihood >= base.log_likelihood:

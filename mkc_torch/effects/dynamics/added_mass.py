@@ -33,7 +33,7 @@ class AddedMass(RateEffect):
     most = 1.0
     plausible = 0.9
     gain = "share"
-    of = "rate"
+    along = "rate"
     equation = "δv̇ = −γ f,  γ = m_a / (m + m_a)"
     explanation = "Everything that accelerates the body does so too much: fluid that moves along adds to its mass."
     advice = "Add the mass of the fluid that moves along, this share of all the mass."

@@ -37,7 +37,7 @@ class Buoyancy(RateEffect):
     relative: Mapping[str, tuple[str, str]] = {"surface": ("position", "largest"), "draught": ("position", "largest")}
     needs = ("height", "deflection")  # heights that are measured from about where the surface is
     gain = "lift"
-    of = "position"
+    along = "position"
     equation = "δv̇ = γ clip((c − x) / h, 0, 1)"
     explanation = "Something carries the body upwards, below a height: it dips into a fluid."
     advice = "Add the weight of the fluid that is displaced."

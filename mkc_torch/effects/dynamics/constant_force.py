@@ -29,7 +29,7 @@ class ConstantForce(RateEffect):
     id = "constant_force"
     least = -math.inf
     gain = "push"
-    of = ""
+    along = ""
     equation = "δẋ = γ"
     explanation = "Something pushes all the time."
     advice = "Look for a bias of the actuator, a tilted base, an unbalanced weight or buoyancy."

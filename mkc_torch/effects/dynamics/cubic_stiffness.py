@@ -30,7 +30,7 @@ class CubicStiffness(RateEffect):
     least = -math.inf
     gain = "stiffness"
     power = 3.0
-    of = "position"
+    along = "position"
     equation = "δv̇ = −γ x³"
     explanation = "The restoring force bends: the spring is harder, or softer, at large deflections."
     advice = "Add a cubic spring with this coefficient."

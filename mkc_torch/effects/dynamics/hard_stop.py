@@ -37,7 +37,7 @@ class HardStop(RateEffect):
     fitted_shape: Mapping[str, tuple[float, float]] = {"place": (0.4, 0.98), "exponent": (1.0, 3.0)}
     needs = ("position",)
     gain = "stiffness"
-    of = "position"
+    along = "position"
     power = 1.0
     equation = "δv̇ = −γ₁ h (h/c)ⁿ⁻¹ + γ₂ h' (h'/c)ⁿ⁻¹,  h = max(x − c, 0), h' = max(−c − x, 0)"
     explanation = "The motion runs into a stop: beyond a place something pushes back."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -36,7 +35,6 @@ class LoadDependentFriction(RateEffect):
     needs = ("reversing", "load")  # at speeds of one sign it is a constant force
     relative: Mapping[str, tuple[str, str]] = {"width": ("own", "typical")}
     gain = "friction"
-    most: float = math.inf
     equation = "δv̇ = −(γ₁ + γ₂ |a − h|) tanh(v / w)"
     explanation = "Dry friction holds against the motion, the more the harder the drive works against its load."
     advice = "Add dry friction with a part in proportion to the load."

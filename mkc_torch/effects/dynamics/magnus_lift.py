@@ -37,7 +37,7 @@ class MagnusLift(RateEffect):
     needs = ("own", "other", "sideways")
     least = -math.inf
     gain = "turning"
-    of = "other"
+    along = "other"
     equation = "δv̇_x = −γ v_y,  δv̇_y = γ v_x"
     explanation = "Something drives the motion across its way, in proportion to its speed, as air does a spinning ball."
     advice = "Add a force across the way with this coefficient, and record the spin."

@@ -35,7 +35,7 @@ class PositionPeriodicForce(RateEffect):
     needs = ("angle",)
     least = -math.inf
     gain = "amplitude"
-    of = "angle"
+    along = "angle"
     equation = "δv̇ = γ₁ sin(k x) + γ₂ cos(k x)"
     explanation = "A force repeats with the position, as the cogging of a motor or an eccentric weight does."
     advice = "Add a force with this period."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -27,29 +26,20 @@ class RateEffect(GainEffect):
     state is the speed of, if anything, its part "position".
 
     Attributes:
-        needs: parts that a port must have for the effect to be tried there.
-        power: of the state's own unit in the course, for the unit of γ; 0 for a course without unit.
+        power: of the unit of what it is along in the course, for the unit of γ; 0 for a course without unit.
     """
 
     port = "rate"
     follows_signal = True
     needs: tuple[str, ...] = ("own",)
-    least: float = 0.0
-    most: float = math.inf
+    least = 0.0
+    along = "own"
     power: float = 0.0
-    of: str = "own"
-
-    @property
-    def along(self) -> str:
-        return self.of
 
     def unit(self, context: Context) -> str:
         if not self.power:
             return context.signal_unit
-        return quotient(context.signal_unit, context.unit_of(self.of), int(self.power)) or "1/s"
-
-    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
-        return ({},)
+        return quotient(context.signal_unit, context.unit_of(self.along), int(self.power)) or "1/s"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity(self.gain, 1, self.unit(context)),)

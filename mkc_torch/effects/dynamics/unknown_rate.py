@@ -35,6 +35,8 @@ class UnknownRate(RateEffect):
     """
 
     id = "unknown"
+    words = "an effect outside the catalogue"
+    is_curve = True
     least = -math.inf
     gain = "legendre"
     equation = "δẋ = f(x), a smooth curve"
@@ -43,14 +45,14 @@ class UnknownRate(RateEffect):
     source = "none: a curve, not physics"
 
     def __init__(self, of: str = "own") -> None:
-        self.of = of
+        self.along = of
         self.needs = ("own", of)
         self._reach = f"reach_of_{of}"
         self.choices = (self._reach,)
         self.relative: Mapping[str, tuple[str, str]] = {self._reach: (of, "largest")}
 
     def equation_of(self, shape: Shape, context: Context) -> str:
-        reach = sized(float(shape[self._reach]), context.unit_of(self.of))
+        reach = sized(float(shape[self._reach]), context.unit_of(self.along))
         return f"{self.equation},  f(x) = Σ γ_j P_j(x / {reach}),  P_j Legendre's polynomials, constant beyond ±1"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
@@ -60,14 +62,14 @@ class UnknownRate(RateEffect):
         return tuple(Quantity(f"{self.gain}_{j}", 1, context.signal_unit) for j in range(1, DEGREE + 1))
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:
-        t = (context.part(self.of) / shape[self._reach]).clamp(-1.0, 1.0)
+        t = (context.part(self.along) / shape[self._reach]).clamp(-1.0, 1.0)
         square = t.square()
         fourth = (35.0 * square.square() - 30.0 * square + 3.0) / 8.0
         curves = torch.stack([t, 1.5 * square - 0.5, 2.5 * t * square - 1.5 * t, fourth], -1)
         return (curves @ gamma).unsqueeze(-1)
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
-        t = f"torch.clamp({names[self.of]} / {shape[self._reach]!r}, -1.0, 1.0)"
+        t = f"torch.clamp({names[self.along]} / {shape[self._reach]!r}, -1.0, 1.0)"
         curves = (t, f"(1.5 * {t} ** 2 - 0.5)", f"(2.5 * {t} ** 3 - 1.5 * {t})")
         fourth = f"(35.0 * {t} ** 4 - 30.0 * {t} ** 2 + 3.0) / 8.0"
         return (" + ".join(f"({one!r}) * {curve}" for one, curve in zip(gamma, (*curves, fourth), strict=True)),)

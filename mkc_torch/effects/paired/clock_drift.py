@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.paired.between import shifted
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 
-class ClockDrift:
+class ClockDrift(Effect):
     """The recording's clock and the simulator's run at different rates.
 
     Simulation: adds ``y(t + γ (t − t₀)) − y(t)`` to all outputs, t₀ the middle of the run.
@@ -27,7 +28,6 @@ class ClockDrift:
 
     id = "clock_drift"
     port = "outputs"
-    roles: tuple[str, ...] = ()
     follows_signal = True
     plausible = 0.01
     equation = "δy = y(t + γ (t − t₀)) − y(t)"
@@ -35,9 +35,6 @@ class ClockDrift:
     advice = "Take both times from one clock, or rescale one of them."
     again = "clocks that drift apart do so the farther, the longer a recording is"
     source = "Mills, RFC 5905 (2010)"
-
-    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
-        return ({},)
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity("rate", 1, ""),)

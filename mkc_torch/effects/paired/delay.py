@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.paired.between import shifted
 
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-class Delay:
+class Delay(Effect):
     """What is measured comes after what is simulated by a constant time, or before it.
 
     Simulation: adds ``y(t − γ) − y(t)`` to an output y.
@@ -26,18 +27,13 @@ class Delay:
 
     id = "delay"
     port = "output"
-    roles: tuple[str, ...] = ()
-    needs: tuple[str, ...] = ("own", "compared")
+    needs = ("own", "compared")
     follows_signal = True
-    plausible = float("inf")
     equation = "δy = y(t − γ) − y(t)"
     explanation = "What is measured comes later than what is simulated, or earlier."
     advice = "Look for filters and transport on the way to the recording, and for how its clock was set."
     again = "a delay is as long in a longer recording"
     source = "transport delays; Åström & Murray, Feedback Systems (2008), 3.4"
-
-    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
-        return ({},)
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity("delay", 1, "s"),)

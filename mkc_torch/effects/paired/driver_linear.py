@@ -30,8 +30,9 @@ class DriverLinear(GainEffect):
     """
 
     id = "driver_linear"
+    words = "linear dependence"
     port = "output"
-    needs: tuple[str, ...] = ("own", "compared")
+    needs = ("own", "compared")
     roles: tuple[str, ...] = ("any", "temperature", "current")
     equation = "δy = b + k (x − x̄)"
     explanation = "What is measured follows this column in a straight line."

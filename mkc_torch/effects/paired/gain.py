@@ -26,7 +26,7 @@ class Gain(GainEffect):
 
     id = "gain"
     port = "output"
-    needs: tuple[str, ...] = ("own", "compared")
+    needs = ("own", "compared")
     follows_signal = True
     along = "own"
     gain = "gain_error"

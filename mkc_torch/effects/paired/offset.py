@@ -26,7 +26,7 @@ class Offset(GainEffect):
 
     id = "offset"
     port = "output"
-    needs: tuple[str, ...] = ("own", "compared")
+    needs = ("own", "compared")
     gain = "offset"
     equation = "δy = γ"
     explanation = "What is measured lies beside what is simulated by a constant."

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-class CubicNonlinearity:
+class CubicNonlinearity(Effect):
     """The sensing element's response to the field is not quite a straight line.
 
     Simulation: adds ``α_i B_i³`` to each axis of the sensor, with B the simulated measurement less its offset: the
@@ -34,9 +35,7 @@ class CubicNonlinearity:
     """
 
     id = "cubic_nonlinearity"
-    port = "sensor"
     follows_signal = True
-    roles: tuple[str, ...] = ()
     equation = "δB_i = α_i B_i³ (+ β_i B_i²)"
     explanation = "The sensor's response is not a straight line: it bends at large fields."
     advice = "Correct with the fitted coefficients; check the sensor's range setting."

@@ -40,6 +40,7 @@ class DriverOffset(GainEffect):
     """
 
     id = "driver_offset"
+    words = "offset dependence"
     roles: tuple[str, ...] = ("any",)
     gain = "offset_per_unit"
     equation = "δB = k (x − x̄)"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.courses import combined, per
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-class FieldGradient:
+class FieldGradient(Effect):
     """Iron in a building bends the Earth's field, so that it changes with position.
 
     Simulation: adds a polynomial of the position, less its mean, of degree one or two to the ambient field. Where the
@@ -37,7 +38,7 @@ class FieldGradient:
 
     id = "field_gradient"
     port = "field"
-    roles: tuple[str, ...] = ("position",)
+    roles = ("position",)
     equation = "B(p) = B₀ + G p + …,  ∇·B = 0, ∇×B = 0"
     explanation = "The ambient field is not the same everywhere: iron nearby bends it."
     advice = "Record in the open, or turn the sensor on the spot."

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-class HeadingReset:
+class HeadingReset(Effect):
     """The filter that the attitude is from set its heading anew, by an angle that the sensor did not turn by.
 
     Simulation: turns the ambient field about the vertical, by φ_k from the k-th jump of the recorded heading on.
@@ -36,20 +37,15 @@ class HeadingReset:
     id = "heading_reset"
     port = "heading"
     least, most = -180.0, 180.0
-    roles: tuple[str, ...] = ()
     equation = "B = R_z(Σ φ_k · 1[t > t_k]) B₀"
     explanation = "The recorded heading was set anew: the attitude turned about the vertical and the sensor did not."
     advice = "Use an attitude that this sensor does not steer, or the samples from between two of the jumps."
     again = "an attitude that this sensor does not steer is not set anew"
     placed = True
+    follows_signal = False  # what passes here is known and has no noise
     plausible = 180.0
     plausible_unit = "°"
     source = "filters align their heading by the compass again at arming and after take-off"
-
-    # not one that follows the signal: what passes here is known and has no noise
-
-    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
-        return ({},)
 
     def moments(self, context: Context) -> tuple[float, ...]:
         # the last sample before each jump, as the simulation tells them

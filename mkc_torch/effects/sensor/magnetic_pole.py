@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.unit_text import sized
+from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.courses import combined
 from mkc_torch.nonlinear import beside
@@ -24,7 +25,7 @@ _FAR = 3.0
 """Places that are fitted, likewise: from farther away a field looks like a polynomial."""
 
 
-class MagneticPole:
+class MagneticPole(Effect):
     """The end of a magnetised beam, bar or pipe bends the field around it.
 
     Simulation: adds to the ambient field that of a pole at a place c, ``q r / (r² + s²)^(3/2)`` with r from c to the
@@ -49,7 +50,7 @@ class MagneticPole:
 
     id = "field_gradient"
     port = "field"
-    roles: tuple[str, ...] = ("position",)
+    roles = ("position",)
     equation = "B(p) = B₀ + q r / r³,  r = p - c"
     explanation = (
         "The ambient field is not the same everywhere: the end of a beam or a bar of iron is near. Its place is given "

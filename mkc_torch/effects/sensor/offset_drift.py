@@ -48,6 +48,7 @@ class OffsetDrift(GainEffect):
         "middle": (0.05, 0.95),
         "width": (0.02, 0.3),
     }
+    shape_units: Mapping[str, str] = dict.fromkeys(("time_constant", "middle", "width"), "s")
     equation = "δB = Δb s(t),  s from 0 to 1 over the recording"
     explanation = "The sensor's offset drifted slowly over the recording, as it does while electronics warm up."
     advice = "Let the sensor warm up before calibrating, or record its temperature beside it."

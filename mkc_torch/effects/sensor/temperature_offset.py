@@ -37,6 +37,7 @@ class TemperatureOffset(DriverOffset):
     """
 
     id = "temperature_offset"
+    words = "temperature offset"
     roles = ("temperature",)
     gain = "offset_per_kelvin"
     equation = "δB = k (T − T̄) (1 + c (T − T̄))"
@@ -45,7 +46,6 @@ class TemperatureOffset(DriverOffset):
     plausible = 5.0
     plausible_unit = "µT/K"
     source = "offset temperature coefficients of MEMS magnetometers, about 0.2 µT/K in data sheets"
-    choices: tuple[str, ...] = ()
     lags = (0.0, 1.0, 5.0)
     continuous: Mapping[str, tuple[float, float]] = {"lag": (0.0, 0.2)}
 
@@ -60,7 +60,7 @@ class TemperatureOffset(DriverOffset):
         return "δB = k (T − T̄)"
 
     def unit_of_shape(self, name: str, context: Context) -> str:
-        return per("1", context.units[0]) if name == "curvature" else ""
+        return per("1", context.units[0]) if name == "curvature" else super().unit_of_shape(name, context)
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         follows = super().course(shape, context)

@@ -9,19 +9,17 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.unit_text import sized
+from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-UNKNOWN = "unknown"
-"""Id of the effect that is a curve, not physics."""
-
 DEGREE = 3
 """Of the curve."""
 
 
-class Unknown:
+class Unknown(Effect):
     """The offset follows a column along a smooth curve, by physics that the catalogue does not have.
 
     Simulation: adds ``Σ γ_j P_j(x)`` to the sensor's axes, with Legendre polynomials P_1 to P_3 and the column's range
@@ -40,17 +38,13 @@ class Unknown:
     """
 
     id = "unknown"
-    port = "sensor"
-    roles: tuple[str, ...] = ("temperature", "current", "any")
+    words = "an effect outside the catalogue"
+    is_curve = True
+    roles = ("temperature", "current", "any")
     equation = "δB = f(x), a smooth curve"
     explanation = "The offset follows this column along a curve that no effect of the catalogue describes."
     advice = "Look at the curve; find out what the column does to the sensor."
-    choices: tuple[str, ...] = ()
-    plausible = float("inf")
     source = "none: a curve, not physics"
-
-    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
-        return ({},)
 
     def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
         x, unit = context.drivers[:, 0], context.units[0]

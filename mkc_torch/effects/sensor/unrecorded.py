@@ -40,16 +40,22 @@ class Unrecorded(GainEffect):
     """
 
     id = "unknown"
+    words = "an effect outside the catalogue"
+    is_curve = True
+    unrecorded = True
     gain = "offset_change"
     equation = "δB = Δb s(t),  one course s for all axes"
     explanation = "Something that was not recorded moved the sensor's offset to and fro along one direction."
     advice = "Look at its course over time: find out what was warmed, switched or moved then, and record it."
-    choices: tuple[str, ...] = ()
     source = "none: a course, not physics"
 
     def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
         course = "s(t) = Σ c_k cos(π k (n + ½) / N) less its last value"
         return f"{self.equation},  {course},  sample n of N,  {len(shape)} numbers c_k in model.json"
+
+    def reports(self, name: str) -> bool:
+        """The course is drawn, and its numbers are not told one by one."""
+        return not name.startswith(COURSE)
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
         # its course is read off the noise, and none can be tried before

@@ -8,6 +8,7 @@ from collections.abc import Collection, Sequence
 
 from mkc_torch.diagnosis.findings.worth import confirmation
 from mkc_torch.diagnosis.result import Alternative, Candidate, Finding, HeldOut, Region
+from mkc_torch.effects import is_curve, words_of
 from mkc_torch.report.diagnosis.evidence import of_driver
 from mkc_torch.report.diagnosis.numbers import Clock
 from mkc_torch.report.words.numbers import number, size
@@ -19,7 +20,6 @@ __all__ = [
     "better",
     "counted_from",
     "driven_by",
-    "effect_name",
     "experiments",
     "finding_name",
     "inseparable",
@@ -34,13 +34,6 @@ __all__ = [
 ]
 
 _MOST_EXPERIMENTS = 6
-_NAMES = {"coulomb": "Coulomb", "stribeck": "Stribeck", "bouc": "Bouc", "wen": "Wen", "magnus": "Magnus"}
-_WORDS = {
-    "driver_linear": "linear dependence",
-    "driver_quadratic": "quadratic dependence",
-    "driver_offset": "offset dependence",
-    "unknown": "an effect outside the catalogue",
-}
 _AXES: dict[tuple[str, ...], str] = {
     ("x", "y", "z"): "finding.acts_on_axes",
     ("east", "north", "up"): "finding.acts_on_world",
@@ -59,19 +52,6 @@ _BOUNDS = {
 }
 
 
-def effect_name(effect: str) -> str:
-    """The name of an effect in words.
-
-    Example:
-        >>> effect_name("hard_iron_step"), effect_name("coulomb_friction"), effect_name("unknown")
-        ('hard-iron step', 'Coulomb friction', 'an effect outside the catalogue')
-    """
-    if effect in _WORDS:
-        return _WORDS[effect]
-    words = effect.replace("_", " ").replace("hard iron", "hard-iron").replace("soft iron", "soft-iron")
-    return " ".join(_NAMES.get(word, word) for word in words.split(" "))
-
-
 def with_drivers(effect: str, drivers: Sequence[str], at: str = "") -> str:
     """An effect with what drives it, and where it acts.
 
@@ -85,7 +65,7 @@ def with_drivers(effect: str, drivers: Sequence[str], at: str = "") -> str:
         >>> with_drivers("field_gradient", ["position_x", "position_y", "position_z"])
         'field gradient (position)'
     """
-    driven = effect_name(effect) + (f" ({_together(drivers)})" if drivers else "")
+    driven = words_of(effect) + (f" ({_together(drivers)})" if drivers else "")
     if not at:
         return driven
     key = "finding.on" if at.startswith("all ") else "finding.on_the"
@@ -107,7 +87,7 @@ def finding_name(finding: Finding) -> str:
 
 
 def unrecorded(finding: Finding) -> bool:
-    return finding.effect == "unknown" and finding.curve is not None and finding.curve.driver == "time"
+    return is_curve(finding.effect) and finding.curve is not None and finding.curve.driver == "time"
 
 
 def label_name(label: str) -> str:
@@ -118,7 +98,7 @@ def label_name(label: str) -> str:
         'current field (battery_A)'
     """
     effect, space, rest = label.partition(" ")
-    return effect_name(plain(effect)) + space + plain(rest)
+    return words_of(plain(effect)) + space + plain(rest)
 
 
 def counted_from(finding: Finding) -> str:
@@ -295,7 +275,7 @@ def with_names(sentence: str, ids: Collection[str]) -> str:
         >>> with_names("hard_iron_step: p = 4e-05, by -6.1 µT.", {"hard_iron_step"})
         'hard-iron step: p = 4 × 10⁻⁵, by −6.1 µT.'
     """
-    named = re.sub(r"[a-z]\w*", lambda word: effect_name(word[0]) if word[0] in ids else word[0], sentence)
+    named = re.sub(r"[a-z]\w*", lambda word: words_of(word[0]) if word[0] in ids else word[0], sentence)
     return typeset(named)
 
 

@@ -1,7 +1,5 @@
 """Lines of Python that effects write are what the effects do."""
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 
@@ -11,48 +9,9 @@ from mkc_torch.diagnosis.files.python_source import SourceError
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects import DYNAMICS
-from mkc_torch.effects.base import CodedEffect
-from mkc_torch.effects.context import Context
-from mkc_torch.effects.courses import lagged
-from mkc_torch.effects.dynamics.backlash import played
-from mkc_torch.effects.dynamics.rate import beyond
+from mkc_torch.effects.base import Effect
 from mkc_torch.effects.dynamics.thermal_loss import ThermalLoss
-from mkc_torch.effects.paired.between import shifted
-from mkc_torch.effects.share import soft_clip
 from mkc_torch.simulation import Dynamics
-
-N = 200
-NAMES = ("speed", "angle", "other", "load", "rate")
-EXPRESSIONS = {
-    "own": "x.speed", "position": "x.angle", "angle": "x.angle", "deflection": "x.angle", "other": "x.other",
-    "load": "x.load", "zero": "0.0", "rate": "x.rate", "memory": "x.memory",
-}  # fmt: skip
-PARTS = {
-    "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "other": "other", "load": "load",
-    "temperature": "speed", "reversing": "speed", "level": "speed", "rate": "rate",
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("effect", DYNAMICS, ids=lambda e: e.id)
-def test_the_line_is_the_change(effect):
-    assert isinstance(effect, CodedEffect)
-    time = torch.arange(N, dtype=torch.float64) / 10.0
-    signal = torch.stack([torch.sin((k + 1) * time + k) for k in range(5)], -1)
-    outputs = effect.port == "output"
-    channels = ("speed",) if outputs or effect.port != "exchange" else ("speed", "other")
-    carried = signal[:, :1] if outputs else signal
-    if effect.port == "hysteretic rate":
-        carried = torch.cat([signal, torch.cos(time).unsqueeze(-1)], -1)  # its internal state is solved for
-    seen = Context(time, time.new_zeros(N, 0), (), carried, "", channels, () if outputs else NAMES, PARTS)
-    shape = effect.shapes(time)[-1]
-    size = sum(q.size for q in effect.quantities(shape, seen))
-    gamma = torch.linspace(0.3, 0.7, size, dtype=torch.float64)
-    names = {"speed": "x.speed"} if outputs else EXPRESSIONS
-    x = SimpleNamespace(**dict(zip(NAMES, signal.unbind(-1), strict=True)), memory=torch.cos(time))
-    known = {"x": x, "torch": torch, "time": time, "run": torch.zeros(N, dtype=torch.long)}
-    known |= {"lagged": lagged, "shifted": shifted, "played": played, "soft_clip": soft_clip, "beyond": beyond}
-    written = [eval(line, known) + torch.zeros_like(time) for line in effect.code(gamma.tolist(), shape, names)]
-    torch.testing.assert_close(torch.stack(written, -1), effect.change(gamma, shape, seen), rtol=1e-9, atol=1e-9)
 
 
 class Vessel(Dynamics):
@@ -87,7 +46,7 @@ def test_what_cannot_be_written_out():
 
     class Silent(ThermalLoss):
         id = "silent"
-        code = None
+        code = Effect.code
 
     with pytest.raises(SourceError, match="silent cannot be written out as Python: it has no `code` method"):
         model(Silent(), Vessel()).to_python()

@@ -8,7 +8,6 @@ from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.search.preference import Preference
 from mkc_torch.effects import CATALOGUE
-from mkc_torch.effects.sensor.unknown import UNKNOWN
 from mkc_torch.simulation import Dynamics
 
 TIME = torch.arange(300, dtype=torch.float64) * 0.02
@@ -39,7 +38,7 @@ def test_a_named_force_gives_nothing(search):
 
 def test_a_curve_over_the_motion_gives_half_of_its_gain_and_ten_nats(search):
     prefer, terms = search
-    curves = [term for term in terms if term.effect.id == UNKNOWN and term.driver is None]
+    curves = [term for term in terms if term.effect.is_curve and term.driver is None]
     assert curves
     assert all(prefer.handicap(term, 100.0) == pytest.approx(60.0) for term in curves)
     assert all(prefer.handicap(term, -5.0) == pytest.approx(10.0) for term in curves)

@@ -1,4 +1,4 @@
-"""What every effect on differential equations promises."""
+"""The physics of the effects on differential equations, and where they are tried."""
 
 import math
 from dataclasses import replace
@@ -9,11 +9,9 @@ import torch
 from mkc_torch import Recording
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.grid import candidate_terms
-from mkc_torch.diagnosis.model.term import limits
-from mkc_torch.effects import CATALOGUE, DYNAMICS, Context, ContinuousEffect
-from mkc_torch.effects.base import BoundedEffect, ChoosyEffect, PartEffect, RelativeEffect, ShapedEffect
+from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics
-from tests.effects.contexts import size_of
+from tests.effects.contexts import dynamic_context, size_of
 
 IDS = (
     "constant_force", "linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction",
@@ -29,43 +27,6 @@ SHARES = ("input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlas
 N = 80
 
 
-def signal(*names, seed=0):
-    """Components that change their sign, of size 2, by their names."""
-    generator = torch.Generator().manual_seed(seed)
-    return 2.0 * torch.randn(N, len(names), generator=generator, dtype=torch.float64)
-
-
-def make_context(effect):
-    """What the effect sees at a port that has all it could need; times are uneven."""
-    generator = torch.Generator().manual_seed(1)
-    time = 0.02 + 0.05 * torch.rand(N, generator=generator, dtype=torch.float64).cumsum(0)
-    none = time.new_zeros(N, 0)
-    if effect.port in ("input", "output"):
-        parts, units = {"own": "force"}, {"own": "N"}
-        return Context(time, none, (), signal("force"), "N", ("force",), parts=parts, part_units=units)
-    names = ("angle", "speed", "other", "load", "rate")
-    parts = {
-        "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "reversing": "speed",
-        "temperature": "speed", "level": "speed", "other": "other", "load": "load",
-        "rate": "rate", "height": "angle", "sideways": "other",
-    }  # fmt: skip
-    of = {"angle": "rad", "speed": "rad/s", "other": "rad/s", "load": "rad/s/s", "rate": "rad/s/s"}
-    units = {part: of[name] for part, name in parts.items()}
-    channels = ("speed", "other") if effect.port == "exchange" else ("speed",)
-    values = signal(*names)
-    values[:, 3] = values[:, 3].abs()
-    return Context(time, none, (), values, "rad/s/s", channels, names, parts, units)
-
-
-def cases():
-    for effect in DYNAMICS:
-        context = make_context(effect)
-        shapes = effect.shapes(context.time)
-        for k, shape in enumerate(shapes if len(shapes) == 1 else (shapes[0], shapes[-1])):
-            yield pytest.param(effect, shape, context, id=f"{effect.id}-{k}")
-
-
-CASES = list(cases())
 EFFECTS = pytest.mark.parametrize("effect", DYNAMICS, ids=lambda e: e.id)
 OF = {effect.id: effect for effect in DYNAMICS}
 
@@ -74,89 +35,31 @@ def change(effect, gamma, shape, context):
     return effect.change(torch.as_tensor(gamma, dtype=torch.float64), shape, context)
 
 
-def test_ids_are_the_contract():
-    assert {effect.id for effect in DYNAMICS} >= set(IDS)
-    several = ("unknown", "field_gradient")
-    named = [effect.id for effect in CATALOGUE if effect.id not in several]
-    assert len(set(named)) == len(named)
-    assert set(DYNAMICS) < set(CATALOGUE)
-
-
-@pytest.mark.parametrize(("effect", "shape", "context"), CASES)
-def test_nothing_changes_without_an_amplitude(effect, shape, context):
-    size = size_of(effect, shape, context)
-    nothing = change(effect, [0.0] * size, shape, context)
-    assert nothing.shape == (N, len(context.channels))
-    assert nothing.dtype == torch.float64
-    assert float(nothing.abs().max()) == 0.0
-
-
-@pytest.mark.parametrize(("effect", "shape", "context"), CASES)
-def test_the_change_is_linear_in_the_amplitude(effect, shape, context):
-    generator = torch.Generator().manual_seed(0)
-    a, b = torch.randn(2, size_of(effect, shape, context), generator=generator, dtype=torch.float64)
-    together = effect.change(2.0 * a - 3.0 * b, shape, context)
-    parts = 2.0 * effect.change(a, shape, context) - 3.0 * effect.change(b, shape, context)
-    assert float(effect.change(a, shape, context).abs().max()) > 1e-3
-    torch.testing.assert_close(together, parts, rtol=1e-9, atol=1e-9 * float(parts.abs().max()))
-
-
-@pytest.mark.parametrize(("effect", "shape", "context"), CASES)
-def test_each_amplitude_has_a_tangent_of_its_own(effect, shape, context):
-    zero = torch.zeros(size_of(effect, shape, context), dtype=torch.float64)
-    tangent = torch.func.jacfwd(lambda g: effect.change(g, shape, context))(zero).flatten(0, 1)
-    assert int(torch.linalg.matrix_rank(tangent)) == len(zero)
-    torch.testing.assert_close(
-        tangent @ torch.ones_like(zero), effect.change(torch.ones_like(zero), shape, context).flatten()
-    )
-
-
-@pytest.mark.parametrize(("effect", "shape", "context"), CASES)
-def test_the_change_has_a_slope_in_what_is_fitted_of_its_shape(effect, shape, context):
-    names = list(effect.fitted_shape) if isinstance(effect, ShapedEffect) else []
-    gamma = torch.ones(size_of(effect, shape, context), dtype=torch.float64)
-
-    def changed(values):
-        return effect.change(gamma, {**shape, **dict(zip(names, values.unbind(), strict=True))}, context)
-
-    values = torch.tensor([shape[name] for name in names], dtype=torch.float64)
-    slopes = torch.func.jacfwd(changed)(values) if names else torch.zeros(1, 0)
-    for k, value in enumerate(values.tolist()):
-        step = torch.zeros_like(values)
-        step[k] = 1e-6 * value
-        numerical = (changed(values + step) - changed(values - step)) / (2.0 * step[k])
-        assert float(numerical.abs().max()) > 0.0
-        torch.testing.assert_close(slopes[..., k], numerical, rtol=1e-4, atol=1e-4 * float(numerical.abs().max()))
-
-
-@pytest.mark.parametrize(("effect", "shape", "context"), CASES)
-def test_its_slope_along_the_signal_is_finite_everywhere(effect, shape, context):
-    """Trajectories are found by Newton's method: standstill and rest must not break it."""
-    gamma = torch.ones(size_of(effect, shape, context), dtype=torch.float64)
-    for values in (context.signal, torch.zeros_like(context.signal), 1e4 * context.signal):
-        slope = torch.func.jvp(
-            lambda s: effect.change(gamma, shape, replace(context, signal=s)), (values,), (torch.ones_like(values),)
-        )[1]
-        assert bool(slope.isfinite().all())
-
-
 @pytest.mark.parametrize("name", LOSSES)
 def test_what_brakes_takes_energy_out(name):
-    effect, context = OF[name], make_context(OF[name])
+    effect, context = OF[name], dynamic_context(OF[name])
     for shape in effect.shapes(context.time):
         for gamma in torch.eye(size_of(effect, shape, context), dtype=torch.float64):
             power = effect.change(gamma, shape, context)[:, 0] * context.part("own")
             assert float(power.max()) <= 0.0
             assert float(power.min()) < -1e-3
-    assert limits(effect) == (0.0, math.inf)
+    assert (effect.least, effect.most) == (0.0, math.inf)
 
 
 def test_signs_of_amplitudes():
-    assert {e.id for e in DYNAMICS if limits(e)[0] == -math.inf} >= set(EITHER_SIGN)
-    assert {e.id for e in DYNAMICS if limits(e) == (0.0, 1.0)} >= set(SHARES)
+    assert {e.id for e in DYNAMICS if e.least == -math.inf} >= set(EITHER_SIGN)
+    assert {e.id for e in DYNAMICS if (e.least, e.most) == (0.0, 1.0)} >= set(SHARES)
     for effect in DYNAMICS:
-        assert isinstance(effect, BoundedEffect)
-        assert effect.id in EITHER_SIGN or limits(effect)[0] == 0.0 or effect.id not in IDS
+        assert effect.one_sided or effect.id in EITHER_SIGN or effect.id not in IDS
+
+
+def test_what_acts_on_equations_follows_their_states_or_inputs_alone():
+    for effect in DYNAMICS:
+        assert effect.follows_signal
+        assert effect.roles == () or effect.driver_optional
+        assert all(low > 0.0 for low, _ in effect.fitted_shape.values())
+        assert effect.along in ("", *dynamic_context(effect).parts)
+        assert effect.equation.startswith("δ")
 
 
 class TestPhysics:
@@ -165,7 +68,7 @@ class TestPhysics:
     @staticmethod
     def at(name, gamma, shape=None, **values):
         effect = OF[name]
-        context = make_context(effect)
+        context = dynamic_context(effect)
         carried = context.carries or context.channels
         row = torch.tensor([values.get(one, 0.0) for one in carried], dtype=torch.float64)
         return change(effect, gamma, shape or {}, replace(context, signal=row.expand(N, -1)))[0].tolist()
@@ -218,7 +121,7 @@ class TestPhysics:
     def test_radiation_in_either_unit(self):
         effect = OF["thermal_loss"]
         for unit, room in (("°C", 20.0), ("K", 293.15)):
-            context = replace(make_context(effect), part_units={"own": unit})
+            context = replace(dynamic_context(effect), part_units={"own": unit})
             hot = context.signal.new_tensor([0.0, room, 0.0, 0.0, 0.0]).expand(N, -1)
             assert float(change(effect, [1.0], {}, replace(context, signal=hot))[0]) == pytest.approx(0.0, abs=1e-9)
             hot = hot + hot.new_tensor([0.0, 0.01, 0.0, 0.0, 0.0])  # a linear loss near room temperature
@@ -234,7 +137,7 @@ class TestPhysics:
 
 def test_a_delay_shows_what_was_also_between_the_samples():
     effect = OF["input_delay"]
-    context = make_context(effect)
+    context = dynamic_context(effect)
     course = (3.0 * context.time + 1.0).unsqueeze(-1)
     for delay in (0.003, 0.1, 0.57):
         delayed = course + change(effect, [1.0], {"delay": delay}, replace(context, signal=course))
@@ -247,7 +150,7 @@ def test_a_delay_does_not_reach_into_another_run():
     effect = OF["input_delay"]
     time = torch.cat([torch.linspace(0.0, 2.0, 40), torch.linspace(0.0, 1.0, 40)]).double()
     course = torch.cat([7.0 + 0.0 * time[:40], 1.0 + time[40:]]).unsqueeze(-1)
-    context = replace(make_context(effect), time=time, signal=course)
+    context = replace(dynamic_context(effect), time=time, signal=course)
     delayed = (course + change(effect, [1.0], {"delay": 0.3}, context))[:, 0]
     torch.testing.assert_close(delayed[:40], torch.full((40,), 7.0).double())
     torch.testing.assert_close(delayed[40:], 1.0 + (time[40:] - 0.3).clamp(min=0.0))
@@ -262,7 +165,7 @@ def test_runs_are_told_apart_by_their_number_whatever_their_clocks_do(name):
     run = torch.arange(2).repeat_interleave(40)
     shape = effect.shapes(one)[-1]
     for later in (other, other - 2.1):
-        both = replace(make_context(effect), time=torch.cat([one, later]), signal=course, run=run)
+        both = replace(dynamic_context(effect), time=torch.cat([one, later]), signal=course, run=run)
         together = change(effect, [1.0], shape, both)
         for part, time in ((slice(0, 40), one), (slice(40, 80), later)):
             alone = replace(both, time=time, signal=course[part], run=None)
@@ -273,35 +176,9 @@ def test_a_sensor_lags_by_its_time_constant():
     effect = OF["sensor_lag"]
     time = torch.linspace(0.0, 5.0, N, dtype=torch.float64)
     ramp = 3.0 * time.unsqueeze(-1)
-    context = replace(make_context(effect), time=time, signal=ramp)
+    context = replace(dynamic_context(effect), time=time, signal=ramp)
     shown = (ramp + change(effect, [1.0], {"lag": 0.8}, context))[:, 0]
     torch.testing.assert_close(shown, 3.0 * (time - 0.8 * (1.0 - torch.exp(-time / 0.8))))
-
-
-@EFFECTS
-def test_users_are_told_what_it_is(effect):
-    assert effect.equation.startswith("δ")
-    for sentence in (effect.explanation, effect.advice):
-        assert sentence.endswith(".")
-        assert sentence[0].isupper()
-    assert len(effect.source) > 10
-    assert effect.plausible > 0
-    assert effect.roles == () or effect.driver_optional
-    assert effect.follows_signal
-    words = type(effect).__doc__
-    for heading in ("Simulation:", "Drivers:", "Units:", "Plausible:", "Source:"):
-        assert heading in words
-
-
-@EFFECTS
-def test_amplitudes_have_names_and_units(effect):
-    context = make_context(effect)
-    for shape in effect.shapes(context.time):
-        quantities = effect.quantities(shape, context)
-        assert all(quantity.name.isidentifier() for quantity in quantities)
-        assert all(isinstance(quantity.unit, str) for quantity in quantities)
-        shares = effect.id in SHARES or any(q.name.startswith("share") for q in quantities)
-        assert shares or all(quantity.unit for quantity in quantities)
 
 
 @pytest.mark.parametrize(
@@ -317,30 +194,9 @@ def test_amplitudes_have_names_and_units(effect):
 )
 def test_units_of_amplitudes(name, units):
     effect = OF[name]
-    context = replace(make_context(effect), signal_unit="m/s²")
+    context = replace(dynamic_context(effect), signal_unit="m/s²")
     shape = effect.shapes(context.time)[0]
     assert [quantity.unit for quantity in effect.quantities(shape, context)] == units
-
-
-@EFFECTS
-def test_what_is_said_of_shapes_is_of_shapes(effect):
-    numbers = {name for shape in effect.shapes(torch.linspace(0.0, 9.0, N).double()) for name in shape}
-    assert isinstance(effect, RelativeEffect) == hasattr(effect, "relative")
-    assert isinstance(effect, ContinuousEffect) == hasattr(effect, "continuous")
-    if isinstance(effect, RelativeEffect):
-        assert set(effect.relative) <= numbers
-        assert all(which in ("typical", "largest") for _, which in effect.relative.values())
-    if isinstance(effect, ContinuousEffect):
-        assert set(effect.continuous) <= numbers
-        assert all(low < high for low, high in effect.continuous.values())
-    assert isinstance(effect, ShapedEffect) == hasattr(effect, "fitted_shape")
-    if isinstance(effect, ShapedEffect):
-        assert set(effect.fitted_shape) <= numbers
-        for name, (low, high) in effect.fitted_shape.items():
-            grid = [shape[name] for shape in effect.shapes(torch.linspace(0.0, 1.0, N).double())]
-            assert 0.0 < low <= min(grid) <= max(grid) < high
-    if isinstance(effect, PartEffect) and effect.along:
-        assert effect.along in make_context(effect).parts
 
 
 # where they are tried
@@ -473,7 +329,7 @@ class TestNeeds:
             "height", "sideways", "flowing",
         }  # fmt: skip
         for effect in DYNAMICS:
-            assert set(effect.needs if isinstance(effect, ChoosyEffect) else ()) <= known
+            assert set(effect.needs) <= known
 
 
 def test_shapes_are_in_the_units_of_the_recording():
@@ -494,7 +350,7 @@ def test_shapes_are_in_the_units_of_the_recording():
 @EFFECTS
 def test_a_found_effect_acts_on_a_recording_that_shows_less(effect):
     """What was needed to tell it from others, such as a reversal, need not happen again."""
-    context = make_context(effect)
+    context = dynamic_context(effect)
     lasting = {"own", "position", "angle", "other", "load", "temperature", "rate"}
     fewer = {part: name for part, name in context.parts.items() if part in lasting}
     for shape in effect.shapes(context.time):

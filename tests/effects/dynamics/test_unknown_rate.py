@@ -68,5 +68,5 @@ def test_a_force_that_is_in_no_catalogue_is_found_without_a_name(diagnosis):
 
 def test_its_model_comes_back_with_the_same_curve(diagnosis):
     again = DiagnosedModel.from_json(diagnosis.model.to_json(), simulation=Pendulum())
-    assert again.terms[0].effect.of == diagnosis.model.terms[0].effect.of
+    assert again.terms[0].effect.along == diagnosis.model.terms[0].effect.along
     assert again.terms[0].shape == diagnosis.model.terms[0].shape

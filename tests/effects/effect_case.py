@@ -1,0 +1,245 @@
+"""What every effect promises, whatever its physics: the case that each of the catalogue, and a user's own, has to pass.
+
+A new effect is asked all of it as soon as it is in the catalogue. One that bends with its amplitude, or whose numbers
+have no unit, is entered in a list here.
+"""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from mkc_torch.effects import Effect, beyond, lagged, played, shifted, soft_clip
+from mkc_torch.effects.courses import gained
+from tests.effects.contexts import contexts_of, kinds_of_shapes, size_of
+
+BENT = ("delay", "clock_drift")
+"""Not linear in γ: they move a signal in time by it."""
+
+UNITLESS = ("share", "share_of_load", "gain_error", "rate")
+"""Quantities that are shares."""
+
+SAID_ALL_THE_SAME = {"constant_force": True, "heading_reset": False}
+"""Whether these say that they follow the signal: all on a rate do, and what passes a heading's port has no noise."""
+
+
+def cases(effects):
+    """An effect, a shape and a context, for :class:`OfEveryShape`."""
+    for effect in effects:
+        for place, context in enumerate(contexts_of(effect)):
+            for k, shape in enumerate(kinds_of_shapes(effect, context)):
+                yield pytest.param(effect, shape, context, id=f"{type(effect).__name__}-{effect.along}-{place}-{k}")
+
+
+def random_gammas(count, size):
+    generator = torch.Generator().manual_seed(0)
+    return 0.05 * torch.randn(count, size, generator=generator, dtype=torch.float64)
+
+
+class OfEveryEffect:
+    """Asked of an effect alone: give it the argument ``effect``."""
+
+    def test_it_is_an_effect_with_an_id_a_port_and_roles(self, effect):
+        assert isinstance(effect, Effect)
+        assert effect.id.isidentifier()
+        assert effect.port
+        assert isinstance(effect.roles, tuple)
+        assert isinstance(effect.needs, tuple)
+
+    def test_users_are_told_what_it_is(self, effect):
+        assert "=" in effect.equation
+        for sentence in (effect.explanation, effect.advice):
+            assert sentence.endswith(".")
+            assert sentence[0].isupper()
+        assert len(effect.source) > 5
+        assert effect.plausible > 0.0
+
+    def test_its_name_in_words_is_a_name(self, effect):
+        assert effect.words.strip() == effect.words != ""
+        assert "_" not in effect.words
+
+    def test_what_another_recording_shows_is_a_clause(self, effect):
+        assert effect.again == "" or (effect.again[0].islower() and not effect.again.endswith("."))
+
+    def test_its_bounds_hold_nothing(self, effect):
+        assert effect.least < effect.most
+        assert effect.least <= 0.0 <= effect.most
+        assert effect.one_sided == (effect.least == 0.0)
+
+    def test_what_it_says_of_its_shapes_is_of_its_shapes(self, effect):
+        # of a recording of one second, shares of its length are times
+        shapes = effect.shapes(torch.linspace(0.0, 1.0, 100).double())
+        assert shapes
+        numbers = {name for shape in shapes for name in shape}
+        for said in (effect.relative, effect.continuous, effect.fitted_shape, effect.choices):
+            assert set(said) <= numbers
+        assert all(which in ("typical", "largest") for _, which in effect.relative.values())
+        assert all(low < high for low, high in effect.continuous.values())
+        for name, (low, high) in effect.fitted_shape.items():
+            grid = [shape[name] for shape in shapes]
+            assert low <= min(grid) <= max(grid) < high
+        assert not set(effect.shape_units) & set(effect.relative)
+        assert all(effect.shape_units[name] == "s" for name in effect.continuous)
+
+    def test_a_simpler_form_is_the_same_physics(self, effect):
+        simpler = effect.simpler
+        if simpler is None:
+            assert type(effect).simpler is Effect.simpler
+            return
+        assert (simpler.id, simpler.words, simpler.port) == (effect.id, effect.words, effect.port)
+        for context in contexts_of(effect):
+            assert simpler.shapes(context.time) == effect.shapes(context.time)
+            for shape in effect.shapes(context.time):
+                sizes = [size_of(one, shape, context) for one in (simpler, effect)]
+                gamma = random_gammas(1, sizes[0])[0]
+                each = gamma.repeat_interleave(sizes[1] // sizes[0])
+                alike = [one.change(g, shape, context) for one, g in ((simpler, gamma), (effect, each))]
+                torch.testing.assert_close(*alike)
+
+
+class OfEveryShape:
+    """Asked of an effect with a shape in a context: give it the arguments ``effect``, ``shape`` and ``context``."""
+
+    def test_nothing_changes_without_an_amplitude(self, effect, shape, context):
+        change = effect.change(random_gammas(1, size_of(effect, shape, context))[0] * 0.0, shape, context)
+        assert change.shape == (len(context.time), len(context.channels))
+        assert change.dtype == torch.float64
+        assert float(change.abs().max()) <= (1e-12 if effect.id in BENT else 0.0)
+
+    def test_the_change_is_linear_in_the_amplitude(self, effect, shape, context):
+        a, b = random_gammas(2, size_of(effect, shape, context))
+        together = effect.change(2.0 * a - 3.0 * b, shape, context)
+        parts = 2.0 * effect.change(a, shape, context) - 3.0 * effect.change(b, shape, context)
+        largest = float(parts.abs().max())
+        assert largest > 1e-4
+        assert (float((together - parts).abs().max()) > 1e-6 * largest) == (effect.id in BENT)
+        if effect.id not in BENT:
+            torch.testing.assert_close(together, parts, rtol=1e-9, atol=1e-9 * largest)
+
+    def test_each_amplitude_has_a_tangent_of_its_own(self, effect, shape, context):
+        size = size_of(effect, shape, context)
+        gamma = torch.full((size,), 0.0123, dtype=torch.float64)
+        tangent = torch.func.jacfwd(lambda g: effect.change(g, shape, context))(gamma)
+        assert tangent.shape == (len(context.time), len(context.channels), size)
+        h = 1e-6 if effect.id in BENT else 1e-3
+        steps = h * torch.eye(size, dtype=torch.float64)
+        near = [effect.change(gamma + s, shape, context) - effect.change(gamma - s, shape, context) for s in steps]
+        near = torch.stack(near, -1) / (2.0 * h)
+        torch.testing.assert_close(tangent, near, rtol=1e-5, atol=1e-6 * float(near.abs().max()))
+        assert int(torch.linalg.matrix_rank(tangent.flatten(0, 1))) == size
+
+    def test_its_slope_along_the_signal_is_finite_everywhere(self, effect, shape, context):
+        """Trajectories are found by Newton's method: standstill and rest must not break it."""
+        gamma = torch.ones(size_of(effect, shape, context), dtype=torch.float64)
+        for values in (context.signal, torch.zeros_like(context.signal), 1e4 * context.signal):
+            slope = torch.func.jvp(
+                lambda s: effect.change(gamma, shape, replace(context, signal=s)), (values,), (torch.ones_like(values),)
+            )[1]
+            assert bool(slope.isfinite().all())
+
+    def test_an_effect_of_the_signal_says_so(self, effect, shape, context):
+        gamma = random_gammas(1, size_of(effect, shape, context))[0]
+        doubled = replace(context, signal=2.0 * context.signal)
+        follows = not torch.equal(effect.change(gamma, shape, context), effect.change(gamma, shape, doubled))
+        assert effect.follows_signal == SAID_ALL_THE_SAME.get(effect.id, follows)
+
+    def test_the_change_has_a_slope_in_what_is_fitted_of_its_shape(self, effect, shape, context):
+        gamma = torch.ones(size_of(effect, shape, context), dtype=torch.float64)
+        assert set(effect.fitted_shape) <= set(shape)
+        for name in effect.fitted_shape:
+            value = torch.tensor(float(shape[name]), dtype=torch.float64)
+
+            def changed(at, name=name):
+                return effect.change(gamma, {**shape, name: at}, context)
+
+            slope = torch.func.jacfwd(changed)(value)
+            step = 1e-6 * (value.abs() + (value == 0.0))
+            numerical = (changed(value + step) - changed(value - step)) / (2.0 * step)
+            largest = float(numerical.abs().max())
+            assert largest > 0.0
+            torch.testing.assert_close(slope, numerical, rtol=1e-4, atol=1e-4 * largest)
+
+    def test_its_amplitudes_have_names_and_units(self, effect, shape, context):
+        quantities = effect.quantities(shape, context)
+        assert len({quantity.name for quantity in quantities}) == len(quantities)
+        for quantity in quantities:
+            assert quantity.name.isidentifier()
+            assert quantity.size > 0
+            assert (quantity.unit == "") == (quantity.name in UNITLESS)
+            assert len(effect.components(quantity.name, shape, context)) in (0, quantity.size)
+
+    def test_its_numbers_have_their_units(self, effect, shape, context):
+        assert effect.unit_of_shape("none of its numbers", context) == ""
+        for name in shape:
+            unit = effect.unit_of_shape(name, context)
+            if name in effect.relative:
+                part = effect.relative[name][0]
+                assert unit == (context.units[0] if part == "driver" else context.unit_of(part)) != ""
+            else:
+                assert unit == effect.shape_units.get(name, unit)
+            assert unit == "s" or name not in effect.continuous
+
+    def test_its_equation_is_of_the_form_that_the_shape_chose(self, effect, shape, context):
+        told = effect.equation_of(shape, context)
+        assert told.startswith(effect.equation.partition("=")[0])
+        assert not any(word in told for word in ("terms", "degree", "radius", "power", "order", "width =", "nan"))
+        assert all(effect.reports(name) == (name not in effect.choices) for name in shape)
+
+    def test_its_moments_ascend_within_the_recording(self, effect, shape, context):  # noqa: ARG002
+        moments = effect.moments(context)
+        assert list(moments) == sorted(set(moments))
+        assert all(float(context.time[0]) <= one <= float(context.time[-1]) for one in moments)
+        assert bool(moments) == (type(effect).moments is not Effect.moments)
+
+    def test_its_shape_is_anchored_once(self, effect, shape, context):
+        anchored = effect.anchored(shape, context)
+        assert effect.anchored(anchored, context) == anchored
+        assert anchored.items() >= shape.items()
+        gamma = random_gammas(1, size_of(effect, shape, context))[0]
+        torch.testing.assert_close(effect.change(gamma, anchored, context), effect.change(gamma, shape, context))
+
+    def test_a_basis_or_a_course_is_the_change(self, effect, shape, context):
+        gamma = random_gammas(1, size_of(effect, shape, context))[0]
+        change = effect.change(gamma, shape, context)
+        if effect.has_basis:
+            torch.testing.assert_close(effect.basis(shape, context) @ gamma, change)
+        else:
+            with pytest.raises(NotImplementedError, match="`basis`"):
+                effect.basis(shape, context)
+        if effect.has_course:
+            assert torch.equal(gained(effect.course(shape, context), gamma), change)
+
+    def test_what_lasts_is_nothing_without_an_amplitude(self, effect, shape, context):
+        gamma = random_gammas(1, size_of(effect, shape, context))[0]
+        if not effect.lasts:
+            with pytest.raises(NotImplementedError, match="`lasting`"):
+                effect.lasting(gamma, context)
+            return
+        left = effect.lasting(gamma, context)
+        assert left.shape == (len(context.time), len(context.channels))
+        assert torch.equal(left, effect.change(gamma, shape, context)[-1].expand_as(left))
+        assert not bool(effect.lasting(0.0 * gamma, context).any())
+
+    def test_its_line_of_python_is_the_change(self, effect, shape, context):
+        gamma = random_gammas(1, size_of(effect, shape, context))[0].abs()
+        if not effect.has_code:
+            with pytest.raises(NotImplementedError, match="`code`"):
+                effect.code(gamma.tolist(), shape, {})
+            return
+        if context.units:  # what a column drives is not written out
+            assert effect.driver_optional
+            return
+        carried = context.carries or context.channels
+        if effect.port == "hysteretic rate":  # its internal state is solved for
+            context = replace(context, signal=torch.cat([context.signal, context.time.cos().unsqueeze(-1)], -1))
+        x = SimpleNamespace(**dict(zip((*carried, "memory"), context.signal.unbind(-1), strict=False)))
+        names = {part: f"x.{name}" for part, name in context.parts.items()} | {"memory": "x.memory", "zero": "0.0"}
+        if not effect.needs and effect.port == "output":  # it is of all outputs
+            names = {name: f"x.{name}" for name in carried}
+        known = {"x": x, "torch": torch, "time": context.time, "run": context.runs}
+        known |= {"lagged": lagged, "shifted": shifted, "played": played, "soft_clip": soft_clip, "beyond": beyond}
+        shape = {name: float(value) for name, value in shape.items()}
+        lines = effect.code(gamma.tolist(), shape, names)
+        written = torch.stack([eval(line, known) + torch.zeros_like(context.time) for line in lines], -1)
+        torch.testing.assert_close(written, effect.change(gamma, shape, context), rtol=1e-9, atol=1e-9)

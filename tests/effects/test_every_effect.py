@@ -1,0 +1,163 @@
+"""Every effect of the catalogue, the simpler forms of some, and one as a user writes it pass the same case."""
+
+import pytest
+import torch
+
+from mkc_torch import effects
+from mkc_torch.effects import (
+    ATTITUDE,
+    CATALOGUE,
+    DYNAMICS,
+    PAIRED,
+    SENSOR,
+    Effect,
+    GainEffect,
+    Quantity,
+    is_curve,
+    words_of,
+)
+from mkc_torch.effects.sensor.field_gradient import FieldGradient
+from mkc_torch.effects.sensor.magnetic_pole import MagneticPole
+from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
+from tests.effects.contexts import make_context
+from tests.effects.effect_case import OfEveryEffect, OfEveryShape, cases
+
+SIMPLER = tuple(effect.simpler for effect in CATALOGUE if effect.simpler is not None)
+
+
+class SupplyOffset(GainEffect):
+    """As the README has it."""
+
+    id = "supply_offset"
+    roles = ("voltage",)
+    equation = "δB = k (V − V̄)"
+    explanation = "The offset follows the supply voltage."
+    advice = "Give the sensor a regulator of its own."
+    plausible = 1.0
+    source = "our bench"
+
+    def course(self, shape, context):  # noqa: ARG002
+        return context.drivers[:, 0]
+
+
+class Square(Effect):
+    """With the two methods that an effect has to have, and no more."""
+
+    id = "squared_response"
+    follows_signal = True
+    equation = "δB = γ B²"
+    explanation = "The response bends."
+    advice = "Look for a magnet beside the element."
+    source = "our bench"
+
+    def quantities(self, shape, context):  # noqa: ARG002
+        return (Quantity("coefficient", len(context.channels), f"1/{context.signal_unit}"),)
+
+    def change(self, gamma, shape, context):  # noqa: ARG002
+        return gamma * context.signal.square()
+
+
+ALL = (*CATALOGUE, SupplyOffset(), Square())
+
+
+@pytest.mark.parametrize("effect", ALL, ids=lambda e: f"{type(e).__name__}-{e.along}")
+class TestEveryEffect(OfEveryEffect):
+    pass
+
+
+@pytest.mark.parametrize(("effect", "shape", "context"), list(cases((*ALL, *SIMPLER))))
+class TestEveryShape(OfEveryShape):
+    pass
+
+
+COURSES = {f"{COURSE}{k}": 0.5 / k for k in (1, 3)}
+
+
+@pytest.mark.parametrize(("effect", "shape", "context"), [(Unrecorded(), COURSES, make_context(Unrecorded()))])
+class TestACourse(OfEveryShape):
+    """It has no shapes that could be tried, and is one all the same."""
+
+    def test_its_equation_is_of_the_form_that_the_shape_chose(self, effect, shape, context):
+        told = effect.equation_of(shape, context)
+        assert told.startswith(effect.equation)
+        assert told.endswith("2 numbers c_k in model.json")
+        assert not any(effect.reports(name) for name in shape)
+        assert effect.shapes(context.time) == ()
+
+
+@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: f"{type(e).__name__}-{e.along}")
+def test_its_docstring_says_what_it_is(effect):
+    for heading in ("Simulation:", "Drivers:", "Units:", "Plausible:", "Source:"):
+        assert heading in type(effect).__doc__
+
+
+def test_ids_are_the_contract():
+    assert tuple(effect.id for effect in SENSOR) == (
+        "hard_iron_step", "offset_drift", "temperature_offset", "current_field", "field_gradient", "field_gradient",
+        "cubic_nonlinearity", "driver_offset", "unknown",
+    )  # fmt: skip
+    assert tuple(effect.id for effect in ATTITUDE) == ("heading_reset",)
+    assert tuple(effect.id for effect in PAIRED) == (
+        "gain", "offset", "delay", "clock_drift", "output_saturation", "driver_linear", "driver_quadratic",
+    )  # fmt: skip
+    assert {effect.id for effect in DYNAMICS} >= {
+        "constant_force", "linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction",
+        "load_dependent_friction", "cubic_stiffness", "position_periodic_force", "coupling", "hard_stop", "overflow",
+        "thermal_loss", "input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "bouc_wen_hysteresis",
+        "added_mass", "magnus_lift", "buoyancy",
+    }  # fmt: skip
+    assert (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED) == CATALOGUE
+    named = [effect.id for effect in CATALOGUE if effect.id not in ("unknown", "field_gradient")]
+    assert len(set(named)) == len(named)
+
+
+def test_what_effects_can_do_beside():
+    assert {e.id for e in CATALOGUE if e.lasts} == {"hard_iron_step", "offset_drift"}
+    assert {e.id for e in CATALOGUE if type(e).anchored is not Effect.anchored} == {"unknown"}
+    assert {type(e) for e in CATALOGUE if e.has_basis} == {FieldGradient, MagneticPole}
+    assert {e.id for e in CATALOGUE if e.has_code} == {e.id for e in DYNAMICS} | {"output_saturation"}
+    assert {e.id for e in CATALOGUE if e.simpler} == {"coupling", "sensor_lag"}
+    assert {e.id for e in CATALOGUE if e.is_curve} == {"unknown"}
+    assert {e.id for e in SENSOR if e.continuous} == {"hard_iron_step", "offset_drift", "temperature_offset"}
+    assert {e.id for e in CATALOGUE if not e.has_course} & {"hard_iron_step", "linear_drag", "gain"} == set()
+
+
+def test_what_belongs_to_a_place_or_an_attitude_says_so():
+    assert {e.id for e in CATALOGUE if e.placed} == {"field_gradient", "heading_reset"}
+    assert {e.port for e in CATALOGUE if e.placed} == {"field", "heading"}
+
+
+def test_names_in_words_are_one_for_each_id():
+    words = {effect.id: {e.words for e in CATALOGUE if e.id == effect.id} for effect in CATALOGUE}
+    assert all(len(told) == 1 for told in words.values())
+    assert len({told for each in words.values() for told in each}) == len(words)
+    assert all({words_of(effect_id)} == told for effect_id, told in words.items())
+    assert words_of("bouc_wen_hysteresis") == "Bouc Wen hysteresis"
+    assert words_of("driver_linear") == "linear dependence"
+    assert words_of("temperature_offset") == "temperature offset"
+    assert words_of("supply_offset") == SupplyOffset().words == "supply offset"
+
+
+def test_an_id_says_whether_it_is_a_curve():
+    assert is_curve(Unrecorded.id)
+    assert not is_curve("supply_offset")
+    assert Unrecorded().is_curve
+
+
+def test_names_of_abilities_that_files_import_are_effects():
+    for name in ("Anchored", "Continuous", "Lasting", "Linear", "Nested", "Shaped", "Signal"):
+        assert getattr(effects, f"{name}Effect") is Effect
+
+
+def test_an_effect_has_to_say_what_it_changes():
+    class Empty(GainEffect):
+        id = "empty"
+
+    with pytest.raises(NotImplementedError, match="the effect empty to have a method `course`; give it one"):
+        Empty().change(torch.ones(3, dtype=torch.float64), {}, make_context(Empty()))
+
+    class Silent(Effect):
+        id = "silent"
+
+    with pytest.raises(TypeError, match="change"):
+        Silent()
