@@ -5,10 +5,17 @@ import warnings
 import numpy  # noqa: F401 - its linear algebra can only be limited once it is there
 import pytest
 import torch
+from _pytest.doctest import DoctestModule
 
 from mkc_torch._parallel.processes import one_thread
 
 one_thread()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collect_file():
+    """Tests hold no doctests: without this every one of their files would be collected twice."""
+    return [one for one in (yield) if not isinstance(one, DoctestModule)]
 
 
 @pytest.fixture(scope="session", autouse=True)

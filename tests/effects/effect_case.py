@@ -32,6 +32,34 @@ def cases(effects):
                 yield pytest.param(effect, shape, context, id=f"{type(effect).__name__}-{effect.along}-{place}-{k}")
 
 
+def asked_of(cases):
+    """A class whose questions are each asked of all cases in one test, and that names the case that fails.
+
+    Args:
+        cases: a function that gives them, with their arguments and their name.
+    """
+
+    def in_turn(question):
+        def named(self, case):
+            try:
+                question(self, *case.values)
+            except AssertionError as error:
+                raise AssertionError(f"{case.id}: {error}") from error
+
+        def test(self):
+            for case in cases():
+                named(self, case)
+
+        return test
+
+    def decorated(cls):
+        for name in [name for name in dir(cls) if name.startswith("test_")]:
+            setattr(cls, name, in_turn(getattr(cls, name)))
+        return cls
+
+    return decorated
+
+
 def random_gammas(count, size):
     generator = torch.Generator().manual_seed(0)
     return 0.05 * torch.randn(count, size, generator=generator, dtype=torch.float64)

@@ -20,7 +20,7 @@ from mkc_torch.effects.sensor.field_gradient import FieldGradient
 from mkc_torch.effects.sensor.magnetic_pole import MagneticPole
 from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
 from tests.effects.contexts import make_context
-from tests.effects.effect_case import OfEveryEffect, OfEveryShape, cases
+from tests.effects.effect_case import OfEveryEffect, OfEveryShape, asked_of, cases
 
 SIMPLER = tuple(effect.simpler for effect in CATALOGUE if effect.simpler is not None)
 
@@ -60,12 +60,12 @@ class Square(Effect):
 ALL = (*CATALOGUE, SupplyOffset(), Square())
 
 
-@pytest.mark.parametrize("effect", ALL, ids=lambda e: f"{type(e).__name__}-{e.along}")
+@asked_of(lambda: [pytest.param(effect, id=f"{type(effect).__name__}-{effect.along}") for effect in ALL])
 class TestEveryEffect(OfEveryEffect):
     pass
 
 
-@pytest.mark.parametrize(("effect", "shape", "context"), list(cases((*ALL, *SIMPLER))))
+@asked_of(lambda: cases((*ALL, *SIMPLER)))
 class TestEveryShape(OfEveryShape):
     pass
 
@@ -85,10 +85,10 @@ class TestACourse(OfEveryShape):
         assert effect.shapes(context.time) == ()
 
 
-@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: f"{type(e).__name__}-{e.along}")
-def test_its_docstring_says_what_it_is(effect):
-    for heading in ("Simulation:", "Drivers:", "Units:", "Plausible:", "Source:"):
-        assert heading in type(effect).__doc__
+def test_docstrings_say_what_effects_are():
+    for effect in CATALOGUE:
+        for heading in ("Simulation:", "Drivers:", "Units:", "Plausible:", "Source:"):
+            assert heading in type(effect).__doc__, effect.id
 
 
 def test_ids_are_the_contract():

@@ -8,7 +8,7 @@ import torch
 
 from mkc_torch import Recording
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
-from mkc_torch.diagnosis.model.joint import JointModel, with_constant
+from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics
@@ -189,11 +189,9 @@ class TestMemory:
         theta = parameters[: model.base]
         seen = model.prepared.signals(theta, changes)
         nothing, something = (torch.full((len(seen[port]), 1), one).double() for one in (0.0, 0.1))
-        plain = model.prepared.simulated(theta, changes)
-        same = model.prepared.simulated(theta, with_constant(changes, port, nothing))
-        torch.testing.assert_close(same, plain)
-        pushed = model.prepared.simulated(theta, with_constant(changes, port, something))
-        other = model.prepared.simulated(theta, with_constant(changes, "rate of speed", something))
+        torch.testing.assert_close(model.pushed(parameters, port, nothing), model.residual(parameters))
+        pushed = model.pushed(parameters, port, something)
+        other = model.pushed(parameters, "rate of speed", something)
         torch.testing.assert_close(pushed, other, rtol=0.0, atol=1e-9)
 
     def test_without_it_there_is_no_internal_state(self):
