@@ -1,6 +1,7 @@
 """The house: rooms import only downwards, no file is too long to read, and the face shows public names alone."""
 
 import ast
+import re
 import sys
 from collections import defaultdict
 from functools import cache
@@ -127,3 +128,11 @@ def test_every_public_name_of_a_room_is_there():
     for name in PACKAGES:
         module = __import__(name, fromlist=["__all__"])
         assert [one for one in getattr(module, "__all__", ()) if not hasattr(sys.modules[name], one)] == []
+
+
+def test_the_page_on_architecture_names_what_is_there():
+    text = (ROOT.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`((?:[a-z_]+/)*[a-z_]+(?:/|\.py))`", text))
+    tops = [ROOT, ROOT / "diagnosis", ROOT / "diagnosis" / "evidence", ROOT.parent]
+    assert {name for name in named if not any((top / name).exists() for top in tops)} == set()
+    assert {f"{floor}/" for floors in FLOORS for floor in floors if (ROOT / floor).is_dir()} <= named
