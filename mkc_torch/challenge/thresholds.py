@@ -26,7 +26,6 @@ LEVEL = 0.05
 STRONG_Z = 10.0
 """Effects with z and z_sep of at least this have to be named."""
 
-COVERAGE_LEVEL = 0.90
 COVERAGE_FACTOR = 1.6448536269514722
 """Half-width of a 90 % interval in standard errors."""
 

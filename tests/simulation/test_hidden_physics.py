@@ -272,3 +272,28 @@ def test_runs_whose_clock_goes_on_do_not_see_each_other_s_inputs(name):
         simulated.append(model.residual(torch.cat([theta, theta.new_ones(1)])))
     torch.testing.assert_close(simulated[0], simulated[1], rtol=0.0, atol=1e-9)
     assert math.isfinite(float(simulated[0].abs().max()))
+
+
+class Idle(Dynamics):
+    """A declared input that its rates do not use."""
+
+    states = ("angle", "speed")
+    inputs = ("torque",)
+    outputs = ("angle",)
+    parameters = {"stiffness": 9.0}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle)}
+
+
+def test_an_input_that_is_not_used_moves_nothing():
+    time = torch.arange(0.0, 4.0, 0.05, dtype=torch.float64)
+    recording = Recording({"time": time, "torque": torch.sin(time), "angle": torch.cos(3.0 * time)})
+    simulation = Idle().prepare(recording)
+    terms = [
+        Term(OF[name], None, shape, "input torque")
+        for name, shape in (("input_delay", {"delay": 0.1}), ("dead_zone", {"width": 0.3, "softness": 0.1}))
+    ]
+    found = tangents_of(JointModel(simulation), simulation.start(), terms).candidates
+    assert [one.shape for one in found] == [(80, 1, 1)] * 2
+    assert all(float(one.abs().max()) == 0.0 for one in found)

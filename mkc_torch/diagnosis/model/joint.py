@@ -225,4 +225,5 @@ def through_port(
     def push(direction: Tensor) -> Tensor:
         return torch.func.jvp(lambda change: model.pushed(parameters, port, change), (zero,), (direction,))[1]
 
-    return torch.vmap(push, in_dims=-1, out_dims=-1, chunk_size=_CHUNK)(courses)
+    # where nothing follows the change, torch takes an out_dims of -1 for a place in memory
+    return torch.vmap(push, in_dims=-1, chunk_size=_CHUNK)(courses).movedim(0, -1)
