@@ -40,6 +40,12 @@ def main() -> None:
         app(prog_name="mkc")
     except KeyboardInterrupt:  # a second one, while the first was being dealt with
         sys.exit(130)
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        # what streams still hold would fail again when Python ends
+        os.write(2, f"mkc: what it says could not be written: {error.strerror}.\n".encode())
+        os._exit(1)
 
 
 def _quit(_signal: int, _frame: FrameType | None) -> None:

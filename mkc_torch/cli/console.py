@@ -125,13 +125,15 @@ def with_unit(recording: Recording, unit: str) -> Recording:
 
 
 def refuse_same_names(recordings: Sequence[Path]) -> None:
-    """Refuses recordings whose results would go to one place.
+    """Refuses recordings whose results would go to one place, or to one outside of ``--output``.
 
     Raises:
-        typer.BadParameter: two have the same name, but for the ending and for capitals.
+        typer.BadParameter: two have the same name, but for the ending and for capitals; or one has no name but dots.
     """
     taken: dict[str, Path] = {}
     for path in recordings:
+        if not path.stem.strip("."):
+            raise typer.BadParameter(term("command.no_folder", one=path))
         other = taken.setdefault(path.stem.casefold(), path)
         if other is not path:
             raise typer.BadParameter(term("command.same_folder", one=other, other=path, folder=path.stem))

@@ -22,13 +22,13 @@ class Parameter:
     """A parameter of a simulation, which is fitted.
 
     Attributes:
-        value: to start from; where it is out of the bounds, from the nearer one.
+        value: to start from.
         lower, upper: least and greatest value.
         unit: for reports.
 
     Raises:
         TypeError: a value or a bound is no number, or the unit no text.
-        ValueError: the value is not finite, or ``lower`` exceeds ``upper``.
+        ValueError: the value is not finite or out of its bounds, or ``lower`` exceeds ``upper``.
 
     Example:
         >>> Parameter(0.1, lower=0.0, unit="1/s")
@@ -47,6 +47,11 @@ class Parameter:
         if self.lower > self.upper:
             raise ValueError(
                 f"Expected argument `lower` to be at most `upper` but got {self.lower} and {self.upper}; swap them."
+            )
+        if not self.lower <= self.value <= self.upper:
+            raise ValueError(
+                f"Expected argument `value` to lie in [{self.lower}, {self.upper}], its own bounds, but got "
+                f"{self.value}; start within them, or widen them."
             )
         refuse_other_type("unit", self.unit, str, "text", "write '1/s' say")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -13,6 +12,7 @@ from torch import Tensor, nn
 from mkc_torch._support.arguments import refuse_other_type, refuse_text
 from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
 from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
 from mkc_torch.simulation.parameter import Parameter, SimulationError, known_parameters
 from mkc_torch.simulation.protocol import Changes, ClosedForm, Nearby, Port, refuse_no_recording
@@ -140,8 +140,8 @@ class Static:
                     f"{', '.join(self.inputs) or 'no inputs'}: {error}"
                 ) from error
             return self._checked_module(found, len(time))
-        u = SimpleNamespace(**dict(zip(self.inputs, inputs.unbind(-1), strict=True)))
-        p = SimpleNamespace(**dict(zip(self.parameters, theta.unbind(), strict=True)))
+        u = Names(**dict(zip(self.inputs, inputs.unbind(-1), strict=True)))
+        p = Names(**dict(zip(self.parameters, theta.unbind(), strict=True)))
         outputs = self.output(time, u, p)
         return torch.stack([self._checked(outputs, name, len(time)) for name in self.outputs], -1)
 

@@ -440,3 +440,25 @@ def test_missing_extra_is_one_line(missing):
     assert done.stderr.strip().splitlines() == [
         f'mkc: {missing} is not installed; install the command line with `pip install "mkc-torch[cli]"`.'
     ]
+
+
+def test_a_recording_without_a_name_is_refused(good, tmp_path):
+    nameless = tmp_path / "in" / "...csv"
+    nameless.parent.mkdir()
+    nameless.write_bytes(good.read_bytes())
+    for command in (("calibrate",), ("diagnose", "--simulation", "magnetometer")):
+        result = mkc(*command, nameless, "--output", tmp_path / "out")
+        assert result.exit_code == 2
+        assert "has no name that a folder of results could have" in " ".join(result.stderr.split())
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_a_full_disk_behind_the_terminal_is_told_in_a_line(good, tmp_path):
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "mkc_torch.cli", "calibrate", good, "--output", tmp_path / "out"],
+            stdout=full, stderr=subprocess.PIPE, text=True, check=False,
+        )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr == "mkc: what it says could not be written: No space left on device.\n"

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, NamedTuple
 
 from torch import Tensor
 
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.user_functions import check_value, namespace
+from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import SimulationError
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ class Moments(NamedTuple):
 
 
 def check_functions(
-    system: Equations, p: SimpleNamespace, stations: Moments, samples: Moments, channels: tuple[str, ...]
+    system: Equations, p: Names, stations: Moments, samples: Moments, channels: tuple[str, ...]
 ) -> None:
     """Refuse functions that do not fit the names of the system.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -22,6 +21,7 @@ from mkc_torch.simulation.dynamics.ports import RATES, Places, common_unit
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
 from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, defect, marched, solve, stations
 from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
+from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import Parameter
 from mkc_torch.simulation.protocol import Answer, Changes, Clock, FreeChange, Nearby, Port
 from mkc_torch.simulation.runs import experiment_runs
@@ -318,7 +318,7 @@ class PreparedDynamics:
             for k, name in enumerate(self.system.inputs)
         }
         run = self.run[self.clock.before]
-        acting = self.system.actuated(self.clock.time, SimpleNamespace(**columns), self._parameters(theta), run)
+        acting = self.system.actuated(self.clock.time, Names(**columns), self._parameters(theta), run)
         return torch.stack([acting[name] for name in self.system.inputs], -1)
 
     def _outputs(self, theta: Tensor, found: Trajectory) -> Float[Tensor, "N m"]:
@@ -328,8 +328,8 @@ class PreparedDynamics:
         values = self.system.sensed(self.time, self.system.output(self.time, x, u, p), p, self.run)
         return torch.stack([values[name] for name in self.channels], -1)
 
-    def _parameters(self, theta: Tensor) -> SimpleNamespace:
-        return SimpleNamespace(**dict(zip(self.known, theta[: self._p].unbind(), strict=True)))
+    def _parameters(self, theta: Tensor) -> Names:
+        return Names(**dict(zip(self.known, theta[: self._p].unbind(), strict=True)))
 
     def _check_functions(self) -> None:
         theta = self.time.new_tensor([one.value for one in self.known.values()])

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from mkc_torch.simulation.dynamics.equations import Equations
+from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import Parameter, SimulationError
 
 if TYPE_CHECKING:
@@ -19,6 +19,11 @@ __all__ = ["check_names", "check_value", "kinematic", "namespace"]
 
 
 def check_names(system: Equations) -> None:
+    for what in ("states", "inputs", "outputs"):
+        if isinstance(given := getattr(system, what), str):
+            raise SimulationError(
+                f"{system.name}: `{what}` should hold names but is the text {given!r}; write ({given!r},)."
+            )
     names = [*system.states, *system.inputs, *system.parameters]
     if system.between not in ("held", "linear", "smooth"):
         raise SimulationError(
@@ -34,7 +39,7 @@ def check_names(system: Equations) -> None:
             raise SimulationError(f"{system.name}: `{name}` cannot be an attribute; use letters, digits and _.")
 
 
-def check_value(what: str, value: object, time: Tensor, x: SimpleNamespace, p: SimpleNamespace) -> None:
+def check_value(what: str, value: object, time: Tensor, x: Names, p: Names) -> None:
     if not isinstance(value, Tensor) or value.dim() > 1 or (value.dim() == 1 and len(value) not in (1, len(time))):
         found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
         raise SimulationError(
@@ -60,7 +65,7 @@ def kinematic(system: Equations, known: Mapping[str, Parameter]) -> dict[str, st
 
     states = drawn(len(system.states))
     x, u = namespace(system.states, states), namespace(system.inputs, drawn(len(system.inputs)))
-    p = SimpleNamespace(**{name: torch.tensor(one.value).double() for name, one in known.items()})
+    p = Names(**{name: torch.tensor(one.value).double() for name, one in known.items()})
     found = system.derivative(drawn(1)[:, 0], x, u, p)
     if not isinstance(found, Mapping | Sequence | Tensor):
         raise SimulationError(
@@ -78,5 +83,5 @@ def kinematic(system: Equations, known: Mapping[str, Parameter]) -> dict[str, st
     return pairs
 
 
-def namespace(names: Sequence[str], values: Float[Tensor, "S n"]) -> SimpleNamespace:
-    return SimpleNamespace(**dict(zip(names, values.unbind(-1), strict=True)))
+def namespace(names: Sequence[str], values: Float[Tensor, "S n"]) -> Names:
+    return Names(**dict(zip(names, values.unbind(-1), strict=True)))

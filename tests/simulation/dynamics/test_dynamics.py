@@ -740,7 +740,7 @@ def test_rows_that_are_not_finite_are_left_out():
     assert "Dropped 2 of 500" in prepared.recording.warnings[0]
 
 
-def test_a_trajectory_that_was_found_is_gone_on_from(monkeypatch):
+def test_a_trajectory_nearby_is_gone_on_from(monkeypatch):
     """What a fit reached step by step is not always reached again from another model's states."""
     started = []
     real = trajectory.solve
@@ -750,12 +750,32 @@ def test_a_trajectory_that_was_found_is_gone_on_from(monkeypatch):
         return real(rate, grid, begin, guess, known)
 
     prepared = Pendulum().prepare(table(time=TIME, angle=TRUTH[0]))
-    first, other = torch.tensor([9.0, 0.1, 0.5, 0.0]).double(), torch.tensor([4.0, 0.3, 0.2, 0.1]).double()
-    states = prepared.trajectory(first, {}).states
-    prepared.trajectory(other, {})
+    first = torch.tensor([9.0, 0.1, 0.5, 0.0]).double()
+    found = prepared.trajectory(first, {})
     monkeypatch.setattr(prepared_dynamics, "solve", watched)
-    again = prepared.trajectory(first, {}).states
-    (guess, known), *_ = started
-    assert known is None
-    assert torch.equal(guess, states)
-    assert torch.allclose(again, states, rtol=0.0, atol=1e-9)
+    for near in (found, found.bare):
+        again = prepared.trajectory(first, {}, near)
+        torch.testing.assert_close(again.states, found.states, rtol=0.0, atol=1e-9)
+    (_, linear), (guess, without) = started
+    assert linear is found  # with its equations as they were linearised
+    assert without is None
+    assert torch.equal(guess, found.states)
+
+
+def test_a_name_that_is_not_there_is_told_with_those_that_are():
+    class Misspelt(Pendulum):
+        def derivative(self, time, x, u, p):  # noqa: ARG002
+            return {"angle": x.sped, "speed": -x.angle}
+
+    with pytest.raises(AttributeError, match="there is no `sped` here; there is angle, speed"):
+        Misspelt().prepare(table(time=TIME, angle=TRUTH[0]))
+
+
+@pytest.mark.parametrize("what", ["states", "inputs", "outputs"])
+def test_names_that_are_one_text_are_refused(what):
+    system = Pendulum()
+    setattr(system, what, "angle")
+    with pytest.raises(
+        SimulationError, match=rf"`{what}` should hold names but is the text 'angle'; write \('angle',\)"
+    ):
+        system.prepare(table(time=TIME, angle=TRUTH[0]))

@@ -1,0 +1,26 @@
+"""What a user's functions are given: values as attributes, by their names."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+__all__ = ["Names"]
+
+
+class Names(SimpleNamespace):
+    """Values by name; one that is not there is an error that lists those that are.
+
+    Example:
+        >>> Names(climb=1.0).clmb
+        Traceback (most recent call last):
+        AttributeError: there is no `clmb` here; there is climb. Names are those of `states`, `inputs`, `parameters`.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        known = ", ".join(vars(self)) or "nothing"
+        raise AttributeError(
+            f"there is no `{name}` here; there is {known}. Names are those of `states`, `inputs`, `parameters`."
+        )
