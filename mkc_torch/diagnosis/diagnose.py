@@ -99,6 +99,7 @@ def diagnose(
     asked = Asked(level, surrogates, max_findings, seed)
     generator = torch.Generator().manual_seed(seed)
     base = _base(prepared)
+    _refuse_no_noise(base, where)
     search = begun(base, terms, asked, generator)
 
     def case(search: Search) -> Case:
@@ -125,3 +126,16 @@ def _base(prepared: PreparedSimulation) -> FittedModel:
     rough = fitted(JointModel(prepared), prepared.start())
     bound = _WIDER * torch.maximum(rough.bound, rough.bound.mean())
     return fitted(rough.model, rough.parameters, bound, graduate=False)
+
+
+def _refuse_no_noise(base: FittedModel, where: str) -> None:
+    """Refuse a channel that the simulation answers exactly: there is no noise that structure could be told from."""
+    same = (base.residual == base.residual[:1]).all(0)
+    nothing = base.d.square() < torch.finfo(base.d.dtype).tiny
+    exact = (same | nothing).tolist()
+    names = [name for name, one in zip(base.model.prepared.channels, exact, strict=True) if one]
+    if names:
+        raise ValueError(
+            f"{where}`{names[0]}` differs from the simulation by the same number in every sample, so it has no noise "
+            "to tell structure from. Leave it out of what is compared, or record it with its noise."
+        )

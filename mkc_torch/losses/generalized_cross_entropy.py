@@ -308,6 +308,8 @@ def _checked(
             f"{tuple(target.shape)}; the classes are dimension {axis} of `input`, and probabilities of them, one-hot "
             "or soft, need a floating-point type."
         )
+    # -100 is 156 among labels of eight bits
+    target = target.long()
     counts = target != ignore_index
     if watched:
         _refuse_out_of_range(target, counts, classes, ignore_index)

@@ -13,7 +13,7 @@ from mkc_torch.diagnosis.files.model import ModelFileError
 from mkc_torch.effects import GainEffect
 from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
 from mkc_torch.recording.recording import MissingColumnError, Recording
-from mkc_torch.simulation import Magnetometer
+from mkc_torch.simulation import Dynamics, Magnetometer, Static
 from tests.shared_data import shared_data
 from tests.simulation.tumbling import FIELD, changed, tumbling
 
@@ -254,3 +254,29 @@ def test_a_magnet_that_is_taken_off_a_real_sensor_is_seen(name, onset, step):
     assert finding.effect == "hard_iron_step"
     assert finding.onset == pytest.approx(onset, abs=1.0)
     assert np.abs(np.array(finding.parameters[0].value) - step).max() < 1.0
+
+
+class Swing(Dynamics):
+    states = ("angle", "speed")
+    outputs = ("angle",)
+    parameters = {"stiffness": 2.0}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"angle": x.speed, "speed": -p.stiffness * x.angle}
+
+
+class Divider(Static):
+    inputs, outputs, parameters = ("supply",), ("voltage",), {"share": 1.0}
+
+    def output(self, time, u, p):  # noqa: ARG002
+        return {"voltage": p.share * u.supply}
+
+
+@pytest.mark.parametrize("simulation", [Swing(), Divider()])
+def test_an_output_without_noise_is_refused(simulation):
+    time = torch.arange(0.0, 6.0, 0.05, dtype=torch.float64)
+    recording = Recording({"time": time, "supply": torch.sin(time), simulation.outputs[0]: 0.0 * time}, name="still")
+    with pytest.raises(
+        ValueError, match=rf"still: `{simulation.outputs[0]}` differs .* no noise to tell structure from"
+    ):
+        diagnose(simulation, recording)

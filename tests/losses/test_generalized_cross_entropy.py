@@ -477,3 +477,10 @@ def test_arguments_that_are_no_numbers_are_refused_by_name():
     for options in ({"progress": "a"}, {"progress": 0.5, "start": "a"}, {"progress": 0.5, "until": None}):
         with pytest.raises(TypeError, match="to be a number in"):
             graduated_sigma(**options)
+
+
+def test_labels_of_eight_bits_are_not_taken_for_the_one_that_does_not_count():
+    logits = torch.randn(2, 200, generator=torch.Generator().manual_seed(0))
+    label = torch.tensor([156, 3])
+    loss = GeneralizedCrossEntropyLoss(math.inf, reduction="none")
+    torch.testing.assert_close(loss(logits, label.to(torch.uint8)), cross_entropy(logits, label, reduction="none"))
