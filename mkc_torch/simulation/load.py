@@ -25,7 +25,7 @@ class SimulationFileError(ValueError):
 def load_simulation(source: str) -> Simulation:
     """The simulation that ``FILE.py:NAME`` names: a class, which is called without arguments, or an instance.
 
-    The file is run, as a script would be: it can import modules beside it.
+    The file is run, as a script would be: it can import modules beside it, and those of the folder it is called in.
 
     Raises:
         SimulationFileError: no such file or name, a file or class that raises, or something that is no simulation.
@@ -93,13 +93,14 @@ def _module(path: Path) -> ModuleType:
 
 @contextmanager
 def _beside(path: Path) -> Iterator[None]:
-    """The file's folder is searched for modules first."""
-    folder = str(path.resolve().parent)
-    sys.path.insert(0, folder)
+    """The file's folder is searched for modules first, then the one that the command was given in."""
+    folders = [str(path.resolve().parent), str(Path.cwd())]
+    sys.path[:0] = folders
     try:
         yield
     finally:
-        sys.path.remove(folder)
+        for folder in folders:
+            sys.path.remove(folder)
 
 
 def _told(error: BaseException, path: Path) -> str:

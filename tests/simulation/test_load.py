@@ -129,3 +129,33 @@ def test_a_derivative_that_cannot_be_used(value, words):
     time = torch.arange(0.0, 5.0, 0.1)
     with pytest.raises(SimulationError, match=words):
         Wrong(value).prepare(Recording({"time": time, "level": torch.exp(-time)}))
+
+
+def test_a_file_elsewhere_imports_what_lies_where_it_is_asked_for(tmp_path, monkeypatch):
+    """As a corrected.py among the results does with the class that it was made from."""
+    (tmp_path / "own_base_of_a_test.py").write_text(TEXT_OF_A_BASE, encoding="utf-8")
+    results = tmp_path / "results"
+    results.mkdir()
+    (results / "corrected.py").write_text(
+        "from own_base_of_a_test import Base\n\n\nclass Corrected(Base):\n    parameters = {'rate': 2.0}\n",
+        encoding="utf-8",
+    )
+    monkeypatch.chdir(tmp_path)
+    before = list(sys.path)
+    simulation = load_simulation(f"{results / 'corrected.py'}:Corrected")
+    assert simulation.parameters == {"rate": 2.0}
+    assert sys.path == before
+    sys.modules.pop("own_base_of_a_test")
+
+
+TEXT_OF_A_BASE = """
+from mkc_torch.simulation import Dynamics
+
+
+class Base(Dynamics):
+    states = ("level",)
+    parameters = {"rate": 1.0}
+
+    def derivative(self, time, x, u, p):
+        return {"level": -p.rate * x.level}
+"""
