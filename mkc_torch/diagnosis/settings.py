@@ -190,7 +190,7 @@ class ConfirmationSettings(_Stage):
     """When what was located counts as a finding, and when the search goes on. By judgement, unless a source is named.
 
     Attributes:
-        folds: of the held-out blocks, at least 2. Five are usual (Hastie, Tibshirani & Friedman, "The Elements of
+        folds: of the held-out blocks, at least 3. Five are usual (Hastie, Tibshirani & Friedman, "The Elements of
             Statistical Learning", 2009, 7.10).
         blocks_per_fold: blocks of a fold, all over the recording.
         gap: share of the recording that is left out beside a held-out block; a correlation time at least.
@@ -216,7 +216,7 @@ class ConfirmationSettings(_Stage):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checked_whole("folds", self.folds, 2, "5 are usual")
+        checked_whole("folds", self.folds, 3, "5 are usual")
         checked_number("unrecorded", self.unrecorded, 0.0, 1.0, advice="0.1 is usual")
 
 

@@ -44,8 +44,8 @@ def test_a_step_to_where_there_is_no_answer_is_not_taken(monkeypatch):
 def tangents_before(line):
     """The tangents of the plain line; from then on it has no answer but where it was fitted."""
 
-    def then_none(model, parameters):
-        found = tangents_of(model, parameters, NoiseSettings())
+    def then_none(model, parameters, settings):
+        found = tangents_of(model, parameters, settings)
         line.known = parameters.detach().clone()
         return found
 

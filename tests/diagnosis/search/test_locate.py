@@ -63,15 +63,15 @@ def test_a_fit_without_slopes_gives_way_to_the_next(monkeypatch):
     fits = [dataclasses.replace(fit, model=model.with_term(term)) for term in terms]
     known = object()
 
-    def tangents(of, _parameters, _terms):
+    def tangents(of, _parameters, _settings, _terms):
         if of is fits[0].model:
             raise NoFitError("no finite slope")
         return known
 
     monkeypatch.setattr("mkc_torch.diagnosis.search.locate.tangents_of", tangents)
-    assert _with_tangents(fits, terms) == (fits[1], terms, known)
+    assert _with_tangents(fits, terms, Settings()) == (fits[1], terms, known)
     with pytest.raises(NoFitError, match="no finite slope"):
-        _with_tangents(fits[:1], terms)
+        _with_tangents(fits[:1], terms, Settings())
 
 
 def test_gains_of_other_candidates_are_those_of_a_search_with_them():
@@ -144,7 +144,7 @@ class Driven(Line):
 )
 def test_where_a_fit_began_is_looked_at_if_it_went_far_from_there(line, now, starts):
     fit = fitted(JointModel(line), line.start())
-    found = _first_start(dataclasses.replace(fit, parameters=torch.tensor(now, dtype=torch.float64)))
+    found = _first_start(dataclasses.replace(fit, parameters=torch.tensor(now, dtype=torch.float64)), 5.0)
     assert len(found) == starts
     for parameters, _ in found:
         torch.testing.assert_close(parameters, line.start())
