@@ -55,7 +55,9 @@ def _refuse_no_effect(effect: object) -> None:
 
 
 def refuse_no_settings(settings: object) -> None:
-    advice = "make one, Settings(), or change one, dataclasses.replace(settings, naming=NamingSettings(separable=8.0))"
+    advice = (
+        "make one, Settings(), or change one, dataclasses.replace(Settings(), naming=NamingSettings(separable=8.0))"
+    )
     refuse_other_type("settings", settings, Settings, "Settings", advice)
 
 

@@ -64,8 +64,8 @@ def diagnose(
         surrogates: draws of noise for each p-value; at least ``1 / level - 1``.
         max_findings: findings at most.
         seed: of the draws.
-        settings: the numbers that decide, by stages; see :class:`mkc_torch.diagnosis.Settings`. Those given were used
-            for whatever was measured of false alarms and power.
+        settings: the numbers that decide, by stages; see :class:`mkc_torch.diagnosis.Settings`. What was measured of
+            false alarms and power was measured with the default.
 
     Returns:
         The diagnosis.
