@@ -3,5 +3,6 @@
 from mkc_torch.diagnosis.diagnose import diagnose
 from mkc_torch.diagnosis.files.model import DiagnosedModel
 from mkc_torch.diagnosis.result import Diagnosis
+from mkc_torch.diagnosis.settings import Settings
 
-__all__ = ["DiagnosedModel", "Diagnosis", "diagnose"]
+__all__ = ["DiagnosedModel", "Diagnosis", "Settings", "diagnose"]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from mkc_torch._support.arguments import checked_number, checked_whole, told
+from mkc_torch._support.arguments import checked_number, checked_whole, refuse_other_type, told
+from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.recording import Recording
 
@@ -51,6 +52,13 @@ def _refuse_no_effect(effect: object) -> None:
     else:
         return
     raise TypeError(f"Expected argument `effects` to hold Effects but got {told(effect)}; {mend}.")
+
+
+def refuse_no_settings(settings: object) -> None:
+    advice = (
+        "make one, Settings(), or change one, dataclasses.replace(Settings(), naming=NamingSettings(separable=8.0))"
+    )
+    refuse_other_type("settings", settings, Settings, "Settings", advice)
 
 
 def check_numbers(level: float, surrogates: int, max_findings: int, seed: int) -> None:

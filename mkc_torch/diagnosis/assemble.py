@@ -59,7 +59,7 @@ def assembled(
         simulation=prepared.name,
         samples=len(prepared.time),
         level=asked.level,
-        noise=noise_summary(final),
+        noise=noise_summary(final, asked.settings.noise),
         candidates_tried=tried,
         surrogates=asked.surrogates,
         seed=asked.seed,

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from mkc_torch._parallel.fork import meanwhile, shared
-from mkc_torch.diagnosis.arguments import check_numbers, checked_effects, refuse_no_simulation
+from mkc_torch.diagnosis.arguments import check_numbers, checked_effects, refuse_no_settings, refuse_no_simulation
 from mkc_torch.diagnosis.assemble import assembled, with_rest
 from mkc_torch.diagnosis.evidence.after_the_search import answers_of, parts_ahead
 from mkc_torch.diagnosis.evidence.base import Case
@@ -19,6 +19,7 @@ from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.rounds import Asked, Search, begun, continued
+from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.recording import Recording
@@ -27,13 +28,13 @@ from mkc_torch.simulation.protocol import PreparedSimulation, Simulation, refuse
 __all__ = ["diagnose"]
 
 LEVEL = 0.05
+"""Rate of false alarms, if none is asked for."""
+
 SURROGATES = 99
+"""Draws of noise for each p-value, if no number is asked for."""
+
 MAX_FINDINGS = 3
-
-FEWEST = 40
-"""With fewer samples nothing can be said about structure."""
-
-_WIDER = 3.0
+"""Findings at most, if no number is asked for."""
 
 
 def diagnose(
@@ -45,6 +46,7 @@ def diagnose(
     surrogates: int = SURROGATES,
     max_findings: int = MAX_FINDINGS,
     seed: int = 0,
+    settings: Settings = Settings(),  # noqa: B008
 ) -> Diagnosis:
     """What a simulation lacks, by one recording of what it simulates.
 
@@ -62,6 +64,8 @@ def diagnose(
         surrogates: draws of noise for each p-value; at least ``1 / level - 1``.
         max_findings: findings at most.
         seed: of the draws.
+        settings: the numbers that decide, by stages; see :class:`mkc_torch.diagnosis.Settings`. What was measured of
+            false alarms and power was measured with the default.
 
     Returns:
         The diagnosis.
@@ -82,28 +86,30 @@ def diagnose(
     refuse_no_recording("recording", recording)
     effects = checked_effects(effects)
     check_numbers(level, surrogates, max_findings, seed)
+    refuse_no_settings(settings)
+    fewest = settings.search.fewest_samples
     where = f"{recording.name}: " if recording.name else ""
-    if len(recording) < FEWEST:
+    if len(recording) < fewest:
         raise ValueError(
-            f"{where}{len(recording)} samples are too few for a diagnosis; it needs {FEWEST} at least. Record longer."
+            f"{where}{len(recording)} samples are too few for a diagnosis; it needs {fewest} at least. Record longer."
         )
     prepared = simulation.prepare(recording)
-    if len(prepared.time) < FEWEST:
+    if len(prepared.time) < fewest:
         raise ValueError(
-            f"{where}{len(prepared.time)} usable samples are too few for a diagnosis; it needs {FEWEST} at least."
+            f"{where}{len(prepared.time)} usable samples are too few for a diagnosis; it needs {fewest} at least."
         )
     roles = frozenset(role for effect in effects for role in effect.roles)
     measured: frozenset[str] = getattr(simulation, "measured", frozenset())
-    drivers = find_drivers(prepared.recording, simulation.columns, roles, measured)
+    drivers = find_drivers(prepared.recording, simulation.columns, settings.drivers, roles, measured)
     terms = candidate_terms(prepared, drivers.drivers, effects)
-    asked = Asked(level, surrogates, max_findings, seed)
+    asked = Asked(level, surrogates, max_findings, seed, settings)
     generator = torch.Generator().manual_seed(seed)
-    base = _base(prepared)
+    base = _base(prepared, settings.noise.domain)
     _refuse_no_noise(base, where)
     search = begun(base, terms, asked, generator)
 
     def case(search: Search) -> Case:
-        return Case(base, search.first, search.found, search.evidence, search.blocks, drivers.drivers, seed)
+        return Case(base, search.first, search.found, search.evidence, search.blocks, drivers.drivers, seed, settings)
 
     def diagnosis(search: Search, done: Sequence[Any]) -> Diagnosis:
         answers = answers_of(case(search), done)
@@ -121,10 +127,10 @@ def diagnose(
     return diagnosis(search, shared(parts_ahead(case(search)), [*known, *search.parts]))
 
 
-def _base(prepared: PreparedSimulation) -> FittedModel:
+def _base(prepared: PreparedSimulation, domain: float) -> FittedModel:
     """The simulation alone, on the domain that all models share: wide enough for whatever effect reshapes residuals."""
     rough = fitted(JointModel(prepared), prepared.start())
-    bound = _WIDER * torch.maximum(rough.bound, rough.bound.mean())
+    bound = domain * torch.maximum(rough.bound, rough.bound.mean())
     return fitted(rough.model, rough.parameters, bound, graduate=False)
 
 

@@ -19,31 +19,31 @@ from mkc_torch.diagnosis.noise.colour import correlation_time
 from mkc_torch.diagnosis.noise.innovations import innovation_gain
 from mkc_torch.diagnosis.search.first_look import p_value_beside
 from mkc_torch.diagnosis.search.locate import Located, locate
-from mkc_torch.diagnosis.search.preference import ALIKE_COLUMNS, alike
+from mkc_torch.diagnosis.search.preference import alike
+from mkc_torch.diagnosis.settings import ConfirmationSettings, Settings
 from mkc_torch.nonlinear import NoFitError
-
-_NEAR = 0.05
-
-_BEYOND_DOUBT, _FURTHER = 8.0, 20.0
-"""Nats beyond all draws of noise from which unseen blocks need only not to be clearly worse with a first finding, and
-from which they need only to lean the way of a further one."""
-
-_QUIET, _GLANCE = 0.1, 49
-"""A p-value at a first look beside a finding above which nothing further is searched, and the draws that it takes."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """The arguments of :func:`diagnose` that are numbers."""
+    """The arguments of :func:`diagnose` that are numbers, or hold them."""
 
     level: float
     surrogates: int
     max_findings: int
     seed: int
+    settings: Settings
 
 
 def _holds(
-    located: Located, before: Evidence, after: Evidence, blocks: HeldOutBlocks, seed: int, *, first: bool
+    located: Located,
+    before: Evidence,
+    after: Evidence,
+    blocks: HeldOutBlocks,
+    seed: int,
+    settings: ConfirmationSettings,
+    *,
+    first: bool,
 ) -> bool:
     """Whether what was found counts.
 
@@ -56,10 +56,10 @@ def _holds(
     difference = after.log_likelihood - before.log_likelihood
     gain, (low, high) = gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))
     if first:
-        plain = located.beyond > _BEYOND_DOUBT and high > 0.0
+        plain = located.beyond > settings.beyond_doubt and high > 0.0
         price = 0.5 * located.fit.model.sizes[-1] * math.log(len(after.log_likelihood))
         return gain > 0.0 or plain or innovation_gain(before.residual, after.residual) > price
-    return low > 0.0 or (gain > 0.0 and located.beyond > _FURTHER)
+    return low > 0.0 or (gain > 0.0 and located.beyond > settings.further)
 
 
 @dataclass(frozen=True)
@@ -90,12 +90,12 @@ class Search:
 def begun(base: FittedModel, terms: tuple[Term, ...], asked: Asked, generator: torch.Generator) -> Search:
     """The first search, and its finding, if unseen blocks confirm it."""
     prepared = base.model.prepared
-    correlation = max(correlation_time(one) for one in base.pseudo[0].unbind(1))
-    blocks = blocks_of(len(base.residual), math.ceil(correlation))
+    correlation = max(correlation_time(one) for one in base.pseudo(asked.settings.noise)[0].unbind(1))
+    blocks = blocks_of(len(base.residual), math.ceil(correlation), asked.settings.confirmation)
     first = None
     with meanwhile([partial(held_out, base, blocks)], common_parts(prepared, ())) as judged:
         if terms:
-            first = locate(base, terms, level=asked.level, surrogates=asked.surrogates, generator=generator)
+            first = _located(base, terms, asked, generator)
         [evidence] = judged()
     begun = Search(first, (), None, blocks, (evidence,), terms)
     if first is None:
@@ -117,24 +117,36 @@ def continued(search: Search, asked: Asked, generator: torch.Generator) -> Searc
         return replace(search, left=())
     fit = search.found[-1].fit
     try:
-        located = locate(
-            fit, search.left, level=asked.level, surrogates=asked.surrogates, generator=generator, parts=False
-        )
-        return _taken_up(search, located, asked)
+        return _taken_up(search, _located(fit, search.left, asked, generator, parts=False), asked)
     except NoFitError as error:
         return replace(search, left=(), given_up=str(error))  # what was found before is not to be lost
 
 
+def _located(
+    fit: FittedModel, terms: tuple[Term, ...], asked: Asked, generator: torch.Generator, *, parts: bool = True
+) -> Located:
+    return locate(
+        fit,
+        terms,
+        level=asked.level,
+        surrogates=asked.surrogates,
+        generator=generator,
+        settings=asked.settings,
+        parts=parts,
+    )
+
+
 def _quiet(search: Search, asked: Asked) -> bool:
     """Whether what is beside the last finding is far from anything that could count."""
-    return _beside(search, asked) > max(_QUIET, asked.level)
+    return _beside(search, asked) > max(asked.settings.confirmation.quiet, asked.level)
 
 
 def _beside(search: Search, asked: Asked) -> float:
     """The p-value of a first look beside the last finding."""
-    last, near = search.found[-1], _near(search.found[-1].fit)
-    others = [all(not _same(term, one.term, near) for one in search.found) for term in last.scene.terms]
-    return p_value_beside(last, others, _GLANCE, torch.Generator().manual_seed(asked.seed))
+    last, settings = search.found[-1], asked.settings
+    near = _near(last.fit, settings)
+    others = [all(not _same(term, one.term, near, settings) for one in search.found) for term in last.scene.terms]
+    return p_value_beside(last, others, settings.confirmation.glance, torch.Generator().manual_seed(asked.seed))
 
 
 def _taken_up(search: Search, located: Located, asked: Asked, after: Evidence | None = None) -> Search:
@@ -148,29 +160,31 @@ def _taken_up(search: Search, located: Located, asked: Asked, after: Evidence | 
 
     def holds(fit: FittedModel, evidence: Evidence) -> bool:
         one = replace(located, fit=fit)
-        return _holds(one, before, evidence, search.blocks, asked.seed, first=not search.found)
+        return _holds(
+            one, before, evidence, search.blocks, asked.seed, asked.settings.confirmation, first=not search.found
+        )
 
     if not holds(located.fit, after):
         return replace(over, unconfirmed=located)
     if len(search.found) == asked.max_findings:
         return replace(over, cut=True)
-    fit, after = simplified(located.fit, after, search.blocks, holds)
+    fit, after = simplified(located.fit, after, search.blocks, holds, asked.settings.naming)
     found = (*search.found, replace(located, fit=fit))
-    near = _near(located.fit)
-    left = tuple(t for t in search.left if not _same(t, located.term, near))
+    near = _near(located.fit, asked.settings)
+    left = tuple(t for t in search.left if not _same(t, located.term, near, asked.settings))
     taken = replace(search, found=found, evidence=(*search.evidence, after), left=left)
     # a p-value of 0 is that of a look that sees nothing
     full = len(found) == asked.max_findings and not 0.0 < _beside(taken, asked) <= asked.level
     return replace(taken, left=()) if full else taken
 
 
-def _near(fit: FittedModel) -> float:
+def _near(fit: FittedModel, settings: Settings) -> float:
     """Seconds within which a step is the same one."""
     time = fit.model.prepared.time
-    return _NEAR * float(time[-1] - time[0])
+    return settings.confirmation.near * float(time[-1] - time[0])
 
 
-def _same(term: Term, found: Term, near: float) -> bool:
+def _same(term: Term, found: Term, near: float, settings: Settings) -> bool:
     """Whether a candidate is the found effect again, or a curve over its driver.
 
     A step further away than ``near``, in s, is another one; closer by, it would only mend how the first one rises.
@@ -180,4 +194,6 @@ def _same(term: Term, found: Term, near: float) -> bool:
     if term.key == found.key or (term.effect.is_curve and term.columns == found.columns):
         return True
     # beside a driver that was found, a column that goes the same way would only share its amplitude
-    return term.driver is not None and found.driver is not None and alike(term.driver, found.driver) > ALIKE_COLUMNS
+    if term.driver is None or found.driver is None:
+        return False
+    return alike(term.driver, found.driver) > settings.naming.alike_columns

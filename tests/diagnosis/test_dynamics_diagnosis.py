@@ -13,6 +13,7 @@ from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics, Parameter
 from tests.shared_data import shared_data
@@ -284,8 +285,8 @@ def test_water_that_carries_leads_the_search_of_all_effects():
     simulation = Buoy().prepare(recording)
     base = fitted(JointModel(simulation), simulation.start())
     terms = candidate_terms(simulation, (), DYNAMICS)
-    tangents = tangents_of(base.model, base.parameters, terms)
-    search = linearise(base.model, base.parameters, *base.pseudo, tangents, white=True, wander=False)
+    tangents = tangents_of(base.model, base.parameters, NoiseSettings(), terms)
+    search = linearise(base.model, base.parameters, *base.pseudo(NoiseSettings()), tangents, white=True, wander=False)
     order = search.search.gains(search.series.unsqueeze(-1)).log_p[:, 0].argsort().tolist()
     assert terms[order[0]].effect.id == "buoyancy"
     lift, _ = search.search.estimate(order[0], search.series)

@@ -58,7 +58,9 @@ def diagnosed(recording, monkeypatch):
             return beside(base, first[0])
 
         monkeypatch.setattr(rounds, "locate", search)
-        monkeypatch.setattr(ending_of, "estimate", lambda fit: begun.append(fit.model.near.states) or estimate(fit))
+        monkeypatch.setattr(
+            ending_of, "estimate", lambda fit, noise: begun.append(fit.model.near.states) or estimate(fit, noise)
+        )
         return diagnose(Sled(), recording, effects=EFFECTS), searches, begun
 
     return run

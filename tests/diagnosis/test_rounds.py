@@ -8,10 +8,11 @@ import torch
 
 from mkc_torch.diagnosis.evidence.held_out import blocks_of
 from mkc_torch.diagnosis.noise.innovations import innovation_gain
+from mkc_torch.diagnosis.settings import ConfirmationSettings
 
 holds = importlib.import_module("mkc_torch.diagnosis.rounds")._holds
 N = 2000
-BLOCKS = blocks_of(N, 1)
+BLOCKS = blocks_of(N, 1, ConfirmationSettings())
 
 
 def evidence(mean, spread):
@@ -41,7 +42,10 @@ def located(beyond):
     ],
 )
 def test_a_finding_counts(first, mean, spread, beyond, counts):
-    assert holds(located(beyond), NOTHING, evidence(mean, spread), BLOCKS, 0, first=first) is counts
+    assert (
+        holds(located(beyond), NOTHING, evidence(mean, spread), BLOCKS, 0, ConfirmationSettings(), first=first)
+        is counts
+    )
 
 
 def walks(step):
@@ -57,14 +61,14 @@ def walks(step):
 def test_what_is_plain_beside_a_wander_counts_though_blocks_see_the_wander_alone():
     before, after = walks(0.5)
     assert innovation_gain(before.residual, after.residual) > 50.0
-    assert holds(located(0.0), before, after, BLOCKS, 0, first=True)
-    assert not holds(located(0.0), before, after, BLOCKS, 0, first=False)
+    assert holds(located(0.0), before, after, BLOCKS, 0, ConfirmationSettings(), first=True)
+    assert not holds(located(0.0), before, after, BLOCKS, 0, ConfirmationSettings(), first=False)
 
 
 def test_what_is_worth_less_than_its_parameters_does_not():
     before, after = walks(0.05)
     assert innovation_gain(before.residual, after.residual) < 10.0
-    assert not holds(located(0.0), before, after, BLOCKS, 0, first=True)
+    assert not holds(located(0.0), before, after, BLOCKS, 0, ConfirmationSettings(), first=True)
 
 
 def test_the_gain_of_innovations_is_that_of_least_squares_in_white_noise():

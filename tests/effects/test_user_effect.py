@@ -8,6 +8,7 @@ from mkc_torch import diagnose
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects import CATALOGUE, GainEffect
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling
@@ -47,7 +48,7 @@ def test_a_curve_without_a_name_is_tried_on_its_column_too():
     """Where the user's formula is not the right one, the mismatch must not pass for adequate."""
     prepared = Magnetometer().prepare(tumbling(600, noise=0.3, voltage=np.sin(np.arange(600) / 25.0)))
     effects = (*CATALOGUE, SupplyOffset())
-    drivers = find_drivers(prepared.recording, Magnetometer().columns, frozenset({"voltage", "any"}))
+    drivers = find_drivers(prepared.recording, Magnetometer().columns, DriverSettings(), frozenset({"voltage", "any"}))
     tried = {term.key for term in candidate_terms(prepared, drivers.drivers, effects)}
     tried = {key[:2] for key in tried}
     assert ("supply_offset", ("voltage",)) in tried

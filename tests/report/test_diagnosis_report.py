@@ -27,6 +27,7 @@ from mkc_torch.diagnosis.result import (
     Table,
     Told,
 )
+from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.report.diagnosis import noise, numbers
 from mkc_torch.report.diagnosis import verdict as top
@@ -368,7 +369,7 @@ def test_the_noise_has_units_and_its_density_is_compared():
         DensityCheck("norm", 0.021, 0.034, 4.0, 0.05, False),
         DensityCheck("turn_x", 0.2, 0.01, 2.0, 0.05, True),
     ]
-    changed = with_evidence(dataclasses.replace(made, noise=noise), density.said(checks))
+    changed = with_evidence(dataclasses.replace(made, noise=noise), density.said(checks, EvidenceSettings()))
     text = text_of(diagnosis_report(changed))
     assert "Is the density right? channel distance of the density" in text
     assert "slow wander of the offset 0.379 µT, its standard deviation over the recording" in text
@@ -432,7 +433,7 @@ def test_whether_a_finding_extrapolates_is_said():
         (-0.02, (-0.12, 0.09), "it says nothing where that is high: −0.020"),
         (-0.3, (-0.4, -0.2), "it misleads where that is high: −0.300"),
     ):
-        said = extrapolation.said(Extrapolation(gain, interval), BY_LOAD)
+        said = extrapolation.said(Extrapolation(gain, interval), BY_LOAD, EvidenceSettings())
         text = text_of(diagnosis_report(first_changed(diagnosis, said)))
         assert f"beyond its range fitted where its driver is low, {told}" in text
 
@@ -441,7 +442,7 @@ def test_what_shifted_copies_of_the_driver_gain_is_said():
     for as_good, told in ((0, "none of 38 copies"), (1, "one of 38 copies"), (12, "12 of 38 copies")):
         changed = first_changed(
             make_diagnosis(1, samples=240),
-            driver_shift.said(DriverShift(38, as_good, 22.5), BY_LOAD),
+            driver_shift.said(DriverShift(38, as_good, 22.5), BY_LOAD, EvidenceSettings()),
             drivers=("load",),
         )
         verb = "gain" if as_good > 1 else "gains"

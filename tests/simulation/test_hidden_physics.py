@@ -10,6 +10,7 @@ from mkc_torch import Recording
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.settings import DriverSettings, NoiseSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics
 from tests.simulation.dynamics.runge_kutta import runge_kutta
@@ -169,7 +170,7 @@ class TestAgainstSteps:
         _, shape, gamma, rate, first, _ = CASES[name]
         simulation, _, theta = prepared(name, rate, first, step=0.02)
         model, parameters = joint(name, simulation, shape, [0.0] * len(gamma), theta)
-        found = tangents_of(JointModel(simulation), theta, model.terms).candidates[0]
+        found = tangents_of(JointModel(simulation), theta, NoiseSettings(), model.terms).candidates[0]
         exact = torch.func.jacfwd(model.residual)(parameters)[..., -1:]
         torch.testing.assert_close(found, exact, rtol=0.0, atol=0.01 * float(exact.abs().max()))
 
@@ -225,7 +226,9 @@ def test_a_recorded_spin_drives_the_lift():
     simulation = type("Ball", (Ball,), {"step": 0.01})().prepare(recording)
     from mkc_torch.diagnosis.model.drivers import find_drivers
 
-    (driver,) = find_drivers(simulation.recording, simulation.system.columns, frozenset({"spin"})).drivers
+    (driver,) = find_drivers(
+        simulation.recording, simulation.system.columns, DriverSettings(), frozenset({"spin"})
+    ).drivers
     model = JointModel(simulation, (Term(OF["magnus_lift"], driver, {}, "exchange of vx and vy"),))
     mean = 0.01 * float(driver.reference)
     parameters = torch.tensor([0.05, 0.0, 1.0, 20.0, 5.0, mean, 0.01], dtype=torch.float64)
@@ -246,7 +249,9 @@ def test_what_scales_everything_is_no_added_mass():
     truth = runge_kutta(mass(), [0.5, 0.0], TIME)
     simulation = Own().prepare(table(time=TIME, push=push(TIME), height=truth[:, 0]))
     theta = torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64)
-    found = tangents_of(JointModel(simulation), theta, (Term(OF["added_mass"], None, {}, "rate of speed"),))
+    found = tangents_of(
+        JointModel(simulation), theta, NoiseSettings(), (Term(OF["added_mass"], None, {}, "rate of speed"),)
+    )
     own, tangent = found.nuisance[:, 0], found.candidates[0][:, 0]
     left = tangent - own @ torch.linalg.lstsq(own, tangent).solution
     assert float(left.norm()) < 1e-6 * float(tangent.norm())

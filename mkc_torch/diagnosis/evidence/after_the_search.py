@@ -65,4 +65,4 @@ def _ahead(test: EvidenceTest, case: Case) -> list[Any]:
 
 
 def _final(case: Case) -> Estimate:
-    return estimate(case.fit).at_least(case.held_out[-1].jackknife)
+    return estimate(case.fit, case.settings.noise).at_least(case.held_out[-1].jackknife)

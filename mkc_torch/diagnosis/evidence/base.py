@@ -15,15 +15,13 @@ from mkc_torch.diagnosis.model.fit import FittedModel, without_term
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import Row, SmoothCorrection, Spread, Table, Told
 from mkc_torch.diagnosis.search.locate import Located
+from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 __all__ = ["Case", "EvidenceTest", "Row", "SmoothCorrection", "Table", "Told", "gain_of"]
-
-_IN_USE = 0.5
-"""Weight from which a sample is one that the fit believes."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +36,7 @@ class Case:
         blocks: those blocks.
         drivers: the recorded columns.
         seed: of draws; a test begins with a generator of its own.
+        settings: the numbers that decide.
         number: of the finding, for a test that is asked of each.
         estimate: the final parameters; None ahead of them.
         ahead: what the test's own ``ahead`` gave.
@@ -50,6 +49,7 @@ class Case:
     blocks: HeldOutBlocks
     drivers: tuple[Driver, ...]
     seed: int
+    settings: Settings
     number: int = 0
     estimate: Estimate | None = None
     ahead: Any = None
@@ -100,8 +100,8 @@ class Case:
     @property
     def inliers(self) -> Bool[Tensor, "N m"]:
         """The samples that both the final fit and the model on held-out blocks believe."""
-        last = self.held_out[-1]
-        return (last.residual.abs() <= 3.0 * last.d) & (self.final.fit.weights > _IN_USE)
+        last, settings = self.held_out[-1], self.settings.evidence
+        return (last.residual.abs() <= settings.inlier * last.d) & (self.final.fit.weights > settings.believed)
 
     def rms(self, model: Evidence) -> float:
         """Root mean square of a model's held-out residuals over the inliers."""

@@ -30,16 +30,19 @@ _PENALTIES = (1e-3, 3e-2, 1.0)
 """Strengths tried of the pull on a quadratic, over that of the training samples; on steeper curves it is stronger."""
 
 _MIDDLE = 3e-2
-"""The one that columns are taken up with."""
+"""The strength that columns are taken up with."""
 
 _ROUNDS = 2
-"""Of reweighting, by the density that the round before has left."""
+"""Rounds of reweighting, by the density that the round before has left."""
 
 _ALIKE = 0.02
 """Share of the loss that is not worth another column, if it is within the error."""
 
 _TINY = 1e-9
+"""Least root mean square of a tangent, and the precision, a sample, of directions that nothing is known of."""
+
 _ROUNDING = 1e-12
+"""Share of its own that is added to the products of each tangent, for of two that are one rounding would decide."""
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 __all__ = ["CommonCause", "common_cause"]
 
 _ROUNDS, _SETTLED = 40, 1e-2
+"""Steps at most towards the likeliest covariance, and the nats that a step has to bring for another."""
+
 _LEAST = 1e-6
 """Smallest variance of a direction, over that of all channels together."""
 

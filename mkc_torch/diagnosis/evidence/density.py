@@ -12,6 +12,7 @@ from torch import Tensor
 from mkc_torch.density.distribution import MKCDistribution
 from mkc_torch.diagnosis.evidence.base import Case, Table, Told
 from mkc_torch.diagnosis.result import DensityCheck
+from mkc_torch.diagnosis.settings import EvidenceSettings
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -30,30 +31,30 @@ __all__ = [
 _FREEDOM = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 """Degrees of freedom that are tried."""
 
-_BEYOND = 1.95
-"""Kolmogorov's statistic, distance times root of N, that one set of samples in a thousand exceeds; of a density that
-was fitted to them far fewer do."""
-
-_CLOSER = 0.5
-"""Share of the density's distance that a Student-t's has to be below."""
-
 _ROUNDS, _NODES = 30, 2001
+"""Of the EM algorithm for a Student-t's scale, and nodes of the integral of its density."""
 
 _COLUMNS = ("channel", "distance of the density", "distance of a Student-t", "by chance up to", "")
 _NOTE = (
     "The largest distance between the distribution function of the residuals and that of the density fitted to them, "
-    "and of the likeliest Student-t; 0 is a perfect fit. One recording in a thousand is beyond what is given as chance."
+    "and of the likeliest Student-t; 0 is a perfect fit. A share of {chance:.1g} of recordings is "
+    "beyond what is given as chance."
 )
 
 
 def test(case: Case) -> Told:
     """How far the density of each channel is off, and a warning where a Student-t is clearly closer."""
     fit = case.final.fit
-    return said(density_checks(fit.residual, fit.sigma, fit.d, fit.bound, case.prepared.channels))
+    channels, settings = case.prepared.channels, case.settings.evidence
+    return said(density_checks(fit.residual, fit.sigma, fit.d, fit.bound, channels, settings), settings)
 
 
-def said(checks: Sequence[DensityCheck]) -> Told:
-    table = Table("Is the density right?", _COLUMNS, tuple(_in_words(check) for check in checks), _NOTE)
+def said(checks: Sequence[DensityCheck], settings: EvidenceSettings) -> Told:
+    # the tail of Kolmogorov's distribution
+    chance = 2.0 * math.exp(-2.0 * settings.density_off**2)
+    table = Table(
+        "Is the density right?", _COLUMNS, tuple(_in_words(check) for check in checks), _NOTE.format(chance=chance)
+    )
     content = [
         {
             "channel": check.channel,
@@ -94,6 +95,7 @@ def density_checks(
     d: Float[Tensor, " m"],
     bound: Float[Tensor, " m"],
     channels: Sequence[str],
+    settings: EvidenceSettings,
 ) -> tuple[DensityCheck, ...]:
     """How far the residuals of each channel, outliers among them, are from their density, and from a Student-t.
 
@@ -106,12 +108,13 @@ def density_checks(
         residual: of the final model.
         sigma, d, bound: of the density.
         channels: their names.
+        settings: what so many samples allow, and what is closer.
 
     Example:
         >>> order = torch.randperm(4000, generator=torch.Generator().manual_seed(0)).double()
         >>> cauchy = torch.tan(torch.pi * ((order + 0.5) / 4000 - 0.5)).unsqueeze(-1)
         >>> sigma, d, bound = (torch.tensor([v], dtype=torch.float64) for v in (3.0, 1.0, 2000.0))
-        >>> (check,) = density_checks(cauchy, sigma, d, bound, ["norm"])
+        >>> (check,) = density_checks(cauchy, sigma, d, bound, ["norm"], EvidenceSettings())
         >>> check.degrees_of_freedom, check.closer
         (1.0, True)
     """
@@ -123,10 +126,11 @@ def density_checks(
     found = []
     for k, channel in enumerate(channels):
         distance = kolmogorov(uniform[:, k])
-        allowed = _BEYOND / math.sqrt(effective_size(uniform[:, k]))
+        allowed = settings.density_off / math.sqrt(effective_size(uniform[:, k]))
         freedom, scale, other = student_fit(residual[:, k])
         near = kolmogorov(student_cdf(size[:, k] / scale, freedom))
-        closer = distance > allowed and other > float(likelihood[k]) and near < min(_CLOSER * distance, allowed)
+        close = near < min(settings.student_closer * distance, allowed)
+        closer = distance > allowed and other > float(likelihood[k]) and close
         found.append(DensityCheck(channel, distance, near, freedom, allowed, closer))
     return tuple(found)
 

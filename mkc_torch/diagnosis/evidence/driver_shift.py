@@ -16,26 +16,21 @@ from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import DriverShift
 from mkc_torch.diagnosis.search.locate import Located
+from mkc_torch.diagnosis.settings import EvidenceSettings
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = ["of_finding", "said", "shifted", "test"]
 
-_SHARE = 0.25
-"""Of the recording, by which a driver is shifted at most, and which is left out at both ends whatever the shift."""
-
 _COPIES = 19
-"""To either side."""
+"""Shifted copies to either side."""
 
 _AT_ONCE = 19
 """Copies that are laid out together."""
 
 _FEWEST = 200
 """With fewer samples in the middle there is nothing to compare."""
-
-_MANY = 0.1
-"""A larger share of copies that gain as much is warned of."""
 
 _AS_MUCH = 0.999
 """Share of the gain that a copy has to have: those of a ramp are the ramp again, to rounding."""
@@ -47,10 +42,10 @@ def of_finding(case: Case) -> DriverShift | None:
 
 def test(case: Case) -> Told:
     """How many shifted copies of the finding's driver gain as much, and a warning where many do."""
-    return said(case.ahead, case.term)
+    return said(case.ahead, case.term, case.settings.evidence)
 
 
-def said(shift: DriverShift | None, term: Term) -> Told:
+def said(shift: DriverShift | None, term: Term, settings: EvidenceSettings) -> Told:
     if shift is None:
         return Told("driver_shift")
     some = {0: "none", 1: "one"}.get(shift.as_good, str(shift.as_good))
@@ -62,7 +57,7 @@ def said(shift: DriverShift | None, term: Term) -> Told:
         f"for {term.effect.id} as the column itself: its timing does not show that it is the driver, rather than "
         "something else that changes as slowly."
     )
-    many = shift.as_good > _MANY * shift.copies
+    many = shift.as_good > settings.shift_many * shift.copies
     return Told("driver_shift", shift, keys={"driver_shift": shift}, warnings=(sentence,) if many else (), rows=(row,))
 
 
@@ -86,7 +81,7 @@ def shifted(model: JointModel, located: Located) -> DriverShift | None:
     term = located.term
     pointwise = located.scene.tangents.pointwise[term.port]
     N = len(located.scene.values)
-    most = int(_SHARE * N)
+    most = int(located.scene.settings.evidence.shift * N)
     if term.driver is None or pointwise is None or model.prepared.ports[term.port].clock is not None:
         return None
     if N - 2 * most < _FEWEST:

@@ -12,27 +12,24 @@ from mkc_torch.diagnosis.evidence.held_out import gain_interval, scored
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import Extrapolation
+from mkc_torch.diagnosis.settings import EvidenceSettings
 
 __all__ = ["extrapolated", "of_finding", "said", "test"]
 
-SHARE = 0.7
-"""Of the samples, those with the lowest values of the driver, that the fits are to."""
-
 _BLOCKS, _FEWEST = 25, 5
-_SPREAD = 0.25
-"""Share of the driver's range that the lowest values must cover for a fit to them to say anything."""
+"""Blocks of the recording for the interval of the gain, and how many of them the high values have to be in."""
 
 
 def of_finding(case: Case) -> Extrapolation | None:
-    return extrapolated(*case.without_and_with, case.term, case.seed)
+    return extrapolated(*case.without_and_with, case.term, case.seed, case.settings.evidence)
 
 
 def test(case: Case) -> Told:
     """What the finding is worth where its driver is high, and a warning where it makes it clearly worse."""
-    return said(case.ahead, case.term)
+    return said(case.ahead, case.term, case.settings.evidence)
 
 
-def said(extrapolation: Extrapolation | None, term: Term) -> Told:
+def said(extrapolation: Extrapolation | None, term: Term, settings: EvidenceSettings) -> Told:
     if extrapolation is None:
         return Told("extrapolation")
     low, high = extrapolation.confidence_interval
@@ -40,7 +37,7 @@ def said(extrapolation: Extrapolation | None, term: Term) -> Told:
     gain = _in_words(extrapolation)
     row = Row("beyond its range", f"fitted where its driver is low, it {verb} where that is high: {gain}", False)
     sentence = (
-        f"{term.effect.id} does not extrapolate: fitted to the {100.0 * SHARE:.0f} % of samples where "
+        f"{term.effect.id} does not extrapolate: fitted to the {100.0 * settings.low_share:.0f} % of samples where "
         f"{', '.join(term.columns)} is lowest, it predicts the others worse than the model without it. Do not use it "
         "beyond the range recorded."
     )
@@ -60,7 +57,9 @@ def _in_words(extrapolation: Extrapolation) -> str:
     return f"{gain:+.{places}f} nats a sample (95 %: {low:.{places}f} to {high:.{places}f})"
 
 
-def extrapolated(without: FittedModel, fit: FittedModel, term: Term, seed: int) -> Extrapolation | None:
+def extrapolated(
+    without: FittedModel, fit: FittedModel, term: Term, seed: int, settings: EvidenceSettings
+) -> Extrapolation | None:
     """Fit with and without an effect to the low values of its driver, and compare on the high ones.
 
     A driver of several columns is high where it is far from its mean. The shapes of effects stay as they are, and so
@@ -71,6 +70,7 @@ def extrapolated(without: FittedModel, fit: FittedModel, term: Term, seed: int) 
         fit: the same with it.
         term: the effect.
         seed: of the bootstrap of blocks.
+        settings: which values are low.
 
     Returns:
         None where the driver was not recorded, or where its low values hardly vary, as those of a switch, or the high
@@ -79,12 +79,12 @@ def extrapolated(without: FittedModel, fit: FittedModel, term: Term, seed: int) 
     reach = _reach(term)
     if reach is None:
         return None
-    low = reach <= torch.quantile(reach, SHARE)
+    low = reach <= torch.quantile(reach, settings.low_share)
     high = ~low
     block = (torch.arange(len(reach)) * _BLOCKS).div(len(reach), rounding_mode="floor")[high]
     seen, block = block.unique_consecutive(return_inverse=True)
     spread = float(reach[low].max() - reach[low].min())
-    if spread < _SPREAD * float(reach.max() - reach.min()) or len(seen) < _FEWEST:
+    if spread < settings.low_spread * float(reach.max() - reach.min()) or len(seen) < _FEWEST:
         return None
     before, after = (_score(model, low)[high] for model in (without, fit))
     gain, interval = gain_interval(after - before, block, torch.Generator().manual_seed(seed))

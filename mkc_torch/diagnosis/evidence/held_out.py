@@ -14,17 +14,13 @@ from torch import Tensor
 from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.settings import ConfirmationSettings
 from mkc_torch.functional import mkc_nll
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 __all__ = ["Evidence", "HeldOutBlocks", "blocks_of", "gain_interval", "held_out", "scored"]
-
-FOLDS = 5
-BLOCKS_PER_FOLD = 5
-_GAP = 0.01
-"""Left out beside a held-out block, as a share of the recording; a correlation time at least."""
 
 
 @dataclass(frozen=True)
@@ -60,22 +56,25 @@ class Evidence:
         return ((1.0 - self.left_out) / self.left_out * self.parameters.var(0, correction=0)).sqrt()
 
 
-def blocks_of(N: int, correlation: int) -> HeldOutBlocks:
-    """Twenty-five blocks, five folds; between training and held-out samples lies a correlation time at least.
+def blocks_of(N: int, correlation: int, settings: ConfirmationSettings) -> HeldOutBlocks:
+    """Blocks in folds, twenty-five in five unless set otherwise.
 
-    But no more than half a block, so that training blocks are left: noise that wanders for longer leans both ways.
+    Between training and held-out samples lies a correlation time at least, but no more than half a block, so that
+    training blocks are left: noise that wanders for longer leans both ways.
 
     Args:
         N: number of samples.
         correlation: integrated correlation time in samples.
+        settings: how many, and what is left out beside them.
     """
-    count = FOLDS * BLOCKS_PER_FOLD
+    folds = settings.folds
+    count = folds * settings.blocks_per_fold
     block = (torch.arange(N) * count).div(N, rounding_mode="floor")
-    fold = block % FOLDS
+    fold = block % folds
     # never so much that training blocks of an ordinary recording are left empty
-    gap = max(1, min(max(math.ceil(_GAP * N), correlation), N // (2 * count)))
+    gap = max(1, min(max(math.ceil(settings.gap * N), correlation), N // (2 * count)))
     train = []
-    for k in range(FOLDS):
+    for k in range(folds):
         near = (fold == k).to(torch.float64).reshape(1, 1, -1)
         widened = torch.nn.functional.max_pool1d(near, 2 * gap + 1, stride=1, padding=gap)
         train.append(widened.reshape(-1) == 0)

@@ -27,7 +27,7 @@ _RISE = 1
 """Samples to either side: a change takes its time, and its middle can lie off where an instant one fits best."""
 
 _GROWTH = 1.3
-"""Of the distance from one sample that is tried to the next."""
+"""Growth of the distance from one sample that is tried to the next."""
 
 _BETWEEN = 12
 """Samples that are tried between the last one within and the first one beyond."""

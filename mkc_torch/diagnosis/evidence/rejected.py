@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.base import Case, Told
-from mkc_torch.diagnosis.noise.pseudo_residual import REJECTED_BELOW
+from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.recording.disturbance import Interval, disturbed_intervals
 
 if TYPE_CHECKING:
@@ -15,35 +15,35 @@ if TYPE_CHECKING:
 
 __all__ = ["rejected_warning", "test"]
 
-_SHORTEST = 0.5
-"""Seconds; shorter stretches are bursts of outliers."""
-
 _TOLD = 3
+"""Stretches that are told by their times, the longest ones."""
 
 
 def test(case: Case) -> Told:
     """A warning that names them; of a recording without times there is none."""
     if case.prepared.recording.time is None:
         return Told("rejected")
-    return Told("rejected", warnings=rejected_warning(case.prepared.time, case.final.fit.weights))
+    return Told("rejected", warnings=rejected_warning(case.prepared.time, case.final.fit.weights, case.settings))
 
 
-def rejected_warning(time: Float[Tensor, " N"], weights: Float[Tensor, "N m"]) -> tuple[str, ...]:
+def rejected_warning(time: Float[Tensor, " N"], weights: Float[Tensor, "N m"], settings: Settings) -> tuple[str, ...]:
     """A sentence that names the longest stretches of rejected samples; none where there are none.
 
     Args:
         time: in s.
         weights: of the residuals in the final fit, in [0, 1].
+        settings: below which weight a sample is rejected, and how long a stretch has to be.
 
     Example:
         >>> import torch
         >>> time = torch.arange(1000) / 50.0
         >>> weights = torch.where((time > 4.0) & (time < 7.0), 0.0, 1.0).unsqueeze(-1)
-        >>> rejected_warning(time, weights)
+        >>> rejected_warning(time, weights, Settings())
         ('Most samples were rejected from 4.0 to 7.0 s. ...',)
     """
-    stretches = disturbed_intervals(time, (weights < REJECTED_BELOW).any(-1))
-    found = sorted((one for one in stretches if one.end - one.start >= _SHORTEST), key=_length, reverse=True)
+    stretches = disturbed_intervals(time, (weights < settings.noise.rejected_below).any(-1))
+    long = [one for one in stretches if _length(one) >= settings.evidence.disturbed]
+    found = sorted(long, key=_length, reverse=True)
     if not found:
         return ()
     told = ", ".join(f"from {one.start:.1f} to {one.end:.1f} s" for one in sorted(found[:_TOLD]))

@@ -11,14 +11,9 @@ from mkc_torch.diagnosis.evidence.ceiling import Ceiling, ceiling
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, gain_interval
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.settings import EvidenceSettings
 
 __all__ = ["nameless", "remaining", "remaining_warning", "said", "test", "within_reach"]
-
-_SURE = 0.99
-"""Coverage of the intervals on what columns add: a warning is to be rarer than a finding that is none."""
-
-_WORTH = 0.01
-"""Nats per sample that the correction has to gain, which makes residuals smaller by about a hundredth."""
 
 
 def within_reach(case: Case) -> tuple[Ceiling, tuple[str, ...]]:
@@ -27,7 +22,7 @@ def within_reach(case: Case) -> tuple[Ceiling, tuple[str, ...]]:
     reach = ceiling(base.model, _answerable(base, fit), case.drivers, case.blocks)
     if nameless(fit):
         return reach, ()
-    return reach, remaining(reach, case.held_out[-1], fit, case.drivers, case.blocks, case.seed)
+    return reach, remaining(reach, case.held_out[-1], fit, case.drivers, case.blocks, case.seed, case.settings.evidence)
 
 
 def test(case: Case) -> Told:
@@ -58,6 +53,7 @@ def remaining(
     drivers: Sequence[Driver],
     blocks: HeldOutBlocks,
     seed: int,
+    settings: EvidenceSettings,
 ) -> tuple[str, ...]:
     """The columns along which something smooth remains in a model that passed for complete.
 
@@ -73,6 +69,7 @@ def remaining(
         drivers: the columns.
         blocks: to predict.
         seed: of the bootstraps.
+        settings: how surely, and by how much, the correction has to be better.
     """
 
     def gain(better: Evidence, worse: Evidence, coverage: float) -> tuple[float, float]:
@@ -83,12 +80,13 @@ def remaining(
 
     if gain(alone.evidence, corrected, 0.95)[1] <= 0.0:
         return ()
+    sure = settings.remaining_coverage
     beside = ceiling(fit.model, fit, drivers, blocks) if fit.model.terms else alone
-    mean, low = gain(beside.evidence, corrected, _SURE)
-    if not beside.columns or mean < _WORTH or low <= 0.0:
+    mean, low = gain(beside.evidence, corrected, sure)
+    if not beside.columns or mean < settings.remaining_gain or low <= 0.0:
         return ()
     time = ceiling(fit.model, fit, (), blocks)
-    return beside.columns if gain(beside.evidence, time.evidence, _SURE)[1] > 0.0 else ()
+    return beside.columns if gain(beside.evidence, time.evidence, sure)[1] > 0.0 else ()
 
 
 def remaining_warning(columns: Sequence[str]) -> tuple[str, ...]:

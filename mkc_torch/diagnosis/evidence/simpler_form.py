@@ -11,7 +11,7 @@ from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.noise.innovations import either_way
-from mkc_torch.diagnosis.search.ranking import SEPARABLE
+from mkc_torch.diagnosis.settings import NamingSettings
 from mkc_torch.nonlinear import NoFitError
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ Holds = Callable[[FittedModel, Evidence], bool]
 
 
 def simplified(
-    fit: FittedModel, evidence: Evidence, blocks: HeldOutBlocks, holds: Holds
+    fit: FittedModel, evidence: Evidence, blocks: HeldOutBlocks, holds: Holds, settings: NamingSettings
 ) -> tuple[FittedModel, Evidence]:
     """The fit with the simpler form of each effect that unseen blocks do not speak against, and its evidence.
 
@@ -39,6 +39,7 @@ def simplified(
         evidence: of it, on the blocks.
         blocks: held out.
         holds: whether a fit, with its evidence, still makes a finding of the last effect.
+        settings: what is clearly less likely.
     """
     for number in range(len(fit.model.terms)):
         start = _simpler(fit, number)
@@ -50,7 +51,7 @@ def simplified(
             continue
         after = held_out(other, blocks)
         lost = float((evidence.log_likelihood - after.log_likelihood).sum())
-        as_well = lost <= SEPARABLE or either_way(after.residual, evidence.residual) <= 0.0
+        as_well = lost <= settings.separable or either_way(after.residual, evidence.residual) <= 0.0
         if as_well and holds(other, after):
             fit, evidence = other, after
     return fit, evidence

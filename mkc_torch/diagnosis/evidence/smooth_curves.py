@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["Smooth", "curves_of", "legendre", "smooth_tangents"]
 
 DEGREE = 5
-"""Of the curves of columns."""
+"""Degree of the curves of columns."""
 
 COURSES = 10
 """Slow courses of time; cosines, for a polynomial runs away in a block at either end."""

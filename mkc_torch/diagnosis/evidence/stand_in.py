@@ -13,12 +13,6 @@ from mkc_torch.effects.sensor.unrecorded import Unrecorded
 
 __all__ = ["goes_on", "test"]
 
-_SURE = 0.01
-"""p-value of what the axes of the wander have in common: a warning is to be rarer than a finding that is none."""
-
-_SAME_WAY = 0.9
-"""Cosine between its direction and that of the effect."""
-
 
 def test(case: Case) -> Told:
     """A warning, where the last finding's column follows its cause in part: it may stand in for one not recorded."""
@@ -34,15 +28,15 @@ def test(case: Case) -> Told:
 
 def goes_on(case: Case) -> bool:
     """Whether what the last finding leaves wanders along its own direction."""
-    fit = case.fit
+    fit, settings = case.fit, case.settings
     last = fit.model.terms[-1] if fit.model.terms else None
     if last is None or last.driver is None or last.driver.role != ANY or last.port != Unrecorded.port:
         return False
-    tangents = tangents_of(fit.model, fit.parameters)
-    left = beside_wander(fit, fit.model, fit.parameters, tangents)
+    tangents = tangents_of(fit.model, fit.parameters, settings.noise)
+    left = beside_wander(fit, fit.model, fit.parameters, tangents, settings.noise)
     cause = common_cause(left.noise, left.slow)
     gamma = fit.model.gammas(fit.parameters)[-1]
-    if cause is None or cause.p_value > _SURE or len(gamma) != len(cause.direction):
+    if cause is None or cause.p_value > settings.evidence.stand_in or len(gamma) != len(cause.direction):
         return False
     cosine = torch.nn.functional.cosine_similarity(gamma, cause.direction, dim=0)
-    return float(cosine.abs()) >= _SAME_WAY
+    return float(cosine.abs()) >= settings.evidence.stand_in_along

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.base import Case, Told, gain_of
+from mkc_torch.diagnosis.settings import EvidenceSettings
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -16,8 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["comes_and_goes", "memory_of", "said", "test"]
 
 _FREQUENCIES = 4001
-_NATS, _SHARE = 7.0, 0.05
-"""What a step has to lose in a stretch after its onset: nats, and the share of all that it gains."""
+"""Frequencies at which a spectrum is summed."""
 
 
 def test(case: Case) -> Told:
@@ -26,14 +26,21 @@ def test(case: Case) -> Told:
     if onset is None:
         return said(False)
     memory = memory_of(case.final.colour.coefficients)
-    return said(comes_and_goes(gain_of(case.final, case.number), case.prepared.time, onset, memory))
+    gain = gain_of(case.final, case.number)
+    return said(comes_and_goes(gain, case.prepared.time, onset, case.settings.evidence, memory))
 
 
 def said(switched: bool) -> Told:
     return Told("switched", switched, keys={"comes_and_goes": True} if switched else {})
 
 
-def comes_and_goes(gain: Float[Tensor, " N"], time: Float[Tensor, " N"], onset: float, memory: float = 1.0) -> bool:
+def comes_and_goes(
+    gain: Float[Tensor, " N"],
+    time: Float[Tensor, " N"],
+    onset: float,
+    settings: EvidenceSettings,
+    memory: float = 1.0,
+) -> bool:
     """Whether the recording is much less likely with the step than without it in some stretch after the onset.
 
     Of a step that lasts, a stretch of independent samples loses c nats by chance with a probability below exp(−c); of
@@ -43,18 +50,20 @@ def comes_and_goes(gain: Float[Tensor, " N"], time: Float[Tensor, " N"], onset: 
         gain: log-likelihood in nats with the step less that without it.
         time: of the samples, ascending.
         onset: of the step.
+        settings: what it has to lose.
         memory: samples that tell as much as one independent one; see :func:`memory_of`.
 
     Example:
         >>> time = torch.arange(100.0)
         >>> lasts = torch.where(time < 20.0, 0.0, 1.0)
         >>> switched = torch.where(time < 20.0, 0.0, torch.sign(torch.sin(0.1 * (time - 20.0) + 0.01)))
-        >>> comes_and_goes(lasts, time, 20.0), comes_and_goes(switched, time, 20.0)
+        >>> usual = EvidenceSettings()
+        >>> comes_and_goes(lasts, time, 20.0, usual), comes_and_goes(switched, time, 20.0, usual)
         (False, True)
     """
     running = torch.cat([gain.new_zeros(1), gain[time >= onset].cumsum(0)])
     fall = float((running.cummax(0).values - running).max())
-    return fall > max(_NATS * memory, _SHARE * float(gain.sum()))
+    return fall > max(settings.switched * memory, settings.switched_share * float(gain.sum()))
 
 
 def memory_of(coefficients: Sequence[Float[Tensor, " order"]]) -> float:

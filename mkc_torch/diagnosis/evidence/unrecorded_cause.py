@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 
 __all__ = ["course_without", "located_cause"]
 
-_SHARE = 0.1
-"""Of the level: the question is asked last, of recordings in which the search found nothing."""
-
 
 def located_cause(base: FittedModel, located: Located, level: float, surrogates: int) -> Located | None:
     """A search that found nothing, with the cause that moves the channels of the wander together; None without one.
@@ -36,9 +33,9 @@ def located_cause(base: FittedModel, located: Located, level: float, surrogates:
         level: of false alarms.
         surrogates: draws of noise that other p-values are from, than which none can be smaller.
     """
-    slow = located.scene.tangents.slow
+    slow, share = located.scene.tangents.slow, located.scene.settings.confirmation.unrecorded
     cause = common_cause(located.beside_nothing, slow)
-    if cause is None or slow is None or slow.port != Unrecorded.port or cause.p_value > _SHARE * level:
+    if cause is None or slow is None or slow.port != Unrecorded.port or cause.p_value > share * level:
         return None
     model, start = _with_cause(base, cause.direction, cause.shape)
     term = model.terms[-1]
@@ -48,7 +45,7 @@ def located_cause(base: FittedModel, located: Located, level: float, surrogates:
         located,
         term=term,
         fit=fit,
-        p_value=max(cause.p_value / _SHARE, 1.0 / (1 + surrogates)),
+        p_value=max(cause.p_value / share, 1.0 / (1 + surrogates)),
         beyond=0.0,
         stretch=None,
         ranking=(Ranked(len(located.scene.terms), cause.gain, 0.0), *others),

@@ -10,14 +10,12 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.base import Case, Row, Table, Told
+from mkc_torch.diagnosis.settings import EvidenceSettings
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = ["Whiteness", "test", "whiteness"]
-
-_LEVEL = 0.01
-"""Share of white channels that are called correlated, half of it by either criterion."""
 
 _FIRST = 20
 """Lags of the portmanteau statistic: enough for noise with a memory, few enough to see a short one."""
@@ -28,8 +26,8 @@ _FARTHEST = 0.25
 _TITLE = "Is what is left over white?"
 _NOTE = (
     "Autocorrelation of what the final model leaves over, rejected samples aside: the last lag at which it is beyond "
-    "chance, that of neighbours, and the p-value of all lags up to the {lags}th together. One white channel in a "
-    "hundred is called correlated."
+    "chance, that of neighbours, and the p-value of all lags up to the {lags}th together. Of white channels "
+    "{level:.2g} are called correlated."
 )
 
 
@@ -48,12 +46,13 @@ class Whiteness:
 
 def test(case: Case) -> Told:
     """The channels of the final fit's pseudo-residual, each by itself."""
-    values, counts = case.final.fit.pseudo
+    settings = case.settings.evidence
+    values, counts = case.final.fit.pseudo(case.settings.noise)
     time = case.prepared.time
     step = 1.0 if case.prepared.recording.time is None else float(time.diff().median())
     unit = "samples" if case.prepared.recording.time is None else "s"
     channels = {
-        name: whiteness(column, used)
+        name: whiteness(column, used, settings)
         for name, column, used in zip(case.prepared.channels, values.unbind(-1), counts.unbind(-1), strict=True)
     }
     content = [
@@ -73,7 +72,7 @@ def test(case: Case) -> Told:
         _TITLE,
         ("channel", "correlated up to", "correlation of neighbours", "p-value"),
         rows,
-        _NOTE.format(lags=next(iter(channels.values())).lags),
+        _NOTE.format(lags=next(iter(channels.values())).lags, level=settings.white_level),
     )
     return Told(
         "whiteness",
@@ -104,7 +103,7 @@ def _in_words(channels: Mapping[str, Whiteness], step: float, unit: str) -> str:
     return f"{name} {reach}; {white or 'none'} of {len(channels)} channels white"
 
 
-def whiteness(values: Float[Tensor, " N"], counts: Float[Tensor, " N"]) -> Whiteness:
+def whiteness(values: Float[Tensor, " N"], counts: Float[Tensor, " N"], settings: EvidenceSettings) -> Whiteness:
     """Whether a series is white, where some of its samples do not count.
 
     It is not if the squares of its first autocorrelations are too large together, or one is at any lag, by Bartlett's
@@ -116,10 +115,12 @@ def whiteness(values: Float[Tensor, " N"], counts: Float[Tensor, " N"]) -> White
     Args:
         values: 0 where they do not count.
         counts: 1 where they do, else 0.
+        settings: the share of white series that may be called correlated.
 
     Example:
         >>> draws = torch.randn(2000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> whiteness(draws, torch.ones_like(draws)).lag, whiteness(draws[1:] + draws[:-1], torch.ones(1999)).lag
+        >>> sums, ones, usual = draws[1:] + draws[:-1], torch.ones_like(draws), EvidenceSettings()
+        >>> whiteness(draws, ones, usual).lag, whiteness(sums, ones[1:], usual).lag
         (0, 1)
     """
     N = len(values)
@@ -137,9 +138,9 @@ def whiteness(values: Float[Tensor, " N"], counts: Float[Tensor, " N"]) -> White
     p_value = float(torch.special.gammaincc(0.5 * statistic.new_tensor(first), 0.5 * statistic))
     error = ((1.0 + 2.0 * (square.cumsum(0) - square)) / pairs[1:]).sqrt()
     size = correlation.abs() / error
-    most = float(torch.special.ndtri(torch.tensor(1.0 - 0.25 * _LEVEL / farthest, dtype=torch.float64)))
+    most = float(torch.special.ndtri(torch.tensor(1.0 - 0.25 * settings.white_level / farthest, dtype=torch.float64)))
     beyond = (size > most).nonzero().flatten().tolist()
-    if not beyond and p_value <= 0.5 * _LEVEL:
+    if not beyond and p_value <= 0.5 * settings.white_level:
         beyond = [int(size[:first].argmax())]
     return Whiteness(beyond[-1] + 1 if beyond else 0, float(correlation[0]), p_value, first)
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["SourceError", "python_source"]
 
 _DIGITS = 9
+"""Significant digits of a number in the source."""
 _FROM_HERE: Mapping[str, str] = {
     "lagged(": "from mkc_torch.effects import lagged",
     "played(": "from mkc_torch.effects import played",

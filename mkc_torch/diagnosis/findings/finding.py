@@ -19,7 +19,6 @@ from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import Alternative, Curve, Finding, Number, Parameter, Reference
 from mkc_torch.diagnosis.search.locate import Located
-from mkc_torch.diagnosis.search.ranking import SEPARABLE
 from mkc_torch.effects.context import Context
 from mkc_torch.nonlinear import beside
 
@@ -29,10 +28,20 @@ if TYPE_CHECKING:
 __all__ = ["finding_of", "intervals_of", "labels", "parameters_of", "places_of"]
 
 _MOST_ALTERNATIVES = 5
+"""Alternatives that are listed, unless more are not told apart."""
+
 _FARTHEST = 30.0
+"""Nats behind the finding beyond which an alternative is not listed."""
+
 _BLOCKS, _MOST_GAIN, _CONCENTRATED = 60, 0.9, 0.35
+"""Blocks of the recording, the share of the gain that the best of them hold, and the share of them that they may be for
+the gain to be called concentrated there."""
+
 _POINTS = 80
+"""Points of a curve."""
+
 _NORMAL_95 = 1.959964
+"""Standard errors to either side that a 95 % interval of a normal variable reaches."""
 
 
 def finding_of(located: Located, final: Estimate, number: int) -> Finding:
@@ -168,6 +177,7 @@ def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
         found += [
             Alternative(term.effect.id, (copy,), 0.0, False, term.at, told_by=SAME) for copy in term.driver.copies
         ]
+    separable = located.scene.settings.naming.separable
     own = [ranked.number for ranked in located.ranking if located.scene.terms[ranked.number].key == term.key]
     for ranked in located.ranking:
         rival = located.scene.terms[ranked.number]
@@ -175,9 +185,9 @@ def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
             continue
         gap = max(ranked.gap, 0.0)
         again, told = rival.effect.again, ""
-        if own and gap < SEPARABLE:
+        if own and gap < separable:
             told = told_by(located, own[0], ranked.number)
-        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= SEPARABLE, rival.at, again, told))
+        found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= separable, rival.at, again, told))
     near = [a for a in found if not a.separable]
     return tuple(near + [a for a in found if a.separable][: max(0, _MOST_ALTERNATIVES - len(near))])
 

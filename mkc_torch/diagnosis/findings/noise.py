@@ -5,33 +5,27 @@ from __future__ import annotations
 import torch
 
 from mkc_torch.diagnosis.linearised.estimate import Estimate
-from mkc_torch.diagnosis.linearised.tangents import CORNERS
 from mkc_torch.diagnosis.result import Noise, Number
+from mkc_torch.diagnosis.settings import NoiseSettings
 
 __all__ = ["noise_summary"]
 
-_CLEAR = 3.0
-"""Nats by which a wander has to be likelier than none to be told of."""
 
-_COLOURED = 0.05
-"""Sum of squared autoregression coefficients from which noise is called coloured."""
-
-
-def noise_summary(final: Estimate) -> Noise:
+def noise_summary(final: Estimate, settings: NoiseSettings) -> Noise:
     """White, autoregressive, or wandering like a random walk, with its numbers."""
     fit, wander = final.fit, final.noise
     prepared = fit.model.prepared
     orders = final.colour.coefficients
-    coloured = any(float(phi.square().sum()) > _COLOURED for phi in orders)
+    coloured = any(float(phi.square().sum()) > settings.told_colour for phi in orders)
     parameters: dict[str, Number] = {}
     units: dict[str, str] = {}
-    clear = wander.size > 0 and wander.gain > _CLEAR
+    clear = wander.size > 0 and wander.gain > settings.told_wander
     if clear:
         parameters["wander"] = final.wander_spread
         units["wander"] = next(port.unit for port in prepared.ports.values() if port.wanders)
         if wander.family > 0:
             length = float(prepared.time[-1] - prepared.time[0])
-            parameters["wander_period"] = 2.0 * length / CORNERS[wander.family - 1]
+            parameters["wander_period"] = 2.0 * length / settings.plateaus[wander.family - 1][0]
             units["wander_period"] = "s"
     if coloured:
         parameters["autoregression"] = tuple(tuple(phi.tolist()) for phi in orders)

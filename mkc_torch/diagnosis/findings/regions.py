@@ -25,15 +25,23 @@ if TYPE_CHECKING:
 __all__ = ["Attribution", "attributed", "map_of", "region_of", "shares_of_runs"]
 
 _NODES = 6
+"""Sizes between none and its own at which an effect's slope is taken, nodes of Gauss's rule."""
+
 _TIMES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
+"""Shares of the time that a region may hold."""
+
 _CLEARLY = 0.3
 """What the share of the gain in a region has to exceed its share of the time by to be told."""
 
 _MOST, _SLICES = 1.25, 20
-"""Where more is gained than this share of the gain, and lost elsewhere, it says nothing of where the gain arises."""
+"""Where more is gained than this share of the gain, and lost elsewhere, it says nothing of where the gain arises; and
+the slices of a state's range that are asked."""
 
 _BINS = 24
+"""Cells of a map along either state."""
+
 _REVERSES = 0.05
+"""Share of the time that a state has to have either sign for to be near zero, or far from it."""
 
 
 @dataclass(frozen=True)

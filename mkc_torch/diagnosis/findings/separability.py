@@ -11,6 +11,7 @@ from mkc_torch.diagnosis.search.locate import Located
 __all__ = ["separability"]
 
 _MOST = 8
+"""Candidates in the matrix, the leading ones."""
 
 
 def separability(located: Located) -> Separability:

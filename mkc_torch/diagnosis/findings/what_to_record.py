@@ -12,7 +12,6 @@ from torch import Tensor
 
 from mkc_torch._support.unit_text import sized
 from mkc_torch.diagnosis.search.locate import Located
-from mkc_torch.diagnosis.search.ranking import SEPARABLE
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -28,7 +27,10 @@ _BETTER, _FEWEST = 1.5, 0.03
 """Times that a sample has to tell more than one on average, and the share of samples that do, to be worth a word."""
 
 _MAINLY = 0.8
+"""Share of a signal's length that an axis has to have for the signal to be mainly along it."""
+
 _MOST = 20.0
+"""Times as many samples beyond which it is told as far more."""
 
 
 def told_by(located: Located, own: int, rival: int) -> str:
@@ -49,7 +51,7 @@ def told_by(located: Located, own: int, rival: int) -> str:
     nats = 0.5 * float((trace - space @ (space.mT @ trace)).square().sum())
     if nats < _NOTHING:
         return SAME
-    more = SEPARABLE / nats
+    more = located.scene.settings.naming.separable / nats
     often = f"about {more:.1f} times as many samples" if more > 1.0 else "as many samples again"
     if more > _MOST:
         often = "far more samples"

@@ -15,6 +15,7 @@ SMALL = 0.05
 """Share by which a finding has to make the residual smaller to be more than small beside the noise."""
 
 _NORMAL_95 = 1.96
+"""Standard errors to either side that a 95 % interval of a normal variable reaches."""
 
 
 def confirmation(gain: float, interval: tuple[float, float]) -> Confirmation:

@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.noise.bursts import near_median, of_all, out_of_bursts, together
 from mkc_torch.diagnosis.noise.pseudo_residual import pseudo_residual
+from mkc_torch.diagnosis.settings import NoiseSettings
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -23,19 +24,13 @@ if TYPE_CHECKING:
 __all__ = ["Local", "beside_wander", "explained"]
 
 _ROUNDS = 4
+"""Times at most that residuals are judged by their distance from the wander, and the wander is estimated anew."""
 
 _MEDIANS = 75
 """Windows of a running median that make up a recording."""
 
-_FAR = 2.6
-"""Robust scales beyond which what is left beside the wander does not count. Where outliers five scales away are many,
-the likeliest density is so wide that most of them would, and in bursts of one sign they pass for a wander."""
-
 _ALIKE = 1e-10
 """Smallest eigenvalue, over the largest, of tangents on scales of their own that still tells them apart."""
-
-_EXCEPTION = 1.0 / 3.0
-"""Largest share of the residuals that can be bursts: what is off more often is physics that is not in the model yet."""
 
 _SETTLED = 5e-3
 """Share of the residuals that may still come to count or cease to."""
@@ -58,7 +53,13 @@ class Local:
     slow: Slow | None
 
 
-def beside_wander(fit: FittedModel, model: JointModel, parameters: Float[Tensor, " p"], tangents: Tangents) -> Local:
+def beside_wander(
+    fit: FittedModel,
+    model: JointModel,
+    parameters: Float[Tensor, " p"],
+    tangents: Tangents,
+    settings: NoiseSettings,
+) -> Local:
     """The pseudo-residual of a fit, around the likeliest wander of its noise.
 
     The fit alone takes a wander that is larger than the white noise for a heavy tail, and turns down its excursions.
@@ -67,13 +68,14 @@ def beside_wander(fit: FittedModel, model: JointModel, parameters: Float[Tensor,
         fit: its residuals are judged.
         model, parameters: where the tangents are from; ``fit`` may have a term more.
         tangents: of the parameters and of the ports.
+        settings: when a residual is rejected.
     """
     slow = tangents.slow
     if slow is None:
-        values, counts = fit.pseudo
+        values, counts = fit.pseudo(settings)
         return Local(values, counts, linearise(model, parameters, values, counts, tangents.bare), None)
     # a burst must not pull the first course its way
-    counts = near_median(fit.residual, len(fit.residual) // _MEDIANS)
+    counts = near_median(fit.residual, len(fit.residual) // _MEDIANS, settings)
     values = counts * fit.residual
     noise = linearise(model, parameters, values, counts, tangents.bare, white=True)
     family = noise.search.noise_fit(noise.series).family
@@ -84,10 +86,10 @@ def beside_wander(fit: FittedModel, model: JointModel, parameters: Float[Tensor,
         quick = fit.residual - course
         density = fit_density(quick, bound=fit.bound)
         before = counts
-        values, counts = pseudo_residual(quick, density.sigma, density.d)
-        alone = out_of_bursts((quick.abs() <= _FAR * robust_scale(quick)).to(quick.dtype))
-        near = of_all(alone * together(quick, counts * alone))
-        if float(near.mean()) < 1.0 - _EXCEPTION:
+        values, counts = pseudo_residual(quick, density.sigma, density.d, settings.rejected_below)
+        alone = out_of_bursts((quick.abs() <= settings.far * robust_scale(quick)).to(quick.dtype), settings)
+        near = of_all(alone * together(quick, counts * alone, settings), settings)
+        if float(near.mean()) < 1.0 - settings.bursts:
             near = alone
         values, counts = values * near, counts * near
         values = values + counts * course

@@ -18,6 +18,7 @@ from mkc_torch.diagnosis.model.grid import reach_of
 from mkc_torch.diagnosis.model.shaped import ShapedModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.colour import Colour
+from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import beside
 
 if TYPE_CHECKING:
@@ -25,9 +26,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Estimate", "estimate"]
 
-_MOST_ERRORS = 5.0
-
 _AT_END = 1e-6
+"""Distance from an end of its range, over that end, within which a shape's number is at the end, to rounding."""
+
 _UNKNOWN = 0.5
 """Share of a number beyond which its error says no more than that it is not known."""
 
@@ -60,16 +61,16 @@ class Estimate:
         return replace(self, covariance=larger.unsqueeze(-1) * self.covariance * larger)
 
 
-def estimate(fit: FittedModel) -> Estimate:
+def estimate(fit: FittedModel, settings: NoiseSettings) -> Estimate:
     """One step of generalised least squares on the pseudo-residuals, with the colour and wander of their noise.
 
     The M-estimate weighs samples as if they were independent; where noise is coloured this step is the more precise
-    one, and its covariance respects the autocorrelation. A step of more than five standard errors is a fit that the
-    noise model does not describe, and is not taken.
+    one, and its covariance respects the autocorrelation. A step of more than ``last_step`` standard errors, five if
+    not set, is a fit that the noise model does not describe, and is not taken.
     """
     model, parameters = fit.model, fit.parameters
-    tangents = tangents_of(model, parameters)
-    local = beside_wander(fit, model, parameters, tangents)
+    tangents = tangents_of(model, parameters, settings)
+    local = beside_wander(fit, model, parameters, tangents, settings)
     found = linearise(
         model,
         parameters,
@@ -81,7 +82,7 @@ def estimate(fit: FittedModel) -> Estimate:
     )
     step, covariance = found.search.estimate(0, found.series)
     error = covariance.diagonal().clamp(min=1e-300).sqrt()
-    if float((step.abs() / error).max()) <= _MOST_ERRORS:
+    if float((step.abs() / error).max()) <= settings.last_step:
         parameters = parameters - step
         if model.bounds is not None:
             parameters = parameters.clamp(*model.bounds)
@@ -93,7 +94,9 @@ def estimate(fit: FittedModel) -> Estimate:
     noise = found.search.noise_fit(found.series)
     spread = found.search.wander_spread(noise) if noise.size > 0 else 0.0
     plain = Estimate(fit, covariance, noise, found.colour, spread, tuple({} for _ in fit.model.terms))
-    return _shapes_free(plain.at_least(found.search.doubted_error(0, found.series)), tangents, local)
+    return _shapes_free(
+        plain.at_least(found.search.doubted_error(0, found.series, settings.doubted_family)), tangents, local
+    )
 
 
 def _shapes_free(plain: Estimate, tangents: Tangents, local: Local) -> Estimate:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.linearised.wander import NoiseFit, SlowPart, Wander, price_of, without_wander
+from mkc_torch.diagnosis.linearised.wander import NoiseFit, SlowPart, Wander, without_wander
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -29,14 +29,11 @@ _LEFT = 1e-4
 _SINGULAR = 1e-10
 """Smallest eigenvalue, over the largest, of parameters on scales of their own that still tells them apart."""
 
-
 _CELLS = 3_000_000
 """Numbers of candidates' inner products with series, over several sizes, that are held at once."""
 
 _EQUAL = 3.0
-
-_NEARLY = 12.0
-"""Nats that a family of wander may be less likely than another one and still be asked how sure a size is."""
+"""Courses' worth of equal channels that stand beside what a series says of each channel's share of the wander."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +67,7 @@ class LinearSearch:
         candidates: whitened tangents of each candidate, (M, q).
         wander: (M, k) whitened tangents of slow courses at the ports; k may be 0.
         scales: standard deviations of those courses, up to one size, for each family of wander, (F, k).
+        walk_first: nats by which another family than the first, a random walk, has to be likelier than that one.
     """
 
     def __init__(
@@ -78,6 +76,7 @@ class LinearSearch:
         candidates: Sequence[Float[Tensor, "M q"]],
         wander: Float[Tensor, "M k"],
         scales: Float[Tensor, "F k"],
+        walk_first: float,
     ) -> None:
         self._basis = torch.linalg.qr(nuisance / torch.linalg.vector_norm(nuisance, dim=0).clamp(min=1e-300)).Q
         self._dof = nuisance.shape[0] - nuisance.shape[1]
@@ -86,6 +85,7 @@ class LinearSearch:
         gram = _gram(wander) - _gram(self._wander_basis)
         self._families = [Wander(scale, gram) for scale in scales] if wander.shape[1] else []
         self._possible = range(len(self._families))
+        self._walk_first = walk_first
         self._try(candidates)
 
     def _try(self, candidates: Sequence[Float[Tensor, "M q"]]) -> None:
@@ -109,12 +109,13 @@ class LinearSearch:
     def without(self, columns: Float[Tensor, "M q"]) -> LinearSearch:
         """The same candidates and noise, with these tangents taken out of everything too."""
         nuisance = torch.cat([self._basis, columns], -1)
-        return LinearSearch(nuisance, self._flat.split(self._widths, -1), self._wander, self._scales)
+        own = self._flat.split(self._widths, -1)
+        return LinearSearch(nuisance, own, self._wander, self._scales, self._walk_first)
 
     def scaled(self, factor: Float[Tensor, " M"]) -> LinearSearch:
         """The same with each row times a factor."""
         nuisance, columns, wander = (factor.unsqueeze(-1) * known for known in (self._basis, self._flat, self._wander))
-        other = LinearSearch(nuisance, columns.split(self._widths, -1), wander, self._scales)
+        other = LinearSearch(nuisance, columns.split(self._widths, -1), wander, self._scales, self._walk_first)
         other._possible = self._possible
         return other
 
@@ -157,7 +158,7 @@ class LinearSearch:
         """The same on the first K rows times these factors, without a wander."""
         rows = len(factor)
         nuisance, columns = (factor.unsqueeze(-1) * known[:rows] for known in (self._basis, self._flat))
-        return LinearSearch(nuisance, columns.split(self._widths, -1), nuisance[:, :0], nuisance.new_zeros(0, 0))
+        return LinearSearch(nuisance, columns.split(self._widths, -1), nuisance[:, :0], nuisance.new_zeros(0, 0), 0.0)
 
     @property
     def dof(self) -> Float[Tensor, " C"]:
@@ -238,7 +239,7 @@ class LinearSearch:
         for number in self._possible:
             family = self._families[number]
             left, log_det = without_wander(power, family.axes.mT @ (family.scale.unsqueeze(-1) * slow), family)
-            values = (-0.5 * log_det - 0.5 * self._dof * left.log()).squeeze(-1) - price_of(number)
+            values = (-0.5 * log_det - 0.5 * self._dof * left.log()).squeeze(-1) - (self._walk_first if number else 0.0)
             place = int(values.argmax())
             value = float(values[place])
             if value > best.log_likelihood:
@@ -255,8 +256,8 @@ class LinearSearch:
         best = int(value.argmax())
         return gamma[best], covariance[best]
 
-    def doubted_error(self, number: int, series: Float[Tensor, " M"]) -> Float[Tensor, " q"]:
-        """Standard errors of γ: the largest of those by each family of wander that is nearly as likely.
+    def doubted_error(self, number: int, series: Float[Tensor, " M"], within: float) -> Float[Tensor, " q"]:
+        """Standard errors of γ: the largest of those by each family of wander that is as likely, within some nats.
 
         What is slow in a recording says little of how a wander goes on towards what is slower, and the size of a slow
         effect is as unsure as that.
@@ -266,7 +267,7 @@ class LinearSearch:
         for family in self._allowed:
             rows.append(slice(rows[-1].stop, rows[-1].stop + len(family.sizes) - 1))
         best = [part.start + int(value[part].argmax()) for part in rows]
-        near = [row for row in best if float(value[row]) > float(value.max()) - _NEARLY]
+        near = [row for row in best if float(value[row]) > float(value.max()) - within]
         return covariance[near].diagonal(dim1=-2, dim2=-1).amax(0).clamp(min=0.0).sqrt()
 
     def _estimates(self, number: int, series: Float[Tensor, " M"]) -> tuple[Tensor, Tensor, Tensor]:
@@ -291,7 +292,7 @@ class LinearSearch:
             grams.append(gram.flatten() - share @ (cross.unsqueeze(-1) * cross.unsqueeze(-2)).flatten(1))
             inners.append(inner - share @ (cross * rotated.unsqueeze(-1)))
             powers.append(power - share @ rotated.square())
-            log_dets.append(torch.log1p(sizes * family.strength).sum(-1) + 2.0 * price_of(place))
+            log_dets.append(torch.log1p(sizes * family.strength).sum(-1) + 2.0 * (self._walk_first if place else 0.0))
         scale = size_of.unsqueeze(-1) * size_of
         scaled = torch.cat(grams).unflatten(-1, (q, q)) * scale
         inverse = torch.linalg.pinv(scaled, hermitian=True, atol=_SINGULAR, rtol=0.0) * scale

@@ -32,6 +32,8 @@ __all__ = ["Linearised", "linearise"]
 
 
 _MOST, _MARGIN, _FEWEST = 0.9, 3.0, 1000
+"""Share of what moves that the slowest cosine coefficients hold, times as many that are kept, and how many at least."""
+
 _FILLED_AT_ONCE = 64
 """Candidates whose tangents are moved about together: they stay in a core's own memory. To fill them, a large matrix
 passes by each time."""
@@ -42,9 +44,6 @@ which is some twenty numbers, gains by chance."""
 
 _REACHED = 0.98
 """Share of a random walk's power that lies at the frequencies that it reaches."""
-
-_PLAUSIBLE = 6.0
-"""Nats that a colour may be less likely than another one: as many as one of more numbers gains by chance."""
 
 _FARTHEST = 10.0
 """Times that a step may go beyond, of the root of a spectrum."""
@@ -74,13 +73,14 @@ class Linearised:
     filling: Filling
     others: tuple[Linearised, ...] = ()
 
-    def plausible(self) -> list[Colour]:
-        """Other colours that the noise may have: nearly as likely ones, to which the alternation comes from elsewhere.
+    def plausible(self, within: float) -> list[Colour]:
+        """Other colours that the noise may have: as likely ones, within some nats.
 
-        A spectrum of twenty numbers that a wander hides in part has several.
+        The alternation comes to them from elsewhere: a spectrum of twenty numbers that a wander hides in part has
+        several.
         """
         settled = [_settled(one) for one in self.others]
-        return [one.colour for one in settled if one.evidence > self.evidence - _PLAUSIBLE]
+        return [one.colour for one in settled if one.evidence > self.evidence - within]
 
     def colour_beside(self) -> Colour:
         """The colour of what is left beside the wander."""
@@ -258,6 +258,7 @@ def _searching(
         [parameters] if joint else candidates,
         pull.below(colour.scaled(seen.slow)),
         flat.new_zeros(0, 0) if slow is None else slow.scales,
+        0.0 if slow is None else slow.walk_first,
     )
     return Linearised(search, pull.beside(flat), colour, None, filling)
 

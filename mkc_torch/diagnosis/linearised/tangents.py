@@ -12,6 +12,7 @@ from torch import Tensor
 from mkc_torch.diagnosis.model.joint import JointModel, directions, port_jacobian, through_port
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.cosine_basis import cosines, dct, dct_of_courses
+from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError
 
 if TYPE_CHECKING:
@@ -21,14 +22,8 @@ __all__ = ["Slow", "Tangents", "candidate_tangents", "tangents_of"]
 
 T = TypeVar("T")
 
-SLOW_COURSES = 120
-"""Cosine courses of each wandering channel: on 90 s they reach 0.67 Hz."""
-
-CORNERS, WALKS = (25.0, 25.0), (0.0, 5.0)
-"""Beside a random walk: numbers of the courses beyond which a wander falls off, and up to which a walk beside it is
-larger."""
-
 AT_ONCE = 8
+"""Candidates whose tangents are computed together: they stay in a core's own memory."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +59,7 @@ class Slow:
     """Slow courses of a port's channels, and their standard deviations in each family of wander (F, k).
 
     ``tangents`` are those of each course of each channel, (N, m, k), or, where the port is ``pointwise``, those of the
-    channels, (N, m, c), which the courses modulate.
+    channels, (N, m, c), which the courses modulate. Another family than the first has to gain ``walk_first`` nats more.
     """
 
     port: str
@@ -72,6 +67,7 @@ class Slow:
     tangents: Tensor
     pointwise: bool
     scales: Tensor
+    walk_first: float
 
     @property
     def count(self) -> int:
@@ -99,8 +95,15 @@ class Slow:
         return replace(self, scales=self.scales[number : number + 1])
 
 
-def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Sequence[Term] = ()) -> Tangents:
+def tangents_of(
+    model: JointModel, parameters: Float[Tensor, " p"], settings: NoiseSettings, terms: Sequence[Term] = ()
+) -> Tangents:
     """The tangents at these parameters, by forward mode.
+
+    Args:
+        model, parameters: where.
+        settings: the families of wander.
+        terms: candidates.
 
     Raises:
         NoFitError: the residual has no finite slope by a parameter there.
@@ -128,7 +131,7 @@ def tangents_of(model: JointModel, parameters: Float[Tensor, " p"], terms: Seque
         if term.effect.follows_signal:
             nuisance[..., start : start + size] *= independent[:, None]
         start += size
-    slow = _slow_courses(model, parameters, pointwise)
+    slow = _slow_courses(model, parameters, pointwise, settings)
     return Tangents(nuisance, candidate_tangents(model, parameters, terms, pointwise), pointwise, slow)
 
 
@@ -168,24 +171,23 @@ def in_blocks(items: Sequence[T], at_once: int = AT_ONCE) -> list[Sequence[T]]:
     return [items[first : first + at_once] for first in range(0, len(items), at_once)]
 
 
-def _slow_courses(model: JointModel, parameters: Tensor, pointwise: dict[str, Tensor | None]) -> Slow | None:
+def _slow_courses(
+    model: JointModel, parameters: Tensor, pointwise: dict[str, Tensor | None], settings: NoiseSettings
+) -> Slow | None:
     N = len(model.prepared.time)
-    count = min(SLOW_COURSES, N // 10)
+    count = min(settings.slow_courses, N // 10)
     wandering = [name for name, port in model.prepared.ports.items() if port.wanders]
     if not wandering or count == 0:
         return None
     name = wandering[0]
     c = len(model.prepared.ports[name].channels)
     k = torch.arange(1, count + 1, dtype=parameters.dtype).repeat_interleave(c)
-    others = (
-        (1.0 + (k / corner).square()).reciprocal() + (walk / k).square()
-        for corner, walk in zip(CORNERS, WALKS, strict=True)
-    )
+    others = ((1.0 + (k / corner).square()).reciprocal() + (walk / k).square() for corner, walk in settings.plateaus)
     scales = torch.stack([1.0 / k, *(square.sqrt() for square in others)])
     known = pointwise[name]
     if known is not None:
-        return Slow(name, c, known, True, scales)
+        return Slow(name, c, known, True, scales, settings.walk_first)
     courses = cosines(count, N)
     eye = torch.eye(c, dtype=courses.dtype)
     spread = (courses[:, None, :, None] * eye[:, None, :]).reshape(N, c, count * c)
-    return Slow(name, c, through_port(model, parameters, name, spread, None), False, scales)
+    return Slow(name, c, through_port(model, parameters, name, spread, None), False, scales, settings.walk_first)

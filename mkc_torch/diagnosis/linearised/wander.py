@@ -18,10 +18,6 @@ __all__ = ["SlowPart"]
 _SIZES = 36
 """Sizes of wander tried, from none to a few times the largest that could fit."""
 
-_PREFERRED = 5.0
-"""Nats by which the first family of wander, a random walk, goes before another one: beside a spectrum of any form that
-one can pass for a walk, and then knows too little of its slowest courses."""
-
 
 @dataclass(frozen=True)
 class SlowPart:
@@ -93,11 +89,6 @@ class NoiseFit:
     variance: float
     log_likelihood: float
     gain: float
-
-
-def price_of(family: int) -> float:
-    """Nats by which a family of wander has to be likelier than the first one."""
-    return _PREFERRED if family > 0 else 0.0
 
 
 def without_wander(power: Tensor, rotated: Tensor, family: Wander) -> tuple[Tensor, Tensor]:

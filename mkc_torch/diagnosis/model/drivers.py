@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.recording.recording import Recording
 
 if TYPE_CHECKING:
@@ -16,17 +17,8 @@ if TYPE_CHECKING:
 
 __all__ = ["ANY", "Driver", "Drivers", "find_drivers"]
 
-FEWEST_FINITE = 0.5
-"""A column with a smaller share of finite values is no driver."""
-
 COPY = 1e-9
 """Two columns whose correlation is nearer to ±1 than this are one driver."""
-
-_REPEATS = 0.995
-"""Correlation with a measured column from which one repeats it."""
-
-_WILD, _FEW, _ALONE = 50.0, 5e-3, 3
-"""Times the range of all others that a value is off, the share of the samples that may be, and how many in a row."""
 
 ANY = "any"
 """The role of a column whose role is not known."""
@@ -68,6 +60,7 @@ class Drivers:
 def find_drivers(
     recording: Recording,
     taken: frozenset[str],
+    settings: DriverSettings,
     roles: frozenset[str] = frozenset(),
     measured: frozenset[str] = frozenset(),
 ) -> Drivers:
@@ -79,13 +72,14 @@ def find_drivers(
     Args:
         recording: the samples in use.
         taken: columns that the simulation uses itself.
+        settings: what makes a column a driver, and a value a wild one.
         roles: further roles, of a user's own effects: a column has one if its name is that or begins with it.
         measured: columns that are compared with the simulation; what repeats one of them drives nothing.
 
     Example:
         >>> ramp = torch.linspace(20.0, 30.0, 50)
         >>> columns = {"time": ramp, "temp_imu": ramp, "load": ramp.sin(), "state": torch.ones(50)}
-        >>> found = find_drivers(Recording(columns), frozenset({"time"}))
+        >>> found = find_drivers(Recording(columns), frozenset({"time"}), DriverSettings())
         >>> [(d.columns, d.role) for d in found.drivers], found.warnings
         ([(('temp_imu',), 'temperature'), (('load',), 'any')], ('Column `state` is constant and can drive nothing.',))
     """
@@ -94,8 +88,8 @@ def find_drivers(
     for name in recording.names:
         if name in taken or name == "experiment":
             continue
-        values, complaint = _usable(name, recording[name])
-        repeated = None if values is None else _repeated(values, recording, measured)
+        values, complaint = _usable(name, recording[name], settings)
+        repeated = None if values is None else _repeated(values, recording, measured, settings)
         if repeated is not None:
             values, complaint = None, [f"Column `{name}` repeats `{repeated}` and is left out: it drives nothing."]
         warnings += complaint
@@ -133,17 +127,17 @@ def _own_role(name: str, roles: frozenset[str]) -> str:
     return max(fitting, key=len, default="")
 
 
-def _usable(name: str, values: Tensor) -> tuple[Tensor | None, list[str]]:
+def _usable(name: str, values: Tensor, settings: DriverSettings) -> tuple[Tensor | None, list[str]]:
     finite = values.isfinite()
     share = float(finite.double().mean())
-    if share < FEWEST_FINITE:
+    if share < settings.fewest_finite:
         found = "no finite values" if share == 0 else f"only {share:.0%} finite values"
         return None, [f"Column `{name}` has {found} and is left out."]
     warnings = []
     if share < 1.0:
         warnings.append(f"Column `{name}` lacks {int((~finite).sum())} values, filled from their neighbours in time.")
         values = _filled(values, finite)
-    wild = _wild(values)
+    wild = _wild(values, settings)
     if bool(wild.any()):
         first, last = (f"{float(end):.6g}" for end in torch.aminmax(values[wild]))
         told = first if first == last else f"between {first} and {last}"
@@ -158,27 +152,29 @@ def _usable(name: str, values: Tensor) -> tuple[Tensor | None, list[str]]:
     return values, warnings
 
 
-def _wild(values: Float[Tensor, " N"]) -> Bool[Tensor, " N"]:
+def _wild(values: Float[Tensor, " N"], settings: DriverSettings) -> Bool[Tensor, " N"]:
     """A few values that are far from all others and come alone, or are all the same: glitches, and codes for none."""
-    few = max(int(_FEW * len(values)), 1)
+    few = max(int(settings.wild_share * len(values)), 1)
     ordered = values.sort().values
     span = ordered[-1 - few] - ordered[few]
-    far = (values - ordered[len(values) // 2]).abs() > _WILD * span
+    far = (values - ordered[len(values) // 2]).abs() > settings.wild * span
     if not bool(span > 0) or not 0 < int(far.sum()) <= few:
         return torch.zeros_like(far)
     _, length = torch.unique_consecutive(far, return_counts=True)
     runs = length[int(not bool(far[0])) :: 2]
     same = bool((values[far] == values[far][0]).all())
-    return far if same or int(runs.max()) <= _ALONE else torch.zeros_like(far)
+    return far if same or int(runs.max()) <= settings.wild_in_a_row else torch.zeros_like(far)
 
 
-def _repeated(values: Float[Tensor, " N"], recording: Recording, measured: frozenset[str]) -> str | None:
+def _repeated(
+    values: Float[Tensor, " N"], recording: Recording, measured: frozenset[str], settings: DriverSettings
+) -> str | None:
     """The measured column that these values are but for offset, gain and rounding."""
     unit = _centred(values)
     for name in sorted(measured):
         if name in recording and bool(recording[name].isfinite().all()):
             other = _centred(recording[name])
-            if abs(float(unit @ other)) > _REPEATS:
+            if abs(float(unit @ other)) > settings.repeats:
                 return name
     return None
 

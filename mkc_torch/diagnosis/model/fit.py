@@ -12,6 +12,7 @@ from mkc_torch import nonlinear
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.noise.pseudo_residual import pseudo_residual
+from mkc_torch.diagnosis.settings import NoiseSettings
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -19,7 +20,10 @@ if TYPE_CHECKING:
 __all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_beside", "without_term"]
 
 _CLIP = 2.0
+"""Robust standard deviations at which residuals are clipped where a fit is only begun with them."""
+
 _SHARES = (1.0, 0.3, 0.1, 0.01, 0.0)
+"""Of the size that an effect begins with, tried one after the other where the simulation has no finite answer."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +48,9 @@ class FittedModel:
     log_likelihood: float
     converged: bool
 
-    @property
-    def pseudo(self) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
+    def pseudo(self, settings: NoiseSettings) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
         """The pseudo-residual, and 1 where it counts."""
-        return pseudo_residual(self.residual, self.sigma, self.d)
+        return pseudo_residual(self.residual, self.sigma, self.d, settings.rejected_below)
 
 
 def fitted(

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["candidate_terms", "described", "finer", "reach_of"]
 
 _STEPS = 8
+"""Values of a shape's number to either side of the present one, and what its range is divided by each round."""
 
 
 def candidate_terms(

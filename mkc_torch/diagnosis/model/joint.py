@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["JointModel", "directions", "port_jacobian", "summed", "through_port"]
 
 _CHUNK = 64
+"""Courses whose effect on the residual is computed together."""
 
 
 class JointModel:

@@ -66,6 +66,8 @@ class Colour:
 
 
 _SHARED, _CLEARLY = 0.5, 1.01
+"""Share of a port's axes that two samples have in common for their product to tell of noise at the port, and times that
+noise at a port has to explain the products better than the residual's own."""
 
 
 def port_colour(values: Float[Tensor, "N m"], pointwise: Float[Tensor, "N m c"]) -> Tensor:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["either_way", "innovation_gain"]
 
 _CLIPPED = 3.0
+"""Robust standard deviations at which residuals are clipped around their running medians, and their squares end."""
 
 _NEAR = 10
 """Samples to either side whose median a sample is compared with, to tell an outlier from a course."""

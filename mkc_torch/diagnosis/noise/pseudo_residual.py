@@ -13,23 +13,24 @@ if TYPE_CHECKING:
 __all__ = ["pseudo_residual"]
 
 
-REJECTED_BELOW = 0.1
-"""A residual of a smaller weight says nothing, neither of the noise nor of an effect."""
-
-
 def pseudo_residual(
-    error: Float[Tensor, "N m"], sigma: Float[Tensor, " m"], d: Float[Tensor, " m"]
+    error: Float[Tensor, "N m"], sigma: Float[Tensor, " m"], d: Float[Tensor, " m"], rejected_below: float
 ) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:
     """The score of the MKC density over its mean slope, and 1 where a residual counts: 0 where it is rejected.
 
+    Args:
+        error: the residual.
+        sigma, d: of the density.
+        rejected_below: weight below which a residual says nothing, neither of the noise nor of an effect.
+
     Example:
         >>> error = torch.tensor([[0.1], [-0.1], [50.0]])
-        >>> values, counts = pseudo_residual(error, torch.tensor([2.0]), torch.tensor([1.0]))
+        >>> values, counts = pseudo_residual(error, torch.tensor([2.0]), torch.tensor([1.0]), 0.1)
         >>> values.round(decimals=2).squeeze(-1) + 0.0, counts.squeeze(-1)
         (tensor([ 0.1000, -0.1000,  0.0000]), tensor([1., 1., 0.]))
     """
     x = sigma.pow(-2) * (error / d).square()
     weight = torch.exp(-0.5 * x)
-    counts = (weight >= REJECTED_BELOW).to(error.dtype)
+    counts = (weight >= rejected_below).to(error.dtype)
     slope = (counts * weight * (1.0 - x)).sum(-2) / counts.sum(-2).clamp(min=1.0)
     return counts * weight * error / slope.clamp(min=0.2), counts

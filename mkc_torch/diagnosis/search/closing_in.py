@@ -14,12 +14,7 @@ from mkc_torch.functional import mkc_energy
 __all__ = ["closer", "coloured", "middle", "refined"]
 
 _ROUNDS = 3
-
-_CLEAR = 4.0
-"""Nats by which the noise of the search has to prefer another shape to the one of the joint fit."""
-
-_FLAT = 0.5
-"""Nats within which it does not tell neighbouring shapes apart."""
+"""Times that the range about a shape's number is narrowed."""
 
 
 def refined(best: FittedModel, base: FittedModel, *, again: bool = False) -> FittedModel:
@@ -71,7 +66,7 @@ def coloured(best: FittedModel, look: Look) -> FittedModel:
     That is another one where it is clearly better, else the middle one of those that are not told apart, as all onsets
     within a burst of rejected samples are.
     """
-    own, base = best.model.terms[-1], look.scene.base
+    own, base, naming = best.model.terms[-1], look.scene.base, look.settings.naming
     names = continuous(own)
     if not names or look.scene.bends(own):
         return best
@@ -81,30 +76,31 @@ def coloured(best: FittedModel, look: Look) -> FittedModel:
 
     others = closer([own], look)
     here, *there = gains([own, *others])
-    if there and there[0] > here + _CLEAR:
+    if there and there[0] > here + naming.shape_clear:
         moved = others[0]
     else:
         moved = own
         for name in names * _ROUNDS:
             shapes = finer(moved, name, base.model.prepared.time, 1)
-            moved = shapes[middle(gains(shapes), [shape.shape for shape in shapes].index(moved.shape))]
+            place = [shape.shape for shape in shapes].index(moved.shape)
+            moved = shapes[middle(gains(shapes), place, naming.shape_alike)]
     if moved.shape == own.shape:
         return best
     fit = fitted_beside(base, best.model.with_shape(moved.shape), best.parameters, graduate=False)
     return fit if fit.converged else best
 
 
-def middle(values: Sequence[float], place: int) -> int:
-    """The middle one of the neighbours of a place that are not told apart from it, by values in nats.
+def middle(values: Sequence[float], place: int, alike: float) -> int:
+    """The middle one of the neighbours of a place that are not told apart from it, alike within some nats.
 
     Example:
-        >>> middle([1.0, 7.0, 7.2, 7.1, 7.0, 7.2, 2.0, 7.2], 1)
+        >>> middle([1.0, 7.0, 7.2, 7.1, 7.0, 7.2, 2.0, 7.2], 1, 0.5)
         3
     """
     first = last = place
-    while first > 0 and abs(values[first - 1] - values[place]) < _FLAT:
+    while first > 0 and abs(values[first - 1] - values[place]) < alike:
         first -= 1
-    while last < len(values) - 1 and abs(values[last + 1] - values[place]) < _FLAT:
+    while last < len(values) - 1 and abs(values[last + 1] - values[place]) < alike:
         last += 1
     return (first + last) // 2
 

@@ -34,4 +34,5 @@ def p_value_beside(located: Located, possible: Sequence[bool], surrogates: int, 
     mask = torch.tensor(list(possible)) & beside.possible
     if not bool(mask.any()):
         return 1.0
-    return judged(beside.linearised, beside.noise, beside.gains, mask, surrogates, generator)[0]
+    noise = scene.settings.noise
+    return judged(beside.linearised, beside.noise, beside.gains, mask, surrogates, generator, noise)[0]

@@ -20,28 +20,21 @@ from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.colour import Colour
-from mkc_torch.diagnosis.noise.pseudo_residual import REJECTED_BELOW
 from mkc_torch.diagnosis.search.closing_in import closer, coloured, refined
 from mkc_torch.diagnosis.search.look import Look, Scene
 from mkc_torch.diagnosis.search.one_stretch import telling_stretch
 from mkc_torch.diagnosis.search.p_value import judged
 from mkc_torch.diagnosis.search.preference import Preference
-from mkc_torch.diagnosis.search.ranking import SEPARABLE, Ranked, ranked
-from mkc_torch.diagnosis.search.rivals import KEPT, by_joint_fits
+from mkc_torch.diagnosis.search.ranking import Ranked, ranked
+from mkc_torch.diagnosis.search.rivals import by_joint_fits
 from mkc_torch.diagnosis.search.strongest import refitted, strongest
+from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = ["Located", "locate"]
-
-_DOUBTED = 25.0
-"""Nats beyond all draws of noise up to which draws of other noise that is nearly as likely are asked too."""
-
-_HIDDEN, _SMALLER = 0.01, 0.8
-"""Share of the residuals that a fit without an effect may reject and one with it takes, and the scale with it over that
-without, from which the former hides nothing of the effect."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +76,7 @@ def locate(
     level: float,
     surrogates: int,
     generator: torch.Generator,
+    settings: Settings,
     parts: bool = True,
 ) -> Located:
     """Search the candidates beside a fit.
@@ -93,15 +87,16 @@ def locate(
         level: below which p-value the candidate is named with care.
         surrogates: draws of noise that the strongest candidate is judged against, of each kind of noise.
         generator: of the draws.
+        settings: the numbers that decide.
         parts: also start from fits to parts of the recording, for where one model over all of it runs away.
     """
     terms = tuple(terms)
-    prefer = Preference(terms, base.model.prepared)
+    prefer = Preference(terms, base.model.prepared, settings.naming)
     tried = len(terms)
-    fits, tangents = strongest(base, terms, prefer, parts=parts)
-    best, scene = _scene(base, fits, terms, tangents)
+    fits, tangents = strongest(base, terms, prefer, settings, parts=parts)
+    best, scene = _scene(base, fits, terms, tangents, settings)
     # without the effect, as what is left beside it weighs the samples
-    left = beside_wander(best, base.model, scene.around.parameters[: base.model.size], scene.tangents)
+    left = beside_wander(best, base.model, scene.around.parameters[: base.model.size], scene.tangents, settings.noise)
     added = _added(best, scene)
     scene = replace(
         scene,
@@ -116,15 +111,15 @@ def locate(
         look = seen = scene.under()
         p_value, beyond = _judged(look, tried, surrogates, generator)
         noise, beside_nothing = look.noise, look.linearised
-        if p_value <= level and beyond < _DOUBTED:
-            for colour in look.linearised.plausible():
+        if p_value <= level and beyond < settings.search.doubted:
+            for colour in look.linearised.plausible(settings.noise.plausible):
                 p_other, beyond_other = _judged(scene.under(colour), tried, surrogates, generator)
                 p_value, beyond = max(p_value, p_other), min(beyond, beyond_other)
         stretch = None
         if p_value <= level:
             own = int(torch.where(look.possible, look.gains.log_p[:, 0], 0.0).argmin())
             trace = scene.counts * (scene.tangents.candidates[own] @ look.estimate(own))
-            stretch = telling_stretch(scene.values, scene.counts, trace, scene.tangents.nuisance)
+            stretch = telling_stretch(scene.values, scene.counts, trace, scene.tangents.nuisance, settings)
         if stretch is not None:
             rest = scene.without(stretch).under()
             p_other, beyond_other = _judged(rest, tried, surrogates, generator)
@@ -155,20 +150,20 @@ def locate(
 
 
 def _scene(
-    base: FittedModel, fits: Sequence[FittedModel], terms: tuple[Term, ...], tangents: Tangents
+    base: FittedModel, fits: Sequence[FittedModel], terms: tuple[Term, ...], tangents: Tangents, settings: Settings
 ) -> tuple[FittedModel, Scene]:
     """The first fit that can be looked at, and the candidates where they are linear, its own shape included."""
-    if _shows(base, fits[0]):
+    if _shows(base, fits[0], settings):
         best = around = fits[0]
         around, own = base, best.model.terms[-1]
         if own not in terms:
             more = candidate_tangents(base.model, base.parameters, [own], tangents.pointwise)
             terms, tangents = (*terms, own), replace(tangents, candidates=(*tangents.candidates, *more))
     else:
-        best, terms, tangents = _with_tangents(fits, terms)
+        best, terms, tangents = _with_tangents(fits, terms, settings)
         around = best
     tangents = replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
-    return best, Scene(base, around, terms, tangents, around.residual, torch.ones_like(around.residual))
+    return best, Scene(base, around, terms, tangents, around.residual, torch.ones_like(around.residual), settings)
 
 
 def _added(best: FittedModel, scene: Scene) -> Float[Tensor, "N m"]:
@@ -179,7 +174,7 @@ def _added(best: FittedModel, scene: Scene) -> Float[Tensor, "N m"]:
     return torch.einsum("nmq,q->nm", scene.tangents.candidates[number], gamma)
 
 
-def _shows(base: FittedModel, fit: FittedModel) -> bool:
+def _shows(base: FittedModel, fit: FittedModel, settings: Settings) -> bool:
     """Whether a fit without an effect shows what there is of it: it rejects no more, and its scale is no larger.
 
     Then tangents there are the ones to judge it by. At a fit with it, an effect that is nearly not to be seen may have
@@ -188,13 +183,15 @@ def _shows(base: FittedModel, fit: FittedModel) -> bool:
     """
     if fit.model.prepared.ports[fit.model.terms[-1].port].clock is not None:
         return False
-    rejected = (base.weights < REJECTED_BELOW) & (fit.weights >= REJECTED_BELOW)
-    return float(rejected.double().mean()) < _HIDDEN and bool((fit.d > _SMALLER * base.d).all())
+    least, search = settings.noise.rejected_below, settings.search
+    rejected = (base.weights < least) & (fit.weights >= least)
+    return float(rejected.double().mean()) < search.hidden and bool((fit.d > search.smaller * base.d).all())
 
 
 def _judged(look: Look, tried: int, surrogates: int, generator: torch.Generator) -> tuple[float, float]:
     """As :func:`judged` says, of the strongest of the first candidates."""
-    return judged(look.linearised, look.noise, look.gains, look.possible[:tried], surrogates, generator)
+    noise = look.settings.noise
+    return judged(look.linearised, look.noise, look.gains, look.possible[:tried], surrogates, generator, noise)
 
 
 class _Named(NamedTuple):
@@ -207,8 +204,8 @@ class _Named(NamedTuple):
 
 def _named(best: FittedModel, scene: Scene, colour: Colour, prefer: Preference, level: float) -> _Named:
     """Whether there is an effect is asked of the noise that has it in; which one it is, of the noise beside it."""
-    look, base = scene.under(colour), scene.base
-    near = [scene.terms[one.number] for one in ranked(look, prefer) if one.gap < 2.0 * SEPARABLE]
+    look, base, naming = scene.under(colour), scene.base, scene.settings.naming
+    near = [scene.terms[one.number] for one in ranked(look, prefer) if one.gap < 2.0 * naming.separable]
     look = look.with_more(closer(near, look))
     terms, ranking = look.scene.terms, ranked(look, prefer)
     first, own = terms[ranking[0].number], best.model.terms[-1]
@@ -218,8 +215,8 @@ def _named(best: FittedModel, scene: Scene, colour: Colour, prefer: Preference, 
         # the search is linear: where the joint fit loses much of the gain, it went too far; but where noise may wander,
         # what follows the wander gains most in joint fits, and the search knows better if it tells the two apart
         behind = [one.gap for one in ranking if terms[one.number].key == own.key]
-        clear = scene.tangents.slow is not None and not (behind and behind[0] < SEPARABLE)
-        least = 0.0 if clear else KEPT * max(prefer.score(best, base), 0.0)
+        clear = scene.tangents.slow is not None and not (behind and behind[0] < naming.separable)
+        least = 0.0 if clear else naming.kept * max(prefer.score(best, base), 0.0)
         gain = other.log_likelihood - base.log_likelihood if clear else prefer.score(other, base)
         if gain > least or (bends and prefer.by_innovations(best, other) > 0.0):
             best = other
@@ -227,14 +224,14 @@ def _named(best: FittedModel, scene: Scene, colour: Colour, prefer: Preference, 
 
 
 def _with_tangents(
-    fits: Sequence[FittedModel], terms: tuple[Term, ...]
+    fits: Sequence[FittedModel], terms: tuple[Term, ...], settings: Settings
 ) -> tuple[FittedModel, tuple[Term, ...], Tangents]:
     """The first fit that has finite tangents, with them and their candidates, its own shape included."""
     for fit in fits:
         own = fit.model.terms[-1]
         tried = terms if own in terms else (*terms, own)
         try:
-            return fit, tried, tangents_of(fit.model, fit.parameters, tried)
+            return fit, tried, tangents_of(fit.model, fit.parameters, settings.noise, tried)
         except NoFitError:
             if fit is fits[-1]:
                 raise

@@ -17,6 +17,7 @@ from mkc_torch.diagnosis.linearised.wander import NoiseFit
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.colour import Colour
+from mkc_torch.diagnosis.settings import Settings
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -34,6 +35,7 @@ class Scene:
         terms: the candidates.
         tangents: of the parameters of ``base`` and of the candidates.
         values, counts: (N, m), the pseudo-residual without a candidate, and what counts of it.
+        settings: of the search.
     """
 
     base: FittedModel
@@ -42,6 +44,7 @@ class Scene:
     tangents: Tangents
     values: Float[Tensor, "N m"]
     counts: Float[Tensor, "N m"]
+    settings: Settings
 
     @property
     def parts(self) -> tuple[Tensor, ...]:
@@ -80,6 +83,11 @@ class Look:
 
     scene: Scene
     linearised: Linearised
+
+    @property
+    def settings(self) -> Settings:
+        """Those of the scene."""
+        return self.scene.settings
 
     @cached_property
     def gains(self) -> Gains:

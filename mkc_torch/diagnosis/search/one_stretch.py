@@ -8,17 +8,12 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.linearised.beside_wander import explained
 from mkc_torch.diagnosis.noise.bursts import crowded
+from mkc_torch.diagnosis.settings import Settings
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = ["telling_stretch"]
-
-_STRETCHES = 25
-"""A stretch is as long as one of so many parts of the recording, as the blocks of the held-out evidence are."""
-
-_MOST = 0.5
-"""Share of the evidence from which it lies in one stretch."""
 
 
 def telling_stretch(
@@ -26,6 +21,7 @@ def telling_stretch(
     counts: Float[Tensor, "N m"],
     trace: Float[Tensor, "N m"],
     nuisance: Float[Tensor, "N m p"],
+    settings: Settings,
 ) -> tuple[int, int] | None:
     """First sample and the one after the last of the stretch that most of the evidence is from; None if it is spread.
 
@@ -36,6 +32,7 @@ def telling_stretch(
         counts: 0 where a residual is rejected.
         trace: the effect in it, at its likeliest size.
         nuisance: tangents of the simulation's own parameters.
+        settings: how long a stretch is, what share of the evidence lies in it, and what a burst of outliers is.
 
     Example:
         >>> import torch
@@ -43,19 +40,20 @@ def telling_stretch(
         >>> trace[400:420] = 1.0
         >>> counts = torch.ones_like(trace)
         >>> counts[700:730] = 0.0
-        >>> telling_stretch(trace, counts, trace, torch.ones(1000, 1, 1, dtype=torch.float64))
+        >>> telling_stretch(trace, counts, trace, torch.ones(1000, 1, 1, dtype=torch.float64), Settings())
         (380, 420)
-        >>> telling_stretch(trace, torch.ones_like(trace), trace, torch.ones(1000, 1, 1, dtype=torch.float64))
+        >>> everything = torch.ones_like(trace)
+        >>> telling_stretch(trace, everything, trace, torch.ones(1000, 1, 1, dtype=torch.float64), Settings())
     """
     N = len(pseudo)
     left = counts * (pseudo - explained(pseudo, counts, nuisance))
     own = counts * (trace - explained(trace, counts, nuisance))
     gain = (own * (left - 0.5 * own)).sum(-1)
-    width = max(N // _STRETCHES, 1)
+    width = max(N // settings.search.stretches, 1)
     within = gain.unfold(0, width, 1).sum(-1)
     first = int(within.argmax())
-    if not float(within[first]) > _MOST * float(gain.sum()) > 0.0:
+    if not float(within[first]) > settings.search.in_one_stretch * float(gain.sum()) > 0.0:
         return None
-    elsewhere = crowded(1.0 - counts).amax(-1)
+    elsewhere = crowded(1.0 - counts, settings.noise).amax(-1)
     elsewhere[max(first - width, 0) : first + 2 * width] = False
     return (first, first + width) if bool(elsewhere.any()) else None

@@ -11,14 +11,12 @@ from mkc_torch.diagnosis.linearised.linear_search import Gains, log_survival
 from mkc_torch.diagnosis.linearised.linearise import Linearised
 from mkc_torch.diagnosis.linearised.wander import NoiseFit
 from mkc_torch.diagnosis.search.own_colour import own_colour_gains
+from mkc_torch.diagnosis.settings import NoiseSettings
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 __all__ = ["either", "judged"]
-
-_WANDERS = 2.0
-"""Nats that a wander has to gain to be in the draws of noise."""
 
 
 def judged(
@@ -28,6 +26,7 @@ def judged(
     possible: Bool[Tensor, " tried"],
     count: int,
     generator: torch.Generator,
+    settings: NoiseSettings,
 ) -> tuple[float, float]:
     """The p-value of the strongest candidate after the whole search, and how far it is beyond draws of fitted noise.
 
@@ -43,7 +42,7 @@ def judged(
     stationary = linearised.entering(count, generator)
     if stationary is None:
         stationary = linearised.search.white(count, generator)
-    if noise.gain > _WANDERS:
+    if noise.gain > settings.wander_drawn:
         stationary = stationary + linearised.search.wander(count, noise, generator)
     drawn = linearised.search.gains(stationary)
     dof = found.dof.clamp(min=1.0)

@@ -13,25 +13,13 @@ from mkc_torch.diagnosis.model.drivers import ANY, Driver
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term, continuous
 from mkc_torch.diagnosis.noise.innovations import either_way
+from mkc_torch.diagnosis.settings import NamingSettings
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["ALIKE_COLUMNS", "Preference", "alike", "schwarz"]
-
-NAMELESS, OVER_DRIVER, OVER_MOTION = 10.0, 0.25, 0.5
-"""A curve without a name can follow any named effect a little better: nats, and shares of its gain, that it gives.
-
-Of the motion itself all forces are functions, and it repeats itself: there a curve follows them more closely.
-"""
-
-ROLELESS, FOLLOWER, ALIKE_COLUMNS = 0.3, 0.95, 0.9
-"""A column of unknown role may be a consequence of a known driver; the second share holds above this correlation."""
-
-EVENT, ALIKE_EVENT = 0.05, 0.85
-"""An event in time that goes along with a known driver to more than this correlation gives this share."""
-
+__all__ = ["Preference", "alike", "schwarz"]
 
 AKAIKE = 1.0
 """Nats for every number (Akaike's criterion)."""
@@ -43,26 +31,29 @@ class Preference:
     Args:
         terms: all candidates; their drivers of known role are what others are compared with.
         prepared: the simulation of the recording.
+        settings: the handicaps.
     """
 
-    def __init__(self, terms: Sequence[Term], prepared: PreparedSimulation) -> None:
+    def __init__(self, terms: Sequence[Term], prepared: PreparedSimulation, settings: NamingSettings) -> None:
         drivers = {
             id(t.driver): t.driver for t in terms if t.driver is not None and t.driver.role not in (ANY, "position")
         }
         courses = [_unit(driver.values[:, 0]) for driver in drivers.values()]
         self._known = torch.stack(courses) if courses else prepared.time.new_zeros(0, len(prepared.time))
         self._prepared = prepared
+        self._settings = settings
 
     def handicap(self, term: Term, gain: float) -> float:
         """What a candidate's gain is lessened by before it is compared with others."""
-        fixed = share = 0.0
+        fixed, share, give = 0.0, 0.0, self._settings
         if term.effect.is_curve:
-            fixed, share = NAMELESS, OVER_MOTION if term.driver is None else OVER_DRIVER
+            fixed, share = give.nameless, give.over_motion if term.driver is None else give.over_driver
         if term.driver is not None and term.driver.role == ANY:
-            share += FOLLOWER if self._alike(term.driver.values[:, 0]) > ALIKE_COLUMNS else ROLELESS
+            follows = self._alike(term.driver.values[:, 0]) > give.alike_columns
+            share += give.follower if follows else give.roleless
         elif term.driver is None and term.effect.has_course and not term.effect.follows_signal:
             course = term.effect.course(term.shape, term.context(self._prepared, None))
-            share += EVENT if self._alike(course) > ALIKE_EVENT else 0.0
+            share += give.event if self._alike(course) > give.alike_event else 0.0
         return fixed + share * max(gain, 0.0)
 
     def score(self, fit: FittedModel, base: FittedModel) -> float:

@@ -10,10 +10,7 @@ from mkc_torch.diagnosis.model.term import Key, continuous
 from mkc_torch.diagnosis.search.look import Look
 from mkc_torch.diagnosis.search.preference import Preference
 
-__all__ = ["SEPARABLE", "Ranked", "ranked"]
-
-SEPARABLE = 4.5
-"""Nats by which a rival must be less likely to count as told apart: three standard errors of what sets them apart."""
+__all__ = ["Ranked", "ranked"]
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,10 @@ from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.search.closing_in import refined
 from mkc_torch.diagnosis.search.look import Look
 from mkc_torch.diagnosis.search.preference import Preference, schwarz
-from mkc_torch.diagnosis.search.ranking import SEPARABLE, Ranked
+from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.strongest import refitted
 
-__all__ = ["KEPT", "by_joint_fits"]
-
-KEPT = 0.8
-"""Share of the gain that a joint fit keeps of what the search, which is linear, has promised."""
+__all__ = ["by_joint_fits"]
 
 
 def by_joint_fits(
@@ -35,21 +32,22 @@ def by_joint_fits(
     ``known`` fit keeps the gain.
     """
     base, terms, own = look.scene.base, look.scene.terms, best.model.terms[-1].key
-    reach = SEPARABLE + max([one.gap for one in ranking if terms[one.number].key == own], default=0.0)
+    naming = look.settings.naming
+    reach = naming.separable + max([one.gap for one in ranking if terms[one.number].key == own], default=0.0)
     near = [
         one
         for one in ranking
         if one.gap < reach and terms[one.number].key != own and look.scene.bends(terms[one.number])
     ]
     won = prefer.score(best, base)
-    fitted = {fit.model.terms[-1].key: fit for fit in reversed(known) if prefer.score(fit, base) >= KEPT * won}
+    fitted = {fit.model.terms[-1].key: fit for fit in reversed(known) if prefer.score(fit, base) >= naming.kept * won}
     new = [one for one in near if terms[one.number].key not in fitted]
     works = [partial(_tried, best, terms[one.number], look, one.number) for one in new]
     for fit in at_once(works, base.model.prepared, [terms[one.number] for one in new]):
         fitted[fit.model.terms[-1].key] = fit
     fits = [fitted[terms[one.number].key] for one in near]
     scores = [prefer.score(fit, base) for fit in fits]
-    behind = {one.number: won - score for one, score in zip(near, scores, strict=True) if score < KEPT * won}
+    behind = {one.number: won - score for one, score in zip(near, scores, strict=True) if score < naming.kept * won}
     told = sorted((replace(one, gap=max(one.gap, behind.get(one.number, 0.0))) for one in ranking), key=_gap)
     told = [replace(one, gap=one.gap - told[0].gap) for one in told]
     simpler = [
@@ -62,7 +60,7 @@ def by_joint_fits(
     if simpler:
         return max(simpler, key=lambda one: one[0])[1], tuple(told)
     bent = [fit for fit in known if look.scene.bends(fit.model.terms[-1])]
-    return _by_innovations(best, tuple(told), terms, prefer, [*fits, *bent])
+    return _by_innovations(best, tuple(told), terms, prefer, [*fits, *bent], naming.separable)
 
 
 def _by_innovations(
@@ -71,6 +69,7 @@ def _by_innovations(
     terms: tuple[Term, ...],
     prefer: Preference,
     fits: Sequence[FittedModel],
+    separable: float,
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
     """The fit, or one of another physics that clearly leaves less in coloured noise; and the ranking by that.
 
@@ -82,7 +81,7 @@ def _by_innovations(
     fits = [best, *fits]
     for fit in fits:
         another = fit.model.terms[-1].key != best.model.terms[-1].key
-        if another and prefer.by_innovations(best, fit) > SEPARABLE:
+        if another and prefer.by_innovations(best, fit) > separable:
             best = fit
     own = best.model.terms[-1].key
     behind: dict[Key, float] = {}

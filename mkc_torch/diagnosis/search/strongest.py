@@ -20,6 +20,7 @@ from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.search.closing_in import refined
 from mkc_torch.diagnosis.search.look import Look
 from mkc_torch.diagnosis.search.preference import Preference
+from mkc_torch.diagnosis.settings import SearchSettings, Settings
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.protocol import Beginning
 
@@ -30,16 +31,6 @@ T = TypeVar("T")
 
 __all__ = ["refitted", "strongest"]
 
-_SHORT_LIST = 6
-_PARTS, _BETTER = 2, 0.8
-_AWAY = 5.0
-"""Times that a parameter is larger, or smaller, than where its fit began."""
-
-_LEADING, _THIRD, _MUCH = 2, 0.6, 50.0
-"""Fits whose shapes are tried; a third one, where it has this share of the first one's score and as many nats."""
-
-_SHAPES = 5
-
 Start = tuple[Tensor, tuple[Tensor, Tensor]]
 """Parameters to linearise around, and the pseudo-residual there with what counts of it."""
 
@@ -48,7 +39,7 @@ Listed = tuple[Term, Tensor]
 
 
 def strongest(
-    base: FittedModel, terms: tuple[Term, ...], prefer: Preference, *, parts: bool
+    base: FittedModel, terms: tuple[Term, ...], prefer: Preference, settings: Settings, *, parts: bool
 ) -> tuple[list[FittedModel], Tangents]:
     """The joint refits, the likeliest first; the leading ones each at its best shape, and behind them the others.
 
@@ -59,28 +50,34 @@ def strongest(
     where its fit began.
     """
     around = base.parameters
-    tangents = tangents_of(base.model, around, terms)
-    looks = [((around, base.pseudo), _SHORT_LIST), ((around, clipped_residual(base.residual)), 2)]
+    noise, search = settings.noise, settings.search
+    tangents = tangents_of(base.model, around, noise, terms)
+    looks = [
+        ((around, base.pseudo(noise)), search.refitted),
+        ((around, clipped_residual(base.residual)), search.refitted_elsewhere),
+    ]
     works = [partial(_short_list, base, terms, start, tangents, most) for start, most in looks]
     lists = at_once(works, base.model.prepared, terms)
     fits: dict[Key, FittedModel] = {}
-    fitted_parts = _part_fits(base) if parts else []
+    fitted_parts = _part_fits(base, search.parts) if parts else []
     listed: dict[Key, Listed] = {}
     for one in chain(*(chosen for chosen, _ in lists)):
         listed.setdefault(one[0].key, one)
     starts = _refit_all(fits, base, list(listed.values()), prefer, fitted_parts)
     if parts:
         least = torch.stack([fit.d for fit in fits.values()]).amin(0)
-        started = [one.start for one in starts if one is not None and bool((one.scale < _BETTER * least).any())]
+        started = [
+            one.start for one in starts if one is not None and bool((one.scale < search.part_better * least).any())
+        ]
         more = [
-            _short_list(base, terms, start, tangents_of(base.model, start[0], terms), 2)
-            for start in (*started, *_first_start(base))
+            _short_list(base, terms, start, tangents_of(base.model, start[0], noise, terms), search.refitted_elsewhere)
+            for start in (*started, *_first_start(base, search.ran_away))
         ]
         _refit_all(fits, base, [*chain(*(chosen for chosen, _ in more))], prefer)
         lists += more
     likeliest = torch.stack([log_p for _, log_p in lists]).amin(0)
     order = [terms[number] for number in likeliest.argsort().tolist()]
-    leading = _at_best_shapes(_leading(list(fits.values()), base, prefer), base, order, prefer)
+    leading = _at_best_shapes(_leading(list(fits.values()), base, prefer, search), base, order, prefer, search.shapes)
     shaped = at_once([partial(refined, fit, base) for fit in leading], base.model.prepared, terms)
     keys = {fit.model.terms[-1].key for fit in shaped}
     parted = shaped, [fit for key, fit in fits.items() if key not in keys]
@@ -122,7 +119,7 @@ class _Part:
     scale: Float[Tensor, " m"]
 
 
-def _part_fits(base: FittedModel) -> list[Callable[[], _Part | None]]:
+def _part_fits(base: FittedModel, parts: int) -> list[Callable[[], _Part | None]]:
     """Works that fit parts of the recording; None where one cannot be fitted alone."""
     N = len(base.model.prepared.time)
 
@@ -135,18 +132,18 @@ def _part_fits(base: FittedModel) -> list[Callable[[], _Part | None]]:
         residual = base.model.residual(parameters)
         return _Part((parameters, clipped_residual(residual)), robust_scale(residual[rows]))
 
-    part = torch.arange(N) * _PARTS // N
-    return [partial(fit_to, part == number) for number in range(_PARTS)]
+    part = torch.arange(N) * parts // N
+    return [partial(fit_to, part == number) for number in range(parts)]
 
 
-def _first_start(base: FittedModel) -> list[Start]:
+def _first_start(base: FittedModel, away: float) -> list[Start]:
     """Around where the fit began, if a parameter of the equations went far from there: what they lack can drive it."""
     prepared = base.model.prepared
     if not isinstance(prepared, Beginning):
         return []
     theta, own = prepared.start(), base.model.base - prepared.beginnings
     sizes = torch.stack([theta[:own], base.parameters[:own]]).abs()
-    if not bool((sizes.amax(0) > _AWAY * sizes.amin(0)).any()):
+    if not bool((sizes.amax(0) > away * sizes.amin(0)).any()):
         return []
     parameters = torch.cat([theta, base.parameters[base.model.base :]])
     residual = base.model.residual(parameters)
@@ -169,17 +166,20 @@ def _refit_all(
     return done[len(works) :]
 
 
-def _leading(fits: Sequence[FittedModel], base: FittedModel, prefer: Preference) -> list[FittedModel]:
+def _leading(
+    fits: Sequence[FittedModel], base: FittedModel, prefer: Preference, settings: SearchSettings
+) -> list[FittedModel]:
     """The first ones, and another that is close behind."""
-    first = sorted(fits, key=lambda fit: prefer.score(fit, base), reverse=True)[: _LEADING + 1]
-    close = max(_THIRD * prefer.score(first[0], base), _MUCH)
-    return [fit for place, fit in enumerate(first) if place < _LEADING or prefer.score(fit, base) > close]
+    leading = settings.leading
+    first = sorted(fits, key=lambda fit: prefer.score(fit, base), reverse=True)[: leading + 1]
+    close = max(settings.third_share * prefer.score(first[0], base), settings.third_nats)
+    return [fit for place, fit in enumerate(first) if place < leading or prefer.score(fit, base) > close]
 
 
 def _at_best_shapes(
-    fits: Sequence[FittedModel], base: FittedModel, terms: Sequence[Term], prefer: Preference
+    fits: Sequence[FittedModel], base: FittedModel, terms: Sequence[Term], prefer: Preference, most: int
 ) -> list[FittedModel]:
-    """Each fit, or a better one with another shape of the same effect, the likeliest of ``terms`` first.
+    """Each fit, or a better one with another shape of the same effect, of so many of ``terms`` the likeliest first.
 
     Onsets are many, and closed in on later.
     """
@@ -187,7 +187,7 @@ def _at_best_shapes(
     for place, fit in enumerate(fits):
         own = fit.model.terms[-1]
         others = [t for t in terms if t.key == own.key and t.shape != own.shape]
-        tried += [(place, other) for other in others[:_SHAPES] if "onset" not in own.shape]
+        tried += [(place, other) for other in others[:most] if "onset" not in own.shape]
     works = [partial(_reshaped, fits[k], base, other) for k, other in tried]
     refits = at_once(works, base.model.prepared, terms)
     best = list(fits)

@@ -16,6 +16,7 @@ from mkc_torch.diagnosis.model.drivers import Driver, find_drivers
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.settings import ConfirmationSettings, DriverSettings, EvidenceSettings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.line import Line
@@ -45,7 +46,11 @@ def made(sensor=0.0, *, use="norm", seed=0, **columns):
     simulation = Magnetometer(use=use)
     prepared = simulation.prepare(recording)
     fit = fitted(JointModel(prepared), prepared.start())
-    return fit, find_drivers(prepared.recording, simulation.columns).drivers, blocks_of(N, 3)
+    return (
+        fit,
+        find_drivers(prepared.recording, simulation.columns, DriverSettings()).drivers,
+        blocks_of(N, 3, ConfirmationSettings()),
+    )
 
 
 def gained(better, worse, blocks):
@@ -142,7 +147,7 @@ def line_and_drivers(count):
 def test_a_port_that_is_not_pointwise(count):
     """Both where all columns are made and where the promising ones have to be chosen by reverse mode."""
     line, drivers = line_and_drivers(count)
-    fit, blocks = fitted(JointModel(line), line.start()), blocks_of(600, 3)
+    fit, blocks = fitted(JointModel(line), line.start()), blocks_of(600, 3, ConfirmationSettings())
     found = ceiling(fit.model, fit, drivers, blocks)
     assert "column_0" in found.columns
     level = stats.norm(0.0, 0.1).logpdf(found.evidence.residual.numpy()).sum(-1).mean()
@@ -151,7 +156,7 @@ def test_a_port_that_is_not_pointwise(count):
 
 
 def test_a_fold_knows_nothing_of_its_own_samples():
-    line, spoilt, blocks = Line(300), Line(300), blocks_of(300, 1)
+    line, spoilt, blocks = Line(300), Line(300), blocks_of(300, 1, ConfirmationSettings())
     hidden = ~blocks.train[2]
     spoilt.measured[hidden] += 0.7
     first = fitted(JointModel(line), line.start())
@@ -194,7 +199,7 @@ def test_noise_that_wanders_is_not_told_as_what_remains(wandering):
     fit, drivers, blocks, alone = wandering
     corrected = held_out(fit, blocks)
     assert gained(alone.evidence, corrected, blocks) > 0.0
-    assert remaining(alone, corrected, fit, drivers, blocks, 0) == ()
+    assert remaining(alone, corrected, fit, drivers, blocks, 0, EvidenceSettings()) == ()
 
 
 def test_a_wandering_column_that_matters_is_told_from_wandering_noise():
@@ -202,7 +207,7 @@ def test_a_wandering_column_that_matters_is_told_from_wandering_noise():
     offset = NOISE * np.cumsum(random.standard_normal((N, 3)), 0) / np.sqrt(N)
     fit, drivers, blocks = made(offset + along(LOAD), load=LOAD, **walks(3, seed=7))
     alone = ceiling(fit.model, fit, drivers, blocks)
-    assert "load" in remaining(alone, held_out(fit, blocks), fit, drivers, blocks, 0)
+    assert "load" in remaining(alone, held_out(fit, blocks), fit, drivers, blocks, 0, EvidenceSettings())
 
 
 def scores(gain, columns=("load",)):
@@ -224,4 +229,15 @@ def scores(gain, columns=("load",)):
 def test_what_remains_gains_enough_and_more_than_time(monkeypatch, gain, by_time, columns, told):
     monkeypatch.setattr("mkc_torch.diagnosis.evidence.remaining.ceiling", lambda *_: scores(by_time, ()))
     fit = SimpleNamespace(model=SimpleNamespace(terms=()))
-    assert remaining(scores(gain, columns), scores(0.0).evidence, fit, (), blocks_of(N, 3), 0) == told
+    assert (
+        remaining(
+            scores(gain, columns),
+            scores(0.0).evidence,
+            fit,
+            (),
+            blocks_of(N, 3, ConfirmationSettings()),
+            0,
+            EvidenceSettings(),
+        )
+        == told
+    )

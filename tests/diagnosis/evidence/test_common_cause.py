@@ -14,6 +14,7 @@ from mkc_torch.diagnosis.files.model import DiagnosedModel
 from mkc_torch.diagnosis.linearised.linear_search import LinearSearch
 from mkc_torch.diagnosis.linearised.tangents import Slow
 from mkc_torch.diagnosis.noise.cosine_basis import cosines
+from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
 from mkc_torch.report.diagnosis.verdict import headline
 from mkc_torch.simulation import Magnetometer
@@ -43,12 +44,12 @@ def searching(covariance, seed, size=3.0):
     k = torch.arange(1, K + 1, dtype=torch.float64).repeat_interleave(C)
     scales = (1.0 / k).unsqueeze(0)
     channels = torch.randn(SAMPLES, 1, C, generator=generator, dtype=torch.float64)
-    slow = Slow("sensor", C, channels, True, scales)
+    slow = Slow("sensor", C, channels, True, scales, NoiseSettings().walk_first)
     tangents = (cosines(K, SAMPLES)[:, :, None] * channels).reshape(SAMPLES, K * C)
     root = torch.linalg.cholesky(torch.as_tensor(covariance) + 1e-9 * torch.eye(C, dtype=torch.float64))
     drawn = size * (torch.randn(K, C, generator=generator, dtype=torch.float64) @ root.mT).flatten() / k
     series = tangents @ drawn + torch.randn(SAMPLES, generator=generator, dtype=torch.float64)
-    search = LinearSearch(torch.ones(SAMPLES, 1, dtype=torch.float64), [], tangents, scales)
+    search = LinearSearch(torch.ones(SAMPLES, 1, dtype=torch.float64), [], tangents, scales, NoiseSettings().walk_first)
     linearised = SimpleNamespace(search=search, series=series, wanders=search.noise_fit(series).gain > 0)
     return linearised, slow, tangents @ drawn
 

@@ -15,6 +15,7 @@ from mkc_torch.diagnosis.evidence.density import (
     student_cdf,
     student_fit,
 )
+from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling
 
@@ -25,7 +26,9 @@ def checked(*channels):
     """Of residuals, each channel with the density that is fitted to it."""
     residual = torch.stack([torch.as_tensor(channel) for channel in channels], -1)
     fit = fit_density(residual)
-    return density_checks(residual, fit.sigma, fit.d, fit.bound, [f"channel_{k}" for k in range(len(channels))])
+    return density_checks(
+        residual, fit.sigma, fit.d, fit.bound, [f"channel_{k}" for k in range(len(channels))], EvidenceSettings()
+    )
 
 
 def warned(*channels):
@@ -80,7 +83,9 @@ def test_distances_are_told_whether_or_not_there_is_a_warning():
 
 def test_residuals_that_are_all_zero_have_distances():
     one = torch.ones(1, dtype=torch.float64)
-    (check,) = density_checks(torch.zeros(50, 1, dtype=torch.float64), one, one, 10.0 * one, ["norm"])
+    (check,) = density_checks(
+        torch.zeros(50, 1, dtype=torch.float64), one, one, 10.0 * one, ["norm"], EvidenceSettings()
+    )
     assert check.distance == pytest.approx(1.0)
     assert check.student_distance == pytest.approx(1.0)
 

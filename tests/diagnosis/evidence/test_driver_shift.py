@@ -13,6 +13,7 @@ from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import DriverShift
 from mkc_torch.diagnosis.search.locate import locate
+from mkc_torch.diagnosis.settings import DriverSettings, EvidenceSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling
@@ -31,17 +32,19 @@ def found(N, driver, effect="current_field", *, searched=None, **columns):
     simulation = Magnetometer("attitude")
     prepared = simulation.prepare(recording)
     roles = frozenset(role for one in CATALOGUE for role in one.roles)
-    drivers = find_drivers(prepared.recording, simulation.columns, roles).drivers
+    drivers = find_drivers(prepared.recording, simulation.columns, DriverSettings(), roles).drivers
     base = fitted(JointModel(prepared), prepared.start())
     terms = candidate_terms(prepared, drivers, [one for one in CATALOGUE if one.id == (searched or effect)])
-    located = locate(base, terms, level=0.05, surrogates=19, generator=torch.Generator().manual_seed(0))
+    located = locate(
+        base, terms, level=0.05, surrogates=19, generator=torch.Generator().manual_seed(0), settings=Settings()
+    )
     return shifted(base.model, located)
 
 
 def warning(shift):
     effect = next(e for e in CATALOGUE if e.id == "current_field")
     column = Driver(("load",), "current", torch.zeros(5, 1), torch.zeros(1), ("A",))
-    return said(shift, Term(effect, column, {})).warnings
+    return said(shift, Term(effect, column, {}), EvidenceSettings()).warnings
 
 
 def test_no_shifted_copy_of_a_lively_driver_gains_as_much():

@@ -18,6 +18,7 @@ from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.rounds import Asked, begun, continued
+from mkc_torch.diagnosis.settings import ConfirmationSettings, DriverSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.line import Line
@@ -30,8 +31,8 @@ TIME = np.arange(N) / 50.0
 def without_findings():
     line = Line(300)
     base = fitted(JointModel(line), line.start())
-    blocks = blocks_of(300, 1)
-    return Case(base, None, (), (held_out(base, blocks),), blocks, (), 0)
+    blocks = blocks_of(300, 1, ConfirmationSettings())
+    return Case(base, None, (), (held_out(base, blocks),), blocks, (), 0, Settings())
 
 
 def with_findings():
@@ -42,13 +43,13 @@ def with_findings():
     prepared = simulation.prepare(tumbling(N, noise=0.3, sensor=sensor, current=current))
     effects = [effect for effect in CATALOGUE if effect.id in ("current_field", "hard_iron_step")]
     roles = frozenset(role for effect in effects for role in effect.roles)
-    drivers = find_drivers(prepared.recording, simulation.columns, roles).drivers
+    drivers = find_drivers(prepared.recording, simulation.columns, DriverSettings(), roles).drivers
     base = fitted(JointModel(prepared), prepared.start())
-    asked, generator = Asked(0.05, 19, 2, 0), torch.Generator().manual_seed(0)
+    asked, generator = Asked(0.05, 19, 2, 0, Settings()), torch.Generator().manual_seed(0)
     search = begun(base, candidate_terms(prepared, drivers, effects), asked, generator)
     search = continued(search, asked, generator)
     assert len(search.found) == 2
-    return Case(base, search.first, search.found, search.evidence, search.blocks, drivers, 0)
+    return Case(base, search.first, search.found, search.evidence, search.blocks, drivers, 0, Settings())
 
 
 @pytest.fixture(scope="module", params=[without_findings, with_findings])

@@ -11,6 +11,7 @@ from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import Extrapolation
+from mkc_torch.diagnosis.settings import DriverSettings, EvidenceSettings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import FIELD, RESPONSE, tumbling, turns
@@ -33,7 +34,7 @@ def both(trace, effect="driver_offset", **columns):
     recording = tumbling(N, noise=0.4, sensor=sensor + outliers(), **columns)
     simulation = Magnetometer(use="norm")
     prepared = simulation.prepare(recording)
-    driver = find_drivers(prepared.recording, simulation.columns).drivers[0]
+    driver = find_drivers(prepared.recording, simulation.columns, DriverSettings()).drivers[0]
     without = fitted(JointModel(prepared), prepared.start())
     physics = next(e for e in CATALOGUE if e.id == effect)
     term = Term(physics, driver, physics.shapes(prepared.time)[0])
@@ -44,13 +45,13 @@ def both(trace, effect="driver_offset", **columns):
 
 def held_beyond(fits, seed=0):
     without, fit = fits
-    return extrapolated(without, fit, fit.model.terms[-1], seed)
+    return extrapolated(without, fit, fit.model.terms[-1], seed, EvidenceSettings())
 
 
 def warning(found):
     effect = next(e for e in CATALOGUE if e.id == "driver_offset")
     load = Driver(("load",), "any", torch.zeros(5, 1), torch.zeros(1), ("A",))
-    return said(found, Term(effect, load, {})).warnings
+    return said(found, Term(effect, load, {}), EvidenceSettings()).warnings
 
 
 def test_what_is_in_proportion_throughout_holds_where_the_driver_is_high():

@@ -10,12 +10,13 @@ from scipy import stats
 from mkc_torch.diagnosis.evidence.held_out import blocks_of, gain_interval, held_out, scored
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.settings import ConfirmationSettings
 from tests.diagnosis.line import Line
 
 
 @pytest.mark.parametrize("N", [100, 777, 4500])
 def test_every_sample_is_held_out_once(N):
-    blocks = blocks_of(N, 3)
+    blocks = blocks_of(N, 3, ConfirmationSettings())
     assert blocks.block.tolist() == sorted(blocks.block.tolist())
     counts = torch.bincount(blocks.block)
     assert len(counts) == 25
@@ -30,7 +31,7 @@ def test_every_sample_is_held_out_once(N):
 @pytest.mark.parametrize("N", [100, 777, 4500])
 @pytest.mark.parametrize("correlation", [1, 5])
 def test_a_gap_lies_beside_held_out_samples(N, correlation):
-    blocks = blocks_of(N, correlation)
+    blocks = blocks_of(N, correlation, ConfirmationSettings())
     index = torch.arange(N)
     for k in range(5):
         held, train = index[blocks.fold == k], index[blocks.train[k]]
@@ -40,7 +41,7 @@ def test_a_gap_lies_beside_held_out_samples(N, correlation):
 
 
 def test_the_gap_is_a_correlation_time_at_least():
-    blocks = blocks_of(4500, 80)
+    blocks = blocks_of(4500, 80, ConfirmationSettings())
     index = torch.arange(4500)
     for k in range(5):
         held, train = index[blocks.fold == k], index[blocks.train[k]]
@@ -54,7 +55,7 @@ def fit():
 
 
 def test_held_out_residuals_are_those_of_the_fit_to_the_rest(fit):
-    blocks = blocks_of(300, 1)
+    blocks = blocks_of(300, 1, ConfirmationSettings())
     found = held_out(fit, blocks)
     line = fit.model.prepared
     assert found.residual.shape == (300, 2)
@@ -72,7 +73,7 @@ def test_held_out_residuals_are_those_of_the_fit_to_the_rest(fit):
 
 
 def test_a_fold_knows_nothing_of_its_own_samples(fit):
-    blocks = blocks_of(300, 1)
+    blocks = blocks_of(300, 1, ConfirmationSettings())
     spoilt = Line(300)
     hidden = ~blocks.train[2]
     spoilt.measured[hidden] += 0.7

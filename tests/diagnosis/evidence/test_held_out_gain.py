@@ -14,6 +14,7 @@ from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import fitted, fitted_beside
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.settings import ConfirmationSettings, DriverSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling
@@ -32,7 +33,10 @@ def fits():
     recording = tumbling(N, noise=0.3, sensor=sensor, small=SMALL, large=LARGE)
     simulation = Magnetometer("norm")
     prepared = simulation.prepare(recording)
-    known = {driver.columns[0]: driver for driver in find_drivers(prepared.recording, simulation.columns).drivers}
+    known = {
+        driver.columns[0]: driver
+        for driver in find_drivers(prepared.recording, simulation.columns, DriverSettings()).drivers
+    }
     done = [fitted(JointModel(prepared), prepared.start())]
     for name in ("small", "large"):
         model = done[-1].model.with_term(Term(OFFSET, known[name], OFFSET.shapes(prepared.time)[0]))
@@ -44,12 +48,12 @@ def fits():
 @pytest.fixture
 def beside(fits):
     """The evidence without the small effect, if that is asked for."""
-    blocks = blocks_of(N, 1)
+    blocks = blocks_of(N, 1, ConfirmationSettings())
     none, small, both = fits
     found = SimpleNamespace(fit=small), SimpleNamespace(fit=both)
 
     def without(*evidence):
-        return held_out_gain.beside_the_others(Case(none, None, found, evidence, blocks, (), 0))
+        return held_out_gain.beside_the_others(Case(none, None, found, evidence, blocks, (), 0, Settings()))
 
     return without, [held_out(fit, blocks) for fit in fits]
 
@@ -57,7 +61,7 @@ def beside(fits):
 def test_what_is_not_confirmed_by_itself_is_judged_beside_the_other(fits, beside):
     without_small, (none, _, both) = beside
     without = without_small(none, none, both)
-    blocks = blocks_of(N, 1)
+    blocks = blocks_of(N, 1, ConfirmationSettings())
     alone = fitted_beside(
         fits[0], fits[0].model.with_term(fits[2].model.terms[1]), torch.cat([fits[0].parameters, torch.zeros(3)])
     )

@@ -10,12 +10,13 @@ from mkc_torch.diagnosis.evidence import one_stretch
 from mkc_torch.diagnosis.evidence.base import Case
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE
 
 EFFECTS = {effect.id: effect for effect in CATALOGUE}
 LOAD = Driver(("load",), "any", torch.zeros(5, 1), torch.zeros(1), ("A",))
 PREPARED = SimpleNamespace(time=torch.arange(100) / 10.0)
-CASE = Case(SimpleNamespace(model=SimpleNamespace(prepared=PREPARED)), None, (), (), None, (), 0)
+CASE = Case(SimpleNamespace(model=SimpleNamespace(prepared=PREPARED)), None, (), (), None, (), 0, Settings())
 
 
 def said(term, stretch):

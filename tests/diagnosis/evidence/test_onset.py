@@ -15,6 +15,7 @@ from mkc_torch.diagnosis.model.fit import fitted, fitted_beside
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.look import Scene
+from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import RATE, tumbling
@@ -37,11 +38,11 @@ def interval(size, seed, *, spoilt=(0, 0), effect=STEP, shape=None):
     start = base.parameters.new_zeros(model.size)
     start[: len(base.parameters)] = base.parameters
     best = fitted_beside(base, model, start)
-    tangents = tangents_of(best.model, best.parameters, best.model.terms)
+    tangents = tangents_of(best.model, best.parameters, NoiseSettings(), best.model.terms)
     tangents = dataclasses.replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
-    pseudo, counts = best.pseudo
+    pseudo, counts = best.pseudo(NoiseSettings())
     without = pseudo - counts * (tangents.candidates[0] @ best.parameters[base.model.size :])
-    scene = Scene(base, best, best.model.terms, tangents, without, counts)
+    scene = Scene(base, best, best.model.terms, tangents, without, counts, Settings())
     return onset_interval(base.model, SimpleNamespace(fit=best, scene=scene, look=scene.under()))
 
 

@@ -13,6 +13,7 @@ from mkc_torch.diagnosis.linearised.estimate import estimate
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.settings import ConfirmationSettings, NamingSettings, NoiseSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics, Parameter
 
@@ -64,7 +65,7 @@ def fit_of(recording, *effects, start=0.3):
     base = fitted(JointModel(prepared), prepared.start())
     more = base.parameters.new_full((model.size - model.base,), start)
     fit = fitted(model, torch.cat([base.parameters, more]), base.bound)
-    blocks = blocks_of(N, 1)
+    blocks = blocks_of(N, 1, ConfirmationSettings())
     return fit, held_out(fit, blocks), blocks
 
 
@@ -76,7 +77,7 @@ def always(_fit, _evidence):
 def test_sensors_that_are_alike_share_one_number(seed):
     fit, evidence, blocks = fit_of(recorded(share=(1.0, 1.0), seed=seed), OF["sensor_lag"])
     assert fit.model.sizes == (2,)
-    simple, after = simplified(fit, evidence, blocks, always)
+    simple, after = simplified(fit, evidence, blocks, always, NamingSettings())
     assert simple.model.sizes == (1,)
     lag = simple.model.terms[0].shape["lag"]  # fitted again
     assert lag != 0.5
@@ -87,7 +88,7 @@ def test_sensors_that_are_alike_share_one_number(seed):
 
 def test_where_one_sensor_is_quick_each_keeps_its_own():
     fit, evidence, blocks = fit_of(recorded(share=(1.0, 0.0)), OF["sensor_lag"])
-    kept, after = simplified(fit, evidence, blocks, always)
+    kept, after = simplified(fit, evidence, blocks, always, NamingSettings())
     assert kept is fit
     assert after is evidence
     assert fit.parameters[-2:].tolist() == pytest.approx([1.0, 0.0], abs=0.2)
@@ -96,7 +97,7 @@ def test_where_one_sensor_is_quick_each_keeps_its_own():
 @pytest.mark.parametrize(("exchange", "size"), [((0.2, 0.2), 1), ((0.3, 0.1), 2)])
 def test_what_equals_exchange_is_one_number(exchange, size):
     fit, evidence, blocks = fit_of(recorded(exchange), OF["coupling"], start=0.1)
-    simple, _ = simplified(fit, evidence, blocks, always)
+    simple, _ = simplified(fit, evidence, blocks, always, NamingSettings())
     assert simple.model.sizes == (size,)
     assert simple.parameters[-size:].tolist() == pytest.approx(list(exchange[:size]), abs=0.02)
 
@@ -109,26 +110,26 @@ def test_a_form_that_makes_no_finding_any_more_is_not_taken():
         asked.append((other.model.sizes, len(after.log_likelihood)))
         return False
 
-    assert simplified(fit, evidence, blocks, never) == (fit, evidence)
+    assert simplified(fit, evidence, blocks, never, NamingSettings()) == (fit, evidence)
     assert asked == [((1,), N)]
 
 
 def test_an_earlier_effect_is_simplified_beside_a_later_one():
     fit, evidence, blocks = fit_of(recorded((0.3, 0.1), (1.0, 1.0)), OF["sensor_lag"], OF["coupling"], start=0.2)
-    simple, _ = simplified(fit, evidence, blocks, always)
+    simple, _ = simplified(fit, evidence, blocks, always, NamingSettings())
     assert simple.model.sizes == (1, 2)
     assert simple.parameters[simple.model.base :].tolist() == pytest.approx([1.0, 0.3, 0.1], abs=0.1)
 
 
 def test_an_effect_without_a_simpler_form_stays():
     fit, evidence, blocks = fit_of(recorded(), OF["linear_drag"], start=0.0)
-    assert simplified(fit, evidence, blocks, always) == (fit, evidence)
+    assert simplified(fit, evidence, blocks, always, NamingSettings()) == (fit, evidence)
 
 
 def test_the_simpler_form_is_written_and_read_like_the_other():
     recording = recorded((0.2, 0.2))
-    simple, _ = simplified(*fit_of(recording, OF["coupling"], start=0.1), always)
-    model = model_of(estimate(simple), Bodies())
+    simple, _ = simplified(*fit_of(recording, OF["coupling"], start=0.1), always, NamingSettings())
+    model = model_of(estimate(simple, NoiseSettings()), Bodies())
     again = DiagnosedModel.from_json(model.to_json(), simulation=Bodies())
     torch.testing.assert_close(again(recording)["left"], model(recording)["left"])
 

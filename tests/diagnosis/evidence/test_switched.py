@@ -5,6 +5,7 @@ import torch
 
 from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.evidence.switched import comes_and_goes, memory_of
+from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
 from mkc_torch.simulation import Magnetometer
 
@@ -28,7 +29,9 @@ def gain_of(course, size, phi=0.0, seed=0):
 @pytest.mark.parametrize(("size", "phi"), [(3.0, 0.0), (0.15, 0.0), (3.0, 0.9), (0.7, 0.9)])
 def test_a_step_that_lasts_does_not_come_and_go(size, phi, seed):
     gain = gain_of((TIME >= ONSET).double(), size, phi, seed)
-    assert not comes_and_goes(gain, TIME, float(ONSET), memory_of([torch.tensor([phi], dtype=torch.float64)]))
+    assert not comes_and_goes(
+        gain, TIME, float(ONSET), EvidenceSettings(), memory_of([torch.tensor([phi], dtype=torch.float64)])
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -36,7 +39,9 @@ def test_a_step_that_lasts_does_not_come_and_go(size, phi, seed):
 def test_what_is_switched_comes_and_goes(size, phi, seed):
     switched = (TIME >= ONSET).double() * (torch.sin((TIME - ONSET) / 100.0) >= -0.3).double()
     gain = gain_of(switched, size, phi, seed)
-    assert comes_and_goes(gain, TIME, float(ONSET), memory_of([torch.tensor([phi], dtype=torch.float64)]))
+    assert comes_and_goes(
+        gain, TIME, float(ONSET), EvidenceSettings(), memory_of([torch.tensor([phi], dtype=torch.float64)])
+    )
 
 
 @pytest.mark.parametrize("lasts", [True, False])

@@ -9,6 +9,7 @@ import torch
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.evidence.whiteness import whiteness
 from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
+from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling
 
@@ -20,7 +21,7 @@ def draws(seed, count=N):
 
 
 def of(values, counts=None):
-    return whiteness(values, torch.ones_like(values) if counts is None else counts)
+    return whiteness(values, torch.ones_like(values) if counts is None else counts, EvidenceSettings())
 
 
 def autoregressive(seed, phi):

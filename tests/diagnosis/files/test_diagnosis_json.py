@@ -22,6 +22,7 @@ from mkc_torch.diagnosis.result import (
     Region,
     Told,
 )
+from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.effects import CATALOGUE
 from tests.diagnosis.factory import make_diagnosis, with_evidence
 
@@ -74,7 +75,9 @@ def test_the_ceiling_is_written_as_the_other_models_are():
 
 
 def test_what_is_for_the_report_alone_is_not_written():
-    diagnosis = with_finding(make_diagnosis(1), extrapolation.said(Extrapolation(0.2, (0.1, 0.3)), BY_LOAD))
+    diagnosis = with_finding(
+        make_diagnosis(1), extrapolation.said(Extrapolation(0.2, (0.1, 0.3)), BY_LOAD, EvidenceSettings())
+    )
     assert written(diagnosis) == written(make_diagnosis(1))
 
 
@@ -89,9 +92,9 @@ def test_the_region_and_the_experiments_are_written_where_there_are_any():
 
 
 def test_what_shifted_copies_of_a_driver_gain_is_written():
-    (finding,) = written(with_finding(make_diagnosis(1), driver_shift.said(DriverShift(38, 2, 22.5), BY_LOAD)))[
-        "findings"
-    ]
+    (finding,) = written(
+        with_finding(make_diagnosis(1), driver_shift.said(DriverShift(38, 2, 22.5), BY_LOAD, EvidenceSettings()))
+    )["findings"]
     assert finding["driver_shift"] == {"copies": 38, "as_good": 2, "reach": 22.5}
     assert "driver_shift" not in written(make_diagnosis(1))["findings"][0]
 
@@ -120,7 +123,9 @@ def test_the_noise_s_units_and_its_density_s_distances_are_written():
     made = make_diagnosis(1)
     check = DensityCheck("norm", 0.02, 0.03, 4.0, 0.05, False)
     noise = dataclasses.replace(made.noise, units={"wander": "µT"}, unit="µT")
-    told = written(with_evidence(dataclasses.replace(made, noise=noise), density.said([check])))["noise"]
+    told = written(with_evidence(dataclasses.replace(made, noise=noise), density.said([check], EvidenceSettings())))[
+        "noise"
+    ]
     assert (told["unit"], told["units"]) == ("µT", {"wander": "µT"})
     assert told["density_check"] == [
         {

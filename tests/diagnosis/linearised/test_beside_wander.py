@@ -12,6 +12,7 @@ from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.noise.bursts import of_all, out_of_bursts, together
+from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.line import Line
 from tests.simulation.tumbling import RATE, tumbling, turns
@@ -30,8 +31,8 @@ def local_of(sensor, use, noise=0.3):
     prepared = Magnetometer(use).prepare(tumbling(N, noise=noise, sensor=sensor, attitude=True, gyro=True))
     model = JointModel(prepared)
     fit = fitted(model, prepared.start())
-    tangents = tangents_of(model, fit.parameters)
-    return fit, tangents, beside_wander(fit, model, fit.parameters, tangents)
+    tangents = tangents_of(model, fit.parameters, NoiseSettings())
+    return fit, tangents, beside_wander(fit, model, fit.parameters, tangents, NoiseSettings())
 
 
 @pytest.mark.parametrize("use", ["norm", "attitude"])
@@ -53,7 +54,7 @@ def test_bursts_beside_a_wander_do_not_count():
     def rejected(counts):
         return float((counts[hit] == 0).any(-1).double().mean())
 
-    assert rejected(fit.pseudo[1]) < 0.3
+    assert rejected(fit.pseudo(NoiseSettings())[1]) < 0.3
     assert rejected(local.counts) > 0.7
     assert float(local.counts[~hit].mean()) > 0.95
 
@@ -104,16 +105,16 @@ def test_neighbours_to_one_side_together_do_not_count():
     for n in range(1, 3000):
         slow[n] += 0.98 * slow[n - 1]
     every = torch.ones_like(draws)
-    assert float(together(draws, every).mean()) == 1.0
-    assert float(together(slow, every).mean()) > 0.99
+    assert float(together(draws, every, NoiseSettings()).mean()) == 1.0
+    assert float(together(slow, every, NoiseSettings()).mean()) > 0.99
     draws[1000:1030, 1] += 1.5
     draws[2000:2600, 0] *= 1.5
-    found = together(draws, every)
+    found = together(draws, every, NoiseSettings())
     assert float(found[1002:1028, 1].sum()) == 0.0
     assert float(found[:, 0].min()) == 1.0 == float(found[:970, 1].min()) == float(found[1060:, 1].min())
     rejected = every.clone()
     rejected[1000:1030, 1] = 0.0
-    assert float(together(draws, rejected)[:, 1].min()) == 1.0
+    assert float(together(draws, rejected, NoiseSettings())[:, 1].min()) == 1.0
 
 
 def test_what_is_in_the_midst_of_outliers_is_one():
@@ -121,7 +122,7 @@ def test_what_is_in_the_midst_of_outliers_is_one():
     near[40:60, 0] = 0.0
     near[45::4, 0] = 1.0  # a course that follows the burst lets some of it through
     near[10::7, 1] = 0.0  # single outliers, however many, take nothing with them
-    found = out_of_bursts(near)
+    found = out_of_bursts(near, NoiseSettings())
     assert float(found[43:57, 0].sum()) == 0.0
     assert float(found[:35, 0].min()) == float(found[66:, 0].min()) == 1.0
     assert torch.equal(found[:, 1], near[:, 1])
@@ -130,13 +131,13 @@ def test_what_is_in_the_midst_of_outliers_is_one():
 def test_outliers_that_come_together_count_in_no_channel():
     draws = torch.from_numpy(np.random.default_rng(4).random((2000, 3)))
     apart = (draws > 0.15).double()
-    assert torch.equal(of_all(apart), apart)
+    assert torch.equal(of_all(apart, NoiseSettings()), apart)
     together = apart.clone()
     together[:, 1] *= apart[:, 0]
     together[:, 2] *= (draws[:, 0] > 0.1).double()
-    assert torch.equal(of_all(together), together.amin(1, keepdim=True).expand(-1, 3))
-    assert torch.equal(of_all(apart[:, :1]), apart[:, :1])
-    assert torch.equal(of_all(torch.ones_like(apart)), torch.ones_like(apart))
+    assert torch.equal(of_all(together, NoiseSettings()), together.amin(1, keepdim=True).expand(-1, 3))
+    assert torch.equal(of_all(apart[:, :1], NoiseSettings()), apart[:, :1])
+    assert torch.equal(of_all(torch.ones_like(apart), NoiseSettings()), torch.ones_like(apart))
 
 
 def slow_in_the_world(seed, keep=0.998, size=0.8):
@@ -190,7 +191,11 @@ def test_another_colour_is_the_search_that_begins_with_it():
     prepared = Magnetometer("attitude").prepare(tumbling(N, noise=0.3, sensor=walk([0.05] * 3), attitude=True))
     model = JointModel(prepared)
     fit = fitted(model, prepared.start())
-    tangents, values, counts = tangents_of(model, fit.parameters), fit.residual, torch.ones_like(fit.residual)
+    tangents, values, counts = (
+        tangents_of(model, fit.parameters, NoiseSettings()),
+        fit.residual,
+        torch.ones_like(fit.residual),
+    )
     found = linearise(model, fit.parameters, values, counts, tangents, white=True)
     colour = found.colour_beside()
     built = linearise(model, fit.parameters, values, counts, tangents, colour=colour)
@@ -202,7 +207,7 @@ def test_another_colour_is_the_search_that_begins_with_it():
 
 def test_white_noise_is_left_as_it_is():
     fit, _, local = local_of(np.zeros((N, 3)), "attitude")
-    values, counts = fit.pseudo
+    values, counts = fit.pseudo(NoiseSettings())
     assert float((local.counts != counts).double().mean()) < 0.02
     both = (local.counts > 0) & (counts > 0)
     assert float((local.values - values)[both].square().mean().sqrt()) < 0.05
@@ -212,6 +217,8 @@ def test_a_simulation_of_two_channels_is_served_alike():
     line = Line(600)
     model = JointModel(line)
     fit = fitted(model, line.start())
-    local = beside_wander(fit, model, fit.parameters, tangents_of(model, fit.parameters))
+    local = beside_wander(
+        fit, model, fit.parameters, tangents_of(model, fit.parameters, NoiseSettings()), NoiseSettings()
+    )
     assert local.values.shape == (600, 2)
     assert bool(torch.isfinite(local.values).all())

@@ -6,6 +6,7 @@ from mkc_torch.diagnosis.linearised.estimate import estimate
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.settings import NoiseSettings
 from tests.diagnosis.line import Line
 
 
@@ -24,7 +25,7 @@ class Cliff(Line):
 def test_the_step_moves_the_parameters_by_less_than_their_errors():
     line = Line(600)
     fit = fitted(JointModel(line), line.start())
-    found = estimate(fit)
+    found = estimate(fit, NoiseSettings())
     moved = (found.fit.parameters - fit.parameters).abs()
     assert bool((moved > 0).any())
     assert bool((moved < found.standard_error).all())
@@ -35,7 +36,7 @@ def test_a_step_to_where_there_is_no_answer_is_not_taken(monkeypatch):
     line = Cliff(600)
     fit = fitted(JointModel(line), line.start())
     monkeypatch.setattr("mkc_torch.diagnosis.linearised.estimate.tangents_of", tangents_before(line))
-    found = estimate(fit)
+    found = estimate(fit, NoiseSettings())
     assert torch.equal(found.fit.parameters, fit.parameters)
     assert bool(found.fit.residual.isfinite().all())
 
@@ -43,8 +44,8 @@ def test_a_step_to_where_there_is_no_answer_is_not_taken(monkeypatch):
 def tangents_before(line):
     """The tangents of the plain line; from then on it has no answer but where it was fitted."""
 
-    def then_none(model, parameters):
-        found = tangents_of(model, parameters)
+    def then_none(model, parameters, settings):
+        found = tangents_of(model, parameters, settings)
         line.known = parameters.detach().clone()
         return found
 

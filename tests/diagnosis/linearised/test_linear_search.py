@@ -5,8 +5,8 @@ import pytest
 import torch
 from scipy import stats
 
-from mkc_torch.diagnosis.linearised.linear_search import _NEARLY, LinearSearch, log_survival
-from mkc_torch.diagnosis.linearised.wander import _PREFERRED
+from mkc_torch.diagnosis.linearised.linear_search import LinearSearch, log_survival
+from mkc_torch.diagnosis.settings import NoiseSettings
 
 M, P, K = 200, 4, 12
 
@@ -34,12 +34,12 @@ NO_WANDER = (torch.zeros(M, 0).double(), torch.zeros(0, 0).double())
 
 @pytest.fixture(scope="module")
 def plain():
-    return LinearSearch(NUISANCE, CANDIDATES, *NO_WANDER)
+    return LinearSearch(NUISANCE, CANDIDATES, *NO_WANDER, NoiseSettings().walk_first)
 
 
 @pytest.fixture(scope="module")
 def search():
-    return LinearSearch(NUISANCE, CANDIDATES, WANDER, SCALES)
+    return LinearSearch(NUISANCE, CANDIDATES, WANDER, SCALES, NoiseSettings().walk_first)
 
 
 def squares(columns, y):
@@ -141,7 +141,7 @@ def test_sizes_of_wander_reach_from_none_to_all_there_is(search):
 
 def test_the_noise_of_a_series_is_the_likeliest_of_the_grid(search):
     dense, series = Dense(search), wandering(30.0, 0, seed=20)
-    values = [fit[0] for fit in dense.fits(series, price=_PREFERRED)]
+    values = [fit[0] for fit in dense.fits(series, price=NoiseSettings().walk_first)]
     found = search.noise_fit(series)
     best = int(np.argmax(values))
     assert (found.family, found.size) == pytest.approx(dense.noises[best])
@@ -157,7 +157,7 @@ def test_the_noise_of_a_series_is_the_likeliest_of_the_grid(search):
 @pytest.mark.parametrize("size", [0.0, 100.0])
 def test_estimates_are_those_of_generalised_least_squares(search, number, size):
     series = wandering(size, 0, seed=30) + 0.4 * CANDIDATES[number].sum(-1)
-    _, expected, spread = Dense(search).best(series, CANDIDATES[number], _PREFERRED)
+    _, expected, spread = Dense(search).best(series, CANDIDATES[number], NoiseSettings().walk_first)
     gamma, covariance = search.estimate(number, series)
     np.testing.assert_allclose(gamma, expected, rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(covariance, spread, rtol=1e-7, atol=1e-12)
@@ -166,16 +166,16 @@ def test_estimates_are_those_of_generalised_least_squares(search, number, size):
 @pytest.mark.parametrize("family", [0, 1])
 def test_a_size_is_as_unsure_as_the_least_favourable_family_that_is_nearly_as_likely(search, family):
     series = wandering(100.0, family, seed=30) + 0.4 * CANDIDATES[2].sum(-1)
-    fits = list(Dense(search).fits(series, CANDIDATES[2], _PREFERRED))
+    fits = list(Dense(search).fits(series, CANDIDATES[2], NoiseSettings().walk_first))
     highest = max(fit[0] for fit in fits)
     noises = Dense(search).noises
     errors = []
     for number in (None, 0, 1):
         mine = [fit for fit, (f, size) in zip(fits, noises, strict=True) if (f if size else None) == number]
         value, _, covariance = max(mine, key=lambda fit: fit[0])
-        if value > highest - _NEARLY:
+        if value > highest - NoiseSettings().doubted_family:
             errors.append(np.sqrt(np.diag(covariance)))
-    found = search.doubted_error(2, series)
+    found = search.doubted_error(2, series, NoiseSettings().doubted_family)
     np.testing.assert_allclose(found, np.max(errors, axis=0), rtol=1e-7)
     assert float(found) >= float(search.estimate(2, series)[1].sqrt())
 
@@ -208,7 +208,7 @@ def test_p_values_of_draws_with_wander_are_not_too_small(search):
     share = (p < 0.05).double().mean(-1)
     assert float(share.max()) < 0.09
     assert float(share.min()) > 0.02
-    blind = LinearSearch(NUISANCE, CANDIDATES, *NO_WANDER).gains(drawn).log_p.exp()
+    blind = LinearSearch(NUISANCE, CANDIDATES, *NO_WANDER, NoiseSettings().walk_first).gains(drawn).log_p.exp()
     assert float((blind[2] < 0.05).double().mean()) > 0.3
 
 
@@ -233,7 +233,7 @@ def test_the_nuisance_is_taken_out_of_everything(search):
 def test_scales_of_columns_and_of_the_series_mean_nothing(search):
     scaled = LinearSearch(
         NUISANCE * torch.tensor([1e-6, 1.0, 1e6, 3.0]), [1e5 * CANDIDATES[0], *CANDIDATES[1:3], 1e-7 * CANDIDATES[3]],
-        WANDER, SCALES,
+        WANDER, SCALES, NoiseSettings().walk_first,
     )  # fmt: skip
     series = wandering(10.0, 0, seed=60).unsqueeze(-1)
     torch.testing.assert_close(scaled.gains(1e3 * series).ratio, search.gains(series).ratio, rtol=1e-6, atol=1e-8)
@@ -243,7 +243,9 @@ def test_directions_that_the_nuisance_takes_over_are_dropped():
     inside = NUISANCE @ randn(P, 2, seed=1)
     half = torch.cat([randn(M, 1, seed=2), inside[:, :1]], -1)
     twice = torch.cat([CANDIDATES[0], 2.0 * CANDIDATES[0]], -1)
-    search = LinearSearch(NUISANCE, [inside, half, twice, half[:, :1], CANDIDATES[0]], WANDER, SCALES)
+    search = LinearSearch(
+        NUISANCE, [inside, half, twice, half[:, :1], CANDIDATES[0]], WANDER, SCALES, NoiseSettings().walk_first
+    )
     assert search.dof.tolist() == [0.0, 1.0, 1.0, 1.0, 1.0]
     series = wandering(10.0, 0, seed=70) + 0.3 * half[:, 0]
     found = search.gains(series.unsqueeze(-1))
@@ -256,7 +258,7 @@ def test_directions_that_the_nuisance_takes_over_are_dropped():
 def test_the_estimate_is_nothing_along_directions_that_the_nuisance_takes_over():
     inside = NUISANCE @ randn(P, 1, seed=1)
     half = torch.cat([randn(M, 1, seed=2), inside], -1)
-    search = LinearSearch(NUISANCE, [half, half[:, :1]], WANDER, SCALES)
+    search = LinearSearch(NUISANCE, [half, half[:, :1]], WANDER, SCALES, NoiseSettings().walk_first)
     series = wandering(10.0, 0, seed=70) + 0.3 * half[:, 0]
     gamma, covariance = search.estimate(0, series)
     alone, spread = search.estimate(1, series)
@@ -311,14 +313,16 @@ def test_the_stationary_power_has_what_nuisance_and_wander_took_given_back(searc
 
 def test_a_search_takes_other_candidates(search):
     y = wandering(3.0, 0, seed=20).unsqueeze(-1)
-    other = LinearSearch(NUISANCE, CANDIDATES[2:], WANDER, SCALES)
+    other = LinearSearch(NUISANCE, CANDIDATES[2:], WANDER, SCALES, NoiseSettings().walk_first)
     torch.testing.assert_close(search.with_candidates(CANDIDATES[2:]).gains(y).ratio, other.gains(y).ratio)
     torch.testing.assert_close(search.gains(y).ratio[2:], other.gains(y).ratio)
 
 
 def test_rows_times_a_factor_are_a_search_of_such_tangents(search):
     factor = 0.5 + torch.linspace(0.0, 2.0, M, dtype=torch.float64).unsqueeze(-1)
-    built = LinearSearch(factor * NUISANCE, [factor * c for c in CANDIDATES], factor * WANDER, SCALES)
+    built = LinearSearch(
+        factor * NUISANCE, [factor * c for c in CANDIDATES], factor * WANDER, SCALES, NoiseSettings().walk_first
+    )
     series = factor * wandering(10.0, 0, seed=70).unsqueeze(-1)
     torch.testing.assert_close(search.scaled(factor.squeeze(-1)).gains(series).ratio, built.gains(series).ratio)
 
@@ -328,7 +332,7 @@ def test_the_share_of_a_channel_is_its_variance():
     courses = torch.cat([smooth(30) * randn(M, 1, seed=6), smooth(30) * randn(M, 1, seed=7)], -1)
     courses = courses.unflatten(-1, (2, 30)).mT.flatten(-2)
     scales = torch.ones(1, 60).double()
-    search = LinearSearch(NUISANCE, [], courses, scales)
+    search = LinearSearch(NUISANCE, [], courses, scales, NoiseSettings().walk_first)
     size = torch.tensor([3.0, 1.0]).double().repeat(30)
     found = torch.stack(
         [search.shares(randn(M, seed=s) + courses @ (size * randn(60, seed=100 + s)), 2) for s in range(40)]
@@ -339,7 +343,7 @@ def test_the_share_of_a_channel_is_its_variance():
 
 
 def test_without_a_wander_channels_are_alike():
-    quiet = LinearSearch(NUISANCE, [], WANDER, SCALES)
+    quiet = LinearSearch(NUISANCE, [], WANDER, SCALES, NoiseSettings().walk_first)
     y = randn(M, seed=5)
     y = y - WANDER @ torch.linalg.lstsq(WANDER, y).solution
     assert quiet.noise_fit(y).size == 0

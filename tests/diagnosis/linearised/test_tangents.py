@@ -6,6 +6,7 @@ import torch
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects.base import GainEffect
 from mkc_torch.nonlinear import NoFitError
 from tests.diagnosis.line import Line
@@ -37,12 +38,12 @@ class Vertical(Offset):
 def test_a_parameter_without_a_slope_is_named():
     model = JointModel(Edge())
     with pytest.raises(NoFitError, match="no finite slope by level, slope at the fitted values"):
-        tangents_of(model, torch.tensor([1.0, 0.0], dtype=torch.float64))
+        tangents_of(model, torch.tensor([1.0, 0.0], dtype=torch.float64), NoiseSettings())
 
 
 def test_a_candidate_without_a_slope_is_left_out():
     model = JointModel(Line())
     terms = (Term(Offset(), None, {}), Term(Vertical(), None, {}))
-    first, second = tangents_of(model, model.prepared.start(), terms).candidates
+    first, second = tangents_of(model, model.prepared.start(), NoiseSettings(), terms).candidates
     assert float(first.abs().max()) > 0
     assert float(second.abs().max()) == 0

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.model.drivers import find_drivers, role_of
+from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.recording.recording import Recording
 
 RAMP = torch.linspace(0.0, 1.0, 100, dtype=torch.float64)
@@ -14,7 +15,7 @@ WAVES = {k: torch.sin((3.0 + k) * RAMP + k) for k in range(8)}
 
 
 def found(columns, units=None, taken=frozenset({"time"})):
-    return find_drivers(Recording({"time": 10.0 * RAMP} | columns, units=units), taken)
+    return find_drivers(Recording({"time": 10.0 * RAMP} | columns, units=units), taken, DriverSettings())
 
 
 @pytest.mark.parametrize(
@@ -156,7 +157,9 @@ def test_no_columns_no_drivers():
 def test_effects_can_ask_for_roles_of_their_own():
     columns = {"voltage_bus": WAVES[0], "overvoltage": WAVES[1], "temperature": WAVES[2]}
     recording = Recording({"time": RAMP} | columns)
-    drivers = find_drivers(recording, frozenset({"time"}), frozenset({"voltage", "any", "temperature"})).drivers
+    drivers = find_drivers(
+        recording, frozenset({"time"}), DriverSettings(), frozenset({"voltage", "any", "temperature"})
+    ).drivers
     assert [(d.columns[0], d.role) for d in drivers] == [
         ("voltage_bus", "voltage"), ("overvoltage", "any"), ("temperature", "temperature"),
     ]  # fmt: skip
@@ -164,7 +167,7 @@ def test_effects_can_ask_for_roles_of_their_own():
 
 def test_a_part_of_the_position_is_no_position():
     recording = Recording({"time": RAMP, "position_x": WAVES[0], "position_y": WAVES[1], "position_z": 0.0 * RAMP})
-    drivers = find_drivers(recording, frozenset({"time"}), frozenset({"position", "any"})).drivers
+    drivers = find_drivers(recording, frozenset({"time"}), DriverSettings(), frozenset({"position", "any"})).drivers
     assert [(d.columns, d.role) for d in drivers] == [(("position_x",), "any"), (("position_y",), "any")]
 
 
@@ -175,7 +178,7 @@ def test_a_few_values_far_from_all_others_count_as_missing(glitch, places):
     clean = 3.0 + torch.sin(time)
     values = clean.clone()
     values[places] = glitch
-    result = find_drivers(Recording({"time": time, "current": values}), frozenset({"time"}))
+    result = find_drivers(Recording({"time": time, "current": values}), frozenset({"time"}), DriverSettings())
     (driver,) = result.drivers
     torch.testing.assert_close(driver.values[:, 0] + driver.reference, clean, atol=0.02, rtol=0.0)
     (sentence,) = result.warnings
@@ -192,7 +195,9 @@ def test_pulses_of_a_driver_are_no_glitches():
     assert int(on.sum()) == 5
     pulses = 0.01 * noise + 5.0 * on * (1.0 + 0.1 * noise)
     switch = on.double()
-    result = find_drivers(Recording({"time": time, "current": pulses, "switch": switch}), frozenset({"time"}))
+    result = find_drivers(
+        Recording({"time": time, "current": pulses, "switch": switch}), frozenset({"time"}), DriverSettings()
+    )
     assert result.warnings == ()
     assert [float(driver.values.max()) > 0.9 for driver in result.drivers] == [True, True]
 
@@ -201,7 +206,9 @@ def test_a_column_that_repeats_what_is_measured_drives_nothing():
     time = torch.linspace(0.0, 20.0, 1000, dtype=torch.float64)
     measured = 40.0 * torch.sin(time)
     columns = {"time": time, "mag_x": measured, "raw_x": (6.842 * measured).round() + 17.0, "load": torch.cos(time)}
-    result = find_drivers(Recording(columns), frozenset({"time", "mag_x"}), measured=frozenset({"mag_x"}))
+    result = find_drivers(
+        Recording(columns), frozenset({"time", "mag_x"}), DriverSettings(), measured=frozenset({"mag_x"})
+    )
     assert [driver.columns for driver in result.drivers] == [("load",)]
     assert result.warnings == ("Column `raw_x` repeats `mag_x` and is left out: it drives nothing.",)
 

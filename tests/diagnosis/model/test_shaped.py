@@ -11,6 +11,7 @@ from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms, reach_of
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shaped import ShapedModel, shape_fitted
+from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics, Parameter
 
@@ -141,7 +142,7 @@ def test_its_parameters_are_the_joint_ones_and_the_logarithms_of_the_shape():
 def test_errors_are_those_of_least_squares_with_the_shape_among_the_parameters():
     """In white normal noise: σ² (JᵀJ)⁻¹, J by differences of parameters and limit."""
     fit = shape_fitted(found(driven(lambda u: u.clamp(-1.37, 1.37), seed=2), OF["input_saturation"], {"limit": 1.2}))
-    final = estimate(fit)
+    final = estimate(fit, NoiseSettings())
     shape, theta = final.fit.model.terms[-1].shape, final.fit.parameters
     (errors,) = final.shape_errors
     assert set(errors) == {"limit"}  # its corner is as hard as can be

@@ -211,7 +211,7 @@ def test_noise_of_a_port_that_turns_fast_has_a_stationary_colour():
 def test_without_a_tail_the_pseudo_residual_is_the_residual():
     error = randn(100, 2)
     values, counts = pseudo_residual(
-        error, torch.tensor([math.inf, math.inf]).double(), torch.tensor([1.0, 0.3]).double()
+        error, torch.tensor([math.inf, math.inf]).double(), torch.tensor([1.0, 0.3]).double(), 0.1
     )
     assert torch.equal(values, error)
     assert torch.equal(counts, torch.ones_like(error))
@@ -223,7 +223,7 @@ def test_the_pseudo_residual_is_the_score_over_its_mean_slope():
     def energy(e):
         return mkc_energy(e, sigma, d).sum()
 
-    values, counts = pseudo_residual(error, sigma, d)
+    values, counts = pseudo_residual(error, sigma, d, 0.1)
     score = torch.func.grad(energy)(error)
     slope = torch.func.vmap(torch.func.grad(lambda e: torch.func.grad(energy)(e).sum()))(error)
     used = counts > 0
@@ -241,7 +241,7 @@ def test_least_squares_on_pseudo_residuals_is_the_robust_estimate_to_first_order
         error = randn(400, 1, seed=seed)
         error[::5] += 30.0
         found = fit_density(error, bound=60.0)
-        values, counts = pseudo_residual(error, found.sigma, found.d)
+        values, counts = pseudo_residual(error, found.sigma, found.d, 0.1)
         draws.append(float(values.sum() / counts.sum()))
     assert np.std(draws) < 1.4 * math.sqrt(1.0 / 320)
     assert abs(np.mean(draws)) < 4.0 * np.std(draws) / math.sqrt(40)
@@ -250,7 +250,7 @@ def test_least_squares_on_pseudo_residuals_is_the_robust_estimate_to_first_order
 def test_the_spread_of_pseudo_residuals_is_that_of_the_estimate():
     error = torch.from_numpy(stats.t(4).rvs(4000, random_state=0)).unsqueeze(-1)
     found = fit_density(error)
-    values, counts = pseudo_residual(error, found.sigma, found.d)
+    values, counts = pseudo_residual(error, found.sigma, found.d, 0.1)
     # the mean of values has the sandwich variance of the location, which for this t is near its bound of 7/5
     predicted = float(values.square().mean() / counts.mean().square())
     assert predicted == pytest.approx(1.4, abs=0.15)

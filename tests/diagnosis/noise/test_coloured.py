@@ -14,6 +14,7 @@ from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search import closing_in
 from mkc_torch.diagnosis.search.closing_in import coloured, middle
 from mkc_torch.diagnosis.search.look import Scene
+from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import RATE, tumbling
@@ -41,11 +42,11 @@ def with_shape(base, effect, shape):
     start = base.parameters.new_zeros(model.size)
     start[: len(base.parameters)] = base.parameters
     best = fitted_beside(base, model, start)
-    tangents = tangents_of(best.model, best.parameters, best.model.terms)
+    tangents = tangents_of(best.model, best.parameters, NoiseSettings(), best.model.terms)
     tangents = dataclasses.replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
-    pseudo, counts = best.pseudo
+    pseudo, counts = best.pseudo(NoiseSettings())
     moved = tangents.candidates[0] @ best.parameters[base.model.size :]
-    return best, Scene(base, best, best.model.terms, tangents, pseudo - counts * moved, counts).under()
+    return best, Scene(base, best, best.model.terms, tangents, pseudo - counts * moved, counts, Settings()).under()
 
 
 @pytest.mark.parametrize("onset", [FIRST / RATE + 0.02, LAST / RATE - 0.02])
@@ -81,12 +82,12 @@ def test_what_has_no_shape_or_does_not_converge_stays(burst, monkeypatch):
 @settings(deadline=None)
 def test_the_middle_is_never_told_apart_from_the_place(values, data):
     place = data.draw(st.integers(0, len(values) - 1))
-    found = middle(values, place)
+    found = middle(values, place, 0.5)
     between = values[min(found, place) : max(found, place) + 1]
     assert all(abs(value - values[place]) < 0.5 for value in between)
 
 
 def test_the_middle_of_a_plateau_is_its_middle_from_any_place():
     values = [0.0, 3.0, *[9.0] * 7, 2.0]
-    assert [middle(values, place) for place in range(2, 9)] == [5] * 7
-    assert middle(values, 0) == 0
+    assert [middle(values, place, 0.5) for place in range(2, 9)] == [5] * 7
+    assert middle(values, 0, 0.5) == 0

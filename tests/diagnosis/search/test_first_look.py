@@ -14,6 +14,7 @@ from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.search.first_look import p_value_beside
 from mkc_torch.diagnosis.search.locate import locate
+from mkc_torch.diagnosis.settings import DriverSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import RATE, tumbling
@@ -36,10 +37,12 @@ def located(*effects, seed=0):
     simulation = Magnetometer("attitude")
     prepared = simulation.prepare(recording(*effects, seed=seed))
     roles = frozenset(role for effect in CATALOGUE for role in effect.roles)
-    drivers = find_drivers(prepared.recording, simulation.columns, roles).drivers
+    drivers = find_drivers(prepared.recording, simulation.columns, DriverSettings(), roles).drivers
     base = fitted(JointModel(prepared), prepared.start())
     terms = candidate_terms(prepared, drivers, CATALOGUE)
-    found = locate(base, terms, level=0.05, surrogates=99, generator=torch.Generator().manual_seed(0))
+    found = locate(
+        base, terms, level=0.05, surrogates=99, generator=torch.Generator().manual_seed(0), settings=Settings()
+    )
     assert found.term.effect.id == "current_field"
     return found
 

@@ -14,6 +14,7 @@ from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.locate import _settled, _with_tangents, locate
 from mkc_torch.diagnosis.search.strongest import _first_start
+from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation import Magnetometer
@@ -35,7 +36,7 @@ def found():
     base = fitted(JointModel(prepared), prepared.start())
     terms = candidate_terms(prepared, (), TIMED)
     generator = torch.Generator().manual_seed(0)
-    return prepared, terms, locate(base, terms, level=0.05, surrogates=19, generator=generator)
+    return prepared, terms, locate(base, terms, level=0.05, surrogates=19, generator=generator, settings=Settings())
 
 
 def test_the_first_of_the_ranking_has_a_shape_between_those_tried(found):
@@ -62,15 +63,15 @@ def test_a_fit_without_slopes_gives_way_to_the_next(monkeypatch):
     fits = [dataclasses.replace(fit, model=model.with_term(term)) for term in terms]
     known = object()
 
-    def tangents(of, _parameters, _terms):
+    def tangents(of, _parameters, _settings, _terms):
         if of is fits[0].model:
             raise NoFitError("no finite slope")
         return known
 
     monkeypatch.setattr("mkc_torch.diagnosis.search.locate.tangents_of", tangents)
-    assert _with_tangents(fits, terms) == (fits[1], terms, known)
+    assert _with_tangents(fits, terms, Settings()) == (fits[1], terms, known)
     with pytest.raises(NoFitError, match="no finite slope"):
-        _with_tangents(fits[:1], terms)
+        _with_tangents(fits[:1], terms, Settings())
 
 
 def test_gains_of_other_candidates_are_those_of_a_search_with_them():
@@ -80,7 +81,7 @@ def test_gains_of_other_candidates_are_those_of_a_search_with_them():
     values, counts = fit.residual * 1.0, torch.ones_like(fit.residual)
     counts[100:120, 0] = 0.0
     values = values * counts
-    tangents = tangents_of(model, fit.parameters, STEPS)
+    tangents = tangents_of(model, fit.parameters, NoiseSettings(), STEPS)
     whole = linearise(model, fit.parameters, values, counts, tangents)
     bare = linearise(model, fit.parameters, values, counts, tangents.bare, colour=whole.colour)
     beside = candidate_tangents(model, fit.parameters, STEPS, tangents.pointwise)
@@ -98,13 +99,15 @@ def test_a_joint_fit_at_another_moment_gives_way_to_that_of_the_search(monkeypat
     terms = candidate_terms(prepared, (), (STEP,))
     late = max(terms, key=lambda term: term.shape["onset"])
 
-    def strongest(base, terms, prefer, *, parts):  # noqa: ARG001
+    def strongest(base, terms, prefer, settings, *, parts):  # noqa: ARG001
         model = base.model.with_term(late)
         fit = fitted(model, torch.cat([base.parameters, torch.zeros(3)]), base.bound)
-        return [fit], tangents_of(base.model, base.parameters, terms)
+        return [fit], tangents_of(base.model, base.parameters, NoiseSettings(), terms)
 
     monkeypatch.setattr("mkc_torch.diagnosis.search.locate.strongest", strongest)
-    located = locate(base, terms, level=0.05, surrogates=19, generator=torch.Generator().manual_seed(0))
+    located = locate(
+        base, terms, level=0.05, surrogates=19, generator=torch.Generator().manual_seed(0), settings=Settings()
+    )
     assert located.p_value <= 0.05
     assert located.term.shape["onset"] == pytest.approx(float(prepared.time[671]), abs=0.1)
 
@@ -141,7 +144,7 @@ class Driven(Line):
 )
 def test_where_a_fit_began_is_looked_at_if_it_went_far_from_there(line, now, starts):
     fit = fitted(JointModel(line), line.start())
-    found = _first_start(dataclasses.replace(fit, parameters=torch.tensor(now, dtype=torch.float64)))
+    found = _first_start(dataclasses.replace(fit, parameters=torch.tensor(now, dtype=torch.float64)), 5.0)
     assert len(found) == starts
     for parameters, _ in found:
         torch.testing.assert_close(parameters, line.start())

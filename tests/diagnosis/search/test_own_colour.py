@@ -10,6 +10,7 @@ from mkc_torch.diagnosis.linearised.linearise import Linearised
 from mkc_torch.diagnosis.noise.colour import colour_of, whittle
 from mkc_torch.diagnosis.noise.gaps import Filling
 from mkc_torch.diagnosis.search.own_colour import own_colour_gains
+from mkc_torch.diagnosis.settings import NoiseSettings
 
 N, M = 800, 2
 
@@ -39,7 +40,9 @@ def searching(size, seed=3):
     nuisance, effect, rival = (
         colour.scaled(SCALE.unsqueeze(-1) * one) for one in (OFFSET, EFFECT.unsqueeze(-1), RIVAL.unsqueeze(-1))
     )
-    search = LinearSearch(nuisance, [rival, effect], nuisance[:, :0], nuisance.new_zeros(0, 0))
+    search = LinearSearch(
+        nuisance, [rival, effect], nuisance[:, :0], nuisance.new_zeros(0, 0), NoiseSettings().walk_first
+    )
     return Linearised(search, colour.scaled(values.unsqueeze(-1)).squeeze(-1), colour, None, Filling((None,) * M, 0.0))
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from mkc_torch.diagnosis.linearised.linear_search import Gains, log_survival
 from mkc_torch.diagnosis.search import p_value as judge
 from mkc_torch.diagnosis.search.p_value import either
+from mkc_torch.diagnosis.settings import NoiseSettings
 
 DRAWS = 99
 DOF = torch.tensor([3.0, 3.0]).double()
@@ -38,7 +39,9 @@ def judged(own, tried, possible=None, *, gain=0.0, wandering=None):
     )
     linearised = SimpleNamespace(entering=lambda _count, _generator: None, search=search, series=torch.zeros(1))
     possible = torch.ones(tried, dtype=torch.bool) if possible is None else torch.tensor(possible)
-    return judge.judged(linearised, SimpleNamespace(gain=gain), gains([[own[0]], [own[1]]]), possible, DRAWS, None)
+    return judge.judged(
+        linearised, SimpleNamespace(gain=gain), gains([[own[0]], [own[1]]]), possible, DRAWS, None, NoiseSettings()
+    )
 
 
 def test_what_exceeds_all_draws_has_the_smallest_p_value_and_says_by_how_much():

@@ -7,6 +7,7 @@ from mkc_torch import Recording
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.search.preference import Preference
+from mkc_torch.diagnosis.settings import DriverSettings, NamingSettings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Dynamics
 
@@ -26,8 +27,10 @@ def search():
     columns = {"time": TIME, "angle": torch.cos(3.0 * TIME), "battery": torch.sin(0.7 * TIME) + 11.0}
     prepared = Swing().prepare(Recording(columns))
     roles = frozenset(role for effect in CATALOGUE for role in effect.roles)
-    terms = candidate_terms(prepared, find_drivers(prepared.recording, Swing().columns, roles).drivers, CATALOGUE)
-    return Preference(terms, prepared), terms
+    terms = candidate_terms(
+        prepared, find_drivers(prepared.recording, Swing().columns, DriverSettings(), roles).drivers, CATALOGUE
+    )
+    return Preference(terms, prepared, NamingSettings()), terms
 
 
 def test_a_named_force_gives_nothing(search):

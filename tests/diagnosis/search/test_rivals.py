@@ -9,6 +9,7 @@ from mkc_torch.diagnosis.search import rivals
 from mkc_torch.diagnosis.search.preference import Preference
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.rivals import by_joint_fits
+from mkc_torch.diagnosis.settings import Settings
 
 BENT, POINTWISE = "rate", "sensor"
 
@@ -55,7 +56,9 @@ def judged(monkeypatch):
         monkeypatch.setattr(rivals, "at_once", lambda works, *_: [work() for work in works])
         best = fit_of(FRICTION, 100.0, size)
         scene = SimpleNamespace(base=fit_of(None, 0.0), terms=TERMS, bends=lambda term: term.port == BENT)
-        found, told = by_joint_fits(best, ranking, SimpleNamespace(scene=scene), Indifferent(**new), known)
+        found, told = by_joint_fits(
+            best, ranking, SimpleNamespace(scene=scene, settings=Settings()), Indifferent(**new), known
+        )
         return found.model.terms[-1].key, {TERMS[one.number].key: one.gap for one in told}, asked
 
     return run

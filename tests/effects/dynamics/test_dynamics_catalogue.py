@@ -9,6 +9,7 @@ import torch
 from mkc_torch import Recording
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.simulation import Dynamics
 from tests.effects.contexts import dynamic_context, size_of
@@ -301,7 +302,7 @@ class TestNeeds:
         assert tried(prepared(Ball, **fall))["exchange of vx and vy"] == {"coupling", "magnus_lift"}
         simulation = prepared(Ball, **fall, spin_z=50.0 - TIME)
         roles = frozenset(role for effect in DYNAMICS for role in effect.roles)
-        drivers = find_drivers(simulation.recording, simulation.system.columns, roles)
+        drivers = find_drivers(simulation.recording, simulation.system.columns, DriverSettings(), roles)
         terms = [t for t in candidate_terms(simulation, drivers.drivers, DYNAMICS) if t.effect.id == "magnus_lift"]
         assert [term.columns for term in terms] == [(), ("spin_z",)]
 

@@ -11,6 +11,7 @@ from mkc_torch import diagnose
 from mkc_torch.diagnosis.files.model import DiagnosedModel
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.grid import candidate_terms, reach_of
+from mkc_torch.diagnosis.settings import DriverSettings
 from mkc_torch.effects.sensor.field_gradient import FieldGradient
 from mkc_torch.effects.sensor.magnetic_pole import MagneticPole
 from mkc_torch.recording.recording import Recording
@@ -108,7 +109,7 @@ def test_a_pole_beside_the_path_is_found_where_it_is():
 def test_its_places_are_around_the_middle_of_the_path():
     seen = recording((9.0, 9.0, 9.0), 0.0)
     prepared = Magnetometer().prepare(seen)
-    drivers = find_drivers(prepared.recording, Magnetometer().columns).drivers
+    drivers = find_drivers(prepared.recording, Magnetometer().columns, DriverSettings()).drivers
     terms = candidate_terms(prepared, drivers, (FieldGradient(), POLE))
     away = torch.linalg.vector_norm(drivers[0].values, dim=-1)
     poles = [term for term in terms if term.effect is POLE]
