@@ -22,7 +22,7 @@ SMALL = {
     "mkc challenge --output proof": "--cases 1 --empty 1 --duration 10 --workers 1",
     "mkc challenge --family dynamics --output proof_of_dynamics": "--cases 0 --empty 1 --workers 1",
     "mkc challenge --seed 9421 --workers 2 --output proof": "--seed 1 --cases 0 --empty 1 --duration 10 --workers 1",
-    "mkc challenge --family dynamics --seed 5521 --workers 2 --output proof_of_dynamics": (
+    "mkc challenge --family dynamics --seed 7741 --workers 2 --output proof_of_dynamics": (
         "--seed 1 --cases 0 --empty 1 --workers 1"
     ),
 }
