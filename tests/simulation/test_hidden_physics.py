@@ -299,6 +299,6 @@ def test_an_input_that_is_not_used_moves_nothing():
         Term(OF[name], None, shape, "input torque")
         for name, shape in (("input_delay", {"delay": 0.1}), ("dead_zone", {"width": 0.3, "softness": 0.1}))
     ]
-    found = tangents_of(JointModel(simulation), simulation.start(), terms).candidates
+    found = tangents_of(JointModel(simulation), simulation.start(), NoiseSettings(), terms).candidates
     assert [one.shape for one in found] == [(80, 1, 1)] * 2
     assert all(float(one.abs().max()) == 0.0 for one in found)
