@@ -98,9 +98,6 @@ class Trajectory:
         """The states alone: small, and the same in whichever process they were found."""
         return Trajectory(self.states, self.converged)
 
-    def __reduce__(self) -> tuple[type[Trajectory], tuple[Tensor, bool]]:
-        return Trajectory, (self.states, self.converged)
-
 
 @dataclass(frozen=True)
 class Linear:
