@@ -14,7 +14,7 @@ from mkc_torch.simulation.dynamics.equations import Equations
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["first_guess"]
+__all__ = ["despiked", "first_guess"]
 
 _WIDTH = 5
 _FAR = 6.0
@@ -43,7 +43,7 @@ def first_guess(
     known, at = {}, recording["time"]
     for name in system.states:
         if name in channels:
-            known[name] = _despiked(recording[name], at, begins)
+            known[name] = despiked(recording[name], at, begins)
     for name, rate in kinematic.items():
         if name in known and rate not in known:
             known[rate] = _slope(known[name], at, begins)
@@ -67,9 +67,7 @@ def _windows(values: Float[Tensor, " N"], begins: Bool[Tensor, " N"]) -> Float[T
     return values[torch.minimum(lowest.unsqueeze(-1) + torch.arange(_WIDTH), last.unsqueeze(-1))]
 
 
-def _despiked(
-    values: Float[Tensor, " N"], time: Float[Tensor, " N"], begins: Bool[Tensor, " N"]
-) -> Float[Tensor, " N"]:
+def despiked(values: Float[Tensor, " N"], time: Float[Tensor, " N"], begins: Bool[Tensor, " N"]) -> Float[Tensor, " N"]:
     """The values, and the line through their neighbours where they are far from it.
 
     The line is that of repeated medians, which two of five samples cannot move: Siegel, Biometrika 69 (1982), 242.

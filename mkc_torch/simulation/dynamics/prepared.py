@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -16,7 +17,8 @@ from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.between_samples import smooth_between
 from mkc_torch.simulation.dynamics.checks import Moments, check_functions
 from mkc_torch.simulation.dynamics.equations import Equations
-from mkc_torch.simulation.dynamics.first_guess import first_guess
+from mkc_torch.simulation.dynamics.first_guess import despiked, first_guess
+from mkc_torch.simulation.dynamics.observer import Correcting, Disturbance, Observer
 from mkc_torch.simulation.dynamics.ports import RATES, Places, common_unit
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
 from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, defect, marched, solve, stations
@@ -46,6 +48,7 @@ class PreparedDynamics:
     """A system of differential equations with the recording that answers it."""
 
     prior: GaussianPrior | None = None
+    observer: Observer | None = None
 
     def __init__(self, system: Equations, recording: Recording, outputs: tuple[str, ...]) -> None:
         self.system, self.recording, self.channels = system, recording, outputs
@@ -71,6 +74,7 @@ class PreparedDynamics:
         high = [one.upper for one in self.known.values()]
         self.bounds = self.time.new_tensor(low + [-torch.inf] * n), self.time.new_tensor(high + [torch.inf] * n)
         self._p = p
+        self._clean = torch.stack([despiked(one, self.time, self.begins) for one in self.measured.unbind(-1)], -1)
         self._check_functions()
         self._refine()
 
@@ -111,6 +115,14 @@ class PreparedDynamics:
             return self.clock.at(inputs)
         return smooth_between(inputs, self.time, self.begins, self.clock)
 
+    def observed(self, observer: Observer | None) -> PreparedDynamics:
+        """The same, predicted from sample to sample by an observer; None for a free run."""
+        if observer is self.observer:
+            return self
+        other = copy.copy(self)
+        other.observer = observer
+        return other
+
     @cached_property
     def ports(self) -> dict[str, Port]:
         """The rate of each state, exchange between two of the same unit, each input, and the outputs."""
@@ -138,7 +150,7 @@ class PreparedDynamics:
             typical = self._guess.abs().median(0).values.clamp(min=1e-12)
 
             def lacking(values: Tensor) -> Tensor:
-                left = defect(self._rate(torch.cat([values, begin]), {}), self._guess, step) / typical
+                left = defect(self.rate(torch.cat([values, begin]), {}), self._guess, step) / typical
                 total = torch.cat([torch.zeros_like(left[:1]), left.cumsum(0)])
                 return total[_WINDOW:] - total[:-_WINDOW]
 
@@ -173,13 +185,17 @@ class PreparedDynamics:
         # a tensor of a transform must not outlive it
         lasting = found.converged and not torch._C._functorch.is_functorch_wrapped_tensor(found.states)
         nearby = replace(found, states=found.states.detach()) if lasting else None
-        return Answer(self.measured - self._simulated(theta, changes, found), nearby)
+        return Answer(self._residual(theta, changes, found), nearby)
 
     def residual(
         self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
     ) -> Float[Tensor, "N m"]:
         """That of the answer."""
-        return self.measured - self.simulated(theta, changes, near)
+        return self._residual(theta, changes, self.trajectory(theta, changes, near))
+
+    def _residual(self, theta: Tensor, changes: Changes, found: Trajectory) -> Float[Tensor, "N m"]:
+        left = self.measured - self._simulated(theta, changes, found)
+        return left if self.observer is None else self.observer.whitened(left)
 
     def simulated(
         self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
@@ -191,12 +207,14 @@ class PreparedDynamics:
         outputs = self._outputs(theta, found)
         if "output" in changes:
             outputs = outputs + changes["output"](outputs)
+        outputs = outputs + self._pushed_outputs(found.states[self.rows])
         return outputs if found.converged else outputs * torch.nan
 
     def signals(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Mapping[str, Tensor]:
         found = self.trajectory(theta, changes, near)
         inputs = self._inputs(theta, changes)
-        at_stations = stations(self._rate(theta, changes), found.states, self.grid.step.unsqueeze(-1))
+        jump = self.jump(theta, changes)
+        at_stations = stations(self.rate(theta, changes), found.states, self.grid.step.unsqueeze(-1), jump)
         at_stations = at_stations[:, : len(self.system.states)]
         outputs = self._outputs(theta, found)
         rates = self._rates(theta, at_stations, inputs)
@@ -225,21 +243,21 @@ class PreparedDynamics:
             patient: go from moment to moment if it must.
         """
         begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
-        rate = self._rate(theta, changes)
-        begin = _of_width(begin, begin.shape[1] + len(self._remembering(changes)))
-        width = begin.shape[1]
+        rate = self.rate(theta, changes)
+        begin = _of_width(begin, begin.shape[1] + len(self._remembering(changes)) + len(self.lasting))
+        width, jump = begin.shape[1], self.jump(theta, changes)
         known = near if isinstance(near, Trajectory) else None
         guess = _of_width(self._guess if known is None else known.states, width)
         linear = known is not None and known.linear is not None and known.states.shape[1] == width
-        found = solve(rate, self.grid, begin, guess, known if linear else None)
+        found = solve(rate, self.grid, begin, guess, known if linear else None, jump=jump)
         if not found.converged and known is not None:
-            found = solve(rate, self.grid, begin, _of_width(self._guess, width))
+            found = solve(rate, self.grid, begin, _of_width(self._guess, width), jump=jump)
         if not found.converged and known is None:
-            nearer = marched(rate, self.grid, begin, guess)
-            found = found if nearer is None else solve(rate, self.grid, begin, nearer)
+            nearer = marched(rate, self.grid, begin, guess, jump=jump)
+            found = found if nearer is None else solve(rate, self.grid, begin, nearer, jump=jump)
         if not found.converged and patient:
-            nearer = marched(rate, self.grid, begin, guess, stride=_PATIENT)
-            found = found if nearer is None else solve(rate, self.grid, begin, nearer)
+            nearer = marched(rate, self.grid, begin, guess, stride=_PATIENT, jump=jump)
+            found = found if nearer is None else solve(rate, self.grid, begin, nearer, jump=jump)
         return found
 
     def since_begin(self) -> Float[Tensor, " N"]:
@@ -258,11 +276,12 @@ class PreparedDynamics:
                     found[name] = port.memory
         return found
 
-    def _rate(self, theta: Tensor, changes: Changes) -> Callable[[Tensor], Tensor]:
+    def rate(self, theta: Tensor, changes: Changes) -> Callable[[Tensor], Tensor]:
         """Of the states, and of the internal states that effects bring, which come after them."""
         inputs = self._inputs(theta, changes)
         remembering = self._remembering(changes)
         rows = [*self.system.states, *remembering.values()]
+        lasting = self.lasting
         acting = [
             (port, [rows.index(row) for row in (*port.channels, *([port.memory] if name in remembering else []))], name)
             for name, port in self.ports.items()
@@ -270,7 +289,7 @@ class PreparedDynamics:
         ]
 
         def rate(states: Tensor) -> Tensor:
-            own, memories = states.split([len(self.system.states), len(remembering)], -1)
+            own, memories, pushes = states.split([len(self.system.states), len(remembering), len(lasting)], -1)
             plain = self._rates(theta, own, inputs)
             rates = [*plain, *(torch.zeros_like(one) for one in memories.unbind(-1))]
             for port, places, name in acting:
@@ -279,9 +298,63 @@ class PreparedDynamics:
                     signal = torch.cat([signal, states[:, places[-1:]]], -1)
                 for k, added in zip(places, changes[name](signal).unbind(-1), strict=True):
                     rates[k] = rates[k] + added
+            for one, push in zip(lasting, pushes.unbind(-1), strict=True):
+                if one.at_rate:
+                    rates[rows.index(one.place)] = rates[rows.index(one.place)] + push
+                rates.append(-push / one.lasting)
             return torch.stack(rates, -1)
 
         return rate
+
+    @property
+    def pushable(self) -> tuple[str, ...]:
+        """States whose rate something unrecorded can push; that of a position is its speed."""
+        return tuple(name for name in self.system.states if name not in self._kinematic)
+
+    @property
+    def lasting(self) -> tuple[Disturbance, ...]:
+        """What the observer follows beside the states."""
+        return () if self.observer is None else self.observer.lasting
+
+    def jump(self, theta: Tensor, changes: Changes) -> Correcting | None:
+        """How the observer corrects the states at the samples."""
+        if self.observer is None:
+            return None
+        n, memories, pushes = len(self.system.states), len(self._remembering(changes)), len(self.lasting)
+        places = (*range(n), *range(n + memories, n + memories + pushes))
+        by_states = self.predicted(theta)
+
+        def predict(states: Tensor) -> Tensor:
+            return by_states(states) + self._pushed_outputs(states)
+
+        return Correcting(self.observer, self.rows, places, self.seen(theta, changes), predict)
+
+    def seen(self, theta: Tensor, changes: Changes) -> Float[Tensor, "N m"]:
+        """The recording less what sensors and effects make of outputs: of these they may remember the earlier ones."""
+        clean = dict(zip(self.channels, self._clean.unbind(-1), strict=True))
+        sensed = self.system.sensed(self.time, clean, self._parameters(theta), self.run)
+        made = torch.stack([sensed[name] - clean[name] for name in self.channels], -1)
+        if "output" in changes:
+            made = made + changes["output"](self._clean + made)
+        return self.measured - made
+
+    def predicted(self, theta: Tensor) -> Callable[[Tensor], Tensor]:
+        """Outputs at the samples by the states there, before a sensor makes something of them."""
+        n, p, u = len(self.system.states), self._parameters(theta), namespace(self.system.inputs, self.inputs_at_rows)
+
+        def outputs(states: Tensor) -> Tensor:
+            values = self.system.output(self.time, namespace(self.system.states, states[:, :n]), u, p)
+            return torch.stack([values[name] + torch.zeros_like(states[:, 0]) for name in self.channels], -1)
+
+        return outputs
+
+    def _pushed_outputs(self, states: Float[Tensor, "N n"]) -> Tensor:
+        """What lasting disturbances add to the outputs."""
+        added = [torch.zeros_like(states[:, 0]) for _ in self.channels]
+        for one, push in zip(self.lasting, states[:, states.shape[1] - len(self.lasting) :].unbind(-1), strict=True):
+            if not one.at_rate:
+                added[self.channels.index(one.place)] = added[self.channels.index(one.place)] + push
+        return torch.stack(added, -1)
 
     def _rates(self, theta: Tensor, states: Tensor, inputs: Tensor) -> list[Tensor]:
         """Of the states, by the simulation's own equations."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor
@@ -23,7 +23,20 @@ from mkc_torch.nonlinear import load_forward_mode
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Grid", "Linear", "Rate", "Recurrence", "Trajectory", "defect", "marched", "solve", "stations"]
+__all__ = [
+    "Grid",
+    "Jump",
+    "Linear",
+    "Rate",
+    "Recurrence",
+    "Trajectory",
+    "carried",
+    "defect",
+    "marched",
+    "slopes",
+    "solve",
+    "stations",
+]
 
 Rate = Callable[[Tensor], Tensor]
 """Of change of the states, (S, n) → (S, n), at the stations of a grid."""
@@ -79,6 +92,18 @@ class Grid:
         return int(torch.cat([first, first.new_tensor([len(self.begins)])]).diff().max())
 
 
+class Jump(Protocol):
+    """What happens to the states at the moments of a grid, as where they are corrected by what was measured."""
+
+    def applied(self, states: Float[Tensor, "G n"]) -> Float[Tensor, "G n"]:
+        """The states just after each moment, by those just before it."""
+        ...
+
+    def slope(self, states: Float[Tensor, "G n"]) -> Float[Tensor, "G n n"]:
+        """Of the states after by those before, as a constant."""
+        ...
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """States at the moments of a grid.
@@ -113,6 +138,7 @@ def solve(
     begin: Float[Tensor, "K n"],
     guess: Float[Tensor, "G n"],
     known: Trajectory | None = None,
+    jump: Jump | None = None,
 ) -> Trajectory:
     """The trajectories that begin in given states.
 
@@ -126,6 +152,7 @@ def solve(
         guess: of all states.
         known: a trajectory nearby, instead of the guess, with its equations linearised: they serve as long as they
             bring these to rest quickly.
+        jump: what happens to the states at each moment; the trajectory has those just before. None for nothing.
 
     Example:
         A decay at a rate of 2/s:
@@ -141,10 +168,10 @@ def solve(
     origin = grid.begins.unsqueeze(-1)
     places = grid.begins.long().cumsum(0) - 1
     states = torch.where(origin, begin.detach()[places], (guess if known is None else known.states).detach())
-    at = _Point.of(rate, states, step)
+    at = _Point.of(rate, states, step, jump)
     linear = None if known is None else known.linear
     fresh, moved_on = linear is None, False
-    recurrence = _recurrence(rate, states, step, grid) if linear is None else linear.recurrence
+    recurrence = _recurrence(rate, states, step, grid, jump) if linear is None else linear.recurrence
     converged = False
     settled = max(_SETTLED, _DIGITS * torch.finfo(states.dtype).eps)
     norms = [at.norm]
@@ -157,12 +184,12 @@ def solve(
         after, part = at, 1.0
         if size < torch.inf:
             for _ in range(_HALVINGS if fresh else 1):
-                after = _Point.of(rate, at.states + part * change, step)
+                after = _Point.of(rate, at.states + part * change, step, jump)
                 if after.norm <= at.norm:
                     break
                 part *= 0.5
         if not fresh and not after.norm <= _QUICK * at.norm:
-            recurrence, fresh = _recurrence(rate, at.states, step, grid), True
+            recurrence, fresh = _recurrence(rate, at.states, step, grid, jump), True
             continue
         if after is at or (not after.norm < at.norm and size * part > _ROUNDING):
             break
@@ -176,7 +203,7 @@ def solve(
     def renewed() -> Recurrence:
         # nothing here is of a transform that this is asked for in, and in one it would be forward mode again
         with nullcontext() if transformed else temporarily_clear_interpreter_stack():
-            return _recurrence(rate, states, step, grid)
+            return _recurrence(rate, states, step, grid, jump)
 
     if transformed or any(one.requires_grad for one in (left, begin)):
         # outside of the transform it is the same, and cheaper
@@ -187,7 +214,13 @@ def solve(
 
 
 def marched(
-    rate: Rate, grid: Grid, begin: Float[Tensor, "K n"], guess: Float[Tensor, "G n"], *, stride: int = _HORIZON
+    rate: Rate,
+    grid: Grid,
+    begin: Float[Tensor, "K n"],
+    guess: Float[Tensor, "G n"],
+    *,
+    stride: int = _HORIZON,
+    jump: Jump | None = None,
 ) -> Float[Tensor, "G n"] | None:
     """A guess that is near the trajectories, from one that is not: they are solved over a horizon that grows.
 
@@ -195,6 +228,7 @@ def marched(
         rate, grid, begin: as of :func:`solve`.
         guess: of all states.
         stride: moments by which the horizon grows; fewer find more, and take longer.
+        jump: as of :func:`solve`.
 
     Returns:
         The states, to a rough tolerance; None where even a short horizon has no solution.
@@ -209,17 +243,17 @@ def marched(
         states = states[torch.minimum(index, first + horizon - stride)]
         inside = (place <= horizon).unsqueeze(-1)
         for _ in range(_MOST_STEPS):
-            at = _Point.of(rate, states, step)
+            at = _Point.of(rate, states, step, jump)
             left = torch.where(inside[1:], at.left.detach(), 0.0)
             change = torch.where(
-                inside, _recurrence(rate, states, step, grid).solved(torch.zeros_like(states), left), 0.0
+                inside, _recurrence(rate, states, step, grid, jump).solved(torch.zeros_like(states), left), 0.0
             )
             size = float((change / at.scale).abs().max())
             if not size < torch.inf:
                 return None
             part, norm = 1.0, float((left / at.scale).square().mean())
             for _ in range(_HALVINGS):
-                after = defect(rate, states + part * change, step).detach()
+                after = defect(rate, states + part * change, step, jump).detach()
                 if float((torch.where(inside[1:], after, 0.0) / at.scale).square().mean()) <= norm:
                     break
                 part *= 0.5
@@ -239,10 +273,10 @@ class _Point:
     norm: float
 
     @classmethod
-    def of(cls, rate: Rate, states: Tensor, step: Tensor) -> _Point:
+    def of(cls, rate: Rate, states: Tensor, step: Tensor, jump: Jump | None) -> _Point:
         scale = states.abs().amax(0)
         scale = scale + 1e-6 * scale.max() + 1e-12
-        left = defect(rate, states, step)
+        left = defect(rate, states, step, jump)
         return cls(states, left, scale, float((left.detach() / scale).square().mean()))
 
 
@@ -255,19 +289,28 @@ def _joined(left: Tensor, middle: Tensor, right: Tensor) -> Tensor:
     return torch.stack([left, middle, right], 1).flatten(0, 1)
 
 
-def stations(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"]) -> Float[Tensor, "3G-3 n"]:
+def stations(
+    rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], jump: Jump | None = None
+) -> Float[Tensor, "3G-3 n"]:
     """States at the stations: in the middle of an interval those of the cubic through its ends."""
-    left, right = states[:-1], states[1:]
+    left, right = _after(states, jump)[:-1], states[1:]
     middle = 0.5 * (left + right)
     at_left, _, at_right = _ends(rate(_joined(left, middle, right)))
     return _joined(left, middle + 0.125 * step * (at_left - at_right), right)
 
 
-def defect(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"]) -> Float[Tensor, "G-1 n"]:
+def defect(
+    rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], jump: Jump | None = None
+) -> Float[Tensor, "G-1 n"]:
     """What the ends of each interval lack of Simpson's rule; 0 before the beginning of a trajectory."""
-    left, middle, right = _ends(rate(stations(rate, states, step)))
-    jump = torch.where(step > 0, states[1:] - states[:-1], 0.0)
-    return jump - step / 6.0 * (left + 4.0 * middle + right)
+    at = stations(rate, states, step, jump)
+    left, middle, right = _ends(rate(at))
+    gone = torch.where(step > 0, states[1:] - at[::3], 0.0)
+    return gone - step / 6.0 * (left + 4.0 * middle + right)
+
+
+def _after(states: Float[Tensor, "G n"], jump: Jump | None) -> Float[Tensor, "G n"]:
+    return states if jump is None else jump.applied(states)
 
 
 @dataclass(frozen=True)
@@ -308,16 +351,27 @@ def _in_turn(first: Float[Tensor, "G n"], second: Float[Tensor, "H n"]) -> Float
     return torch.cat([paired, first[len(second) :]])
 
 
-def _recurrence(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], grid: Grid) -> Recurrence:
+def carried(
+    rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], jump: Jump | None = None
+) -> tuple[Float[Tensor, "G-1 n n"], Float[Tensor, "G-1 n n"]]:
+    """How a small change of the states just after a moment arrives at the next one, and how a lack of it does."""
     n = states.shape[1]
     eye = torch.eye(n, dtype=states.dtype, device=states.device)
-    slope = _slopes(rate, stations(rate, states, step).detach())
+    slope = slopes(rate, stations(rate, states, step, jump).detach())
     left, middle, right = _ends(slope)
     h = step.unsqueeze(-1)
     behind = -eye - h / 6.0 * (left + 4.0 * middle @ (0.5 * eye + 0.125 * h * left))
     ahead = eye - h / 6.0 * (right + 4.0 * middle @ (0.5 * eye - 0.125 * h * right))
     inverse, _ = torch.linalg.inv_ex(ahead)
-    carries = torch.where(h > 0, -inverse @ behind, 0.0)
+    return torch.where(h > 0, -inverse @ behind, 0.0), inverse
+
+
+def _recurrence(
+    rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], grid: Grid, jump: Jump | None
+) -> Recurrence:
+    carries, inverse = carried(rate, states, step, jump)
+    if jump is not None:
+        carries = carries @ jump.slope(states.detach())[:-1]
     # the first moment has none before it
     carries = torch.cat([torch.zeros_like(carries[:1]), carries])
     longest, levels = grid.longest, []
@@ -333,7 +387,7 @@ def _recurrence(rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G
     return Recurrence(tuple(levels), tuple(products), inverse)
 
 
-def _slopes(rate: Rate, at: Float[Tensor, "S n"]) -> Float[Tensor, "S n n"]:
+def slopes(rate: Rate, at: Float[Tensor, "S n"]) -> Float[Tensor, "S k n"]:
     """Of the rates by the states of their own station: as a constant, in reverse mode where nothing else is watched.
 
     Forward mode computes with the zeros of every constant in the user's function, for more than all the rest. Reverse
@@ -343,9 +397,9 @@ def _slopes(rate: Rate, at: Float[Tensor, "S n"]) -> Float[Tensor, "S n n"]:
         given = at.requires_grad_() if not torch._C._functorch.is_functorch_wrapped_tensor(at) else at
         rates = rate(given)
         if not torch._C._functorch.is_functorch_wrapped_tensor(rates):
-            n = at.shape[1]
+            n = rates.shape[1]
             if not rates.requires_grad:
-                return at.new_zeros(*at.shape, n)
+                return at.new_zeros(len(at), n, at.shape[1])
             rows = [
                 torch.autograd.grad(
                     one.sum(), given, retain_graph=k + 1 < n, allow_unused=True, materialize_grads=True

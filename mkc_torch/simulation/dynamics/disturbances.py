@@ -1,0 +1,248 @@
+"""The noise of the world: what pushes each state's rate, and what is added to each output, by likelihood."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mkc_torch.simulation.dynamics.kalman import Flow, Models, filtered, robust_likelihood
+from mkc_torch.simulation.dynamics.observer import Disturbance, Observer
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["Disturbed", "disturbed", "observer_of"]
+
+_SIZES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+"""Tried, over that at which a disturbance moves an output by as much as its white noise."""
+
+_LASTING = (0.004, 0.015, 0.06, 0.25)
+"""Time constants tried, as shares of the longest run."""
+
+_FINER = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.0)
+_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Disturbed:
+    """The likeliest noise.
+
+    Attributes:
+        disturbances: strongest first; none where white noise of the sensors is enough.
+        errors: standard error of the logarithm of each one's size.
+        gains: nats by which each is needed beside those before it.
+        sensor: (m,), standard deviation of each output's white noise.
+        log_likelihood: in nats, robust, up to a constant.
+    """
+
+    disturbances: tuple[Disturbance, ...]
+    errors: tuple[float, ...]
+    gains: tuple[float, ...]
+    sensor: Float[Tensor, " m"]
+    log_likelihood: float
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """One model of the noise: disturbances by their number of place, size and time constant."""
+
+    sensor: tuple[float, ...]
+    pushes: tuple[tuple[int, float, float], ...] = ()
+
+
+def disturbed(
+    flow: Flow, names: Sequence[str], channels: Sequence[str], floor: Float[Tensor, " m"], least: float, most: int = 2
+) -> Disturbed:
+    """The likeliest noise along a flow: one disturbance after the other is taken up, whichever gains most.
+
+    Args:
+        flow: of the trajectory.
+        names: of the states whose rates can be pushed, in the order of the flow.
+        channels: of the outputs.
+        floor: a first guess of the outputs' white noise.
+        least: nats that a disturbance has to gain.
+        most: disturbances at most.
+    """
+    p, m = flow.rates, len(channels)
+    best = _Noise(tuple(floor.tolist()))
+    best, value = _finer(flow, best)
+    gains: list[float] = []
+    for _ in range(most):
+        tried = [replace(best, pushes=(*best.pushes, one)) for one in _candidates(flow, best, p + m)]
+        values, scales = _likelihoods(flow, tried)
+        number = int(values.argmax())
+        if values[number] <= value:
+            break
+        other, more = _finer(flow, _scaled(tried[number], float(scales[number])))
+        if more < value + least:
+            break
+        gains.append(more - value)
+        best, value = other, more
+    errors = _errors(flow, best, value)
+    found = [
+        Disturbance((*names, *channels)[place], place < p, lasting, size) for place, size, lasting in best.pushes
+    ]
+    return Disturbed(tuple(found), errors, tuple(gains), floor.new_tensor(best.sensor), value)
+
+
+def _candidates(flow: Flow, known: _Noise, places: int) -> list[tuple[int, float, float]]:
+    """Disturbances of any place, time constant and size that is not there yet."""
+    p, m = flow.rates, places - flow.rates
+    longest = _longest(flow)
+    usual = float(np.median(flow.step[flow.step > 0]))
+    lasting = sorted({max(share * longest, 2.0 * usual) for share in _LASTING})
+    sensor = np.array(known.sensor)
+    found = []
+    for place in range(places):
+        if place < p:
+            times = [0.0, *lasting]
+            units = [_unit(flow, place, time, sensor) for time in times]
+        else:
+            times, units = list(lasting), [float(sensor[place - p])] * len(lasting)
+        for time, unit in zip(times, units, strict=True):
+            if not any(one[0] == place and one[2] == time for one in known.pushes):
+                found += [(place, size * unit, time) for size in _SIZES if math.isfinite(size * unit)]
+    return found
+
+
+def _longest(flow: Flow) -> float:
+    """Length of the longest run in s."""
+    ends = np.flatnonzero(np.concatenate([flow.step <= 0, [True]]))
+    total = np.concatenate([[0.0], flow.step.cumsum()])
+    return float(np.diff(np.concatenate([[0.0], total[ends]])).max())
+
+
+_REACH = 400
+"""Samples over which the effect of a push is followed to find its usual size."""
+
+
+def _unit(flow: Flow, place: int, lasting: float, sensor: Float[np.ndarray, " m"]) -> float:
+    """The size of a push at which it moves an output by the sensor's noise, somewhere along a run."""
+    N = len(flow.new)
+    state = np.zeros(flow.carried.shape[1])
+    power = np.zeros(len(sensor))
+    start = N // 3
+    most = 0.0
+    hold = lasting if lasting > 0 else 0.0
+    age = 0.0
+    for row in range(start, min(start + _REACH, N - 1)):
+        if flow.step[row] <= 0:
+            break
+        state = flow.carried[row] @ state
+        if age <= hold:
+            state = state + flow.pushed[row][:, place]
+        age += flow.step[row]
+        seen = flow.seen[row + 1] @ state
+        power = power + seen**2 if lasting == 0.0 else np.maximum(power, seen**2)
+        most = max(most, float((np.sqrt(power) / sensor).max()))
+    return 1.0 / most if most > 0 else math.inf
+
+
+def _models(flow: Flow, noises: Sequence[_Noise]) -> Models:
+    p = flow.rates
+    D = max(sum(1 for one in noise.pushes if one[2] > 0) for noise in noises)
+    B = len(noises)
+    white, place = np.zeros((B, p)), np.zeros((B, D), dtype=int)
+    size, lasting = np.zeros((B, D)), np.ones((B, D))
+    for row, noise in enumerate(noises):
+        slot = 0
+        for at, one, time in noise.pushes:
+            if time > 0:
+                place[row, slot], size[row, slot], lasting[row, slot] = at, one, time
+                slot += 1
+            else:
+                white[row, at] = one
+    return Models(white, place, size, lasting, np.array([noise.sensor for noise in noises]))
+
+
+def _likelihoods(flow: Flow, noises: Sequence[_Noise]) -> tuple[np.ndarray, np.ndarray]:
+    return robust_likelihood(filtered(flow, _models(flow, noises)), flow.counts)
+
+
+def _scaled(noise: _Noise, scale: float) -> _Noise:
+    return _Noise(tuple(scale * one for one in noise.sensor), tuple((a, scale * s, t) for a, s, t in noise.pushes))
+
+
+def _finer(flow: Flow, noise: _Noise) -> tuple[_Noise, float]:
+    """Sizes, time constants and the sensors' noise one after the other, on a grid that closes in; the scale at once."""
+    value = -math.inf
+    power = 1.0
+    for _ in range(_ROUNDS):
+        tried = [noise]
+        for j in range(len(noise.sensor) if noise.pushes or len(noise.sensor) > 1 else 0):
+            tried += [
+                replace(noise, sensor=(*noise.sensor[:j], f**power * noise.sensor[j], *noise.sensor[j + 1 :]))
+                for f in _FINER
+                if f != 1.0
+            ]
+        for d, (place, size, lasting) in enumerate(noise.pushes):
+            others = [(place, f**power * size, lasting) for f in _FINER if f != 1.0]
+            if lasting > 0:
+                others += [(place, size, f**power * lasting) for f in _FINER if f != 1.0]
+                others += [(place, f ** (0.5 * power) * size, lasting / f**power) for f in _FINER if f != 1.0]
+            tried += [replace(noise, pushes=(*noise.pushes[:d], one, *noise.pushes[d + 1 :])) for one in others]
+        values, scales = _likelihoods(flow, tried)
+        number = int(values.argmax())
+        noise, value = _scaled(tried[number], float(scales[number])), float(values[number])
+        if number == 0:
+            power *= 0.4
+    return noise, value
+
+
+def _errors(flow: Flow, noise: _Noise, value: float) -> tuple[float, ...]:
+    """Of the logarithm of each size, by the curvature of the likelihood."""
+    if not noise.pushes:
+        return ()
+    away, tried = 0.3, []
+    for d, (place, size, lasting) in enumerate(noise.pushes):
+        for sign in (-1.0, 1.0):
+            one = (place, size * math.exp(sign * away), lasting)
+            tried.append(replace(noise, pushes=(*noise.pushes[:d], one, *noise.pushes[d + 1 :])))
+    values, _ = _likelihoods(flow, tried)
+    curves = [(2.0 * value - values[2 * d] - values[2 * d + 1]) / away**2 for d in range(len(noise.pushes))]
+    return tuple(1.0 / math.sqrt(curve) if curve > 0 else math.inf for curve in curves)
+
+
+def observer_of(flow: Flow, found: Disturbed, names: Sequence[str], channels: Sequence[str]) -> Observer | None:
+    """The gains of a noise along a flow; None where there is nothing but the sensors' white noise."""
+    if not found.disturbances:
+        return None
+    places = [*names, *channels]
+    pushes = tuple((_place(places, one, len(names)), one.size, one.lasting) for one in found.disturbances)
+    models = _models(flow, [_Noise(tuple(found.sensor.tolist()), pushes)])
+    kept = filtered(flow, models, keep=True)
+    D, m = models.place.shape[1], flow.new.shape[1]
+    own = np.zeros((m, D))
+    for d in range(D):
+        if models.place[0, d] >= len(names):
+            own[models.place[0, d] - len(names), d] = 1.0
+    C = np.concatenate([flow.seen, np.broadcast_to(own, (len(flow.new), m, D))], -1)
+    P = kept.prior[:, 0]
+    cross = P @ C.swapaxes(1, 2)
+    S = C @ cross + np.diag(models.sensor[0] ** 2)
+    counts = flow.counts
+    gain = np.linalg.solve(S, cross.swapaxes(1, 2)).swapaxes(1, 2) * counts[:, None, :]
+    L = np.linalg.cholesky(S)
+    white = np.linalg.inv(L)
+    # of mean logarithm 0, so that likelihoods compare
+    level = np.exp(-np.log(np.diagonal(white, axis1=1, axis2=2)).mean(0))
+    white = white * level[:, None]
+    as_tensor = found.sensor.new_tensor
+    return Observer(
+        found.disturbances,
+        found.sensor,
+        as_tensor(gain),
+        as_tensor(white),
+        as_tensor(np.sqrt(np.diagonal(S, axis1=1, axis2=2).copy())),
+    )
+
+
+def _place(places: Sequence[str], one: Disturbance, rates: int) -> int:
+    """Number of a disturbance's place; a state and an output may have one name."""
+    return places.index(one.place) if one.at_rate else rates + places[rates:].index(one.place)

@@ -1,0 +1,79 @@
+"""A simulation's trajectory, linearised from sample to sample."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mkc_torch.simulation.dynamics.kalman import Flow
+from mkc_torch.simulation.dynamics.trajectory import carried, slopes
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+    from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+    from mkc_torch.simulation.protocol import Changes, Nearby
+
+__all__ = ["flow_of"]
+
+
+def flow_of(
+    prepared: PreparedDynamics,
+    theta: Float[Tensor, " p"],
+    changes: Changes,
+    near: Nearby | None,
+    counts: Bool[Tensor, "N m"],
+) -> Flow | None:
+    """The flow near a trajectory, free or observed; None where there is no trajectory.
+
+    Args:
+        prepared: the simulation.
+        theta, changes, near: of the trajectory; see :meth:`mkc_torch.simulation.PreparedSimulation.answer`.
+        counts: the samples that count.
+    """
+    found = prepared.trajectory(theta, changes, near)
+    if not found.converged:
+        return None
+    states = found.states.detach()
+    n = len(prepared.system.states)
+    own, step = states[:, :n], prepared.grid.step
+    rate, jump = prepared.rate(theta, changes), prepared.jump(theta, changes)
+    # internal states of effects and pushes are where they are; what is linearised are the system's own
+    A, _ = carried(rate, states, step.unsqueeze(-1), jump)
+    A = A[:, :n, :n].detach()
+    places = [prepared.system.states.index(name) for name in prepared.pushable]
+    unit = torch.eye(n, dtype=own.dtype)[:, places]
+    G = step[:, None, None] * 0.5 * (unit + A @ unit)
+    carry, push = _between_samples(A, G, prepared.rows)
+    at = states[prepared.rows]
+    predict = prepared.predicted(theta)
+    C = slopes(predict, at)[..., :n].detach()
+    new = (prepared.seen(theta, changes) - predict(at)).detach()
+    after = at if jump is None else jump.applied(states)[prepared.rows].detach()
+    # the trajectory itself moved by its corrections and pushes
+    shift = torch.einsum("kij,kj->ki", carry, (after - at)[:-1, :n])
+    lasting = prepared.lasting
+    for number, one in enumerate(lasting):
+        if one.at_rate:
+            value = after[:-1, states.shape[1] - len(lasting) + number]
+            shift = shift + push[:, :, prepared.pushable.index(one.place)] * value.unsqueeze(-1)
+    gap = torch.where(prepared.begins[1:], 0.0, prepared.time.diff())
+    arrays = (carry, push, C, new, shift, gap, counts.to(own.dtype))
+    return Flow(*(one.detach().cpu().numpy().astype(np.float64) for one in arrays))
+
+
+def _between_samples(A: Tensor, G: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """From node to node joined to from sample to sample."""
+    count = rows.diff()
+    n = A.shape[1]
+    carry = torch.eye(n, dtype=A.dtype).expand(len(count), n, n).clone()
+    push = A.new_zeros(len(count), n, G.shape[-1])
+    for part in range(int(count.max())):
+        there = part < count
+        at = (rows[:-1] + part)[there]
+        push[there] = A[at] @ push[there] + G[at]
+        carry[there] = A[at] @ carry[there]
+    return carry, push

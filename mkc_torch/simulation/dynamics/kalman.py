@@ -1,0 +1,194 @@
+"""Kalman filters for many models of the noise at once, along one linearised trajectory.
+
+Each model pushes rates, white or for a while, and adds to the outputs' white noise an own slow part; states begin where
+the simulation says. Outputs are taken up one after the other, which needs no inverse (Anderson & Moore, "Optimal
+Filtering", 1979, 6.4), and an innovation far outside of its distribution moves the states as one at its edge does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+__all__ = ["Filtered", "Flow", "Models", "filtered", "robust_likelihood", "smoothed"]
+
+_CLIP = 4.0
+_CORNER = 2.5
+_SCALINGS = 30
+
+
+@dataclass(frozen=True)
+class Flow:
+    """A trajectory, linearised from sample to sample.
+
+    Attributes:
+        carried: (N-1, n, n), the states at the next sample by those just after this one; 0 where a run ends.
+        pushed: (N-1, n, p), the same by a constant push of each of p rates in between.
+        seen: (N, m, n), outputs by states.
+        new: (N, m), recording less what the trajectory's states give.
+        shift: (N-1, n), by how much more than its own states the trajectory had moved at the next sample.
+        step: (N-1,), in s.
+        counts: (N, m), 0 where a sample does not count.
+    """
+
+    carried: Float[np.ndarray, "N-1 n n"]
+    pushed: Float[np.ndarray, "N-1 n p"]
+    seen: Float[np.ndarray, "N m n"]
+    new: Float[np.ndarray, "N m"]
+    shift: Float[np.ndarray, "N-1 n"]
+    step: Float[np.ndarray, " N-1"]
+    counts: Float[np.ndarray, "N m"]
+
+    @property
+    def rates(self) -> int:
+        return self.pushed.shape[-1]
+
+
+@dataclass(frozen=True)
+class Models:
+    """B models of the noise with D lasting disturbances each.
+
+    Attributes:
+        white: (B, p), standard deviation of a push of each rate that is new at each sample.
+        place: (B, D), what a lasting disturbance acts on: a rate, or p and more for an output.
+        size: (B, D), its standard deviation.
+        lasting: (B, D), its time constant in s.
+        sensor: (B, m), standard deviation of each output's white noise.
+    """
+
+    white: Float[np.ndarray, "B p"]
+    place: Int[np.ndarray, "B D"]
+    size: Float[np.ndarray, "B D"]
+    lasting: Float[np.ndarray, "B D"]
+    sensor: Float[np.ndarray, "B m"]
+
+    def __len__(self) -> int:
+        return len(self.white)
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """What a filter leaves: standardised innovations, and for one model the covariances and states on its way."""
+
+    standard: Float[np.ndarray, "N B m"]
+    log_spread: Float[np.ndarray, "N B m"]
+    prior: Float[np.ndarray, "N B k k"]
+    state: Float[np.ndarray, "N B k"]
+    after: Float[np.ndarray, "N B k"]
+    posterior: Float[np.ndarray, "N B k k"]
+
+
+def filtered(flow: Flow, models: Models, *, keep: bool = False) -> Filtered:
+    """Run the filters; ``keep`` for covariances and states too."""
+    N, m = flow.new.shape
+    n, p, B = flow.carried.shape[1], flow.rates, len(models)
+    D = models.place.shape[1]
+    k = n + D
+    at_rate = models.place < p
+    which = np.where(at_rate, models.place, 0)
+    C = np.zeros((B, m, k))
+    for d in range(D):
+        for j in range(m):
+            C[:, j, n + d] = models.place[:, d] == p + j
+    state = np.zeros((B, k))
+    P = np.zeros((B, k, k))
+    index = n + np.arange(D)
+    P[:, index, index] = models.size**2
+    variance = models.sensor**2
+    standard, log_spread = np.zeros((N, B, m)), np.zeros((N, B, m))
+    kept = (N, B, k, k) if keep else (0, B, k, k)
+    priors, posteriors = np.zeros(kept), np.zeros(kept)
+    states, afters = np.zeros(kept[:3]), np.zeros(kept[:3])
+    A = np.zeros((B, k, k))
+    for row in range(N):
+        if row:
+            step = flow.step[row - 1]
+            A[:, :n, :n] = flow.carried[row - 1]
+            if D:
+                push = flow.pushed[row - 1].T[which]  # (B, D, n)
+                A[:, :n, n:] = np.where(at_rate[..., None], push, 0.0).swapaxes(1, 2)
+                phi = np.exp(-step / models.lasting) if step > 0 else np.zeros_like(models.lasting)
+                A[:, index, index] = phi
+            state = (A @ state[..., None])[..., 0]
+            state[:, :n] -= flow.shift[row - 1]
+            P = A @ P @ A.swapaxes(1, 2)
+            if D:
+                P[:, index, index] += models.size**2 * (1.0 - phi**2)
+            white = flow.pushed[row - 1] * models.white[:, None, :]
+            P[:, :n, :n] += white @ white.swapaxes(1, 2)
+        C[:, :, :n] = flow.seen[row]
+        if keep:
+            priors[row], states[row] = P, state
+        for j in range(m):
+            c = C[:, j]
+            Pc = (P @ c[..., None])[..., 0]
+            S = (c * Pc).sum(-1) + variance[:, j]
+            root = np.sqrt(S)
+            z = (flow.new[row, j] - (c * state).sum(-1)) / root
+            standard[row, :, j], log_spread[row, :, j] = z, np.log(root)
+            if flow.counts[row, j]:
+                pulled = _CLIP * np.tanh(z / _CLIP) * root / S
+                state = state + Pc * pulled[:, None]
+                P = P - Pc[:, :, None] * Pc[:, None, :] / S[:, None, None]
+        if keep:
+            afters[row], posteriors[row] = state, P
+    return Filtered(standard, log_spread, priors, states, afters, posteriors)
+
+
+def robust_likelihood(
+    found: Filtered, counts: Float[np.ndarray, "N m"]
+) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"]]:
+    """Log-likelihood of each model with its scale profiled out, and that scale: Huber's density for innovations.
+
+    Huber, "Robust Statistics" (1981), 4.5 and 7.7.
+    """
+    N, B, m = found.standard.shape
+    weight = np.broadcast_to(counts[:, None, :], (N, B, m)).swapaxes(0, 1).reshape(B, -1)
+    z = np.abs(found.standard).swapaxes(0, 1).reshape(B, -1)
+    total = weight.sum(-1)
+    scale = np.maximum(np.median(z, -1) / 0.6745, 1e-300)
+    for _ in range(_SCALINGS):
+        ratio = z / scale[:, None]
+        # the scale at which Huber's density is likeliest
+        inner = ratio * np.minimum(ratio, _CORNER)
+        scale = scale * np.sqrt(np.maximum((weight * inner).sum(-1) / total, 1e-12))
+    ratio = z / scale[:, None]
+    rho = np.where(ratio <= _CORNER, 0.5 * ratio**2, _CORNER * ratio - 0.5 * _CORNER**2)
+    spread = found.log_spread.swapaxes(0, 1).reshape(B, -1)
+    value = -(weight * (rho + spread)).sum(-1) - total * np.log(scale)
+    return value, scale
+
+
+def smoothed(
+    flow: Flow, models: Models, found: Filtered
+) -> tuple[Float[np.ndarray, "N k"], Float[np.ndarray, "N k k"]]:
+    """States and lasting disturbances of the first model by all of the samples, and their covariance.
+
+    Rauch, Tung & Striebel, AIAA Journal 3 (1965), 1445.
+    """
+    N, n, p = len(flow.new), flow.carried.shape[1], flow.rates
+    D = models.place.shape[1]
+    state, P = found.after[:, 0].copy(), found.posterior[:, 0].copy()
+    for row in range(N - 2, -1, -1):
+        step = flow.step[row]
+        if step <= 0:
+            continue
+        A = np.zeros((n + D, n + D))
+        A[:n, :n] = flow.carried[row]
+        for d in range(D):
+            place = models.place[0, d]
+            if place < p:
+                A[:n, n + d] = flow.pushed[row][:, place]
+            A[n + d, n + d] = np.exp(-step / models.lasting[0, d])
+        prior, at = found.prior[row + 1, 0], found.state[row + 1, 0]
+        scale = 1.0 / np.sqrt(np.maximum(prior.diagonal(), 1e-300))
+        inverse = np.linalg.pinv(prior * scale[:, None] * scale, rcond=1e-10, hermitian=True) * scale[:, None] * scale
+        back = found.posterior[row, 0] @ A.T @ inverse
+        state[row] = found.after[row, 0] + back @ (state[row + 1] - at)
+        P[row] = found.posterior[row, 0] + back @ (P[row + 1] - prior) @ back.T
+    return state, P

@@ -1,0 +1,116 @@
+"""A trajectory that is corrected by what was measured: prediction from sample to sample, where states are pushed.
+
+Where what is left of a simulation is not the sensors' noise alone, a free run drifts from the recording, and its
+residual says little about the next sample. With the gains of a Kalman filter, fixed beforehand, states and pushes are
+moved at each sample towards what was measured, and what is new in each sample is the residual: an innovations model
+(Ljung, "System Identification", 1999, 4.3; Kristensen, Madsen & Jørgensen, Automatica 40 (2004), 225).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.simulation.dynamics.trajectory import slopes
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+__all__ = ["Correcting", "Disturbance", "Observer"]
+
+_CLIP = 4.0
+"""Standard deviations of what is new in a sample beyond which it moves the states no further: it may be an outlier."""
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """Something random that acts on the rate of a state, or is added to an output.
+
+    Attributes:
+        place: the state or the output.
+        at_rate: whether it acts on a rate.
+        lasting: time constant in s in which it forgets its value; 0 for one that is new at each sample.
+        size: standard deviation, in the unit of the rate or of the output.
+    """
+
+    place: str
+    at_rate: bool
+    lasting: float
+    size: float
+
+
+@dataclass(frozen=True)
+class Observer:
+    """Gains by which states and lasting disturbances are corrected at the samples, and the scale of what is new.
+
+    Attributes:
+        disturbances: all of them.
+        sensor: (m,), standard deviation of each output's white noise.
+        gain: (N, n + D, m), of n states and the D lasting disturbances, 0 where a sample does not count.
+        white: (N, m, m), what makes the innovations of a sample independent and of one size; its determinants have
+            a mean logarithm of 0 for each output, so that likelihoods compare across observers.
+        spread: (N, m), standard deviation of each innovation.
+    """
+
+    disturbances: tuple[Disturbance, ...]
+    sensor: Float[Tensor, " m"]
+    gain: Float[Tensor, "N k m"]
+    white: Float[Tensor, "N m m"]
+    spread: Float[Tensor, "N m"]
+
+    @property
+    def lasting(self) -> tuple[Disturbance, ...]:
+        """Those that have a memory, in the order of their states."""
+        return tuple(one for one in self.disturbances if one.lasting > 0.0)
+
+    def whitened(self, new: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
+        """Innovations as independent residuals of one size, in the outputs' units."""
+        return torch.einsum("nij,nj->ni", self.white, new)
+
+
+@dataclass(frozen=True)
+class Correcting:
+    """The jump of a trajectory's states at the samples.
+
+    Attributes:
+        observer: the gains.
+        rows: (N,), the moment of each sample.
+        places: where the states that the gains are of stand among those of the trajectory.
+        measured: (N, m), with what effects and sensors make of the outputs taken off.
+        predict: outputs at the samples by the states there, (N, n) to (N, m).
+    """
+
+    observer: Observer
+    rows: Int[Tensor, " N"]
+    places: tuple[int, ...]
+    measured: Float[Tensor, "N m"]
+    predict: Callable[[Tensor], Tensor]
+
+    def applied(self, states: Float[Tensor, "G n"]) -> Float[Tensor, "G n"]:
+        at = states[self.rows]
+        limit = _CLIP * self.observer.spread
+        moved = limit * torch.tanh((self.measured - self.predict(at)) / limit)
+        return states.index_put((self.rows,), at + self._spread_out(torch.einsum("nkm,nm->nk", self._gain, moved), at))
+
+    def slope(self, states: Float[Tensor, "G n"]) -> Float[Tensor, "G n n"]:
+        at = states[self.rows]
+        limit = _CLIP * self.observer.spread
+        given = torch.tanh((self.measured.detach() - self.predict(at).detach()) / limit)
+        C = slopes(self.predict, at) * (1.0 - given.square()).unsqueeze(-1)
+        n = states.shape[1]
+        eye = torch.eye(n, dtype=states.dtype, device=states.device).expand(len(states), n, n)
+        pulled = self._spread_out(-(self._gain @ C).movedim(1, -1), at).movedim(-1, 1)
+        return eye.index_put((self.rows,), eye[: len(at)] + pulled)
+
+    @property
+    def _gain(self) -> Tensor:
+        return self.observer.gain
+
+    def _spread_out(self, values: Float[Tensor, "N *rest k"], at: Float[Tensor, "N n"]) -> Float[Tensor, "N *rest n"]:
+        """Values for the states with gains, as values for all states."""
+        all_ = values.new_zeros(*values.shape[:-1], at.shape[1])
+        return all_.index_copy(-1, torch.tensor(self.places, device=at.device), values)
