@@ -20,9 +20,10 @@ from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.model.drivers import Drivers
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.grid import described
-from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability, Traces, Verdict
+from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability, Traces
 from mkc_torch.diagnosis.rounds import Asked, Search
 from mkc_torch.diagnosis.search.locate import Located
+from mkc_torch.diagnosis.world import Verdict
 from mkc_torch.recording.unit_warnings import unit_warnings
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from torch import Tensor
 
 from mkc_torch.diagnosis.correcting_model import CorrectingModel
+from mkc_torch.diagnosis.world import Grade, Shape, Verdict, World
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
 __all__ = [
     "Alternative",
     "Candidate",
-    "Curve",
     "DensityCheck",
     "Diagnosis",
     "DriverShift",
@@ -29,6 +29,7 @@ __all__ = [
     "Region",
     "Row",
     "Separability",
+    "Sizes",
     "SmoothCorrection",
     "Spread",
     "StateMap",
@@ -37,7 +38,6 @@ __all__ = [
     "Traces",
 ]
 
-Verdict = Literal["adequate", "explained", "unexplained"]
 Number = float | tuple["Number", ...]
 
 
@@ -115,14 +115,29 @@ class Reference:
 
 
 @dataclass(frozen=True)
+class Sizes:
+    """Residuals of one output before and after, in its own unit."""
+
+    before: float
+    after: float
+    unit: str
+
+
+@dataclass(frozen=True)
 class HeldOut:
-    """Evidence on blocks that the fit has not seen; the gain in nats per sample, with its 95 % interval."""
+    """Evidence on blocks that the fit has not seen; the gain in nats per sample, with its 95 % interval.
+
+    ``outputs`` has each output's residuals; ``left`` says of which blocks the free run leaves the recording's range,
+    which enter no mean, and is empty where none does.
+    """
 
     log_likelihood_gain: float
     confidence_interval: tuple[float, float]
     rmse_before: float
     rmse_after: float
     unit: str
+    outputs: Mapping[str, Sizes] = field(default_factory=dict)
+    left: str = ""
 
 
 @dataclass(frozen=True)
@@ -160,22 +175,6 @@ class Alternative:
 
 
 @dataclass(frozen=True)
-class Curve:
-    """The trace of an effect against what drives it, one row a point, one column a channel.
-
-    ``band`` is the half-width of a 95 % interval.
-    """
-
-    driver: str
-    unit: str
-    x: Float[Tensor, " points"]
-    value: Float[Tensor, "points channels"]
-    band: Float[Tensor, "points channels"]
-    channels: tuple[str, ...]
-    value_unit: str
-
-
-@dataclass(frozen=True)
 class Region:
     """A part of a state's range in which most of a finding's gain arises, in less of the time.
 
@@ -210,6 +209,7 @@ class Finding:
     ``moments`` are those at which an effect sets in that does so several times, the first of them its onset.
     ``references`` are what the equation counts its drivers from, ``advice`` what to do about it, ``again`` what becomes
     of it in another recording; one that is ``placed`` belongs to the place or the attitude of this recording.
+    ``grade`` is what it is worth, ``shape`` whether its name's shape is the recording's; None where that is not asked.
     ``evidence`` is what the tests say that are asked of each finding.
     """
 
@@ -234,6 +234,8 @@ class Finding:
     advice: str = ""
     again: str = ""
     placed: bool = False
+    grade: Grade = "left out"
+    shape: Shape | None = None
     evidence: tuple[Told, ...] = ()
 
     @property
@@ -381,7 +383,7 @@ class Diagnosis:
         noise: the noise model that structure was tested against.
         candidates_tried, surrogates, seed: the size of the search.
         p_value: of the strongest candidate after the whole search.
-        verdict: "adequate", "explained" or "unexplained".
+        verdict: "unfit", "adequate", "explained" or "unexplained".
         findings: strongest first.
         baseline, corrected: the simulation without and with the findings, on held-out blocks.
         advice: what to do or to record next, in sentences, effects by their ids.
@@ -391,6 +393,7 @@ class Diagnosis:
         traces: the residuals.
         model: the simulation's sensor or system with the findings in it; None where there is none to apply.
         evidence: what the tests say that are asked of the whole diagnosis.
+        world: how the simulation follows the recording, and the noise of the world around it.
 
     Example:
         >>> import torch
@@ -426,6 +429,7 @@ class Diagnosis:
     traces: Traces
     model: CorrectingModel | None = field(default=None, repr=False, compare=False)
     evidence: tuple[Told, ...] = ()
+    world: World = field(default_factory=World)
 
     @property
     def ceiling(self) -> Spread | None:

@@ -10,7 +10,6 @@ from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.result import (
     Alternative,
     Candidate,
-    Curve,
     Diagnosis,
     Finding,
     HeldOut,
@@ -22,6 +21,7 @@ from mkc_torch.diagnosis.result import (
     Spread,
     Traces,
 )
+from mkc_torch.diagnosis.world import Curve
 
 CHANNELS = ("norm", "turn_x", "turn_y", "turn_z")
 CATALOGUE = (

@@ -17,8 +17,9 @@ from mkc_torch.diagnosis.findings.regions import attributed, map_of, region_of, 
 from mkc_torch.diagnosis.findings.what_to_record import SAME, told_by
 from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.result import Alternative, Curve, Finding, Number, Parameter, Reference
+from mkc_torch.diagnosis.result import Alternative, Finding, Number, Parameter, Reference
 from mkc_torch.diagnosis.search.locate import Located
+from mkc_torch.diagnosis.world import Curve
 from mkc_torch.effects.context import Context
 from mkc_torch.nonlinear import beside
 

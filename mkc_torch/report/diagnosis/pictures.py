@@ -14,7 +14,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from mkc_torch.diagnosis.result import Curve, Diagnosis, Finding, Traces
+from mkc_torch.diagnosis.result import Diagnosis, Finding, Traces
+from mkc_torch.diagnosis.world import Curve
 from mkc_torch.report.drawing import BLUE, GREY, INK, ORANGE, SHADE, STYLE, svg
 from mkc_torch.report.words.terms import term
 from mkc_torch.report.words.typesetting import capital, plain

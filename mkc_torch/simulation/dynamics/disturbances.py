@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from mkc_torch.simulation.dynamics.kalman import Flow, Models, filtered, robust_likelihood
@@ -85,15 +84,13 @@ def disturbed(
         gains.append(more - value)
         best, value = other, more
     errors = _errors(flow, best, value)
-    found = [
-        Disturbance((*names, *channels)[place], place < p, lasting, size) for place, size, lasting in best.pushes
-    ]
+    found = [Disturbance((*names, *channels)[place], place < p, lasting, size) for place, size, lasting in best.pushes]
     return Disturbed(tuple(found), errors, tuple(gains), floor.new_tensor(best.sensor), value)
 
 
 def _candidates(flow: Flow, known: _Noise, places: int) -> list[tuple[int, float, float]]:
     """Disturbances of any place, time constant and size that is not there yet."""
-    p, m = flow.rates, places - flow.rates
+    p = flow.rates
     longest = _longest(flow)
     usual = float(np.median(flow.step[flow.step > 0]))
     lasting = sorted({max(share * longest, 2.0 * usual) for share in _LASTING})
