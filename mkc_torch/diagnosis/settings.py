@@ -77,6 +77,8 @@ class NoiseSettings(_Stage):
             more numbers gains by chance.
         told_wander: nats that a wander has to gain to be told of.
         told_colour: sum of squared autoregression coefficients above which noise is called coloured.
+        pushed: nats that a push of a state, or slow noise of an output, has to gain to be in the noise of the world.
+        pushes: of these at most.
         last_step: standard errors beyond which the final step of least squares is not taken, for the noise misfits.
     """
 
@@ -96,6 +98,8 @@ class NoiseSettings(_Stage):
     plausible: float = 6.0
     told_wander: float = 3.0
     told_colour: float = 0.05
+    pushed: float = 6.0
+    pushes: int = 2
     last_step: float = 5.0
 
     def __post_init__(self) -> None:

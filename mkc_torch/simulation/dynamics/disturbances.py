@@ -16,7 +16,7 @@ from mkc_torch.simulation.dynamics.observer import Disturbance, Observer
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Disturbed", "disturbed", "observer_of"]
+__all__ = ["Disturbed", "disturbed", "models_of", "observer_of", "usual_size"]
 
 _SIZES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 """Tried, over that at which a disturbance moves an output by as much as its white noise."""
@@ -49,14 +49,21 @@ class Disturbed:
 
 @dataclass(frozen=True)
 class _Noise:
-    """One model of the noise: disturbances by their number of place, size and time constant."""
+    """One model of the noise: disturbances by their number of place, size and time constant, and what is declared."""
 
     sensor: tuple[float, ...]
     pushes: tuple[tuple[int, float, float], ...] = ()
+    known: tuple[bool, ...] = ()
 
 
 def disturbed(
-    flow: Flow, names: Sequence[str], channels: Sequence[str], floor: Float[Tensor, " m"], least: float, most: int = 2
+    flow: Flow,
+    names: Sequence[str],
+    channels: Sequence[str],
+    floor: Float[Tensor, " m"],
+    known: Sequence[bool],
+    least: float,
+    most: int,
 ) -> Disturbed:
     """The likeliest noise along a flow: one disturbance after the other is taken up, whichever gains most.
 
@@ -64,12 +71,13 @@ def disturbed(
         flow: of the trajectory.
         names: of the states whose rates can be pushed, in the order of the flow.
         channels: of the outputs.
-        floor: a first guess of the outputs' white noise.
+        floor: the outputs' white noise where it is known, else a first guess.
+        known: whether it is known.
         least: nats that a disturbance has to gain.
         most: disturbances at most.
     """
     p, m = flow.rates, len(channels)
-    best = _Noise(tuple(floor.tolist()))
+    best = _Noise(tuple(floor.tolist()), (), tuple(known))
     best, value = _finer(flow, best)
     gains: list[float] = []
     for _ in range(most):
@@ -99,7 +107,7 @@ def _candidates(flow: Flow, known: _Noise, places: int) -> list[tuple[int, float
     for place in range(places):
         if place < p:
             times = [0.0, *lasting]
-            units = [_unit(flow, place, time, sensor) for time in times]
+            units = [usual_size(flow, place, time, sensor) for time in times]
         else:
             times, units = list(lasting), [float(sensor[place - p])] * len(lasting)
         for time, unit in zip(times, units, strict=True):
@@ -119,7 +127,7 @@ _REACH = 400
 """Samples over which the effect of a push is followed to find its usual size."""
 
 
-def _unit(flow: Flow, place: int, lasting: float, sensor: Float[np.ndarray, " m"]) -> float:
+def usual_size(flow: Flow, place: int, lasting: float, sensor: Float[np.ndarray, " m"]) -> float:
     """The size of a push at which it moves an output by the sensor's noise, somewhere along a run."""
     N = len(flow.new)
     state = np.zeros(flow.carried.shape[1])
@@ -159,11 +167,13 @@ def _models(flow: Flow, noises: Sequence[_Noise]) -> Models:
 
 
 def _likelihoods(flow: Flow, noises: Sequence[_Noise]) -> tuple[np.ndarray, np.ndarray]:
-    return robust_likelihood(filtered(flow, _models(flow, noises)), flow.counts)
+    """Of each, its scale profiled out, and that scale; at the scale it has, where some of the sensors' is declared."""
+    return robust_likelihood(filtered(flow, _models(flow, noises)), flow.counts, free=not any(noises[0].known))
 
 
 def _scaled(noise: _Noise, scale: float) -> _Noise:
-    return _Noise(tuple(scale * one for one in noise.sensor), tuple((a, scale * s, t) for a, s, t in noise.pushes))
+    pushes = tuple((place, scale * size, lasting) for place, size, lasting in noise.pushes)
+    return replace(noise, sensor=tuple(scale * one for one in noise.sensor), pushes=pushes)
 
 
 def _finer(flow: Flow, noise: _Noise) -> tuple[_Noise, float]:
@@ -172,7 +182,8 @@ def _finer(flow: Flow, noise: _Noise) -> tuple[_Noise, float]:
     power = 1.0
     for _ in range(_ROUNDS):
         tried = [noise]
-        for j in range(len(noise.sensor) if noise.pushes or len(noise.sensor) > 1 else 0):
+        alone = len(noise.sensor) == 1 and not noise.pushes  # its size is the scale
+        for j in [j for j, known in enumerate(noise.known) if not known and not alone]:
             tried += [
                 replace(noise, sensor=(*noise.sensor[:j], f**power * noise.sensor[j], *noise.sensor[j + 1 :]))
                 for f in _FINER
@@ -206,13 +217,17 @@ def _errors(flow: Flow, noise: _Noise, value: float) -> tuple[float, ...]:
     return tuple(1.0 / math.sqrt(curve) if curve > 0 else math.inf for curve in curves)
 
 
-def observer_of(flow: Flow, found: Disturbed, names: Sequence[str], channels: Sequence[str]) -> Observer | None:
+def observer_of(
+    flow: Flow,
+    disturbances: tuple[Disturbance, ...],
+    sensor: Float[Tensor, " m"],
+    names: Sequence[str],
+    channels: Sequence[str],
+) -> Observer | None:
     """The gains of a noise along a flow; None where there is nothing but the sensors' white noise."""
-    if not found.disturbances:
+    if not disturbances:
         return None
-    places = [*names, *channels]
-    pushes = tuple((_place(places, one, len(names)), one.size, one.lasting) for one in found.disturbances)
-    models = _models(flow, [_Noise(tuple(found.sensor.tolist()), pushes)])
+    models = models_of(flow, disturbances, sensor, names, channels)
     kept = filtered(flow, models, keep=True)
     D, m = models.place.shape[1], flow.new.shape[1]
     own = np.zeros((m, D))
@@ -230,14 +245,26 @@ def observer_of(flow: Flow, found: Disturbed, names: Sequence[str], channels: Se
     # of mean logarithm 0, so that likelihoods compare
     level = np.exp(-np.log(np.diagonal(white, axis1=1, axis2=2)).mean(0))
     white = white * level[:, None]
-    as_tensor = found.sensor.new_tensor
+    as_tensor = sensor.new_tensor
     return Observer(
-        found.disturbances,
-        found.sensor,
+        disturbances,
+        sensor,
         as_tensor(gain),
         as_tensor(white),
         as_tensor(np.sqrt(np.diagonal(S, axis1=1, axis2=2).copy())),
     )
+
+
+def models_of(
+    flow: Flow,
+    disturbances: Sequence[Disturbance],
+    sensor: Float[Tensor, " m"],
+    names: Sequence[str],
+    channels: Sequence[str],
+) -> Models:
+    places = [*names, *channels]
+    pushes = tuple((_place(places, one, len(names)), one.size, one.lasting) for one in disturbances)
+    return _models(flow, [_Noise(tuple(sensor.tolist()), pushes, (False,) * len(channels))])
 
 
 def _place(places: Sequence[str], one: Disturbance, rates: int) -> int:

@@ -141,9 +141,9 @@ def filtered(flow: Flow, models: Models, *, keep: bool = False) -> Filtered:
 
 
 def robust_likelihood(
-    found: Filtered, counts: Float[np.ndarray, "N m"]
+    found: Filtered, counts: Float[np.ndarray, "N m"], *, free: bool = True
 ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"]]:
-    """Log-likelihood of each model with its scale profiled out, and that scale: Huber's density for innovations.
+    """Log-likelihood of each model by Huber's density for innovations, and its scale: profiled out if free, else one.
 
     Huber, "Robust Statistics" (1981), 4.5 and 7.7.
     """
@@ -151,8 +151,8 @@ def robust_likelihood(
     weight = np.broadcast_to(counts[:, None, :], (N, B, m)).swapaxes(0, 1).reshape(B, -1)
     z = np.abs(found.standard).swapaxes(0, 1).reshape(B, -1)
     total = weight.sum(-1)
-    scale = np.maximum(np.median(z, -1) / 0.6745, 1e-300)
-    for _ in range(_SCALINGS):
+    scale = np.maximum(np.median(z, -1) / 0.6745, 1e-300) if free else np.ones(B)
+    for _ in range(_SCALINGS if free else 0):
         ratio = z / scale[:, None]
         # the scale at which Huber's density is likeliest
         inner = ratio * np.minimum(ratio, _CORNER)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ from torch import Tensor
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.nonlinear import GaussianPrior, NoFitError, fit, load_forward_mode
 from mkc_torch.recording.recording import Recording
-from mkc_torch.simulation.dynamics.between_samples import smooth_between
+from mkc_torch.simulation.dynamics.between_samples import inputs_between
 from mkc_torch.simulation.dynamics.checks import Moments, check_functions
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.first_guess import despiked, first_guess
@@ -64,6 +65,7 @@ class PreparedDynamics:
         }
         self.begins, self.labels = beginnings(recording, system)
         self.run = experiment_runs(recording)
+        self.between = dict.fromkeys(system.inputs, system.between)
         refuse_few(self.begins, system.name)
         self._kinematic = kinematic(system, self.known)
         self._lay_out(1)
@@ -75,6 +77,7 @@ class PreparedDynamics:
         self.bounds = self.time.new_tensor(low + [-torch.inf] * n), self.time.new_tensor(high + [torch.inf] * n)
         self._p = p
         self._clean = torch.stack([despiked(one, self.time, self.begins) for one in self.measured.unbind(-1)], -1)
+        self.counts = self._clean == self.measured
         self._check_functions()
         self._refine()
 
@@ -102,18 +105,27 @@ class PreparedDynamics:
         inputs = self.recording.stack(*self.system.inputs) if self.system.inputs else self.time.new_zeros(N, 0)
         self.inputs = self._between(inputs)
         self.inputs_at_rows = inputs
-        self._guess = first_guess(
+        self.guess = first_guess(
             self.system, self.recording, self.channels, self.begins, self._kinematic, time, node_before, node_share
         )
         self.__dict__.pop("ports", None)  # their clock is that of the stations
 
     def _between(self, inputs: Float[Tensor, "N u"]) -> Float[Tensor, "S u"]:
         """Inputs at the stations."""
-        if self.system.between == "held":
-            return inputs[self.clock.before]
-        if self.system.between == "linear":
-            return self.clock.at(inputs)
-        return smooth_between(inputs, self.time, self.begins, self.clock)
+        columns = [
+            inputs_between(inputs[:, [k]], how, self.time, self.begins, self.clock)
+            for k, how in enumerate(self.between.values())
+        ]
+        return torch.cat(columns, -1) if columns else inputs.new_zeros(len(self.clock.time), 0)
+
+    def holding(self, between: Mapping[str, str]) -> PreparedDynamics:
+        """The same with inputs that do something else between samples: "held", "linear" or "smooth", by their names."""
+        other = copy.copy(self)
+        other.between = {**self.between, **between}
+        other.inputs = other._between(self.inputs_at_rows)
+        for known in ("_start", "warnings"):
+            other.__dict__.pop(known, None)
+        return other
 
     def observed(self, observer: Observer | None) -> PreparedDynamics:
         """The same, predicted from sample to sample by an observer; None for a free run."""
@@ -127,7 +139,7 @@ class PreparedDynamics:
     def ports(self) -> dict[str, Port]:
         """The rate of each state, exchange between two of the same unit, each input, and the outputs."""
         places = Places(
-            self.system, self.recording, self.channels, self._kinematic, self._guess[self.rows], self.clock, self.run
+            self.system, self.recording, self.channels, self._kinematic, self.guess[self.rows], self.clock, self.run
         )
         return places.ports()
 
@@ -139,27 +151,30 @@ class PreparedDynamics:
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
         return self._start.clone()
 
+    @property
+    def given(self) -> Float[Tensor, " p"]:
+        """The user's values, and the first guess of the first states."""
+        values = self.time.new_tensor([one.value for one in self.known.values()])
+        return torch.cat([values, self.guess[self.grid.begins].flatten()])
+
     @cached_property
     def _start(self) -> Float[Tensor, " p"]:
         """The user's values, or those with which the measured states obey the equations, whichever simulates better."""
-        values = self.time.new_tensor([one.value for one in self.known.values()])
-        begin = self._guess[self.grid.begins].flatten()
-        starts = [torch.cat([values, begin])]
+        values, begin = self.given[: self._p], self.given[self._p :]
+        starts = [self.given]
         if self._p:
             step = self.grid.step.unsqueeze(-1)
-            typical = self._guess.abs().median(0).values.clamp(min=1e-12)
+            typical = self.guess.abs().median(0).values.clamp(min=1e-12)
 
             def lacking(values: Tensor) -> Tensor:
-                left = defect(self.rate(torch.cat([values, begin]), {}), self._guess, step) / typical
+                left = defect(self.rate(torch.cat([values, begin]), {}), self.guess, step) / typical
                 total = torch.cat([torch.zeros_like(left[:1]), left.cumsum(0)])
                 return total[_WINDOW:] - total[:-_WINDOW]
 
             low, high = (bound[: self._p] for bound in self.bounds)
-            try:
+            with suppress(NoFitError):  # the equations cannot be looked at there
                 found = fit(lacking, values, lower=low, upper=high, covariance=None, max_iter=60).theta
-            except NoFitError:
-                found = values  # the equations cannot be looked at there
-            starts.append(torch.cat([found, begin]))
+                starts.append(torch.cat([found, begin]))
         spread = [robust_scale(self.residual(one, {}).nan_to_num(torch.inf, torch.inf, torch.inf)) for one in starts]
         return starts[0] if bool((spread[0] <= spread[-1]).all()) else starts[-1]
 
@@ -174,7 +189,7 @@ class PreparedDynamics:
         tangents = torch.func.jacfwd(lambda values: self.residual(values, {}, near))(theta).flatten(0, 1)
         # a value near 0 says nothing of the size that is meant
         meant = theta.new_tensor([one.value for one in self.known.values()])
-        typical = self._guess.abs().median(0).values.repeat(int(self.begins.sum()))
+        typical = self.guess.abs().median(0).values.repeat(int(self.begins.sum()))
         meant = torch.cat([meant.abs(), typical])
         size = torch.where(theta.abs() < _NOUGHT * meant, meant, theta.abs())
         return undetermined(tangents, size, self.parameter_names, self._p)
@@ -247,11 +262,11 @@ class PreparedDynamics:
         begin = _of_width(begin, begin.shape[1] + len(self._remembering(changes)) + len(self.lasting))
         width, jump = begin.shape[1], self.jump(theta, changes)
         known = near if isinstance(near, Trajectory) else None
-        guess = _of_width(self._guess if known is None else known.states, width)
+        guess = _of_width(self.guess if known is None else known.states, width)
         linear = known is not None and known.linear is not None and known.states.shape[1] == width
         found = solve(rate, self.grid, begin, guess, known if linear else None, jump=jump)
         if not found.converged and known is not None:
-            found = solve(rate, self.grid, begin, _of_width(self._guess, width), jump=jump)
+            found = solve(rate, self.grid, begin, _of_width(self.guess, width), jump=jump)
         if not found.converged and known is None:
             nearer = marched(rate, self.grid, begin, guess, jump=jump)
             found = found if nearer is None else solve(rate, self.grid, begin, nearer, jump=jump)
@@ -271,7 +286,7 @@ class PreparedDynamics:
         for name, port in self.ports.items():
             # what does not see the signal remembers nothing
             if port.memory and name in changes and not isinstance(changes[name], FreeChange):
-                seen = self._guess.new_zeros(len(self.clock.time), len(port.carries) + 1)
+                seen = self.guess.new_zeros(len(self.clock.time), len(port.carries) + 1)
                 if changes[name](seen).shape[1] > len(port.channels):
                     found[name] = port.memory
         return found
@@ -406,7 +421,7 @@ class PreparedDynamics:
 
     def _check_functions(self) -> None:
         theta = self.time.new_tensor([one.value for one in self.known.values()])
-        at = self.grid.spread(self._guess)
+        at = self.grid.spread(self.guess)
         first = at[::3][:1].expand(len(self.time), -1)
         stations = Moments(self.clock.time, at, self.inputs, self.run[self.clock.before])
         samples = Moments(self.time, first, self.inputs_at_rows, self.run)
