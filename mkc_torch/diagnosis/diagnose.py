@@ -14,16 +14,16 @@ from mkc_torch.diagnosis.evidence.after_the_search import answers_of, parts_ahea
 from mkc_torch.diagnosis.evidence.base import Case
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.drivers import find_drivers
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.grid import candidate_terms
-from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.in_the_world import at_liberty, between_samples, simulation_in_the_world
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.rounds import Asked, Search, begun, continued
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.recording import Recording
-from mkc_torch.simulation.protocol import PreparedSimulation, Simulation, refuse_no_recording
+from mkc_torch.simulation.protocol import Simulation, refuse_no_recording
 
 __all__ = ["diagnose"]
 
@@ -98,13 +98,17 @@ def diagnose(
         raise ValueError(
             f"{where}{len(prepared.time)} usable samples are too few for a diagnosis; it needs {fewest} at least."
         )
+    asked = Asked(level, surrogates, max_findings, seed, settings)
+    generator = torch.Generator().manual_seed(seed)
+    world = simulation_in_the_world(prepared, asked.declared, settings.noise)
+    world = between_samples(world, asked.declared, {}, settings.noise)
+    base = world.fit
+    prepared = at_liberty(base.model.prepared)
     roles = frozenset(role for effect in effects for role in effect.roles)
     measured: frozenset[str] = getattr(simulation, "measured", frozenset())
     drivers = find_drivers(prepared.recording, simulation.columns, settings.drivers, roles, measured)
     terms = candidate_terms(prepared, drivers.drivers, effects)
-    asked = Asked(level, surrogates, max_findings, seed, settings)
-    generator = torch.Generator().manual_seed(seed)
-    base = _base(prepared, settings.noise.domain)
+    print("WORLD", base.model.prepared.between, world.noise and world.noise.disturbed, base.parameters.tolist()[:4])
     _refuse_no_noise(base, where)
     search = begun(base, terms, asked, generator)
 
@@ -125,13 +129,6 @@ def diagnose(
                 return diagnosis(after, done())
         search = after
     return diagnosis(search, shared(parts_ahead(case(search)), [*known, *search.parts]))
-
-
-def _base(prepared: PreparedSimulation, domain: float) -> FittedModel:
-    """The simulation alone, on the domain that all models share: wide enough for whatever effect reshapes residuals."""
-    rough = fitted(JointModel(prepared), prepared.start())
-    bound = domain * torch.maximum(rough.bound, rough.bound.mean())
-    return fitted(rough.model, rough.parameters, bound, graduate=False)
 
 
 def _refuse_no_noise(base: FittedModel, where: str) -> None:

@@ -129,6 +129,7 @@ class SearchSettings(_Stage):
         smaller: scale with the effect over that without, which has to be above this, for the fit without it to hide
             nothing: then the effect is judged by tangents there.
         doubted: nats beyond all draws of noise up to which draws of other plausible noise are asked too.
+        own_noise: leading candidates that are fitted and compared under the pushes that each of them leaves.
         stretches: a stretch of the recording is as long as one of so many.
         in_one_stretch: share of an effect's evidence above which it lies in one stretch. If there are bursts of
             outliers elsewhere, the stretch may be another, and the effect is judged without it.
@@ -147,6 +148,7 @@ class SearchSettings(_Stage):
     hidden: float = 0.01
     smaller: float = 0.8
     doubted: float = 25.0
+    own_noise: int = 6
     stretches: int = 25
     in_one_stretch: float = 0.5
 

@@ -22,7 +22,16 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["InTheWorld", "at_liberty", "between_samples", "in_the_world", "noise_around", "simulation_in_the_world"]
+__all__ = [
+    "InTheWorld",
+    "at_liberty",
+    "beside_effects",
+    "between_samples",
+    "freed",
+    "in_the_world",
+    "noise_around",
+    "simulation_in_the_world",
+]
 
 _ROUNDS = 2
 """Times that the noise is sought along a trajectory and the parameters are fitted under it."""
@@ -56,6 +65,12 @@ class InTheWorld:
 def at_liberty(prepared: PreparedSimulation) -> PreparedSimulation:
     """The simulation as it runs freely."""
     return prepared.observed(None) if isinstance(prepared, PreparedDynamics) else prepared
+
+
+def pushed(fit: FittedModel) -> bool:
+    """Whether a fit is under more noise than the sensors' white one."""
+    prepared = fit.model.prepared
+    return isinstance(prepared, PreparedDynamics) and prepared.observer is not None
 
 
 def noise_around(fit: FittedModel, declared: Mapping[str, float], settings: NoiseSettings) -> NoiseOfTheWorld | None:
@@ -130,6 +145,36 @@ def in_the_world(
     if best[1].observer is None and free is not None:
         return InTheWorld(free, free, best[1], starts)
     return InTheWorld(free, *best, starts)
+
+
+def beside_effects(fit: FittedModel, declared: Mapping[str, float], settings: NoiseSettings) -> FittedModel | None:
+    """The same joint model under the noise that is left beside its effects; None of a simulation without states."""
+    prepared = fit.model.prepared
+    if not isinstance(prepared, PreparedDynamics):
+        return None
+    free = freed(fit)
+    if prepared.observer is None:
+        return in_the_world(free, declared, settings).fit if free is not None else None
+    found = [_under_noise(fit, noise_around(fit, declared, settings), declared, settings)]
+    if free is not None:
+        world = in_the_world(free, declared, settings)
+        if not world.pushed:
+            return free
+        found.append((world.fit, world.noise) if world.noise is not None else None)
+    fits = [one[0] for one in found if one is not None]
+    return max(fits, key=lambda one: one.log_likelihood) if fits else fit
+
+
+def freed(fit: FittedModel) -> FittedModel | None:
+    """The same joint model fitted to its free run; None where that loses the recording."""
+    prepared = at_liberty(fit.model.prepared)
+    if prepared is fit.model.prepared:
+        return fit
+    try:
+        found = fitted(JointModel(prepared, fit.model.terms, fit.model.near), fit.parameters, fit.bound, graduate=False)
+    except NoFitError:
+        return None
+    return found
 
 
 def _free(model: JointModel, start: Float[Tensor, " p"]) -> FittedModel | None:
@@ -209,7 +254,21 @@ def between_samples(
         works = [partial(_holding, base, name, other, declared, settings) for other in others]
         tried = [one for one in at_once(works, prepared) if one is not None]
         base = max([base, *tried], key=lambda one: one.fit.log_likelihood)
-    return base
+    return _with_sizes(base)
+
+
+def _with_sizes(base: InTheWorld) -> InTheWorld:
+    """The same with the fitted trajectory as the guess of all states, of those that no output shows as well."""
+    known, near = base.fit.model.prepared, base.fit.model.near
+    assert isinstance(known, PreparedDynamics)
+
+    def moved(fit: FittedModel) -> FittedModel:
+        prepared = fit.model.prepared
+        assert isinstance(prepared, PreparedDynamics)
+        return replace(fit, model=JointModel(prepared.guessed(near), (), fit.model.near))
+
+    free = None if base.free is None else moved(base.free)
+    return replace(base, free=free, fit=free if base.fit is base.free and free is not None else moved(base.fit))
 
 
 def _holding(

@@ -247,6 +247,7 @@ def observer_of(
     white = white * level[:, None]
     as_tensor = sensor.new_tensor
     return Observer(
+        tuple(channels),
         disturbances,
         sensor,
         as_tensor(gain),

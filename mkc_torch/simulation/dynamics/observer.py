@@ -54,6 +54,7 @@ class Observer:
     """Gains by which states and lasting disturbances are corrected at the samples, and the scale of what is new.
 
     Attributes:
+        outputs: names.
         disturbances: all of them.
         sensor: (m,), standard deviation of each output's white noise.
         gain: (N, n + D, m), of n states and the D lasting disturbances, 0 where a sample does not count.
@@ -62,6 +63,7 @@ class Observer:
         spread: (N, m), standard deviation of each innovation.
     """
 
+    outputs: tuple[str, ...]
     disturbances: tuple[Disturbance, ...]
     sensor: Float[Tensor, " m"]
     gain: Float[Tensor, "N k m"]
@@ -133,6 +135,7 @@ class Observable(Protocol):
         time, begins: (N,), of the samples, and where a run begins.
         grid, rows, guess: the moments, those of the samples, and a first guess of the states then.
         bounds: of the parameters.
+        observer: that corrects it; None where it runs freely.
         lasting: what an observer follows beside the states.
     """
 
@@ -146,6 +149,7 @@ class Observable(Protocol):
     rows: Tensor
     guess: Tensor
     bounds: tuple[Tensor, Tensor]
+    observer: Observer | None
 
     @property
     def pushable(self) -> tuple[str, ...]: ...

@@ -127,6 +127,15 @@ class PreparedDynamics:
             other.__dict__.pop(known, None)
         return other
 
+    def guessed(self, near: Nearby | None) -> PreparedDynamics:
+        """The same with the states of a trajectory as its guess: states that no output shows have a size then."""
+        if not isinstance(near, Trajectory):
+            return self
+        other = copy.copy(self)
+        other.guess = near.states[:, : len(self.system.states)]
+        other.__dict__.pop("ports", None)
+        return other
+
     def observed(self, observer: Observer | None) -> PreparedDynamics:
         """The same, predicted from sample to sample by an observer; None for a free run."""
         if observer is self.observer:
@@ -149,7 +158,7 @@ class PreparedDynamics:
         return len(self.parameter_names) - self._p
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
-        return self._start.clone()
+        return self.observed(None)._start.clone()
 
     @property
     def given(self) -> Float[Tensor, " p"]:
@@ -183,6 +192,8 @@ class PreparedDynamics:
         """What of the parameters the recording leaves undetermined, near where the fit starts."""
         if not self._p:
             return ()
+        if self.observer is not None:
+            return self.observed(None).warnings
         load_forward_mode()
         theta = self.start()
         near = self.trajectory(theta, {})
