@@ -39,6 +39,8 @@ def show_worlds(score: WorldsScore, total: int, output: Path) -> None:
             aims.add_row(f"  {measured.threshold.sentence}", measured_text(measured), Text(word, style=style))
         console.print(aims)
     console.print()
+    failed = [name for world in score.worlds for name in world.failed]
+    console.print(Text(f"{'failed':<15}{', '.join(failed) or 'none'}"))
     for name in ("challenge.html", "score.json", "summary.md", "key_hash.txt"):
         # outside the table, where a long path would be broken and could not be copied
         console.print(Text.assemble(f"{'written':<15}", (str(output / name), "cyan")), soft_wrap=True)
