@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Generator, Tensor
 
-from mkc_torch.challenge.draws import direction, log_uniform, uniform, whole
+from mkc_torch.challenge.draws import log_uniform, smooth, uniform, whole
 from mkc_torch.challenge.magnetometer.noise import Noise
 from mkc_torch.challenge.magnetometer.process import Process
 
@@ -25,6 +25,9 @@ BURSTS, BURST = (2, 5), (0.01, 0.04)
 HEIGHT = (5.0, 30.0)
 """Of a burst, over the standard deviation of the sensor's noise."""
 
+PERIOD = (0.1, 0.6)
+"""Shortest period of what is in a burst, s."""
+
 
 def wandering(g: Generator, noise: Noise, samples: int) -> tuple[Noise, float]:
     """The noise with a random walk of each axis, and how far the walks go, over the noise."""
@@ -35,13 +38,23 @@ def wandering(g: Generator, noise: Noise, samples: int) -> tuple[Noise, float]:
     return replace(noise, kind=f"{noise.kind}, wander", walks=(x, y, z)), wanted
 
 
-def bursts(g: Generator, sigma: float, samples: int) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, " N"]]:
-    """Fields of sources that come and go in a few stretches, µT in the sensor's axes, and where they are."""
+def bursts(g: Generator, sigma: float, samples: int, step: float) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, " N"]]:
+    """Fields that swell and fade in a few stretches, each way about nought: no passing dipole, which goes one path.
+
+    Args:
+        sigma: standard deviation of the sensor's noise, µT.
+        samples: N.
+        step: time between samples in s.
+
+    Returns:
+        The fields in µT in the sensor's axes, and where they are.
+    """
     field, mask = torch.zeros(samples, 3, dtype=torch.float64), torch.zeros(samples, dtype=torch.bool)
     for _ in range(whole(g, *BURSTS)):
         length = max(round(uniform(g, *BURST) * samples), 3)
         start = whole(g, 0, samples - length)
         rise = torch.sin(math.pi * (torch.arange(length, dtype=torch.float64) + 0.5) / length)
-        field[start : start + length] += log_uniform(g, *HEIGHT) * sigma * rise[:, None] * direction(g)
+        path = smooth(g, length, 3, step, log_uniform(g, *PERIOD))
+        field[start : start + length] += log_uniform(g, *HEIGHT) * sigma / math.sqrt(3.0) * rise[:, None] * path
         mask[start : start + length] = True
     return field, mask

@@ -78,7 +78,7 @@ def draw(world: str, duration: float, seed: int, index: int, hidden: bool, numbe
         push = KeyPush("wander", "sensor", far * noise.sigma, "µT", far)
     burst, disturbed = torch.zeros_like(scene.field), torch.zeros(count, dtype=torch.bool)
     if world == "bursts":
-        burst, disturbed = bursts(stream("bursts"), noise.sigma, count)
+        burst, disturbed = bursts(stream("bursts"), noise.sigma, count, scene.step)
         told = float(disturbed.double().mean())
         push = push or KeyPush("bursts", "sensor", float(burst.abs().max()), "µT", 0.0, {"share": told})
         outliers = replace(outliers, share=min(outliers.share + told, 0.5))
