@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from mkc_torch.challenge.page import measured_text, share_text
-from mkc_torch.challenge.worlds.page import NOT_HELD, held
+from mkc_torch.challenge.worlds.page import NOT_HELD, TOO_FEW, held
 from mkc_torch.challenge.worlds.score import WorldScore, WorldsScore
 from mkc_torch.cli.console import out
 
@@ -35,7 +35,7 @@ def show_worlds(score: WorldsScore, total: int, output: Path) -> None:
         aims.add_column(no_wrap=True)
         for measured in world.measured:
             word = held(measured)
-            style = "bold yellow" if word == NOT_HELD else ""
+            style = "bold yellow" if word in (NOT_HELD, TOO_FEW) else ""
             aims.add_row(f"  {measured.threshold.sentence}", measured_text(measured), Text(word, style=style))
         console.print(aims)
     console.print()

@@ -15,7 +15,7 @@ from mkc_torch.challenge.worlds.score import WorldScore, WorldsScore
 _TEMPLATES = Path(__file__).parents[1] / "templates"
 _SHARED = Path(__file__).parents[2] / "report" / "templates"
 
-HELD, NOT_HELD, NOT_MEASURED = "held", "not held", "not measured"
+HELD, NOT_HELD, TOO_FEW, NOT_MEASURED = "held", "not held", "too few", "not measured"
 
 Column = tuple[str, Callable[[WorldScore], str]]
 
@@ -52,7 +52,9 @@ def held(measured: Measured) -> str:
     """
     if math.isnan(measured.value):
         return NOT_MEASURED
-    return HELD if measured.holds else NOT_HELD
+    if measured.holds:
+        return HELD
+    return TOO_FEW if math.isinf(measured.threshold.high) else NOT_HELD
 
 
 def worlds_page(score: WorldsScore, settings: Mapping[str, Any]) -> str:
@@ -109,7 +111,7 @@ def _table(columns: Sequence[Column], rows: Sequence[WorldScore]) -> list[str]:
 
 
 def _marked(word: str) -> str:
-    return f"**{word}**" if word == NOT_HELD else word
+    return f"**{word}**" if word in (NOT_HELD, TOO_FEW) else word
 
 
 def _rows(score: WorldsScore) -> list[WorldScore]:
