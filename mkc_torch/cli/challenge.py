@@ -278,6 +278,7 @@ def _show(score: Score, cases: int, empty: int, output: Path) -> None:
     facts = Table.grid(padding=(0, 3, 0, 0))
     facts.add_column(no_wrap=True)
     facts.add_column(overflow="fold")
+    facts.add_row("said of empty", ", ".join(f"{verdict} {count}" for verdict, count in score.verdicts.items()))
     facts.add_row("false alarms", share_text(score.false_alarms))
     facts.add_row("named right", share_text(score.named))
     if score.driver.total:

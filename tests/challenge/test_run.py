@@ -105,6 +105,7 @@ def test_the_page_is_whole_and_loads_nothing(run):
 def test_summary_and_score_are_written(run):
     _, output, _ = run
     assert "| asked | measured | holds |" in (output / "summary.md").read_text(encoding="utf-8")
+    assert "| said of empty recordings: unexplained | 0 | 0 |" in (output / "summary.md").read_text(encoding="utf-8")
     record = json.loads((output / "score.json").read_text())
     assert record["settings"]["seed"] == 3
     assert sum(record["score"]["verdicts"].values()) == 3
