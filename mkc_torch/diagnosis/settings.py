@@ -148,7 +148,7 @@ class SearchSettings(_Stage):
     hidden: float = 0.01
     smaller: float = 0.8
     doubted: float = 25.0
-    own_noise: int = 6
+    own_noise: int = 5
     stretches: int = 25
     in_one_stretch: float = 0.5
 
@@ -249,6 +249,12 @@ class EvidenceSettings(_Stage):
         student_closer: share of the density's distance that a Student-t's has to be below for a warning.
         white_level: share of white channels that are called correlated, half of it by either criterion (Ljung & Box,
             Biometrika 65, 1978; Bartlett, J. R. Stat. Soc. Suppl. 8, 1946).
+        followed: share of an output's variation that a free run has to explain to follow it at all.
+        mended: the same with findings, for them to make a simulation follow that does not by itself.
+        above_floor: times a declared noise floor above which a residual is more than the sensor's noise.
+        shape_level: chance with which a free curve is as much better where a name's shape is right, below which the
+            name is but the nearest in the catalogue, and
+        shape_nats: what the curve has to gain beyond Schwarz's price of its numbers.
         disturbed: seconds from which a stretch of rejected samples is warned of; shorter ones are bursts of outliers.
     """
 
@@ -267,6 +273,11 @@ class EvidenceSettings(_Stage):
     density_off: float = 1.95
     student_closer: float = 0.5
     white_level: float = 0.01
+    followed: float = 0.5
+    mended: float = 0.9
+    above_floor: float = 1.5
+    shape_level: float = 0.001
+    shape_nats: float = 6.0
     disturbed: float = 0.5
 
 

@@ -6,8 +6,18 @@ import math
 from typing import Literal
 
 from mkc_torch.diagnosis.result import Finding, HeldOut
+from mkc_torch.diagnosis.world import Grade
 
-__all__ = ["Confirmation", "carries_over", "change", "confirmation", "confirmed", "small", "worth_correcting"]
+__all__ = [
+    "Confirmation",
+    "carries_over",
+    "change",
+    "confirmation",
+    "confirmed",
+    "grade_of",
+    "small",
+    "worth_correcting",
+]
 
 Confirmation = Literal["surely", "probably", "not shown", "worse"]
 
@@ -71,3 +81,10 @@ def carries_over(finding: Finding) -> bool:
     What belongs to the place of this one, or comes and goes at times that nothing tells, is not.
     """
     return worth_correcting(finding) and finding.plausible and not (finding.placed or finding.comes_and_goes)
+
+
+def grade_of(finding: Finding) -> Grade:
+    """What a finding is worth by unseen blocks and its size; whether its name fits is another question."""
+    if not confirmed(finding):
+        return "not confirmed"
+    return "real but small" if small(finding) else "left out"

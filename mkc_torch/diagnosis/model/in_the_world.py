@@ -130,9 +130,10 @@ def in_the_world(
         return InTheWorld(free, free, noise, starts)
     own = model if free is None else free.model
     assert own is not None
-    works = [partial(_under_noise, free, noise, declared, settings)] if free is not None else []
     bound = None if free is None else free.bound
-    works += [partial(_from_short, own, start, bound, declared, settings) for start in beside]
+    works = [partial(_from_short, own, start, bound, declared, settings) for start in beside]
+    if free is not None and not works:
+        works = [partial(_under_noise, free, noise, declared, settings)]
     tried = at_once(works, own.prepared)
     found = [one for one in tried if one is not None]
     if not found:
@@ -147,22 +148,16 @@ def in_the_world(
     return InTheWorld(free, *best, starts)
 
 
-def beside_effects(fit: FittedModel, declared: Mapping[str, float], settings: NoiseSettings) -> FittedModel | None:
-    """The same joint model under the noise that is left beside its effects; None of a simulation without states."""
-    prepared = fit.model.prepared
-    if not isinstance(prepared, PreparedDynamics):
-        return None
-    free = freed(fit)
-    if prepared.observer is None:
-        return in_the_world(free, declared, settings).fit if free is not None else None
-    found = [_under_noise(fit, noise_around(fit, declared, settings), declared, settings)]
-    if free is not None:
-        world = in_the_world(free, declared, settings)
-        if not world.pushed:
-            return free
-        found.append((world.fit, world.noise) if world.noise is not None else None)
-    fits = [one[0] for one in found if one is not None]
-    return max(fits, key=lambda one: one.log_likelihood) if fits else fit
+def beside_effects(fit: FittedModel, declared: Mapping[str, float], settings: NoiseSettings) -> FittedModel:
+    """A joint model under the pushes that are left beside its effects, or, where it is as likely, running freely."""
+    found = _under_noise(fit, noise_around(fit, declared, settings), declared, settings)
+    best = fit if found is None else found[0]
+    free = freed(best)
+    if free is None:
+        return best
+    if pushed(best) and free.log_likelihood < best.log_likelihood - settings.pushed:
+        return best
+    return free
 
 
 def freed(fit: FittedModel) -> FittedModel | None:
@@ -190,7 +185,7 @@ _Found = tuple[FittedModel, NoiseOfTheWorld]
 def _under_noise(
     fit: FittedModel, noise: NoiseOfTheWorld | None, declared: Mapping[str, float], settings: NoiseSettings
 ) -> _Found | None:
-    """Fits under the noise of the fit before, the likeliest of them."""
+    """Fits under the noise of the fit before, the likeliest of them, with the noise that is around it."""
     best: _Found | None = None
     for _ in range(_ROUNDS):
         if noise is None:
@@ -199,17 +194,16 @@ def _under_noise(
         assert isinstance(prepared, PreparedDynamics)
         model = JointModel(prepared.observed(noise.observer), fit.model.terms, fit.model.near)
         try:
-            fit = fitted(model, fit.parameters, fit.bound)
+            fit = fitted(model, fit.parameters, fit.bound, graduate=False)
         except NoFitError:
             break
+        under, noise = noise, noise_around(fit, declared, settings)
         if best is None or fit.log_likelihood > best[0].log_likelihood:
-            best = fit, noise
-        noise = noise_around(fit, declared, settings)
-    if best is None:
-        return None
-    # what is told of the noise is what is around the fit that is told
-    again = noise_around(best[0], declared, settings)
-    return best if again is None or (again.observer is None) != (best[1].observer is None) else (best[0], again)
+            same = noise is not None and (noise.observer is None) == (under.observer is None)
+            best = fit, noise if same and noise is not None else under
+        if noise is not None and noise.observer is None and under.observer is None:
+            break
+    return best
 
 
 def _from_short(

@@ -135,8 +135,7 @@ def _own(
 ) -> FittedModel:
     """The joint fit of a candidate, under the noise that it leaves."""
     fit = _fit_of(base, term, found, number)
-    around = beside_effects(fit, declared, settings.noise)
-    return shape_fitted(fit if around is None else around)
+    return shape_fitted(beside_effects(fit, declared, settings.noise))
 
 
 def _by_own_noise(

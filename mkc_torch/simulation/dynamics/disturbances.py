@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 from torch import Tensor
 
-from mkc_torch.simulation.dynamics.kalman import Flow, Models, filtered, robust_likelihood
+from mkc_torch.simulation.dynamics.kalman import Flow, Models, Parts, filtered, robust_likelihood
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer
 
 if TYPE_CHECKING:
@@ -23,6 +24,9 @@ _SIZES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 
 _LASTING = (0.004, 0.015, 0.06, 0.25)
 """Time constants tried, as shares of the longest run."""
+
+_STRETCH, _BEFORE = 150, 50
+"""Samples of a stretch that is filtered beside others, and before it, for the filter to find its way."""
 
 _FINER = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.0)
 _ROUNDS = 3
@@ -78,20 +82,23 @@ def disturbed(
     """
     p, m = flow.rates, len(channels)
     best = _Noise(tuple(floor.tolist()), (), tuple(known))
-    best, value = _finer(flow, best)
+    best, value = _white(flow, best)
     gains: list[float] = []
     for _ in range(most):
         tried = [replace(best, pushes=(*best.pushes, one)) for one in _candidates(flow, best, p + m)]
-        values, scales = _likelihoods(flow, tried)
-        number = int(values.argmax())
-        if values[number] <= value:
+        if not tried:
             break
-        other, more = _finer(flow, _scaled(tried[number], float(scales[number])))
-        if more < value + least:
+        values, scales = _likelihoods(flow, tried)
+        number = int(np.nan_to_num(values, nan=-np.inf).argmax())
+        other = _finer(flow, _scaled(tried[number], float(scales[number])))
+        more, scale = _exactly(flow, other)
+        # the others may have come nearer to their best as well
+        value = max(value, _exactly(flow, replace(other, pushes=other.pushes[:-1]))[0])
+        if not more > value + least:
             break
         gains.append(more - value)
-        best, value = other, more
-    errors = _errors(flow, best, value)
+        best, value = _scaled(other, scale), more
+    errors = _errors(flow, best)
     found = [Disturbance((*names, *channels)[place], place < p, lasting, size) for place, size, lasting in best.pushes]
     return Disturbed(tuple(found), errors, tuple(gains), floor.new_tensor(best.sensor), value)
 
@@ -168,7 +175,22 @@ def _models(flow: Flow, noises: Sequence[_Noise]) -> Models:
 
 def _likelihoods(flow: Flow, noises: Sequence[_Noise]) -> tuple[np.ndarray, np.ndarray]:
     """Of each, its scale profiled out, and that scale; at the scale it has, where some of the sensors' is declared."""
-    return robust_likelihood(filtered(flow, _models(flow, noises)), flow.counts, free=not any(noises[0].known))
+    return _by_parts(_parts(flow), flow, noises)
+
+
+def _exactly(flow: Flow, noise: _Noise) -> tuple[float, float]:
+    """The same of one, in one stretch: without a push there is nothing that corrects a filter which begins inside."""
+    values, scales = _by_parts(flow.whole, flow, [noise])
+    return float(values[0]), float(scales[0])
+
+
+def _by_parts(parts: Parts, flow: Flow, noises: Sequence[_Noise]) -> tuple[np.ndarray, np.ndarray]:
+    return robust_likelihood(filtered(parts, _models(flow, noises)), parts.mine, free=not any(noises[0].known))
+
+
+@lru_cache(maxsize=2)
+def _parts(flow: Flow) -> Parts:
+    return flow.in_parts(_STRETCH, _BEFORE)
 
 
 def _scaled(noise: _Noise, scale: float) -> _Noise:
@@ -176,9 +198,21 @@ def _scaled(noise: _Noise, scale: float) -> _Noise:
     return replace(noise, sensor=tuple(scale * one for one in noise.sensor), pushes=pushes)
 
 
-def _finer(flow: Flow, noise: _Noise) -> tuple[_Noise, float]:
+def _white(flow: Flow, noise: _Noise) -> tuple[_Noise, float]:
+    """The sensors' white noise alone, each output by itself where there are several."""
+    if not any(noise.known):
+        new = flow.new
+        sizes = [
+            float(np.median(np.abs(one[used > 0])) / 0.6745) for one, used in zip(new.T, flow.counts.T, strict=True)
+        ]
+        typical = [max(size, 1e-300) for size in sizes]
+        noise = min((noise, replace(noise, sensor=tuple(typical))), key=lambda one: -_exactly(flow, one)[0])
+    value, scale = _exactly(flow, noise)
+    return _scaled(noise, scale), value
+
+
+def _finer(flow: Flow, noise: _Noise) -> _Noise:
     """Sizes, time constants and the sensors' noise one after the other, on a grid that closes in; the scale at once."""
-    value = -math.inf
     power = 1.0
     for _ in range(_ROUNDS):
         tried = [noise]
@@ -196,14 +230,14 @@ def _finer(flow: Flow, noise: _Noise) -> tuple[_Noise, float]:
                 others += [(place, f ** (0.5 * power) * size, lasting / f**power) for f in _FINER if f != 1.0]
             tried += [replace(noise, pushes=(*noise.pushes[:d], one, *noise.pushes[d + 1 :])) for one in others]
         values, scales = _likelihoods(flow, tried)
-        number = int(values.argmax())
-        noise, value = _scaled(tried[number], float(scales[number])), float(values[number])
+        number = int(np.nan_to_num(values, nan=-np.inf).argmax())
+        noise = _scaled(tried[number], float(scales[number]))
         if number == 0:
             power *= 0.4
-    return noise, value
+    return noise
 
 
-def _errors(flow: Flow, noise: _Noise, value: float) -> tuple[float, ...]:
+def _errors(flow: Flow, noise: _Noise) -> tuple[float, ...]:
     """Of the logarithm of each size, by the curvature of the likelihood."""
     if not noise.pushes:
         return ()
@@ -212,7 +246,7 @@ def _errors(flow: Flow, noise: _Noise, value: float) -> tuple[float, ...]:
         for sign in (-1.0, 1.0):
             one = (place, size * math.exp(sign * away), lasting)
             tried.append(replace(noise, pushes=(*noise.pushes[:d], one, *noise.pushes[d + 1 :])))
-    values, _ = _likelihoods(flow, tried)
+    (value, *values), _ = _likelihoods(flow, [noise, *tried])
     curves = [(2.0 * value - values[2 * d] - values[2 * d + 1]) / away**2 for d in range(len(noise.pushes))]
     return tuple(1.0 / math.sqrt(curve) if curve > 0 else math.inf for curve in curves)
 
@@ -228,14 +262,14 @@ def observer_of(
     if not disturbances:
         return None
     models = models_of(flow, disturbances, sensor, names, channels)
-    kept = filtered(flow, models, keep=True)
+    kept = filtered(flow.whole, models, keep=True)
     D, m = models.place.shape[1], flow.new.shape[1]
     own = np.zeros((m, D))
     for d in range(D):
         if models.place[0, d] >= len(names):
             own[models.place[0, d] - len(names), d] = 1.0
     C = np.concatenate([flow.seen, np.broadcast_to(own, (len(flow.new), m, D))], -1)
-    P = kept.prior[:, 0]
+    P = kept.prior[:, 0, 0]
     cross = P @ C.swapaxes(1, 2)
     S = C @ cross + np.diag(models.sensor[0] ** 2)
     counts = flow.counts

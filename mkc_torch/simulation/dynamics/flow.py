@@ -66,7 +66,7 @@ def flow_along(
             value = after[:-1, states.shape[1] - len(prepared.lasting) + number]
             shift = shift + push[:, :, prepared.pushable.index(one.place)] * value.unsqueeze(-1)
     gap = torch.where(prepared.begins[1:], 0.0, prepared.time.diff())
-    arrays = (carry, push, C, new, shift, gap, prepared.counts.to(new.dtype))
+    arrays = (carry, push, C, new, shift, gap, prepared.counts.to(new.dtype), at[:, :n].std(0))
     return Flow(*(one.detach().cpu().numpy().astype(np.float64) for one in arrays))
 
 

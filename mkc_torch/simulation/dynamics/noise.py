@@ -83,7 +83,7 @@ def pushes_over_time(
     usual = float(np.median(flow.step[flow.step > 0]))
     lasting = tuple(one.lasting_at_least(0.1 * usual) for one in found.disturbances)
     models = models_of(flow, lasting, found.sensor, prepared.pushable, prepared.channels)
-    state, covariance = smoothed(flow, models, filtered(flow, models, keep=True))
+    state, covariance = smoothed(flow, models, filtered(flow.whole, models, keep=True))
     n = flow.carried.shape[1]
     courses = []
     for number in range(len(lasting)):
