@@ -39,8 +39,8 @@ def refuse_out_of_reach(bound: Tensor, scale: Tensor) -> None:
         channel = f" of channel {int(first[-1])}" if bound.shape[-1] > 1 else ""
         raise NoFitError(
             f"The fit begins too far from the data: the residuals{channel} have a robust scale of "
-            f"{scale[first].item():.4g}, and the domain of errors, `bound`, reaches to {bound[first].item():.4g}, which "
-            f"is less than two of that. Begin nearer, or give a `bound` of {2.0 * scale[first].item():.4g} or more."
+            f"{scale[first].item():.4g}, and the domain of errors, `bound`, reaches to {bound[first].item():.4g}, "
+            f"less than two of that. Begin nearer, or give a `bound` of {2.0 * scale[first].item():.4g} or more."
         )
 
 
