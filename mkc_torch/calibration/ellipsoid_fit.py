@@ -61,7 +61,7 @@ of the fit. A ball of noise scatters by half."""
 
 LENT_BY_NOISE = 5.0
 """Information that points on two circles, which determine no ellipsoid, seem to have by their scatter alone, over its
-square as a share of the shortest semi-axis: 1 to 5."""
+square as a share of the shortest semi-axis: 1 to 7 by how their planes lie; from 5 on, they come out."""
 
 _EXACT = 1e4
 """Roundings by which a point may be off a surface that it is on."""

@@ -5,6 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from mkc_torch import diagnose
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.simulation import Magnetometer
 from mkc_torch.simulation.magnetometer.parts import ellipsoid_of_a_part, sphere_of_all
@@ -142,3 +143,16 @@ def test_samples_that_cover_too_little_start_nothing():
     with pytest.raises(NotIdentifiableError):
         Magnetometer().prepare(little)
     assert sphere_of_all(little.magnetometer(), torch.arange(N)) is None
+
+
+def test_a_step_is_named_by_the_length_where_the_gyroscope_is_in_degrees():
+    recording = changed(
+        tumbling(N, noise=0.5, seed=1, moments=SLOW, sensor=STEP), **rates(np.rad2deg(0.1 * body_rate(SLOW)))
+    )
+    found = diagnose(Magnetometer(), recording, surrogates=19)
+    (finding,) = found.findings
+    assert finding.effect == "hard_iron_step"
+    assert finding.onset == pytest.approx(30.0, abs=0.2)
+    (change,) = (parameter for parameter in finding.parameters if parameter.name == "offset_change")
+    assert change.value == pytest.approx((8.0, -5.0, 3.0), abs=1.0)
+    assert any("The gyroscope is left out" in warning for warning in found.warnings)
