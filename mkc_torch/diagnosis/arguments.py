@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_other_type, told
 from mkc_torch.diagnosis.settings import Settings
@@ -71,3 +71,33 @@ def check_numbers(level: float, surrogates: int, max_findings: int, seed: int) -
             f"Expected argument `surrogates` to be at least {math.ceil(1.0 / level - 1.0 - 1e-9)} at level {level}, "
             f"for no p-value can be smaller than 1 / (surrogates + 1), but got {surrogates}."
         )
+
+
+def checked_noise(noise: Mapping[str, float] | None, outputs: Sequence[str]) -> dict[str, float]:
+    """Sizes of outputs' white noise.
+
+    Raises:
+        ValueError: a name that is no output, or a size that is not positive and finite.
+    """
+    found = {}
+    for name, size in (noise or {}).items():
+        if name not in outputs:
+            raise ValueError(f"Expected `noise` to name outputs ({', '.join(outputs)}) but got `{name}`.")
+        found[name] = checked_number(f"noise of {name}", size, advice="it is a standard deviation")
+    return found
+
+
+def checked_between(between: Mapping[str, str] | None, prepared: object) -> dict[str, str]:
+    """What inputs do between samples.
+
+    Raises:
+        ValueError: a name that is no input, or something that no input does.
+    """
+    inputs: Mapping[str, str] = getattr(prepared, "between", {})
+    for name, how in (between or {}).items():
+        if name not in inputs:
+            named = f"inputs ({', '.join(inputs)})" if inputs else "inputs, of which this simulation has none,"
+            raise ValueError(f"Expected `between` to name {named} but got `{name}`.")
+        if how not in ("held", "linear", "smooth"):
+            raise ValueError(f'Expected `between` of {name} to be "held", "linear" or "smooth" but got {how!r}.')
+    return dict(between or {})

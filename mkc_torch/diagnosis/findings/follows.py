@@ -15,7 +15,7 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["follows_of", "misses", "size_of"]
+__all__ = ["follows_of", "misses", "size_of", "units_of"]
 
 _FAR = 5.0
 """Robust standard deviations at which a residual's square ends: outliers do not count, a long way off still does."""
@@ -60,7 +60,7 @@ def follows_of(
     steps = _steps(recorded)
     estimated = _new(recorded if residual is None or lost else residual) if floor is None else left.new_tensor(floor)
     last = size_of(recorded[1:] - recorded[:-1])
-    units = [prepared.unit] * len(prepared.channels) if prepared.unit else _units(prepared)
+    units = units_of(prepared)
     found = []
     for k, name in enumerate(prepared.channels):
         of_steps = float(steps[k]) / 12.0**0.5
@@ -106,9 +106,10 @@ def _steps(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
     return values.new_tensor(steps)
 
 
-def _units(prepared: PreparedSimulation) -> list[str]:
+def units_of(prepared: PreparedSimulation) -> tuple[str, ...]:
+    """Of the channels of a simulation's residual."""
     output = prepared.ports.get("output")
-    if output is None:
-        return [""] * len(prepared.channels)
+    if prepared.unit or output is None:
+        return (prepared.unit,) * len(prepared.channels)
     names = {output.parts.get(part, part): unit for part, unit in output.part_units.items()}
-    return [names.get(name, "") for name in prepared.channels]
+    return tuple(names.get(name, "") for name in prepared.channels)
