@@ -38,8 +38,8 @@ __all__ = [
 Change = Callable[[Tensor], Tensor]
 """What effects add at a port, (N, c), as a function of the signal that passes through it.
 
-At a port with memory a signal can have one component more, the internal state; what is added then has one channel more,
-the internal state's rate.
+At a port with memory a signal can have more components, the internal states; what is added then has more channels,
+their rates.
 """
 
 Changes = Mapping[str, Change]
@@ -91,7 +91,8 @@ class Port:
         part_units, sizes: of the parts; a size is a typical and the largest absolute value.
         clock: when; None for the recording's samples.
         run: number of each moment's run; None where the simulation knows of no runs.
-        memory: name of the internal state that an effect here may bring; empty where none may.
+        memory: names of the internal states that an effect here may bring, and the state whose first value each begins
+            with; empty for 0.
 
     Example:
         >>> sensor = Port(("mag_x", "mag_y", "mag_z"), "µT", kind="sensor")
@@ -110,7 +111,7 @@ class Port:
     sizes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     clock: Clock | None = None
     run: Int[Tensor, " G"] | None = None
-    memory: str = ""
+    memory: Mapping[str, str] = field(default_factory=dict)
 
     def at(self, values: Float[Tensor, N * rest]) -> Float[Tensor, G * rest]:
         """Values of the samples, at the moments of this port's signal."""

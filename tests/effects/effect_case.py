@@ -12,6 +12,7 @@ import torch
 
 from mkc_torch.effects import Effect, beyond, lagged, played, shifted, soft_clip
 from mkc_torch.effects.courses import gained
+from mkc_torch.simulation.dynamics.ports import memory_at
 from tests.effects.contexts import contexts_of, kinds_of_shapes, size_of
 
 BENT = ("delay", "clock_drift")
@@ -259,10 +260,13 @@ class OfEveryShape:
             assert effect.driver_optional
             return
         carried = context.carries or context.channels
-        if effect.port == "hysteretic rate":  # its internal state is solved for
-            context = replace(context, signal=torch.cat([context.signal, context.time.cos().unsqueeze(-1)], -1))
-        x = SimpleNamespace(**dict(zip((*carried, "memory"), context.signal.unbind(-1), strict=False)))
-        names = {part: f"x.{name}" for part, name in context.parts.items()} | {"memory": "x.memory", "zero": "0.0"}
+        inner = ("memory", "memory_2")[: len(memory_at(effect.port, "speed"))]
+        if inner:  # internal states are solved for
+            more = [(k * context.time).cos() for k, _ in enumerate(inner, start=1)]
+            context = replace(context, signal=torch.cat([context.signal, torch.stack(more, -1)], -1))
+        x = SimpleNamespace(**dict(zip((*carried, *inner), context.signal.unbind(-1), strict=True)))
+        names = {part: f"x.{name}" for part, name in context.parts.items()} | {one: f"x.{one}" for one in inner}
+        names["zero"] = "0.0"
         if not effect.needs and effect.port == "output":  # it is of all outputs
             names = {name: f"x.{name}" for name in carried}
         known = {"x": x, "torch": torch, "time": context.time, "run": context.runs}

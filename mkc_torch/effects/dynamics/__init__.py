@@ -13,6 +13,8 @@ from mkc_torch.effects.dynamics.coupling import Coupling
 from mkc_torch.effects.dynamics.cubic_stiffness import CubicStiffness
 from mkc_torch.effects.dynamics.dead_zone import DeadZone
 from mkc_torch.effects.dynamics.hard_stop import HardStop
+from mkc_torch.effects.dynamics.hidden_lag import HiddenLag
+from mkc_torch.effects.dynamics.hidden_mode import HiddenMode
 from mkc_torch.effects.dynamics.input_delay import InputDelay
 from mkc_torch.effects.dynamics.input_saturation import InputSaturation
 from mkc_torch.effects.dynamics.linear_drag import LinearDrag
@@ -38,6 +40,8 @@ DYNAMICS: tuple[Effect, ...] = (
     CubicStiffness(),
     PositionPeriodicForce(),
     BoucWenHysteresis(),
+    HiddenLag(),
+    HiddenMode(),
     AddedMass(),
     Buoyancy(),
     Coupling(),

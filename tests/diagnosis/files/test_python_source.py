@@ -68,6 +68,8 @@ class Cart(Dynamics):
 PLACES = {
     "backlash": ("input push", {"half_gap": 0.3}),
     "bouc_wen_hysteresis": ("hysteretic rate of speed", {"yield_deflection": 0.2}),
+    "hidden_lag": ("lagged rate of drift", {"time_constant": 0.3}),
+    "hidden_mode": ("resonant rate of speed", {"period": 0.8, "damping": 0.05}),
     "added_mass": ("rate of speed", {}),
     "load_dependent_friction": ("loaded rate of speed", {"width": 0.05}),
     "buoyancy": ("rate of speed", {"surface": 0.1, "draught": 0.3}),
@@ -101,7 +103,12 @@ def test_the_corrected_class_simulates_what_the_model_does(names):
     exec(text.replace("from carts import Cart", ""), known)
     again = known["CorrectedCart"]().prepare(recording)
     starts = theta[1:].unflatten(0, (2, 4))
-    memory = starts.new_zeros(2, len(again.system.states) - 4)
+    like = {"lagged_drift": 3, "hidden_speed": 2}
+    inner = again.system.states[4:]
+    memory = [starts[:, like[name]] if name in like else starts.new_zeros(2) for name in inner]
+    memory = torch.stack(memory, -1) if memory else starts.new_zeros(2, 0)
+    for name in set(inner) & set(like):  # begun about where the runs of the recording begin
+        assert again.system.initial[name] == pytest.approx(float(starts[:, like[name]].mean()))
     whole = torch.cat([theta[:1], torch.cat([starts, memory], -1).flatten()])
     with_it = joint.residual(torch.cat([theta, *gammas]))
     torch.testing.assert_close(again.residual(whole, {}), with_it, rtol=0.0, atol=1e-7)

@@ -18,7 +18,7 @@ IDS = (
     "constant_force", "linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction",
     "load_dependent_friction", "cubic_stiffness", "position_periodic_force", "coupling", "hard_stop", "overflow",
     "thermal_loss", "input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "bouc_wen_hysteresis",
-    "added_mass", "magnus_lift", "buoyancy",
+    "added_mass", "magnus_lift", "buoyancy", "hidden_lag", "hidden_mode",
 )  # fmt: skip
 
 LOSSES = ("linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction", "load_dependent_friction")
@@ -269,8 +269,11 @@ class TestNeeds:
     def test_of_a_pendulum(self):
         places = tried(prepared(Pendulum, angle=torch.cos(3.0 * TIME)))
         of_speed = EVERYWHERE | REVERSING | {"cubic_stiffness", "hard_stop", "position_periodic_force", "added_mass"}
-        assert set(places) == {"rate of speed", "hysteretic rate of speed", "output"}
+        remembering = {"hysteretic rate of speed", "lagged rate of speed", "resonant rate of speed"}
+        assert set(places) == {"rate of speed", "output", *remembering}
         assert places["hysteretic rate of speed"] == {"bouc_wen_hysteresis"}
+        assert places["lagged rate of speed"] == {"hidden_lag"}
+        assert places["resonant rate of speed"] == {"hidden_mode"}
         assert places["rate of speed"] & set(IDS) == of_speed
         assert places["output"] == {"sensor_lag"}
 
@@ -316,12 +319,15 @@ class TestNeeds:
         class Pieces(Pendulum):
             segment = 2.0
 
-        assert "hysteretic rate of speed" not in prepared(Pieces, angle=torch.cos(3.0 * TIME)).ports
+        assert set(prepared(Pieces, angle=torch.cos(3.0 * TIME)).ports) == {"rate of speed", "output"}
 
     def test_of_two_bodies(self):
         decay = torch.exp(-0.1 * TIME)
         places = tried(prepared(Bodies, inner=20.0 + 60.0 * decay, outer=20.0 + 20.0 * decay))
         assert places["exchange of inner and outer"] == {"coupling"}
+        # heat is stored elsewhere too, and has no inertia to swing with
+        assert places["lagged rate of inner"] == {"hidden_lag"}
+        assert "resonant rate of inner" not in places
         assert places["rate of inner"] & set(IDS) == {"constant_force", "linear_drag", "thermal_loss"}
 
     def test_every_need_is_a_part_that_some_port_has(self):

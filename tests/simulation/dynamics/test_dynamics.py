@@ -342,7 +342,8 @@ class TestPorts:
     def test_of_a_pendulum(self):
         ports = self.pendulum()
         # that of the angle is the speed, by what the words mean
-        assert list(ports) == ["rate of speed", "hysteretic rate of speed", "output"]
+        kinds = ("rate", "hysteretic rate", "lagged rate", "resonant rate")
+        assert list(ports) == [*(f"{kind} of speed" for kind in kinds), "output"]
         port = ports["rate of speed"]
         assert (port.kind, port.channels, port.unit, port.pointwise) == ("rate", ("speed",), "rad/s/s", False)
         assert port.carries == ("angle", "speed", "rate of speed")
@@ -368,7 +369,8 @@ class TestPorts:
         time = np.arange(50) * 0.1
         recording = table(time=time, upper=1.0 + 0 * time, lower=np.exp(-0.3 * time), pump=0.3 + 0.1 * np.sin(time))
         ports = Tanks().prepare(recording).ports
-        names = ["rate of upper", "rate of lower", "exchange of upper and lower", "input pump", "output"]
+        rates = [f"{kind} of {one}" for one in ("upper", "lower") for kind in ("rate", "lagged rate", "resonant rate")]
+        names = [*rates, "exchange of upper and lower", "input pump", "output"]
         assert list(ports) == names
         both = ports["exchange of upper and lower"]
         assert (both.channels, both.kind, dict(both.parts)) == (

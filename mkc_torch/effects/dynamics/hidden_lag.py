@@ -1,0 +1,61 @@
+"""A part that follows a state late, and that the equations do not have."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.context import Context, Quantity, Shape
+from mkc_torch.effects.courses import lagged
+from mkc_torch.effects.dynamics.rate import RateEffect
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+SHARES = (0.005, 0.015, 0.05, 0.15)
+"""Time constants that are searched, as shares of the longest run."""
+
+
+class HiddenLag(RateEffect):
+    """A second store behind a resistance: heat in a wall, water in a side tank, a mass that a damper drags along.
+
+    Simulation: adds ``γ (z − x)`` to the rate of a state x, with an internal state z of its own that begins like x:
+        ``τ ż = x − z``. What the state gives off the store takes up, ``γ τ`` times as large as the state's own.
+    Drivers: none but the state, all of its course since the run's beginning.
+    Units: γ in 1/s; the time constant τ in s.
+    Plausible: γ ≥ 0: exchange evens out.
+    Source: two-node thermal networks; Bacher & Madsen, Energy and Buildings 43 (2011); Maxwell's model of a damper.
+    """
+
+    id = "hidden_lag"
+    port = "lagged rate"
+    general = True
+    continuous: Mapping[str, tuple[float, float]] = {"time_constant": (0.001, 0.4)}
+    fitted_shape: Mapping[str, tuple[float, float]] = {"time_constant": (0.001, 0.4)}
+    gain = "exchange"
+    along = ""
+    equation = "δẋ = γ (z − x),  τ ż = x − z"
+    explanation = "The state exchanges with something that is not in the equations and follows it late."
+    advice = "Add a second store with this time constant, such as a wall behind a resistance."
+    source = "two-node thermal networks; Bacher & Madsen, Energy and Buildings 43 (2011)"
+
+    def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
+        length = float(time.max() - time.min())
+        return tuple({"time_constant": share * length} for share in SHARES)
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return (Quantity(self.gain, 1, "1/s"),)
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
+        """The exchange, and beside it the rate of z, where z is solved for; along the known path, where it is not."""
+        x, z, lag = context.part("own"), context.memory, shape["time_constant"]
+        if z is None:
+            return (gamma[0] * (lagged(x, context.time, lag, context.runs) - x)).unsqueeze(-1)
+        return torch.stack([gamma[0] * (z - x), (x - z) / lag], -1)
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        x, z = names["own"], names["memory"]
+        return f"{gamma[0]!r} * ({z} - {x})", f"({x} - {z}) / {shape['time_constant']!r}"
