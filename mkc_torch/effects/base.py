@@ -204,7 +204,7 @@ class Effect(ABC):
             gamma: the effect's numbers.
             shape: its shape.
             names: expression of each part of the port's signal, such as ``{"own": "x.speed"}``; "memory", "memory_2"
-                and so on of internal states; "zero" is what makes a temperature "own" absolute.
+                and so on of internal states; "zero" is what makes a temperature absolute.
         """
         self._refuse("code")
 

@@ -40,10 +40,12 @@ def dynamic_context(effect, N=80, driven=False):
     parts = {
         "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "reversing": "speed",
         "temperature": "speed", "level": "speed", "other": "other", "load": "load",
-        "rate": "rate", "height": "angle", "sideways": "other",
+        "rate": "rate", "height": "angle", "sideways": "other", "surroundings": "other",
     }  # fmt: skip
     of = {"angle": "rad", "speed": "rad/s", "other": "rad/s", "load": "rad/s/s", "rate": "rad/s/s"}
     units = {part: of[name] for part, name in parts.items()}
+    if "temperature" in effect.needs:
+        units |= dict.fromkeys(("own", "temperature", "surroundings"), "°C")
     channels = ("speed", "other") if effect.port == "exchange" else ("speed",)
     signal = oscillating(N, len(names))
     signal[:, 3] = signal[:, 3].abs()

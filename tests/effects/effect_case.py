@@ -13,6 +13,7 @@ import torch
 from mkc_torch.effects import Effect, beyond, lagged, played, shifted, soft_clip
 from mkc_torch.effects.courses import gained
 from mkc_torch.simulation.dynamics.ports import memory_at
+from mkc_torch.simulation.protocol import Sizes
 from tests.effects.contexts import contexts_of, kinds_of_shapes, size_of
 
 BENT = ("delay", "clock_drift")
@@ -103,7 +104,7 @@ class OfEveryEffect:
         numbers = {name for shape in shapes for name in shape}
         for said in (effect.relative, effect.continuous, effect.fitted_shape, effect.choices):
             assert set(said) <= numbers
-        assert all(which in ("typical", "largest") for _, which in effect.relative.values())
+        assert all(which in Sizes._fields for _, which in effect.relative.values())
         assert all(low < high for low, high in effect.continuous.values())
         for name, (low, high) in effect.fitted_shape.items():
             grid = [shape[name] for shape in shapes]
@@ -266,7 +267,7 @@ class OfEveryShape:
             context = replace(context, signal=torch.cat([context.signal, torch.stack(more, -1)], -1))
         x = SimpleNamespace(**dict(zip((*carried, *inner), context.signal.unbind(-1), strict=True)))
         names = {part: f"x.{name}" for part, name in context.parts.items()} | {one: f"x.{one}" for one in inner}
-        names["zero"] = "0.0"
+        names["zero"] = "273.15" if context.unit_of("own") == "°C" else "0.0"
         if not effect.needs and effect.port == "output":  # it is of all outputs
             names = {name: f"x.{name}" for name in carried}
         known = {"x": x, "torch": torch, "time": context.time, "run": context.runs}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from mkc_torch.recording.recording import DEFAULT_UNITS
 from mkc_torch.simulation.dynamics.definition import Dynamics
 from mkc_torch.simulation.dynamics.ports import memory_at
+from mkc_torch.simulation.dynamics.surroundings import surroundings
 from mkc_torch.simulation.dynamics.user_functions import kinematic
 from mkc_torch.simulation.parameter import Parameter
 
@@ -198,6 +199,7 @@ def _parts(state: str, system: Dynamics) -> dict[str, str]:
     return {
         "own": f"x.{state}",
         **dict.fromkeys(("position", "angle", "deflection"), f"x.{position}"),
+        "surroundings": f"u.{surroundings(system).get(state, '')}",
         "load": "load",
         "rate": f'self.plain_rates(time, x, u, p)["{state}"]',
         "zero": "273.15" if celsius else "0.0",

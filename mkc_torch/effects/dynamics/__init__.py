@@ -22,6 +22,7 @@ from mkc_torch.effects.dynamics.load_dependent_friction import LoadDependentFric
 from mkc_torch.effects.dynamics.magnus_lift import MagnusLift
 from mkc_torch.effects.dynamics.overflow import Overflow
 from mkc_torch.effects.dynamics.position_periodic_force import PositionPeriodicForce
+from mkc_torch.effects.dynamics.power_law import PowerLaw
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from mkc_torch.effects.dynamics.sensor_lag import SensorLag
 from mkc_torch.effects.dynamics.stribeck_friction import StribeckFriction
@@ -32,6 +33,7 @@ __all__ = ["DYNAMICS"]
 
 DYNAMICS: tuple[Effect, ...] = (
     ConstantForce(),
+    LinearDrag(beside=True),
     LinearDrag(),
     QuadraticDrag(),
     CoulombFriction(),
@@ -39,6 +41,9 @@ DYNAMICS: tuple[Effect, ...] = (
     LoadDependentFriction(),
     CubicStiffness(),
     PositionPeriodicForce(),
+    PowerLaw("difference"),
+    PowerLaw("position"),
+    PowerLaw(),
     BoucWenHysteresis(),
     HiddenLag(),
     HiddenMode(),
@@ -48,6 +53,7 @@ DYNAMICS: tuple[Effect, ...] = (
     MagnusLift(),
     HardStop(),
     Overflow(),
+    ThermalLoss(beside=True),
     ThermalLoss(),
     InputDelay(),
     InputSaturation(),

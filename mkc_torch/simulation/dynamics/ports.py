@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,8 @@ from torch import Tensor
 
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.equations import Equations
-from mkc_torch.simulation.protocol import Clock, Port
+from mkc_torch.simulation.dynamics.surroundings import surroundings
+from mkc_torch.simulation.protocol import Clock, Port, Sizes
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -86,7 +88,7 @@ class Places:
                 kind="input",
                 parts={"own": name},
                 part_units={"own": self._unit_of(name)},
-                sizes={"own": _sizes(self.recording[name])},
+                sizes={"own": Sizes.of(self.recording[name])},
                 clock=self.clock,
                 run=self.run[self.clock.before],
             )
@@ -115,6 +117,8 @@ class Places:
             parts["height"] = positions[0]
         if self._reverses(state):
             parts["reversing"] = state
+        if state in self._surroundings:
+            parts["surroundings"] = self._surroundings[state]
         if self._unit_of(state) in ("°C", "K"):
             parts["temperature"] = state
         else:
@@ -142,15 +146,23 @@ class Places:
             kind=kind,
             carries=(*self.system.states, *self.system.inputs, *(parts[of] for of in ("load", "rate") if of in parts)),
             parts=parts,
-            part_units={part: self._unit_of(name) for part, name in parts.items()},
-            sizes={
-                part: _sizes(self.guess[:, self.system.states.index(name)])
-                for part, name in parts.items()
-                if name in self.system.states
-            },
+            part_units={part: self._unit_of(state if part == "surroundings" else name) for part, name in parts.items()},
+            sizes=self._sizes(state, parts),
             clock=self.clock,
             run=self.run[self.clock.before],
         )
+
+    @cached_property
+    def _surroundings(self) -> dict[str, str]:
+        return surroundings(self.system)
+
+    def _sizes(self, state: str, parts: Mapping[str, str]) -> dict[str, Sizes]:
+        """Of the parts that are states, and of the surroundings how far the state is from them."""
+        values = dict(zip(self.system.states, self.guess.unbind(-1), strict=True))
+        sizes = {part: Sizes.of(values[name]) for part, name in parts.items() if name in values}
+        if "surroundings" in parts:
+            sizes["surroundings"] = Sizes.of(values[state] - self.recording[parts["surroundings"]])
+        return sizes
 
     def _unit_of(self, name: str) -> str:
         return self.system.units.get(name, self.recording.units[name] if name in self.recording else "")
@@ -174,8 +186,3 @@ def common_unit(units: Iterable[str]) -> str:
     """The unit that all of them are; empty where they differ."""
     found = set(units)
     return found.pop() if len(found) == 1 else ""
-
-
-def _sizes(values: Float[Tensor, " N"]) -> tuple[float, float]:
-    """Typical and largest absolute value."""
-    return float(values.abs().median()), float(values.abs().amax())
