@@ -60,6 +60,7 @@ DYNAMICS: tuple[Effect, ...] = (
     DeadZone(),
     Backlash(),
     SensorLag(),
+    UnknownRate("difference"),
     UnknownRate("own"),
     UnknownRate("position"),
 )

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mkc_torch._support.unit_text import sized
 from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.dynamics.rate import SURROUNDINGS, RateEffect
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -53,7 +53,7 @@ class PowerLaw(RateEffect):
 
     def __init__(self, of: str = "own") -> None:
         self.of = of
-        part = "surroundings" if of == "difference" else of
+        part = SURROUNDINGS if of == "difference" else of
         self.along = "position" if of == "position" else "own"
         # of a temperature in °C a power is no physics
         self.needs = {"own": ("own", "flowing"), "position": ("position", "deflection")}.get(of, ("own", part))
@@ -66,7 +66,8 @@ class PowerLaw(RateEffect):
 
     def equation_of(self, shape: Shape, context: Context) -> str:
         scale = sized(float(shape[self._scale]), context.unit_of(self.along))
-        return f"{self.equation},  c = {scale}, the largest of the recording"
+        beside = f",  u = {context.parts[SURROUNDINGS]}" if self.of == "difference" else ""
+        return f"{self.equation},  c = {scale}, the largest of the recording{beside}"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return tuple({self._scale: 1.0, "exponent": exponent} for exponent in EXPONENTS)
@@ -74,13 +75,13 @@ class PowerLaw(RateEffect):
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         y = context.part(self.along)
         if self.of == "difference":
-            y = y - context.part("surroundings")
+            y = y - context.part(SURROUNDINGS)
         t = y / shape[self._scale]
         return -t * (t.square() + ROUNDED**2) ** (0.5 * (shape["exponent"] - 1.0))
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
         y = names[self.along]
         if self.of == "difference":
-            y = f"({y} - {names['surroundings']})"
-        t, raised = f"({y} / {shape[self._scale]!r})", 0.5 * (shape["exponent"] - 1.0)
+            y = f"({y} - {names[SURROUNDINGS]})"
+        t, raised = f"({y} / {shape[self._scale]!r})", round(0.5 * (shape["exponent"] - 1.0), 12)
         return (f"-({gamma[0]!r}) * {t} * ({t} ** 2 + {ROUNDED**2!r}) ** {raised!r}",)

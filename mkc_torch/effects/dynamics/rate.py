@@ -45,6 +45,10 @@ class RateEffect(GainEffect):
             return context.signal_unit
         return quotient(context.signal_unit, context.unit_of(self.along), int(self.power)) or "1/s"
 
+    def equation_of(self, shape: Shape, context: Context) -> str:
+        beside = f",  u = {context.parts[SURROUNDINGS]}" if SURROUNDINGS in shape else ""
+        return f"{self.equation}{beside}"
+
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity(self.gain, 1, self.unit(context)),)
 

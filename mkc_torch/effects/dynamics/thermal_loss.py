@@ -21,7 +21,7 @@ class ThermalLoss(RateEffect):
     """A body loses heat by radiation, with the fourth power of its temperature.
 
     Simulation: adds ``−γ (T⁴ − T₀⁴) / (4 T₀³)`` to the rate of a temperature, T absolute and T₀ 293 K; where an input
-        T_u is the surroundings', ``−γ (T⁴ − T_u⁴) / (4 T₀³)``.
+        u is the surroundings', ``−γ (T⁴ − u⁴) / (4 T₀³)``.
     Drivers: none but the state.
     Units: γ in 1/s, as of a linear loss near T₀.
     Plausible: γ ≥ 0.
@@ -42,7 +42,7 @@ class ThermalLoss(RateEffect):
     def __init__(self, *, beside: bool = False) -> None:
         if beside:
             self.needs, self.choices = ("own", "temperature", SURROUNDINGS), (SURROUNDINGS,)
-            self.equation = "δṪ = −γ (T⁴ − T_u⁴) / (4 T₀³)"
+            self.equation = "δṪ = −γ (T⁴ − u⁴) / (4 T₀³)"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return (dict.fromkeys(self.choices, 1.0),)
