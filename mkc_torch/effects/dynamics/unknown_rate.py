@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import torch
@@ -102,21 +103,38 @@ def spline_within(
             the curve's values at the ends.
 
     Example:
-        >>> spline_within(torch.tensor([-1.0, 0.0, 0.5, 1.0, 2.0]), 0.0, 1.0, [4.0, 1.0, 0.0, 0.0, 0.0, -2.0])
-        tensor([ 4.,  4.,  0., -2., -2.])
+        >>> found = spline_within(torch.tensor([-1.0, 0.0, 0.25, 1.0, 2.0]), 0.0, 1.0, [4.0, 1.0, 0.0, 0.0, 0.0, -2.0])
+        >>> [round(float(one), 2) for one in found]
+        [4.0, 4.0, 0.1, -2.0, -2.0]
     """
     given = torch.as_tensor(heights, dtype=values.dtype, device=values.device)
-    half, count = len(given) // 2, len(given) + 1 - CUBIC
-    turn = torch.arange(count + 1, dtype=values.dtype, device=values.device) * (math.pi / count)
-    places = lowest + (highest - lowest) * 0.5 * (1.0 - turn.cos())
-    knots = torch.cat([places[:1].expand(CUBIC), places, places[-1:].expand(CUBIC)])
-    at = values.clamp(lowest, highest).unsqueeze(-1)
-    # the last interval of some width has its end too
-    inside = (at >= knots[:-1]) & ((at < knots[1:]) | (knots[1:] >= knots[-1]) & (at >= places[-2]))
-    splines = (inside & (knots[:-1] < knots[1:])).to(values.dtype)
+    if not highest > lowest:
+        return 0.0 * given[0] * values  # a range without width has no curve
+    places, turned = (one.to(values) for one in _truncated(len(given)))
+    half = len(given) // 2
+    amplitudes = turned @ torch.cat([given[:half], given.new_zeros(1), given[half:]])
+    u = ((values - lowest) / (highest - lowest)).clamp(0.0, 1.0)
+    return _powers(u, places) @ amplitudes
+
+
+def _powers(u: Float[Tensor, " N"], places: Float[Tensor, " k"]) -> Float[Tensor, "N q"]:
+    """``1, u, u², u³`` and for each place ``max(u − p, 0)³``: the same curves as of the splines, and far quicker."""
+    beyond = (u.unsqueeze(-1) - places).clamp(min=0.0)
+    return torch.cat([torch.stack([torch.ones_like(u), u, u * u, u * u * u], -1), beyond * beyond * beyond], -1)
+
+
+@lru_cache(maxsize=4)
+def _truncated(count: int) -> tuple[Float[Tensor, " k"], Float[Tensor, "q q"]]:
+    """The places inside of the range [0, 1], and what each spline is in powers that begin there."""
+    turn = torch.arange(count - 1, dtype=torch.float64) * (math.pi / (count - 2))
+    places = 0.5 * (1.0 - turn.cos())
+    knots = torch.cat([places.new_zeros(CUBIC), places, places.new_ones(CUBIC)])
+    share = torch.tensor([0.1, 0.4, 0.6, 0.9], dtype=torch.float64)
+    at = torch.lerp(places[:-1, None], places[1:, None], share).reshape(-1, 1)
+    splines = ((at >= knots[:-1]) & (at < knots[1:])).double()
     for degree in range(1, CUBIC + 1):
         width = knots[degree:] - knots[:-degree]
         share = torch.where(width > 0.0, (at - knots[:-degree]) / torch.where(width > 0.0, width, 1.0), 0.0)
         rest = torch.where(width > 0.0, 1.0 - share, 0.0)
         splines = share[:, :-1] * splines[:, :-1] + rest[:, 1:] * splines[:, 1:]
-    return splines @ torch.cat([given[:half], given.new_zeros(1), given[half:]])
+    return places[1:-1], torch.linalg.lstsq(_powers(at[:, 0], places[1:-1]), splines).solution
