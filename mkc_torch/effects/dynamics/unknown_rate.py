@@ -105,7 +105,7 @@ def spline_within(
     Example:
         >>> found = spline_within(torch.tensor([-1.0, 0.0, 0.25, 1.0, 2.0]), 0.0, 1.0, [4.0, 1.0, 0.0, 0.0, 0.0, -2.0])
         >>> [round(float(one), 2) for one in found]
-        [4.0, 4.0, 0.1, -2.0, -2.0]
+        [4.0, 4.0, 0.18, -2.0, -2.0]
     """
     given = torch.as_tensor(heights, dtype=values.dtype, device=values.device)
     if not highest > lowest:
