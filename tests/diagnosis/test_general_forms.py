@@ -50,14 +50,14 @@ def test_convection_is_named_with_its_exponent():
 
 
 def test_a_wall_that_takes_up_heat_is_named_and_sized():
-    """It has a third of the body's capacity, and gives nothing off to the room."""
+    """It has two fifths of the body's capacity, and gives nothing off to the room."""
 
     def rate(y, power, room):
         flow = 0.5 * (y[1] - y[0])
         return [(power - 0.4 * (y[0] - room) + flow) / 50.0, -flow / 20.0]
 
     finding = explained(diagnose(Body(), heated(rate, [20.0, 20.0], 0.05), **QUICK), "hidden_lag")
-    assert value(finding, "exchange")[0] == pytest.approx(0.01, abs=0.001)
+    assert value(finding, "share")[0] == pytest.approx(0.4, abs=0.04)
     assert value(finding, "time_constant")[0] == pytest.approx(40.0, abs=4.0)
 
 

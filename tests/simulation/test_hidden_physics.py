@@ -135,7 +135,7 @@ CASES = {
         "hysteretic rate of speed", {"yield_deflection": 0.2}, [3.0], hysteretic(3.0, 0.2), [0.5, 0.0, 0.0], 2e-4,
     ),
     "hidden_lag": (
-        "lagged rate of speed", {"time_constant": 0.4}, [1.5], dragged(1.5, 0.4), [0.5, 0.7, 0.7], 1e-4,
+        "lagged rate of speed", {"time_constant": 0.4}, [0.6], dragged(1.5, 0.4), [0.5, 0.7, 0.7], 1e-4,
     ),
     "hidden_mode": (
         "resonant rate of speed", {"period": 0.9, "damping": 0.1}, [0.3], sprung(0.3, 0.9, 0.1),
@@ -241,15 +241,24 @@ class TestMemory:
             assert begin[2:].tolist() == [float(first[1]) if one else 0.0 for one in like]
 
     def test_a_lag_of_no_time_changes_nothing(self):
-        _, _, gamma, rate, first, _ = CASES["hidden_lag"]
+        rate, first = CASES["hidden_lag"][3:5]
         simulation, _, theta = prepared("hidden_lag", rate, first)
         plain = simulation.residual(theta, {})
         left = []
         for lag in (1e-2, 1e-3, 1e-4):
-            model, parameters = joint("hidden_lag", simulation, {"time_constant": lag}, gamma, theta)
+            exchange = 1.5  # with a store that becomes ever smaller
+            model, parameters = joint("hidden_lag", simulation, {"time_constant": lag}, [exchange * lag], theta)
             left.append(float((model.residual(parameters) - plain).abs().max()))
         assert left[0] > 9.0 * left[1] > 81.0 * left[2]
         assert left[2] < 1e-3
+
+    def test_a_store_that_follows_at_once_only_adds_its_capacity(self):
+        simulation, _, theta = prepared("hidden_lag", *CASES["hidden_lag"][3:5])
+        larger = JointModel(simulation, (Term(OF["added_mass"], None, {}, "rate of speed"),))
+        whole = larger.residual(torch.cat([theta, theta.new_tensor([0.6 / 1.6])]))
+        model, parameters = joint("hidden_lag", simulation, {"time_constant": 1e-3}, [0.6], theta)
+        away = (whole - simulation.residual(theta, {})).abs().max()
+        assert float((model.residual(parameters) - whole).abs().max()) < 0.02 * float(away)
 
     def test_a_stiff_spring_only_adds_its_mass(self):
         _, _, _, rate, first, _ = CASES["hidden_mode"]

@@ -22,11 +22,12 @@ SHARES = (0.005, 0.015, 0.05, 0.15)
 class HiddenLag(RateEffect):
     """A second store behind a resistance: heat in a wall, water in a side tank, a mass that a damper drags along.
 
-    Simulation: adds ``γ (z − x)`` to the rate of a state x, with an internal state z of its own that begins like x:
-        ``τ ż = x − z``. What the state gives off the store takes up, ``γ τ`` times as large as the state's own.
+    Simulation: adds ``γ (z − x) / τ`` to the rate of a state x, with an internal state z of its own that begins like x:
+        ``τ ż = x − z``. What the state gives off, the store takes up.
     Drivers: none but the state, all of its course since the run's beginning.
-    Units: γ in 1/s; the time constant τ in s.
-    Plausible: γ ≥ 0: exchange evens out.
+    Units: γ, the store's capacity as a share of the state's own, is a number; the time constant τ in s.
+    Plausible: γ from 0 to thirty, for exchange evens out; a store that follows at once only adds to the capacity, which
+        is often a parameter of the simulation, and then nothing would hold γ.
     Source: two-node thermal networks; Bacher & Madsen, Energy and Buildings 43 (2011); Maxwell's model of a damper.
     """
 
@@ -35,9 +36,10 @@ class HiddenLag(RateEffect):
     general = True
     continuous: Mapping[str, tuple[float, float]] = {"time_constant": (0.001, 0.4)}
     fitted_shape: Mapping[str, tuple[float, float]] = {"time_constant": (0.001, 0.4)}
-    gain = "exchange"
+    most = 30.0
+    gain = "share"
     along = ""
-    equation = "δẋ = γ (z − x),  τ ż = x − z"
+    equation = "δẋ = γ (z − x) / τ,  τ ż = x − z"
     explanation = "The state exchanges with something that is not in the equations and follows it late."
     advice = "Add a second store with this time constant, such as a wall behind a resistance."
     source = "two-node thermal networks; Bacher & Madsen, Energy and Buildings 43 (2011)"
@@ -47,15 +49,16 @@ class HiddenLag(RateEffect):
         return tuple({"time_constant": share * length} for share in SHARES)
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
-        return (Quantity(self.gain, 1, "1/s"),)
+        return (Quantity(self.gain, 1, ""),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
         """The exchange, and beside it the rate of z, where z is solved for; along the known path, where it is not."""
         x, z, lag = context.part("own"), context.memory, shape["time_constant"]
         if z is None:
-            return (gamma[0] * (lagged(x, context.time, lag, context.runs) - x)).unsqueeze(-1)
-        return torch.stack([gamma[0] * (z - x), (x - z) / lag], -1)
+            return (gamma[0] * (lagged(x, context.time, lag, context.runs) - x) / lag).unsqueeze(-1)
+        gone = (x - z) / lag
+        return torch.stack([-gamma[0] * gone, gone], -1)
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
-        x, z = names["own"], names["memory"]
-        return f"{gamma[0]!r} * ({z} - {x})", f"({x} - {z}) / {shape['time_constant']!r}"
+        gone = f"({names['own']} - {names['memory']}) / {shape['time_constant']!r}"
+        return f"-{gamma[0]!r} * {gone}", gone

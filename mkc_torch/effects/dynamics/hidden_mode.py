@@ -39,7 +39,8 @@ class HiddenMode(RateEffect):
     Drivers: none but the state, all of its course since the run's beginning.
     Units: γ, the second mass as a share of the first, is a number; the period 2π/ω in s; the damping ζ, as a share of
         critical damping, is a number.
-    Plausible: γ ≥ 0.
+    Plausible: γ from 0 to ten; a second mass on a stiff spring only adds to the first, often a parameter of the
+        simulation, and then nothing would hold γ.
     Source: Den Hartog, "Mechanical Vibrations" (1956), 3.2; Spong, Journal of Dynamic Systems, Measurement, and Control
         109 (1987), for flexible joints; Dodge, "The New Dynamic Behavior of Liquids in Moving Containers" (2000).
     """
@@ -51,6 +52,7 @@ class HiddenMode(RateEffect):
     continuous: Mapping[str, tuple[float, float]] = {"period": (0.0005, 0.6)}
     fitted_shape: Mapping[str, tuple[float, float]] = {"period": (0.0005, 0.6), "damping": (0.002, 0.9)}
     shape_units: Mapping[str, str] = {"period": "s"}
+    most = 10.0
     gain = "share"
     along = ""
     equation = "δv̇ = γ (ω² s + 2 ζ ω ṡ),  ṡ = w − v,  ẇ = −ω² s − 2 ζ ω ṡ,  ω = 2π / period"

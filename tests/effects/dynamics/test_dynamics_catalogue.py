@@ -49,6 +49,7 @@ def test_what_brakes_takes_energy_out(name):
 
 def test_signs_of_amplitudes():
     assert {e.id for e in DYNAMICS if e.least == -math.inf} >= set(EITHER_SIGN)
+    assert {e.id: e.most for e in DYNAMICS if 1.0 < e.most < math.inf} == {"hidden_lag": 30.0, "hidden_mode": 10.0}
     assert {e.id for e in DYNAMICS if (e.least, e.most) == (0.0, 1.0)} >= set(SHARES)
     for effect in DYNAMICS:
         assert effect.one_sided or effect.id in EITHER_SIGN or effect.id not in IDS
