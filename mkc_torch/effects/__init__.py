@@ -19,7 +19,7 @@ from mkc_torch.effects.courses import lagged
 from mkc_torch.effects.dynamics import DYNAMICS
 from mkc_torch.effects.dynamics.backlash import played
 from mkc_torch.effects.dynamics.rate import beyond
-from mkc_torch.effects.dynamics.unknown_rate import spline_within
+from mkc_torch.effects.dynamics.unknown_near_ends import curve_within
 from mkc_torch.effects.paired import PAIRED
 from mkc_torch.effects.paired.between import shifted
 from mkc_torch.effects.sensor import ATTITUDE, SENSOR
@@ -44,12 +44,12 @@ __all__ = [
     "ShapedEffect",
     "SignalEffect",
     "beyond",
+    "curve_within",
     "is_curve",
     "lagged",
     "played",
     "shifted",
     "soft_clip",
-    "spline_within",
     "words_of",
 ]
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.effects import Effect, beyond, lagged, played, shifted, soft_clip, spline_within
+from mkc_torch.effects import Effect, beyond, curve_within, lagged, played, shifted, soft_clip
 from mkc_torch.effects.courses import gained
 from mkc_torch.simulation.dynamics.ports import memory_at
 from mkc_torch.simulation.protocol import Sizes
@@ -272,7 +272,7 @@ class OfEveryShape:
             names = {name: f"x.{name}" for name in carried}
         known = {"x": x, "torch": torch, "time": context.time, "run": context.runs}
         known |= {"lagged": lagged, "shifted": shifted, "played": played, "soft_clip": soft_clip, "beyond": beyond}
-        known["spline_within"] = spline_within
+        known["curve_within"] = curve_within
         shape = {name: float(value) for name, value in shape.items()}
         lines = effect.code(gamma.tolist(), shape, names)
         written = torch.stack([eval(line, known) + torch.zeros_like(context.time) for line in lines], -1)

@@ -27,7 +27,7 @@ _FROM_HERE: Mapping[str, str] = {
     "played(": "from mkc_torch.effects import played",
     "shifted(": "from mkc_torch.effects import shifted",
     "soft_clip(": "from mkc_torch.effects import soft_clip",
-    "spline_within(": "from mkc_torch.effects import spline_within",
+    "curve_within(": "from mkc_torch.effects import curve_within",
     "beyond(": "from mkc_torch.effects import beyond",
     "SimpleNamespace(": "from types import SimpleNamespace",
     "Parameter(": "from mkc_torch.simulation import Parameter",

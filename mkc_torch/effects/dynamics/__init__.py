@@ -27,6 +27,7 @@ from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from mkc_torch.effects.dynamics.sensor_lag import SensorLag
 from mkc_torch.effects.dynamics.stribeck_friction import StribeckFriction
 from mkc_torch.effects.dynamics.thermal_loss import ThermalLoss
+from mkc_torch.effects.dynamics.unknown_near_ends import UnknownNearEnds
 from mkc_torch.effects.dynamics.unknown_rate import UnknownRate
 
 __all__ = ["DYNAMICS"]
@@ -63,5 +64,6 @@ DYNAMICS: tuple[Effect, ...] = (
     UnknownRate("difference"),
     UnknownRate("own"),
     UnknownRate("position"),
+    UnknownNearEnds(),
 )
 """The effects that a diagnosis of differential equations tries."""
