@@ -8,7 +8,7 @@ import torch
 
 from mkc_torch.recording.recording import DEFAULT_UNITS
 from mkc_torch.simulation.dynamics.equations import Equations
-from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
+from mkc_torch.simulation.dynamics.user_functions import namespace
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import Parameter
 
@@ -38,9 +38,8 @@ def surroundings(system: Equations) -> dict[str, str]:
         {'temp': 'outside'}
     """
     known = {name: one if isinstance(one, Parameter) else Parameter(one) for name, one in system.parameters.items()}
-    ways = kinematic(system, known)
     found = {}
-    for state in (one for one in system.states if one not in ways):
+    for state in system.states:
         unit = _unit_of(system, state)
         alike = [other for other in system.states if other == state or (unit and _unit_of(system, other) == unit)]
         shifted = [name for name in system.inputs if _shifts(system, known, state, alike, name)]
@@ -56,11 +55,7 @@ def _unit_of(system: Equations, name: str) -> str:
 
 def _shifts(system: Equations, known: dict[str, Parameter], state: str, alike: list[str], name: str) -> bool:
     """Whether the rate of a state depends on states of one unit only by their difference to an input."""
-    generator = torch.Generator().manual_seed(0)
-    time, states, inputs = (
-        torch.rand(20, count, generator=generator, dtype=torch.float64) + 0.1
-        for count in (1, len(system.states), len(system.inputs))
-    )
+    time, states, inputs = _scattered(1), _scattered(len(system.states)), _scattered(len(system.inputs))
     # a parameter that begins at 0 would hide what it multiplies
     p = Names(**{one: torch.tensor(known[one].value or 1.0).double() for one in known})
 
@@ -76,3 +71,11 @@ def _shifts(system: Equations, known: dict[str, Parameter], state: str, alike: l
     if torch.allclose(rate(_SHIFT, 0.0), plain, rtol=1e-6, equal_nan=False):
         return False
     return torch.allclose(rate(_SHIFT, _SHIFT), plain, rtol=1e-9)
+
+
+def _scattered(count: int) -> torch.Tensor:
+    """(20, count) values from 0.1 to 1.1; the same ones each time, and allowed where random ones are not."""
+    turns = (
+        torch.arange(1, 21, dtype=torch.float64).unsqueeze(-1) * (torch.arange(count, dtype=torch.float64) + 2.7).sqrt()
+    )
+    return turns.remainder(1.0) + 0.1

@@ -351,9 +351,10 @@ class TestPorts:
             "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "reversing": "speed",
         }  # fmt: skip
         assert port.part_units["position"] == "rad"
-        typical, largest = port.sizes["own"]
-        assert typical == pytest.approx(np.median(np.abs(TRUTH[1])), rel=0.1)
-        assert largest == pytest.approx(np.abs(TRUTH[1]).max(), rel=0.1)
+        size = port.sizes["own"]
+        assert size.typical == pytest.approx(np.median(np.abs(TRUTH[1])), rel=0.1)
+        assert size.largest == pytest.approx(np.abs(TRUTH[1]).max(), rel=0.1)
+        assert (size.lowest, size.highest) == pytest.approx((TRUTH[1].min(), TRUTH[1].max()), rel=0.1)
 
     def test_an_angle_is_one_in_rad(self):
         assert "angle" not in self.pendulum(units={"angle": "m"})["rate of speed"].parts
@@ -380,7 +381,7 @@ class TestPorts:
         assert ports["rate of upper"].unit == "m/s"
         pump = ports["input pump"]
         assert (pump.kind, pump.channels, pump.unit) == ("input", ("pump",), "V")
-        assert pump.sizes["own"] == pytest.approx((0.3, 0.4), rel=0.1)
+        assert pump.sizes["own"] == pytest.approx((0.3, 0.4, 0.2, 0.4), rel=0.1)
         assert ports["output"].channels == ("upper", "lower")
         assert ports["output"].unit == "m"
         units = {name: ports["output"].part_units[part] for part, name in ports["output"].parts.items()}
