@@ -270,14 +270,16 @@ class PreparedDynamics:
         """
         begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
         rate = self.rate(theta, changes)
-        begin = _of_width(begin, begin.shape[1] + len(self._remembering(changes)) + len(self.lasting))
-        width, jump = begin.shape[1], self.jump(theta, changes)
+        memories = [like for memory in self._remembering(changes).values() for like in memory.values()]
+        memories += [""] * len(self.lasting)
+        begin, jump = self._with_memories(begin, memories), self.jump(theta, changes)
+        width = begin.shape[1]
         known = near if isinstance(near, Trajectory) else None
-        guess = _of_width(self.guess if known is None else known.states, width)
+        guess = self._with_memories(self.guess if known is None else known.states, memories)
         linear = known is not None and known.linear is not None and known.states.shape[1] == width
         found = solve(rate, self.grid, begin, guess, known if linear else None, jump=jump)
         if not found.converged and known is not None:
-            found = solve(rate, self.grid, begin, _of_width(self.guess, width), jump=jump)
+            found = solve(rate, self.grid, begin, self._with_memories(self.guess, memories), jump=jump)
         if not found.converged and known is None:
             nearer = marched(rate, self.grid, begin, guess, jump=jump)
             found = found if nearer is None else solve(rate, self.grid, begin, nearer, jump=jump)
@@ -291,13 +293,22 @@ class PreparedDynamics:
         first = torch.where(self.begins, torch.arange(len(self.time)), 0).cummax(0).values
         return self.time - self.time[first]
 
-    def _remembering(self, changes: Changes) -> dict[str, str]:
-        """Ports at which an effect brings an internal state, with its name: one that adds its rate when it sees it."""
+    def _with_memories(self, states: Float[Tensor, "G n"], memories: Sequence[str]) -> Float[Tensor, "G w"]:
+        """The states, and internal ones that are not yet among them: like another state, or zeros."""
+        n = len(self.system.states)
+        more = [
+            states[:, self.system.states.index(like)] if like else states.new_zeros(len(states))
+            for like in memories[states.shape[1] - n :]
+        ]
+        return torch.cat([states[:, : n + len(memories)], *(one.unsqueeze(-1) for one in more)], -1)
+
+    def _remembering(self, changes: Changes) -> dict[str, Mapping[str, str]]:
+        """Ports at which an effect brings internal states, with these: one that adds their rates when it sees them."""
         found = {}
         for name, port in self.ports.items():
             # what does not see the signal remembers nothing
             if port.memory and name in changes and not isinstance(changes[name], FreeChange):
-                seen = self.guess.new_zeros(len(self.clock.time), len(port.carries) + 1)
+                seen = self.guess.new_zeros(len(self.clock.time), len(port.carries) + len(port.memory))
                 if changes[name](seen).shape[1] > len(port.channels):
                     found[name] = port.memory
         return found
@@ -306,22 +317,22 @@ class PreparedDynamics:
         """Of the states, and of the internal states that effects bring, which come after them."""
         inputs = self._inputs(theta, changes)
         remembering = self._remembering(changes)
-        rows = [*self.system.states, *remembering.values()]
-        lasting = self.lasting
+        rows = [*self.system.states, *(one for memory in remembering.values() for one in memory)]
+        lasting, n = self.lasting, len(self.system.states)
         acting = [
-            (port, [rows.index(row) for row in (*port.channels, *([port.memory] if name in remembering else []))], name)
+            (port, [rows.index(row) for row in (*port.channels, *remembering.get(name, ()))], name)
             for name, port in self.ports.items()
             if port.kind in RATES and name in changes
         ]
 
         def rate(states: Tensor) -> Tensor:
-            own, memories, pushes = states.split([len(self.system.states), len(remembering), len(lasting)], -1)
+            own, memories, pushes = states.split([n, len(rows) - n, len(lasting)], -1)
             plain = self._rates(theta, own, inputs)
             rates = [*plain, *(torch.zeros_like(one) for one in memories.unbind(-1))]
             for port, places, name in acting:
                 signal = self._signal(port, theta, own, inputs, plain)
                 if name in remembering:
-                    signal = torch.cat([signal, states[:, places[-1:]]], -1)
+                    signal = torch.cat([signal, states[:, places[len(port.channels) :]]], -1)
                 for k, added in zip(places, changes[name](signal).unbind(-1), strict=True):
                     rates[k] = rates[k] + added
             for one, push in zip(lasting, pushes.unbind(-1), strict=True):
@@ -346,7 +357,8 @@ class PreparedDynamics:
         """How the observer corrects the states at the samples."""
         if self.observer is None:
             return None
-        n, memories, pushes = len(self.system.states), len(self._remembering(changes)), len(self.lasting)
+        n, pushes = len(self.system.states), len(self.lasting)
+        memories = sum(len(memory) for memory in self._remembering(changes).values())
         places = (*range(n), *range(n + memories, n + memories + pushes))
         by_states = self.predicted(theta)
 
@@ -456,9 +468,3 @@ class PreparedDynamics:
                 break
             parts, before = 2 * parts, after
         self._lay_out(parts if bool(before.isfinite().all()) else 1)
-
-
-def _of_width(states: Float[Tensor, "G n"], width: int) -> Float[Tensor, "G w"]:
-    """The first states, and zeros for internal ones that are not among them."""
-    more = max(width - states.shape[1], 0)
-    return torch.cat([states[:, :width], states.new_zeros(len(states), more)], -1)
