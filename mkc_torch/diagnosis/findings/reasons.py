@@ -154,16 +154,18 @@ def _trials(prepared: PreparedDynamics) -> list[_Trial]:
     for number, name in enumerate(prepared.system.inputs):
         turned = prepared.inputs_at_rows.clone()
         turned[:, number] = -turned[:, number]
-        trials.append(
-            _Trial(lambda _, name=name: f"With the sign of `{name}` turned round", _with_inputs(prepared, turned))
-        )  # type: ignore[misc]
+        trials.append(_Trial(_always(f"With the sign of `{name}` turned round"), _with_inputs(prepared, turned)))
         step = float(prepared.time.diff().median())
         for lag in (lag for lag in _LAGS if lag < len(prepared.time) // 10):
             late = prepared.inputs_at_rows.clone()
             late[lag:, number] = prepared.inputs_at_rows[:-lag, number]
             told = f"With `{name}` late by {lag * step:.3g} s"
-            trials.append(_Trial(lambda _, told=told: told, _with_inputs(prepared, late)))  # type: ignore[misc]
+            trials.append(_Trial(_always(told), _with_inputs(prepared, late)))
     return trials
+
+
+def _always(told: str) -> Callable[[Tensor], str]:
+    return lambda _: told
 
 
 def _still(prepared: PreparedDynamics, number: int) -> Float[Tensor, "N u"]:

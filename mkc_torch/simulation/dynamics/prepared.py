@@ -19,11 +19,12 @@ from mkc_torch.simulation.dynamics.between_samples import inputs_between
 from mkc_torch.simulation.dynamics.checks import Moments, check_functions
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.first_guess import despiked, first_guess
-from mkc_torch.simulation.dynamics.observer import Correcting, Disturbance, Observer
+from mkc_torch.simulation.dynamics.observer import Observer
 from mkc_torch.simulation.dynamics.ports import RATES, Places, common_unit
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
 from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, defect, marched, solve, stations
 from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
+from mkc_torch.simulation.dynamics.watched import Watched
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import Parameter
 from mkc_torch.simulation.protocol import Answer, Changes, Clock, FreeChange, Nearby, Port
@@ -45,11 +46,10 @@ _WINDOW = 4
 _NOUGHT = 1e-3
 
 
-class PreparedDynamics:
+class PreparedDynamics(Watched):
     """A system of differential equations with the recording that answers it."""
 
     prior: GaussianPrior | None = None
-    observer: Observer | None = None
 
     def __init__(self, system: Equations, recording: Recording, outputs: tuple[str, ...]) -> None:
         self.system, self.recording, self.channels = system, recording, outputs
@@ -67,7 +67,7 @@ class PreparedDynamics:
         self.run = experiment_runs(recording)
         self.between = dict.fromkeys(system.inputs, system.between)
         refuse_few(self.begins, system.name)
-        self._kinematic = kinematic(system, self.known)
+        self.kinematic = kinematic(system, self.known)
         self._lay_out(1)
         starts = [f"{state} at the start{label}" for label in self.labels for state in system.states]
         self.parameter_names = (*self.known, *starts)
@@ -76,8 +76,8 @@ class PreparedDynamics:
         high = [one.upper for one in self.known.values()]
         self.bounds = self.time.new_tensor(low + [-torch.inf] * n), self.time.new_tensor(high + [torch.inf] * n)
         self._p = p
-        self._clean = torch.stack([despiked(one, self.time, self.begins) for one in self.measured.unbind(-1)], -1)
-        self.counts = self._clean == self.measured
+        self.clean = torch.stack([despiked(one, self.time, self.begins) for one in self.measured.unbind(-1)], -1)
+        self.counts = self.clean == self.measured
         self._check_functions()
         self._refine()
 
@@ -106,7 +106,7 @@ class PreparedDynamics:
         self.inputs = self._between(inputs)
         self.inputs_at_rows = inputs
         self.guess = first_guess(
-            self.system, self.recording, self.channels, self.begins, self._kinematic, time, node_before, node_share
+            self.system, self.recording, self.channels, self.begins, self.kinematic, time, node_before, node_share
         )
         self.__dict__.pop("ports", None)  # their clock is that of the stations
 
@@ -148,7 +148,7 @@ class PreparedDynamics:
     def ports(self) -> dict[str, Port]:
         """The rate of each state, exchange between two of the same unit, each input, and the outputs."""
         places = Places(
-            self.system, self.recording, self.channels, self._kinematic, self.guess[self.rows], self.clock, self.run
+            self.system, self.recording, self.channels, self.kinematic, self.guess[self.rows], self.clock, self.run
         )
         return places.ports()
 
@@ -233,7 +233,7 @@ class PreparedDynamics:
         outputs = self._outputs(theta, found)
         if "output" in changes:
             outputs = outputs + changes["output"](outputs)
-        outputs = outputs + self._pushed_outputs(found.states[self.rows])
+        outputs = outputs + self.pushed_outputs(found.states[self.rows])
         return outputs if found.converged else outputs * torch.nan
 
     def signals(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Mapping[str, Tensor]:
@@ -270,7 +270,7 @@ class PreparedDynamics:
         """
         begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
         rate = self.rate(theta, changes)
-        memories = [like for memory in self._remembering(changes).values() for like in memory.values()]
+        memories = [like for memory in self.remembering(changes).values() for like in memory.values()]
         memories += [""] * len(self.lasting)
         begin, jump = self._with_memories(begin, memories), self.jump(theta, changes)
         width = begin.shape[1]
@@ -302,7 +302,7 @@ class PreparedDynamics:
         ]
         return torch.cat([states[:, : n + len(memories)], *(one.unsqueeze(-1) for one in more)], -1)
 
-    def _remembering(self, changes: Changes) -> dict[str, Mapping[str, str]]:
+    def remembering(self, changes: Changes) -> dict[str, Mapping[str, str]]:
         """Ports at which an effect brings internal states, with these: one that adds their rates when it sees them."""
         found = {}
         for name, port in self.ports.items():
@@ -316,7 +316,7 @@ class PreparedDynamics:
     def rate(self, theta: Tensor, changes: Changes) -> Callable[[Tensor], Tensor]:
         """Of the states, and of the internal states that effects bring, which come after them."""
         inputs = self._inputs(theta, changes)
-        remembering = self._remembering(changes)
+        remembering = self.remembering(changes)
         rows = [*self.system.states, *(one for memory in remembering.values() for one in memory)]
         lasting, n = self.lasting, len(self.system.states)
         acting = [
@@ -343,61 +343,10 @@ class PreparedDynamics:
 
         return rate
 
-    @property
-    def pushable(self) -> tuple[str, ...]:
-        """States whose rate something unrecorded can push; that of a position is its speed."""
-        return tuple(name for name in self.system.states if name not in self._kinematic)
-
-    @property
-    def lasting(self) -> tuple[Disturbance, ...]:
-        """What the observer follows beside the states."""
-        return () if self.observer is None else self.observer.lasting
-
-    def jump(self, theta: Tensor, changes: Changes) -> Correcting | None:
-        """How the observer corrects the states at the samples."""
-        if self.observer is None:
-            return None
-        n, pushes = len(self.system.states), len(self.lasting)
-        memories = sum(len(memory) for memory in self._remembering(changes).values())
-        places = (*range(n), *range(n + memories, n + memories + pushes))
-        by_states = self.predicted(theta)
-
-        def predict(states: Tensor) -> Tensor:
-            return by_states(states) + self._pushed_outputs(states)
-
-        return Correcting(self.observer, self.rows, places, self.seen(theta, changes), predict)
-
-    def seen(self, theta: Tensor, changes: Changes) -> Float[Tensor, "N m"]:
-        """The recording less what sensors and effects make of outputs: of these they may remember the earlier ones."""
-        clean = dict(zip(self.channels, self._clean.unbind(-1), strict=True))
-        sensed = self.system.sensed(self.time, clean, self._parameters(theta), self.run)
-        made = torch.stack([sensed[name] - clean[name] for name in self.channels], -1)
-        if "output" in changes:
-            made = made + changes["output"](self._clean + made)
-        return self.measured - made
-
-    def predicted(self, theta: Tensor) -> Callable[[Tensor], Tensor]:
-        """Outputs at the samples by the states there, before a sensor makes something of them."""
-        n, p, u = len(self.system.states), self._parameters(theta), namespace(self.system.inputs, self.inputs_at_rows)
-
-        def outputs(states: Tensor) -> Tensor:
-            values = self.system.output(self.time, namespace(self.system.states, states[:, :n]), u, p)
-            return torch.stack([values[name] + torch.zeros_like(states[:, 0]) for name in self.channels], -1)
-
-        return outputs
-
-    def _pushed_outputs(self, states: Float[Tensor, "N n"]) -> Tensor:
-        """What lasting disturbances add to the outputs."""
-        added = [torch.zeros_like(states[:, 0]) for _ in self.channels]
-        for one, push in zip(self.lasting, states[:, states.shape[1] - len(self.lasting) :].unbind(-1), strict=True):
-            if not one.at_rate:
-                added[self.channels.index(one.place)] = added[self.channels.index(one.place)] + push
-        return torch.stack(added, -1)
-
     def _rates(self, theta: Tensor, states: Tensor, inputs: Tensor) -> list[Tensor]:
         """Of the states, by the simulation's own equations."""
         u = namespace(self.system.inputs, inputs)
-        return self._derivative(self.clock.time, states, u, self._parameters(theta))
+        return self._derivative(self.clock.time, states, u, self.parameters_of(theta))
 
     def _signal(
         self, port: Port, theta: Tensor, states: Tensor, inputs: Tensor, rates: Sequence[Tensor]
@@ -408,7 +357,7 @@ class PreparedDynamics:
             return torch.cat([states, inputs, rates[own].unsqueeze(-1)], -1)
         if "load" not in port.parts:
             return torch.cat([states, inputs], -1)
-        p, idle = self._parameters(theta), namespace(self.system.inputs, torch.zeros_like(inputs))
+        p, idle = self.parameters_of(theta), namespace(self.system.inputs, torch.zeros_like(inputs))
         at_rest = torch.cat([states[:, :own], torch.zeros_like(states[:, [own]]), states[:, own + 1 :]], -1)
         coasting, held = (self._derivative(self.clock.time, x, idle, p)[own] for x in (states, at_rest))
         load = (rates[own] - coasting - held).abs().unsqueeze(-1)  # of the drive against what holds it
@@ -429,17 +378,17 @@ class PreparedDynamics:
             for k, name in enumerate(self.system.inputs)
         }
         run = self.run[self.clock.before]
-        acting = self.system.actuated(self.clock.time, Names(**columns), self._parameters(theta), run)
+        acting = self.system.actuated(self.clock.time, Names(**columns), self.parameters_of(theta), run)
         return torch.stack([acting[name] for name in self.system.inputs], -1)
 
     def _outputs(self, theta: Tensor, found: Trajectory) -> Float[Tensor, "N m"]:
-        p = self._parameters(theta)
+        p = self.parameters_of(theta)
         x = namespace(self.system.states, found.states[self.rows, : len(self.system.states)])
         u = namespace(self.system.inputs, self.inputs_at_rows)
         values = self.system.sensed(self.time, self.system.output(self.time, x, u, p), p, self.run)
         return torch.stack([values[name] for name in self.channels], -1)
 
-    def _parameters(self, theta: Tensor) -> Names:
+    def parameters_of(self, theta: Tensor) -> Names:
         return Names(**dict(zip(self.known, theta[: self._p].unbind(), strict=True)))
 
     def _check_functions(self) -> None:
@@ -448,7 +397,7 @@ class PreparedDynamics:
         first = at[::3][:1].expand(len(self.time), -1)
         stations = Moments(self.clock.time, at, self.inputs, self.run[self.clock.before])
         samples = Moments(self.time, first, self.inputs_at_rows, self.run)
-        check_functions(self.system, self._parameters(theta), stations, samples, self.channels)
+        check_functions(self.system, self.parameters_of(theta), stations, samples, self.channels)
 
     def _refine(self) -> None:
         """Parts of an interval between samples: by the greatest step, or until twice as many change nothing."""

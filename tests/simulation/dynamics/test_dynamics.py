@@ -748,9 +748,9 @@ def test_a_trajectory_nearby_is_gone_on_from(monkeypatch):
     started = []
     real = trajectory.solve
 
-    def watched(rate, grid, begin, guess, known=None):
+    def watched(rate, grid, begin, guess, known=None, jump=None):
         started.append((guess, known))
-        return real(rate, grid, begin, guess, known)
+        return real(rate, grid, begin, guess, known, jump)
 
     prepared = Pendulum().prepare(table(time=TIME, angle=TRUTH[0]))
     first = torch.tensor([9.0, 0.1, 0.5, 0.0]).double()
