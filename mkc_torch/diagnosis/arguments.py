@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_other_type, told
 from mkc_torch.diagnosis.settings import Settings
@@ -71,3 +71,55 @@ def check_numbers(level: float, surrogates: int, max_findings: int, seed: int) -
             f"Expected argument `surrogates` to be at least {math.ceil(1.0 / level - 1.0 - 1e-9)} at level {level}, "
             f"for no p-value can be smaller than 1 / (surrogates + 1), but got {surrogates}."
         )
+
+
+BETWEEN = ("held", "linear", "smooth")
+"""What an input can do between two samples."""
+
+
+def checked_noise(noise: object, outputs: Sequence[str]) -> dict[str, float]:
+    """Declared sizes of the sensors' white noise, by output.
+
+    Example:
+        >>> checked_noise({"angle": 0.005}, ["angle", "rate"])
+        {'angle': 0.005}
+        >>> checked_noise({"x": 0.005}, ["angle"])
+        Traceback (most recent call last):
+        ValueError: Expected argument `noise` to name outputs of the simulation but got `x`; they are `angle`.
+    """
+    return {
+        name: checked_number(f"noise[{name!r}]", size, advice="the standard deviation of that sensor's white noise")
+        for name, size in _of_known("noise", noise, outputs, "outputs", '{"angle": 0.005}').items()
+    }
+
+
+def checked_between(between: object, inputs: Sequence[str]) -> dict[str, str]:
+    """What inputs are declared to do between two samples.
+
+    Example:
+        >>> checked_between({"torque": "held"}, ["torque"])
+        {'torque': 'held'}
+    """
+    found = {}
+    for name, told_as in _of_known("between", between, inputs, "inputs", '{"torque": "held"}').items():
+        if not isinstance(told_as, str) or told_as not in BETWEEN:
+            raise ValueError(
+                f"Expected argument `between` to say one of {', '.join(BETWEEN)} of `{name}` but got {told_as!r}."
+            )
+        found[name] = told_as
+    return found
+
+
+def _of_known(argument: str, given: object, names: Sequence[str], what: str, example: str) -> dict[str, object]:
+    """A mapping from names that the simulation has; None is an empty one."""
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise TypeError(f"Expected argument `{argument}` to be a dict such as {example} but got {told(given)}.")
+    for name in given:
+        if name not in names:
+            known = f"they are {', '.join(f'`{one}`' for one in names)}" if names else "it has none"
+            raise ValueError(
+                f"Expected argument `{argument}` to name {what} of the simulation but got `{name}`; {known}."
+            )
+    return dict(given)

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 
 from mkc_torch._parallel.fork import meanwhile, shared
-from mkc_torch.diagnosis.arguments import check_numbers, checked_effects, refuse_no_settings, refuse_no_simulation
+from mkc_torch.diagnosis.arguments import (
+    check_numbers,
+    checked_between,
+    checked_effects,
+    checked_noise,
+    refuse_no_settings,
+    refuse_no_simulation,
+)
 from mkc_torch.diagnosis.assemble import assembled, with_rest
 from mkc_torch.diagnosis.evidence.after_the_search import answers_of, parts_ahead
 from mkc_torch.diagnosis.evidence.base import Case
@@ -46,6 +53,8 @@ def diagnose(
     surrogates: int = SURROGATES,
     max_findings: int = MAX_FINDINGS,
     seed: int = 0,
+    noise: Mapping[str, float] | None = None,
+    between: Mapping[str, str] | None = None,
     settings: Settings = Settings(),  # noqa: B008
 ) -> Diagnosis:
     """What a simulation lacks, by one recording of what it simulates.
@@ -64,6 +73,9 @@ def diagnose(
         surrogates: draws of noise for each p-value; at least ``1 / level - 1``.
         max_findings: findings at most.
         seed: of the draws.
+        noise: standard deviation of the white noise of a sensor, by output, in the output's unit, where it is known;
+            of the others it is estimated.
+        between: what an input does between two samples, "held", "linear" or "smooth", by input, where it is known.
         settings: the numbers that decide, by stages; see :class:`mkc_torch.diagnosis.Settings`. What was measured of
             false alarms and power was measured with the default.
 
@@ -94,6 +106,8 @@ def diagnose(
             f"{where}{len(recording)} samples are too few for a diagnosis; it needs {fewest} at least. Record longer."
         )
     prepared = simulation.prepare(recording)
+    checked_noise(noise, getattr(simulation, "outputs", None) or prepared.channels)
+    checked_between(between, getattr(simulation, "inputs", None) or ())
     if len(prepared.time) < fewest:
         raise ValueError(
             f"{where}{len(prepared.time)} usable samples are too few for a diagnosis; it needs {fewest} at least."

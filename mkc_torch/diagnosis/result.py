@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from torch import Tensor
 
 from mkc_torch.diagnosis.correcting_model import CorrectingModel
-from mkc_torch.diagnosis.world import Grade, Shape, Verdict, World
+from mkc_torch.diagnosis.world import Curve, Grade, Shape, Verdict, World
 
 if TYPE_CHECKING:
     from jaxtyping import Float

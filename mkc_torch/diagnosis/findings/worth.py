@@ -6,8 +6,18 @@ import math
 from typing import Literal
 
 from mkc_torch.diagnosis.result import Finding, HeldOut
+from mkc_torch.diagnosis.world import Grade
 
-__all__ = ["Confirmation", "carries_over", "change", "confirmation", "confirmed", "small", "worth_correcting"]
+__all__ = [
+    "Confirmation",
+    "carries_over",
+    "change",
+    "confirmation",
+    "confirmed",
+    "grade_of",
+    "small",
+    "worth_correcting",
+]
 
 Confirmation = Literal["surely", "probably", "not shown", "worse"]
 
@@ -45,13 +55,21 @@ def confirmed(finding: Finding) -> bool:
 
 
 def change(held_out: HeldOut) -> float:
-    """Share by which a finding makes the residual smaller; 0 where that is not known.
+    """Share by which a finding makes the residual smaller, of the output where that is most; 0 where it is not known.
 
     Example:
         >>> round(change(HeldOut(0.3, (0.2, 0.4), 2.0, 1.5, "µT")), 3)
         0.25
+        >>> from mkc_torch.diagnosis.result import Sizes
+        >>> each = {"angle": Sizes(0.2, 0.1, "rad"), "speed": Sizes(3.0, 3.0, "rad/s")}
+        >>> change(HeldOut(0.3, (0.2, 0.4), 3.0, 3.0, "", each))
+        0.5
     """
-    before, after = held_out.rmse_before, held_out.rmse_after
+    each = [(one.before, one.after) for one in held_out.outputs.values()]
+    return max(_less(*pair) for pair in each or [(held_out.rmse_before, held_out.rmse_after)])
+
+
+def _less(before: float, after: float) -> float:
     return 1.0 - after / before if before > 0.0 and math.isfinite(after / before) else 0.0
 
 
@@ -60,9 +78,24 @@ def small(finding: Finding) -> bool:
     return finding.held_out is not None and change(finding.held_out) < SMALL
 
 
+def grade_of(finding: Finding) -> Grade:
+    """What a finding is worth by its evidence, as long as its shape is the recording's.
+
+    Example:
+        >>> from mkc_torch.diagnosis.result import Told
+        >>> held = HeldOut(0.02, (0.01, 0.03), 2.0, 1.96, "µT")
+        >>> seen = (Told("held_out", (held, "")),)
+        >>> grade_of(Finding("time_lag", (), (), (), None, "", "", (), 0.01, (), True, "", evidence=seen))
+        'real but small'
+    """
+    if not confirmed(finding):
+        return "not confirmed"
+    return "real but small" if small(finding) else "left out"
+
+
 def worth_correcting(finding: Finding) -> bool:
-    """Whether a simulation is clearly better with it."""
-    return confirmed(finding) and not small(finding)
+    """Whether a simulation is clearly better with it, in this form."""
+    return finding.grade == "left out"
 
 
 def carries_over(finding: Finding) -> bool:

@@ -286,6 +286,7 @@ TERMS: dict[str, str] = {
     "command.all_written": "all was written.",
     "command.no_file": "{file}cannot be written or read: {reason}; choose another place.",
     "command.no_pair": '"{part}" is no pair; write name=column, such as mag_x=mx,mag_y=my,mag_z=mz.',
+    "command.no_option_pair": '{option} "{part}" is no pair; write name=value, such as {example}.',
     "command.no_folder": "{one} has no name that a folder of results could have; rename it.",
     "command.twice": '"{name}" is given twice.',
     "command.same_folder": "{one} and {other} would write into the same folder, {folder}; rename one, or give them in"
