@@ -16,7 +16,8 @@ __all__ = ["advice_of", "nothing_shows"]
 def nothing_shows(diagnosis: Diagnosis) -> bool:
     """Whether the simulation may be used as it is: it follows, and what is left is the sensor's noise."""
     d = diagnosis
-    return d.verdict == "adequate" and d.p_value > d.level and not d.remaining and follows_all(d.world)
+    quiet = bool(d.findings) or d.p_value > d.level
+    return d.verdict == "adequate" and quiet and not d.remaining and follows_all(d.world)
 
 
 def advice_of(diagnosis: Diagnosis) -> tuple[str, ...]:
@@ -25,7 +26,7 @@ def advice_of(diagnosis: Diagnosis) -> tuple[str, ...]:
     if d.verdict == "unfit":
         return _mend_first(d)
     if nothing_shows(d):
-        return ("Use the simulation as it is, within what this recording covers.",)
+        return (_USE, *(_hold_back(f) for f in d.findings))
     advice = [sentence for finding in d.findings for sentence in _of(finding, alone=len(d.findings) == 1)]
     advice += _of_what_remains(d)
     use = [_called(f) for f in d.findings if carries_over(f)]
@@ -118,6 +119,8 @@ def _hold_back(finding: Finding) -> str:
         f"longer{wider} and see whether it comes back."
     )
 
+
+_USE = "Use the simulation as it is, within what this recording covers."
 
 _SWITCHED = (
     "Look for something that is switched on and off, such as a heater, a lamp or a motor, and record it: the offset "

@@ -9,6 +9,7 @@ from mkc_torch.diagnosis.result import Finding, HeldOut
 from mkc_torch.diagnosis.world import Grade
 
 __all__ = [
+    "SMALL",
     "Confirmation",
     "carries_over",
     "change",
