@@ -37,10 +37,7 @@ def advice_of(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 def _mend_first(diagnosis: Diagnosis) -> tuple[str, ...]:
     known = "what stands under the reasons" if diagnosis.world.reasons else "its signs, units, delays and start values"
-    return (
-        f"Do not rely on this simulation yet: check {known}, then diagnose again. Physics is named only beside a "
-        "simulation that follows.",
-    )
+    return (f"Do not rely on this simulation yet: check {known}, then diagnose again.",)
 
 
 def _of_what_remains(diagnosis: Diagnosis) -> Iterator[str]:
@@ -52,8 +49,10 @@ def _of_what_remains(diagnosis: Diagnosis) -> Iterator[str]:
         yield _find_what_pushes(rates[0])
     elif d.verdict == "unexplained" and d.world.pushes:
         yield (
-            f"Find out what moves the sensor of {d.world.pushes[0].place} slowly, such as warming up, and record it."
+            f"Find out what moves the sensor of `{d.world.pushes[0].place}` slowly, such as warming up, and record it."
         )
+    elif any(f.grade == "nearest in the catalogue" for f in d.findings):
+        return  # its curve is where to look
     elif not d.findings or d.verdict == "unexplained":
         yield (
             "Record again, for longer, with more columns that could drive what remains, such as temperature, current "
@@ -64,7 +63,7 @@ def _of_what_remains(diagnosis: Diagnosis) -> Iterator[str]:
 def _find_what_pushes(push: Push) -> str:
     size = f"{push.size:.2g} {push.unit}".rstrip()
     return (
-        f"Look for what drives the rate of {push.place}, in the picture of what pushes it, and record it. Until then "
+        f"Look for what drives the rate of `{push.place}`, in the picture of what pushes it, and record it. Until then "
         f"count on {size} there wherever the simulation predicts, as the process noise of a filter, say."
     )
 

@@ -7,7 +7,7 @@ import unicodedata
 from collections.abc import Collection, Sequence
 
 from mkc_torch.diagnosis.result import Alternative, Candidate, Finding, Region
-from mkc_torch.diagnosis.world import Grade, Shape
+from mkc_torch.diagnosis.world import Grade
 from mkc_torch.effects import is_curve, words_of
 from mkc_torch.report.diagnosis.evidence import of_driver
 from mkc_torch.report.diagnosis.numbers import Clock, probability
@@ -232,17 +232,20 @@ def grade(finding: Finding) -> str:
     return term(_GRADES[finding.grade])
 
 
-def shape(found: Shape) -> str:
-    """Whether the shape that a name claims is the recording's.
+def shape(finding: Finding) -> str:
+    """Whether the shape that a name claims is the recording's; empty where that was not asked.
 
     Example:
-        >>> shape(Shape(163.0, 0.002))
-        'a free curve of the same variables at the same place is likelier by 163 nats (p = 0.002 if the name were right)'
-        >>> shape(Shape(1.2, 0.4))
+        >>> from mkc_torch.diagnosis.world import Shape
+        >>> right = Finding("linear_drag", (), (), (), None, "", "", (), 0.01, (), True, "", shape=Shape(1.2, 0.4))
+        >>> shape(right)
         'a free curve of the same variables is not clearly better (p = 0.4)'
     """
+    found = finding.shape
+    if found is None:
+        return ""
     p = probability(found.p_value)
-    if found.curve is None:
+    if finding.grade != "nearest in the catalogue":
         return term("evidence.as_good", p=p)
     return term("evidence.free_curve", nats=size(found.free_curve_gain), p=p)
 

@@ -35,12 +35,13 @@ def of_forcing(diagnosis: Diagnosis, index: int) -> str:
             draw_curve(ax, curve, has_time)
             ax.set_ylabel(short(curve.value_unit))
             title(ax, term("picture.over", name=short(curve.driver)))
-        _same_height([ax for ax in figure.axes[1:]])
+        _same_height(list(figure.axes[1:]))
         return svg(figure, f"forcing{index + 1}", term("picture.about_forcing"))
 
 
 def _course(ax: Any, forcing: Forcing, has_time: bool) -> None:
-    time, value, band = (_joined(array(forcing.time), array(one)) for one in (forcing.time, forcing.value, forcing.band))
+    course = array(forcing.time)
+    time, value, band = (_joined(course, array(one)) for one in (forcing.time, forcing.value, forcing.band))
     ax.axhline(0.0, color=GREY, lw=0.7, zorder=1)
     ax.fill_between(time, value - band, value + band, color=BLUE, alpha=0.2, lw=0, zorder=2)
     ax.plot(time, value, color=BLUE, lw=1.2, zorder=3)

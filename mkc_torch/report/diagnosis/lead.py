@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from mkc_torch.diagnosis.result import Diagnosis, Finding
+from mkc_torch.effects import is_curve
 from mkc_torch.report.diagnosis.findings import acts_on, finding_name, grade, inseparable, rivals, where
 from mkc_torch.report.diagnosis.noise import noise_model, smooth_fit
 from mkc_torch.report.diagnosis.numbers import clock_of, evidence, gain, largest, probability
-from mkc_torch.report.diagnosis.unseen import better, residual_of_all, residuals
+from mkc_torch.report.diagnosis.unseen import better, left, residual_of_all, residuals
 from mkc_torch.report.diagnosis.verdict import reasons
 from mkc_torch.report.diagnosis.world import noise_lines, output_lines
 from mkc_torch.report.words.numbers import share, size
@@ -45,7 +47,7 @@ def _of_findings(diagnosis: Diagnosis) -> Iterator[Row]:
     if not d.findings:
         if not d.world.follows:
             yield _row("label.residual", residual_alone(d))
-        yield _row("label.how_sure", chance(d.p_value, d))
+        yield _row("label.how_sure", *_sure_of_pushes(d), chance(d.p_value, d))
         return
     if len(d.findings) > 1:
         for number, f in enumerate(d.findings, 1):
@@ -56,17 +58,26 @@ def _of_findings(diagnosis: Diagnosis) -> Iterator[Row]:
         yield _row("label.how_sure", chance(d.findings[0].p_value, d))
         return
     (f,) = d.findings
-    told = [largest(p) for p in f.parameters[:2]]
+    told = _sizes(f, 2)
     if told:
-        yield _row("label.how_large", "; ".join(told) + ".")
+        yield _row("label.how_large", f"{told}.")
     yield _row("label.where", f"{_place(f, d)}.")
     yield _row("label.how_sure", chance(f.p_value, d))
     if f.held_out is None:
-        yield _row("label.how_much_better", f"{capital(term('evidence.not_measured'))}: {f.held_out_note}.")
+        yield _row("label.how_much_better", f"{capital(term('evidence.not_measured'))}: {_closed(f.held_out_note)}")
         return
     sure = f"{capital(better(f.held_out))}; {gain(f.held_out)}."
     sizes = [term("evidence.on_unseen", change=one) for one in residuals(f.held_out, d.world)]
-    yield _row("label.how_much_better", *sizes, sure, *([f.held_out.left] if f.held_out.left else []))
+    yield _row("label.how_much_better", *sizes, sure, *filter(None, [left(f.held_out)]))
+
+
+def _sure_of_pushes(diagnosis: Diagnosis) -> Iterator[str]:
+    """How much less likely the noise is without what pushes; nothing where physics is what is asked about."""
+    known = [push for push in diagnosis.world.pushes if math.isfinite(push.nats)]
+    if known:
+        yield term("world.less_likely", nats=size(known[0].nats), place=plain(known[0].place))
+        if diagnosis.p_value > diagnosis.level:
+            yield term("world.no_physics")
 
 
 def _in_short(finding: Finding, diagnosis: Diagnosis) -> Iterator[str]:
@@ -74,14 +85,24 @@ def _in_short(finding: Finding, diagnosis: Diagnosis) -> Iterator[str]:
     f = finding
     rival = f"; {term('evidence.rivals', rivals=rivals(f))}" if inseparable(f) else ""
     yield f"{capital(grade(f))}{rival}."
-    if f.parameters:
-        yield f"{capital(largest(f.parameters[0]))}."
+    told = _sizes(f, 1)
+    if told:
+        yield f"{told}."
     yield f"{_place(f, diagnosis)}."
     sure = probability(f.p_value)
     if f.held_out is None:
-        yield f"{sure}; {term('evidence.not_measured')}: {f.held_out_note}."
+        yield f"{sure}; {term('evidence.not_measured')}: {_closed(f.held_out_note)}"
         return
     yield f"{sure}; {better(f.held_out)}: {'; '.join(residuals(f.held_out, diagnosis.world))}."
+
+
+def _sizes(finding: Finding, most: int) -> str:
+    """How large it is; of a curve, which has no size of its own, its picture says so."""
+    return "" if is_curve(finding.effect) else "; ".join(largest(p) for p in finding.parameters[:most])
+
+
+def _closed(sentence: str) -> str:
+    return sentence if sentence.endswith(".") else f"{sentence}."
 
 
 def _place(finding: Finding, diagnosis: Diagnosis) -> str:

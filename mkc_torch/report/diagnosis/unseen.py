@@ -12,7 +12,7 @@ from mkc_torch.report.words.numbers import size
 from mkc_torch.report.words.terms import term
 from mkc_torch.report.words.typesetting import plain
 
-__all__ = ["better", "residual_of_all", "residuals"]
+__all__ = ["better", "left", "residual_of_all", "residuals"]
 
 _BETTER = {
     "surely": "evidence.surely",
@@ -46,6 +46,11 @@ def _reason(held_out: HeldOut, *, surely: bool) -> str:
     if change(held_out) < SMALL:
         return ""
     return held_out.left.rstrip(".") or term("evidence.blocks_differ")
+
+
+def left(held_out: HeldOut) -> str:
+    """Of which blocks the free run leaves the recording's range; empty where none does or it was told as a reason."""
+    return "" if not held_out.left or held_out.left.rstrip(".") in better(held_out) else held_out.left
 
 
 def residuals(held_out: HeldOut, world: World) -> list[str]:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from mkc_torch.diagnosis.findings.advice import nothing_shows
+from mkc_torch.diagnosis.findings.following import follows_all
 from mkc_torch.diagnosis.findings.worth import carries_over, small, worth_correcting
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.report.diagnosis.findings import finding_name, inseparable, rivals, unrecorded, with_names
@@ -15,7 +16,7 @@ from mkc_torch.report.words.numbers import size
 from mkc_torch.report.words.terms import term
 from mkc_torch.report.words.typesetting import capital, plain, several
 
-__all__ = ["Tone", "apply_command", "headline", "left_open", "reasons", "to_do", "tone", "warned"]
+__all__ = ["Tone", "apply_command", "headline", "left_in_short", "left_open", "reasons", "to_do", "tone", "warned"]
 
 Tone = Literal["good", "found", "faint", "open"]
 """Nothing is missing; physics is, and it is named; nothing that is worth correcting; the simulation does not follow, or
@@ -37,7 +38,7 @@ def tone(diagnosis: Diagnosis) -> Tone:
 def headline(diagnosis: Diagnosis) -> str:
     """The verdict in a sentence or two, the findings by their grades."""
     d = diagnosis
-    if d.verdict == "unfit":
+    if d.verdict == "unfit" or (d.verdict == "adequate" and not follows_all(d.world)):
         return term("verdict.unfit")
     if nothing_shows(d):
         real = [f for f in d.findings if f.grade != "not confirmed"]
@@ -85,22 +86,39 @@ def _named(finding: Finding, *, alone: bool) -> str:
 def left_open(diagnosis: Diagnosis) -> str:
     """What no finding accounts for; empty where there is nothing."""
     d = diagnosis
-    beside = any(f.grade != "not confirmed" for f in d.findings)
+    beside = any(worth_correcting(f) for f in d.findings)
     if d.verdict == "unexplained" and d.world.pushes:
-        rates = [plain(push.place) for push in d.world.pushes if push.at_rate]
-        outputs = [plain(push.place) for push in d.world.pushes if not push.at_rate]
+        rates, places = _driven(d)
         pair = ("verdict.pushed", "verdict.yet_pushed") if rates else ("verdict.slow", "verdict.yet_slow")
-        places = [f"`{place}`" for place in dict.fromkeys(rates or outputs)]
         return term(pair[int(beside)], places=several(places))
     if d.remaining:
-        return term("verdict.yet_smooth" if d.findings else "verdict.smooth", columns=several(d.remaining))
+        return term("verdict.yet_smooth" if beside else "verdict.smooth", columns=several(d.remaining))
     if not d.findings and d.p_value <= d.level and d.verdict == "adequate":
         return term("verdict.unnamed")
     if d.verdict != "unexplained":
         return ""
     if any(unrecorded(f) for f in d.findings):
         return term("verdict.course_alone")
-    return term("verdict.yet_structure" if d.findings else "verdict.structure")
+    return term("verdict.yet_structure" if beside else "verdict.structure")
+
+
+def _driven(diagnosis: Diagnosis) -> tuple[bool, list[str]]:
+    """The states whose rates something pushes, and whether there are any; else the outputs that it is added to."""
+    pushes = diagnosis.world.pushes
+    rates = [push.place for push in pushes if push.at_rate]
+    places = rates or [push.place for push in pushes]
+    return bool(rates), [f"`{plain(place)}`" for place in dict.fromkeys(places)]
+
+
+def left_in_short(diagnosis: Diagnosis) -> str:
+    """Where something is without a name, in a few words; empty where nothing is."""
+    d = diagnosis
+    if not left_open(d):
+        return ""
+    if d.verdict == "unexplained" and d.world.pushes:
+        rates, places = _driven(d)
+        return term("world.rate_of", place=several(places)) if rates else several(places)
+    return several(d.remaining) if d.remaining else term("world.structure")
 
 
 def reasons(diagnosis: Diagnosis) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+
 from mkc_torch.diagnosis.result import Diagnosis, Table
 from mkc_torch.diagnosis.world import Follows, Push, World
 from mkc_torch.report.diagnosis.numbers import measured
@@ -126,10 +127,7 @@ def push_sentence(push: Push) -> str:
         'Something slow is added to `angle` beside its noise: 0.0100 ± 0.0020 rad, for about 30 s at a time.'
     """
     told = measured(push.size, push.standard_error, push.unit)[0]
-    if push.lasting > 0.0:
-        lasts = term("world.lasts", lasting=f"{push.lasting:.2g}")
-    else:
-        lasts = term("world.each_sample")
+    lasts = term("world.lasts", lasting=f"{push.lasting:.2g}") if push.lasting > 0.0 else term("world.each_sample")
     return term("world.push" if push.at_rate else "world.slow", place=plain(push.place), size=told, lasts=lasts)
 
 

@@ -89,7 +89,12 @@ TERMS: dict[str, str] = {
     "world.linear": "`{input}` goes straight",
     "world.smooth": "`{input}` runs smoothly",
     "world.sensor_alone": "What is left is the sensor's noise.",
+    "world.less_likely": "Noise without what pushes `{place}` is less likely by {nats} [unit.nats].",
+    "world.no_physics": "No physics stands out beside it.",
     "world.nothing_named": "nothing: physics is named only beside a simulation that follows",
+    "world.nothing_sure": "nothing surely: {findings}",
+    "world.graded": "{finding} ({grade})",
+    "world.structure": "structure without a name",
     "world.follows_note": "Robust sizes of recording less simulation, the simulation running freely. The noise floor is"
     " the sensor's own. Off by as much as the mean or more: the simulation tells nothing of that output.",
     "world.pushes_note": "± is a [unit.standard_error]; the last column is by how many [unit.nats] the noise is less"
@@ -128,7 +133,7 @@ TERMS: dict[str, str] = {
     "evidence.yes": "yes",
     "evidence.no": "no",
     "evidence.of_residual": "residual {change}",
-    "evidence.together": "residual {change} on [unit.held_out] data",
+    "evidence.together": "{change} on [unit.held_out] data",
     # findings
     "finding.unrecorded": "a cause that no column recorded",
     "finding.comes_and_goes": "{finding} that comes and goes",
@@ -219,7 +224,7 @@ TERMS: dict[str, str] = {
     "label.why": "why",
     "label.named": "named",
     "label.unexplained": "unexplained",
-    "label.pushed": "pushed",
+    "label.sensor": "sensor",
     "label.shape": "shape",
     "label.how_large": "how large",
     "label.where": "where",
@@ -265,7 +270,6 @@ TERMS: dict[str, str] = {
     "table.as_it_is": "the simulation as it is",
     "table.with_findings": "with the findings",
     "table.with_smooth": "with a smooth correction by all recorded columns",
-    "table.shape": "shape",
     "table.gain": "gain, [unit.nats]",
     "table.z": "z",
     "table.behind": "behind the first, [unit.nats]",

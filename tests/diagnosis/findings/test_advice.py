@@ -88,11 +88,11 @@ def test_a_contradiction_never_says_that_the_simulation_can_be_used():
 
 def test_what_pushes_a_state_is_looked_for_and_counted_on():
     (only,) = make_diagnosis(0, samples=50, verdict="unexplained", world=make_world()).advice
-    assert only.startswith("Look for what drives the rate of rate")
+    assert only.startswith("Look for what drives the rate of `rate`")
     assert "count on 0.23 rad/s² there" in only
     slow = dataclasses.replace(PUSHED, place="angle", at_rate=False)
     (only,) = make_diagnosis(0, samples=50, verdict="unexplained", world=make_world(pushes=(slow,))).advice
-    assert only.startswith("Find out what moves the sensor of angle slowly")
+    assert only.startswith("Find out what moves the sensor of `angle` slowly")
 
 
 def test_a_step_and_a_drift_are_told_apart_by_another_recording():
