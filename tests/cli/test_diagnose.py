@@ -106,7 +106,8 @@ def test_files_and_summary(stepped):
     content = content_of(folder)
     validate(content)
     assert (content["recording"], content["simulation"], content["verdict"]) == (path.stem, "magnetometer", "explained")
-    assert content["search"] == {"candidates": content["search"]["candidates"], "surrogates": 19, "seed": 5}
+    search = {"candidates": content["search"]["candidates"], "surrogates": 19, "seed": 5}
+    assert content["search"] == search | {"starts": content["search"]["starts"]}
     first = content["findings"][0]
     assert first["effect"] == "hard_iron_step"
     assert first["onset"] == pytest.approx(9.0, abs=0.2)

@@ -44,7 +44,7 @@ def test_a_finding_in_a_dozen_lines():
         "how sure p = 0.005, the smallest that 199 surrogates can show",
         "held out residual 0.912 → 0.521 µT (43 % less); surely better on unseen blocks; +0.312 nats a sample (95 %: "
         "0.281 to 0.350); 0 is no better",
-        "named hard-iron step (left out of the simulation)",
+        "named hard-iron step: left out of the simulation",
         "unexplained nothing",
         "or current field (current): this recording cannot tell",
         "compare a smooth correction by all recorded columns and by time reaches",
@@ -78,9 +78,9 @@ def test_nothing_found():
 def test_several_findings_are_numbered():
     text = shown(make_diagnosis(3))
     for line in (
-        "1  hard-iron step (left out of the simulation)",
-        "2  current field (current) (left out of the simulation)",
-        "3  an effect outside the catalogue (temperature) (not confirmed on unseen blocks)",
+        "1  hard-iron step: left out of the simulation",
+        "2  current field (current): left out of the simulation",
+        "3  an effect outside the catalogue (temperature): not confirmed on unseen blocks",
     ):
         assert line in text.splitlines()
     assert "doubtful A curve has no size to compare." in flat(text)
@@ -186,7 +186,7 @@ def test_what_is_only_nearest_or_not_confirmed_is_not_called_named():
     made = make_diagnosis(1, verdict="unexplained")
     for change, grade in ((nearest, "nearest in the catalogue"), (lambda f: graded(f, "not confirmed"), "not conf")):
         text = flat(shown(dataclasses.replace(made, findings=(change(made.findings[0]),)), width=200))
-        assert f"named nothing surely: hard-iron step ({grade}" in text
+        assert f"named nothing surely; hard-iron step: {grade}" in text
         assert "unexplained structure without a name" in text
     shape = flat(shown(dataclasses.replace(made, findings=(nearest(made.findings[0]),)), width=200))
     assert "likelier by 163 nats (p = 0.002 if the name were right); 0.0071 |x|^1.52 sign(x)" in shape

@@ -182,7 +182,7 @@ def test_smaller_and_not_shown_to_be_better_never_stand_together_without_the_rea
     left = "In 1 of 25 blocks the free run leaves the recording's range."
     for held, reason in (
         (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m"), "from block to block the gain differs by more than itself"),
-        (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m", left=left), left.rstrip(".")),
+        (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m", left=left), left[1:].rstrip(".")),
         (HeldOut(0.3, (0.2, 0.4), 1.0, 1.3, "m"), "in the tail"),
     ):
         assert reason in unseen.better(held)
@@ -207,7 +207,7 @@ def test_each_output_has_its_own_sizes_beside_its_floor():
         assert "angle 0.0200 → 0.00510 rad (74 % less), noise floor 0.00500 rad" in text
         assert "rate 0.300 → 0.100 rad/s (67 % less)" in text
         assert "15671" not in text
-        assert "In 1 of 25 blocks the free run of the simulation alone leaves" in text
+        assert "n 1 of 25 blocks the free run of the simulation alone leaves" in text
     # what is not told for each output has no number of all together
     bare = dataclasses.replace(made, findings=tuple(dataclasses.replace(f, evidence=()) for f in made.findings))
     assert unseen.residual_of_all(bare) == []
@@ -239,7 +239,24 @@ def test_the_statisticians_numbers_are_one_click_below():
         "How the simulation follows", "What pushes it", "On data the fit had not seen",
         "The noise that structure was tested against",
     ]  # fmt: skip
-    assert page.count("Gains are in nats") <= 1
+
+
+def test_the_noise_floor_lies_beside_the_residual_in_its_picture():
+    made = make_diagnosis(0, samples=200, world=make_world(follows=(make_follows("norm", "µT"),), pushes=()))
+    page = diagnosis_report(made)
+    assert "Dotted: the sensor's noise floor." in text_of(page)
+    without = diagnosis_report(dataclasses.replace(made, world=make_world(pushes=())))  # of no channel
+    assert "Dotted" not in without
+    assert page.count("stroke-dasharray") == without.count("stroke-dasharray") + 2
+
+
+def test_nats_are_explained_once_where_they_are_met():
+    told = "How much likelier one model is than another is told in nats"
+    for made in (make_diagnosis(3, samples=100, channels=2), pushed()):
+        page = diagnosis_report(made)
+        assert page.count(told) == 1
+        assert page.index(told) < page.index("<h2>")
+    assert told not in diagnosis_report(make_unfit())
 
 
 def test_names_of_the_world_are_escaped():

@@ -30,8 +30,8 @@ def lead(diagnosis: Diagnosis) -> list[Row]:
     rows = [_row("label.follows", *follows)] if follows else []
     if d.verdict == "unfit":
         return [*rows, *([_row("label.why", *reasons(d))] if d.world.reasons else [])]
-    rows += _of_findings(d)
-    rows.append(_row("label.noise", *(noise_lines(d) or [f"{capital(noise_model(d.noise))}."])))
+    noise = _row("label.noise", *(noise_lines(d) or [f"{capital(noise_model(d.noise))}."]))
+    rows += [noise, *_of_findings(d)] if follows else [*_of_findings(d), noise]
     beside = "" if d.findings else smooth_fit(d)
     if beside:
         rows.append(_row("label.for_comparison", f"{capital(beside)}."))

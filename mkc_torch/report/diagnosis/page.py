@@ -93,6 +93,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
         maps=drawn[count : 2 * count],
         shapes=drawn[2 * count : 3 * count],
         forced=drawn[3 * count :],
+        floors=pictures.floors(d),
         panels=[pictures.driver_panels(d, i) for i in range(len(d.findings))],
         curve_colors=CURVE_COLORS,
         bars=bars(d.candidates),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +17,7 @@ from mkc_torch.report.drawing import BLUE, GREY, INK, ORANGE, SHADE, svg
 from mkc_torch.report.words.terms import term
 from mkc_torch.report.words.typesetting import capital
 
-__all__ = ["Panel", "driver_panels", "numbered", "of_finding", "over_states", "over_time"]
+__all__ = ["Panel", "driver_panels", "floors", "numbered", "of_finding", "over_states", "over_time"]
 
 _USED, _REJECTED, _DARK = "#7FB8DA", "#F2C7AA", "#9A4300"
 _MOST_POINTS = 5_000  # of a panel
@@ -55,7 +56,7 @@ def over_time(diagnosis: Diagnosis) -> str:
     """
     t, findings = diagnosis.traces, diagnosis.findings
     rows, columns = min(len(t.channels), _MOST_ROWS), 2 if findings else 1
-    above = numbered(diagnosis)
+    above, known = numbered(diagnosis), floors(diagnosis)
     grid = Grid(rows, columns, top=0.55 if above else 0.35, below=0.42)
     with style():
         figure = grid.figure()
@@ -64,6 +65,8 @@ def over_time(diagnosis: Diagnosis) -> str:
             for ax in axes:
                 _mark(ax, findings)
             _residual(axes, t, array(t.time), row)
+            for ax in axes:
+                _floor(ax, known.get(t.channels[row]))
             if above and row == 0:
                 for ax in axes:
                     _number(ax, findings)
@@ -74,6 +77,17 @@ def over_time(diagnosis: Diagnosis) -> str:
                 else:
                     ax.tick_params(labelbottom=False)
         return svg(figure, "time", term("picture.about_time"))
+
+
+def floors(diagnosis: Diagnosis) -> dict[str, float]:
+    """The sensor's noise floor of each channel that is an output."""
+    return {one.output: one.noise_floor for one in diagnosis.world.follows if one.output in diagnosis.traces.channels}
+
+
+def _floor(ax: Any, size: float | None) -> None:
+    """The noise floor to either side of zero."""
+    for side in (-1.0, 1.0) if size is not None and math.isfinite(size) else ():
+        ax.axhline(side * (size or 0.0), color=GREY, lw=1.1, ls=":", zorder=6)
 
 
 def numbered(diagnosis: Diagnosis) -> bool:

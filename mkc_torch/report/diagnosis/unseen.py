@@ -45,12 +45,17 @@ def _reason(held_out: HeldOut, *, surely: bool) -> str:
         return term("evidence.in_the_tail") if change(held_out) < _WORSE else ""
     if change(held_out) < SMALL:
         return ""
-    return held_out.left.rstrip(".") or term("evidence.blocks_differ")
+    return _within(held_out.left) or term("evidence.blocks_differ")
+
+
+def _within(sentence: str) -> str:
+    """A sentence as a part of another."""
+    return sentence[:1].lower() + sentence[1:].rstrip(".")
 
 
 def left(held_out: HeldOut) -> str:
     """Of which blocks the free run leaves the recording's range; empty where none does or it was told as a reason."""
-    return "" if not held_out.left or held_out.left.rstrip(".") in better(held_out) else held_out.left
+    return "" if not held_out.left or _within(held_out.left) in better(held_out) else held_out.left
 
 
 def residuals(held_out: HeldOut, world: World) -> list[str]:

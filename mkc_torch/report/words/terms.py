@@ -92,8 +92,8 @@ TERMS: dict[str, str] = {
     "world.less_likely": "Noise without what pushes `{place}` is less likely by {nats} [unit.nats].",
     "world.no_physics": "No physics stands out beside it.",
     "world.nothing_named": "nothing: physics is named only beside a simulation that follows",
-    "world.nothing_sure": "nothing surely: {findings}",
-    "world.graded": "{finding} ({grade})",
+    "world.nothing_sure": "nothing surely; {findings}",
+    "world.graded": "{finding}: {grade}",
     "world.structure": "structure without a name",
     "world.follows_note": "Robust sizes of recording less simulation, the simulation running freely. The noise floor is"
     " the sensor's own. Off by as much as the mean or more: the simulation tells nothing of that output.",
