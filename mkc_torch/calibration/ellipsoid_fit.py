@@ -59,6 +59,10 @@ MAX_SCATTER = 0.2
 """Largest scatter of the points about the surface, as a share of its shortest semi-axis: the square of it is the bias
 of the fit. A ball of noise scatters by half."""
 
+LENT_BY_NOISE = 5.0
+"""Information that points on two circles, which determine no ellipsoid, seem to have by their scatter alone, over its
+square as a share of the shortest semi-axis: 1 to 7 by how their planes lie; from 5 on, they come out."""
+
 _EXACT = 1e4
 """Roundings by which a point may be off a surface that it is on."""
 
@@ -193,7 +197,10 @@ class EllipsoidFit(Fitted):
         if covariance is not None:
             self._standard_errors(local, scale, parameters, covariance, ellipsoid_of)
         self._refuse_uncovered(self.calibrate(points), weight)
-        self._refuse_scattered(self.calibrate(points), weight)
+        scatter = self._scatter(self.calibrate(points), weight)
+        self._refuse_scattered(self.calibrate(points), scatter)
+        if self.max_scatter < math.inf:
+            self._refuse_lent(self.calibrate(points), scatter)
 
     def _finished(self, local: Ellipsoid, points: Tensor, scale: Tensor, weight: Tensor | None) -> NonlinearFit:
         """The maximum of the likelihood of the distances that is nearest to an ellipsoid, all in local coordinates."""
@@ -309,12 +316,30 @@ class EllipsoidFit(Fitted):
                 )
 
     @torch.no_grad()
-    def _refuse_scattered(self, field: Tensor, weight: Tensor | None) -> None:
-        """Refuse a surface that the points do not draw: that of a ball of noise is as wide as the noise."""
+    def _scatter(self, field: Tensor, weight: Tensor | None) -> Tensor:
+        """Of the points about the surface, as a share of its shortest semi-axis, for each problem."""
         radius = self.radius_[..., None, None]
         distance = distance_along(field / radius, self.calibration_matrix_ / radius).unsqueeze(-1)
         used = None if weight is None else (weight > 0).to(field).unsqueeze(-1)
-        scatter = (robust_scale(distance, used) / self.semi_axes_[..., :1]).reshape(-1)
+        return (robust_scale(distance, used) / self.semi_axes_[..., :1]).reshape(-1)
+
+    def _refuse_lent(self, field: Tensor, scatter: Tensor) -> None:
+        """Refuse directions that seem to be covered because the points scatter: the ellipsoid is that of the noise."""
+        found = self.coverage_ if isinstance(self.coverage_, list) else [self.coverage_]
+        for index, one in enumerate(found):
+            lent = LENT_BY_NOISE * float(scatter[index]) ** 2
+            if one.information < MIN_INFORMATION + lent:
+                where = f"Problem {index}: " if field.dim() > 2 else ""
+                raise not_identifiable(
+                    f"{where}Not identifiable: too few directions are covered for points that scatter about the "
+                    f"ellipsoid by {100.0 * float(scatter[index]):.0f} % of its shortest semi-axis "
+                    f"({one.information:.1e} of the information of an even coverage; {MIN_INFORMATION + lent:.1e} is "
+                    "needed, for the scatter alone seems to cover as much).",
+                    field.detach().reshape(-1, *field.shape[-2:])[index],
+                )
+
+    def _refuse_scattered(self, field: Tensor, scatter: Tensor) -> None:
+        """Refuse a surface that the points do not draw: that of a ball of noise is as wide as the noise."""
         wide = (scatter > self.max_scatter).nonzero().flatten()
         if len(wide) > 0:
             where = f"Problem {int(wide[0])}: " if field.dim() > 2 else ""

@@ -88,8 +88,8 @@ class Key:
         return json.loads(json.dumps(asdict(self)))
 
 
-def canonical(keys: Sequence[Key]) -> str:
-    """One text for one set of keys: JSON without spaces, names in order.
+def canonical(keys: Sequence[Any]) -> str:
+    """One text for one set of keys, which are dataclasses: JSON without spaces, names in order.
 
     Example:
         >>> canonical([])

@@ -10,6 +10,7 @@ from typing import Any
 from mkc_torch.challenge.binomial import Share
 from mkc_torch.challenge.key import Key
 from mkc_torch.challenge.score import Measured, Score
+from mkc_torch.challenge.verdict import ADEQUATE, UNEXPLAINED, UNFIT
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _SHARED = Path(__file__).parents[1] / "report" / "templates"
@@ -85,7 +86,11 @@ def comparison(score: Score, baselines: Mapping[str, Score]) -> list[tuple[str, 
     rows = [(label, [share_text(of(s)) for s in scores]) for label, of in asked if any(of(s).total for s in scores)]
     if sum(score.doubles.values()):
         rows.append(("both of two named", [f"{s.doubles[2]} of {sum(s.doubles.values())}" for s in scores]))
-    return [*rows, ("failed", [str(len(s.failed)) for s in scores])]
+    said = [
+        (f"said of empty recordings: {verdict}", [str(s.verdicts[verdict]) for s in scores])
+        for verdict in (ADEQUATE, UNEXPLAINED, UNFIT)
+    ]
+    return [*rows, *said, ("failed", [str(len(s.failed)) for s in scores])]
 
 
 def hidden_table(keys: Sequence[Key]) -> list[dict[str, Any]]:

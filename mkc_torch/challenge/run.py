@@ -4,46 +4,32 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from mkc_torch._parallel.processes import keep_memory, one_thread
 from mkc_torch._support.files import claim_folder, write_atomically
 from mkc_torch.challenge.draws import generator
 from mkc_torch.challenge.key import Key, canonical, digest
 from mkc_torch.challenge.magnetometer.subject import magnetometer
 from mkc_torch.challenge.page import challenge_page, summary
+from mkc_torch.challenge.pool import BATCH, Diagnose, Pool, Progress, content_of, diagnose_batch, every, silent
 from mkc_torch.challenge.score import Score, score
 from mkc_torch.challenge.subject import Subject
 from mkc_torch.recording.recording import Recording, write_table
 
-Diagnose = Callable[[list[Path], Path], object]
-"""Writes ``<folder>/<stem>/diagnosis.json`` and ``model.json`` for each recording."""
-
 Apply = Callable[[Path, Path], Mapping[str, Tensor]]
 """From ``model.json`` and a recording the corrected columns, a row for a row."""
-
-Progress = Callable[[str, int, int], None]
 
 SEED = 1
 
 SIMULATIONS = "simulations.py"
 """Name of the file with the simulations in the proof's folder."""
-
-_BATCH = 4
-"""Recordings in one call of the diagnosis."""
-
-T = TypeVar("T")
-R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -98,24 +84,24 @@ def run_challenge(
         source = subject.simulations.read_text(encoding="utf-8")
         write_atomically(output / SIMULATIONS, source, overwrite=overwrite)
     work = _Work(subject, seed, output)
-    tell = progress or _silent
+    tell = progress or silent
     addresses = list(enumerate(_which_are_empty(seed, cases, empty)))
-    with _Pool(workers) as pool:
-        keys = _all(pool, partial(_write_case, work), addresses, partial(tell, "draw"))
+    with Pool(workers) as pool:
+        keys = every(pool, partial(_write_case, work), addresses, partial(tell, "draw"))
         text = canonical(keys)
         write_atomically(output / "key_hash.txt", f"{digest(text)}\n", overwrite=overwrite)
         paths = [output / "recordings" / f"{key.name}.csv" for key in keys]
-        batches = [paths[k : k + _BATCH] for k in range(0, len(paths), _BATCH)]
-        _all(pool, partial(_diagnose_batch, diagnose, output / "diagnoses"), batches, partial(tell, "diagnose"))
+        batches = [paths[k : k + BATCH] for k in range(0, len(paths), BATCH)]
+        every(pool, partial(diagnose_batch, diagnose, output / "diagnoses"), batches, partial(tell, "diagnose"))
         write_atomically(output / "key.json", f"{text}\n", overwrite=overwrite)
         hidden = [key for key in keys if key.kind != "empty"]
-        ratios = _all(pool, partial(_second_ratio, apply, work), hidden, partial(tell, "second recordings"))
+        ratios = every(pool, partial(_second_ratio, apply, work), hidden, partial(tell, "second recordings"))
         naive = {
-            name: _all(pool, competitor, paths, partial(tell, "baseline"))
+            name: every(pool, competitor, paths, partial(tell, "baseline"))
             for name, competitor in subject.baselines.items()
         }
     names = [key.name for key in keys]
-    diagnoses = {name: _read(output / "diagnoses" / name / "diagnosis.json") for name in names}
+    diagnoses = {name: content_of(output / "diagnoses" / name / "diagnosis.json") for name in names}
     found = {key.name: ratio for key, ratio in zip(hidden, ratios, strict=True)}
     result = score(keys, diagnoses, found, subject.thresholds)
     baselines = {
@@ -154,14 +140,6 @@ def _write_case(work: _Work, address: tuple[int, bool]) -> Key:
     return case.key
 
 
-def _diagnose_batch(diagnose: Diagnose, folder: Path, paths: list[Path]) -> None:
-    try:
-        diagnose(paths, folder)
-    except Exception as error:
-        # what is missing afterwards is scored as failed
-        (folder / f"{paths[0].stem}.error.txt").write_text(f"{type(error).__name__}: {error}\n", encoding="utf-8")
-
-
 def _second_ratio(apply: Apply, work: _Work, key: Key) -> float:
     model = work.output / "diagnoses" / key.name / "model.json"
     if not model.is_file():
@@ -172,54 +150,3 @@ def _second_ratio(apply: Apply, work: _Work, key: Key) -> float:
     except Exception as error:
         (model.parent / "apply.error.txt").write_text(f"{type(error).__name__}: {error}\n", encoding="utf-8")
         return math.inf
-
-
-def _read(path: Path) -> dict[str, Any] | None:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-
-
-class _Pool:
-    """Processes, or for one worker none."""
-
-    def __init__(self, workers: int) -> None:
-        self._workers = workers
-        self._executor: ProcessPoolExecutor | None = None
-
-    def __enter__(self) -> Callable[[Callable[[T], R], Sequence[T]], Iterable[R]]:
-        if self._workers <= 1:
-            return map
-        # torch's threads do not survive a fork
-        context = multiprocessing.get_context("spawn")
-        self._executor = ProcessPoolExecutor(self._workers, mp_context=context, initializer=_alone_on_its_core)
-        return self._executor.map
-
-    def __exit__(self, *_: object) -> None:
-        if self._executor is not None:
-            self._executor.shutdown(cancel_futures=True)
-
-
-def _alone_on_its_core() -> None:
-    one_thread()
-    keep_memory()
-
-
-def _all(
-    run: Callable[[Callable[[T], R], Sequence[T]], Iterable[R]],
-    job: Callable[[T], R],
-    items: Sequence[T],
-    tell: Callable[[int, int], None],
-) -> list[R]:
-    return list(_told(run(job, items), len(items), tell))
-
-
-def _told(results: Iterable[R], total: int, tell: Callable[[int, int], None]) -> Iterator[R]:
-    for done, result in enumerate(results, start=1):
-        tell(done, total)
-        yield result
-
-
-def _silent(stage: str, done: int, total: int) -> None:
-    """Progress that nobody watches."""

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
@@ -17,6 +17,7 @@ from mkc_torch.challenge.thresholds import INSEPARABLE_BELOW, STRONG_Z, THRESHOL
 from mkc_torch.challenge.verdict import (
     FAILED,
     NOTHING,
+    VERDICTS,
     Answer,
     answer,
     covered,
@@ -27,6 +28,8 @@ from mkc_torch.challenge.verdict import (
 
 BINS = (0.0, 3.0, 5.0, 7.0, 10.0, 15.0, 30.0, math.inf)
 """Edges of the bins of z and z_sep."""
+
+T = TypeVar("T")
 
 ONSET_TOLERANCE = 1.0
 """s."""
@@ -58,12 +61,15 @@ class Measured:
 class Score:
     """The result of a proof. Single effects with z and z_sep of at least ten are called strong.
 
+    A false alarm is a claim that physics is missing, of the empty recordings that were diagnosed; ``verdicts`` counts
+    what was said of all empty ones, and what failed.
     ``confusion`` counts what was hidden (an effect, ``nothing``, or an effect with its driver withheld) against what
     was named first; ``located`` how many strong ones were put at the right of several places; ``doubles`` how many of
     two hidden effects were named; ``ratios`` are residuals on second recordings relative to the oracle's.
     """
 
     false_alarms: Share
+    verdicts: Mapping[str, int]
     p_values: tuple[float, ...]
     p_distance: float
     p_uniform: float
@@ -90,7 +96,7 @@ class Score:
 
     def numbers(self) -> dict[str, Any]:
         """As JSON has it; infinite and undefined numbers become null."""
-        return _plain(asdict(self) | {"holds": {m.threshold.measure: m.holds for m in self.measured}})
+        return plain_numbers(asdict(self) | {"holds": {m.threshold.measure: m.holds for m in self.measured}})
 
 
 @dataclass(frozen=True)
@@ -106,15 +112,15 @@ class _Single:
 
     @property
     def named(self) -> bool:
-        return bool(self.said.findings) and named_right(self.said.findings[0].named, self.truth)
+        return bool(self.said.claims) and named_right(self.said.claims[0].named, self.truth)
 
     @property
     def driver(self) -> bool:
-        return bool(self.said.findings) and driver_right(self.said.findings[0].named, self.truth)
+        return bool(self.said.claims) and driver_right(self.said.claims[0].named, self.truth)
 
     @property
     def located(self) -> bool:
-        return bool(self.said.findings) and located_right(self.said.findings[0].named, self.truth)
+        return bool(self.said.claims) and located_right(self.said.claims[0].named, self.truth)
 
 
 def score(
@@ -137,23 +143,24 @@ def score(
     empty = [said[key.name] for key in keys if key.kind == "empty"]
     p_values = tuple(a.p_value for a in empty if a.p_value is not None)
     distance, p_uniform = uniformity(p_values)
-    told = [case for case in singles if case.truth.z_sep >= INSEPARABLE_BELOW and case.said.findings]
+    told = [case for case in singles if case.truth.z_sep >= INSEPARABLE_BELOW and case.said.claims]
     by_effect, missing = coverage(singles)
     strong_names = {k.name for k in keys if k.kind == "single" and min(k.effects[0].z, k.effects[0].z_sep) >= STRONG_Z}
     results: dict[str, Any] = {
-        "false_alarms": _share_of(empty, lambda a: a.alarm),
+        "false_alarms": share_of([a for a in empty if a.verdict != FAILED], lambda a: a.alarm),
+        "verdicts": {verdict: sum(a.verdict == verdict for a in empty) for verdict in VERDICTS},
         "p_values": p_values,
         "p_distance": distance,
         "p_uniform": p_uniform,
         "confusion": confusion(keys, said),
         "strong": len(strong),
-        "named": _share_of(strong, lambda case: case.named),
-        "driver": _share_of([case for case in strong if not case.truth.at], lambda case: case.driver),
-        "located": _share_of([case for case in strong if case.truth.at], lambda case: case.located),
-        "withheld_named": _share_of([case for case in strong if case.truth.withheld], lambda case: case.named),
-        "extra": _share_of(strong, lambda case: len(case.said.findings) > 1),
-        "separable": _share_of(told, lambda case: not case.said.findings[0].others),
-        "candidates": _mean([1.0 + len(case.said.findings[0].others) for case in told]),
+        "named": share_of(strong, lambda case: case.named),
+        "driver": share_of([case for case in strong if not case.truth.at], lambda case: case.driver),
+        "located": share_of([case for case in strong if case.truth.at], lambda case: case.located),
+        "withheld_named": share_of([case for case in strong if case.truth.withheld], lambda case: case.named),
+        "extra": share_of(strong, lambda case: len(case.said.claims) > 1),
+        "separable": share_of(told, lambda case: not case.said.claims[0].others),
+        "candidates": _mean([1.0 + len(case.said.claims[0].others) for case in told]),
         "onset_errors": onset_errors(strong),
         "onset_covered": onset_covered(singles),
         "coverage": share(sum(s.count for s in by_effect.values()), sum(s.total for s in by_effect.values())),
@@ -189,7 +196,7 @@ def onset_errors(cases: Sequence[_Single]) -> tuple[float, ...]:
     """s, of steps that were named; infinite where no onset was given."""
     errors = []
     for case in cases:
-        truth, findings = case.truth, case.said.findings
+        truth, findings = case.truth, case.said.claims
         if truth.effect == "hard_iron_step" and findings and findings[0].named.effect == truth.effect:
             onset = findings[0].onset
             errors.append(math.inf if onset is None or truth.onset is None else abs(onset - truth.onset))
@@ -199,9 +206,9 @@ def onset_errors(cases: Sequence[_Single]) -> tuple[float, ...]:
 def onset_covered(cases: Sequence[_Single]) -> Share:
     """Of the steps that were named, those whose onset lies in the interval that was told with it."""
     told = [
-        (case.truth.onset, case.said.findings[0].onset_interval)
+        (case.truth.onset, case.said.claims[0].onset_interval)
         for case in cases
-        if case.named and case.said.findings[0].named.effect == case.truth.effect and case.truth.onset is not None
+        if case.named and case.said.claims[0].named.effect == case.truth.effect and case.truth.onset is not None
     ]
     inside = [
         onset is not None and interval is not None and interval[0] <= onset <= interval[1] for onset, interval in told
@@ -214,12 +221,12 @@ def coverage(cases: Sequence[_Single]) -> tuple[dict[str, Share], int]:
     inside: dict[str, list[bool]] = {}
     missing = 0
     for case in cases:
-        if not (case.named and case.driver) or case.said.findings[0].named.effect != case.truth.effect:
+        if not (case.named and case.driver) or case.said.claims[0].named.effect != case.truth.effect:
             continue
         for parameter in case.truth.parameters:
             if not parameter.scored:
                 continue
-            found = covered(case.said.findings[0], parameter)
+            found = covered(case.said.claims[0], parameter)
             missing += found is None
             inside.setdefault(case.truth.effect, []).extend(found or [])
     return {effect: share(sum(hits), len(hits)) for effect, hits in sorted(inside.items())}, missing
@@ -230,8 +237,8 @@ def power(cases: Sequence[_Single], measure: Callable[[KeyEffect], float]) -> tu
     bins = []
     for low, high in pairwise(BINS):
         part = [case for case in cases if low <= measure(case.truth) < high]
-        found = _share_of(part, lambda case: case.said.verdict != FAILED and case.said.alarm)
-        bins.append(Bin(low, high, found, _share_of(part, lambda case: case.named)))
+        found = share_of(part, lambda case: case.said.found)
+        bins.append(Bin(low, high, found, share_of(part, lambda case: case.named)))
     return tuple(bins)
 
 
@@ -240,7 +247,7 @@ def doubles(keys: Sequence[Key], said: Mapping[str, Answer]) -> dict[int, int]:
     counts = {0: 0, 1: 0, 2: 0}
     for key in keys:
         if key.kind == "double":
-            left = [finding.named for finding in said[key.name].findings]
+            left = [finding.named for finding in said[key.name].claims]
             right = 0
             for truth in key.effects:
                 match = next((k for k, named in enumerate(left) if named_right(named, truth)), None)
@@ -270,7 +277,13 @@ def _measured(results: Mapping[str, Any], thresholds: Sequence[Threshold]) -> tu
     return tuple(Measured(threshold, values[threshold.measure]) for threshold in thresholds)
 
 
-def _share_of(cases: Sequence[Any], holds: Callable[[Any], bool]) -> Share:
+def share_of(cases: Sequence[T], holds: Callable[[T], bool]) -> Share:
+    """The share of cases for which it holds, with its interval.
+
+    Example:
+        >>> share_of([1, 2, 3], lambda number: number > 2).count
+        1
+    """
     return share(sum(bool(holds(case)) for case in cases), len(cases))
 
 
@@ -278,9 +291,15 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values) if values else math.nan
 
 
-def _plain(value: Any) -> Any:
+def plain_numbers(value: Any) -> Any:
+    """As JSON can hold it: lists for tuples, null for what is not finite.
+
+    Example:
+        >>> plain_numbers({"a": (1.0, math.inf)})
+        {'a': [1.0, None]}
+    """
     if isinstance(value, Mapping):
-        return {str(name): _plain(item) for name, item in value.items()}
+        return {str(name): plain_numbers(item) for name, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain_numbers(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -13,6 +13,13 @@ from mkc_torch.challenge.magnetometer.families import POSITION
 from mkc_torch.challenge.thresholds import COVERAGE_FACTOR
 
 NOTHING, UNKNOWN, FAILED = "nothing", "unknown", "failed"
+UNFIT, ADEQUATE, EXPLAINED, UNEXPLAINED = "unfit", "adequate", "explained", "unexplained"
+VERDICTS = (UNFIT, ADEQUATE, EXPLAINED, UNEXPLAINED, FAILED)
+
+CLAIMS = ("left out", "real but small")
+"""Grades of findings that say: this physics is missing. One without a grade says it too."""
+
+NEAREST = "nearest in the catalogue"
 
 _WITHHELD = ("offset_drift", "hard_iron_step", UNKNOWN)
 """The time course of a driver that was not recorded is all there is to name."""
@@ -31,34 +38,61 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Finding:
-    """``others`` are the alternatives that the diagnosis says its data cannot rule out."""
+    """``others`` are the alternatives that the diagnosis says its data cannot rule out; ``grade`` is "" without one."""
 
     named: Candidate
     others: tuple[Candidate, ...]
     onset: float | None
     onset_interval: tuple[float, float] | None
     parameters: tuple[Mapping[str, Any], ...]
+    grade: str = ""
+
+    @property
+    def claimed(self) -> bool:
+        """It says that this physics is missing."""
+        return not self.grade or self.grade in CLAIMS
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A diagnosis; ``verdict`` is ``failed`` where there is none."""
+    """A diagnosis; ``verdict`` is ``failed`` where there is none.
+
+    Example:
+        >>> said = answer({"verdict": "unexplained", "findings": [{"effect": "backlash", "grade": "not confirmed"}]})
+        >>> said.alarm, said.name
+        (False, 'unknown')
+    """
 
     verdict: str
     p_value: float | None
     findings: tuple[Finding, ...]
 
     @property
+    def claims(self) -> tuple[Finding, ...]:
+        """What it says is missing, strongest first."""
+        return tuple(finding for finding in self.findings if finding.claimed)
+
+    @property
+    def nearest(self) -> tuple[Finding, ...]:
+        """What it says is only the nearest that the catalogue has."""
+        return tuple(finding for finding in self.findings if finding.grade == NEAREST)
+
+    @property
     def alarm(self) -> bool:
-        """It claims that something is there. A diagnosis that failed counts as one: it helps nobody."""
-        return self.verdict != "adequate" or bool(self.findings)
+        """It claims that physics is missing; "unexplained" without a claim, "unfit" and a refusal do not."""
+        return bool(self.claims)
+
+    @property
+    def found(self) -> bool:
+        """It says that something is there, named or not."""
+        return self.verdict not in (ADEQUATE, FAILED) or bool(self.findings)
 
     @property
     def name(self) -> str:
-        """The effect it names first."""
-        if self.findings:
-            return self.findings[0].named.effect
-        return {"adequate": NOTHING, FAILED: FAILED}.get(self.verdict, UNKNOWN)
+        """The effect it claims first."""
+        if self.claims:
+            return self.claims[0].named.effect
+        return {ADEQUATE: NOTHING, FAILED: FAILED, UNFIT: UNFIT}.get(self.verdict, UNKNOWN)
 
 
 def answer(diagnosis: Mapping[str, Any] | None) -> Answer:
@@ -78,6 +112,7 @@ def _finding(numbers: Mapping[str, Any]) -> Finding:
         numbers.get("onset"),
         None if numbers.get("onset_interval") is None else (numbers["onset_interval"][0], numbers["onset_interval"][1]),
         tuple(numbers.get("parameters") or ()),
+        numbers.get("grade") or "",
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,6 +19,7 @@ from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.files import diagnosis_json as diagnosis_file
 from mkc_torch.diagnosis.files import model as diagnosed_model
 from mkc_torch.diagnosis.files.model import refuse_unknown
+from mkc_torch.recording.kept_columns import write_beside
 from mkc_torch.recording.recording import Recording, write_table
 from mkc_torch.report.words.numbers import size
 from mkc_torch.simulation.load import raised_in
@@ -55,10 +56,10 @@ def apply(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
-    """Write what a calibration or a model makes of a recording.
+    """Write what a calibration or a model makes of a recording, beside the recording's own columns.
 
-    Of a magnetometer: time, field_x, field_y, field_z, the corrected field row by row. Of a simulation of your own, or
-    of a simulator's output: time, the run if there are several, and the outputs, simulated with what was found. Of a
+    Of a magnetometer: field_x, field_y, field_z, the corrected field row by row. Of a simulation of your own, or of a
+    simulator's output: the outputs, simulated with what was found, in the place of the columns of their names. Of a
     model's effects those are left out that belong to the time or the place of the diagnosed recording.
     """
     names = parsed_columns(columns)
@@ -80,7 +81,7 @@ def apply(
             table = Recording.read(recording, columns=names)
             corrected = correct(known, table)
             subject = output
-            write_table(output, corrected.columns, labels=table.labels, overwrite=force)
+            corrected = _written(recording, output, table, corrected, force=force)
     except Exception as error:
         told = raised_in(simulation, error) if simulation and simulation not in SIMULATIONS else None
         if told is None and not isinstance(error, FAILURES):
@@ -88,6 +89,26 @@ def apply(
         complain(subject, told or error)
         raise typer.Exit(1) from None
     _show(table, corrected, output)
+
+
+def _written(recording: Path, output: Path, table: Recording, corrected: Corrected, *, force: bool) -> Corrected:
+    """Writes the file, with the columns of the recording where the rows are its rows; says so where they are not."""
+    if not _row_by_row(table, corrected):
+        write_table(output, corrected.columns, labels=table.labels, overwrite=force)
+        note = "the rows are not those of the recording, so its other columns are not kept."
+        return replace(corrected, notes=(*corrected.notes, note))
+    of_file = {name for name in _NOT_MEASURED if name in table}
+    own = {name: values for name, values in corrected.columns.items() if name not in of_file}
+    write_beside(recording, output, own, overwrite=force)
+    return corrected
+
+
+def _row_by_row(table: Recording, corrected: Corrected) -> bool:
+    """Whether what was corrected stands in the rows of the recording."""
+    if len(next(iter(corrected.columns.values()))) != len(table):
+        return False
+    time = corrected.columns.get("time")
+    return time is None or table.time is None or bool(torch.equal(time.nan_to_num(), table.time.nan_to_num()))
 
 
 def _refuse_input(output: Path, *inputs: Path | None) -> None:

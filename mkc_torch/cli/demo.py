@@ -25,6 +25,7 @@ from mkc_torch.cli.diagnosis_files import WRITTEN, write_diagnosis
 from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.linear import LeastSquares
 from mkc_torch.recording.demonstration import FIELD_PER_AMPERE, Truth, concealed_recording, simulated_recording
+from mkc_torch.recording.kept_columns import write_beside
 from mkc_torch.recording.recording import Recording, write_table
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.words.numbers import number
@@ -144,7 +145,8 @@ def _correct(folder: Path, diagnosis: Diagnosis, *, force: bool) -> _Second:
     corrected = diagnosis.model(second)
     files = [folder / "second.csv", folder / "corrected.csv"]
     write_table(files[0], second.columns, overwrite=force)
-    write_table(files[1], corrected, overwrite=force)
+    field = {name: values for name, values in corrected.items() if name not in second.columns}
+    write_beside(files[0], files[1], field, overwrite=force)
     alone = calibrate(concealed_recording()).apply(second)
     return _Second(_scatter(alone), _scatter(corrected), files)
 

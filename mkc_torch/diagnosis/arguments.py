@@ -85,7 +85,7 @@ def checked_noise(noise: object, outputs: Sequence[str]) -> dict[str, float]:
         {'angle': 0.005}
         >>> checked_noise({"x": 0.005}, ["angle"])
         Traceback (most recent call last):
-        ValueError: Expected argument `noise` to name outputs of the simulation but got `x`; they are `angle`.
+        ValueError: Expected argument `noise` to name outputs of this simulation but got `x`; they are `angle`.
     """
     return {
         name: checked_number(f"noise[{name!r}]", size, advice="the standard deviation of that sensor's white noise")
@@ -94,14 +94,14 @@ def checked_noise(noise: object, outputs: Sequence[str]) -> dict[str, float]:
 
 
 def checked_between(between: object, inputs: Sequence[str]) -> dict[str, str]:
-    """What inputs are declared to do between two samples.
+    """What inputs of differential equations are declared to do between two samples.
 
     Example:
         >>> checked_between({"torque": "held"}, ["torque"])
         {'torque': 'held'}
     """
     found = {}
-    for name, told_as in _of_known("between", between, inputs, "inputs", '{"torque": "held"}').items():
+    for name, told_as in _of_known("between", between, inputs, "inputs in the equations", '{"torque": "held"}').items():
         if not isinstance(told_as, str) or told_as not in BETWEEN:
             raise ValueError(
                 f"Expected argument `between` to say one of {', '.join(BETWEEN)} of `{name}` but got {told_as!r}."
@@ -120,6 +120,6 @@ def _of_known(argument: str, given: object, names: Sequence[str], what: str, exa
         if name not in names:
             known = f"they are {', '.join(f'`{one}`' for one in names)}" if names else "it has none"
             raise ValueError(
-                f"Expected argument `{argument}` to name {what} of the simulation but got `{name}`; {known}."
+                f"Expected argument `{argument}` to name {what} of this simulation but got `{name}`; {known}."
             )
     return dict(given)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -16,52 +16,69 @@ from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.findings.finding import finding_of
 from mkc_torch.diagnosis.findings.noise import noise_summary
 from mkc_torch.diagnosis.findings.separability import separability
+from mkc_torch.diagnosis.findings.shape import shape_of
+from mkc_torch.diagnosis.findings.worth import grade_of
 from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.model.drivers import Drivers
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.grid import described
-from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability, Traces
+from mkc_torch.diagnosis.model.in_the_world import InTheWorld
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.result import Candidate, Diagnosis, Finding, Separability, Traces
 from mkc_torch.diagnosis.rounds import Asked, Search
 from mkc_torch.diagnosis.search.locate import Located
-from mkc_torch.diagnosis.world import Verdict
+from mkc_torch.diagnosis.verdict import around, verdict_of, world_of
 from mkc_torch.recording.unit_warnings import unit_warnings
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
-__all__ = ["assembled", "with_rest"]
+__all__ = ["Whole", "assembled", "with_rest"]
 
 
-def assembled(
-    simulation: Simulation,
-    drivers: Drivers,
-    tried: int,
-    answers: Answers,
-    asked: Asked,
-    *,
-    cut: bool,
-) -> Diagnosis:
-    """The diagnosis, with advice.
+@dataclass(frozen=True)
+class Whole:
+    """All that a diagnosis is assembled from beside the answers of the tests.
 
-    Args:
+    Attributes:
         simulation: as it was given.
         drivers: the recorded columns, and what is to be said of them.
-        tried: number of candidates.
-        answers: what the tests of evidence say, of what case.
+        terms: the candidates.
+        base: the simulation alone, in the noise of the world.
+        final: with all findings, under the pushes that are left.
         asked: for.
         cut: whether there was more to be found than was asked for.
     """
-    case, prepared = answers.case, answers.case.prepared
-    first, final = case.first, case.final
-    findings = tuple(
-        replace(finding_of(located, final, number), evidence=answers.of_findings[number])
-        for number, located in enumerate(case.found)
+
+    simulation: Simulation
+    drivers: Drivers
+    terms: tuple[Term, ...]
+    base: InTheWorld
+    final: FittedModel
+    asked: Asked
+    cut: bool
+
+
+def assembled(whole: Whole, answers: Answers) -> Diagnosis:
+    """The diagnosis, with advice.
+
+    Args:
+        whole: what it is of.
+        answers: what the tests of evidence say, of what case.
+    """
+    case, prepared, asked = answers.case, answers.case.prepared, whole.asked
+    first, final, settings = case.first, case.final, asked.settings
+    known = around(whole.base, whole.final, asked.declared, settings.noise)
+    unfit = known.unfit(settings.evidence)
+    findings = (
+        () if unfit else tuple(_finding(case.found, number, final, whole, answers) for number in range(len(case.found)))
     )
     diagnosis = Diagnosis(
         recording=prepared.recording.name,
         simulation=prepared.name,
         samples=len(prepared.time),
         level=asked.level,
-        noise=noise_summary(final, asked.settings.noise),
-        candidates_tried=tried,
+        noise=noise_summary(final, settings.noise),
+        candidates_tried=len(whole.terms),
         surrogates=asked.surrogates,
         seed=asked.seed,
         p_value=first.p_value if first else 1.0,
@@ -74,34 +91,40 @@ def assembled(
             *prepared.recording.warnings,
             *unit_warnings(prepared.recording),
             *prepared.warnings,
-            *drivers.warnings,
+            *whole.drivers.warnings,
             *_time_warnings(prepared),
             *answers.warnings,
         ),
         candidates=_candidates(first),
         separability=separability(first) if first else _nothing_to_separate(),
-        traces=_traces(prepared, drivers, case.base, final),
-        model=model_of(final, simulation),
+        traces=_traces(prepared, whole.drivers, case.base, final),
+        model=model_of(final, whole.simulation),
         evidence=answers.of_all,
+        world=world_of(whole.base, whole.final, known, unfit=unfit),
     )
-    verdict = _verdict(first, case.found, final.fit, diagnosis.remaining, cut, asked)
+    there = first is not None and first.p_value <= asked.level and not case.found
+    structure = there or bool(diagnosis.remaining) or whole.cut or nameless(final.fit)
+    verdict = verdict_of(known, findings, structure=structure, white=_white(diagnosis), settings=settings.evidence)
     diagnosis = replace(diagnosis, verdict=verdict)
     return replace(diagnosis, advice=advice_of(diagnosis))
 
 
-def _verdict(
-    first: Located | None,
-    found: Sequence[Located],
-    final: FittedModel,
-    left: Sequence[str],
-    cut: bool,
-    asked: Asked,
-) -> Verdict:
-    """Whether there is structure beyond the noise, and whether the findings account for it."""
-    if not found:
-        there = bool(left) or (first is not None and first.p_value <= asked.level)
-        return "unexplained" if there else "adequate"
-    return "unexplained" if nameless(final) or left or cut else "explained"
+def _finding(found: Sequence[Located], number: int, final: Estimate, whole: Whole, answers: Answers) -> Finding:
+    """A finding, with what the tests say of it, its shape and its grade."""
+    finding = replace(finding_of(found[number], final, number), evidence=answers.of_findings[number])
+    shape = None
+    if isinstance(whole.final.model.prepared, PreparedDynamics):
+        shape = shape_of(whole.final, number, whole.terms, whole.asked.settings.evidence)
+    grade = grade_of(finding)
+    if shape is not None and shape.curve is not None:
+        grade = "nearest in the catalogue"
+    return replace(finding, grade=grade, shape=shape)
+
+
+def _white(diagnosis: Diagnosis) -> bool:
+    """Whether what is left over is white."""
+    told = next((said.value for said in diagnosis.evidence if said.test == "whiteness"), None)
+    return not told or all(one.lag == 0 for one in told.values())
 
 
 def with_rest(diagnosis: Diagnosis, search: Search) -> Diagnosis:

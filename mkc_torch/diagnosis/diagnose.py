@@ -16,21 +16,24 @@ from mkc_torch.diagnosis.arguments import (
     refuse_no_settings,
     refuse_no_simulation,
 )
-from mkc_torch.diagnosis.assemble import assembled, with_rest
+from mkc_torch.diagnosis.assemble import Whole, assembled, with_rest
 from mkc_torch.diagnosis.evidence.after_the_search import answers_of, parts_ahead
 from mkc_torch.diagnosis.evidence.base import Case
+from mkc_torch.diagnosis.evidence.running_freely import running_freely
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.drivers import find_drivers
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.grid import candidate_terms
-from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.in_the_world import at_liberty, between_samples, simulation_in_the_world
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.rounds import Asked, Search, begun, continued
 from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.diagnosis.verdict import lost_from_the_start
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.recording import Recording
-from mkc_torch.simulation.protocol import PreparedSimulation, Simulation, refuse_no_recording
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+from mkc_torch.simulation.protocol import Simulation, refuse_no_recording
 
 __all__ = ["diagnose"]
 
@@ -53,9 +56,9 @@ def diagnose(
     surrogates: int = SURROGATES,
     max_findings: int = MAX_FINDINGS,
     seed: int = 0,
+    settings: Settings = Settings(),  # noqa: B008
     noise: Mapping[str, float] | None = None,
     between: Mapping[str, str] | None = None,
-    settings: Settings = Settings(),  # noqa: B008
 ) -> Diagnosis:
     """What a simulation lacks, by one recording of what it simulates.
 
@@ -73,11 +76,12 @@ def diagnose(
         surrogates: draws of noise for each p-value; at least ``1 / level - 1``.
         max_findings: findings at most.
         seed: of the draws.
-        noise: standard deviation of the white noise of a sensor, by output, in the output's unit, where it is known;
-            of the others it is estimated.
-        between: what an input does between two samples, "held", "linear" or "smooth", by input, where it is known.
         settings: the numbers that decide, by stages; see :class:`mkc_torch.diagnosis.Settings`. What was measured of
             false alarms and power was measured with the default.
+        noise: standard deviation of the sensor's white noise, by the output's name and in its unit, where it is known;
+            estimated otherwise.
+        between: what an input does between two samples, "held" or "linear", where it is known; otherwise whichever is
+            likelier. Of differential equations only.
 
     Returns:
         The diagnosis.
@@ -106,46 +110,52 @@ def diagnose(
             f"{where}{len(recording)} samples are too few for a diagnosis; it needs {fewest} at least. Record longer."
         )
     prepared = simulation.prepare(recording)
-    checked_noise(noise, getattr(simulation, "outputs", None) or prepared.channels)
-    checked_between(between, getattr(simulation, "inputs", None) or ())
     if len(prepared.time) < fewest:
         raise ValueError(
             f"{where}{len(prepared.time)} usable samples are too few for a diagnosis; it needs {fewest} at least."
         )
+    declared = checked_noise(noise, prepared.channels)
+    fixed = checked_between(between, tuple(getattr(prepared, "between", ())))
+    asked = Asked(level, surrogates, max_findings, seed, settings, declared)
+    generator = torch.Generator().manual_seed(seed)
+    if isinstance(prepared, PreparedDynamics):
+        prepared = prepared.holding(fixed)
+    world = simulation_in_the_world(prepared, declared, settings.noise)
+    world = between_samples(world, declared, fixed, settings.noise)
+    base = world.fit
+    prepared = at_liberty(base.model.prepared)
     roles = frozenset(role for effect in effects for role in effect.roles)
     measured: frozenset[str] = getattr(simulation, "measured", frozenset())
     drivers = find_drivers(prepared.recording, simulation.columns, settings.drivers, roles, measured)
     terms = candidate_terms(prepared, drivers.drivers, effects)
-    asked = Asked(level, surrogates, max_findings, seed, settings)
-    generator = torch.Generator().manual_seed(seed)
-    base = _base(prepared, settings.noise.domain)
     _refuse_no_noise(base, where)
-    search = begun(base, terms, asked, generator)
+    hopeless = lost_from_the_start(world, declared, settings.evidence)
+    search = begun(base, () if hopeless else terms, asked, generator)
 
     def case(search: Search) -> Case:
-        return Case(base, search.first, search.found, search.evidence, search.blocks, drivers.drivers, seed, settings)
+        free = running_freely(base, world.free, search.found, search.evidence, search.blocks)
+        found, judged = free.found, search.evidence
+        return Case(
+            free.base, search.first, found, free.held_out, search.blocks, drivers.drivers, seed, settings, judged=judged
+        )
 
-    def diagnosis(search: Search, done: Sequence[Any]) -> Diagnosis:
-        answers = answers_of(case(search), done)
-        return with_rest(assembled(simulation, drivers, len(terms), answers, asked, cut=search.cut), search)
+    def diagnosis(search: Search, known: Case, done: Sequence[Any]) -> Diagnosis:
+        final = search.found[-1].fit if search.found else base
+        whole = Whole(simulation, drivers, terms, world, final, asked, search.cut)
+        return with_rest(assembled(whole, answers_of(known, done)), search)
 
     known = [simulation, base, base.model, *common_parts(prepared, terms)]
 
     while search.left:
+        so_far = case(search)
         # most often there is nothing more
-        with meanwhile(parts_ahead(case(search)), [*known, *search.parts]) as done:
+        with meanwhile(parts_ahead(so_far), [*known, *search.parts]) as done:
             after = continued(search, asked, generator)
             if after.found == search.found:
-                return diagnosis(after, done())
+                return diagnosis(after, so_far, done())
         search = after
-    return diagnosis(search, shared(parts_ahead(case(search)), [*known, *search.parts]))
-
-
-def _base(prepared: PreparedSimulation, domain: float) -> FittedModel:
-    """The simulation alone, on the domain that all models share: wide enough for whatever effect reshapes residuals."""
-    rough = fitted(JointModel(prepared), prepared.start())
-    bound = domain * torch.maximum(rough.bound, rough.bound.mean())
-    return fitted(rough.model, rough.parameters, bound, graduate=False)
+    so_far = case(search)
+    return diagnosis(search, so_far, shared(parts_ahead(so_far), [*known, *search.parts]))
 
 
 def _refuse_no_noise(base: FittedModel, where: str) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import torch
@@ -14,9 +15,11 @@ from mkc_torch.diagnosis.evidence.simpler_form import simplified
 from mkc_torch.diagnosis.evidence.unrecorded_cause import course_without, located_cause
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.in_the_world import pushed
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.colour import correlation_time
 from mkc_torch.diagnosis.noise.innovations import innovation_gain
+from mkc_torch.diagnosis.search.among_pushes import located_among_pushes
 from mkc_torch.diagnosis.search.first_look import p_value_beside
 from mkc_torch.diagnosis.search.locate import Located, locate
 from mkc_torch.diagnosis.search.preference import alike
@@ -33,6 +36,7 @@ class Asked:
     max_findings: int
     seed: int
     settings: Settings
+    declared: Mapping[str, float] = field(default_factory=dict)
 
 
 def _holds(
@@ -125,6 +129,16 @@ def continued(search: Search, asked: Asked, generator: torch.Generator) -> Searc
 def _located(
     fit: FittedModel, terms: tuple[Term, ...], asked: Asked, generator: torch.Generator, *, parts: bool = True
 ) -> Located:
+    if pushed(fit):
+        return located_among_pushes(
+            fit,
+            terms,
+            level=asked.level,
+            surrogates=asked.surrogates,
+            generator=generator,
+            declared=asked.declared,
+            settings=asked.settings,
+        )
     return locate(
         fit,
         terms,

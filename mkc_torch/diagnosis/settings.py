@@ -77,6 +77,8 @@ class NoiseSettings(_Stage):
             more numbers gains by chance.
         told_wander: nats that a wander has to gain to be told of.
         told_colour: sum of squared autoregression coefficients above which noise is called coloured.
+        pushed: nats that a push of a state, or slow noise of an output, has to gain to be in the noise of the world.
+        pushes: of these at most.
         last_step: standard errors beyond which the final step of least squares is not taken, for the noise misfits.
     """
 
@@ -96,6 +98,8 @@ class NoiseSettings(_Stage):
     plausible: float = 6.0
     told_wander: float = 3.0
     told_colour: float = 0.05
+    pushed: float = 6.0
+    pushes: int = 2
     last_step: float = 5.0
 
     def __post_init__(self) -> None:
@@ -125,6 +129,7 @@ class SearchSettings(_Stage):
         smaller: scale with the effect over that without, which has to be above this, for the fit without it to hide
             nothing: then the effect is judged by tangents there.
         doubted: nats beyond all draws of noise up to which draws of other plausible noise are asked too.
+        own_noise: leading candidates that are fitted and compared under the pushes that each of them leaves.
         stretches: a stretch of the recording is as long as one of so many.
         in_one_stretch: share of an effect's evidence above which it lies in one stretch. If there are bursts of
             outliers elsewhere, the stretch may be another, and the effect is judged without it.
@@ -143,6 +148,7 @@ class SearchSettings(_Stage):
     hidden: float = 0.01
     smaller: float = 0.8
     doubted: float = 25.0
+    own_noise: int = 5
     stretches: int = 25
     in_one_stretch: float = 0.5
 
@@ -161,6 +167,8 @@ class NamingSettings(_Stage):
         nameless: nats that a curve without a name gives: it can follow any named effect a little better.
         over_driver: share of its gain that such a curve gives over a driver.
         over_motion: the same over the motion itself, of which all forces are functions, and which repeats itself.
+        general: nats that a form gives which has named ones as special cases, as a power law has drags: it can follow
+            any of them a little better.
         roleless: share of its gain that a column of unknown role gives: it may be a consequence of a known driver.
         follower: the same where it goes along with a known driver.
         alike_columns: correlation, of either sign, above which columns go along.
@@ -176,6 +184,7 @@ class NamingSettings(_Stage):
     nameless: float = 10.0
     over_driver: float = 0.25
     over_motion: float = 0.5
+    general: float = 5.0
     roleless: float = 0.3
     follower: float = 0.95
     alike_columns: float = 0.9
@@ -243,6 +252,12 @@ class EvidenceSettings(_Stage):
         student_closer: share of the density's distance that a Student-t's has to be below for a warning.
         white_level: share of white channels that are called correlated, half of it by either criterion (Ljung & Box,
             Biometrika 65, 1978; Bartlett, J. R. Stat. Soc. Suppl. 8, 1946).
+        followed: share of an output's variation that a free run has to explain to follow it at all.
+        mended: the same with findings, for them to make a simulation follow that does not by itself.
+        above_floor: times a declared noise floor above which a residual is more than the sensor's noise.
+        shape_level: chance with which a free curve is as much better where a name's shape is right, below which the
+            name is but the nearest in the catalogue, and
+        shape_nats: what the curve has to gain beyond Schwarz's price of its numbers.
         disturbed: seconds from which a stretch of rejected samples is warned of; shorter ones are bursts of outliers.
     """
 
@@ -261,6 +276,11 @@ class EvidenceSettings(_Stage):
     density_off: float = 1.95
     student_closer: float = 0.5
     white_level: float = 0.01
+    followed: float = 0.5
+    mended: float = 0.9
+    above_floor: float = 1.5
+    shape_level: float = 0.001
+    shape_nats: float = 6.0
     disturbed: float = 0.5
 
 

@@ -19,6 +19,7 @@ from mkc_torch.effects.courses import lagged
 from mkc_torch.effects.dynamics import DYNAMICS
 from mkc_torch.effects.dynamics.backlash import played
 from mkc_torch.effects.dynamics.rate import beyond
+from mkc_torch.effects.dynamics.unknown_near_ends import curve_within
 from mkc_torch.effects.paired import PAIRED
 from mkc_torch.effects.paired.between import shifted
 from mkc_torch.effects.sensor import ATTITUDE, SENSOR
@@ -43,6 +44,7 @@ __all__ = [
     "ShapedEffect",
     "SignalEffect",
     "beyond",
+    "curve_within",
     "is_curve",
     "lagged",
     "played",

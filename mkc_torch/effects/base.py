@@ -63,6 +63,8 @@ class Effect(ABC):
         placed: whether it is of the place or the attitude of its recording, which another one does not have; default
             False.
         is_curve: whether it is a curve that follows the data and no physics; default False. Named physics goes first.
+        general: whether it has named ones as special cases, such as drags or an added mass; these go first where they
+            do as well. Default False.
         unrecorded: whether it is a course along time that stands for a cause in no column; default False.
 
     Of its amplitude and its shape:
@@ -116,6 +118,7 @@ class Effect(ABC):
     follows_signal: bool = False
     placed: bool = False
     is_curve: bool = False
+    general: bool = False
     unrecorded: bool = False
 
     least: float = -math.inf
@@ -200,8 +203,8 @@ class Effect(ABC):
         Args:
             gamma: the effect's numbers.
             shape: its shape.
-            names: expression of each part of the port's signal, such as ``{"own": "x.speed"}``; "zero" is what makes a
-                temperature "own" absolute.
+            names: expression of each part of the port's signal, such as ``{"own": "x.speed"}``; "memory", "memory_2"
+                and so on of internal states; "zero" is what makes a temperature absolute.
         """
         self._refuse("code")
 

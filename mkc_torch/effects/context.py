@@ -64,10 +64,15 @@ class Context:
         return self.run if known and self.run is not None else run_numbers(self.time)
 
     @property
-    def memory(self) -> Float[Tensor, " N"] | None:
-        """The internal state of a port with memory, where a trajectory is being solved for; None elsewhere."""
+    def memories(self) -> Float[Tensor, "N k"] | None:
+        """The internal states of a port with memory, where a trajectory is being solved for; None elsewhere."""
         known = len(self.carries or self.channels)
-        return self.signal[:, known] if self.signal.shape[1] > known else None
+        return self.signal[:, known:] if self.signal.shape[1] > known else None
+
+    @property
+    def memory(self) -> Float[Tensor, " N"] | None:
+        """The first of the :attr:`memories`."""
+        return None if self.memories is None else self.memories[:, 0]
 
     def part(self, name: str) -> Float[Tensor, " N"]:
         """The component of the signal that is this part.

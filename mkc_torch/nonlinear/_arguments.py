@@ -16,11 +16,32 @@ from mkc_torch.nonlinear._descent import within
 from mkc_torch.nonlinear._problem import Constraint, Point, Problem
 from mkc_torch.nonlinear.prior import GaussianPrior
 
-__all__ = ["per_channel", "prepared"]
+__all__ = ["per_channel", "prepared", "refuse_out_of_reach"]
 
 
 class NoFitError(ValueError):
     """A residual that cannot be fitted from there: it is not finite, has no slope, or is out of the domain's reach."""
+
+
+def refuse_out_of_reach(bound: Tensor, scale: Tensor) -> None:
+    """Refuse a start whose residuals are too large for the domain of errors: the head of the density would not fit.
+
+    Args:
+        bound: half-width of the domain, (*, m).
+        scale: robust scale of the residuals at the start, (*, m).
+
+    Raises:
+        NoFitError: a scale is more than half of its bound.
+    """
+    narrow = bound < 2.0 * scale
+    if bool(narrow.any()):
+        first = tuple(narrow.nonzero()[0])
+        channel = f" of channel {int(first[-1])}" if bound.shape[-1] > 1 else ""
+        raise NoFitError(
+            f"The fit begins too far from the data: the residuals{channel} have a robust scale of "
+            f"{scale[first].item():.4g}, and the domain of errors, `bound`, reaches to {bound[first].item():.4g}, "
+            f"less than two of that. Begin nearer, or give a `bound` of {2.0 * scale[first].item():.4g} or more."
+        )
 
 
 def prepared(

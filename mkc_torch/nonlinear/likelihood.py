@@ -12,10 +12,10 @@ from torch import Tensor
 from mkc_torch._support.arguments import checked_number, checked_whole
 from mkc_torch._support.forward_mode import Residual
 from mkc_torch.density.energy import SIGMA_LEAST
-from mkc_torch.density.fit import DensityState, domain_rule, initial_state, refuse_narrow_bound
+from mkc_torch.density.fit import DensityState, domain_rule, initial_state
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 from mkc_torch.nonlinear._alternate import alternated, gaussian_candidate, likelihood_of
-from mkc_torch.nonlinear._arguments import NoFitError, per_channel, prepared
+from mkc_torch.nonlinear._arguments import per_channel, prepared, refuse_out_of_reach
 from mkc_torch.nonlinear._covariance import parameter_covariance
 from mkc_torch.nonlinear._graduated import LEAST_SCALE, graduated, residual_scale
 from mkc_torch.nonlinear._problem import Constraint, Point, kernel_weights, shaped_jacobian
@@ -197,10 +197,7 @@ def fit(
         state = begun(point, size, domain, (rough.state.kappa,))
         penalty = rough.penalty
     else:
-        try:
-            refuse_narrow_bound(fixed_bound, scale)
-        except ValueError as error:
-            raise NoFitError(str(error)) from None
+        refuse_out_of_reach(fixed_bound, scale)
         state = begun(point, scale, fixed_bound, (0.1, 0.4, 1.5))
         penalty = None
     maximum = alternated(problem, likelihood, point, state, max_iter=max_iter, tol=tol, penalty=penalty)

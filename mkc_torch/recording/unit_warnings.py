@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import math
 
+import torch
+from torch import Tensor
+
+from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.recording.recording import Recording
 
 __all__ = ["RECORDED", "field_warning", "time_warning", "unit_warnings"]
@@ -24,6 +28,14 @@ _GUESSES = (
     (2e4, 1e5, "nanotesla (1000 nT = 1 µT)"),
 )
 
+
+_FEWEST, _ENOUGH, _REWEIGHTED = 20, 1000, 20
+"""Fewest samples that a centre is sought from, how many of more, and how often they are weighed anew."""
+
+_LARGER = 1.2
+_SCATTER, _ASIDE = 0.25, 0.7
+"""Scatter of the distances from a centre, as a share of them, and length of the mean of the directions, up to which a
+sensor turned about that centre: one that hardly turns shows its field and its offset as one."""
 
 _TIMES = ((1e3, "ms", 1e-3), (1e6, "µs", 1e-6), (math.inf, "ns", 1e-9))
 """Up to which interval a time is taken for one in which unit: fifty samples a second are in the midst of it."""
@@ -54,10 +66,49 @@ def _typical(recording: Recording, name: str) -> float | None:
 
 
 def _field(recording: Recording) -> str | None:
-    size = _typical(recording, "mag")
+    size = _field_size(recording)
     if size is None:
         return None
     return field_warning(size, recording.units["mag_x"], "magnetometer measures about", "sizes of effects")
+
+
+def _field_size(recording: Recording) -> float | None:
+    """Length of the field, without a large offset of the sensor where its turns tell the two apart."""
+    length = _typical(recording, "mag")
+    if length is None:
+        return None
+    field = recording.stack(*(f"mag_{axis}" for axis in _AXES))
+    field = field[field.isfinite().all(-1)]
+    center = _center(field[:: max(1, len(field) // _ENOUGH)])
+    away = field - center
+    distance = torch.linalg.vector_norm(away, dim=-1)
+    radius = float(distance.median())
+    # an offset makes the length larger; a sphere that is larger itself goes through outliers
+    if not 0.0 < radius < _LARGER * length or float(torch.linalg.vector_norm(center)) < 0.5 * radius:
+        return length
+    scatter = float(robust_scale(distance.unsqueeze(-1) - radius)) / radius
+    aside = float(torch.linalg.vector_norm((away / distance.clamp(min=1e-300).unsqueeze(-1)).mean(0)))
+    return radius if scatter < _SCATTER and aside < _ASIDE else length
+
+
+def _center(field: Tensor) -> Tensor:
+    """Of the sphere nearest to most samples, as near to their median as they leave it open."""
+    middle = field.median(0).values
+    away = field - middle
+    size = torch.linalg.vector_norm(away, dim=-1).median()
+    if len(field) < _FEWEST or not bool(size > 0):
+        return middle
+    scaled = away / size
+    regressors = torch.cat([2.0 * scaled, torch.ones_like(scaled[:, :1])], -1)
+    square = scaled.square().sum(-1)
+    weight = torch.ones_like(square)
+    known = square.new_zeros(4)
+    for _ in range(_REWEIGHTED):
+        root = weight.sqrt().unsqueeze(-1)
+        known = torch.linalg.pinv(root * regressors, rtol=1e-6) @ (root[:, 0] * square)
+        left = (square - regressors @ known).abs()
+        weight = (1.0 + (left / (2.0 * left.median()).clamp(min=1e-12)).square()).reciprocal().square()
+    return middle + size * known[:3]
 
 
 def field_warning(size: float, unit: str, what: str, numbers: str) -> str | None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib.util
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -83,12 +85,24 @@ def _module(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[module.__name__] = module
     try:
-        with _beside(path):
+        with _beside(path), _not_itself(path):
             spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         del sys.modules[module.__name__]
-        raise SimulationFileError(f"{path}: the file raised an error of its own.\n{_told(error, path)}") from None
+        raise SimulationFileError(
+            f"{path}: the file raised an error of its own.\n{_told(error, path)}{_where_to_call(error)}"
+        ) from None
     return module
+
+
+def _where_to_call(error: BaseException) -> str:
+    """Advice where a module is missing, such as the one with the class that a corrected.py corrects."""
+    if not isinstance(error, ModuleNotFoundError) or not error.name:
+        return ""
+    name = error.name.partition(".")[0]
+    return (
+        f"\nModules are sought beside the file and in the folder of the call: put {name}.py there, or call from there."
+    )
 
 
 @contextmanager
@@ -101,6 +115,39 @@ def _beside(path: Path) -> Iterator[None]:
     finally:
         for folder in folders:
             sys.path.remove(folder)
+
+
+class _Others(MetaPathFinder):
+    """Finds a module of the same name as a file, but never that file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def find_spec(
+        self,
+        fullname: str,
+        path: Sequence[str] | None,
+        target: ModuleType | None = None,
+    ) -> ModuleSpec | None:
+        if fullname != self.path.stem or path is not None:
+            return None
+        folders = [folder for folder in sys.path if Path(folder).resolve() != self.path.resolve().parent]
+        return PathFinder.find_spec(fullname, folders, target)
+
+
+@contextmanager
+def _not_itself(path: Path) -> Iterator[None]:
+    """A corrected.py that was made of another corrected.py imports the other one."""
+    known = sys.modules.get(path.stem)
+    itself = known is not None and _same(getattr(known, "__file__", None) or "", path)
+    if itself:
+        del sys.modules[path.stem]
+    finder = _Others(path)
+    sys.meta_path.insert(0, finder)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(finder)
 
 
 def _told(error: BaseException, path: Path) -> str:

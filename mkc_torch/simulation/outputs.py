@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.simulation.protocol import Changes, Port
+from mkc_torch.simulation.protocol import Changes, Port, Sizes
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -44,7 +44,6 @@ def output_ports(
     """
     ports = {ALL: Port(tuple(channels), unit, wanders=True, kind="outputs", run=run)}
     for k, name in enumerate(channels):
-        values = measured[:, k].abs()
         parts = {"own": name, "compared": name} | ({"fixed zero": name} if name in fixed else {})
         ports[f"output {name}"] = Port(
             (name,),
@@ -52,7 +51,7 @@ def output_ports(
             kind="output",
             parts=parts,
             part_units=dict.fromkeys(parts, units[name]),
-            sizes={"own": (float(values.median()), float(values.amax()))},
+            sizes={"own": Sizes.of(measured[:, k])},
             run=run,
         )
     return ports

@@ -32,14 +32,15 @@ __all__ = [
     "Port",
     "PreparedSimulation",
     "Simulation",
+    "Sizes",
     "refuse_no_recording",
 ]
 
 Change = Callable[[Tensor], Tensor]
 """What effects add at a port, (N, c), as a function of the signal that passes through it.
 
-At a port with memory a signal can have one component more, the internal state; what is added then has one channel more,
-the internal state's rate.
+At a port with memory a signal can have more components, the internal states; what is added then has more channels,
+their rates.
 """
 
 Changes = Mapping[str, Change]
@@ -76,6 +77,26 @@ class Clock:
         return torch.lerp(values[self.before], values[self.after], share)
 
 
+class Sizes(NamedTuple):
+    """How large values are: a typical and the largest absolute one, and the lowest and the highest.
+
+    Example:
+        >>> Sizes.of(torch.tensor([-3.0, 1.0, 2.0]))
+        Sizes(typical=2.0, largest=3.0, lowest=-3.0, highest=2.0)
+    """
+
+    typical: float
+    largest: float
+    lowest: float
+    highest: float
+
+    @classmethod
+    def of(cls, values: Float[Tensor, " N"]) -> Sizes:
+        """Of these values; the typical one is the median."""
+        size = values.abs()
+        return cls(*(float(one) for one in (size.median(), size.amax(), values.amin(), values.amax())))
+
+
 @dataclass(frozen=True)
 class Port:
     """A place in a simulation where an effect adds to a signal.
@@ -88,10 +109,11 @@ class Port:
         kind: an effect is tried at every port of its kind; default the port's own name.
         carries: the components of the signal that passes; default the channels.
         parts: what components of the signal are to each other, such as ``{"own": "speed", "position": "angle"}``.
-        part_units, sizes: of the parts; a size is a typical and the largest absolute value.
+        part_units, sizes: of the parts.
         clock: when; None for the recording's samples.
         run: number of each moment's run; None where the simulation knows of no runs.
-        memory: name of the internal state that an effect here may bring; empty where none may.
+        memory: names of the internal states that an effect here may bring, and the state whose first value each begins
+            with; empty for 0.
 
     Example:
         >>> sensor = Port(("mag_x", "mag_y", "mag_z"), "µT", kind="sensor")
@@ -107,10 +129,10 @@ class Port:
     carries: tuple[str, ...] = ()
     parts: Mapping[str, str] = field(default_factory=dict)
     part_units: Mapping[str, str] = field(default_factory=dict)
-    sizes: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    sizes: Mapping[str, Sizes] = field(default_factory=dict)
     clock: Clock | None = None
     run: Int[Tensor, " G"] | None = None
-    memory: str = ""
+    memory: Mapping[str, str] = field(default_factory=dict)
 
     def at(self, values: Float[Tensor, N * rest]) -> Float[Tensor, G * rest]:
         """Values of the samples, at the moments of this port's signal."""

@@ -15,7 +15,7 @@ from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
 from mkc_torch.simulation.parameter import Parameter, SimulationError, known_parameters
-from mkc_torch.simulation.protocol import Changes, ClosedForm, Nearby, Port, refuse_no_recording
+from mkc_torch.simulation.protocol import Changes, ClosedForm, Nearby, Port, Sizes, refuse_no_recording
 from mkc_torch.simulation.undetermined import undetermined
 
 if TYPE_CHECKING:
@@ -307,14 +307,13 @@ def _ports(
 ) -> dict[str, Port]:
     ports = {}
     for k, name in enumerate(system.inputs):
-        values = inputs[:, k].abs()
         ports[f"input {name}"] = Port(
             (name,),
             units[name],
             kind="input",
             parts={"own": name},
             part_units={"own": units[name]},
-            sizes={"own": (float(values.median()), float(values.amax()))},
+            sizes={"own": Sizes.of(inputs[:, k])},
         )
     return ports | output_ports(system.outputs, units, unit, measured, fixed)
 

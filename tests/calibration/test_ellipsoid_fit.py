@@ -791,3 +791,24 @@ def test_nine_points_leave_nothing_to_tell_errors_from():
     generator = torch.Generator().manual_seed(1)
     points = 50.0 * fibonacci_sphere(9) + torch.randn(9, 3, generator=generator, dtype=torch.float64)
     assert bool(torch.isinf(EllipsoidFit().fit(points).semi_axes_se_).all())
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("noise", [0.02, 0.08, 0.14])
+def test_two_perpendicular_circles_are_refused_at_any_noise_or_come_out_right(seed, noise):
+    """They lie on more than one ellipsoid: what noise seems to cover beside them is no coverage."""
+    generator = torch.Generator().manual_seed(seed)
+    angle = 2.0 * torch.pi * torch.rand(2, 1000, generator=generator, dtype=torch.float64)
+    zero = torch.zeros(1000, dtype=torch.float64)
+    first = torch.stack([angle[0].cos(), angle[0].sin(), zero], -1)
+    second = torch.stack([angle[1].cos(), zero, angle[1].sin()], -1)
+    turn, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))
+    points = torch.cat([first, second]) @ turn * torch.tensor([1.0, 1.0, 5.0])
+    points = points + noise * torch.randn(2000, 3, generator=generator, dtype=torch.float64)
+    try:
+        fit = EllipsoidFit().fit(points)
+    except NotIdentifiableError as error:
+        assert "Not identifiable" in str(error)  # noqa: PT017
+    else:
+        assert seed == 2  # one of six, whose planes happen to lie so that scatter tells one ellipsoid from the others
+        torch.testing.assert_close(fit.semi_axes_, torch.tensor([1.0, 1.0, 5.0]).double(), rtol=0.12, atol=0.0)

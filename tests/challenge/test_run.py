@@ -63,7 +63,8 @@ def test_recordings_do_not_tell_what_is_hidden(run):
 def test_what_failed_is_scored_as_failed(run):
     result, output, _ = run
     assert result.failed == ("case_00000", "case_00002", "case_00004")
-    assert result.false_alarms.total == 3
+    assert (sum(result.verdicts.values()), result.verdicts["failed"]) == (3, 3)
+    assert result.false_alarms.total == 0
     assert "no more" in next((output / "diagnoses").glob("*.error.txt")).read_text()
 
 
@@ -104,9 +105,10 @@ def test_the_page_is_whole_and_loads_nothing(run):
 def test_summary_and_score_are_written(run):
     _, output, _ = run
     assert "| asked | measured | holds |" in (output / "summary.md").read_text(encoding="utf-8")
+    assert "| said of empty recordings: unexplained | 0 | 0 |" in (output / "summary.md").read_text(encoding="utf-8")
     record = json.loads((output / "score.json").read_text())
     assert record["settings"]["seed"] == 3
-    assert record["score"]["false_alarms"]["total"] == 3
+    assert sum(record["score"]["verdicts"].values()) == 3
 
 
 def test_the_same_seed_gives_the_same_key(run, tmp_path):
@@ -123,6 +125,6 @@ def test_a_folder_in_use_is_refused(tmp_path):
 
 def test_default_is_five_empty_for_three_hidden(tmp_path):
     result = run_challenge(diagnose, apply, cases=3, output=tmp_path / "out", subject=magnetometer(DURATION))
-    assert result.false_alarms.total == 5
+    assert sum(result.verdicts.values()) == 5
     assert all(math.isfinite(p) for p in result.p_values)
     assert torch.get_num_threads() == 1

@@ -35,14 +35,31 @@ def measured(result, name):
     return next(m for m in result.measured if m.threshold.measure == name)
 
 
-def test_false_alarms_are_verdicts_findings_and_failures():
-    keys = [key(name, "empty") for name in "abcde"]
-    answers = {"a": NOTHING, "b": says(verdict="unexplained"), "c": says(finding("offset_drift")), "d": NOTHING}
+def test_false_alarms_are_claims_that_physics_is_missing():
+    keys = [key(name, "empty") for name in "abcdef"]
+    answers = {
+        "a": NOTHING,
+        "b": says(verdict="unexplained"),
+        "c": says(finding("offset_drift")),
+        "d": NOTHING,
+        "f": says(verdict="unfit"),
+    }
     result = score(keys, answers)
-    assert (result.false_alarms.count, result.false_alarms.total) == (3, 5)
+    assert (result.false_alarms.count, result.false_alarms.total) == (1, 5)
     assert result.failed == ("e",)
-    assert len(result.p_values) == 4
-    assert result.confusion == {"nothing": {"nothing": 2, "unknown": 1, "offset_drift": 1, "failed": 1}}
+    assert len(result.p_values) == 5
+    assert result.verdicts == {"unfit": 1, "adequate": 2, "explained": 1, "unexplained": 1, "failed": 1}
+    assert result.confusion == {"nothing": {"nothing": 2, "unknown": 1, "offset_drift": 1, "failed": 1, "unfit": 1}}
+
+
+@pytest.mark.parametrize(("grade", "claimed"), [("left out", 1), ("real but small", 1), (None, 1), ("not confirmed", 0),
+                                                ("nearest in the catalogue", 0)])  # fmt: skip
+def test_a_grade_says_whether_a_finding_is_a_claim(grade, claimed):
+    told = says(finding("hard_iron_step") | {"grade": grade}, verdict="unexplained")
+    result = score([key("a"), key("b", "empty")], {"a": told, "b": told})
+    assert result.named.count == result.false_alarms.count == claimed
+    assert result.confusion["nothing"] == {"hard_iron_step" if claimed else "unknown": 1}
+    assert [b.found.count for b in result.power_z if b.found.total] == [1]
 
 
 def test_named_and_driver_right_among_the_strong():

@@ -6,6 +6,7 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
+import polars
 import pytest
 import torch
 
@@ -274,11 +275,35 @@ def test_applied_field_has_the_right_length(calibrated, tmp_path):
     result = mkc("apply", folder / "calibration.json", folder / "recording.csv", "--output", output)
     assert result.exit_code == 0, result.output
     field = Recording.read(output)
-    assert field.names == ("time", "field_x", "field_y", "field_z")
+    new = ("field_x", "field_y", "field_z")
+    assert field.names == (*(name for name in Recording.read(folder / "recording.csv").names), *new)
     assert len(field) == 4500
     c = Calibration.from_json((folder / "calibration.json").read_text(encoding="utf-8"))
     norm = field.stack("field_x", "field_y", "field_z").norm(dim=-1)
     assert float(norm.median()) == pytest.approx(c.field_strength, abs=0.1)
+
+
+def test_apply_keeps_every_column_as_it_stands_in_the_file(calibrated, tmp_path):
+    """Time stamps, words and the digits of numbers among them."""
+    folder, _ = calibrated
+    new = tmp_path / "new.csv"
+    header = "stamp,t,a,b,c,note,count"
+    rows = ["2026-01-01T00:00:00,0.10,1,2,3,begin,1735689600000000001", "2026-01-01T00:00:01,0.20,4,5,6,,2"]
+    new.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    renamed = ("--columns", "time=t,mag_x=a,mag_y=b,mag_z=c")
+    output = tmp_path / "out.csv"
+    assert mkc("apply", folder / "calibration.json", new, "--output", output, *renamed).exit_code == 0
+    written = output.read_text(encoding="utf-8").splitlines()
+    assert written[0] == f"{header},field_x,field_y,field_z"
+    assert [line[: len(row)] for line, row in zip(written[1:], rows, strict=True)] == rows
+    parquet = tmp_path / "out.parquet"
+    assert mkc("apply", folder / "calibration.json", new, "--output", parquet, *renamed).exit_code == 0
+    table = polars.read_parquet(parquet)
+    assert table.columns == written[0].split(",")
+    assert table["stamp"].to_list() == ["2026-01-01T00:00:00", "2026-01-01T00:00:01"]
+    assert table["t"].to_list() == [0.1, 0.2]
+    again = mkc("apply", folder / "calibration.json", parquet, "--output", tmp_path / "o.csv", *renamed)
+    assert again.exit_code == 0, again.output
 
 
 def test_apply_does_not_overwrite_and_keeps_rows_without_values(calibrated, tmp_path):

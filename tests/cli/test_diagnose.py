@@ -127,7 +127,7 @@ def test_the_model_corrects_a_second_recording(stepped, tmp_path):
     assert result.exit_code == 0, result.output
     assert "note: hard_iron_step is bound to the time" in result.stdout
     corrected = Recording.read(output)
-    assert corrected.names == ("time", "field_x", "field_y", "field_z")
+    assert corrected.names == (*Recording.read(new).names, "field_x", "field_y", "field_z")
     length = corrected.stack("field_x", "field_y", "field_z").norm(dim=-1)
     assert float(length.std() / length.mean()) < 0.01
     model = DiagnosedModel.from_json((folder / "model.json").read_text(encoding="utf-8"))

@@ -140,9 +140,9 @@ def test_a_model_simulates_another_recording(tank, tmp_path):
     assert result.exit_code == 0, result.output
     assert "300 rows of level simulated with what was found" in result.stdout
     corrected = Recording.read(output)
-    assert corrected.names == ("time", "experiment", "level")
-    assert torch.equal(corrected["experiment"], Recording.read(new)["experiment"])
-    assert output.read_text().splitlines()[1].startswith("0.0,0,")
+    # its own simulated level takes the place of the measured one
+    assert corrected.names == Recording.read(new).names
+    assert all(torch.equal(corrected[name], Recording.read(new)[name]) for name in corrected.names if name != "level")
     assert float((corrected["level"] - Recording.read(new)["level"]).square().mean().sqrt()) < 0.008
 
 
@@ -210,7 +210,7 @@ def test_noise_and_inputs_are_declared_by_name(thermistor, monkeypatch):
     assert result.exit_code == 1
     assert "they are `voltage`" in flat(result.stderr)
     result = mkc(*command, "--noise", "voltage=0.01", "--between", "voltage=held")
-    assert "they are `temperature`" in flat(result.stderr)
+    assert "inputs in the equations of this simulation but got `voltage`; it has none" in flat(result.stderr)
     monkeypatch.setattr("mkc_torch.cli.diagnosis_files.diagnose", told)
     result = mkc(*command, "--noise", "voltage=0.01, other=2", "--noise", "third=1e-3", "--between", "temperature=held")
     assert "far enough" in result.stderr
@@ -278,3 +278,42 @@ def test_usage_errors(thermistor):
         assert result.exit_code == 2
         assert words in flat(result.stderr.replace("│", " "))
     assert not output.exists()
+
+
+UNUSED = """
+from mkc_torch.simulation import Dynamics
+
+
+class Decay(Dynamics):
+    states = ("level",)
+    inputs = ("inflow",)
+    parameters = {"loss": 0.4}
+
+    def derivative(self, time, x, u, p):
+        return {"level": -p.loss * x.level}
+"""
+
+
+def decay_table(path, *, zero=False):
+    time = torch.arange(150, dtype=torch.float64) / 10.0
+    noise = 0.01 * torch.randn(150, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    level = 0.0 * time if zero else torch.exp(-0.3 * time) + noise
+    write_table(path, {"time": time, "inflow": torch.sin(time), "level": level})
+    return path
+
+
+def test_a_declared_input_that_is_not_used_is_no_crash(tmp_path):
+    (tmp_path / "decay.py").write_text(UNUSED)
+    command = ("--simulation", f"{tmp_path / 'decay.py'}:Decay", "--output", tmp_path / "out", "--surrogates", 19)
+    result = mkc("diagnose", decay_table(tmp_path / "run.csv"), *command)
+    assert result.exit_code == 0, result.output
+    assert "error of the program" not in flat(result.stderr)
+
+
+def test_an_output_that_is_zero_throughout_is_refused_with_words(tmp_path):
+    (tmp_path / "decay.py").write_text(UNUSED)
+    command = ("--simulation", f"{tmp_path / 'decay.py'}:Decay", "--output", tmp_path / "out", "--surrogates", 19)
+    result = mkc("diagnose", decay_table(tmp_path / "run.csv", zero=True), *command)
+    assert result.exit_code == 1
+    assert "`level`" in flat(result.stderr)
+    assert "error of the program" not in flat(result.stderr)

@@ -57,5 +57,6 @@ def test_a_diagnosis_checks_what_is_declared():
     line = Static(torch.nn.Linear(1, 1), inputs=("temperature",), outputs=("voltage",))
     with pytest.raises(ValueError, match="they are `voltage`"):
         diagnose(line, recording, noise={"temperature": 0.1})
-    with pytest.raises(ValueError, match="they are `temperature`"):
-        diagnose(line, recording, between={"voltage": "held"})
+    # no equations, nothing between samples
+    with pytest.raises(ValueError, match="inputs in the equations of this simulation but got `temperature`; it has no"):
+        diagnose(line, recording, between={"temperature": "held"})

@@ -21,6 +21,12 @@ MKC = typer.main.get_command(app).commands
 SMALL = {
     "mkc challenge --output proof": "--cases 1 --empty 1 --duration 10 --workers 1",
     "mkc challenge --family dynamics --output proof_of_dynamics": "--cases 0 --empty 1 --workers 1",
+    "mkc challenge --worlds --output worlds": (
+        "--per-world 1 --hidden-per-world 0 --only white --duration 15 --workers 1"
+    ),
+    "mkc challenge --worlds --family dynamics --output worlds_of_dynamics": (
+        "--per-world 1 --hidden-per-world 0 --only white --workers 1"
+    ),
     "mkc challenge --seed 9421 --workers 2 --output proof": "--seed 1 --cases 0 --empty 1 --duration 10 --workers 1",
     "mkc challenge --family dynamics --seed 7741 --workers 2 --output proof_of_dynamics": (
         "--seed 1 --cases 0 --empty 1 --workers 1"

@@ -4,6 +4,7 @@ import torch
 
 from mkc_torch.effects import DYNAMICS, PAIRED, Context
 from mkc_torch.simulation.outputs import ALL, output_ports
+from mkc_torch.simulation.protocol import Sizes
 
 UNITS = {"temperature": ("°C",), "current": ("A",), "position": ("m", "m", "m"), "any": ("V",), "spin": ("rad/s",)}
 
@@ -40,10 +41,12 @@ def dynamic_context(effect, N=80, driven=False):
     parts = {
         "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "reversing": "speed",
         "temperature": "speed", "level": "speed", "other": "other", "load": "load",
-        "rate": "rate", "height": "angle", "sideways": "other",
+        "rate": "rate", "height": "angle", "sideways": "other", "surroundings": "other",
     }  # fmt: skip
     of = {"angle": "rad", "speed": "rad/s", "other": "rad/s", "load": "rad/s/s", "rate": "rad/s/s"}
     units = {part: of[name] for part, name in parts.items()}
+    if "temperature" in effect.needs:
+        units |= dict.fromkeys(("own", "temperature", "surroundings"), "°C")
     channels = ("speed", "other") if effect.port == "exchange" else ("speed",)
     signal = oscillating(N, len(names))
     signal[:, 3] = signal[:, 3].abs()
@@ -75,10 +78,20 @@ def contexts_of(effect):
     return make_context(effect), make_context(effect, channels=("strength",))
 
 
+def within(effect, shape, context):
+    """The shape with a range that is of the part that it is of."""
+    shape = dict(shape)
+    for name, (part, which) in effect.relative.items():
+        if which in ("lowest", "highest"):
+            values = context.part("own") - context.part(part) if part == "surroundings" else context.part(part)
+            shape[name] *= getattr(Sizes.of(values), which)
+    return shape
+
+
 def kinds_of_shapes(effect, context):
     """Every kind of shape of an effect, of those that differ in their numbers alone the first and the last."""
     kinds = {}
-    for shape in effect.shapes(context.time):
+    for shape in (within(effect, shape, context) for shape in effect.shapes(context.time)):
         kinds.setdefault(tuple(sorted(shape)), []).append(shape)
     return [shape for alike in kinds.values() for shape in (alike[0], *alike[1:][-1:])]
 

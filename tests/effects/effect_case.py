@@ -10,8 +10,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.effects import Effect, beyond, lagged, played, shifted, soft_clip
+from mkc_torch.effects import Effect, beyond, curve_within, lagged, played, shifted, soft_clip
 from mkc_torch.effects.courses import gained
+from mkc_torch.simulation.dynamics.ports import memory_at
+from mkc_torch.simulation.protocol import Sizes
 from tests.effects.contexts import contexts_of, kinds_of_shapes, size_of
 
 BENT = ("delay", "clock_drift")
@@ -102,7 +104,7 @@ class OfEveryEffect:
         numbers = {name for shape in shapes for name in shape}
         for said in (effect.relative, effect.continuous, effect.fitted_shape, effect.choices):
             assert set(said) <= numbers
-        assert all(which in ("typical", "largest") for _, which in effect.relative.values())
+        assert all(which in Sizes._fields for _, which in effect.relative.values())
         assert all(low < high for low, high in effect.continuous.values())
         for name, (low, high) in effect.fitted_shape.items():
             grid = [shape[name] for shape in shapes]
@@ -259,14 +261,18 @@ class OfEveryShape:
             assert effect.driver_optional
             return
         carried = context.carries or context.channels
-        if effect.port == "hysteretic rate":  # its internal state is solved for
-            context = replace(context, signal=torch.cat([context.signal, context.time.cos().unsqueeze(-1)], -1))
-        x = SimpleNamespace(**dict(zip((*carried, "memory"), context.signal.unbind(-1), strict=False)))
-        names = {part: f"x.{name}" for part, name in context.parts.items()} | {"memory": "x.memory", "zero": "0.0"}
+        inner = ("memory", "memory_2")[: len(memory_at(effect.port, "speed"))]
+        if inner:  # internal states are solved for
+            more = [(k * context.time).cos() for k, _ in enumerate(inner, start=1)]
+            context = replace(context, signal=torch.cat([context.signal, torch.stack(more, -1)], -1))
+        x = SimpleNamespace(**dict(zip((*carried, *inner), context.signal.unbind(-1), strict=True)))
+        names = {part: f"x.{name}" for part, name in context.parts.items()} | {one: f"x.{one}" for one in inner}
+        names["zero"] = "273.15" if context.unit_of("own") == "°C" else "0.0"
         if not effect.needs and effect.port == "output":  # it is of all outputs
             names = {name: f"x.{name}" for name in carried}
         known = {"x": x, "torch": torch, "time": context.time, "run": context.runs}
         known |= {"lagged": lagged, "shifted": shifted, "played": played, "soft_clip": soft_clip, "beyond": beyond}
+        known["curve_within"] = curve_within
         shape = {name: float(value) for name, value in shape.items()}
         lines = effect.code(gamma.tolist(), shape, names)
         written = torch.stack([eval(line, known) + torch.zeros_like(context.time) for line in lines], -1)

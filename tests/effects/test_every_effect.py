@@ -104,10 +104,11 @@ def test_ids_are_the_contract():
         "constant_force", "linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction",
         "load_dependent_friction", "cubic_stiffness", "position_periodic_force", "coupling", "hard_stop", "overflow",
         "thermal_loss", "input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "bouc_wen_hysteresis",
-        "added_mass", "magnus_lift", "buoyancy",
+        "added_mass", "magnus_lift", "buoyancy", "hidden_lag", "hidden_mode", "power_law",
     }  # fmt: skip
     assert (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED) == CATALOGUE
-    named = [effect.id for effect in CATALOGUE if effect.id not in ("unknown", "field_gradient")]
+    several = ("unknown", "field_gradient", "power_law", "linear_drag", "thermal_loss")
+    named = [effect.id for effect in CATALOGUE if effect.id not in several]
     assert len(set(named)) == len(named)
 
 
@@ -118,6 +119,7 @@ def test_what_effects_can_do_beside():
     assert {e.id for e in CATALOGUE if e.has_code} == {e.id for e in DYNAMICS} | {"output_saturation"}
     assert {e.id for e in CATALOGUE if e.simpler} == {"coupling", "sensor_lag"}
     assert {e.id for e in CATALOGUE if e.is_curve} == {"unknown"}
+    assert {e.id for e in CATALOGUE if e.general} == {"power_law", "hidden_lag", "hidden_mode"}
     assert {e.id for e in SENSOR if e.continuous} == {"hard_iron_step", "offset_drift", "temperature_offset"}
     assert {e.id for e in CATALOGUE if not e.has_course} & {"hard_iron_step", "linear_drag", "gain"} == set()
 

@@ -95,3 +95,27 @@ def test_parts_of_a_vector_are_not_judged():
     mag = vector("mag", 500.0)
     del mag["mag_z"]
     assert warnings_of(mag) == ()
+
+
+def turned(size, offset, share=1.0):
+    """A field that a sensor with an offset sees from all directions, or from a cone about z."""
+    direction = torch.randn(600, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    direction = direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
+    direction[:, :2] *= share
+    direction = direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
+    if share < 1.0:
+        direction[:, 2] = direction[:, 2].abs()
+    field = size * direction + torch.tensor(offset, dtype=torch.float64)
+    return {f"mag_{axis}": field[:, k] for k, axis in enumerate("xyz")}
+
+
+def test_the_length_is_taken_without_the_offset_where_the_turns_tell_it():
+    assert warnings_of(turned(45.0, (590.0, 0.0, 0.0))) == ()
+    (sentence,) = warnings_of(turned(450.0, (2500.0, 0.0, 0.0)))
+    assert "measures about 450 µT" in sentence
+    assert "milligauss" in sentence
+
+
+def test_a_sensor_that_hardly_turns_is_judged_by_what_it_shows():
+    (sentence,) = warnings_of(turned(450.0, (10.0, 0.0, 30.0), share=0.1))
+    assert "milligauss" in sentence

@@ -78,6 +78,28 @@ def hysteretic(gamma, yields):
     return rate
 
 
+def dragged(gamma, lag):
+    """A second mass behind a damper: its speed is the third state."""
+
+    def rate(t, y):
+        x, v, w = y
+        return [v, push(t) - 4.0 * x - 0.3 * v + gamma * (w - v), (v - w) / lag]
+
+    return rate
+
+
+def sprung(share, period, damping):
+    """A second mass on a spring: its place and its speed are the third and fourth state."""
+    omega = 2.0 * math.pi / period
+
+    def rate(t, y):
+        x, v, place, w = y
+        pull = omega**2 * (place - x) + 2.0 * damping * omega * (w - v)
+        return [v, push(t) - 4.0 * x - 0.3 * v + share * pull, w, -pull]
+
+    return rate
+
+
 def turned(coefficient):
     def rate(t, y):
         _, _, vx, vy = y
@@ -111,6 +133,13 @@ CASES = {
     "backlash": ("input push", {"half_gap": 0.4}, [1.0], with_play(), [0.5, 0.0], 2e-3),
     "bouc_wen_hysteresis": (
         "hysteretic rate of speed", {"yield_deflection": 0.2}, [3.0], hysteretic(3.0, 0.2), [0.5, 0.0, 0.0], 2e-4,
+    ),
+    "hidden_lag": (
+        "lagged rate of speed", {"time_constant": 0.4}, [0.6], dragged(1.5, 0.4), [0.5, 0.7, 0.7], 1e-4,
+    ),
+    "hidden_mode": (
+        "resonant rate of speed", {"period": 0.9, "damping": 0.1}, [0.3], sprung(0.3, 0.9, 0.1),
+        [0.5, 0.7, 0.5, 0.7], 2e-4,
     ),
     "added_mass": ("rate of speed", {}, [0.2], mass(inertia=1.25), [0.5, 0.0], 1e-4),
     "buoyancy": ("rate of speed", {"surface": 0.3, "draught": 0.5}, [6.0], mass(dipped), [0.5, 0.0], 2e-4),
@@ -201,6 +230,62 @@ class TestMemory:
         constant = {"hysteretic rate of speed": lambda s: torch.full_like(s[:, :1], 0.1)}
         assert model.prepared.trajectory(theta, constant).states.shape[1] == 2
         assert model.prepared.trajectory(theta, model.changes(parameters)).states.shape[1] == 3
+
+    def test_a_second_store_begins_like_the_first(self):
+        for name, like in (("hidden_lag", ("speed",)), ("hidden_mode", ("", "speed"))):
+            _, shape, gamma, rate, first, _ = CASES[name]
+            simulation, _, theta = prepared(name, rate, first)
+            model, parameters = joint(name, simulation, shape, gamma, theta)
+            begin = simulation.trajectory(theta, model.changes(parameters)).states[0]
+            assert tuple(simulation.ports[CASES[name][0]].memory.values()) == like
+            assert begin[2:].tolist() == [float(first[1]) if one else 0.0 for one in like]
+
+    def test_a_lag_of_no_time_changes_nothing(self):
+        rate, first = CASES["hidden_lag"][3:5]
+        simulation, _, theta = prepared("hidden_lag", rate, first)
+        plain = simulation.residual(theta, {})
+        left = []
+        for lag in (1e-2, 1e-3, 1e-4):
+            exchange = 1.5  # with a store that becomes ever smaller
+            model, parameters = joint("hidden_lag", simulation, {"time_constant": lag}, [exchange * lag], theta)
+            left.append(float((model.residual(parameters) - plain).abs().max()))
+        assert left[0] > 9.0 * left[1] > 81.0 * left[2]
+        assert left[2] < 1e-3
+
+    def test_a_store_that_follows_at_once_only_adds_its_capacity(self):
+        simulation, _, theta = prepared("hidden_lag", *CASES["hidden_lag"][3:5])
+        larger = JointModel(simulation, (Term(OF["added_mass"], None, {}, "rate of speed"),))
+        whole = larger.residual(torch.cat([theta, theta.new_tensor([0.6 / 1.6])]))
+        model, parameters = joint("hidden_lag", simulation, {"time_constant": 1e-3}, [0.6], theta)
+        away = (whole - simulation.residual(theta, {})).abs().max()
+        assert float((model.residual(parameters) - whole).abs().max()) < 0.02 * float(away)
+
+    def test_a_stiff_spring_only_adds_its_mass(self):
+        _, _, _, rate, first, _ = CASES["hidden_mode"]
+        simulation, _, theta = prepared("hidden_mode", rate, first)
+        heavier = JointModel(simulation, (Term(OF["added_mass"], None, {}, "rate of speed"),))
+        rigid = heavier.residual(torch.cat([theta, theta.new_tensor([0.3 / 1.3])]))
+        left = []
+        for period in (0.4, 0.1):
+            shape = {"period": period, "damping": 0.5}
+            model, parameters = joint("hidden_mode", simulation, shape, [0.3], theta)
+            left.append(float((model.residual(parameters) - rigid).abs().max()))
+        assert left[1] < 0.25 * left[0]
+        assert left[1] < 0.05 * float((rigid - simulation.residual(theta, {})).abs().max())
+
+    def test_several_effects_remember_beside_each_other(self):
+        """Each has its own internal states, whatever else acts at that rate."""
+        names = ("bouc_wen_hysteresis", "hidden_lag", "hidden_mode")
+        simulation, _, theta = prepared("hidden_lag", *CASES["hidden_lag"][3:5])
+        terms = [Term(OF[name], None, CASES[name][1], CASES[name][0]) for name in names]
+        model = JointModel(simulation, terms)
+        gammas = [theta.new_tensor(CASES[name][2]) for name in names]
+        assert simulation.trajectory(theta, model.changes(torch.cat([theta, *gammas]))).states.shape[1] == 6
+        for k, name in enumerate(names):
+            only = [gamma if i == k else 0.0 * gamma for i, gamma in enumerate(gammas)]
+            alone, parameters = joint(name, simulation, CASES[name][1], CASES[name][2], theta)
+            beside = model.residual(torch.cat([theta, *only]))
+            torch.testing.assert_close(beside, alone.residual(parameters), rtol=0.0, atol=1e-9)
 
     def test_it_begins_anew_with_every_run(self):
         """Two runs at once are each run by itself."""

@@ -148,6 +148,28 @@ def test_a_file_elsewhere_imports_what_lies_where_it_is_asked_for(tmp_path, monk
     sys.modules.pop("own_base_of_a_test")
 
 
+def test_a_file_imports_another_one_of_its_name_and_not_itself(tmp_path, monkeypatch):
+    """As a corrected.py does that was made of a corrected.py."""
+    (tmp_path / "corrected.py").write_text(TEXT_OF_A_BASE, encoding="utf-8")
+    results = tmp_path / "results"
+    results.mkdir()
+    (results / "corrected.py").write_text(
+        "from corrected import Base\n\n\nclass Corrected(Base):\n    parameters = {'rate': 2.0}\n", encoding="utf-8"
+    )
+    monkeypatch.chdir(tmp_path)
+    finders = list(sys.meta_path)
+    assert load_simulation("results/corrected.py:Corrected").parameters == {"rate": 2.0}
+    assert load_simulation("corrected.py:Base").parameters == {"rate": 1.0}
+    assert sys.meta_path == finders
+    sys.modules.pop("corrected", None)
+
+
+def test_a_missing_base_is_told_with_where_to_put_it(tmp_path):
+    (tmp_path / "corrected.py").write_text("from nowhere_to_be_found import Base\n", encoding="utf-8")
+    with pytest.raises(SimulationFileError, match=r"put nowhere_to_be_found\.py there, or call from there"):
+        load_simulation(f"{tmp_path / 'corrected.py'}:Base")
+
+
 TEXT_OF_A_BASE = """
 from mkc_torch.simulation import Dynamics
 

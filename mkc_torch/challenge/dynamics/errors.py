@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -20,6 +20,13 @@ OUTLIERS = 0.05
 
 NOISE = (0.005, 0.02)
 """Standard deviation of an output's errors, over that of the output."""
+
+
+class Whitening(Protocol):
+    """What weighs traces of the outputs by the noise in them."""
+
+    def whitened(self, traces: Array) -> Array:
+        """Columns (M, q) of traces (m, T, R, q), or (M,) of (m, T, R), in standard deviations of independent errors."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 
 from mkc_torch.challenge import draws
 from mkc_torch.challenge.dynamics import cart_pole, motor, pendulum, projectile, tanks, thermal
-from mkc_torch.challenge.dynamics.errors import OUTLIERS, Errors, draw_errors, sample, spoil
+from mkc_torch.challenge.dynamics.errors import OUTLIERS, Errors, Whitening, draw_errors, sample, spoil
 from mkc_torch.challenge.dynamics.hidden import Draw
 from mkc_torch.challenge.dynamics.integrate import Course, simulate
 from mkc_torch.challenge.dynamics.oracle import Power, can_be_named, names, power
@@ -55,7 +55,7 @@ SYSTEMS: Mapping[str, System] = MappingProxyType(
 
 
 @dataclass(frozen=True)
-class _Measured:
+class Measured:
     """A recording's columns, what its sensors added (m, T, R), and which samples are bad."""
 
     columns: dict[str, Tensor]
@@ -81,15 +81,15 @@ def draw(seed: int, index: int, *, empty: bool = False) -> Case:
     scene = Scene(plant, setting.trial, simulate(plant, setting.trial))
     errors = draw_errors(stream("noise"), scene.course.outputs)
     if empty:
-        measured = _measured(stream, "", plant, setting.trial, scene.course, errors)
-        return Case(Recording(measured.columns, name=name), None, _key(name, "empty", plant, errors, measured))
+        measured = measured_by(stream, "", plant, setting.trial, scene.course, errors)
+        return Case(Recording(measured.columns, name=name), None, key_of(name, "empty", plant, errors, measured))
     kind, hidden, size, seen = hide(stream, SYSTEMS[system], scene, errors)
-    measured = _measured(stream, "", plant, setting.trial, simulate(plant, setting.trial, hidden, size), errors)
+    measured = measured_by(stream, "", plant, setting.trial, simulate(plant, setting.trial, hidden, size), errors)
     later = simulate(plant, setting.later, hidden, size)
-    again = _measured(stream, "later ", plant, setting.later, later, errors)
+    again = measured_by(stream, "later ", plant, setting.later, later, errors)
     key = replace(
-        _key(name, kind, plant, errors, measured),
-        effects=(_key_effect(hidden, size, seen),),
+        key_of(name, kind, plant, errors, measured),
+        effects=(key_effect(hidden, size, seen),),
         second_outliers=_numbers(again.bad),
         oracle_rms=oracle_rms(plant, setting.later, hidden, size, errors, again.errors, ~again.bad),
     )
@@ -97,11 +97,15 @@ def draw(seed: int, index: int, *, empty: bool = False) -> Case:
 
 
 def hide(
-    stream: Callable[[str], Generator], system: System, scene: Scene, errors: Errors
+    stream: Callable[[str], Generator],
+    system: System,
+    scene: Scene,
+    errors: Whitening,
+    outside_share: float = OUTSIDE_SHARE,
 ) -> tuple[str, Hidden, float, Power]:
     """An effect: its kind, itself, its size, and how well it can be seen at that size."""
     g = stream("effect")
-    outside = draws.happens(g, OUTSIDE_SHARE)
+    outside = draws.happens(g, outside_share)
     hidden = draws.choose(g, system.outside if outside else system.inside)(g, scene)
     known = frozenset() if outside else names(scene)
     while not (outside or can_be_named(hidden, known)):
@@ -111,9 +115,9 @@ def hide(
     return "outside" if outside else "single", hidden, size, seen
 
 
-def _measured(
+def measured_by(
     stream: Callable[[str], Generator], when: str, plant: Plant, trial: Trial, course: Course, errors: Errors
-) -> _Measured:
+) -> Measured:
     """What a logger writes: runs below one another, inputs, outputs with errors, and columns that mean nothing."""
     samples, runs = trial.samples, trial.runs
     noise = sample(stream(f"{when}errors"), errors, samples, runs)
@@ -125,7 +129,7 @@ def _measured(
         columns["experiment"] = torch.arange(runs, dtype=torch.float64).repeat_interleave(samples)
     columns |= {name: _column(values) for name, values in zip(plant.inputs, trial.inputs, strict=True)}
     columns |= {name: _column(values) for name, values in zip(plant.outputs, seen, strict=True)}
-    return _Measured(columns | _decoys(stream(f"{when}decoys"), plant, columns), noise + bad, mask)
+    return Measured(columns | _decoys(stream(f"{when}decoys"), plant, columns), noise + bad, mask)
 
 
 def _decoys(g: Generator, plant: Plant, columns: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -150,7 +154,7 @@ def _numbers(mask: np.ndarray) -> tuple[int, ...]:
     return tuple(np.flatnonzero(mask.transpose(0, 2, 1)).tolist())
 
 
-def _key(name: str, kind: str, plant: Plant, errors: Errors, measured: _Measured) -> Key:
+def key_of(name: str, kind: str, plant: Plant, errors: Errors, measured: Measured) -> Key:
     return Key(
         name=name,
         kind=kind,
@@ -168,7 +172,7 @@ def _key(name: str, kind: str, plant: Plant, errors: Errors, measured: _Measured
     )
 
 
-def _key_effect(hidden: Hidden, size: float, seen: Power) -> KeyEffect:
+def key_effect(hidden: Hidden, size: float, seen: Power) -> KeyEffect:
     told = [KeyRival(rival.effect, (), rival.z_sep, rival.at) for rival in (*seen.rivals, *seen.larger)]
     return KeyEffect(
         effect=hidden.effect,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,7 +31,19 @@ def between(values: Array, parts: int) -> Array:
     return np.concatenate([inside.reshape(k, (samples - 1) * parts, runs), values[:, -1:]], 1)
 
 
-def simulate(plant: Plant, trial: Trial, hidden: Hidden | None = None, size: float = 0.0) -> Course:
+def holding(values: Array, parts: int) -> Array:
+    """The same, of signals that are held until the next sample.
+
+    Example:
+        >>> holding(np.array([[[0.0], [1.0]]]), 2)[0, :, 0].tolist()
+        [0.0, 0.0, 1.0]
+    """
+    return np.concatenate([np.repeat(values[:, :-1], parts, 1), values[:, -1:]], 1)
+
+
+def simulate(
+    plant: Plant, trial: Trial, hidden: Hidden | None = None, size: float = 0.0, push: Array | None = None
+) -> Course:
     """The runs of a trial, with something hidden or nothing.
 
     Args:
@@ -39,46 +51,64 @@ def simulate(plant: Plant, trial: Trial, hidden: Hidden | None = None, size: flo
         trial: the runs.
         hidden: what acts beside the known physics.
         size: of it.
+        push: what is added to the rates (n, F - 1, R), constant in each fine step.
     """
     h = trial.step / plant.fine
-    half = between(trial.inputs, 2 * plant.fine)
+    half = _sent(plant, trial)
     sent = half if hidden is None else hidden.inputs(half, 0.5 * h, size)
-    states = _states(plant, h, sent, trial.begin, hidden, np.full(trial.runs, size))
+    states = _states(plant, h, sent, trial, hidden, np.full(trial.runs, size), push)
     return Course(states, half[:, ::2], _measured(plant, states, h, hidden, size))
 
 
 def outputs_of_sizes(plant: Plant, trial: Trial, hidden: Hidden, sizes: Array) -> list[Array]:
     """Outputs (m, T, R) for each of several sizes, which are integrated side by side as so many more runs."""
     h = trial.step / plant.fine
-    half = between(trial.inputs, 2 * plant.fine)
+    half = _sent(plant, trial)
     sent = np.concatenate([hidden.inputs(half, 0.5 * h, size) for size in sizes], -1)
-    begin = np.tile(trial.begin, len(sizes))
-    states = _states(plant, h, sent, begin, hidden, np.repeat(sizes, trial.runs))
+    many = replace(trial, begin=np.tile(trial.begin, len(sizes)))
+    states = _states(plant, h, sent, many, hidden, np.repeat(sizes, trial.runs))
     parts = np.split(states, len(sizes), -1)
     return [_measured(plant, part, h, hidden, size) for part, size in zip(parts, sizes, strict=True)]
 
 
-def _states(plant: Plant, h: float, sent: Array, begin: Array, hidden: Hidden | None, sizes: Array) -> Array:
-    """(n, F, R) for inputs (k, 2F - 1, R), first states (n, R) and the size of what is hidden in each run (R,)."""
+def _sent(plant: Plant, trial: Trial) -> Array:
+    """Inputs (k, 2F - 1, R) at every half fine step."""
+    return (holding if trial.held else between)(trial.inputs, 2 * plant.fine)
+
+
+def _states(
+    plant: Plant,
+    h: float,
+    sent: Array,
+    trial: Trial,
+    hidden: Hidden | None,
+    sizes: Array,
+    push: Array | None = None,
+) -> Array:
+    """(n, F, R) for inputs (k, 2F - 1, R), a trial's first states (n, R) and the size of what is hidden (R,)."""
     own = 0 if hidden is None else hidden.own
     n, p = len(plant.states), plant.values
 
-    def rate(x: Array, u: Array) -> Array:
-        known = plant.rate(x[:n], u, p)
-        if hidden is None or hidden.rate is None:
-            return known
-        rates, inner = hidden.rate(x[:n], x[n:], u, known, sizes)
-        return np.concatenate([rates, inner]) if own else rates
+    def rate(x: Array, u: Array, pushed: Array | None) -> Array:
+        known, inner = plant.rate(x[:n], u, p), x[n:]
+        if hidden is not None and hidden.rate is not None:
+            known, inner = hidden.rate(x[:n], x[n:], u, known, sizes)
+        if pushed is not None:
+            known = known + pushed
+        return np.concatenate([known, inner]) if own else known
 
-    x = np.concatenate([begin, np.zeros((own, begin.shape[1]))])
+    x = np.concatenate([trial.begin, np.zeros((own, trial.begin.shape[1]))])
     path = np.empty((sent.shape[1] // 2 + 1, *x.shape))
     path[0] = x
     for k in range(len(path) - 1):
         a, b, c = sent[:, 2 * k], sent[:, 2 * k + 1], sent[:, 2 * k + 2]
-        k1 = rate(x, a)
-        k2 = rate(x + 0.5 * h * k1, b)
-        k3 = rate(x + 0.5 * h * k2, b)
-        x = x + h / 6.0 * (k1 + 2.0 * (k2 + k3) + rate(x + h * k3, c))
+        if trial.held:
+            c = b  # the next value begins where this step ends
+        w = None if push is None else push[:, k]
+        k1 = rate(x, a, w)
+        k2 = rate(x + 0.5 * h * k1, b, w)
+        k3 = rate(x + 0.5 * h * k2, b, w)
+        x = x + h / 6.0 * (k1 + 2.0 * (k2 + k3) + rate(x + h * k3, c, w))
         path[k + 1] = x
     return path.transpose(1, 0, 2)[:n]
 

@@ -16,7 +16,7 @@ from itertools import combinations
 
 import numpy as np
 
-from mkc_torch.challenge.dynamics.errors import OUTLIERS, Errors
+from mkc_torch.challenge.dynamics.errors import OUTLIERS, Whitening
 from mkc_torch.challenge.dynamics.integrate import simulate, variation
 from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Trial
 from mkc_torch.challenge.dynamics.rivals import SUPERSETS, Account, accounts
@@ -63,7 +63,7 @@ class Tangents:
     accounts: Sequence[tuple[Account, Array]]
 
 
-def tangents(scene: Scene, errors: Errors, *, rivals: bool) -> Tangents:
+def tangents(scene: Scene, errors: Whitening, *, rivals: bool) -> Tangents:
     """Along the course of a scene, by the variational equation.
 
     Args:
@@ -79,7 +79,7 @@ def tangents(scene: Scene, errors: Errors, *, rivals: bool) -> Tangents:
     forcing = np.concatenate(blocks, -1).transpose(1, 2, 0, 3)
     begin = np.zeros((runs, n, forcing.shape[-1]))
     begin[:, :, p : p + n] = np.eye(n)
-    jacobian = _by_states(plant, x, u).transpose(2, 3, 0, 1)
+    jacobian = jacobian_by_states(plant, x, u).transpose(2, 3, 0, 1)
     moved = variation(jacobian, forcing, begin, trial.step / plant.fine)[:: plant.fine // 2]
     traces = moved.transpose(2, 0, 1, 3)[[plant.row(name) for name in plant.outputs]]
     starts = np.einsum("mtrn,rs->mtrsn", traces[..., p : p + n], np.eye(runs))
@@ -95,7 +95,7 @@ def tangents(scene: Scene, errors: Errors, *, rivals: bool) -> Tangents:
     return Tangents(errors.whitened(known), told)
 
 
-def _by_states(plant: Plant, x: Array, u: Array) -> Array:
+def jacobian_by_states(plant: Plant, x: Array, u: Array) -> Array:
     """Jacobian (n, n, F, R) of the rates, by central differences."""
     p = plant.values
     scale = np.abs(x).max((1, 2)) + 1e-9
@@ -130,7 +130,7 @@ def _by_parameters(plant: Plant, x: Array, u: Array) -> Array:
     return np.stack(columns, -1) if columns else np.zeros((*x.shape, 0))
 
 
-def power(plant: Plant, trial: Trial, hidden: Hidden, size: float, errors: Errors) -> Power:
+def power(plant: Plant, trial: Trial, hidden: Hidden, size: float, errors: Whitening) -> Power:
     """Of an effect at its size, about the parameters and first states that follow it best without it."""
     truth = simulate(plant, trial, hidden, size).outputs
     scene = Scene(plant, trial, simulate(plant, trial))

@@ -49,11 +49,15 @@ class Plant:
 
 @dataclass(frozen=True)
 class Trial:
-    """Runs of one length: inputs (k, T, R) at the samples, between which they are linear, and first states (n, R)."""
+    """Runs of one length: inputs (k, T, R) at the samples, and first states (n, R).
+
+    Between samples inputs are linear, or ``held`` at what they were at the sample before.
+    """
 
     step: float
     inputs: Array
     begin: Array
+    held: bool = False
 
     @property
     def samples(self) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 from torch import Generator
 
 from mkc_torch.challenge.draws import happens, log_uniform
-from mkc_torch.challenge.dynamics.errors import Errors
+from mkc_torch.challenge.dynamics.errors import Whitening
 from mkc_torch.challenge.dynamics.integrate import outputs_of_sizes
 from mkc_torch.challenge.dynamics.oracle import Judge, tangents
 from mkc_torch.challenge.dynamics.plant import Hidden
@@ -27,7 +27,7 @@ _LEAST = 1e-3
 """Smallest size that is tried, as a share of the large one."""
 
 
-def draw_size(g: Generator, hidden: Hidden, scene: Scene, errors: Errors, *, outside: bool) -> float:
+def draw_size(g: Generator, hidden: Hidden, scene: Scene, errors: Whitening, *, outside: bool) -> float:
     """A size between a trifle and ``hidden.large``.
 
     Args:

@@ -73,7 +73,7 @@ _TINY = 1e-12
 
 
 @dataclass(frozen=True)
-class _Spoilt:
+class Spoilt:
     """A measurement, and what went into it beside the truth: errors of the length in µT, and which samples are bad."""
 
     measured: Float[Tensor, "N 3"]
@@ -112,14 +112,14 @@ def draw(
     name = name or f"case_{index:05d}"
     if empty:
         spoilt = spoil_scene(stream("errors"), scene, noise, outliers, torch.zeros_like(scene.field))
-        key = _key(name, "empty", plan, scene, noise, outliers, spoilt, columns)
-        return Case(_recording(name, scene, spoilt, columns), None, key)
+        key = key_of(name, "empty", plan, scene, noise, outliers, spoilt, columns)
+        return Case(recording_of(name, scene, spoilt, columns), None, key)
     found = size_effects(stream("size"), kind, effects, scene, noise, outliers, plan, columns)
     sizes = [size for size, _ in found]
-    spoilt = spoil_scene(stream("errors"), scene, noise, outliers, _total(effects, sizes, scene))
+    spoilt = spoil_scene(stream("errors"), scene, noise, outliers, total_of(effects, sizes, scene))
     later = later_scene(stream("later"), scene)
     later_columns = draw_columns(stream("later columns"), plan, later, noise)
-    again = spoil_scene(stream("later errors"), later, noise, outliers, _total(effects, sizes, later))
+    again = spoil_scene(stream("later errors"), later, noise, outliers, total_of(effects, sizes, later))
     traces = [[effect.trace(at) for effect in effects] for at in (scene, later)]
     rms = second_residual(
         (Metric(scene, noise, False), Metric(later, noise, False)),
@@ -127,17 +127,17 @@ def draw(
         (spoilt.errors, again.errors),
         (~spoilt.mask, ~again.mask),
     )
-    key = _key(name, kind, plan, scene, noise, outliers, spoilt, columns)
+    key = key_of(name, kind, plan, scene, noise, outliers, spoilt, columns)
     key = replace(
         key,
         effects=tuple(
-            _key_effect(effect, size, power, plan) for effect, (size, power) in zip(effects, found, strict=True)
+            key_effect(effect, size, power, plan) for effect, (size, power) in zip(effects, found, strict=True)
         ),
         second_outliers=_numbers(again.mask),
         oracle_rms=rms,
     )
-    second = _recording(f"{name}_second", later, again, later_columns)
-    return Case(_recording(name, scene, spoilt, columns), second, key)
+    second = recording_of(f"{name}_second", later, again, later_columns)
+    return Case(recording_of(name, scene, spoilt, columns), second, key)
 
 
 def draw_scene(g: Generator, duration: float = DURATION, rate: float = RATE) -> Scene:
@@ -237,17 +237,18 @@ def _own_family(
     return None
 
 
-def spoil_scene(g: Generator, scene: Scene, noise: Noise, outliers: Outliers, effect: Float[Tensor, "N 3"]) -> _Spoilt:
+def spoil_scene(g: Generator, scene: Scene, noise: Noise, outliers: Outliers, effect: Float[Tensor, "N 3"]) -> Spoilt:
     """The measurement of a scene with an effect, noise and outliers, µT."""
     count = len(scene.time)
     errors = axis_errors(g, noise, count) + ambient_errors(g, noise, count)[:, None] * scene.along
     direction = torch.nn.functional.normalize(scene.field, dim=-1)
     bad, mask = spoil(g, outliers, noise.sigma, direction)
     clean = scene.field @ scene.sensor.soft.mT + scene.sensor.hard
-    return _Spoilt(clean + effect + errors + bad, errors, mask)
+    return Spoilt(clean + effect + errors + bad, errors, mask)
 
 
-def _total(effects: Sequence[Hidden], sizes: Sequence[float], scene: Scene) -> Tensor:
+def total_of(effects: Sequence[Hidden], sizes: Sequence[float], scene: Scene) -> Float[Tensor, "N 3"]:
+    """What effects of those sizes add to the measurement, µT."""
     total = torch.zeros_like(scene.field)
     for effect, size in zip(effects, sizes, strict=True):
         total = total + size * effect.trace(scene)
@@ -269,7 +270,7 @@ def _drivers(effect: Hidden, plan: Plan) -> tuple[str, ...]:
     return POSITION if effect.driver == "position" else (effect.driver,)
 
 
-def _recording(name: str, scene: Scene, spoilt: _Spoilt, columns: Mapping[str, Tensor]) -> Recording:
+def recording_of(name: str, scene: Scene, spoilt: Spoilt, columns: Mapping[str, Tensor]) -> Recording:
     axes = zip(("mag_x", "mag_y", "mag_z"), spoilt.measured.unbind(-1), strict=True)
     return Recording({"time": scene.time.round(decimals=6), **rounded(dict(axes)), **columns}, name=name)
 
@@ -278,14 +279,14 @@ def _numbers(mask: Tensor) -> tuple[int, ...]:
     return tuple(mask.nonzero().ravel().tolist())
 
 
-def _key(
+def key_of(
     name: str,
     kind: str,
     plan: Plan,
     scene: Scene,
     noise: Noise,
     outliers: Outliers,
-    spoilt: _Spoilt,
+    spoilt: Spoilt,
     columns: Mapping[str, Tensor],
 ) -> Key:
     return Key(
@@ -305,7 +306,7 @@ def _key(
     )
 
 
-def _key_effect(effect: Hidden, size: float, power: Power, plan: Plan) -> KeyEffect:
+def key_effect(effect: Hidden, size: float, power: Power, plan: Plan) -> KeyEffect:
     drivers = _drivers(effect, plan)
     told = [KeyRival(rival.effect, rival.drivers, rival.z_sep) for rival in power.rivals]
     return KeyEffect(

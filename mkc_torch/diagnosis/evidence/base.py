@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, scored
+from mkc_torch.diagnosis.findings.follows import units_of
 from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.fit import FittedModel, without_term
@@ -40,6 +41,7 @@ class Case:
         number: of the finding, for a test that is asked of each.
         estimate: the final parameters; None ahead of them.
         ahead: what the test's own ``ahead`` gave.
+        judged: the same as ``held_out`` under the pushes that are left, by which findings were confirmed.
     """
 
     base: FittedModel
@@ -53,10 +55,25 @@ class Case:
     number: int = 0
     estimate: Estimate | None = None
     ahead: Any = None
+    judged: tuple[Evidence, ...] = ()
 
     @property
     def prepared(self) -> PreparedSimulation:
         return self.base.model.prepared
+
+    @property
+    def of_states(self) -> bool:
+        """Whether a trajectory is simulated, which may be lost."""
+        return (
+            self.prepared.ports.get("output") is not None
+            and self.prepared.ports["output"].clock is None
+            and any(port.clock is not None for port in self.prepared.ports.values())
+        )
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Of the channels."""
+        return units_of(self.prepared)
 
     @property
     def final(self) -> Estimate:

@@ -6,6 +6,7 @@ import torch
 
 from mkc_torch.diagnosis.evidence.base import Case, Told
 from mkc_torch.diagnosis.evidence.held_out import Evidence, gain_interval, held_out
+from mkc_torch.diagnosis.evidence.held_out_sizes import sizes_of
 from mkc_torch.diagnosis.result import HeldOut
 
 __all__ = ["beside_the_others", "test"]
@@ -23,7 +24,7 @@ def beside_the_others(case: Case) -> Evidence | None:
 
 def _confirmed(case: Case) -> bool:
     """Whether unseen blocks are surely better with it, before anything else was found."""
-    before, after = case.held_out[case.number : case.number + 2]
+    before, after = (case.judged or case.held_out)[case.number : case.number + 2]
     difference = after.log_likelihood - before.log_likelihood
     return gain_interval(difference, case.blocks.block, torch.Generator().manual_seed(case.seed))[1][0] > 0.0
 
@@ -33,11 +34,16 @@ def test(case: Case) -> Told:
     if not _long_enough(case, case.number):
         return said(None, _TOO_SHORT)
     before, after = case.held_out[case.number : case.number + 2]
+    worse, better = case.judged[case.number : case.number + 2] if case.judged else (before, after)
     note = ""
     if case.ahead is not None:
         before, after, note = case.ahead, case.held_out[-1], _BESIDE
-    gain, interval = gain_interval(after.log_likelihood - before.log_likelihood, case.blocks.block, _draws(case))
-    return said(HeldOut(gain, interval, case.rms(before), case.rms(after), case.prepared.unit), note)
+        worse, better = before, after
+    gain, interval = gain_interval(better.log_likelihood - worse.log_likelihood, case.blocks.block, _draws(case))
+    outputs, left = sizes_of(case.prepared, case.units, before, after, case.blocks)
+    one = next(iter(outputs.values())) if len(outputs) == 1 and case.of_states else None
+    sizes = (case.rms(before), case.rms(after)) if one is None else (one.before, one.after)
+    return said(HeldOut(gain, interval, *sizes, case.prepared.unit, outputs, left), note)
 
 
 def said(held: HeldOut | None, note: str) -> Told:

@@ -246,7 +246,7 @@ def _read(content: Mapping[str, Any], known: Sequence[Effect], simulation: Simul
 
 
 def _effect(entry: Mapping[str, Any], known: Sequence[Effect]) -> Effect:
-    """The one of that id; of several curves without a name, that with these numbers in its shape."""
+    """The one of that id; of several forms, that with these numbers in its shape."""
     if entry["effect"] == Unrecorded.id and any(name.startswith(COURSE) for name in entry["shape"]):
         return Unrecorded()
     same = [effect for effect in reversed(known) if effect.id == entry["effect"]]
@@ -257,8 +257,8 @@ def _effect(entry: Mapping[str, Any], known: Sequence[Effect]) -> Effect:
         )
     numbers = set(entry["shape"])
     of_shape = [one for one in same if set(one.relative) <= numbers]
-    effect = (of_shape or same)[0]
-    lost = sorted(set(effect.fitted_shape) - numbers)
+    effect = max(of_shape or same, key=lambda one: (-len(set(one.choices) - numbers), len(set(one.choices) & numbers)))
+    lost = sorted({*effect.fitted_shape, *effect.relative} - numbers)
     if lost:
         raise ModelFileError(
             f'the shape of its effect "{effect.id}" lacks {", ".join(lost)}; it may be of another version: diagnose '

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 from mkc_torch.recording.recording import DEFAULT_UNITS
 from mkc_torch.simulation.dynamics.definition import Dynamics
+from mkc_torch.simulation.dynamics.ports import memory_at
+from mkc_torch.simulation.dynamics.surroundings import surroundings
 from mkc_torch.simulation.dynamics.user_functions import kinematic
 from mkc_torch.simulation.parameter import Parameter
 
@@ -25,6 +27,7 @@ _FROM_HERE: Mapping[str, str] = {
     "played(": "from mkc_torch.effects import played",
     "shifted(": "from mkc_torch.effects import shifted",
     "soft_clip(": "from mkc_torch.effects import soft_clip",
+    "curve_within(": "from mkc_torch.effects import curve_within",
     "beyond(": "from mkc_torch.effects import beyond",
     "SimpleNamespace(": "from types import SimpleNamespace",
     "Parameter(": "from mkc_torch.simulation import Parameter",
@@ -47,14 +50,14 @@ def python_source(
 
     Args:
         system: the diagnosed one.
-        theta: its parameters, then the first states, which are left out.
+        theta: its parameters, then the first states; these are left out, but for guesses of internal states.
         terms, gammas: the effects.
         measured: the outputs that were compared.
         module: to import the diagnosed class from.
     """
     kind = type(system)
     rates: list[str] = []
-    memories = tuple(_memory(state) for term in terms if (state := _remembering(term)))
+    memories = {name: like for term in terms for name, like in _memories(term).items()}
     inputs: list[str] = []
     outputs: list[str] = []
     for term, gamma in zip(terms, gammas, strict=True):
@@ -69,7 +72,7 @@ def python_source(
         "    parameters = {",
         *(f"        {line}" for line in _parameters(system, theta)),
         "    }",
-        *_states(kind.__name__, memories),
+        *_states(system, memories, theta),
         *_actuated(inputs),
         *_derivative(memories, rates),
         *_sensed(outputs),
@@ -108,10 +111,17 @@ def _parameters(system: Dynamics, theta: Sequence[float]) -> list[str]:
     return lines
 
 
-def _states(base: str, memories: Sequence[str]) -> list[str]:
-    """The states with the internal ones that effects bring."""
+def _states(system: Dynamics, memories: Mapping[str, str], theta: Sequence[float]) -> list[str]:
+    """The states with the internal ones that effects bring; one that begins like another state begins about there."""
+    base, first = type(system).__name__, theta[len(system.parameters) :]
+    guesses: dict[str, float] = {}
+    for name, like in memories.items():
+        begun = first[system.states.index(like) :: len(system.states)] if like else ()
+        guesses |= {name: sum(begun) / len(begun)} if begun else {}
     told = ", ".join(json.dumps(name) for name in memories)
-    return [f"    states = (*{base}.states, {told})"] if memories else []
+    lines = [f"    states = (*{base}.states, {told})"] if memories else []
+    guessed = ", ".join(f"{json.dumps(name)}: {_rounded(value)!r}" for name, value in guesses.items())
+    return [*lines, f"    initial = {{**{base}.initial, {guessed}}}"] if guessed else lines
 
 
 def _actuated(inputs: list[str]) -> list[str]:
@@ -121,7 +131,7 @@ def _actuated(inputs: list[str]) -> list[str]:
     return ["", "    def actuated(self, time, u, p, run):", *(f"        {line}" for line in lines)]
 
 
-def _derivative(memories: Sequence[str], rates: list[str]) -> list[str]:
+def _derivative(memories: Mapping[str, str], rates: list[str]) -> list[str]:
     if not rates:
         return []
     still = [f'rates["{name}"] = torch.zeros_like(x.{name})' for name in memories]
@@ -143,14 +153,10 @@ def _sensed(outputs: list[str]) -> list[str]:
     return ["", "    def sensed(self, time, y, p, run):", *(f"        {line}" for line in lines)]
 
 
-def _remembering(term: Term) -> str:
-    """The state whose rate an effect with memory acts on; empty for others."""
-    kind, _, state = term.port.rpartition("rate of ")
-    return state if kind.startswith("hysteretic") else ""
-
-
-def _memory(state: str) -> str:
-    return f"memory_of_{state}"
+def _memories(term: Term) -> dict[str, str]:
+    """The internal states that an effect brings, and the state that each begins like; empty for 0."""
+    kind, _, state = term.port.rpartition(" of ")
+    return memory_at(kind, state)
 
 
 def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Sequence[str]) -> list[str]:
@@ -164,9 +170,10 @@ def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Seque
     before: list[str] = []
     if "rate of " in term.port:
         state = term.port.rpartition("rate of ")[2]
-        targets, names = [f'rates["{state}"]'], _parts(state, system)
+        memories = _memories(term)
+        targets = [f'rates["{name}"]' for name in (state, *memories)]
+        names = _parts(state, system) | _numbered([f"x.{name}" for name in memories])
         before = _load(state) if term.port.startswith("loaded") else []
-        targets += [f'rates["{_memory(one)}"]' for one in [_remembering(term)] if one]
     elif term.port.startswith("exchange of "):
         one, _, other = term.port.removeprefix("exchange of ").partition(" and ")
         targets = [f'rates["{one}"]', f'rates["{other}"]']
@@ -193,11 +200,16 @@ def _parts(state: str, system: Dynamics) -> dict[str, str]:
     return {
         "own": f"x.{state}",
         **dict.fromkeys(("position", "angle", "deflection"), f"x.{position}"),
+        "surroundings": f"u.{surroundings(system).get(state, '')}",
         "load": "load",
         "rate": f'self.plain_rates(time, x, u, p)["{state}"]',
-        "memory": f"x.{_memory(state)}",
         "zero": "273.15" if celsius else "0.0",
     }
+
+
+def _numbered(memories: Sequence[str]) -> dict[str, str]:
+    """Expressions of internal states: memory, memory_2 and so on."""
+    return {"memory" if k == 0 else f"memory_{k + 1}": one for k, one in enumerate(memories)}
 
 
 def _load(state: str) -> list[str]:

@@ -23,7 +23,10 @@ _EVEN: dict[str, Callable[[Tensor], Tensor]] = {"{}": lambda x: x, "{}²": torch
 _SIGNED: dict[str, Callable[[Tensor], Tensor]] = {
     **_EVEN, "|{}|": torch.abs, "{0} |{0}|": lambda x: x * x.abs(), "sign({})": torch.sign
 }  # fmt: skip
-_POSITIVE: dict[str, Callable[[Tensor], Tensor]] = {**_EVEN, "√{}": torch.sqrt}
+_FROM_ZERO: dict[str, Callable[[Tensor], Tensor]] = {**_EVEN, "√{}": torch.sqrt}
+_POSITIVE: dict[str, Callable[[Tensor], Tensor]] = {
+    **_FROM_ZERO, "/ {}": torch.reciprocal, "/ {}²": lambda x: x.square().reciprocal()
+}  # fmt: skip
 
 
 def formulas(curve: Curve) -> tuple[str, ...]:
@@ -44,14 +47,19 @@ def formulas(curve: Curve) -> tuple[str, ...]:
         ('δ(rate of speed) = −0.5 speed |speed| m/s² (0 % off)',)
     """
     x = curve.x
-    signed = float(x.min()) < 0.0 < float(x.max())
-    library = _SIGNED if signed else _POSITIVE if float(x.min()) >= 0.0 else _EVEN
-    columns = {name: make(x) for name, make in library.items()}
+    columns = {name: make(x) for name, make in _library(float(x.min()), float(x.max())).items()}
     name = curve.driver
     return tuple(
         _formula(channel, name, curve.value_unit, columns, curve.value[:, k], curve.band[:, k])
         for k, channel in enumerate(curve.channels)
     )
+
+
+def _library(least: float, most: float) -> dict[str, Callable[[Tensor], Tensor]]:
+    """Terms that are finite over a range."""
+    if least < 0.0:
+        return _SIGNED if most > 0.0 else _EVEN
+    return _POSITIVE if least > 0.0 else _FROM_ZERO
 
 
 def _formula(

@@ -51,6 +51,8 @@ class Located:
         look: the search that told candidates apart.
         beside_nothing: the search that the p-value is from; that of ``look`` is another one where an effect was named.
         stretch: samples without which there is nothing, first and the one after the last, if they are few.
+        compared: fits of the leading candidates, each under the noise of the world that it leaves; none where all are
+            under the same.
     """
 
     term: Term
@@ -62,6 +64,7 @@ class Located:
     look: Look
     beside_nothing: Linearised
     stretch: tuple[int, int] | None = None
+    compared: Sequence[FittedModel] = ()
 
     @property
     def scene(self) -> Scene:

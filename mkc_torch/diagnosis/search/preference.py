@@ -45,7 +45,8 @@ class Preference:
 
     def handicap(self, term: Term, gain: float) -> float:
         """What a candidate's gain is lessened by before it is compared with others."""
-        fixed, share, give = 0.0, 0.0, self._settings
+        share, give = 0.0, self._settings
+        fixed = self._of_form(term)
         if term.effect.is_curve:
             fixed, share = give.nameless, give.over_motion if term.driver is None else give.over_driver
         if term.driver is not None and term.driver.role == ANY:
@@ -65,13 +66,19 @@ class Preference:
     def by_innovations(self, one: FittedModel, other: FittedModel, price: float = AKAIKE) -> float:
         """Nats by which the other of two fits is preferred, their noise taken for coloured: as a joint fit does not.
 
-        Each pays a price for every number it has. 0 where one has a handicap, which is meant for likelihoods.
+        Each pays a price for every number it has, and for a form that has others as special cases. 0 where one has
+        another handicap, which is meant for likelihoods.
         """
         terms = [fit.model.terms[-1] for fit in (one, other)]
-        if any(self.handicap(term, 1.0) > 0.0 for term in terms):
+        forms = [self._of_form(term) for term in terms]
+        if any(self.handicap(term, 1.0) > form for term, form in zip(terms, forms, strict=True)):
             return 0.0
         sizes = [fit.model.sizes[-1] + _fitted_numbers(fit.model.terms[-1]) for fit in (one, other)]
-        return either_way(one.residual, other.residual) - price * (sizes[1] - sizes[0])
+        return either_way(one.residual, other.residual) - price * (sizes[1] - sizes[0]) - (forms[1] - forms[0])
+
+    def _of_form(self, term: Term) -> float:
+        """What it gives for a form that has named ones as special cases."""
+        return self._settings.general if term.effect.general else 0.0
 
     def _alike(self, course: Float[Tensor, " N"]) -> float:
         """Largest correlation with one of the known drivers, either sign."""

@@ -13,6 +13,8 @@ from mkc_torch.effects.dynamics.coupling import Coupling
 from mkc_torch.effects.dynamics.cubic_stiffness import CubicStiffness
 from mkc_torch.effects.dynamics.dead_zone import DeadZone
 from mkc_torch.effects.dynamics.hard_stop import HardStop
+from mkc_torch.effects.dynamics.hidden_lag import HiddenLag
+from mkc_torch.effects.dynamics.hidden_mode import HiddenMode
 from mkc_torch.effects.dynamics.input_delay import InputDelay
 from mkc_torch.effects.dynamics.input_saturation import InputSaturation
 from mkc_torch.effects.dynamics.linear_drag import LinearDrag
@@ -20,16 +22,19 @@ from mkc_torch.effects.dynamics.load_dependent_friction import LoadDependentFric
 from mkc_torch.effects.dynamics.magnus_lift import MagnusLift
 from mkc_torch.effects.dynamics.overflow import Overflow
 from mkc_torch.effects.dynamics.position_periodic_force import PositionPeriodicForce
+from mkc_torch.effects.dynamics.power_law import PowerLaw
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from mkc_torch.effects.dynamics.sensor_lag import SensorLag
 from mkc_torch.effects.dynamics.stribeck_friction import StribeckFriction
 from mkc_torch.effects.dynamics.thermal_loss import ThermalLoss
+from mkc_torch.effects.dynamics.unknown_near_ends import UnknownNearEnds
 from mkc_torch.effects.dynamics.unknown_rate import UnknownRate
 
 __all__ = ["DYNAMICS"]
 
 DYNAMICS: tuple[Effect, ...] = (
     ConstantForce(),
+    LinearDrag(beside=True),
     LinearDrag(),
     QuadraticDrag(),
     CoulombFriction(),
@@ -37,20 +42,28 @@ DYNAMICS: tuple[Effect, ...] = (
     LoadDependentFriction(),
     CubicStiffness(),
     PositionPeriodicForce(),
+    PowerLaw("difference"),
+    PowerLaw("position"),
+    PowerLaw(),
     BoucWenHysteresis(),
+    HiddenLag(),
+    HiddenMode(),
     AddedMass(),
     Buoyancy(),
     Coupling(),
     MagnusLift(),
     HardStop(),
     Overflow(),
+    ThermalLoss(beside=True),
     ThermalLoss(),
     InputDelay(),
     InputSaturation(),
     DeadZone(),
     Backlash(),
     SensorLag(),
+    UnknownRate("difference"),
     UnknownRate("own"),
     UnknownRate("position"),
+    UnknownNearEnds(),
 )
 """The effects that a diagnosis of differential equations tries."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.dynamics.rate import SURROUNDINGS, RateEffect
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -17,11 +17,14 @@ if TYPE_CHECKING:
 class LinearDrag(RateEffect):
     """Viscous friction or a leak: the state loses in proportion to itself.
 
-    Simulation: adds ``−γ x`` to the rate of a state x.
+    Simulation: adds ``−γ x`` to the rate of a state x, or ``−γ (x − u)`` where an input u is its surroundings.
     Drivers: none but the state.
     Units: γ in 1/s.
     Plausible: γ ≥ 0; a negative drag would feed energy in.
-    Source: Stokes' law of drag at small Reynolds numbers; viscous friction of bearings.
+    Source: Stokes' law of drag at small Reynolds numbers; viscous friction of bearings; Newton's law of cooling.
+
+    Args:
+        beside: of the difference to the surroundings.
     """
 
     id = "linear_drag"
@@ -32,8 +35,19 @@ class LinearDrag(RateEffect):
     advice = "Add viscous drag with this coefficient."
     source = "Stokes' law at small Reynolds numbers; viscous friction of bearings"
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
-        return -context.part("own")
+    def __init__(self, *, beside: bool = False) -> None:
+        if beside:
+            self.needs, self.choices = ("own", SURROUNDINGS), (SURROUNDINGS,)
+            self.equation = "δẋ = −γ (x − u)"
+            self.explanation = "The state evens out with its surroundings, in proportion to its difference to them."
+            self.advice = "Add a loss to the surroundings with this coefficient."
 
-    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
-        return (f"-{gamma[0]!r} * {names['own']}",)
+    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+        return (dict.fromkeys(self.choices, 1.0),)
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+        return -(context.part("own") - context.part(SURROUNDINGS) if SURROUNDINGS in shape else context.part("own"))
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        own = names["own"]
+        return (f"-{gamma[0]!r} * " + (f"({own} - {names[SURROUNDINGS]})" if SURROUNDINGS in shape else own),)

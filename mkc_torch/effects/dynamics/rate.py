@@ -14,7 +14,10 @@ from mkc_torch.effects.context import Context, Quantity, Shape
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["RateEffect", "beyond"]
+__all__ = ["SURROUNDINGS", "RateEffect", "beyond"]
+
+SURROUNDINGS = "surroundings"
+"""The part that is an input which a state is known by its difference to; in a shape, that the effect is of this."""
 
 _LEAST = 1e-30
 
@@ -23,7 +26,8 @@ class RateEffect(GainEffect):
     """An effect that adds ``γ · course`` to the rate of one state. Give it a ``course``, a function of the signal.
 
     The signal at such a port is all states and inputs; the state whose rate it is, is its part "own", and what that
-    state is the speed of, if anything, its part "position".
+    state is the speed of, if anything, its part "position"; an input that is its surroundings, such as the temperature
+    outside, is its part "surroundings".
 
     Attributes:
         power: of the unit of what it is along in the course, for the unit of γ; 0 for a course without unit.
@@ -40,6 +44,10 @@ class RateEffect(GainEffect):
         if not self.power:
             return context.signal_unit
         return quotient(context.signal_unit, context.unit_of(self.along), int(self.power)) or "1/s"
+
+    def equation_of(self, shape: Shape, context: Context) -> str:
+        beside = f",  u = {context.parts[SURROUNDINGS]}" if SURROUNDINGS in shape else ""
+        return f"{self.equation}{beside}"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity(self.gain, 1, self.unit(context)),)

@@ -8,40 +8,53 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.dynamics.rate import SURROUNDINGS, RateEffect
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-ZERO = 273.15
+ZERO, ROOM = 273.15, 293.15
 
 
 class ThermalLoss(RateEffect):
     """A body loses heat by radiation, with the fourth power of its temperature.
 
-    Simulation: adds ``−γ (T⁴ − T₀⁴) / (4 T₀³)`` to the rate of a temperature, T absolute and T₀ 293 K.
+    Simulation: adds ``−γ (T⁴ − T₀⁴) / (4 T₀³)`` to the rate of a temperature, T absolute and T₀ 293 K; where an input
+        u is the surroundings', ``−γ (T⁴ − u⁴) / (4 T₀³)``.
     Drivers: none but the state.
     Units: γ in 1/s, as of a linear loss near T₀.
     Plausible: γ ≥ 0.
     Source: Stefan and Boltzmann's law.
+
+    Args:
+        beside: to the surroundings that an input tells.
     """
 
     id = "thermal_loss"
-    needs = ("own", "temperature")
+    needs: tuple[str, ...] = ("own", "temperature")
     gain = "loss"
     equation = "δṪ = −γ (T⁴ − T₀⁴) / (4 T₀³)"
     explanation = "The body loses heat with the fourth power of its absolute temperature: it radiates."
     advice = "Add radiation with this coefficient."
     source = "Stefan and Boltzmann's law"
 
+    def __init__(self, *, beside: bool = False) -> None:
+        if beside:
+            self.needs, self.choices = ("own", "temperature", SURROUNDINGS), (SURROUNDINGS,)
+            self.equation = "δṪ = −γ (T⁴ − u⁴) / (4 T₀³)"
+
+    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+        return (dict.fromkeys(self.choices, 1.0),)
+
     def unit(self, context: Context) -> str:  # noqa: ARG002
         return "1/s"
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         offset = ZERO if context.unit_of("own") == "°C" else 0.0
-        room = 293.15
-        return -((context.part("own") + offset).pow(4) - room**4) / (4.0 * room**3)
+        around = (context.part(SURROUNDINGS) + offset).pow(4) if SURROUNDINGS in shape else ROOM**4
+        return -((context.part("own") + offset).pow(4) - around) / (4.0 * ROOM**3)
 
-    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
-        return (f"-{gamma[0]!r} * (({names['own']} + {names['zero']}) ** 4 - 293.15**4) / (4.0 * 293.15**3)",)
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        around = f"({names[SURROUNDINGS]} + {names['zero']})" if SURROUNDINGS in shape else f"{ROOM!r}"
+        return (f"-{gamma[0]!r} * (({names['own']} + {names['zero']}) ** 4 - {around} ** 4) / (4.0 * {ROOM!r}**3)",)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mkc_torch._support.unit_text import sized
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.dynamics.rate import SURROUNDINGS, RateEffect
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -23,15 +23,16 @@ DEGREE = 4
 class UnknownRate(RateEffect):
     """The rate of a state follows a smooth curve over a part of the motion: physics that the catalogue does not have.
 
-    Simulation: adds ``Σ γ_j P_j(x / reach)`` to the rate, with Legendre polynomials P_1 to P_4 of the state itself, or
-    of the position whose speed it is; beyond the largest value of the recording the curve goes on as a constant.
-    Drivers: none but the state.
+    Simulation: adds ``Σ γ_j P_j(x / reach)`` to the rate, with Legendre polynomials P_1 to P_4 of the state itself, of
+        its difference to an input that is its surroundings, or of the position whose speed it is; beyond the largest
+        value of the recording the curve goes on as a constant.
+    Drivers: none but the state and its surroundings.
     Units: γ in the state's unit per s; the reach in that of what the curve is over.
     Plausible: any size, either sign.
     Source: none; it is a curve and no physics.
 
     Args:
-        of: the part that the curve is over, ``own`` or ``position``.
+        of: what the curve is over, ``own``, ``difference`` or ``position``.
     """
 
     id = "unknown"
@@ -45,15 +46,21 @@ class UnknownRate(RateEffect):
     source = "none: a curve, not physics"
 
     def __init__(self, of: str = "own") -> None:
-        self.along = of
-        self.needs = ("own", of)
+        self.of = of
+        part = SURROUNDINGS if of == "difference" else of
+        self.along = "position" if of == "position" else "own"
+        self.needs = ("own", part)
         self._reach = f"reach_of_{of}"
-        self.choices = (self._reach,)
-        self.relative: Mapping[str, tuple[str, str]] = {self._reach: (of, "largest")}
+        self.choices: tuple[str, ...] = (self._reach,)
+        self.relative: Mapping[str, tuple[str, str]] = {self._reach: (part, "largest")}
 
     def equation_of(self, shape: Shape, context: Context) -> str:
         reach = sized(float(shape[self._reach]), context.unit_of(self.along))
-        return f"{self.equation},  f(x) = Σ γ_j P_j(x / {reach}),  P_j Legendre's polynomials, constant beyond ±1"
+        of, beside = "x", ""
+        if self.of == "difference":
+            of, beside = "(x − u)", f",  u = {context.parts[SURROUNDINGS]}"
+        told = f"f(x) = Σ γ_j P_j({of} / {reach}),  P_j Legendre's polynomials, constant beyond ±1"
+        return f"{self.equation},  {told}{beside}"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return ({self._reach: 1.0},)
@@ -61,15 +68,21 @@ class UnknownRate(RateEffect):
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return tuple(Quantity(f"{self.gain}_{j}", 1, context.signal_unit) for j in range(1, DEGREE + 1))
 
+    def over(self, context: Context) -> Float[Tensor, " N"]:
+        """What the curve is over."""
+        y = context.part(self.along)
+        return y - context.part(SURROUNDINGS) if self.of == "difference" else y
+
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:
-        t = (context.part(self.along) / shape[self._reach]).clamp(-1.0, 1.0)
+        t = (self.over(context) / shape[self._reach]).clamp(-1.0, 1.0)
         square = t.square()
         fourth = (35.0 * square.square() - 30.0 * square + 3.0) / 8.0
         curves = torch.stack([t, 1.5 * square - 0.5, 2.5 * t * square - 1.5 * t, fourth], -1)
         return (curves @ gamma).unsqueeze(-1)
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
-        t = f"torch.clamp({names[self.along]} / {shape[self._reach]!r}, -1.0, 1.0)"
+        y = f"({names['own']} - {names[SURROUNDINGS]})" if self.of == "difference" else names[self.along]
+        t = f"torch.clamp({y} / {shape[self._reach]!r}, -1.0, 1.0)"
         curves = (t, f"(1.5 * {t} ** 2 - 0.5)", f"(2.5 * {t} ** 3 - 1.5 * {t})")
         fourth = f"(35.0 * {t} ** 4 - 30.0 * {t} ** 2 + 3.0) / 8.0"
         return (" + ".join(f"({one!r}) * {curve}" for one, curve in zip(gamma, (*curves, fourth), strict=True)),)

@@ -12,9 +12,25 @@ from mkc_torch.simulation.protocol import Clock
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["smooth_between"]
+__all__ = ["inputs_between", "smooth_between"]
 
 _POINTS = 6
+
+
+def inputs_between(
+    values: Float[Tensor, "N u"], how: str, time: Float[Tensor, " N"], begins: Bool[Tensor, " N"], clock: Clock
+) -> Float[Tensor, "S u"]:
+    """Values at the moments of a clock: "held" at the sample before, "linear", or "smooth".
+
+    Args:
+        values: at the samples.
+        how: as above.
+        time, begins: of the samples in s, and where a run begins.
+        clock: the moments.
+    """
+    if how == "held":
+        return values[clock.before]
+    return clock.at(values) if how == "linear" else smooth_between(values, time, begins, clock)
 
 
 def smooth_between(

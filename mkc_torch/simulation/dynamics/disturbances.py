@@ -5,24 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 from torch import Tensor
 
-from mkc_torch.simulation.dynamics.kalman import Flow, Models, filtered, robust_likelihood
+from mkc_torch.simulation.dynamics.kalman import Flow, Models, Parts, filtered, robust_likelihood
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Disturbed", "disturbed", "observer_of"]
+__all__ = ["Disturbed", "disturbed", "models_of", "observer_of", "usual_size"]
 
 _SIZES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 """Tried, over that at which a disturbance moves an output by as much as its white noise."""
 
 _LASTING = (0.004, 0.015, 0.06, 0.25)
 """Time constants tried, as shares of the longest run."""
+
+_STRETCH, _BEFORE = 150, 50
+"""Samples of a stretch that is filtered beside others, and before it, for the filter to find its way."""
 
 _FINER = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.0)
 _ROUNDS = 3
@@ -49,14 +53,21 @@ class Disturbed:
 
 @dataclass(frozen=True)
 class _Noise:
-    """One model of the noise: disturbances by their number of place, size and time constant."""
+    """One model of the noise: disturbances by their number of place, size and time constant, and what is declared."""
 
     sensor: tuple[float, ...]
     pushes: tuple[tuple[int, float, float], ...] = ()
+    known: tuple[bool, ...] = ()
 
 
 def disturbed(
-    flow: Flow, names: Sequence[str], channels: Sequence[str], floor: Float[Tensor, " m"], least: float, most: int = 2
+    flow: Flow,
+    names: Sequence[str],
+    channels: Sequence[str],
+    floor: Float[Tensor, " m"],
+    known: Sequence[bool],
+    least: float,
+    most: int,
 ) -> Disturbed:
     """The likeliest noise along a flow: one disturbance after the other is taken up, whichever gains most.
 
@@ -64,26 +75,30 @@ def disturbed(
         flow: of the trajectory.
         names: of the states whose rates can be pushed, in the order of the flow.
         channels: of the outputs.
-        floor: a first guess of the outputs' white noise.
+        floor: the outputs' white noise where it is known, else a first guess.
+        known: whether it is known.
         least: nats that a disturbance has to gain.
         most: disturbances at most.
     """
     p, m = flow.rates, len(channels)
-    best = _Noise(tuple(floor.tolist()))
-    best, value = _finer(flow, best)
+    best = _Noise(tuple(floor.tolist()), (), tuple(known))
+    best, value = _white(flow, best)
     gains: list[float] = []
     for _ in range(most):
         tried = [replace(best, pushes=(*best.pushes, one)) for one in _candidates(flow, best, p + m)]
-        values, scales = _likelihoods(flow, tried)
-        number = int(values.argmax())
-        if values[number] <= value:
+        if not tried:
             break
-        other, more = _finer(flow, _scaled(tried[number], float(scales[number])))
-        if more < value + least:
+        values, scales = _likelihoods(flow, tried)
+        number = int(np.nan_to_num(values, nan=-np.inf).argmax())
+        other = _finer(flow, _scaled(tried[number], float(scales[number])))
+        more, scale = _exactly(flow, other)
+        # the others may have come nearer to their best as well
+        value = max(value, _exactly(flow, replace(other, pushes=other.pushes[:-1]))[0])
+        if not more > value + least:
             break
         gains.append(more - value)
-        best, value = other, more
-    errors = _errors(flow, best, value)
+        best, value = _scaled(other, scale), more
+    errors = _errors(flow, best)
     found = [Disturbance((*names, *channels)[place], place < p, lasting, size) for place, size, lasting in best.pushes]
     return Disturbed(tuple(found), errors, tuple(gains), floor.new_tensor(best.sensor), value)
 
@@ -99,7 +114,7 @@ def _candidates(flow: Flow, known: _Noise, places: int) -> list[tuple[int, float
     for place in range(places):
         if place < p:
             times = [0.0, *lasting]
-            units = [_unit(flow, place, time, sensor) for time in times]
+            units = [usual_size(flow, place, time, sensor) for time in times]
         else:
             times, units = list(lasting), [float(sensor[place - p])] * len(lasting)
         for time, unit in zip(times, units, strict=True):
@@ -119,7 +134,7 @@ _REACH = 400
 """Samples over which the effect of a push is followed to find its usual size."""
 
 
-def _unit(flow: Flow, place: int, lasting: float, sensor: Float[np.ndarray, " m"]) -> float:
+def usual_size(flow: Flow, place: int, lasting: float, sensor: Float[np.ndarray, " m"]) -> float:
     """The size of a push at which it moves an output by the sensor's noise, somewhere along a run."""
     N = len(flow.new)
     state = np.zeros(flow.carried.shape[1])
@@ -159,20 +174,50 @@ def _models(flow: Flow, noises: Sequence[_Noise]) -> Models:
 
 
 def _likelihoods(flow: Flow, noises: Sequence[_Noise]) -> tuple[np.ndarray, np.ndarray]:
-    return robust_likelihood(filtered(flow, _models(flow, noises)), flow.counts)
+    """Of each, its scale profiled out, and that scale; at the scale it has, where some of the sensors' is declared."""
+    return _by_parts(_parts(flow), flow, noises)
+
+
+def _exactly(flow: Flow, noise: _Noise) -> tuple[float, float]:
+    """The same of one, in one stretch: without a push there is nothing that corrects a filter which begins inside."""
+    values, scales = _by_parts(flow.whole, flow, [noise])
+    return float(values[0]), float(scales[0])
+
+
+def _by_parts(parts: Parts, flow: Flow, noises: Sequence[_Noise]) -> tuple[np.ndarray, np.ndarray]:
+    return robust_likelihood(filtered(parts, _models(flow, noises)), parts.mine, free=not any(noises[0].known))
+
+
+@lru_cache(maxsize=2)
+def _parts(flow: Flow) -> Parts:
+    return flow.in_parts(_STRETCH, _BEFORE)
 
 
 def _scaled(noise: _Noise, scale: float) -> _Noise:
-    return _Noise(tuple(scale * one for one in noise.sensor), tuple((a, scale * s, t) for a, s, t in noise.pushes))
+    pushes = tuple((place, scale * size, lasting) for place, size, lasting in noise.pushes)
+    return replace(noise, sensor=tuple(scale * one for one in noise.sensor), pushes=pushes)
 
 
-def _finer(flow: Flow, noise: _Noise) -> tuple[_Noise, float]:
+def _white(flow: Flow, noise: _Noise) -> tuple[_Noise, float]:
+    """The sensors' white noise alone, each output by itself where there are several."""
+    if not any(noise.known):
+        new = flow.new
+        sizes = [
+            float(np.median(np.abs(one[used > 0])) / 0.6745) for one, used in zip(new.T, flow.counts.T, strict=True)
+        ]
+        typical = [max(size, 1e-300) for size in sizes]
+        noise = min((noise, replace(noise, sensor=tuple(typical))), key=lambda one: -_exactly(flow, one)[0])
+    value, scale = _exactly(flow, noise)
+    return _scaled(noise, scale), value
+
+
+def _finer(flow: Flow, noise: _Noise) -> _Noise:
     """Sizes, time constants and the sensors' noise one after the other, on a grid that closes in; the scale at once."""
-    value = -math.inf
     power = 1.0
     for _ in range(_ROUNDS):
         tried = [noise]
-        for j in range(len(noise.sensor) if noise.pushes or len(noise.sensor) > 1 else 0):
+        alone = len(noise.sensor) == 1 and not noise.pushes  # its size is the scale
+        for j in [j for j, known in enumerate(noise.known) if not known and not alone]:
             tried += [
                 replace(noise, sensor=(*noise.sensor[:j], f**power * noise.sensor[j], *noise.sensor[j + 1 :]))
                 for f in _FINER
@@ -185,14 +230,14 @@ def _finer(flow: Flow, noise: _Noise) -> tuple[_Noise, float]:
                 others += [(place, f ** (0.5 * power) * size, lasting / f**power) for f in _FINER if f != 1.0]
             tried += [replace(noise, pushes=(*noise.pushes[:d], one, *noise.pushes[d + 1 :])) for one in others]
         values, scales = _likelihoods(flow, tried)
-        number = int(values.argmax())
-        noise, value = _scaled(tried[number], float(scales[number])), float(values[number])
+        number = int(np.nan_to_num(values, nan=-np.inf).argmax())
+        noise = _scaled(tried[number], float(scales[number]))
         if number == 0:
             power *= 0.4
-    return noise, value
+    return noise
 
 
-def _errors(flow: Flow, noise: _Noise, value: float) -> tuple[float, ...]:
+def _errors(flow: Flow, noise: _Noise) -> tuple[float, ...]:
     """Of the logarithm of each size, by the curvature of the likelihood."""
     if not noise.pushes:
         return ()
@@ -201,26 +246,30 @@ def _errors(flow: Flow, noise: _Noise, value: float) -> tuple[float, ...]:
         for sign in (-1.0, 1.0):
             one = (place, size * math.exp(sign * away), lasting)
             tried.append(replace(noise, pushes=(*noise.pushes[:d], one, *noise.pushes[d + 1 :])))
-    values, _ = _likelihoods(flow, tried)
+    (value, *values), _ = _likelihoods(flow, [noise, *tried])
     curves = [(2.0 * value - values[2 * d] - values[2 * d + 1]) / away**2 for d in range(len(noise.pushes))]
     return tuple(1.0 / math.sqrt(curve) if curve > 0 else math.inf for curve in curves)
 
 
-def observer_of(flow: Flow, found: Disturbed, names: Sequence[str], channels: Sequence[str]) -> Observer | None:
+def observer_of(
+    flow: Flow,
+    disturbances: tuple[Disturbance, ...],
+    sensor: Float[Tensor, " m"],
+    names: Sequence[str],
+    channels: Sequence[str],
+) -> Observer | None:
     """The gains of a noise along a flow; None where there is nothing but the sensors' white noise."""
-    if not found.disturbances:
+    if not disturbances:
         return None
-    places = [*names, *channels]
-    pushes = tuple((_place(places, one, len(names)), one.size, one.lasting) for one in found.disturbances)
-    models = _models(flow, [_Noise(tuple(found.sensor.tolist()), pushes)])
-    kept = filtered(flow, models, keep=True)
+    models = models_of(flow, disturbances, sensor, names, channels)
+    kept = filtered(flow.whole, models, keep=True)
     D, m = models.place.shape[1], flow.new.shape[1]
     own = np.zeros((m, D))
     for d in range(D):
         if models.place[0, d] >= len(names):
             own[models.place[0, d] - len(names), d] = 1.0
     C = np.concatenate([flow.seen, np.broadcast_to(own, (len(flow.new), m, D))], -1)
-    P = kept.prior[:, 0]
+    P = kept.prior[:, 0, 0]
     cross = P @ C.swapaxes(1, 2)
     S = C @ cross + np.diag(models.sensor[0] ** 2)
     counts = flow.counts
@@ -230,14 +279,27 @@ def observer_of(flow: Flow, found: Disturbed, names: Sequence[str], channels: Se
     # of mean logarithm 0, so that likelihoods compare
     level = np.exp(-np.log(np.diagonal(white, axis1=1, axis2=2)).mean(0))
     white = white * level[:, None]
-    as_tensor = found.sensor.new_tensor
+    as_tensor = sensor.new_tensor
     return Observer(
-        found.disturbances,
-        found.sensor,
+        tuple(channels),
+        disturbances,
+        sensor,
         as_tensor(gain),
         as_tensor(white),
         as_tensor(np.sqrt(np.diagonal(S, axis1=1, axis2=2).copy())),
     )
+
+
+def models_of(
+    flow: Flow,
+    disturbances: Sequence[Disturbance],
+    sensor: Float[Tensor, " m"],
+    names: Sequence[str],
+    channels: Sequence[str],
+) -> Models:
+    places = [*names, *channels]
+    pushes = tuple((_place(places, one, len(names)), one.size, one.lasting) for one in disturbances)
+    return _models(flow, [_Noise(tuple(sensor.tolist()), pushes, (False,) * len(channels))])
 
 
 def _place(places: Sequence[str], one: Disturbance, rates: int) -> int:

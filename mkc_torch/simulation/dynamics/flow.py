@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,43 +10,48 @@ import torch
 from torch import Tensor
 
 from mkc_torch.simulation.dynamics.kalman import Flow
+from mkc_torch.simulation.dynamics.observer import Observable
 from mkc_torch.simulation.dynamics.trajectory import carried, slopes
+from mkc_torch.simulation.protocol import Changes, Nearby
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Float
 
-    from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
-    from mkc_torch.simulation.protocol import Changes, Nearby
 
-__all__ = ["flow_of"]
+__all__ = ["flow_along", "flow_of"]
 
 
 def flow_of(
-    prepared: PreparedDynamics,
+    prepared: Observable,
     theta: Float[Tensor, " p"],
     changes: Changes,
     near: Nearby | None,
-    counts: Bool[Tensor, "N m"],
 ) -> Flow | None:
     """The flow near a trajectory, free or observed; None where there is no trajectory.
 
     Args:
         prepared: the simulation.
         theta, changes, near: of the trajectory; see :meth:`mkc_torch.simulation.PreparedSimulation.answer`.
-        counts: the samples that count.
     """
     found = prepared.trajectory(theta, changes, near)
-    if not found.converged:
-        return None
-    states = found.states.detach()
+    return flow_along(prepared, theta, found.states.detach(), changes) if found.converged else None
+
+
+def flow_along(
+    prepared: Observable,
+    theta: Float[Tensor, " p"],
+    states: Float[Tensor, "G n"],
+    changes: Changes = MappingProxyType({}),
+) -> Flow:
+    """The flow near given states at the moments of the grid, as if they were a trajectory."""
     n = len(prepared.system.states)
-    own, step = states[:, :n], prepared.grid.step
+    step = prepared.grid.step
     rate, jump = prepared.rate(theta, changes), prepared.jump(theta, changes)
     # internal states of effects and pushes are where they are; what is linearised are the system's own
     A, _ = carried(rate, states, step.unsqueeze(-1), jump)
     A = A[:, :n, :n].detach()
     places = [prepared.system.states.index(name) for name in prepared.pushable]
-    unit = torch.eye(n, dtype=own.dtype)[:, places]
+    unit = torch.eye(n, dtype=states.dtype)[:, places]
     G = step[:, None, None] * 0.5 * (unit + A @ unit)
     carry, push = _between_samples(A, G, prepared.rows)
     at = states[prepared.rows]
@@ -55,13 +61,12 @@ def flow_of(
     after = at if jump is None else jump.applied(states)[prepared.rows].detach()
     # the trajectory itself moved by its corrections and pushes
     shift = torch.einsum("kij,kj->ki", carry, (after - at)[:-1, :n])
-    lasting = prepared.lasting
-    for number, one in enumerate(lasting):
+    for number, one in enumerate(prepared.lasting):
         if one.at_rate:
-            value = after[:-1, states.shape[1] - len(lasting) + number]
+            value = after[:-1, states.shape[1] - len(prepared.lasting) + number]
             shift = shift + push[:, :, prepared.pushable.index(one.place)] * value.unsqueeze(-1)
     gap = torch.where(prepared.begins[1:], 0.0, prepared.time.diff())
-    arrays = (carry, push, C, new, shift, gap, counts.to(own.dtype))
+    arrays = (carry, push, C, new, shift, gap, prepared.counts.to(new.dtype), at[:, :n].std(0))
     return Flow(*(one.detach().cpu().numpy().astype(np.float64) for one in arrays))
 
 

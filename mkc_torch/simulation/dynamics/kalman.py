@@ -22,7 +22,7 @@ _CORNER = 2.5
 _SCALINGS = 30
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Flow:
     """A trajectory, linearised from sample to sample.
 
@@ -34,6 +34,7 @@ class Flow:
         shift: (N-1, n), by how much more than its own states the trajectory had moved at the next sample.
         step: (N-1,), in s.
         counts: (N, m), 0 where a sample does not count.
+        spread: (n,), standard deviation of each state along the trajectory.
     """
 
     carried: Float[np.ndarray, "N-1 n n"]
@@ -43,10 +44,64 @@ class Flow:
     shift: Float[np.ndarray, "N-1 n"]
     step: Float[np.ndarray, " N-1"]
     counts: Float[np.ndarray, "N m"]
+    spread: Float[np.ndarray, " n"]
 
     @property
     def rates(self) -> int:
         return self.pushed.shape[-1]
+
+    def in_parts(self, length: int, before: int) -> Parts:
+        """Stretches of so many samples, each with some before it in which a filter finds its way."""
+        N = len(self.new)
+        count = max(N // max(length, 1), 1)
+        edges = np.linspace(0, N, count + 1).astype(int)
+        own = int(np.diff(edges).max())
+        last = edges[1:] - 1
+        index = np.maximum(last[None, :] - (own + before - 1) + np.arange(own + before)[:, None], 0)
+        reached = last[None, :] - (own + before - 1) + np.arange(own + before)[:, None] >= 0
+        mine = (index >= edges[:-1][None, :]) & reached
+        step = np.maximum(index[1:] - 1, 0)
+        gone = reached[:-1]
+        return Parts(
+            np.where(gone[..., None, None], self.carried[step], 0.0),
+            np.where(gone[..., None, None], self.pushed[step], 0.0),
+            self.seen[index],
+            self.new[index],
+            np.where(gone[..., None], self.shift[step], 0.0),
+            np.where(gone, self.step[step], 0.0),
+            np.where(reached[..., None], self.counts[index], 0.0),
+            np.where(mine[..., None], self.counts[index], 0.0),
+            (edges[1:] - own - before) > 0,
+            self.spread,
+        )
+
+    @property
+    def whole(self) -> Parts:
+        """In one stretch."""
+        return self.in_parts(len(self.new), 0)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Stretches of a flow side by side: its arrays with a second dimension, of the G stretches.
+
+    Attributes:
+        carried, pushed, seen, new, shift, step, counts: as a flow has them.
+        mine: (L, G, m), what counts of a stretch's own samples.
+        inside: (G,), whether it begins within the flow, where its states are not known.
+        spread: (n,), by how much they are not.
+    """
+
+    carried: np.ndarray
+    pushed: np.ndarray
+    seen: np.ndarray
+    new: np.ndarray
+    shift: np.ndarray
+    step: np.ndarray
+    counts: np.ndarray
+    mine: np.ndarray
+    inside: np.ndarray
+    spread: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -73,94 +128,103 @@ class Models:
 
 @dataclass(frozen=True)
 class Filtered:
-    """What a filter leaves: standardised innovations, and for one model the covariances and states on its way."""
+    """What a filter leaves: standardised innovations of each stretch, and covariances and states on its way if kept."""
 
-    standard: Float[np.ndarray, "N B m"]
-    log_spread: Float[np.ndarray, "N B m"]
-    prior: Float[np.ndarray, "N B k k"]
-    state: Float[np.ndarray, "N B k"]
-    after: Float[np.ndarray, "N B k"]
-    posterior: Float[np.ndarray, "N B k k"]
+    standard: Float[np.ndarray, "L G B m"]
+    log_spread: Float[np.ndarray, "L G B m"]
+    prior: Float[np.ndarray, "L G B k k"]
+    state: Float[np.ndarray, "L G B k"]
+    after: Float[np.ndarray, "L G B k"]
+    posterior: Float[np.ndarray, "L G B k k"]
 
 
-def filtered(flow: Flow, models: Models, *, keep: bool = False) -> Filtered:
+_ABOUT = 0.1
+"""Share of a state's spread by which it may be off where a stretch begins."""
+
+
+def filtered(flow: Parts, models: Models, *, keep: bool = False) -> Filtered:
     """Run the filters; ``keep`` for covariances and states too."""
-    N, m = flow.new.shape
-    n, p, B = flow.carried.shape[1], flow.rates, len(models)
+    N, G, m = flow.new.shape
+    n, p, B = flow.carried.shape[2], flow.pushed.shape[-1], len(models)
     D = models.place.shape[1]
     k = n + D
     at_rate = models.place < p
     which = np.where(at_rate, models.place, 0)
-    C = np.zeros((B, m, k))
+    C = np.zeros((G, B, m, k))
     for d in range(D):
         for j in range(m):
-            C[:, j, n + d] = models.place[:, d] == p + j
-    state = np.zeros((B, k))
-    P = np.zeros((B, k, k))
+            C[:, :, j, n + d] = models.place[:, d] == p + j
+    state = np.zeros((G, B, k))
+    P = np.zeros((G, B, k, k))
     index = n + np.arange(D)
-    P[:, index, index] = models.size**2
+    P[..., index, index] = models.size**2
     variance = models.sensor**2
-    standard, log_spread = np.zeros((N, B, m)), np.zeros((N, B, m))
-    kept = (N, B, k, k) if keep else (0, B, k, k)
+    # where a stretch begins inside, its states are about where the trajectory has them
+    own = np.arange(n)
+    P[..., own, own] = np.where(flow.inside[:, None, None], (_ABOUT * flow.spread) ** 2, 0.0)
+    standard, log_spread = np.zeros((N, G, B, m)), np.zeros((N, G, B, m))
+    kept = (N, G, B, k, k) if keep else (0, G, B, k, k)
     priors, posteriors = np.zeros(kept), np.zeros(kept)
-    states, afters = np.zeros(kept[:3]), np.zeros(kept[:3])
-    A = np.zeros((B, k, k))
+    states, afters = np.zeros(kept[:4]), np.zeros(kept[:4])
+    A = np.zeros((G, B, k, k))
+    ratio = None if D == 0 else 1.0 / models.lasting
     for row in range(N):
         if row:
-            step = flow.step[row - 1]
-            A[:, :n, :n] = flow.carried[row - 1]
+            A[..., :n, :n] = flow.carried[row - 1][:, None]
+            pushed = flow.pushed[row - 1]
             if D:
-                push = flow.pushed[row - 1].T[which]  # (B, D, n)
-                A[:, :n, n:] = np.where(at_rate[..., None], push, 0.0).swapaxes(1, 2)
-                phi = np.exp(-step / models.lasting) if step > 0 else np.zeros_like(models.lasting)
-                A[:, index, index] = phi
+                push = pushed.swapaxes(1, 2)[:, which]  # (G, B, D, n)
+                A[..., :n, n:] = np.where(at_rate[..., None], push, 0.0).swapaxes(2, 3)
+                step = flow.step[row - 1][:, None, None]
+                phi = np.where(step > 0, np.exp(-step * ratio), 0.0)
+                A[..., index, index] = phi
             state = (A @ state[..., None])[..., 0]
-            state[:, :n] -= flow.shift[row - 1]
-            P = A @ P @ A.swapaxes(1, 2)
+            state[..., :n] -= flow.shift[row - 1][:, None]
+            P = A @ P @ A.swapaxes(2, 3)
             if D:
-                P[:, index, index] += models.size**2 * (1.0 - phi**2)
-            white = flow.pushed[row - 1] * models.white[:, None, :]
-            P[:, :n, :n] += white @ white.swapaxes(1, 2)
-        C[:, :, :n] = flow.seen[row]
+                P[..., index, index] += models.size**2 * (1.0 - phi**2)
+            white = pushed[:, None] * models.white[:, None, :]
+            P[..., :n, :n] += white @ white.swapaxes(2, 3)
+        C[..., :n] = flow.seen[row][:, None]
         if keep:
             priors[row], states[row] = P, state
         for j in range(m):
-            c = C[:, j]
+            c = C[:, :, j]
             Pc = (P @ c[..., None])[..., 0]
             S = (c * Pc).sum(-1) + variance[:, j]
-            root = np.sqrt(S)
-            z = (flow.new[row, j] - (c * state).sum(-1)) / root
-            standard[row, :, j], log_spread[row, :, j] = z, np.log(root)
-            if flow.counts[row, j]:
-                pulled = _CLIP * np.tanh(z / _CLIP) * root / S
-                state = state + Pc * pulled[:, None]
-                P = P - Pc[:, :, None] * Pc[:, None, :] / S[:, None, None]
+            root = np.sqrt(np.maximum(S, 1e-300))
+            z = (flow.new[row, :, j, None] - (c * state).sum(-1)) / root
+            standard[row, :, :, j], log_spread[row, :, :, j] = z, np.log(root)
+            used = flow.counts[row, :, j, None]
+            pulled = used * _CLIP * np.tanh(z / _CLIP) / root
+            state = state + Pc * pulled[..., None]
+            P = P - (used / S)[..., None, None] * Pc[..., :, None] * Pc[..., None, :]
         if keep:
             afters[row], posteriors[row] = state, P
     return Filtered(standard, log_spread, priors, states, afters, posteriors)
 
 
 def robust_likelihood(
-    found: Filtered, counts: Float[np.ndarray, "N m"]
+    found: Filtered, counts: Float[np.ndarray, "L G m"], *, free: bool = True
 ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"]]:
-    """Log-likelihood of each model with its scale profiled out, and that scale: Huber's density for innovations.
+    """Log-likelihood of each model by Huber's density for innovations, and its scale: profiled out if free, else one.
 
     Huber, "Robust Statistics" (1981), 4.5 and 7.7.
     """
-    N, B, m = found.standard.shape
-    weight = np.broadcast_to(counts[:, None, :], (N, B, m)).swapaxes(0, 1).reshape(B, -1)
-    z = np.abs(found.standard).swapaxes(0, 1).reshape(B, -1)
-    total = weight.sum(-1)
-    scale = np.maximum(np.median(z, -1) / 0.6745, 1e-300)
-    for _ in range(_SCALINGS):
+    B = found.standard.shape[2]
+    used = counts > 0
+    z = np.abs(found.standard).swapaxes(2, 3)[used].T  # (B, samples that count)
+    spread = found.log_spread.swapaxes(2, 3)[used].sum(0)
+    total = float(used.sum())
+    scale = np.maximum(np.median(z, -1) / 0.6745, 1e-300) if free else np.ones(B)
+    for _ in range(_SCALINGS if free else 0):
         ratio = z / scale[:, None]
         # the scale at which Huber's density is likeliest
         inner = ratio * np.minimum(ratio, _CORNER)
-        scale = scale * np.sqrt(np.maximum((weight * inner).sum(-1) / total, 1e-12))
+        scale = scale * np.sqrt(np.maximum(inner.sum(-1) / total, 1e-12))
     ratio = z / scale[:, None]
     rho = np.where(ratio <= _CORNER, 0.5 * ratio**2, _CORNER * ratio - 0.5 * _CORNER**2)
-    spread = found.log_spread.swapaxes(0, 1).reshape(B, -1)
-    value = -(weight * (rho + spread)).sum(-1) - total * np.log(scale)
+    value = -rho.sum(-1) - spread - total * np.log(scale)
     return value, scale
 
 
@@ -173,7 +237,7 @@ def smoothed(
     """
     N, n, p = len(flow.new), flow.carried.shape[1], flow.rates
     D = models.place.shape[1]
-    state, P = found.after[:, 0].copy(), found.posterior[:, 0].copy()
+    state, P = found.after[:, 0, 0].copy(), found.posterior[:, 0, 0].copy()
     for row in range(N - 2, -1, -1):
         step = flow.step[row]
         if step <= 0:
@@ -185,10 +249,10 @@ def smoothed(
             if place < p:
                 A[:n, n + d] = flow.pushed[row][:, place]
             A[n + d, n + d] = np.exp(-step / models.lasting[0, d])
-        prior, at = found.prior[row + 1, 0], found.state[row + 1, 0]
+        prior, at = found.prior[row + 1, 0, 0], found.state[row + 1, 0, 0]
         scale = 1.0 / np.sqrt(np.maximum(prior.diagonal(), 1e-300))
         inverse = np.linalg.pinv(prior * scale[:, None] * scale, rcond=1e-10, hermitian=True) * scale[:, None] * scale
-        back = found.posterior[row, 0] @ A.T @ inverse
-        state[row] = found.after[row, 0] + back @ (state[row + 1] - at)
-        P[row] = found.posterior[row, 0] + back @ (P[row + 1] - prior) @ back.T
+        back = found.posterior[row, 0, 0] @ A.T @ inverse
+        state[row] = found.after[row, 0, 0] + back @ (state[row + 1] - at)
+        P[row] = found.posterior[row, 0, 0] + back @ (P[row + 1] - prior) @ back.T
     return state, P

@@ -9,18 +9,20 @@ moved at each sample towards what was measured, and what is new in each sample i
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from torch import Tensor
 
-from mkc_torch.simulation.dynamics.trajectory import slopes
+from mkc_torch.simulation.dynamics.equations import Equations
+from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, slopes
+from mkc_torch.simulation.protocol import Answer, Changes, Nearby
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Correcting", "Disturbance", "Observer"]
+__all__ = ["Correcting", "Disturbance", "Observable", "Observer"]
 
 _CLIP = 4.0
 """Standard deviations of what is new in a sample beyond which it moves the states no further: it may be an outlier."""
@@ -42,12 +44,17 @@ class Disturbance:
     lasting: float
     size: float
 
+    def lasting_at_least(self, time: float) -> Disturbance:
+        """The same with a memory of its own."""
+        return replace(self, lasting=max(self.lasting, time))
+
 
 @dataclass(frozen=True)
 class Observer:
     """Gains by which states and lasting disturbances are corrected at the samples, and the scale of what is new.
 
     Attributes:
+        outputs: names.
         disturbances: all of them.
         sensor: (m,), standard deviation of each output's white noise.
         gain: (N, n + D, m), of n states and the D lasting disturbances, 0 where a sample does not count.
@@ -56,6 +63,7 @@ class Observer:
         spread: (N, m), standard deviation of each innovation.
     """
 
+    outputs: tuple[str, ...]
     disturbances: tuple[Disturbance, ...]
     sensor: Float[Tensor, " m"]
     gain: Float[Tensor, "N k m"]
@@ -114,3 +122,43 @@ class Correcting:
         """Values for the states with gains, as values for all states."""
         all_ = values.new_zeros(*values.shape[:-1], at.shape[1])
         return all_.index_copy(-1, torch.tensor(self.places, device=at.device), values)
+
+
+class Observable(Protocol):
+    """What the noise of the world asks of a prepared system of differential equations.
+
+    Attributes:
+        system: names and functions.
+        channels: the outputs.
+        pushable: states whose rate something unrecorded can push.
+        measured, counts: (N, m), the outputs as they were recorded, and which samples are no outliers by themselves.
+        time, begins: (N,), of the samples, and where a run begins.
+        grid, rows, guess: the moments, those of the samples, and a first guess of the states then.
+        bounds: of the parameters.
+        observer: that corrects it; None where it runs freely.
+        lasting: what an observer follows beside the states.
+    """
+
+    system: Equations
+    channels: tuple[str, ...]
+    measured: Tensor
+    counts: Tensor
+    time: Tensor
+    begins: Tensor
+    grid: Grid
+    rows: Tensor
+    guess: Tensor
+    bounds: tuple[Tensor, Tensor]
+    observer: Observer | None
+
+    @property
+    def pushable(self) -> tuple[str, ...]: ...
+    @property
+    def lasting(self) -> tuple[Disturbance, ...]: ...
+    def observed(self, observer: Observer | None) -> Any: ...
+    def trajectory(self, theta: Tensor, changes: Changes, near: Nearby | None = None) -> Trajectory: ...
+    def answer(self, theta: Tensor, changes: Changes, near: Nearby | None = None) -> Answer: ...
+    def rate(self, theta: Tensor, changes: Changes) -> Callable[[Tensor], Tensor]: ...
+    def jump(self, theta: Tensor, changes: Changes) -> Correcting | None: ...
+    def seen(self, theta: Tensor, changes: Changes) -> Tensor: ...
+    def predicted(self, theta: Tensor) -> Callable[[Tensor], Tensor]: ...

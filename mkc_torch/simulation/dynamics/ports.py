@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -11,14 +12,22 @@ from torch import Tensor
 
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.equations import Equations
-from mkc_torch.simulation.protocol import Clock, Port
+from mkc_torch.simulation.dynamics.surroundings import surroundings
+from mkc_torch.simulation.protocol import Clock, Port, Sizes
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["RATES", "Places", "common_unit"]
+__all__ = ["RATES", "Places", "common_unit", "memory_at"]
 
-RATES = ("rate", "loaded rate", "hysteretic rate", "exchange")
+_MEMORIES: Mapping[str, Mapping[str, bool]] = {
+    "hysteretic rate": {"memory_of": False},
+    "lagged rate": {"lagged": True},
+    "resonant rate": {"deflection_of": False, "hidden": True},
+}
+"""Kinds of ports with internal states: what they are called, and whether they begin like the state or at 0."""
+
+RATES = ("rate", "loaded rate", *_MEMORIES, "exchange")
 """Kinds of ports at which an effect adds to rates of change."""
 
 _REVERSED = 0.05
@@ -59,10 +68,9 @@ class Places:
             places[f"rate of {state}"] = self._rate_port(state, "rate", {**parts, **rate})
             if "position" in parts and system.inputs:
                 places[f"loaded rate of {state}"] = self._rate_port(state, "loaded rate", {**parts, "load": "load"})
-            # segments of one run would each begin without what the one before remembers
-            if "position" in parts and system.segment is None:
-                port = self._rate_port(state, "hysteretic rate", parts)
-                places[f"hysteretic rate of {state}"] = replace(port, memory=f"memory_of_{state}")
+            for kind in self._remembering(parts):
+                port = self._rate_port(state, kind, parts)
+                places[f"{kind} of {state}"] = replace(port, memory=memory_at(kind, state))
         pairs = [
             (one, other)
             for one, other in combinations((s for s in system.states if s not in self.kinematic), 2)
@@ -80,7 +88,7 @@ class Places:
                 kind="input",
                 parts={"own": name},
                 part_units={"own": self._unit_of(name)},
-                sizes={"own": _sizes(self.recording[name])},
+                sizes={"own": Sizes.of(self.recording[name])},
                 clock=self.clock,
                 run=self.run[self.clock.before],
             )
@@ -89,6 +97,13 @@ class Places:
         unit = common_unit(self._unit_of(name) for name in self.channels)
         output = Port(self.channels, unit, pointwise=False, parts=parts, part_units=units, run=self.run)
         return places | {"output": output}
+
+    def _remembering(self, parts: Mapping[str, str]) -> tuple[str, ...]:
+        """Kinds of ports with internal states that the rate of a state with these parts has."""
+        if self.system.segment is not None:
+            return ()  # segments of one run would each begin without what the one before remembers
+        needs = {"hysteretic rate": "position", "lagged rate": "own", "resonant rate": "flowing"}
+        return tuple(kind for kind, part in needs.items() if part in parts)
 
     def _parts(self, state: str) -> dict[str, str]:
         """What an effect on the rate of a state can refer to."""
@@ -102,6 +117,8 @@ class Places:
             parts["height"] = positions[0]
         if self._reverses(state):
             parts["reversing"] = state
+        if state in self._surroundings:
+            parts["surroundings"] = self._surroundings[state]
         if self._unit_of(state) in ("°C", "K"):
             parts["temperature"] = state
         else:
@@ -129,26 +146,43 @@ class Places:
             kind=kind,
             carries=(*self.system.states, *self.system.inputs, *(parts[of] for of in ("load", "rate") if of in parts)),
             parts=parts,
-            part_units={part: self._unit_of(name) for part, name in parts.items()},
-            sizes={
-                part: _sizes(self.guess[:, self.system.states.index(name)])
-                for part, name in parts.items()
-                if name in self.system.states
-            },
+            part_units={part: self._unit_of(state if part == "surroundings" else name) for part, name in parts.items()},
+            sizes=self._sizes(state, parts),
             clock=self.clock,
             run=self.run[self.clock.before],
         )
 
+    @cached_property
+    def _surroundings(self) -> dict[str, str]:
+        return surroundings(self.system)
+
+    def _sizes(self, state: str, parts: Mapping[str, str]) -> dict[str, Sizes]:
+        """Of the parts that are states, and of the surroundings how far the state is from them."""
+        values = dict(zip(self.system.states, self.guess.unbind(-1), strict=True))
+        sizes = {part: Sizes.of(values[name]) for part, name in parts.items() if name in values}
+        if "surroundings" in parts:
+            sizes["surroundings"] = Sizes.of(values[state] - self.recording[parts["surroundings"]])
+        return sizes
+
     def _unit_of(self, name: str) -> str:
         return self.system.units.get(name, self.recording.units[name] if name in self.recording else "")
+
+
+def memory_at(kind: str, state: str) -> dict[str, str]:
+    """Internal states at the rate of a state, and the state that each begins like; empty for 0.
+
+    Args:
+        kind: of the port.
+        state: whose rate it is.
+
+    Example:
+        >>> memory_at("resonant rate", "speed"), memory_at("rate", "speed")
+        ({'deflection_of_speed': '', 'hidden_speed': 'speed'}, {})
+    """
+    return {f"{name}_{state}": state if alike else "" for name, alike in _MEMORIES.get(kind, {}).items()}
 
 
 def common_unit(units: Iterable[str]) -> str:
     """The unit that all of them are; empty where they differ."""
     found = set(units)
     return found.pop() if len(found) == 1 else ""
-
-
-def _sizes(values: Float[Tensor, " N"]) -> tuple[float, float]:
-    """Typical and largest absolute value."""
-    return float(values.abs().median()), float(values.abs().amax())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ from torch import Tensor
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.nonlinear import GaussianPrior, NoFitError, fit, load_forward_mode
 from mkc_torch.recording.recording import Recording
-from mkc_torch.simulation.dynamics.between_samples import smooth_between
+from mkc_torch.simulation.dynamics.between_samples import inputs_between
 from mkc_torch.simulation.dynamics.checks import Moments, check_functions
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.first_guess import despiked, first_guess
@@ -64,6 +65,7 @@ class PreparedDynamics:
         }
         self.begins, self.labels = beginnings(recording, system)
         self.run = experiment_runs(recording)
+        self.between = dict.fromkeys(system.inputs, system.between)
         refuse_few(self.begins, system.name)
         self._kinematic = kinematic(system, self.known)
         self._lay_out(1)
@@ -75,6 +77,7 @@ class PreparedDynamics:
         self.bounds = self.time.new_tensor(low + [-torch.inf] * n), self.time.new_tensor(high + [torch.inf] * n)
         self._p = p
         self._clean = torch.stack([despiked(one, self.time, self.begins) for one in self.measured.unbind(-1)], -1)
+        self.counts = self._clean == self.measured
         self._check_functions()
         self._refine()
 
@@ -102,18 +105,36 @@ class PreparedDynamics:
         inputs = self.recording.stack(*self.system.inputs) if self.system.inputs else self.time.new_zeros(N, 0)
         self.inputs = self._between(inputs)
         self.inputs_at_rows = inputs
-        self._guess = first_guess(
+        self.guess = first_guess(
             self.system, self.recording, self.channels, self.begins, self._kinematic, time, node_before, node_share
         )
         self.__dict__.pop("ports", None)  # their clock is that of the stations
 
     def _between(self, inputs: Float[Tensor, "N u"]) -> Float[Tensor, "S u"]:
         """Inputs at the stations."""
-        if self.system.between == "held":
-            return inputs[self.clock.before]
-        if self.system.between == "linear":
-            return self.clock.at(inputs)
-        return smooth_between(inputs, self.time, self.begins, self.clock)
+        columns = [
+            inputs_between(inputs[:, [k]], how, self.time, self.begins, self.clock)
+            for k, how in enumerate(self.between.values())
+        ]
+        return torch.cat(columns, -1) if columns else inputs.new_zeros(len(self.clock.time), 0)
+
+    def holding(self, between: Mapping[str, str]) -> PreparedDynamics:
+        """The same with inputs that do something else between samples: "held", "linear" or "smooth", by their names."""
+        other = copy.copy(self)
+        other.between = {**self.between, **between}
+        other.inputs = other._between(self.inputs_at_rows)
+        for known in ("_start", "warnings"):
+            other.__dict__.pop(known, None)
+        return other
+
+    def guessed(self, near: Nearby | None) -> PreparedDynamics:
+        """The same with the states of a trajectory as its guess: states that no output shows have a size then."""
+        if not isinstance(near, Trajectory):
+            return self
+        other = copy.copy(self)
+        other.guess = near.states[:, : len(self.system.states)]
+        other.__dict__.pop("ports", None)
+        return other
 
     def observed(self, observer: Observer | None) -> PreparedDynamics:
         """The same, predicted from sample to sample by an observer; None for a free run."""
@@ -127,7 +148,7 @@ class PreparedDynamics:
     def ports(self) -> dict[str, Port]:
         """The rate of each state, exchange between two of the same unit, each input, and the outputs."""
         places = Places(
-            self.system, self.recording, self.channels, self._kinematic, self._guess[self.rows], self.clock, self.run
+            self.system, self.recording, self.channels, self._kinematic, self.guess[self.rows], self.clock, self.run
         )
         return places.ports()
 
@@ -137,29 +158,32 @@ class PreparedDynamics:
         return len(self.parameter_names) - self._p
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
-        return self._start.clone()
+        return self.observed(None)._start.clone()
+
+    @property
+    def given(self) -> Float[Tensor, " p"]:
+        """The user's values, and the first guess of the first states."""
+        values = self.time.new_tensor([one.value for one in self.known.values()])
+        return torch.cat([values, self.guess[self.grid.begins].flatten()])
 
     @cached_property
     def _start(self) -> Float[Tensor, " p"]:
         """The user's values, or those with which the measured states obey the equations, whichever simulates better."""
-        values = self.time.new_tensor([one.value for one in self.known.values()])
-        begin = self._guess[self.grid.begins].flatten()
-        starts = [torch.cat([values, begin])]
+        values, begin = self.given[: self._p], self.given[self._p :]
+        starts = [self.given]
         if self._p:
             step = self.grid.step.unsqueeze(-1)
-            typical = self._guess.abs().median(0).values.clamp(min=1e-12)
+            typical = self.guess.abs().median(0).values.clamp(min=1e-12)
 
             def lacking(values: Tensor) -> Tensor:
-                left = defect(self.rate(torch.cat([values, begin]), {}), self._guess, step) / typical
+                left = defect(self.rate(torch.cat([values, begin]), {}), self.guess, step) / typical
                 total = torch.cat([torch.zeros_like(left[:1]), left.cumsum(0)])
                 return total[_WINDOW:] - total[:-_WINDOW]
 
             low, high = (bound[: self._p] for bound in self.bounds)
-            try:
+            with suppress(NoFitError):  # the equations cannot be looked at there
                 found = fit(lacking, values, lower=low, upper=high, covariance=None, max_iter=60).theta
-            except NoFitError:
-                found = values  # the equations cannot be looked at there
-            starts.append(torch.cat([found, begin]))
+                starts.append(torch.cat([found, begin]))
         spread = [robust_scale(self.residual(one, {}).nan_to_num(torch.inf, torch.inf, torch.inf)) for one in starts]
         return starts[0] if bool((spread[0] <= spread[-1]).all()) else starts[-1]
 
@@ -168,13 +192,15 @@ class PreparedDynamics:
         """What of the parameters the recording leaves undetermined, near where the fit starts."""
         if not self._p:
             return ()
+        if self.observer is not None:
+            return self.observed(None).warnings
         load_forward_mode()
         theta = self.start()
         near = self.trajectory(theta, {})
         tangents = torch.func.jacfwd(lambda values: self.residual(values, {}, near))(theta).flatten(0, 1)
         # a value near 0 says nothing of the size that is meant
         meant = theta.new_tensor([one.value for one in self.known.values()])
-        typical = self._guess.abs().median(0).values.repeat(int(self.begins.sum()))
+        typical = self.guess.abs().median(0).values.repeat(int(self.begins.sum()))
         meant = torch.cat([meant.abs(), typical])
         size = torch.where(theta.abs() < _NOUGHT * meant, meant, theta.abs())
         return undetermined(tangents, size, self.parameter_names, self._p)
@@ -244,14 +270,16 @@ class PreparedDynamics:
         """
         begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
         rate = self.rate(theta, changes)
-        begin = _of_width(begin, begin.shape[1] + len(self._remembering(changes)) + len(self.lasting))
-        width, jump = begin.shape[1], self.jump(theta, changes)
+        memories = [like for memory in self._remembering(changes).values() for like in memory.values()]
+        memories += [""] * len(self.lasting)
+        begin, jump = self._with_memories(begin, memories), self.jump(theta, changes)
+        width = begin.shape[1]
         known = near if isinstance(near, Trajectory) else None
-        guess = _of_width(self._guess if known is None else known.states, width)
+        guess = self._with_memories(self.guess if known is None else known.states, memories)
         linear = known is not None and known.linear is not None and known.states.shape[1] == width
         found = solve(rate, self.grid, begin, guess, known if linear else None, jump=jump)
         if not found.converged and known is not None:
-            found = solve(rate, self.grid, begin, _of_width(self._guess, width), jump=jump)
+            found = solve(rate, self.grid, begin, self._with_memories(self.guess, memories), jump=jump)
         if not found.converged and known is None:
             nearer = marched(rate, self.grid, begin, guess, jump=jump)
             found = found if nearer is None else solve(rate, self.grid, begin, nearer, jump=jump)
@@ -265,13 +293,22 @@ class PreparedDynamics:
         first = torch.where(self.begins, torch.arange(len(self.time)), 0).cummax(0).values
         return self.time - self.time[first]
 
-    def _remembering(self, changes: Changes) -> dict[str, str]:
-        """Ports at which an effect brings an internal state, with its name: one that adds its rate when it sees it."""
+    def _with_memories(self, states: Float[Tensor, "G n"], memories: Sequence[str]) -> Float[Tensor, "G w"]:
+        """The states, and internal ones that are not yet among them: like another state, or zeros."""
+        n = len(self.system.states)
+        more = [
+            states[:, self.system.states.index(like)] if like else states.new_zeros(len(states))
+            for like in memories[states.shape[1] - n :]
+        ]
+        return torch.cat([states[:, : n + len(memories)], *(one.unsqueeze(-1) for one in more)], -1)
+
+    def _remembering(self, changes: Changes) -> dict[str, Mapping[str, str]]:
+        """Ports at which an effect brings internal states, with these: one that adds their rates when it sees them."""
         found = {}
         for name, port in self.ports.items():
             # what does not see the signal remembers nothing
             if port.memory and name in changes and not isinstance(changes[name], FreeChange):
-                seen = self._guess.new_zeros(len(self.clock.time), len(port.carries) + 1)
+                seen = self.guess.new_zeros(len(self.clock.time), len(port.carries) + len(port.memory))
                 if changes[name](seen).shape[1] > len(port.channels):
                     found[name] = port.memory
         return found
@@ -280,22 +317,22 @@ class PreparedDynamics:
         """Of the states, and of the internal states that effects bring, which come after them."""
         inputs = self._inputs(theta, changes)
         remembering = self._remembering(changes)
-        rows = [*self.system.states, *remembering.values()]
-        lasting = self.lasting
+        rows = [*self.system.states, *(one for memory in remembering.values() for one in memory)]
+        lasting, n = self.lasting, len(self.system.states)
         acting = [
-            (port, [rows.index(row) for row in (*port.channels, *([port.memory] if name in remembering else []))], name)
+            (port, [rows.index(row) for row in (*port.channels, *remembering.get(name, ()))], name)
             for name, port in self.ports.items()
             if port.kind in RATES and name in changes
         ]
 
         def rate(states: Tensor) -> Tensor:
-            own, memories, pushes = states.split([len(self.system.states), len(remembering), len(lasting)], -1)
+            own, memories, pushes = states.split([n, len(rows) - n, len(lasting)], -1)
             plain = self._rates(theta, own, inputs)
             rates = [*plain, *(torch.zeros_like(one) for one in memories.unbind(-1))]
             for port, places, name in acting:
                 signal = self._signal(port, theta, own, inputs, plain)
                 if name in remembering:
-                    signal = torch.cat([signal, states[:, places[-1:]]], -1)
+                    signal = torch.cat([signal, states[:, places[len(port.channels) :]]], -1)
                 for k, added in zip(places, changes[name](signal).unbind(-1), strict=True):
                     rates[k] = rates[k] + added
             for one, push in zip(lasting, pushes.unbind(-1), strict=True):
@@ -320,7 +357,8 @@ class PreparedDynamics:
         """How the observer corrects the states at the samples."""
         if self.observer is None:
             return None
-        n, memories, pushes = len(self.system.states), len(self._remembering(changes)), len(self.lasting)
+        n, pushes = len(self.system.states), len(self.lasting)
+        memories = sum(len(memory) for memory in self._remembering(changes).values())
         places = (*range(n), *range(n + memories, n + memories + pushes))
         by_states = self.predicted(theta)
 
@@ -406,7 +444,7 @@ class PreparedDynamics:
 
     def _check_functions(self) -> None:
         theta = self.time.new_tensor([one.value for one in self.known.values()])
-        at = self.grid.spread(self._guess)
+        at = self.grid.spread(self.guess)
         first = at[::3][:1].expand(len(self.time), -1)
         stations = Moments(self.clock.time, at, self.inputs, self.run[self.clock.before])
         samples = Moments(self.time, first, self.inputs_at_rows, self.run)
@@ -430,9 +468,3 @@ class PreparedDynamics:
                 break
             parts, before = 2 * parts, after
         self._lay_out(parts if bool(before.isfinite().all()) else 1)
-
-
-def _of_width(states: Float[Tensor, "G n"], width: int) -> Float[Tensor, "G w"]:
-    """The first states, and zeros for internal ones that are not among them."""
-    more = max(width - states.shape[1], 0)
-    return torch.cat([states[:, :width], states.new_zeros(len(states), more)], -1)

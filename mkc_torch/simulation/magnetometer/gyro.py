@@ -52,9 +52,9 @@ class GyroView(View):
             "field": Port(("strength",), self.unit, pointwise=False),
         }
         self.prior = _prior()
-        self.window, first = _windows(self.time)
-        self.turned = rotation_since(self.time, recording.stack(*GYRO), first)
-        self.summed = _summed(self.turned, self.time, first)
+        self.window, self.first = _windows(self.time)
+        self.turned = rotation_since(self.time, recording.stack(*GYRO), self.first)
+        self.summed = _summed(self.turned, self.time, self.first)
         self.count = int(self.window.max()) + 1
         try:
             fit = self._ellipsoid(None)

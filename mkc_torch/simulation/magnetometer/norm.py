@@ -8,10 +8,12 @@ import torch
 from torch import Tensor
 
 from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
+from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.recording.recording import Recording
-from mkc_torch.simulation.magnetometer.matrix import SYMMETRIC
-from mkc_torch.simulation.magnetometer.view import AXES, View, length_of
+from mkc_torch.simulation.magnetometer.matrix import SOFT_IRON, SYMMETRIC
+from mkc_torch.simulation.magnetometer.parts import Surface, ellipsoid_of_a_part, sphere_of_all
+from mkc_torch.simulation.magnetometer.view import AXES, View, length_of, thinned
 from mkc_torch.simulation.protocol import Changes, Port
 
 if TYPE_CHECKING:
@@ -21,7 +23,19 @@ __all__ = ["NormView"]
 
 
 class NormView(View):
-    """Length of the field: one channel, the distance from the ellipsoid to first order, in the measurement's units."""
+    """Length of the field: one channel, the distance from the ellipsoid to first order, in the measurement's units.
+
+    Where all samples together determine no ellipsoid, a part of the recording may: the sensor is determined then
+    together with what changed it meanwhile, and a fit starts from that part.
+
+    Args:
+        recording: as prepared.
+        sphere: take the sphere nearest to the samples to start from, where no part determines an ellipsoid either, but
+            enough directions are there.
+
+    Raises:
+        NotIdentifiableError: the turns of the sensor do not determine it from the length.
+    """
 
     view = "norm"
     channels = ("norm",)
@@ -32,22 +46,39 @@ class NormView(View):
     )
     prior: GaussianPrior | None = None
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Recording, *, sphere: bool = False) -> None:
         super().__init__(recording)
         self.ports = {
             "sensor": Port(AXES, self.unit, wanders=True),
             "field": Port(("strength",), self.unit),
         }
-        fit = self._ellipsoid(None)
-        self.strength = float(fit.radius_)
-        self._full = self._theta(fit)
+        self.alone = True
+        """Whether the length determines the sensor without what changed it meanwhile."""
+        try:
+            fit = self._ellipsoid(None)
+        except NotIdentifiableError as error:
+            surface = self._of_less(sphere)
+            if surface is None:
+                raise
+            self.alone = False
+            self.strength = surface.radius
+            self._full = _numbers(surface.center, surface.matrix)
+            self.prior = _near(self._full)
+            self.warnings = (*self.warnings, _of_what(surface, self, error))
+        else:
+            self.strength = float(fit.radius_)
+            self._full = self._theta(fit)
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Tensor:
         return self._full.clone() if rows is None else self._theta(self._ellipsoid(rows))
 
+    def _of_less(self, sphere: bool) -> Surface | None:
+        chosen = thinned(self.thin)
+        found = ellipsoid_of_a_part(self.measured, chosen)
+        return sphere_of_all(self.measured, chosen) if found is None and sphere else found
+
     def _theta(self, fit: EllipsoidFit) -> Tensor:
-        matrix = fit.calibration_matrix_ * (self.strength / float(fit.radius_))
-        return torch.cat([fit.center_, torch.stack([matrix[i, j] for i, j in SYMMETRIC])])
+        return _numbers(fit.center_, fit.calibration_matrix_ * (self.strength / float(fit.radius_)))
 
     def residual(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 1"]:
         length, outward = self._length(theta, self._away(theta, changes).mT)
@@ -66,3 +97,27 @@ class NormView(View):
         matrix = self.matrix(theta)
         field = matrix @ away
         return length_of(field), matrix.mT @ field
+
+
+def _numbers(center: Float[Tensor, " 3"], matrix: Float[Tensor, "3 3"]) -> Float[Tensor, " 9"]:
+    return torch.cat([center, torch.stack([matrix[i, j] for i, j in SYMMETRIC])])
+
+
+def _near(theta: Float[Tensor, " 9"]) -> GaussianPrior:
+    """Of the matrix alone: without what is sought, the samples determine none."""
+    precision = torch.zeros_like(theta)
+    precision[3:] = SOFT_IRON**-2
+    return GaussianPrior(theta.clone(), precision)
+
+
+def _of_what(surface: Surface, view: View, error: NotIdentifiableError) -> str:
+    """A sentence about what a fit starts from."""
+    if (surface.first, surface.last) == (0, len(view.measured)):
+        what = "the sphere nearest to all samples"
+    else:
+        begin, end = float(view.time[surface.first]), float(view.time[surface.last - 1])
+        what = f"the ellipsoid of the samples from {begin:.4g} to {end:.4g} s"
+    return (
+        f"All samples together determine no ellipsoid; offset and matrix start from {what}, and hold together with "
+        f"what changed the sensor meanwhile. {error}"
+    )

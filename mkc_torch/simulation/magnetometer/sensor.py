@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from mkc_torch.calibration.calibrate import prepared
-from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.attitude import AttitudeView, with_attitude
+from mkc_torch.simulation.magnetometer.choice import chosen_view
 from mkc_torch.simulation.magnetometer.correction import MagnetometerCorrection
 from mkc_torch.simulation.magnetometer.gyro import GyroView
 from mkc_torch.simulation.magnetometer.norm import NormView
@@ -25,11 +25,13 @@ class Magnetometer:
     What is compared depends on the recording. With an attitude, the vector with the world's field. Otherwise, its
     length with the field's, as a distance in the units of the measurement; and where the turns of the sensor do not
     determine it from the length, but there is a gyroscope, the vector with the field of the same two seconds turned
-    along.
+    along. An attitude or a gyroscope that leaves far more of the field than its length does is not used where the
+    length determines the sensor, alone or together with what changed it; a warning says which, how much and why.
 
     Attributes:
-        use: "attitude", "norm" or "gyro"; None takes the first of these that the recording allows. The length goes
-            before the gyroscope because the drift of a gyroscope enters the vector as structure of its own.
+        use: "attitude", "norm" or "gyro"; None takes the first of these that the recording allows and that
+            explains the field. The length goes before the gyroscope because the drift of a gyroscope enters the vector
+            as structure of its own.
 
     Example:
         >>> from mkc_torch.recording.demonstration import simulated_recording
@@ -64,19 +66,14 @@ class Magnetometer:
         """
         if self.use not in (None, "attitude", "gyro", "norm"):
             raise ValueError(f"Expected argument `use` to be 'attitude', 'gyro', 'norm' or None but got {self.use!r}.")
-        has_attitude = all(name in recording for name in QUATERNION)
-        has_gyro = all(name in recording for name in GYRO) and recording.time is not None
-        if self.use == "attitude" or (self.use is None and has_attitude):
+        if self.use is None:
+            return chosen_view(recording)
+        if self.use == "attitude":
             return AttitudeView(prepared(with_attitude(recording)))
         if self.use == "gyro":
             recording["time"]
             return GyroView(prepared(recording.finite(*GYRO)))
-        try:
-            return NormView(prepared(recording))
-        except NotIdentifiableError:
-            if self.use == "norm" or not has_gyro:
-                raise
-        return GyroView(prepared(recording.finite(*GYRO)))
+        return NormView(prepared(recording))
 
     def correction(self, state: Mapping[str, Any], recording: Recording) -> MagnetometerCorrection:
         """The calibrated sensor on a new recording; see :class:`mkc_torch.simulation.Correction`."""

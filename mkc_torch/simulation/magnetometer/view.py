@@ -61,6 +61,10 @@ class View(ClosedForm):
         """What a model needs on another recording, and what the corrected field's length was here, in which unit."""
         return {"view": self.view, "unit": self.unit, "strength": self.strength}
 
+    def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:
+        """A robust guess of the parameters; see :meth:`mkc_torch.simulation.PreparedSimulation.start`."""
+        raise NotImplementedError
+
     @cached_property
     def time(self) -> Float[Tensor, " N"]:
         known = self.recording.time

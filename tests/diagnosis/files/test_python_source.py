@@ -6,6 +6,7 @@ import torch
 from mkc_torch import Recording
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.files.python_source import SourceError
+from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects import DYNAMICS
@@ -68,6 +69,8 @@ class Cart(Dynamics):
 PLACES = {
     "backlash": ("input push", {"half_gap": 0.3}),
     "bouc_wen_hysteresis": ("hysteretic rate of speed", {"yield_deflection": 0.2}),
+    "hidden_lag": ("lagged rate of drift", {"time_constant": 0.3}),
+    "hidden_mode": ("resonant rate of speed", {"period": 0.8, "damping": 0.05}),
     "added_mass": ("rate of speed", {}),
     "load_dependent_friction": ("loaded rate of speed", {"width": 0.05}),
     "buoyancy": ("rate of speed", {"surface": 0.1, "draught": 0.3}),
@@ -101,8 +104,45 @@ def test_the_corrected_class_simulates_what_the_model_does(names):
     exec(text.replace("from carts import Cart", ""), known)
     again = known["CorrectedCart"]().prepare(recording)
     starts = theta[1:].unflatten(0, (2, 4))
-    memory = starts.new_zeros(2, len(again.system.states) - 4)
+    like = {"lagged_drift": 3, "hidden_speed": 2}
+    inner = again.system.states[4:]
+    memory = [starts[:, like[name]] if name in like else starts.new_zeros(2) for name in inner]
+    memory = torch.stack(memory, -1) if memory else starts.new_zeros(2, 0)
+    for name in set(inner) & set(like):  # begun about where the runs of the recording begin
+        assert again.system.initial[name] == pytest.approx(float(starts[:, like[name]].mean()))
     whole = torch.cat([theta[:1], torch.cat([starts, memory], -1).flatten()])
     with_it = joint.residual(torch.cat([theta, *gammas]))
     torch.testing.assert_close(again.residual(whole, {}), with_it, rtol=0.0, atol=1e-7)
+    assert float((with_it - prepared.residual(theta, {})).abs().max()) > 1e-3
+
+
+class Heater(Dynamics):
+    states, inputs = ("temp",), ("power", "outside")
+    parameters = {"loss": 0.1}  # noqa: RUF012
+    units = {"temp": "°C"}  # noqa: RUF012
+    step = 0.05
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"temp": u.power - p.loss * (x.temp - u.outside)}
+
+
+@pytest.mark.parametrize("place", range(7))
+def test_forms_with_and_without_surroundings_come_back_from_files_and_are_written_out(place):
+    time = torch.arange(80, dtype=torch.float64) * 0.1
+    columns = {"time": time, "power": 3.0 + torch.sin(time), "outside": 5.0 + time.cos(), "temp": 20.0 + time}
+    prepared = Heater().prepare(Recording(columns))
+    forms = [t for t in candidate_terms(prepared, (), DYNAMICS) if t.port == "rate of temp"]
+    forms = {(t.effect.id, tuple(t.shape)): t for t in forms if t.effect.id != "constant_force"}
+    assert len(forms) == 7
+    term = list(forms.values())[place]
+    joint = JointModel(prepared, (term,))
+    theta, gamma = torch.tensor([0.2, 20.0]).double(), torch.full((joint.sizes[0],), 0.02).double()
+    model = DiagnosedModel("Heater", prepared.state, theta, [term], [gamma], Heater())
+    (again,) = DiagnosedModel.from_json(model.to_json(), simulation=Heater()).terms
+    assert again.effect is term.effect
+    known = {"Heater": Heater}
+    exec(model.to_python("heaters").replace("from heaters import Heater", ""), known)
+    written = known["CorrectedHeater"]().prepare(Recording(columns)).residual(theta, {})
+    with_it = joint.residual(torch.cat([theta, gamma]))
+    torch.testing.assert_close(written, with_it, rtol=0.0, atol=1e-6)
     assert float((with_it - prepared.residual(theta, {})).abs().max()) > 1e-3

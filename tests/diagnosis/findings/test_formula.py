@@ -24,6 +24,7 @@ def curve(make, low=-2.0, high=2.0, *, band=0.01, noise=0.0, driver="speed", uni
         (lambda x: -1.2 * torch.sign(x), (-2.0, 2.0), "−1.2 sign(speed) m/s² (0 % off)"),
         (lambda x: -0.4 * x + 0.03 * x * x.abs(), (-5.0, 5.0), "−0.4 speed + 0.03 speed |speed| m/s² (0 % off)"),
         (lambda x: 2.0 * x.sqrt(), (0.0, 9.0), "2 √speed m/s² (0 % off)"),
+        (lambda x: 0.05 / x**2, (0.2, 1.5), "0.05 / speed² m/s² (0 % off)"),
         (lambda x: 2.0 * x, (-9.0, -1.0), "2 speed m/s² (0 % off)"),
     ],
 )

@@ -39,6 +39,12 @@ def test_a_named_force_gives_nothing(search):
     assert prefer.handicap(drag, 100.0) == 0.0
 
 
+def test_a_form_that_has_others_as_special_cases_gives_five_nats(search):
+    prefer, terms = search
+    forms = {term.effect.id: prefer.handicap(term, 100.0) for term in terms if term.effect.general}
+    assert forms == {"power_law": 5.0, "hidden_lag": 5.0, "hidden_mode": 5.0}
+
+
 def test_a_curve_over_the_motion_gives_half_of_its_gain_and_ten_nats(search):
     prefer, terms = search
     curves = [term for term in terms if term.effect.is_curve and term.driver is None]

@@ -18,11 +18,11 @@ IDS = (
     "constant_force", "linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction",
     "load_dependent_friction", "cubic_stiffness", "position_periodic_force", "coupling", "hard_stop", "overflow",
     "thermal_loss", "input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "bouc_wen_hysteresis",
-    "added_mass", "magnus_lift", "buoyancy",
+    "added_mass", "magnus_lift", "buoyancy", "hidden_lag", "hidden_mode", "power_law",
 )  # fmt: skip
 
 LOSSES = ("linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction", "load_dependent_friction")
-EITHER_SIGN = ("constant_force", "cubic_stiffness", "position_periodic_force", "magnus_lift")
+EITHER_SIGN = ("constant_force", "cubic_stiffness", "position_periodic_force", "magnus_lift", "power_law")
 SHARES = ("input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "added_mass")
 
 N = 80
@@ -49,6 +49,7 @@ def test_what_brakes_takes_energy_out(name):
 
 def test_signs_of_amplitudes():
     assert {e.id for e in DYNAMICS if e.least == -math.inf} >= set(EITHER_SIGN)
+    assert {e.id: e.most for e in DYNAMICS if 1.0 < e.most < math.inf} == {"hidden_lag": 30.0, "hidden_mode": 10.0}
     assert {e.id for e in DYNAMICS if (e.least, e.most) == (0.0, 1.0)} >= set(SHARES)
     for effect in DYNAMICS:
         assert effect.one_sided or effect.id in EITHER_SIGN or effect.id not in IDS
@@ -107,6 +108,39 @@ class TestPhysics:
         assert self.at("hard_stop", [5.0, 3.0], shape, angle=1.2) == pytest.approx([-1.0])
         assert self.at("hard_stop", [5.0, 3.0], shape, angle=-1.2) == pytest.approx([0.6])
         assert self.at("hard_stop", [5.0, 3.0], shape, angle=0.9) == [0.0]
+
+    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    def test_a_whole_power_is_a_drag_or_a_spring(self, sign):
+        """γ is what there is at the scale; near 0, a thousandth of it, the curve is straight."""
+        of = {(e.id, e.along, "surroundings" in e.needs): e for e in DYNAMICS}
+        context = dynamic_context(OF["power_law"])
+        speed, angle, wind = (sign * context.component(name) for name in ("speed", "angle", "other"))
+        context = replace(context, signal=sign * context.signal)
+        for key, scale, exponent, expected in (
+            (("power_law", "own", False), "scale_of_own", 1.0, -speed),
+            (("power_law", "own", False), "scale_of_own", 2.0, -speed * speed.abs()),
+            (("power_law", "own", True), "scale_of_difference", 1.0, wind - speed),
+            (("power_law", "position", False), "scale_of_position", 3.0, -angle.pow(3)),
+        ):
+            found = change(of[key], [0.3 * 5.0**exponent], {scale: 5.0, "exponent": exponent}, context)[:, 0]
+            exact = exponent == 1.0
+            torch.testing.assert_close(found, 0.3 * expected, rtol=0.0, atol=1e-12 if exact else 1e-4)
+        named = {e.id: change(e, [0.3], {}, context)[:, 0] for e in (OF["linear_drag"], OF["quadratic_drag"])}
+        for name, exponent in (("linear_drag", 1.0), ("quadratic_drag", 2.0)):
+            shape = {"scale_of_own": 5.0, "exponent": exponent}
+            found = change(OF["power_law"], [0.3 * 5.0**exponent], shape, context)[:, 0]
+            torch.testing.assert_close(found, named[name], rtol=0.0, atol=1e-4)
+
+    def test_what_is_beside_surroundings_evens_out_with_them(self):
+        for name in ("linear_drag", "thermal_loss"):
+            (effect,) = [e for e in DYNAMICS if e.id == name and "surroundings" in e.needs]
+            context = dynamic_context(effect)
+            (shape,) = effect.shapes(context.time)
+            alike = context.signal.clone()
+            alike[:, 1] = alike[:, 2]
+            assert not bool(change(effect, [0.3], shape, replace(context, signal=alike)).any())
+            lost = change(effect, [0.3], shape, context)[:, 0] * (context.part("own") - context.part("surroundings"))
+            assert float(lost.max()) <= 0.0
 
     def test_only_what_is_above_the_rim_runs_over(self):
         assert self.at("overflow", [2.0], {"rim": 1.0, "exponent": 1.0}, speed=1.5) == pytest.approx([-1.0])
@@ -259,7 +293,7 @@ def tried(simulation):
     return places
 
 
-EVERYWHERE = {"constant_force", "linear_drag", "quadratic_drag"}
+EVERYWHERE = {"constant_force", "linear_drag", "quadratic_drag", "power_law"}
 REVERSING = {"coulomb_friction", "stribeck_friction"}
 
 
@@ -269,8 +303,11 @@ class TestNeeds:
     def test_of_a_pendulum(self):
         places = tried(prepared(Pendulum, angle=torch.cos(3.0 * TIME)))
         of_speed = EVERYWHERE | REVERSING | {"cubic_stiffness", "hard_stop", "position_periodic_force", "added_mass"}
-        assert set(places) == {"rate of speed", "hysteretic rate of speed", "output"}
+        remembering = {"hysteretic rate of speed", "lagged rate of speed", "resonant rate of speed"}
+        assert set(places) == {"rate of speed", "output", *remembering}
         assert places["hysteretic rate of speed"] == {"bouc_wen_hysteresis"}
+        assert places["lagged rate of speed"] == {"hidden_lag"}
+        assert places["resonant rate of speed"] == {"hidden_mode"}
         assert places["rate of speed"] & set(IDS) == of_speed
         assert places["output"] == {"sensor_lag"}
 
@@ -312,22 +349,52 @@ class TestNeeds:
 
         assert tried(prepared(Joints, x=TIME, y=TIME))["exchange of vx and vy"] == {"coupling"}
 
+    def test_what_has_surroundings_may_lose_to_them(self):
+        class Room(Dynamics):
+            states, inputs = ("inner", "wall"), ("power", "outside")
+            parameters = {"loss": 0.1}  # noqa: RUF012
+            units = {"inner": "°C", "wall": "°C"}  # noqa: RUF012
+
+            def derivative(self, time, x, u, p):  # noqa: ARG002
+                away = x.wall - x.inner
+                return {"inner": u.power + away, "wall": p.loss * (u.outside - x.wall) - away}
+
+        class Wind(Fall):
+            inputs = ("wind", "push")
+            units = {"height": "m", "speed": "m/s", "wind": "m/s"}  # noqa: RUF012
+
+        warm = {"inner": 30.0 + 0.0 * TIME, "wall": 20.0 + TIME, "power": TIME, "outside": 5.0 + 0.1 * TIME}
+        room = prepared(Room, **warm)
+        assert "surroundings" not in room.ports["rate of inner"].parts
+        assert room.ports["rate of wall"].parts["surroundings"] == "outside"
+        assert room.ports["rate of wall"].part_units["surroundings"] == "°C"
+        assert room.ports["rate of wall"].sizes["surroundings"].highest == pytest.approx(15.0 + 0.9 * 5.95)
+        forms = {t.effect.of for t in candidate_terms(room, (), DYNAMICS) if t.effect.id == "power_law"}
+        assert forms == {"difference"}  # a power of degrees Celsius is no physics
+        falling = prepared(Wind, height=100.0 - 0.5 * TIME**2, wind=TIME, push=TIME)
+        assert falling.ports["rate of speed"].parts["surroundings"] == "wind"
+        forms = {t.effect.of for t in candidate_terms(falling, (), DYNAMICS) if t.effect.id == "power_law"}
+        assert forms == {"difference", "own"}
+
     def test_segments_of_a_run_remember_nothing_of_each_other(self):
         class Pieces(Pendulum):
             segment = 2.0
 
-        assert "hysteretic rate of speed" not in prepared(Pieces, angle=torch.cos(3.0 * TIME)).ports
+        assert set(prepared(Pieces, angle=torch.cos(3.0 * TIME)).ports) == {"rate of speed", "output"}
 
     def test_of_two_bodies(self):
         decay = torch.exp(-0.1 * TIME)
         places = tried(prepared(Bodies, inner=20.0 + 60.0 * decay, outer=20.0 + 20.0 * decay))
         assert places["exchange of inner and outer"] == {"coupling"}
+        # heat is stored elsewhere too, and has no inertia to swing with
+        assert places["lagged rate of inner"] == {"hidden_lag"}
+        assert "resonant rate of inner" not in places
         assert places["rate of inner"] & set(IDS) == {"constant_force", "linear_drag", "thermal_loss"}
 
     def test_every_need_is_a_part_that_some_port_has(self):
         known = {
             "own", "position", "angle", "deflection", "reversing", "load", "temperature", "level", "other", "rate",
-            "height", "sideways", "flowing",
+            "height", "sideways", "flowing", "surroundings",
         }  # fmt: skip
         for effect in DYNAMICS:
             assert set(effect.needs) <= known
@@ -352,7 +419,7 @@ def test_shapes_are_in_the_units_of_the_recording():
 def test_a_found_effect_acts_on_a_recording_that_shows_less(effect):
     """What was needed to tell it from others, such as a reversal, need not happen again."""
     context = dynamic_context(effect)
-    lasting = {"own", "position", "angle", "other", "load", "temperature", "rate"}
+    lasting = {"own", "position", "angle", "other", "load", "temperature", "rate", "surroundings"}
     fewer = {part: name for part, name in context.parts.items() if part in lasting}
     for shape in effect.shapes(context.time):
         gamma = torch.ones(size_of(effect, shape, context), dtype=torch.float64)

@@ -15,31 +15,36 @@ from tests.diagnosis.test_dynamics_diagnosis import NOISE, Pendulum, swung
 REACH = 1.5
 GAMMA = torch.tensor([0.3, -0.7, 0.2, 0.5], dtype=torch.float64)
 
+FORMS = ("own", "position", "difference")
+
 
 @pytest.fixture
 def context():
     angle = torch.linspace(-2.0, 2.0, 41, dtype=torch.float64)
-    signal = torch.stack([angle, 3.0 * angle], -1)
-    parts = {"own": "speed", "position": "angle"}
-    return Context(
-        angle, angle.new_zeros(41, 0), (), signal, "rad/s²", ("speed",), ("angle", "speed"), parts, {"position": "rad"}
-    )
+    signal = torch.stack([angle, 3.0 * angle, 0.3 * angle.cos()], -1)
+    parts = {"own": "speed", "position": "angle", "surroundings": "wind"}
+    names = ("angle", "speed", "wind")
+    return Context(angle, angle.new_zeros(41, 0), (), signal, "rad/s²", ("speed",), names, parts, {"position": "rad"})
 
 
-@pytest.mark.parametrize("of", ["own", "position"])
+def along(context, of):
+    return context.part("own") - context.part("surroundings") if of == "difference" else context.part(of)
+
+
+@pytest.mark.parametrize("of", FORMS)
 def test_the_curve_is_legendres_and_goes_on_as_a_constant(context, of):
     effect = UnknownRate(of)
     found = effect.change(GAMMA, {f"reach_of_{of}": REACH}, context)[:, 0]
-    inside = np.clip(context.part(of).numpy() / REACH, -1.0, 1.0)
+    inside = np.clip(along(context, of).numpy() / REACH, -1.0, 1.0)
     expected = np.polynomial.legendre.legval(inside, [0.0, *GAMMA.tolist()])
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-12, atol=1e-14)
     assert len(GAMMA) == DEGREE
 
 
-@pytest.mark.parametrize("of", ["own", "position"])
+@pytest.mark.parametrize("of", FORMS)
 def test_its_line_of_python_is_the_curve(context, of):
     effect, shape = UnknownRate(of), {f"reach_of_{of}": REACH}
-    names = {part: part for part in ("own", "position")}
+    names = {part: part for part in ("own", "position", "surroundings")}
     (line,) = effect.code(GAMMA.tolist(), shape, names)
     values = {part: context.part(part) for part in names}
     torch.testing.assert_close(eval(line, {"torch": torch}, values), effect.change(GAMMA, shape, context)[:, 0])

@@ -342,7 +342,8 @@ class TestPorts:
     def test_of_a_pendulum(self):
         ports = self.pendulum()
         # that of the angle is the speed, by what the words mean
-        assert list(ports) == ["rate of speed", "hysteretic rate of speed", "output"]
+        kinds = ("rate", "hysteretic rate", "lagged rate", "resonant rate")
+        assert list(ports) == [*(f"{kind} of speed" for kind in kinds), "output"]
         port = ports["rate of speed"]
         assert (port.kind, port.channels, port.unit, port.pointwise) == ("rate", ("speed",), "rad/s/s", False)
         assert port.carries == ("angle", "speed", "rate of speed")
@@ -350,9 +351,10 @@ class TestPorts:
             "own": "speed", "position": "angle", "angle": "angle", "deflection": "angle", "reversing": "speed",
         }  # fmt: skip
         assert port.part_units["position"] == "rad"
-        typical, largest = port.sizes["own"]
-        assert typical == pytest.approx(np.median(np.abs(TRUTH[1])), rel=0.1)
-        assert largest == pytest.approx(np.abs(TRUTH[1]).max(), rel=0.1)
+        size = port.sizes["own"]
+        assert size.typical == pytest.approx(np.median(np.abs(TRUTH[1])), rel=0.1)
+        assert size.largest == pytest.approx(np.abs(TRUTH[1]).max(), rel=0.1)
+        assert (size.lowest, size.highest) == pytest.approx((TRUTH[1].min(), TRUTH[1].max()), rel=0.1)
 
     def test_an_angle_is_one_in_rad(self):
         assert "angle" not in self.pendulum(units={"angle": "m"})["rate of speed"].parts
@@ -368,7 +370,8 @@ class TestPorts:
         time = np.arange(50) * 0.1
         recording = table(time=time, upper=1.0 + 0 * time, lower=np.exp(-0.3 * time), pump=0.3 + 0.1 * np.sin(time))
         ports = Tanks().prepare(recording).ports
-        names = ["rate of upper", "rate of lower", "exchange of upper and lower", "input pump", "output"]
+        rates = [f"{kind} of {one}" for one in ("upper", "lower") for kind in ("rate", "lagged rate", "resonant rate")]
+        names = [*rates, "exchange of upper and lower", "input pump", "output"]
         assert list(ports) == names
         both = ports["exchange of upper and lower"]
         assert (both.channels, both.kind, dict(both.parts)) == (
@@ -378,7 +381,7 @@ class TestPorts:
         assert ports["rate of upper"].unit == "m/s"
         pump = ports["input pump"]
         assert (pump.kind, pump.channels, pump.unit) == ("input", ("pump",), "V")
-        assert pump.sizes["own"] == pytest.approx((0.3, 0.4), rel=0.1)
+        assert pump.sizes["own"] == pytest.approx((0.3, 0.4, 0.2, 0.4), rel=0.1)
         assert ports["output"].channels == ("upper", "lower")
         assert ports["output"].unit == "m"
         units = {name: ports["output"].part_units[part] for part, name in ports["output"].parts.items()}

@@ -175,8 +175,11 @@ def test_an_attitude_of_something_else_is_told_of():
     recording = changed(
         tumbling(500, noise=0.3, attitude=True), **{name: other[name] for name in ("q_w", "q_x", "q_y", "q_z")}
     )
-    view = Magnetometer().prepare(recording)
+    view = Magnetometer(use="attitude").prepare(recording)
     assert any("hardly explains the field" in warning for warning in view.warnings)
+    view = Magnetometer().prepare(recording)
+    assert view.view == "norm"
+    assert "The attitude is left out" in view.warnings[0]
 
 
 def test_a_large_effect_is_no_misfit_of_the_attitude():

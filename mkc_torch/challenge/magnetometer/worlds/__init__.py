@@ -1,0 +1,40 @@
+"""Worlds of the magnetometer: noise of the world, disturbances, resting orientations, and misfits."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from mkc_torch.challenge import aims
+from mkc_torch.challenge.magnetometer.motion import DURATION
+from mkc_torch.challenge.magnetometer.worlds.draw import draw, draw_useless
+from mkc_torch.challenge.thresholds import Threshold
+from mkc_torch.challenge.world import World, Worlds
+
+__all__ = ["magnetometer_worlds"]
+
+
+def magnetometer_worlds(duration: float = DURATION) -> Worlds:
+    """Recordings of a magnetometer in six worlds, each so many seconds long; white noise in all but ``coloured``.
+
+    Example:
+        >>> [world.name for world in magnetometer_worlds().worlds]
+        ['white', 'coloured', 'wander', 'bursts', 'orientations', 'useless']
+    """
+
+    def world(name: str, sentence: str, asked: tuple[Threshold, ...]) -> World:
+        return World(name, sentence, partial(draw, name, duration), asked)
+
+    useless = partial(draw_useless, duration)
+    return Worlds(
+        "magnetometer",
+        (
+            world("white", "white sensor noise", aims.WHITE),
+            world("coloured", "sensor noise correlated from sample to sample", aims.ORDINARY),
+            world("wander", "an offset that wanders", aims.ORDINARY),
+            world("bursts", "disturbances in some stretches", aims.ORDINARY),
+            world("orientations", "the sensor rests in one orientation after another", aims.WHITE),
+            World("useless", "the view cannot follow the recording", useless, aims.USELESS, hides=False),
+        ),
+        aims.TOTALS,
+        {"duration_s": duration},
+    )

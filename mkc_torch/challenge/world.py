@@ -1,0 +1,99 @@
+"""One world of a proof: what noise and inputs are like in it, how its cases are drawn, and what is asked there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from mkc_torch.challenge.key import Key
+from mkc_torch.challenge.thresholds import Threshold
+from mkc_torch.recording.recording import Recording
+
+
+@dataclass(frozen=True)
+class KeyPush:
+    """What disturbs without being recorded.
+
+    Attributes:
+        kind: name of the world that has such disturbances.
+        at: the state whose rate is pushed, or the sensor.
+        size: standard deviation in ``unit``; of white force noise the root of its spectral density.
+        over_noise: what it leaves in the fitted free run over the sensor's noise, root mean square.
+        words: its times in s and the like.
+    """
+
+    kind: str
+    at: str
+    size: float
+    unit: str
+    over_noise: float
+    words: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class WorldKey:
+    """What the diagnosis of a case is not told.
+
+    Attributes:
+        world: its name.
+        index: of the case among those of its world, with something hidden or with nothing.
+        key: what was hidden, if anything, and how well it could be seen.
+        push: what disturbs.
+        useless: why the simulation is of no use; "" where it is of use.
+        follows: of a useless one, the share of an output's variation that its best fit explains.
+    """
+
+    world: str
+    index: int
+    key: Key
+    push: KeyPush | None = None
+    useless: str = ""
+    follows: float | None = None
+
+    @property
+    def name(self) -> str:
+        """Of the recording."""
+        return self.key.name
+
+
+@dataclass(frozen=True)
+class WorldCase:
+    """``simulation`` is the text of the Python file that the diagnosis is given; "" for the family's own."""
+
+    recording: Recording
+    simulation: str
+    key: WorldKey
+
+
+Draw = Callable[[int, int, bool, int], WorldCase]
+"""From the seed, the index, whether something is hidden, and the number in the recording's name."""
+
+
+@dataclass(frozen=True)
+class World:
+    """One world. Its function is that of a module, which other processes can import.
+
+    Attributes:
+        name: as a user asks for it.
+        sentence: what it is like.
+        draw: a case of it.
+        aims: what is asked of diagnoses there.
+        hides: something may be hidden in it.
+    """
+
+    name: str
+    sentence: str
+    draw: Draw
+    aims: Sequence[Threshold]
+    hides: bool = True
+
+
+@dataclass(frozen=True)
+class Worlds:
+    """All worlds of a family; ``totals`` are the aims of all of its useful recordings together."""
+
+    family: str
+    worlds: Sequence[World]
+    totals: Sequence[Threshold]
+    settings: Mapping[str, Any] = field(default_factory=dict)

@@ -1,0 +1,115 @@
+"""Whether a simulation follows its recording at all: its residual beside the output's own variation and the floor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.diagnosis.world import Follows
+from mkc_torch.simulation.protocol import PreparedSimulation
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["follows_of", "misses", "size_of", "units_of"]
+
+_FAR = 5.0
+"""Robust standard deviations at which a residual's square ends: outliers do not count, a long way off still does."""
+
+
+def size_of(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
+    """Root mean square with squares that end far out."""
+    reach = _FAR * robust_scale(values)
+    # of a series that rests most of the time the scale is 0
+    reach = torch.where(reach > 0, reach, values.abs().amax(0))
+    return values.clamp(-reach, reach).square().mean(0).sqrt()
+
+
+def follows_of(
+    prepared: PreparedSimulation,
+    residual: Float[Tensor, "N m"] | None,
+    declared: Mapping[str, float],
+    floor: Sequence[float] | None,
+) -> tuple[Follows, ...]:
+    """Of each output.
+
+    Args:
+        prepared: the simulation.
+        residual: recording less the simulation alone, running freely; None where that run is lost.
+        declared: standard deviation of the white noise of outputs that it is known of.
+        floor: the same as it was estimated; None to estimate it by what is new from sample to sample.
+    """
+    known: Tensor | None = getattr(prepared, "measured", None)
+    if known is None:
+        return ()
+    own = known - known.median(0).values
+    if len(prepared.channels) == 1 and known.shape[1] > 1:
+        # a length is compared, and the vector varies
+        variation = size_of(own).square().mean().sqrt().reshape(1)
+        recorded = torch.linalg.vector_norm(known, dim=-1, keepdim=True)
+    elif known.shape[1] == len(prepared.channels):
+        variation, recorded = size_of(known - _middle(known)), known
+    else:
+        return ()
+    lost = residual is None or not bool(residual.isfinite().all())
+    left = variation.clone() if lost or residual is None else size_of(residual)
+    steps = _steps(recorded)
+    estimated = _new(recorded if residual is None or lost else residual) if floor is None else left.new_tensor(floor)
+    last = size_of(recorded[1:] - recorded[:-1])
+    units = units_of(prepared)
+    found = []
+    for k, name in enumerate(prepared.channels):
+        of_steps = float(steps[k]) / 12.0**0.5
+        size, source = float(estimated[k]), "samples"
+        if name in declared:
+            size, source = declared[name], "declared"
+        elif of_steps > size:
+            size, source = of_steps, "quantisation"
+        whole = float(variation[k])
+        share = 0.0 if lost else 1.0 - (float(left[k]) / whole) ** 2 if whole > 0 else 0.0
+        found.append(
+            Follows(name, units[k], float(left[k]), whole, share, size, source, whole, float(last[k]))  # type: ignore[arg-type]
+        )
+    return tuple(found)
+
+
+def misses(follows: Sequence[Follows], least: float) -> tuple[Follows, ...]:
+    """The outputs that the simulation does not follow: less than this share of their variation is explained."""
+    return tuple(one for one in follows if not one.explained >= least)
+
+
+def _middle(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
+    """Mean of each column, outliers aside."""
+    centre = values.median(0).values
+    reach = _FAR * robust_scale(values)
+    reach = torch.where(reach > 0, reach, torch.inf)
+    return centre + (values - centre).clamp(-reach, reach).mean(0)
+
+
+def _new(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
+    """White noise by third differences."""
+    third = values[3:] - 3.0 * values[2:-1] + 3.0 * values[1:-2] - values[:-3]
+    return robust_scale(third) / 20.0**0.5
+
+
+def _steps(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
+    """Smallest step between two numbers that a column has; 0 where nearly all numbers are different."""
+    steps = []
+    for column in values.unbind(-1):
+        numbers = column.unique()
+        few = len(numbers) < len(column) // 4 and len(numbers) > 1
+        steps.append(float(numbers.diff().min()) if few else 0.0)
+    return values.new_tensor(steps)
+
+
+def units_of(prepared: PreparedSimulation) -> tuple[str, ...]:
+    """Of the channels of a simulation's residual."""
+    output = prepared.ports.get("output")
+    if prepared.unit or output is None:
+        return (prepared.unit,) * len(prepared.channels)
+    names = {output.parts.get(part, part): unit for part, unit in output.part_units.items()}
+    return tuple(names.get(name, "") for name in prepared.channels)

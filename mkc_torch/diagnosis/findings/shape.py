@@ -1,0 +1,133 @@
+"""Whether the shape that a name claims is the recording's: a free curve of the same variables in the name's place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.model.at_once import at_once
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term, continuous
+from mkc_torch.diagnosis.search.preference import schwarz
+from mkc_torch.diagnosis.settings import EvidenceSettings
+from mkc_torch.diagnosis.world import Curve, Shape
+from mkc_torch.nonlinear import NoFitError
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["nearest_power", "shape_of"]
+
+_POWERS = torch.arange(0.0, 4.001, 0.02, dtype=torch.float64)
+_POINTS = 60
+_NORMAL_95 = 1.96
+
+
+def shape_of(fit: FittedModel, number: int, terms: Sequence[Term], settings: EvidenceSettings) -> Shape | None:
+    """Of one effect of a fit; None where the name claims no shape that a curve could be set against.
+
+    Args:
+        fit: with all effects.
+        number: of the effect.
+        terms: all candidates, curves among them.
+        settings: when a curve is clearly better.
+    """
+    term = fit.model.terms[number]
+    curves = _curves(term, terms, fit)
+    if term.effect.is_curve or not curves:
+        return None
+    found = at_once([partial(_instead, fit, number, curve) for curve in curves], fit.model.prepared, curves)
+    fits = [one for one in found if one is not None]
+    if not fits:
+        return None
+    best = max(fits, key=lambda one: one.log_likelihood - schwarz(one) * one.model.sizes[number])
+    gain = best.log_likelihood - fit.log_likelihood
+    more = max(
+        best.model.sizes[number] - fit.model.sizes[number] - len({*continuous(term), *term.effect.fitted_shape}), 1
+    )
+    half, value = torch.tensor(0.5 * more).double(), torch.tensor(max(gain, 0.0)).double()
+    chance = float(torch.special.gammaincc(half, value))
+    if chance >= settings.shape_level or gain <= settings.shape_nats + schwarz(best) * more:
+        return Shape(gain, chance)
+    curve = curve_of(best, number)
+    return Shape(gain, chance, curve, nearest_power(curve))
+
+
+def _curves(term: Term, terms: Sequence[Term], fit: FittedModel) -> list[Term]:
+    """Curves at the rate that a named effect acts on."""
+    channels = fit.model.prepared.ports[term.port].channels
+    found: dict[tuple[str, str], Term] = {}
+    for one in terms:
+        same = one.columns == term.columns and fit.model.prepared.ports[one.port].channels == channels
+        if one.effect.is_curve and same:
+            found.setdefault((one.port, one.effect.along), one)
+    return list(found.values())
+
+
+def _instead(fit: FittedModel, number: int, curve: Term) -> FittedModel | None:
+    """The fit with a curve in the place of a named effect."""
+    model = fit.model
+    terms = (*model.terms[:number], curve, *model.terms[number + 1 :])
+    joint = JointModel(model.prepared, terms, model.near)
+    parts = list(model.gammas(fit.parameters))
+    parts[number] = fit.parameters.new_zeros(joint.sizes[number])
+    start = torch.cat([fit.parameters[: model.base], *parts])
+    try:
+        return fitted(joint, start, fit.bound)
+    except NoFitError:
+        return None
+
+
+def curve_of(fit: FittedModel, number: int) -> Curve:
+    """An effect's change of its rate over the range that was visited, with its 95 % band."""
+    model, term = fit.model, fit.model.terms[number]
+    prepared, port = model.prepared, model.prepared.ports[term.port]
+    signal = model.signals(fit.parameters)[term.port].detach()
+    part = port.parts[term.effect.along]
+    at = signal[:, port.carries.index(part)] if port.carries else signal[:, 0]
+    order = at.argsort()[torch.linspace(0, len(at) - 1, _POINTS).long()]
+    gamma = model.gammas(fit.parameters)[number].detach()
+
+    def change(values: Tensor) -> Tensor:
+        return term.effect.change(values, term.shape, term.context(prepared, signal))[order]
+
+    value, slope = change(gamma), torch.func.jacfwd(change)(gamma)
+    start = model.base + sum(model.sizes[:number])
+    covariance = _covariance(fit)[start : start + len(gamma), start : start + len(gamma)]
+    band = _NORMAL_95 * torch.einsum("ncq,qr,ncr->nc", slope, covariance, slope).clamp(min=0.0).sqrt()
+    unit = port.part_units.get(term.effect.along, "")
+    return Curve(part, unit, at[order], value.detach(), band, (f"rate of {port.channels[0]}",), port.unit)
+
+
+def _covariance(fit: FittedModel) -> Float[Tensor, "p p"]:
+    """Of the parameters, noise taken for white: they are fitted under the pushes that are left."""
+    tangents = torch.func.jacfwd(fit.model.around(fit.parameters).residual)(fit.parameters)
+    weighted = (fit.weights / fit.d.square()).unsqueeze(-1) * tangents
+    gram = torch.einsum("nmp,nmq->pq", weighted, tangents)
+    size = gram.diagonal().clamp(min=1e-300).rsqrt()
+    return size.unsqueeze(-1) * torch.linalg.pinv(size.unsqueeze(-1) * gram * size, hermitian=True) * size
+
+
+def nearest_power(curve: Curve) -> str:
+    """The power law that is nearest to a curve, beside a line and a constant that the simulation may have; as text."""
+    x, y = curve.x, curve.value[:, 0]
+    weight = 1.0 / curve.band[:, 0].clamp(min=float(curve.band.median().clamp(min=1e-300)))
+    best: tuple[float, float, float] | None = None
+    for power in _POWERS.tolist():
+        if abs(power - 1.0) < 0.1 or power < 0.1:
+            continue
+        columns = torch.stack([x.abs().pow(power) * x.sign(), x, torch.ones_like(x)], -1)
+        size = columns.abs().amax(0).clamp(min=1e-300)
+        solution = torch.linalg.lstsq((columns / size) * weight.unsqueeze(-1), (y * weight).unsqueeze(-1)).solution
+        left = float((((columns / size) @ solution).squeeze(-1) - y).mul(weight).square().sum())
+        if best is None or left < best[0]:
+            best = left, power, float(solution[0, 0] / size[0])
+    if best is None or not math.isfinite(best[2]):
+        return ""
+    return f"{best[2]:.3g} |{curve.driver}|^{best[1]:.2g} sign({curve.driver}), beside a straight line"

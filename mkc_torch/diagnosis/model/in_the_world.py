@@ -1,0 +1,290 @@
+"""A simulation with its effects under the likeliest noise of the world: pushes of its states beside its sensors'."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch.diagnosis.model.at_once import at_once
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.settings import NoiseSettings
+from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation.dynamics.first_fit import over_short_horizons, strong_observer
+from mkc_torch.simulation.dynamics.noise import NoiseOfTheWorld, likeliest_noise
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+from mkc_torch.simulation.protocol import PreparedSimulation
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = [
+    "InTheWorld",
+    "at_liberty",
+    "beside_effects",
+    "between_samples",
+    "freed",
+    "in_the_world",
+    "noise_around",
+    "simulation_in_the_world",
+]
+
+_ROUNDS = 2
+"""Times that the noise is sought along a trajectory and the parameters are fitted under it."""
+
+_STRONG = 10.0
+"""Size of the pushes that a first observer is for, over that at which they move an output by its noise."""
+
+
+@dataclass(frozen=True)
+class InTheWorld:
+    """A joint model, fitted.
+
+    Attributes:
+        free: as it runs freely; None where that run loses the recording, or where there is no fit.
+        fit: under the likeliest noise; the same as ``free`` where the sensors' white noise is enough.
+        noise: that noise; None of a simulation that has no states to be pushed.
+        starts: from which a first fit was tried.
+    """
+
+    free: FittedModel | None
+    fit: FittedModel
+    noise: NoiseOfTheWorld | None
+    starts: int = 1
+
+    @property
+    def pushed(self) -> bool:
+        """Whether more than the sensors' white noise is in it."""
+        return self.noise is not None and self.noise.observer is not None
+
+
+def at_liberty(prepared: PreparedSimulation) -> PreparedSimulation:
+    """The simulation as it runs freely."""
+    return prepared.observed(None) if isinstance(prepared, PreparedDynamics) else prepared
+
+
+def pushed(fit: FittedModel) -> bool:
+    """Whether a fit is under more noise than the sensors' white one."""
+    prepared = fit.model.prepared
+    return isinstance(prepared, PreparedDynamics) and prepared.observer is not None
+
+
+def noise_around(fit: FittedModel, declared: Mapping[str, float], settings: NoiseSettings) -> NoiseOfTheWorld | None:
+    """The likeliest noise along a fit's trajectory; None where there is no trajectory, or are no states."""
+    prepared, model = fit.model.prepared, fit.model
+    if not isinstance(prepared, PreparedDynamics):
+        return None
+    theta, changes = fit.parameters[: model.base], model.changes(fit.parameters)
+    return likeliest_noise(
+        prepared, theta, changes, model.near, declared=declared, least=settings.pushed, most=settings.pushes
+    )
+
+
+def simulation_in_the_world(
+    prepared: PreparedSimulation, declared: Mapping[str, float], settings: NoiseSettings
+) -> InTheWorld:
+    """The simulation alone, from as many starts as it takes to trust its first fit.
+
+    Raises:
+        NoFitError: it has no finite answer wherever it begins.
+    """
+    model, starts = JointModel(prepared), [prepared.start()]
+    if isinstance(prepared, PreparedDynamics):
+        short = over_short_horizons(prepared, prepared.given)
+        starts += [] if short is None else [short]
+    tried = at_once([partial(_free, model, start) for start in starts], prepared)
+    known_fits = [one for one in tried if one is not None]
+    if not known_fits and len(starts) == 1:
+        fitted(model, starts[0])  # it says why there is none
+    free = max(known_fits, key=lambda one: one.log_likelihood) if known_fits else None
+    if free is not None:
+        bound = settings.domain * free.bound.maximum(free.bound.mean())
+        free = fitted(free.model, free.parameters, bound, graduate=False)
+    return in_the_world(free, declared, settings, beside=starts[1:], model=model)
+
+
+def in_the_world(
+    free: FittedModel | None,
+    declared: Mapping[str, float],
+    settings: NoiseSettings,
+    *,
+    beside: Sequence[Float[Tensor, " p"]] = (),
+    model: JointModel | None = None,
+) -> InTheWorld:
+    """A free fit under the likeliest noise around it.
+
+    Args:
+        free: the fit; None where there is none.
+        declared: standard deviation of the white noise of outputs that it is known of.
+        settings: of the noise.
+        beside: parameters that predict over short horizons, to begin with as well.
+        model: what is fitted, where there is no free fit.
+    """
+    starts = 1 + len(beside)
+    noise = None if free is None else noise_around(free, declared, settings)
+    if free is not None and (noise is None or noise.observer is None):
+        return InTheWorld(free, free, noise, starts)
+    own = model if free is None else free.model
+    assert own is not None
+    bound = None if free is None else free.bound
+    works = [partial(_from_short, own, start, bound, declared, settings) for start in beside]
+    if free is not None and not works:
+        works = [partial(_under_noise, free, noise, declared, settings)]
+    tried = at_once(works, own.prepared)
+    found = [one for one in tried if one is not None]
+    if not found:
+        if free is None:
+            raise NoFitError(
+                "No trajectory of the simulation was found near the recording, over short horizons either."
+            )
+        return InTheWorld(free, free, noise, starts)
+    best = max(found, key=lambda one: one[0].log_likelihood)
+    if best[1].observer is None and free is not None:
+        return InTheWorld(free, free, best[1], starts)
+    return InTheWorld(free, *best, starts)
+
+
+def beside_effects(fit: FittedModel, declared: Mapping[str, float], settings: NoiseSettings) -> FittedModel:
+    """A joint model under the pushes that are left beside its effects, or, where it is as likely, running freely."""
+    found = _under_noise(fit, noise_around(fit, declared, settings), declared, settings)
+    best = fit if found is None else found[0]
+    free = freed(best)
+    if free is None:
+        return best
+    if pushed(best) and free.log_likelihood < best.log_likelihood - settings.pushed:
+        return best
+    return free
+
+
+def freed(fit: FittedModel) -> FittedModel | None:
+    """The same joint model fitted to its free run; None where that loses the recording."""
+    prepared = at_liberty(fit.model.prepared)
+    if prepared is fit.model.prepared:
+        return fit
+    try:
+        found = fitted(JointModel(prepared, fit.model.terms, fit.model.near), fit.parameters, fit.bound, graduate=False)
+    except NoFitError:
+        return None
+    return found
+
+
+def _free(model: JointModel, start: Float[Tensor, " p"]) -> FittedModel | None:
+    try:
+        return fitted(model, start)
+    except NoFitError:
+        return None
+
+
+_Found = tuple[FittedModel, NoiseOfTheWorld]
+
+
+def _under_noise(
+    fit: FittedModel, noise: NoiseOfTheWorld | None, declared: Mapping[str, float], settings: NoiseSettings
+) -> _Found | None:
+    """Fits under the noise of the fit before, the likeliest of them, with the noise that is around it."""
+    best: _Found | None = None
+    for _ in range(_ROUNDS):
+        if noise is None:
+            break
+        prepared = fit.model.prepared
+        assert isinstance(prepared, PreparedDynamics)
+        model = JointModel(prepared.observed(noise.observer), fit.model.terms, fit.model.near)
+        try:
+            fit = fitted(model, fit.parameters, fit.bound, graduate=False)
+        except NoFitError:
+            break
+        under, noise = noise, noise_around(fit, declared, settings)
+        if best is None or fit.log_likelihood > best[0].log_likelihood:
+            same = noise is not None and (noise.observer is None) == (under.observer is None)
+            best = fit, noise if same and noise is not None else under
+        if noise is not None and noise.observer is None and under.observer is None:
+            break
+    return best
+
+
+def _from_short(
+    model: JointModel,
+    start: Float[Tensor, " p"],
+    bound: Float[Tensor, " m"] | None,
+    declared: Mapping[str, float],
+    settings: NoiseSettings,
+) -> _Found | None:
+    """The same from parameters that predict over short horizons, along an observer that corrects by much."""
+    prepared = model.prepared
+    assert isinstance(prepared, PreparedDynamics)
+    observer = strong_observer(prepared, start, _STRONG)
+    if observer is None:
+        return None
+    strong = JointModel(prepared.observed(observer), model.terms)
+    try:
+        fit = fitted(strong, start, bound, graduate=False)
+    except NoFitError:
+        return None
+    if bound is None:
+        fit = replace(fit, bound=settings.domain * fit.bound.maximum(fit.bound.mean()))
+    return _under_noise(fit, noise_around(fit, declared, settings), declared, settings)
+
+
+def between_samples(
+    base: InTheWorld, declared: Mapping[str, float], fixed: Mapping[str, str], settings: NoiseSettings
+) -> InTheWorld:
+    """The same with inputs that are held or go straight from sample to sample, whichever is likelier.
+
+    Args:
+        base: with what the simulation says of its inputs.
+        declared: of the outputs' white noise.
+        fixed: inputs of which it is known.
+        settings: of the noise.
+    """
+    prepared = at_liberty(base.fit.model.prepared)
+    if not isinstance(prepared, PreparedDynamics):
+        return base
+    for name, how in prepared.between.items():
+        others = [one for one in ("held", "linear") if one != how] if name not in fixed else []
+        works = [partial(_holding, base, name, other, declared, settings) for other in others]
+        tried = [one for one in at_once(works, prepared) if one is not None]
+        base = max([base, *tried], key=lambda one: one.fit.log_likelihood)
+    return _with_sizes(base)
+
+
+def _with_sizes(base: InTheWorld) -> InTheWorld:
+    """The same with the fitted trajectory as the guess of all states, of those that no output shows as well."""
+    known, near = base.fit.model.prepared, base.fit.model.near
+    assert isinstance(known, PreparedDynamics)
+
+    def moved(fit: FittedModel) -> FittedModel:
+        prepared = fit.model.prepared
+        assert isinstance(prepared, PreparedDynamics)
+        return replace(fit, model=JointModel(prepared.guessed(near), (), fit.model.near))
+
+    free = None if base.free is None else moved(base.free)
+    return replace(base, free=free, fit=free if base.fit is base.free and free is not None else moved(base.fit))
+
+
+def _holding(
+    base: InTheWorld, name: str, how: str, declared: Mapping[str, float], settings: NoiseSettings
+) -> InTheWorld | None:
+    known = base.fit.model.prepared
+    assert isinstance(known, PreparedDynamics)
+    prepared = known.holding({name: how})
+    free = None
+    try:
+        if base.free is not None:
+            model = JointModel(prepared.observed(None), (), base.free.model.near)
+            free = fitted(model, base.free.parameters, base.free.bound, graduate=False)
+        if not base.pushed and free is not None:
+            return replace(in_the_world(free, declared, settings), starts=base.starts)
+        fit = fitted(JointModel(prepared, (), base.fit.model.near), base.fit.parameters, base.fit.bound)
+    except NoFitError:
+        return None
+    found = _under_noise(fit, noise_around(fit, declared, settings), declared, settings)
+    if found is None or (found[1].observer is None and free is None):
+        return None
+    if found[1].observer is None or (free is not None and free.log_likelihood > found[0].log_likelihood):
+        assert free is not None
+        return replace(in_the_world(free, declared, settings), starts=base.starts)
+    return InTheWorld(free, *found, base.starts)

@@ -1,0 +1,162 @@
+"""Locate and name beside pushes: by candidates' gains at their own size of the pushes, then by fits of each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.linearised.tangents import tangents_of
+from mkc_torch.diagnosis.model.at_once import at_once
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
+from mkc_torch.diagnosis.model.in_the_world import beside_effects
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shaped import shape_fitted
+from mkc_torch.diagnosis.model.term import Key, Term, continuous
+from mkc_torch.diagnosis.search.locate import Located
+from mkc_torch.diagnosis.search.look import Scene
+from mkc_torch.diagnosis.search.preference import Preference
+from mkc_torch.diagnosis.search.profiled import Profiled, profiled
+from mkc_torch.diagnosis.search.ranking import Ranked
+from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+
+__all__ = ["located_among_pushes"]
+
+Kind = tuple[Key, str]
+"""Of a candidate, and for a curve what it is over."""
+
+
+def located_among_pushes(
+    base: FittedModel,
+    terms: Sequence[Term],
+    *,
+    level: float,
+    surrogates: int,
+    generator: torch.Generator,
+    declared: Mapping[str, float],
+    settings: Settings,
+) -> Located:
+    """The strongest candidate beside a fit under pushes.
+
+    Args:
+        base: the fit.
+        terms: candidates.
+        level: below which p-value candidates are fitted and compared.
+        surrogates: draws of noise.
+        generator: of the draws.
+        declared: standard deviation of the white noise of outputs that it is known of.
+        settings: the numbers that decide.
+
+    Raises:
+        NoFitError: the fit's trajectory is lost.
+    """
+    terms = tuple(terms)
+    tangents = tangents_of(base.model, base.parameters, settings.noise, terms)
+    values, counts = base.pseudo(settings.noise)
+    found = profiled(base, terms, tangents, values, counts, surrogates, generator)
+    if found is None:
+        raise NoFitError("The simulation's trajectory is lost at the fitted values.")
+    prefer = Preference(terms, base.model.prepared, settings.naming)
+    look = Scene(base, base, terms, tangents, values, counts, settings).under()
+    ranking = _ranked(found, terms, prefer)
+    best = _fit_of(base, terms[ranking[0].number], found, ranking[0].number)
+    fits: Sequence[FittedModel] = ()
+    if found.p_value <= level:
+        chosen = _chosen(found, terms, settings.search.own_noise)
+        works = [partial(_own, base, terms[number], found, number, declared, settings) for number in chosen]
+        fits = at_once(works, base.model.prepared, [terms[number] for number in chosen])
+        best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer)
+    return Located(
+        best.model.terms[-1],
+        best,
+        found.p_value,
+        found.beyond,
+        ranking,
+        look.noise,
+        look,
+        look.linearised,
+        compared=fits,
+    )
+
+
+def _ranked(found: Profiled, terms: tuple[Term, ...], prefer: Preference) -> tuple[Ranked, ...]:
+    """By gain less Akaike's price of the numbers and the handicap, each physics at its best shape."""
+    numbers = found.gain.new_tensor([float(len(continuous(term))) for term in terms])
+    handicap = [prefer.handicap(term, float(one)) for term, one in zip(terms, found.gain, strict=True)]
+    score = found.gain - found.dof - numbers - found.gain.new_tensor(handicap)
+    score = torch.where(found.dof > 0, score, -torch.inf)
+    best: dict[Key, int] = {}
+    for number in score.argsort(descending=True).tolist():
+        best.setdefault(terms[number].key, number)
+    return tuple(Ranked(n, float(found.gain[n]), float(score.max() - score[n])) for n in best.values())
+
+
+def _chosen(found: Profiled, terms: tuple[Term, ...], most: int) -> list[int]:
+    """The candidates that gain most, each at its best shape."""
+    chosen: dict[Kind, int] = {}
+    for number in (found.gain - found.dof).argsort(descending=True).tolist():
+        term = terms[number]
+        chosen.setdefault((term.key, term.effect.along if term.effect.is_curve else ""), number)
+        if len(chosen) == most:
+            break
+    return list(chosen.values())
+
+
+def _fit_of(base: FittedModel, term: Term, found: Profiled, number: int) -> FittedModel:
+    """The joint fit of a candidate, under the pushes that it leaves by the search."""
+    prepared = base.model.prepared
+    assert isinstance(prepared, PreparedDynamics)
+    smaller = prepared.observed(found.observers[number])
+    start = torch.cat([_inside(base, base.parameters + found.shift[number]), found.gamma[number]])
+    model = JointModel(smaller, (*base.model.terms, term), base.model.near)
+    there = fitted_beside(base, model, start, graduate=False)
+    if there.model.prepared is smaller:
+        return there
+    return fitted_beside(base, base.model.with_term(term), start, graduate=False)
+
+
+def _inside(base: FittedModel, parameters: Tensor) -> Tensor:
+    """Within the bounds, and where they are free no farther than what is nearly linear."""
+    bounds = base.model.bounds
+    if bounds is not None:
+        parameters = parameters.clamp(*bounds)
+    own = base.model.base
+    far = (parameters - base.parameters).abs() > base.parameters.abs().clamp(min=1e-12)
+    return torch.where(far & (torch.arange(len(parameters)) < own), base.parameters, parameters)
+
+
+def _own(
+    base: FittedModel, term: Term, found: Profiled, number: int, declared: Mapping[str, float], settings: Settings
+) -> FittedModel:
+    """The joint fit of a candidate, under the noise that it leaves."""
+    fit = _fit_of(base, term, found, number)
+    return shape_fitted(beside_effects(fit, declared, settings.noise))
+
+
+def _by_own_noise(
+    base: FittedModel,
+    ranking: tuple[Ranked, ...],
+    chosen: Sequence[int],
+    fits: Sequence[FittedModel],
+    terms: tuple[Term, ...],
+    prefer: Preference,
+) -> tuple[FittedModel, tuple[Ranked, ...]]:
+    """The likeliest of the fits, and the ranking with how far each is behind it; others are behind all of them."""
+    scores = [prefer.score(fit, base) for fit in fits]
+    best = max(range(len(fits)), key=scores.__getitem__)
+    behind: dict[Key, tuple[float, int]] = {}
+    for number, score in zip(chosen, scores, strict=True):
+        key, gap = terms[number].key, scores[best] - score
+        behind[key] = min((gap, number), behind.get(key, (gap, number)))
+    last = max(gap for gap, _ in behind.values())
+    told = []
+    for one in ranking:
+        key = terms[one.number].key
+        gap, number = behind.get(key, (max(last, one.gap), one.number))
+        told.append(replace(one, number=number, gap=gap))
+    return fits[best], tuple(sorted(told, key=lambda one: one.gap))

@@ -1,0 +1,92 @@
+"""The likeliest noise of the world around a simulation, and the same simulation predicted under it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mkc_torch.simulation.dynamics.disturbances import Disturbed, disturbed, models_of, observer_of
+from mkc_torch.simulation.dynamics.first_fit import floor_of
+from mkc_torch.simulation.dynamics.flow import flow_of
+from mkc_torch.simulation.dynamics.kalman import filtered, smoothed
+from mkc_torch.simulation.dynamics.observer import Observable, Observer
+from mkc_torch.simulation.protocol import Changes, Nearby
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["NoiseOfTheWorld", "Pushed", "likeliest_noise", "pushes_over_time"]
+
+
+@dataclass(frozen=True)
+class NoiseOfTheWorld:
+    """What is known of it, and the observer for it; None where the sensors' white noise is enough."""
+
+    disturbed: Disturbed
+    observer: Observer | None
+
+
+def likeliest_noise(
+    prepared: Observable,
+    theta: Float[Tensor, " p"],
+    changes: Changes,
+    near: Nearby | None,
+    *,
+    declared: Mapping[str, float],
+    least: float,
+    most: int,
+) -> NoiseOfTheWorld | None:
+    """The likeliest noise along a simulation's trajectory; None where there is no trajectory.
+
+    Args:
+        prepared: the simulation, free or observed.
+        theta, changes, near: of its trajectory.
+        declared: standard deviation of the white noise of outputs that it is known of.
+        least, most: nats that a disturbance has to gain, and how many there may be.
+    """
+    flow = flow_of(prepared, theta, changes, near)
+    if flow is None or not all(bool(np.isfinite(one).all()) for one in (flow.carried, flow.seen, flow.new, flow.shift)):
+        return None
+    floor = floor_of(prepared)
+    known = [name in declared for name in prepared.channels]
+    sensor = floor.new_tensor(
+        [declared.get(name, float(one)) for name, one in zip(prepared.channels, floor, strict=True)]
+    )
+    names, channels = prepared.pushable, prepared.channels
+    found = disturbed(flow, names, channels, sensor, known, least, most)
+    return NoiseOfTheWorld(found, observer_of(flow, found.disturbances, found.sensor, names, channels))
+
+
+@dataclass(frozen=True)
+class Pushed:
+    """The course of one disturbance by all samples, (N,), and its standard error."""
+
+    value: Float[Tensor, " N"]
+    error: Float[Tensor, " N"]
+
+
+def pushes_over_time(
+    prepared: Observable, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None, found: Disturbed
+) -> tuple[Pushed, ...]:
+    """The courses of disturbances, in their order; none where there is no trajectory.
+
+    What is new at each sample is given a short memory, of a sample's length, for its course to be seen.
+    """
+    flow = flow_of(prepared, theta, changes, near)
+    if flow is None or not found.disturbances:
+        return ()
+    usual = float(np.median(flow.step[flow.step > 0]))
+    lasting = tuple(one.lasting_at_least(0.1 * usual) for one in found.disturbances)
+    models = models_of(flow, lasting, found.sensor, prepared.pushable, prepared.channels)
+    state, covariance = smoothed(flow, models, filtered(flow.whole, models, keep=True))
+    n = flow.carried.shape[1]
+    courses = []
+    for number in range(len(lasting)):
+        variance = np.maximum(covariance[:, n + number, n + number], 0.0)
+        courses.append(Pushed(torch.from_numpy(state[:, n + number].copy()), torch.from_numpy(np.sqrt(variance))))
+    return tuple(courses)

@@ -1,0 +1,81 @@
+"""Inputs that are the surroundings of a state: it is known by its difference to them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+
+from mkc_torch.recording.recording import DEFAULT_UNITS
+from mkc_torch.simulation.dynamics.equations import Equations
+from mkc_torch.simulation.dynamics.user_functions import namespace
+from mkc_torch.simulation.names import Names
+from mkc_torch.simulation.parameter import Parameter
+
+__all__ = ["surroundings"]
+
+_SHIFT = 0.7
+
+
+def surroundings(system: Equations) -> dict[str, str]:
+    """The input that each state is known by its difference to, of states that have one.
+
+    That is an input which can be shifted together with the state, and with all states of its unit, without a change of
+    the state's rate, as can an ambient temperature; where there is none, an input of the same unit.
+
+    Args:
+        system: the equations, with units as they are declared, or as names tell.
+
+    Example:
+        >>> from mkc_torch.simulation import Dynamics
+        >>> class Heater(Dynamics):
+        ...     states, inputs = ("temp",), ("power", "outside")
+        ...     parameters = {"loss": 0.1}
+        ...
+        ...     def derivative(self, time, x, u, p):
+        ...         return {"temp": u.power - p.loss * (x.temp - u.outside)}
+        >>> surroundings(Heater())
+        {'temp': 'outside'}
+    """
+    known = {name: one if isinstance(one, Parameter) else Parameter(one) for name, one in system.parameters.items()}
+    found = {}
+    for state in system.states:
+        unit = _unit_of(system, state)
+        alike = [other for other in system.states if other == state or (unit and _unit_of(system, other) == unit)]
+        shifted = [name for name in system.inputs if _shifts(system, known, state, alike, name)]
+        same = [name for name in system.inputs if unit and _unit_of(system, name) == unit]
+        if shifted or same:
+            found[state] = (shifted or same)[0]
+    return found
+
+
+def _unit_of(system: Equations, name: str) -> str:
+    return system.units.get(name, DEFAULT_UNITS.get(name, ""))
+
+
+def _shifts(system: Equations, known: dict[str, Parameter], state: str, alike: list[str], name: str) -> bool:
+    """Whether the rate of a state depends on states of one unit only by their difference to an input."""
+    time, states, inputs = _scattered(1), _scattered(len(system.states)), _scattered(len(system.inputs))
+    # a parameter that begins at 0 would hide what it multiplies
+    p = Names(**{one: torch.tensor(known[one].value or 1.0).double() for one in known})
+
+    def rate(of_states: float, of_input: float) -> torch.Tensor:
+        moved, driven = states.clone(), inputs.clone()
+        moved[:, [system.states.index(one) for one in alike]] += of_states
+        driven[:, system.inputs.index(name)] += of_input
+        found = system.derivative(time[:, 0], namespace(system.states, moved), namespace(system.inputs, driven), p)
+        value = found[state] if isinstance(found, Mapping) else found[system.states.index(state)]
+        return value + 0.0 * time[:, 0]
+
+    plain = rate(0.0, 0.0)
+    if torch.allclose(rate(_SHIFT, 0.0), plain, rtol=1e-6, equal_nan=False):
+        return False
+    return torch.allclose(rate(_SHIFT, _SHIFT), plain, rtol=1e-9)
+
+
+def _scattered(count: int) -> torch.Tensor:
+    """(20, count) values from 0.1 to 1.1; the same ones each time, and allowed where random ones are not."""
+    turns = (
+        torch.arange(1, 21, dtype=torch.float64).unsqueeze(-1) * (torch.arange(count, dtype=torch.float64) + 2.7).sqrt()
+    )
+    return turns.remainder(1.0) + 0.1

@@ -1,0 +1,184 @@
+"""Each world is what its name says, and gives the same case at the same address."""
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch.challenge.draws import generator
+from mkc_torch.challenge.dynamics.generator import SYSTEMS
+from mkc_torch.challenge.dynamics.integrate import between, holding, simulate
+from mkc_torch.challenge.dynamics.plant import Plant, Trial
+from mkc_torch.challenge.dynamics.worlds import dynamics_worlds
+from mkc_torch.challenge.dynamics.worlds.draw import MOST_FOLLOWED
+from mkc_torch.challenge.dynamics.worlds.follows import best_share
+from mkc_torch.challenge.dynamics.worlds.pushes import KINDS
+from mkc_torch.challenge.dynamics.worlds.simulations import right_source
+from mkc_torch.challenge.dynamics.worlds.wrong import right, wrong
+from mkc_torch.challenge.key import canonical
+from mkc_torch.simulation.load import load_simulation
+
+WORLDS = {world.name: world for world in dynamics_worlds().worlds}
+
+
+def test_the_worlds_are_all_there():
+    assert list(WORLDS) == [
+        "white", "coloured", "pushed_white", "pushed_slowly", "gusts", "held", "far_starts", "runs", "useless",
+    ]  # fmt: skip
+    assert [name for name, world in WORLDS.items() if not world.hides] == ["useless"]
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_the_same_address_gives_the_same_case_under_another_number(name):
+    one, other = (WORLDS[name].draw(3, 1, False, number) for number in (1, 7))
+    assert (one.key.name[-5:], other.key.name[-5:]) == ("00001", "00007")
+    assert one.simulation == other.simulation
+    assert canonical([one.key]) == canonical([other.key]).replace("_00007", "_00001")
+    for column, values in one.recording.columns.items():
+        torch.testing.assert_close(other.recording[column], values, rtol=0, atol=0)
+    elsewhere = WORLDS[name].draw(4, 1, False, 1).recording.columns
+    assert not all(
+        torch.equal(values, elsewhere.get(column, values[:0])) for column, values in one.recording.columns.items()
+    )
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_nothing_is_hidden_in_an_empty_case(name):
+    for index in range(3):
+        key = WORLDS[name].draw(3, index, False, index).key
+        assert key.key.effects == ()
+        assert key.key.kind == ("useless" if name == "useless" else "empty")
+        assert (key.push is not None) == (name in KINDS)
+        assert bool(key.useless) == (name == "useless")
+        assert (key.key.noise["correlation"] > 0.0) == (name == "coloured")
+        if key.push is not None:
+            assert key.push.kind == name
+            assert key.push.over_noise >= 1.5
+
+
+@pytest.mark.parametrize("name", ["white", "gusts", "held"])
+def test_a_push_acts_in_every_second_case_with_something_hidden(name):
+    keys = [WORLDS[name].draw(3, index, True, index).key for index in range(2)]
+    assert [key.push is not None for key in keys] == [True, False]
+    assert all(len(key.key.effects) == 1 for key in keys)
+    assert all(key.key.kind in ("single", "outside") for key in keys)
+
+
+def test_a_push_makes_a_hidden_effect_harder_to_see():
+    """z is that of the noise that is there: with the same effect and size it falls when a push is added."""
+    from mkc_torch.challenge.dynamics.errors import draw_errors
+    from mkc_torch.challenge.dynamics.oracle import power
+    from mkc_torch.challenge.dynamics.scene import Scene
+    from mkc_torch.challenge.dynamics.worlds.noise import PushedErrors, draw_push
+
+    setting = SYSTEMS["thermal"].draw(generator(2))
+    scene = Scene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
+    errors = draw_errors(generator(3), scene.course.outputs)
+    pushes = (draw_push(generator(seed), "pushed_slowly", scene, errors) for seed in range(20))
+    push = next(push for push in pushes if push.state == "temperature_1")
+    effect = SYSTEMS["thermal"].inside[0](generator(5), scene)  # in the same body
+    alone, beside = (
+        power(scene.plant, scene.trial, effect, effect.large, noise)
+        for noise in (errors, PushedErrors(scene, errors, push))
+    )
+    assert beside.z < 0.8 * alone.z
+
+
+def integrator():
+    return Plant("integrator", ("x",), ("u",), ("x",), {"x": "m"}, {}, {}, lambda x, u, p: u + 0.0 * x, 12)  # noqa: ARG005
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_held_input_is_held_in_the_integration(held):
+    inputs = torch.randn(1, 9, 2, dtype=torch.float64, generator=generator(1)).numpy()
+    course = simulate(integrator(), Trial(0.5, inputs, np.zeros((1, 2)), held=held))
+    steps = 0.5 * (inputs[:, :-1] if held else 0.5 * (inputs[:, :-1] + inputs[:, 1:]))
+    np.testing.assert_allclose(np.diff(course.outputs, axis=1), steps, atol=1e-14)
+    at = (holding if held else between)(inputs, 12)
+    np.testing.assert_array_equal(course.inputs, at)
+
+
+def test_the_world_of_held_inputs_differs_from_its_linear_twin_by_more_than_its_noise():
+    """Otherwise nothing would be asked there."""
+    from dataclasses import replace
+
+    more = []
+    for index in range(8):
+        system = list(SYSTEMS)[index % 4]
+        setting = SYSTEMS[system].draw(generator(index, "held"))
+        held = simulate(setting.plant, replace(setting.trial, held=True)).outputs
+        linear = simulate(setting.plant, setting.trial).outputs
+        more.append(np.sqrt(np.square(held - linear).mean()) / linear.std() / 0.02)
+    assert np.median(more) > 0.3
+
+
+def test_runs_are_several_and_throws_have_nothing_to_hold():
+    for index in range(6):
+        recording = WORLDS["runs"].draw(3, index, False, index).recording
+        assert 3 <= len(recording["experiment"].unique()) <= 5
+        for name in ("held", "far_starts"):
+            assert "projectile" not in WORLDS[name].draw(3, index, False, index).key.name
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_far_starts_are_ten_times_off_and_the_true_ones_are_not(index, tmp_path):
+    case = WORLDS["far_starts"].draw(3, index, False, 0)
+    system = case.key.key.mode
+    name = "".join(word.capitalize() for word in system.split("_"))
+    far, near = tmp_path / "far.py", tmp_path / "near.py"
+    far.write_text(case.simulation, encoding="utf-8")
+    near.write_text(right_source(name), encoding="utf-8")
+    far, near = (load_simulation(f"{path}:{name}") for path in (far, near))
+    starts = [
+        [getattr(value, "value", value) for value in simulation.parameters.values()] for simulation in (far, near)
+    ]
+    ratios = np.array(starts[0]) / np.array(starts[1])
+    assert set(np.round(np.log10(ratios), 6)) <= {-1.0, 1.0}
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_a_useless_simulation_cannot_follow(index):
+    key = WORLDS["useless"].draw(3, index, False, index).key
+    assert key.useless == ("wrong sign", "another system", "unrelated output")[index % 3]
+    assert key.follows <= MOST_FOLLOWED
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_the_right_simulation_can_follow(system):
+    """So that a small share means a useless simulation and not a poor fit."""
+    setting = SYSTEMS[system].draw(generator(5, system))
+    outputs = simulate(setting.plant, setting.trial).outputs
+    assert best_share(generator(6), right(setting.plant), setting.trial, outputs) > 0.995
+
+
+class Names:
+    def __init__(self, names, values):
+        self.__dict__.update(zip(names, values, strict=True))
+
+
+@pytest.mark.parametrize("kind", ["wrong sign", "another system"])
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_what_the_diagnosis_is_given_is_what_the_generator_tried(system, kind, tmp_path):
+    from mkc_torch.challenge.dynamics.worlds.simulations import wrong_source
+
+    setting = SYSTEMS[system].draw(generator(3, system))
+    guess = wrong(setting.plant, kind)
+    plant, name = guess.plant, "".join(word.capitalize() for word in system.split("_"))
+    path = tmp_path / "simulation.py"
+    path.write_text(wrong_source(name, kind), encoding="utf-8")
+    simulation = load_simulation(f"{path}:{name}")
+    assert (simulation.states, simulation.inputs) == (plant.states, plant.inputs)
+    assert (simulation.outputs or simulation.states) == plant.outputs
+    given = [
+        (value, -np.inf, np.inf) if isinstance(value, float) else (value.value, value.lower, value.upper)
+        for value in simulation.parameters.values()
+    ]
+    assert given == [(start, *bounds) for start, bounds in zip(guess.starts, guess.bounds, strict=True)]
+    x = 0.5 + torch.rand(len(plant.states), 7, generator=generator(1), dtype=torch.float64)
+    u = torch.rand(len(plant.inputs), 7, generator=generator(2), dtype=torch.float64)
+    values = 0.5 + torch.rand(len(guess.starts), generator=generator(3), dtype=torch.float64)
+    rates = simulation.derivative(
+        torch.zeros(7), Names(plant.states, x), Names(plant.inputs, u), Names(simulation.parameters, values)
+    )
+    expected = plant.rate(x.numpy(), u.numpy(), values.numpy())
+    found = np.stack([(rates[state] + torch.zeros(7)).numpy() for state in plant.states])
+    np.testing.assert_allclose(found, expected, rtol=1e-12)

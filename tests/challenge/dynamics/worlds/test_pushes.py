@@ -1,0 +1,136 @@
+"""Process noise is of the spectrum it is named after, of the size it says, and in the rate of one state alone."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mkc_torch.challenge.draws import generator
+from mkc_torch.challenge.dynamics.errors import draw_errors
+from mkc_torch.challenge.dynamics.generator import SYSTEMS
+from mkc_torch.challenge.dynamics.integrate import simulate
+from mkc_torch.challenge.dynamics.oracle import range_of, tangents
+from mkc_torch.challenge.dynamics.plant import Trial
+from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.worlds.noise import OVER_NOISE, PushedErrors, draw_push, responses
+from mkc_torch.challenge.dynamics.worlds.pushes import GUSTS, KINDS, SLOW, gusts, slow, white
+
+STEP, FINE = 0.05, 8
+
+
+def trial(samples, runs=2):
+    return Trial(STEP, np.zeros((0, samples, runs)), np.zeros((1, runs)))
+
+
+def scene_of(system, seed=3):
+    setting = SYSTEMS[system].draw(generator(seed, system))
+    scene = Scene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
+    return scene, draw_errors(generator(seed, system, "noise"), scene.course.outputs)
+
+
+def test_white_force_noise_is_independent_and_its_integral_does_not_depend_on_the_fine_step():
+    values = white(generator(1), trial(501, 40), FINE).fine
+    count = values.size
+    lags = [(values[k:] * values[:-k]).mean() / values.var() for k in (1, 2, 8)]
+    assert np.abs(lags).max() < 4.0 / np.sqrt(count)
+    power = (np.abs(np.fft.rfft(values, axis=0)[1:]) ** 2).mean(1) * STEP / FINE / len(values)
+    thirds = [part.mean() for part in np.array_split(power, 3)]
+    np.testing.assert_allclose(thirds, 1.0, rtol=0.03)
+    for fine in (2, 16):
+        steps = white(generator(1), trial(501, 40), fine).fine.reshape(500, fine, 40).sum(1) * STEP / fine
+        assert steps.var() / STEP == pytest.approx(1.0, rel=0.03)
+
+
+def test_a_slow_push_forgets_exponentially():
+    many = slow(generator(2), trial(200, 4000), 2)  # the correlation over an ensemble
+    constant = many.words["correlation time"]
+    assert SLOW[0] <= constant / (199 * STEP) <= SLOW[1]
+    values = many.fine[::2]
+    assert values.var() == pytest.approx(1.0, abs=0.03)
+    for lag in (1, 10, 40):
+        found = (values[lag:] * values[:-lag]).mean()
+        assert found == pytest.approx(np.exp(-lag * STEP / constant), abs=0.03)
+        assert many.covariance[0, 0, lag] == pytest.approx(np.exp(-lag * STEP / constant))
+
+
+def test_gusts_are_level_in_some_stretches_and_absent_in_others():
+    values = gusts(generator(3), trial(401, 50), FINE).fine
+    assert not np.diff(values.reshape(400, FINE, 50), axis=1).any()
+    calm = (values == 0.0).mean(0)
+    assert (calm > 0.2).all()
+    assert (calm < 1.0).all()
+    levels = [len(set(run) - {0.0}) for run in values.T]
+    assert max(levels) <= GUSTS[1]
+    assert min(levels) >= 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("system", ["pendulum", "cart_pole", "thermal"])
+def test_a_push_is_in_the_rate_of_its_state_and_of_size_nought_is_not_there(system, kind):
+    scene, errors = scene_of(system)
+    plant = scene.plant
+    push = draw_push(generator(4, kind), kind, scene, errors)
+    others = [plant.row(name) for name in plant.states if name != push.state]
+    assert not push.rates[others].any()
+    assert push.rates[plant.row(push.state)].any()
+    assert push.state not in plant.speeds
+    still = simulate(plant, scene.trial, push=0.0 * push.rates)
+    np.testing.assert_array_equal(still.states, scene.course.states)
+    # in the first fine step nothing but that state has moved to first order
+    first = simulate(plant, scene.trial, push=push.rates).states[:, 1] - scene.course.states[:, 1]
+    step = scene.trial.step / plant.fine
+    np.testing.assert_allclose(first[plant.row(push.state)], step * push.rates[plant.row(push.state), 0], rtol=0.2)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_a_push_leaves_in_the_fitted_run_is_what_the_key_says(kind):
+    scene, errors = scene_of("tanks")
+    push = draw_push(generator(5, kind), kind, scene, errors)
+    moved = simulate(scene.plant, scene.trial, push=push.rates).outputs - scene.course.outputs
+    free = [np.sqrt(np.square(one / d).mean()) for one, d in zip(moved, errors.deviations, strict=True)]
+    assert OVER_NOISE[0] <= push.over_noise <= OVER_NOISE[1]
+    plain = dataclasses.replace(errors, correlation=0.0)
+    if errors.correlation == 0.0:
+        assert max(free) == pytest.approx(push.free_over_noise)
+    basis = range_of(tangents(scene, plain, rivals=False).known)
+    white_moved = plain.whitened(moved)
+    left = (white_moved - basis @ (basis.T @ white_moved)).reshape(len(moved), -1)
+    if errors.correlation == 0.0:
+        assert np.sqrt(np.square(left).mean(1)).max() == pytest.approx(push.over_noise)
+
+
+@pytest.mark.parametrize("system", ["pendulum", "tanks", "projectile"])
+def test_responses_are_those_of_the_true_system(system):
+    scene, _ = scene_of(system)
+    plant, state = scene.plant, next(name for name in scene.plant.states if name not in scene.plant.speeds)
+    push = slow(generator(6), scene.trial, plant.fine)
+    size = 1e-4 * max(scene.pace(state), scene.largest(state) / scene.length)
+    rates = size * push.at(plant, state)
+    means = rates[plant.row(state)].reshape(-1, plant.fine, scene.trial.runs).mean(1)
+    linear = np.einsum("mtrk,kr->mtr", responses(scene, state), means)
+    true = simulate(plant, scene.trial, push=rates).outputs - scene.course.outputs
+    np.testing.assert_allclose(linear, true, atol=0.02 * np.abs(true).max())
+
+
+def test_under_a_push_traces_that_look_like_it_weigh_less():
+    """Draws of noise and push together are white of variance one in that metric, in the mean over many."""
+    scene, errors = scene_of("tanks")
+    errors = dataclasses.replace(errors, correlation=0.0, family="gaussian")
+    push = draw_push(generator(7), "pushed_slowly", scene, errors)
+    weighing = PushedErrors(scene, errors, push)
+    moved = simulate(scene.plant, scene.trial, push=push.rates).outputs - scene.course.outputs
+    assert np.square(weighing.whitened(moved)).sum() < 0.5 * np.square(errors.whitened(moved)).sum()
+    draws = generator(8)
+    squares = []
+    for _ in range(20):
+        again = slow(draws, scene.trial, scene.plant.fine)
+        if not squares:
+            covariance = push.size**2 * again.covariance
+            weighing = PushedErrors(scene, errors, dataclasses.replace(push, covariance=covariance))
+        rates = push.size * again.at(scene.plant, push.state)
+        noise = np.reshape(errors.deviations, (-1, 1, 1)) * np.random.default_rng(len(squares)).standard_normal(
+            moved.shape
+        )
+        total = simulate(scene.plant, scene.trial, push=rates).outputs - scene.course.outputs + noise
+        squares.append(np.square(weighing.whitened(total)).mean())
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.15)

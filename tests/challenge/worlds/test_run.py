@@ -1,0 +1,139 @@
+"""The proof in worlds from end to end, with a diagnosis that costs nothing."""
+
+import json
+import re
+
+import pytest
+
+pytest.importorskip("polars")
+pytest.importorskip("jinja2")
+
+from mkc_torch.challenge.dynamics.worlds import dynamics_worlds
+from mkc_torch.challenge.key import digest
+from mkc_torch.challenge.magnetometer.worlds import magnetometer_worlds
+from mkc_torch.challenge.worlds import run_worlds
+from mkc_torch.challenge.worlds.run import count
+
+
+def cheap(paths, folder):
+    """Says of every third that it is adequate, of the next that it is unfit, and breaks on the last; seeks the key."""
+    output = folder.parent
+    assert (output / "key_hash.txt").is_file()
+    assert not (output / "key.json").exists()
+    broken = ""
+    for path in paths:
+        number = int(path.stem[-5:])
+        if number % 3 == 2:
+            broken = path.stem
+            continue
+        (folder / path.stem).mkdir()
+        said = {"verdict": ("adequate", "unfit")[number % 3], "findings": []}
+        (folder / path.stem / "diagnosis.json").write_text(json.dumps(said))
+    if broken:
+        (folder / f"{broken}.error.txt").write_text("too few samples: record more\n")
+
+
+FAMILIES = {"dynamics": dynamics_worlds(), "magnetometer": magnetometer_worlds(15.0)}
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def done(request, tmp_path_factory):
+    output = tmp_path_factory.mktemp("worlds") / "out"
+    told = []
+    result = run_worlds(
+        cheap, FAMILIES[request.param], per_world=2, hidden=1, seed=3, output=output,
+        progress=lambda stage, done, total: told.append((stage, done, total)),
+    )  # fmt: skip
+    return FAMILIES[request.param], result, output, told
+
+
+def test_the_hash_matches_the_key_and_the_key_is_written_last(done):
+    _, _, output, _ = done
+    assert digest((output / "key.json").read_text().rstrip("\n")) == (output / "key_hash.txt").read_text().strip()
+
+
+def test_every_world_has_its_recordings(done):
+    worlds, result, output, told = done
+    assert [w.name for w in result.worlds] == [w.name for w in worlds.worlds]
+    assert {w.empty for w in result.worlds} == {2}
+    assert [w.hidden for w in result.worlds] == [int(w.hides) for w in worlds.worlds]
+    total = count(worlds, (), 2, 1)
+    assert len(list((output / "recordings").iterdir())) == total == len(result.cases)
+    assert {stage for stage, number, of in told if number == of == total} == {"draw"}
+    assert sum(sum(w.verdicts.values()) for w in result.worlds) == 2 * len(worlds.worlds)
+
+
+def test_neither_names_nor_simulations_tell_the_world(done):
+    worlds, result, output, _ = done
+    known = {world.name for world in worlds.worlds}
+    for path in (output / "recordings").iterdir():
+        assert re.fullmatch(r"[a-z_]+_\d{5}", path.stem)
+        assert path.stem.rpartition("_")[0] not in known
+    for path in (output / "simulations").iterdir():
+        text = path.read_text(encoding="utf-8").lower()
+        assert not any(word in text for word in ("wrong", "other", "useless", "far", "mistake"))
+    order = [case.key.world for case in result.cases]
+    assert order != sorted(order)
+
+
+def test_each_differential_equation_has_a_simulation_of_its_own(done):
+    worlds, result, output, _ = done
+    given = {path.stem for path in (output / "simulations").iterdir()}
+    if worlds.family == "dynamics":
+        assert given == {case.key.name for case in result.cases}
+    else:
+        views = {case.key.name for case in result.cases if case.key.useless not in ("", "unrelated field")}
+        assert given == views
+
+
+def test_what_failed_is_told_with_its_reason_and_raises_no_alarm(done):
+    _, result, output, _ = done
+    record = json.loads((output / "score.json").read_text(encoding="utf-8"))
+    failed = [name for world in result.worlds for name in world.failed]
+    assert set(record["failed"]) == set(failed)
+    assert "too few samples" in "".join(record["failed"].values())
+    assert all(world.false_alarms.count == 0 for world in result.worlds)
+    assert record["settings"]["seed"] == 3
+    assert len(record["worlds"]) == len(result.worlds)
+    assert "aims are held" in (output / "challenge.html").read_text(encoding="utf-8")
+    assert "| world | asked | measured | holds |" in (output / "summary.md").read_text(encoding="utf-8")
+
+
+def quiet(paths, folder):
+    """Writes nothing."""
+
+
+def test_a_larger_run_contains_a_smaller_one(tmp_path):
+    worlds = FAMILIES["magnetometer"]
+    small, large = (
+        run_worlds(quiet, worlds, only=["white"], per_world=n, hidden=0, seed=3, output=tmp_path / str(n))
+        for n in (1, 3)
+    )
+    (one,) = small.cases
+    same = next(case for case in large.cases if case.key.index == one.key.index)
+    assert same.key.key.sensor == one.key.key.sensor
+    for run, name in (("1", one.key.name), ("3", same.key.name)):
+        assert (tmp_path / run / "recordings" / f"{name}.csv").is_file()
+    first, again = (
+        (tmp_path / run / "recordings" / f"{name}.csv").read_bytes()
+        for run, name in (("1", one.key.name), ("3", same.key.name))
+    )
+    assert first == again
+
+
+def test_two_processes_draw_the_same(tmp_path):
+    worlds = FAMILIES["dynamics"]
+    for workers in (1, 2):
+        run_worlds(
+            quiet, worlds, only=["gusts", "useless"], per_world=1, hidden=0, seed=3, output=tmp_path / str(workers),
+            workers=workers,
+        )  # fmt: skip
+    assert (tmp_path / "1" / "key_hash.txt").read_text() == (tmp_path / "2" / "key_hash.txt").read_text()
+
+
+def test_a_world_that_is_not_there_and_a_run_of_nothing_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"one of white, coloured, wander, .* but got 'held'"):
+        run_worlds(quiet, FAMILIES["magnetometer"], only=["held"], output=tmp_path / "a")
+    with pytest.raises(ValueError, match="at least"):
+        run_worlds(quiet, FAMILIES["magnetometer"], per_world=0, output=tmp_path / "a")
+    assert not (tmp_path / "a").exists()

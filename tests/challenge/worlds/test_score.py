@@ -1,0 +1,220 @@
+"""The score of worlds on diagnoses made up for it."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+
+from mkc_torch.challenge import aims
+from mkc_torch.challenge.key import KeyEffect, KeyRival
+from mkc_torch.challenge.world import KeyPush, World, WorldKey, Worlds
+from mkc_torch.challenge.worlds.page import held, worlds_page, worlds_summary
+from mkc_torch.challenge.worlds.score import LEAST_PUSH, score_worlds
+from tests.challenge.test_key import example
+
+SETTINGS = {"family": "dynamics", "seed": 1, "key_sha256": "0" * 64, "empty_per_world": 1, "hidden_per_world": 1}
+
+
+def never(*_):
+    raise AssertionError
+
+
+WORLDS = Worlds(
+    "dynamics",
+    (
+        World("white", "white noise", never, aims.WHITE),
+        World("pushed_white", "white force noise", never, aims.PUSHED),
+        World("useless", "of no use", never, aims.USELESS, hides=False),
+    ),
+    aims.TOTALS,
+)
+
+
+def key(name, world="white", *, push=0.0, useless="", kind="empty", effect="backlash", z=20.0, z_sep=15.0):
+    rival = KeyRival("dead_zone", (), z_sep)
+    truth = KeyEffect(effect, "", (), "", None, 1.0, (), z, z_sep, rival, (), ("input voltage",))
+    plain = dataclasses.replace(
+        example(name), kind="useless" if useless else kind, effects=() if kind == "empty" else (truth,)
+    )
+    told = KeyPush("pushed_white", "speed", 0.1, "m/s²·√s", push) if push else None
+    return WorldKey(world, 0, plain, told, useless)
+
+
+def says(verdict, *findings, driven=None):
+    told = {"verdict": verdict, "findings": list(findings)}
+    if driven:
+        told["noise"] = {"process": {driven: {"size": 1.0, "standard_error": 0.1, "unit": "m/s²"}}}
+    return told
+
+
+def finding(effect, grade="left out"):
+    return {"effect": effect, "grade": grade, "drivers": [], "channels": ["input voltage"], "alternatives": []}
+
+
+def counts(share):
+    return share.count, share.total
+
+
+def world(result, name):
+    return next(world for world in result.worlds if world.name == name)
+
+
+def aim(scored, measure):
+    return next(m for m in scored.measured if m.threshold.measure == measure)
+
+
+def test_empty_recordings_of_an_ordinary_world():
+    answers = {
+        "quiet": says("adequate"),
+        "wandering": says("unexplained", finding("input_delay", "not confirmed")),
+        "alarm": says("explained", finding("input_delay")),
+        "small": says("explained", finding("sensor_lag", "real but small")),
+        "old": says("explained", {"effect": "backlash"}),
+        "unfit": says("unfit"),
+    }
+    scored = world(score_worlds(WORLDS, [key(name) for name in (*answers, "refused")], answers), "white")
+    assert scored.empty == 7
+    assert counts(scored.false_alarms) == (3, 6)  # the refused one is in its own column alone
+    assert scored.alarms == {"input_delay": 1, "sensor_lag": 1, "backlash": 1}
+    assert scored.verdicts == {"unfit": 1, "adequate": 1, "explained": 3, "unexplained": 1, "failed": 1}
+    assert scored.failed == ("refused",)
+    assert counts(scored.adequate) == (1, 7)
+    assert counts(scored.useful_unfit) == (1, 7)
+    assert not aim(scored, "false_alarms").holds
+    assert not aim(scored, "useful_unfit").holds
+    assert scored.false_alarms.low < 0.5 < scored.false_alarms.high
+
+
+def test_pushed_states_are_located_by_process_noise_forcing_or_a_finding():
+    answers = {
+        "noise": says("unexplained", driven="speed"),
+        "forcing": says("unexplained") | {"forcing": [{"state": "speed"}]},
+        "finding": says("unexplained", finding("unknown", "not confirmed") | {"channels": ["rate of speed"]}),
+        "wrong": says("unexplained", driven="angle"),
+        "adequate": says("adequate", driven="speed"),
+        "nowhere": says("unexplained"),
+        "weak": says("adequate"),
+    }
+    keys = [key(name, "pushed_white", push=LEAST_PUSH - 0.1 if name == "weak" else 3.0) for name in answers]
+    scored = world(score_worlds(WORLDS, keys, answers), "pushed_white")
+    assert counts(scored.unexplained_located) == (3, 6)
+    assert counts(scored.located) == (4, 6)
+    assert counts(scored.false_alarms) == (0, 7)
+    assert aim(scored, "unexplained_located").value == 0.5
+    assert held(aim(scored, "unexplained_located")) == "not held"
+    assert held(aim(scored, "false_alarms")) == "held"
+    assert held(aim(scored, "named")) == "not measured"
+
+
+def test_disturbances_of_a_sensor_have_no_state_to_be_located_in():
+    disturbed = dataclasses.replace(key("a", "pushed_white"), push=KeyPush("wander", "sensor", 1.0, "µT", 4.0))
+    scored = world(score_worlds(WORLDS, [disturbed], {"a": says("unexplained")}), "pushed_white")
+    assert scored.unexplained_located.total == 0
+
+
+def test_useless_simulations_have_to_be_unfit_and_never_adequate():
+    keys = [key(name, "useless", useless="wrong sign" if name < "c" else "another system") for name in "abcd"]
+    answers = {"a": says("unfit"), "b": says("adequate"), "c": says("unfit"), "d": None}
+    result = score_worlds(WORLDS, keys, answers)
+    scored = world(result, "useless")
+    assert counts(scored.unfit) == (2, 4)
+    assert scored.reasons["wrong sign"] == {"unfit": 1, "adequate": 1, "explained": 0, "unexplained": 0, "failed": 0}
+    assert scored.reasons["another system"]["failed"] == 1
+    assert [m.holds for m in scored.measured if m.threshold.measure in ("unfit", "adequate")] == [False, False]
+    assert result.total.empty == 0  # none of them is of use
+    good = score_worlds(WORLDS, keys, dict.fromkeys("abcd", says("unfit")))
+    assert all(m.holds for m in world(good, "useless").measured if m.threshold.measure != "empty")
+
+
+def test_names_of_what_is_hidden():
+    answers = {
+        "right": says("explained", finding("backlash")),
+        "wrong": says("explained", finding("dead_zone")),
+        "nearest": says("unexplained", finding("backlash", "nearest in the catalogue")),
+        "unsure": says("unexplained", finding("backlash", "not confirmed")),
+        "unnamed": says("explained", finding("unknown")),
+        "weak": says("adequate"),
+        "unfit": says("unfit"),
+        "close": says("unfit"),
+    }
+    sizes = {"weak": {"z": 5.0, "z_sep": 5.0}, "close": {"z_sep": 3.0}}
+    keys = [
+        key(name, kind="single", push=3.0 if name in ("right", "wrong") else 0.0, **sizes.get(name, {}))
+        for name in answers
+    ]
+    scored = world(score_worlds(WORLDS, keys, answers), "white")
+    assert (scored.hidden, scored.strong) == (8, 6)
+    assert counts(scored.named) == (1, 6)
+    assert counts(scored.named_pushed) == (1, 2)
+    assert counts(scored.named_quiet) == (0, 4)
+    assert counts(scored.wrong) == (1, 6)
+    assert counts(scored.nearest) == (1, 6)
+    assert counts(scored.useful_unfit) == (2, 7)  # with z of at least ten, told from its rivals or not
+    assert scored.false_alarms.total == 0
+
+
+def test_outside_the_catalogue_only_a_wrong_name_is_wrong():
+    answers = {
+        "claimed": says("explained", finding("dead_zone")),
+        "own": says("explained", finding("vibration")),
+        "unknown": says("explained", finding("unknown")),
+        "nearest": says("unexplained", finding("dead_zone", "nearest in the catalogue")),
+        "unseen": says("adequate"),
+        "weak": says("explained", finding("dead_zone")),
+    }
+    keys = [key(n, kind="outside", effect="vibration", z=4.0 if n == "weak" else 15.0) for n in answers]
+    result = score_worlds(WORLDS, keys, answers)
+    assert counts(world(result, "white").outside_wrong) == (1, 5)
+    assert counts(world(result, "white").outside_nearest) == (3, 5)
+    assert world(result, "white").strong == 0
+    assert held(aim(result.total, "outside_wrong")) == "not held"
+
+
+def all_kinds():
+    keys = [
+        key("a"),
+        key("b", "pushed_white", push=3.0),
+        key("c", "useless", useless="wrong <sign>"),
+        key("d", kind="single"),
+    ]
+    answers = {"a": says("adequate"), "b": says("unexplained", driven="speed"), "c": says("unfit")}
+    return score_worlds(WORLDS, keys, answers)
+
+
+def test_the_total_is_of_useful_worlds():
+    result = all_kinds()
+    assert [w.name for w in result.worlds] == ["white", "pushed_white", "useless"]
+    assert (result.total.empty, result.total.hidden) == (2, 1)
+    assert [m.threshold for m in result.total.measured] == list(aims.TOTALS)
+
+
+def test_numbers_are_json_with_a_row_for_each_case():
+    numbers = all_kinds().numbers()
+    assert json.loads(json.dumps(numbers, allow_nan=False)) == numbers
+    assert [case["verdict"] for case in numbers["cases"]] == ["adequate", "unexplained", "unfit", "failed"]
+    assert numbers["cases"][1]["push"]["at"] == numbers["cases"][1]["driven"] == "speed"
+    assert numbers["worlds"][1]["holds"]["unexplained_located"] is True
+    assert numbers["worlds"][0]["holds"]["named"] is False
+    assert numbers["worlds"][1]["holds"]["named"] is None
+
+
+def test_each_world_is_a_row_of_the_page_and_of_the_summary():
+    pytest.importorskip("jinja2")
+    result = all_kinds()  # the strong one that failed was not named
+    page, text = worlds_page(result, SETTINGS), worlds_summary(result, SETTINGS)
+    for name in ("white", "pushed_white", "useless", "all useful"):
+        assert f'<th scope="row">{name}</th>' in page
+        assert f"| {name} |" in text
+    assert "wrong &lt;sign&gt;" in page
+    for words in ("held", "not held", "too few", "not measured", "at most 7 % false alarms"):
+        assert words in page
+        assert words in text
+    assert "100.0 % (1 of 1; 2.5-100.0 %)" in page
+    assert "<script" not in page
+
+
+def test_only_worlds_with_a_key_are_scored():
+    result = score_worlds(WORLDS, [], {})
+    assert result.worlds == ()
+    assert math.isnan(result.total.false_alarms.value)

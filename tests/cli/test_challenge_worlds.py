@@ -1,0 +1,95 @@
+"""``mkc challenge --worlds``."""
+
+import json
+
+import pytest
+
+pytest.importorskip("typer")
+pytest.importorskip("polars")
+pytest.importorskip("jsonschema")
+pytest.importorskip("jinja2")
+
+from mkc_torch.cli import challenge
+from mkc_torch.cli.challenge import diagnose_in_world
+from mkc_torch.cli.diagnosis_files import MAGNETOMETER
+from tests.cli.test_diagnose import mkc, refused
+
+
+def adequate(paths, folder):
+    for path in paths:
+        (folder / path.stem).mkdir()
+        told = {"verdict": "adequate", "findings": []}
+        (folder / path.stem / "diagnosis.json").write_text(json.dumps(told))
+
+
+def test_worlds_are_drawn_scored_and_told_with_their_aims(tmp_path, monkeypatch):
+    monkeypatch.setattr(challenge, "diagnose_in_world", adequate)
+    folder = tmp_path / "worlds"
+    command = ("challenge", "--worlds", "--family", "dynamics", "--per-world", 3, "--hidden-per-world", 1, "--seed", 4)
+    result = mkc(*command, "--only", "gusts", "--only", "useless", "--workers", 1, "--output", folder)
+    assert result.exit_code == 0, result.output
+    flat = " ".join(result.stdout.split())
+    assert "Blind proof in worlds: 7 recordings" in flat
+    assert "gusts: pushes of the rate of one state in some stretches" in flat
+    assert "said of 3 unfit 0, adequate 3, explained 0, unexplained 0, failed 0" in flat
+    assert "false alarms 0.0 % (0 of 3; 0.0-70.8 %)" in flat
+    assert "at most 7 % false alarms 0.0 % held" in flat
+    assert "unexplained, at the right state, in at least 80 % 0.0 % not held" in flat
+    assert "unfit in at least 95 % 0.0 % not held" in flat
+    assert "adequate in none (0 %) 100.0 % not held" in flat
+    assert "wrong sign adequate 1" in flat
+    assert str(folder / "challenge.html") in result.stdout
+    record = json.loads((folder / "score.json").read_text(encoding="utf-8"))
+    assert [world["name"] for world in record["worlds"]] == ["gusts", "useless"]
+    assert record["settings"]["seed"] == 4
+    refused(mkc(*command, "--output", folder), "not empty", "--force")
+
+
+def test_a_third_as_many_have_something_hidden_by_default(tmp_path, monkeypatch):
+    monkeypatch.setattr(challenge, "diagnose_in_world", adequate)
+    command = ("challenge", "--worlds", "--per-world", 3, "--only", "white", "--duration", 12, "--workers", 1)
+    result = mkc(*command, "--output", tmp_path / "a")
+    assert result.exit_code == 0, result.output
+    record = json.loads((tmp_path / "a" / "score.json").read_text(encoding="utf-8"))
+    assert (record["worlds"][0]["empty"], record["worlds"][0]["hidden"]) == (3, 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--worlds", "--cases", 1), ("--cases", "--per-world")),
+        (("--worlds", "--empty", 1), ("--empty", "--per-world")),
+        (("--per-world", 2), ("--per-world", "add --worlds")),
+        (("--only", "white"), ("--only", "add --worlds")),
+        (("--worlds", "--only", "held"), ("white, coloured, wander", "'held'")),
+        (("--worlds", "--per-world", 0), ("both 0",)),
+        (("--worlds", "--family", "dynamics", "--duration", 20), ("each system has a length of its own",)),
+    ],
+)
+def test_what_does_not_belong_together_is_refused(tmp_path, arguments, words):
+    refused(mkc("challenge", *arguments, "--output", tmp_path / "a"), *words, code=2)
+    assert not (tmp_path / "a").exists()
+
+
+def test_each_recording_is_compared_with_the_simulation_that_lies_ready_for_it(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(challenge, "_diagnose", lambda path, _, request: asked.append((path.stem, request.simulation)))
+    (tmp_path / "simulations").mkdir()
+    for name in ("cart_pole_00003", "case_00004"):
+        (tmp_path / "simulations" / f"{name}.py").touch()
+    paths = [tmp_path / "recordings" / f"{name}.csv" for name in ("cart_pole_00003", "case_00004", "case_00005")]
+    diagnose_in_world(paths, tmp_path / "diagnoses")
+    assert asked == [
+        ("cart_pole_00003", f"{tmp_path / 'simulations' / 'cart_pole_00003.py'}:CartPole"),
+        ("case_00004", f"{tmp_path / 'simulations' / 'case_00004.py'}:sensor"),
+        ("case_00005", MAGNETOMETER),
+    ]
+
+
+def test_a_real_diagnosis_is_scored(tmp_path):
+    command = ("challenge", "--worlds", "--per-world", 1, "--only", "white", "--hidden-per-world", 0, "--duration", 15)
+    result = mkc(*command, "--workers", 1, "--seed", 2, "--output", tmp_path / "a")
+    assert result.exit_code == 0, result.output
+    assert "failed 0" in result.stdout
+    (name,) = [path.name for path in (tmp_path / "a" / "diagnoses").iterdir()]
+    assert (tmp_path / "a" / "diagnoses" / name / "diagnosis.json").is_file()

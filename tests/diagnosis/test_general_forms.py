@@ -1,0 +1,105 @@
+"""Forms that have named physics as special cases are named where these will not do, and only there."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch import diagnose
+from mkc_torch.simulation import Dynamics, Parameter
+from tests.diagnosis.test_dynamics_diagnosis import QUICK, Pendulum, explained, measured, swung, value
+
+
+class Body(Dynamics):
+    """Heated, in a room whose temperature is known."""
+
+    states = ("temp",)
+    inputs = ("power", "room")
+    parameters = {"capacity": Parameter(40.0, lower=1.0), "loss": Parameter(0.4, lower=0.0)}  # noqa: RUF012
+    units = {"temp": "°C"}  # noqa: RUF012
+    between = "held"
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"temp": (u.power - p.loss * (x.temp - u.room)) / p.capacity}
+
+
+def heated(rate, first, noise, seed=0):
+    """400 samples of a body that is heated in steps, held between samples as its equations have it."""
+    time = np.arange(400) * 2.0
+    power = np.repeat(np.random.default_rng(seed).uniform(0.0, 40.0, 20), 20)
+    room = 20.0 + np.sin(time / 150.0)
+
+    def driven(t, y):
+        k = min(int(t / 2.0 + 1e-9), 399)
+        return rate(y, power[k], room[k])
+
+    return measured(driven, first, time, noise, seen=("temp",), power=power, room=room)
+
+
+def test_convection_is_named_with_its_exponent():
+    def rate(y, power, room):
+        away = y[0] - room
+        return [(power - 0.3 * away - 0.04 * abs(away) ** 1.4 * np.sign(away)) / 50.0]
+
+    finding = explained(diagnose(Body(), heated(rate, [20.0], 0.05), **QUICK), "power_law")
+    exponent, error = value(finding, "exponent")
+    assert exponent == pytest.approx(1.4, abs=3.0 * error)
+    assert error < 0.1
+    assert "u = room" in finding.equation
+
+
+def test_a_wall_that_takes_up_heat_is_named_and_sized():
+    """It has two fifths of the body's capacity, and gives nothing off to the room."""
+
+    def rate(y, power, room):
+        flow = 0.5 * (y[1] - y[0])
+        return [(power - 0.4 * (y[0] - room) + flow) / 50.0, -flow / 20.0]
+
+    finding = explained(diagnose(Body(), heated(rate, [20.0, 20.0], 0.05), **QUICK), "hidden_lag")
+    assert value(finding, "share")[0] == pytest.approx(0.4, abs=0.04)
+    assert value(finding, "time_constant")[0] == pytest.approx(40.0, abs=4.0)
+
+
+class Joint(Dynamics):
+    """An arm on a stiff shaft, as its equations have it."""
+
+    states = ("angle", "speed")
+    inputs = ("torque",)
+    parameters = {"inertia": Parameter(0.9, lower=0.1), "damping": Parameter(0.3, lower=0.0)}  # noqa: RUF012
+    units = {"angle": "rad", "speed": "rad/s"}  # noqa: RUF012
+    step = 0.02
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"angle": x.speed, "speed": (u.torque - 6.0 * x.angle - p.damping * x.speed) / p.inertia}
+
+
+def test_a_flexible_joint_is_named_with_its_period():
+    """By places and forces: an arm of 0.2 of the drive's inertia behind a spring of 20 units."""
+    time = np.arange(300) * 0.02
+    torque = 3.0 * np.sin(2.0 * time) + 3.0 * np.sin(5.3 * time) + 3.0 * np.sin(11.0 * time + 1.0)
+
+    def rate(t, y):
+        spring = 20.0 * (y[2] - y[0]) + 0.1 * (y[3] - y[1])
+        return [y[1], np.interp(t, time, torque) - 6.0 * y[0] - 0.3 * y[1] + spring, y[3], -spring / 0.2]
+
+    recording = measured(rate, [0.3, 0.0, 0.3, 0.0], time, 0.005, seen=("angle",), torque=torque)
+    finding = explained(diagnose(Joint(), recording, **QUICK), "hidden_mode")
+    assert value(finding, "share")[0] == pytest.approx(0.2, abs=0.02)
+    assert value(finding, "period")[0] == pytest.approx(2.0 * math.pi / 10.0, rel=0.02)
+    assert value(finding, "damping")[0] == pytest.approx(0.1 / (2.0 * 0.2 * 10.0), abs=0.02)
+
+
+class Free(Pendulum):
+    """With a damping that is known."""
+
+    parameters = {"stiffness": 8.0}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle) - 0.05 * x.speed}
+
+
+@pytest.mark.parametrize("name", ["linear_drag", "quadratic_drag"])
+def test_whole_powers_keep_their_names(name):
+    drags = {"linear_drag": lambda _, v: -0.06 * v, "quadratic_drag": lambda _, v: -0.12 * v * abs(v)}
+    explained(diagnose(Free(), swung(drags[name]), **QUICK), name)

@@ -1,0 +1,158 @@
+"""Which view is compared: one whose turns are wrong leaves far more of the field than its length does."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from mkc_torch import diagnose
+from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.simulation import Magnetometer
+from mkc_torch.simulation.magnetometer.parts import ellipsoid_of_a_part, sphere_of_all
+from tests.simulation.tumbling import RATE, body_rate, changed, full_truth, tumbling, turns
+
+N = 3000
+TIME = np.arange(N) / RATE
+SLOW = 0.1 * TIME
+"""Moments of a motion so slow that the length determines the sensor, but no longer together with a step."""
+
+STEP = np.outer(TIME > 30.0, [8.0, -5.0, 3.0])
+
+
+def quaternions(rotation):
+    x, y, z, w = rotation.as_quat().T
+    return {"q_w": w, "q_x": x, "q_y": y, "q_z": z}
+
+
+def rates(rate):
+    return {f"gyro_{axis}": np.ascontiguousarray(column) for axis, column in zip("xyz", rate.T, strict=True)}
+
+
+def prepared(attitude, **further):
+    return Magnetometer().prepare(changed(tumbling(N, noise=0.5, **further), **attitude))
+
+
+def wandering(degrees, tau=10.0):
+    """An attitude's error, as a filter has it."""
+    random, decay = np.random.default_rng(0), np.exp(-1.0 / (RATE * tau))
+    error = np.zeros((N, 3))
+    for k in range(1, N):
+        error[k] = decay * error[k - 1] + np.sqrt(1.0 - decay**2) * random.standard_normal(3)
+    return Rotation.from_rotvec(np.deg2rad(degrees) * error)
+
+
+@pytest.mark.parametrize(
+    "attitude",
+    [
+        quaternions(turns(TIME)),
+        quaternions(wandering(2.0) * turns(TIME)),
+        quaternions(wandering(4.0) * turns(TIME)),
+        quaternions(turns(TIME - 0.01)),
+        quaternions(turns(TIME) * Rotation.from_euler("Z", 40, degrees=True)),
+    ],
+    ids=["exact", "2 degrees", "4 degrees", "10 ms late", "other axes"],
+)
+def test_an_attitude_may_be_off_by_its_own_noise(attitude):
+    assert prepared(attitude).view == "attitude"
+
+
+@pytest.mark.parametrize("size", [10.0, 40.0])
+def test_a_change_of_the_sensor_is_no_fault_of_the_attitude(size):
+    right = quaternions(turns(TIME))
+    assert prepared(right, sensor=np.outer(TIME > 30.0, [0.8, -0.5, 0.3]) * size).view == "attitude"
+    assert prepared(right, sensor=np.outer(TIME / 60.0, [0.8, -0.5, 0.3]) * size).view == "attitude"
+    assert prepared(right, sensor=np.outer(np.sin(TIME) ** 2, [0.8, -0.5, 0.3]) * size).view == "attitude"
+
+
+@pytest.mark.parametrize(
+    ("attitude", "words"),
+    [
+        (quaternions(turns(TIME - 0.1)), "seems to be late by 0.1 s"),
+        (quaternions(turns(TIME + 0.5)), "seems to be early by 0.5 s"),
+        (dict(zip(("q_w", "q_x", "q_y", "q_z"), turns(TIME).as_quat().T, strict=True)), "in the order x, y, z, w"),
+        (quaternions(turns(0.77 * TIME + 31.0)), "see that it is of this recording and of this sensor"),
+        (quaternions(wandering(20.0) * turns(TIME)), "see that it is of this recording and of this sensor"),
+        (quaternions(turns(0.0 * TIME)), "does not turn as the field does"),
+    ],
+    ids=["late", "early", "order", "another's", "poor", "still"],
+)
+def test_a_wrong_attitude_is_left_out_for_the_length_with_the_reason(attitude, words):
+    view = prepared(attitude)
+    assert view.view == "norm"
+    (sentence,) = (warning for warning in view.warnings if "attitude is left out" in warning)
+    assert words in sentence
+    assert float(1.4826 * view.residual(view.start(), {}).abs().median()) < 0.6
+
+
+def test_what_is_left_is_told_in_the_measurements_unit():
+    (sentence,) = prepared(quaternions(turns(TIME - 0.1))).warnings
+    assert "of the field of 47 µT are left in each axis, of the length 0.5 µT" in sentence
+    assert "Without that 0.5" in sentence
+
+
+@pytest.mark.parametrize(
+    ("rate", "words"),
+    [
+        (lambda rate: np.rad2deg(rate), "in degrees per second, not in rad/s. Without"),
+        (lambda rate: -np.rad2deg(rate), "in degrees per second, not in rad/s, and of the other sign"),
+        (lambda rate: np.rad2deg(rate[:, [1, 0, 2]]) * [1.0, 1.0, -1.0], "its x is y as recorded"),
+    ],
+    ids=["degrees", "degrees and sign", "exchanged"],
+)
+def test_a_wrong_gyroscope_is_left_out_where_the_length_holds_together_with_a_step(rate, words):
+    recording = tumbling(N, noise=0.5, moments=SLOW, sensor=STEP)
+    right = 0.1 * body_rate(SLOW)
+    assert Magnetometer().prepare(changed(recording, **rates(right))).view == "gyro"
+    view = Magnetometer().prepare(changed(recording, **rates(rate(right))))
+    assert view.view == "norm"
+    assert "The gyroscope is left out" in view.warnings[0]
+    assert words in view.warnings[0]
+    assert "All samples together determine no ellipsoid" in view.warnings[1]
+    assert view.prior is not None
+
+
+def test_wrong_turns_are_told_of_where_the_length_determines_nothing():
+    little = tumbling(N, noise=0.5, size=(1.0, 0.1, 0.1), moments=0.3 * TIME)
+    rate = 0.3 * body_rate(0.3 * TIME, (1.0, 0.1, 0.1))
+    right = Magnetometer().prepare(changed(little, **rates(rate)))
+    wrong = Magnetometer().prepare(changed(little, **rates(np.rad2deg(rate))))
+    assert (right.view, wrong.view) == ("gyro", "gyro")
+    assert not any("hardly explains" in warning for warning in right.warnings)
+    assert "The gyroscope hardly explains the field" in wrong.warnings[0]
+    assert "degrees per second" in wrong.warnings[0]
+
+
+def test_a_view_that_is_asked_for_is_taken():
+    recording = changed(tumbling(N, noise=0.5), **quaternions(turns(TIME - 0.5)), **rates(-body_rate(TIME)))
+    assert [Magnetometer(use=use).prepare(recording).view for use in ("attitude", "gyro")] == ["attitude", "gyro"]
+
+
+def test_a_part_starts_the_length_where_all_samples_do_not():
+    half = tumbling(N, noise=0.3, moments=np.where(TIME < 30.0, TIME, 30.0 + 0.02 * (TIME - 30.0)))
+    points = half.magnetometer() + torch.as_tensor(np.outer(TIME > 30.0, [300.0, 0.0, 0.0]))
+    surface = ellipsoid_of_a_part(points, torch.arange(N))
+    assert surface.last <= N // 2 + 1
+    assert surface.center == pytest.approx(full_truth(47.0)[:3].tolist(), abs=0.1)
+    assert sphere_of_all(tumbling(N, noise=0.3, sensor=STEP).magnetometer(), torch.arange(N)).radius == pytest.approx(
+        46.7, rel=0.1
+    )
+
+
+def test_samples_that_cover_too_little_start_nothing():
+    little = tumbling(N, noise=0.5, size=(1.0, 0.05, 0.05))
+    with pytest.raises(NotIdentifiableError):
+        Magnetometer().prepare(little)
+    assert sphere_of_all(little.magnetometer(), torch.arange(N)) is None
+
+
+def test_a_step_is_named_by_the_length_where_the_gyroscope_is_in_degrees():
+    recording = changed(
+        tumbling(N, noise=0.5, seed=1, moments=SLOW, sensor=STEP), **rates(np.rad2deg(0.1 * body_rate(SLOW)))
+    )
+    found = diagnose(Magnetometer(), recording, surrogates=19)
+    (finding,) = found.findings
+    assert finding.effect == "hard_iron_step"
+    assert finding.onset == pytest.approx(30.0, abs=0.2)
+    (change,) = (parameter for parameter in finding.parameters if parameter.name == "offset_change")
+    assert change.value == pytest.approx((8.0, -5.0, 3.0), abs=1.0)
+    assert any("The gyroscope is left out" in warning for warning in found.warnings)
