@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -20,6 +21,7 @@ from mkc_torch.diagnosis.assemble import Whole, assembled, with_rest
 from mkc_torch.diagnosis.evidence.after_the_search import answers_of, parts_ahead
 from mkc_torch.diagnosis.evidence.base import Case
 from mkc_torch.diagnosis.evidence.running_freely import running_freely
+from mkc_torch.diagnosis.findings.follows import misses
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import FittedModel
@@ -28,7 +30,7 @@ from mkc_torch.diagnosis.model.in_the_world import at_liberty, between_samples, 
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.rounds import Asked, Search, begun, continued
 from mkc_torch.diagnosis.settings import Settings
-from mkc_torch.diagnosis.verdict import lost_from_the_start
+from mkc_torch.diagnosis.verdict import alone, lost_from_the_start
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.recording import Recording
@@ -129,14 +131,18 @@ def diagnose(
     drivers = find_drivers(prepared.recording, simulation.columns, settings.drivers, roles, measured)
     terms = candidate_terms(prepared, drivers.drivers, effects)
     _refuse_no_noise(base, where)
+    missed = misses(alone(world, declared), settings.evidence.followed)
+    if missed:
+        # one effect may be what it lacks to follow; what it lacks beside that is told once it follows
+        asked = replace(asked, max_findings=min(max_findings, 1))
     hopeless = lost_from_the_start(world, declared, settings.evidence)
     search = begun(base, () if hopeless else terms, asked, generator)
 
     def case(search: Search) -> Case:
         free = running_freely(base, world.free, search.found, search.evidence, search.blocks)
-        found, judged = free.found, search.evidence
+        found, pairs = free.found, search.pairs
         return Case(
-            free.base, search.first, found, free.held_out, search.blocks, drivers.drivers, seed, settings, judged=judged
+            free.base, search.first, found, free.held_out, search.blocks, drivers.drivers, seed, settings, pairs=pairs
         )
 
     def diagnosis(search: Search, known: Case, done: Sequence[Any]) -> Diagnosis:

@@ -14,8 +14,10 @@ from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, block
 from mkc_torch.diagnosis.evidence.simpler_form import simplified
 from mkc_torch.diagnosis.evidence.unrecorded_cause import course_without, located_cause
 from mkc_torch.diagnosis.model.at_once import common_parts
-from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.grid import within_a_sample
 from mkc_torch.diagnosis.model.in_the_world import pushed
+from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.colour import correlation_time
 from mkc_torch.diagnosis.noise.innovations import innovation_gain
@@ -70,7 +72,8 @@ def _holds(
 class Search:
     """One search after the other: the first one, what was found, and what unseen blocks did not confirm.
 
-    ``evidence`` is that of the simulation alone and with one finding more each; ``left`` are candidates that are still
+    ``evidence`` is that of the simulation alone and with one finding more each, ``pairs`` that without and with each
+    finding under the same pushes, by which it was confirmed; ``left`` are candidates that are still
     to be searched beside what was found, none once the search is over; ``given_up`` says why there was no next one, and
     ``cut`` that there was a further finding when as much was found as was asked for.
     """
@@ -81,6 +84,7 @@ class Search:
     blocks: HeldOutBlocks
     evidence: tuple[Evidence, ...]
     left: tuple[Term, ...]
+    pairs: tuple[tuple[Evidence, Evidence], ...] = ()
     given_up: str = ""
     cut: bool = False
 
@@ -88,7 +92,8 @@ class Search:
     def parts(self) -> tuple[object, ...]:
         """What the next search goes on with."""
         fits = [located.fit for located in self.found]
-        return self.first, *self.found, *fits, *(fit.model for fit in fits), self.blocks, *self.evidence
+        pairs = [one for pair in self.pairs for one in pair]
+        return self.first, *self.found, *fits, *(fit.model for fit in fits), self.blocks, *self.evidence, *pairs
 
 
 def begun(base: FittedModel, terms: tuple[Term, ...], asked: Asked, generator: torch.Generator) -> Search:
@@ -104,7 +109,7 @@ def begun(base: FittedModel, terms: tuple[Term, ...], asked: Asked, generator: t
     begun = Search(first, (), None, blocks, (evidence,), terms)
     if first is None:
         return begun
-    taken = _taken_up(begun, first, asked)
+    taken = _taken_up(begun, base, first, asked)
     if taken.found:
         return taken
     cause = located_cause(base, first, asked.level, asked.surrogates)
@@ -112,7 +117,7 @@ def begun(base: FittedModel, terms: tuple[Term, ...], asked: Asked, generator: t
         return taken
     after = held_out(cause.fit, blocks, partial(course_without, base, cause))
     # beside a course that may be any, little is left to be told
-    return replace(_taken_up(replace(taken, first=cause), cause, asked, after), left=())
+    return replace(_taken_up(replace(taken, first=cause), base, cause, asked, after), left=())
 
 
 def continued(search: Search, asked: Asked, generator: torch.Generator) -> Search:
@@ -121,7 +126,7 @@ def continued(search: Search, asked: Asked, generator: torch.Generator) -> Searc
         return replace(search, left=())
     fit = search.found[-1].fit
     try:
-        return _taken_up(search, _located(fit, search.left, asked, generator, parts=False), asked)
+        return _taken_up(search, fit, _located(fit, search.left, asked, generator, parts=False), asked)
     except NoFitError as error:
         return replace(search, left=(), given_up=str(error))  # what was found before is not to be lost
 
@@ -163,8 +168,10 @@ def _beside(search: Search, asked: Asked) -> float:
     return p_value_beside(last, others, settings.confirmation.glance, torch.Generator().manual_seed(asked.seed))
 
 
-def _taken_up(search: Search, located: Located, asked: Asked, after: Evidence | None = None) -> Search:
-    """With what was located, if it counts; ``after`` is its evidence, where that is not the fit's own."""
+def _taken_up(
+    search: Search, beside: FittedModel, located: Located, asked: Asked, after: Evidence | None = None
+) -> Search:
+    """With what was located beside a fit, if it counts; ``after`` is its evidence, where that is not the fit's own."""
     over = replace(search, left=())
     if located.p_value > asked.level or asked.max_findings == 0:
         return over
@@ -178,18 +185,35 @@ def _taken_up(search: Search, located: Located, asked: Asked, after: Evidence | 
             one, before, evidence, search.blocks, asked.seed, asked.settings.confirmation, first=not search.found
         )
 
-    if not holds(located.fit, after):
+    same = _under_the_same(beside, located.fit)
+    paired = after if same is None else held_out(same, search.blocks)
+    if within_a_sample(located.term, located.fit.model.prepared) or not holds(located.fit, paired):
         return replace(over, unconfirmed=located)
     if len(search.found) == asked.max_findings:
         return replace(over, cut=True)
-    fit, after = simplified(located.fit, after, search.blocks, holds, asked.settings.naming)
+    fit = located.fit
+    if same is None:
+        fit, after = simplified(fit, after, search.blocks, holds, asked.settings.naming)
+        paired = after
     found = (*search.found, replace(located, fit=fit))
     near = _near(located.fit, asked.settings)
     left = tuple(t for t in search.left if not _same(t, located.term, near, asked.settings))
-    taken = replace(search, found=found, evidence=(*search.evidence, after), left=left)
+    pairs = (*search.pairs, (before, paired))
+    taken = replace(search, found=found, evidence=(*search.evidence, after), pairs=pairs, left=left)
     # a p-value of 0 is that of a look that sees nothing
     full = len(found) == asked.max_findings and not 0.0 < _beside(taken, asked) <= asked.level
     return replace(taken, left=()) if full else taken
+
+
+def _under_the_same(beside: FittedModel, fit: FittedModel) -> FittedModel | None:
+    """A fit with a finding under the pushes of the one without it, for the two to be compared; None where it is so."""
+    if not pushed(beside) or fit.model.prepared is beside.model.prepared:
+        return None
+    model = JointModel(beside.model.prepared, fit.model.terms, beside.model.near)
+    try:
+        return fitted(model, fit.parameters, beside.bound, graduate=False)
+    except NoFitError:
+        return None
 
 
 def _near(fit: FittedModel, settings: Settings) -> float:

@@ -16,7 +16,7 @@ from mkc_torch.diagnosis.world import Follows, Verdict, World
 from mkc_torch.simulation.dynamics.noise import NoiseOfTheWorld
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
-__all__ = ["Around", "around", "lost_from_the_start", "verdict_of", "world_of"]
+__all__ = ["Around", "alone", "around", "lost_from_the_start", "verdict_of", "world_of"]
 
 
 @dataclass(frozen=True)

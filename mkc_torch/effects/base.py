@@ -155,6 +155,10 @@ class Effect(ABC):
         """Whether no number of γ can be negative."""
         return self.least >= 0.0
 
+    def within_a_sample(self, shape: Shape, step: float) -> bool:  # noqa: ARG002
+        """Whether this shape says no more than what an input does between two samples, ``step`` s apart."""
+        return False
+
     def reports(self, name: str) -> bool:
         """Whether a number of the shape is told as a parameter; default all that choose no form."""
         return name not in self.choices

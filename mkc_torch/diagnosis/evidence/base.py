@@ -41,7 +41,7 @@ class Case:
         number: of the finding, for a test that is asked of each.
         estimate: the final parameters; None ahead of them.
         ahead: what the test's own ``ahead`` gave.
-        judged: the same as ``held_out`` under the pushes that are left, by which findings were confirmed.
+        pairs: without and with each finding under the same pushes, by which it was confirmed.
     """
 
     base: FittedModel
@@ -55,7 +55,7 @@ class Case:
     number: int = 0
     estimate: Estimate | None = None
     ahead: Any = None
-    judged: tuple[Evidence, ...] = ()
+    pairs: tuple[tuple[Evidence, Evidence], ...] = ()
 
     @property
     def prepared(self) -> PreparedSimulation:

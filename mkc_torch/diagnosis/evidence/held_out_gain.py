@@ -24,7 +24,7 @@ def beside_the_others(case: Case) -> Evidence | None:
 
 def _confirmed(case: Case) -> bool:
     """Whether unseen blocks are surely better with it, before anything else was found."""
-    before, after = (case.judged or case.held_out)[case.number : case.number + 2]
+    before, after = case.pairs[case.number] if case.pairs else case.held_out[case.number : case.number + 2]
     difference = after.log_likelihood - before.log_likelihood
     return gain_interval(difference, case.blocks.block, torch.Generator().manual_seed(case.seed))[1][0] > 0.0
 
@@ -34,7 +34,7 @@ def test(case: Case) -> Told:
     if not _long_enough(case, case.number):
         return said(None, _TOO_SHORT)
     before, after = case.held_out[case.number : case.number + 2]
-    worse, better = case.judged[case.number : case.number + 2] if case.judged else (before, after)
+    worse, better = case.pairs[case.number] if case.pairs else (before, after)
     note = ""
     if case.ahead is not None:
         before, after, note = case.ahead, case.held_out[-1], _BESIDE

@@ -37,10 +37,11 @@ _LAGS = (2, 5, 20)
 
 @dataclass(frozen=True)
 class _Trial:
-    """A change of the simulation or the recording, and the sentence where it mends the fit."""
+    """A change of the simulation or the recording, and the sentence where it mends the fit, from a start of its own."""
 
     told: Callable[[Float[Tensor, " p"]], str]
     prepared: PreparedDynamics
+    thorough: bool = False
 
 
 def at_ends(fit: FittedModel) -> tuple[str, ...]:
@@ -110,7 +111,7 @@ def _of_trials(prepared: PreparedDynamics, fits: Sequence[FittedModel], follows:
     """What each trial brings, where it mends the fit; and the inputs that do not matter."""
     now = torch.tensor([one.residual for one in follows], dtype=fits[0].parameters.dtype)
     trials = _trials(prepared)
-    sizes = at_once([partial(_size, trial.prepared, fits) for trial in trials], prepared)
+    sizes = at_once([partial(_size, trial.prepared, fits, thorough=trial.thorough) for trial in trials], prepared)
     told = []
     shares = [float((size / now).max()) if size is not None else torch.inf for size, _ in sizes]
     for number in sorted(range(len(trials)), key=shares.__getitem__):
@@ -149,7 +150,7 @@ def _trials(prepared: PreparedDynamics) -> list[_Trial]:
         return f"With {' and '.join(turned) or 'free ranges'}, which its range forbids,"
 
     if bool(torch.cat(prepared.bounds).isfinite().any()):
-        trials.append(_Trial(of_signs, freed))
+        trials.append(_Trial(of_signs, freed, thorough=True))
     for number, name in enumerate(prepared.system.inputs):
         turned = prepared.inputs_at_rows.clone()
         turned[:, number] = -turned[:, number]
@@ -177,11 +178,12 @@ def _with_inputs(prepared: PreparedDynamics, inputs: Float[Tensor, "N u"]) -> Pr
     return other.holding({})
 
 
-def _size(prepared: PreparedDynamics, fits: Sequence[FittedModel]) -> tuple[Tensor | None, Tensor | None]:
+def _size(
+    prepared: PreparedDynamics, fits: Sequence[FittedModel], *, thorough: bool = False
+) -> tuple[Tensor | None, Tensor | None]:
     """The smallest residual of a changed simulation from a few starts, and its parameters."""
-    starts = [fits[-1].parameters[: len(prepared.parameter_names)]]
-    short = over_short_horizons(prepared, prepared.given)
-    starts += [] if short is None else [short]
+    short = over_short_horizons(prepared, prepared.given) if thorough else None
+    starts = [fits[0].parameters[: len(prepared.parameter_names)] if short is None else short]
     best: tuple[Tensor | None, Tensor | None] = None, None
     for start in starts:
         try:

@@ -18,7 +18,7 @@ from mkc_torch.simulation.protocol import Port, PreparedSimulation, Sizes
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["candidate_terms", "described", "finer", "reach_of"]
+__all__ = ["candidate_terms", "described", "finer", "reach_of", "within_a_sample"]
 
 _STEPS = 8
 """Values of a shape's number to either side of the present one, and what its range is divided by each round."""
@@ -41,7 +41,14 @@ def candidate_terms(
             for driver in fitting
             for shape in (absolute(effect, shape, prepared.ports[at], driver) for shape in shapes)
         ]
-    return tuple(terms)
+    return tuple(term for term in terms if not within_a_sample(term, prepared))
+
+
+def within_a_sample(term: Term, prepared: PreparedSimulation) -> bool:
+    """Whether a candidate says no more than what an input does between two samples."""
+    inside = prepared.time.diff()
+    step = float(inside[inside > 0].median()) if bool((inside > 0).any()) else 0.0
+    return term.effect.within_a_sample(term.shape, step)
 
 
 def _fits(effect: Effect, name: str, port: Port) -> bool:

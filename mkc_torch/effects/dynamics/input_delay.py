@@ -40,6 +40,9 @@ class InputDelay(ShareEffect):
         length = float(time.max() - time.min())
         return tuple({"delay": share * length} for share in SHARES)
 
+    def within_a_sample(self, shape: Shape, step: float) -> bool:
+        return shape["delay"] <= step
+
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         own = context.part("own")
         return shifted(own, context.time, -shape["delay"], context.runs) - own
