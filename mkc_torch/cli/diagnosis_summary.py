@@ -121,9 +121,10 @@ def _of_all(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     beside = noise.smooth_fit(d)
     if beside and d.verdict != "unfit":
         yield term("label.compare"), beside
-    if world.noise_lines(d):
-        yield term("label.sensor"), noise.noise_model(d.noise)
-    yield from rows(d.evidence, terminal=True)
+    if d.verdict != "unfit":
+        if world.noise_lines(d):
+            yield term("label.sensor"), noise.noise_model(d.noise)
+        yield from rows(d.evidence, terminal=True)
     for sentence in top.to_do(d):
         yield term("label.to_do"), sentence
     command = top.apply_command(d)

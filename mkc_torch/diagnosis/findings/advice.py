@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from mkc_torch._support.unit_text import tidy
 from mkc_torch.diagnosis.findings.following import follows_all
 from mkc_torch.diagnosis.findings.worth import carries_over, change, worth_correcting
 from mkc_torch.diagnosis.result import Alternative, Diagnosis, Finding
@@ -61,7 +62,7 @@ def _of_what_remains(diagnosis: Diagnosis) -> Iterator[str]:
 
 
 def _find_what_pushes(push: Push) -> str:
-    size = f"{push.size:.2g} {push.unit}".rstrip()
+    size = f"{push.size:.2g} {tidy(push.unit)}".rstrip()
     return (
         f"Look for what drives the rate of `{push.place}`, in the picture of what pushes it, and record it. Until then "
         f"count on {size} there wherever the simulation predicts, as the process noise of a filter, say."

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mkc_torch._support.unit_text import tidy
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.world import Curve, Forcing
 from mkc_torch.report.diagnosis.panels import MOST_LETTERS, Grid, array, draw_curve, named, short, style, title
@@ -33,7 +34,7 @@ def of_forcing(diagnosis: Diagnosis, index: int) -> str:
         for number, curve in enumerate(curves):
             ax = grid.axes(figure, 1 + number // _IN_A_ROW, number % _IN_A_ROW)
             draw_curve(ax, curve, has_time)
-            ax.set_ylabel(short(curve.value_unit))
+            ax.set_ylabel(short(tidy(curve.value_unit)))
             title(ax, term("picture.over", name=short(curve.driver)))
         _same_height(list(figure.axes[1:]))
         return svg(figure, f"forcing{index + 1}", term("picture.about_forcing"))
@@ -47,7 +48,7 @@ def _course(ax: Any, forcing: Forcing, has_time: bool) -> None:
     ax.plot(time, value, color=BLUE, lw=1.2, zorder=3)
     ax.margins(x=0.01)
     ax.set_xlabel(term("picture.time" if has_time else "unit.sample"))
-    ax.set_ylabel(short(forcing.unit))
+    ax.set_ylabel(short(tidy(forcing.unit)))
     ax.locator_params(axis="y", nbins=5)
     key = "picture.forcing" if forcing.at_rate else "picture.forcing_of_output"
     title(ax, term(key, place=short(forcing.place)))
@@ -86,7 +87,7 @@ def of_shape(diagnosis: Diagnosis, index: int) -> str | None:
         draw_curve(ax, free, diagnosis.traces.has_time, most=3 * MOST_LETTERS)
         if form is not None:
             ax.plot(array(form.x), array(form.value), color=ORANGE, lw=1.6, ls=(0, (5, 2)))
-        ax.set_ylabel(named(term("finding.effect"), free.value_unit))
+        ax.set_ylabel(named(term("finding.effect"), tidy(free.value_unit)))
         title(ax, term("picture.free_curve" if form is not None else "picture.free_curve_alone"))
         return svg(figure, f"shape{index + 1}", term("picture.about_shape", number=index + 1))
 

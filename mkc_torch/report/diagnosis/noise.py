@@ -110,9 +110,9 @@ def held_out_rows(diagnosis: Diagnosis) -> list[tuple[str, list[str]]]:
 
 
 def smooth_fit(diagnosis: Diagnosis) -> str:
-    """How far a smooth correction by all columns comes, beside the residual; empty where what was found is better."""
+    """How far a smooth correction by all columns comes, beside the residual; empty where that is not farther."""
     d = diagnosis
-    if d.ceiling is None or not _shown(d) or not _one_unit(d):
+    if d.ceiling is None or not d.ceiling.rmse < _CLEARLY * d.corrected.rmse or not _one_unit(d):
         return ""
     unit = plain(d.traces.unit)
     smooth = term("noise.smooth_reaches", residual=f"{size(d.ceiling.rmse)} {unit}".rstrip())

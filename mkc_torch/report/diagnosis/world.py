@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from mkc_torch._support.unit_text import tidy
 from mkc_torch.diagnosis.result import Diagnosis, Table
 from mkc_torch.diagnosis.world import Follows, Push, World
 from mkc_torch.report.diagnosis.numbers import measured
@@ -126,7 +127,7 @@ def push_sentence(push: Push) -> str:
         >>> push_sentence(Push("angle", False, 30.0, 0.01, 0.002, "rad", 12.0))
         'Something slow is added to `angle` beside its noise: 0.0100 ± 0.0020 rad, for about 30 s at a time.'
     """
-    told = measured(push.size, push.standard_error, push.unit)[0]
+    told = measured(push.size, push.standard_error, tidy(push.unit))[0]
     lasts = term("world.lasts", lasting=f"{push.lasting:.2g}") if push.lasting > 0.0 else term("world.each_sample")
     return term("world.push" if push.at_rate else "world.slow", place=plain(push.place), size=told, lasts=lasts)
 
@@ -138,7 +139,7 @@ def pushes_table(world: World) -> Table | None:
     rows = tuple(
         (
             term("world.rate_of", place=plain(push.place)) if push.at_rate else plain(push.place),
-            measured(push.size, push.standard_error, push.unit)[0],
+            measured(push.size, push.standard_error, tidy(push.unit))[0],
             f"{push.lasting:.3g} s" if push.lasting > 0.0 else term("unit.sample"),
             size(push.nats) if math.isfinite(push.nats) else term("number.not_known"),
         )
