@@ -199,7 +199,7 @@ def read_correction(path: Path, simulation: Simulation | None = None) -> Calibra
         known = DiagnosedModel.from_json(text, simulation=simulation)
         refuse_unknown(known.simulation, simulation)
         return known
-    if schema == diagnosis_file.SCHEMA:
+    if schema in diagnosis_file.SCHEMAS:
         raise ValueError("this is what a diagnosis says; give the model.json beside it.")
     found = "missing" if schema is None else json.dumps(schema)
     raise ValueError(

@@ -112,6 +112,27 @@ def parsed_columns(text: str | None) -> dict[str, str]:
     return pairs
 
 
+def parsed_pairs(option: str, texts: Sequence[str], example: str) -> dict[str, str]:
+    """Pairs of an option that can be given several times, each time with several pairs.
+
+    Raises:
+        typer.BadParameter: a part that is no pair, or a name given twice.
+
+    Example:
+        >>> parsed_pairs("--noise", ["angle=0.005", "rate=0.1, level=2"], "angle=0.005")
+        {'angle': '0.005', 'rate': '0.1', 'level': '2'}
+    """
+    pairs: dict[str, str] = {}
+    for part in (part for text in texts for part in text.split(",")):
+        name, equals, value = (piece.strip() for piece in part.partition("="))
+        if not (name and equals and value):
+            raise typer.BadParameter(term("command.no_option_pair", option=option, part=part, example=example))
+        if name in pairs:
+            raise typer.BadParameter(term("command.twice", name=name))
+        pairs[name] = value
+    return pairs
+
+
 def with_unit(recording: Recording, unit: str) -> Recording:
     """The recording with its magnetometer in a unit of the user's own."""
     own = {name: unit for name in ("mag_x", "mag_y", "mag_z") if name in recording}

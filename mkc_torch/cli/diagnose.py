@@ -22,10 +22,12 @@ from mkc_torch.cli.console import (
     not_written,
     out,
     parsed_columns,
+    parsed_pairs,
     progress,
     refuse_same_names,
 )
 from mkc_torch.cli.diagnosis_files import MAGNETOMETER, SIMULATIONS, Outcome, Request, diagnose_file, simulation_of
+from mkc_torch.diagnosis.arguments import BETWEEN
 from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
 
 
@@ -54,6 +56,16 @@ def diagnose(
         str | None,
         typer.Option(metavar="COLUMN", help="Column that separates runs in one table; default: experiment, if any."),
     ] = None,
+    noise: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=SIZE", help="White noise of an output's sensor, if it is known: angle=0.005"),
+    ] = None,
+    between: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=HOW", help=f"What an input does between samples, if it is known: {', '.join(BETWEEN)}."
+        ),
+    ] = None,
     level: Annotated[float, typer.Option(metavar="RATE", help="Rate of false alarms.")] = LEVEL,
     surrogates: Annotated[
         int | None,
@@ -72,6 +84,8 @@ def diagnose(
         simulated=simulated,
         columns=_columns(columns, experiments),
         unit=_unit(unit, simulation),
+        noise=_noise(noise or []),
+        between=_between(between or []),
         level=_level(level),
         surrogates=_surrogates(surrogates, level),
         seed=seed,
@@ -168,6 +182,30 @@ def _unit(unit: str | None, simulation: str | None) -> str:
             "--unit is that of a magnetometer's columns; a simulation of your own says its units in its `units`."
         )
     return unit
+
+
+def _noise(texts: list[str]) -> dict[str, float]:
+    """Declared sizes of sensors' noise; whether the simulation has such outputs is known once it is loaded."""
+    sizes: dict[str, float] = {}
+    for name, text in parsed_pairs("--noise", texts, "angle=0.005").items():
+        try:
+            sizes[name] = float(text)
+        except ValueError:
+            raise typer.BadParameter(f'--noise {name}="{text}" is no number; write the size, {name}=0.005.') from None
+        if not (math.isfinite(sizes[name]) and sizes[name] > 0.0):
+            raise typer.BadParameter(
+                f"--noise {name} must be above 0, in the output's unit, but is {text}; leave it out to have it "
+                "estimated."
+            )
+    return sizes
+
+
+def _between(texts: list[str]) -> dict[str, str]:
+    pairs = parsed_pairs("--between", texts, "torque=held")
+    for name, how in pairs.items():
+        if how not in BETWEEN:
+            raise typer.BadParameter(f'--between {name}="{how}" is not known; known: {", ".join(BETWEEN)}.')
+    return pairs
 
 
 def _level(level: float) -> float:

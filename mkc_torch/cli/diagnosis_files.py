@@ -53,6 +53,8 @@ class Request:
     simulated: Path | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
     unit: str = "µT"
+    noise: Mapping[str, float] = field(default_factory=dict)
+    between: Mapping[str, str] = field(default_factory=dict)
     level: float = LEVEL
     surrogates: int = SURROGATES
     seed: int = 0
@@ -159,7 +161,13 @@ def _outcome(
         claim_folder(folder, overwrite=request.force or not label, files=WRITTEN)
         with folder_removed_on_failure(folder):
             diagnosis = diagnose(
-                simulation, recording, level=request.level, surrogates=request.surrogates, seed=request.seed
+                simulation,
+                recording,
+                level=request.level,
+                surrogates=request.surrogates,
+                seed=request.seed,
+                noise=request.noise,
+                between=request.between,
             )
             files = write_diagnosis(diagnosis, folder, force=request.force, report=request.report)
     except Exception as error:

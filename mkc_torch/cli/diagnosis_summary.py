@@ -1,8 +1,8 @@
-"""A diagnosis on the terminal: the verdict, each finding in a few lines, then noise, what to do and the files."""
+"""A diagnosis on the terminal: the verdict, the answers to its four questions, each finding, what to do, the files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -11,13 +11,13 @@ from rich.text import Text
 
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.report.diagnosis import findings as say
-from mkc_torch.report.diagnosis import noise, numbers
+from mkc_torch.report.diagnosis import noise, numbers, unseen, world
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.evidence import rows
 from mkc_torch.report.words.terms import term
 from mkc_torch.report.words.typesetting import plain, typeset
 
-_LABEL = 9  # letters of the longest label
+_LABEL = 11  # letters of the longest label
 _MOST_LINES = 6
 _MOST_WARNINGS = 6
 _STYLE: dict[top.Tone, str] = {"good": "bold green", "found": "bold cyan", "faint": "bold", "open": "bold yellow"}
@@ -32,14 +32,44 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path]) -> None:
         told = term("label.against", recording=told, simulation=plain(d.simulation))
     console.print(Text(told, style="bold"))
     console.print(Text(top.headline(d), style=_STYLE[top.tone(d)]))
+    console.print(_facts(_four_answers(d)))
     for i, finding in enumerate(d.findings, 1):
         if len(d.findings) > 1:
-            console.print(Text(f"{i}  {say.finding_name(finding)}", style="bold"))
+            console.print(Text(f"{i}  {_graded(finding)}", style="bold"))
         console.print(_facts(_of_finding(finding, d, first=i == 1)))
     console.print(_facts(_of_all(d)))
     for file in files:
         # outside the table, where a long path would be broken and could not be copied
         console.print(Text.assemble(f"{term('label.written'):<{_LABEL + 3}}", (str(file), "cyan")), soft_wrap=True)
+
+
+def _four_answers(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
+    """Does it follow, is what is left noise, what is named, and what is left without a name."""
+    d = diagnosis
+    for line in world.output_lines(d):
+        yield term("label.follows"), line
+    if d.verdict == "unfit":
+        for reason in top.reasons(d):
+            yield _striking("label.why"), reason
+        yield term("label.named"), term("world.nothing_named")
+        return
+    for line in world.noise_lines(d) or [noise.noise_model(d.noise)]:
+        yield term("label.noise"), line
+    yield term("label.named"), _named(d.findings)
+    yield term("label.unexplained"), top.left_in_short(d) or term("world.nothing")
+
+
+def _named(findings: Sequence[Finding]) -> str:
+    """What is named for sure; where nothing is, what is not."""
+    sure = [f for f in findings if f.grade in ("left out", "real but small")]
+    told = "; ".join(_graded(f) for f in sure or findings)
+    if sure or not findings:
+        return told or term("world.nothing")
+    return term("world.nothing_sure", findings=told)
+
+
+def _graded(finding: Finding) -> str:
+    return term("world.graded", finding=say.finding_name(finding), grade=say.grade(finding))
 
 
 def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Iterator[tuple[str, str]]:
@@ -59,14 +89,16 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
     yield term("label.driven_by"), say.driven_by(f)
     evidence = numbers.evidence(f.p_value, diagnosis.surrogates)
     yield term("label.how_sure"), term("evidence.after_the_search", evidence=evidence)
+    if f.shape is not None:
+        yield term("label.shape"), "; ".join(filter(None, [say.shape(f), plain(f.shape.formula)]))
     if f.held_out is None:
         yield term("label.held_out"), f"{term('evidence.not_measured')}: {plain(f.held_out_note)}"
     else:
-        change = numbers.improvement(f.held_out.rmse_before, f.held_out.rmse_after, f.held_out.unit)
-        residual = term("evidence.of_residual", change=change)
-        note = f"\n{plain(f.held_out_note)}" if f.held_out_note else ""
         zero = f"; {term('evidence.zero')}" if first else ""
-        yield term("label.held_out"), f"{say.better(f.held_out)}: {residual}, {numbers.gain(f.held_out)}{zero}{note}"
+        residual = "; ".join(unseen.residuals(f.held_out, diagnosis.world))
+        more = [unseen.left(f.held_out), plain(f.held_out_note)]
+        told = f"{residual}; {unseen.better(f.held_out)}; {numbers.gain(f.held_out)}{zero}"
+        yield term("label.held_out"), "\n".join(filter(None, [told, *more]))
     yield from rows(f.evidence, terminal=True)
     if say.inseparable(f):
         yield _striking("label.or"), term("evidence.cannot_tell", rivals=say.rivals(f))
@@ -77,8 +109,9 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
 def _of_all(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
     d = diagnosis
     if len(d.findings) > 1:
-        yield term("label.together"), term("evidence.together", change=numbers.residual_sizes(d))
-    if not d.findings:
+        for change in unseen.residual_of_all(d):
+            yield term("label.together"), term("evidence.together", change=change)
+    if not d.findings and d.verdict != "unfit":
         evidence = numbers.evidence(d.p_value, d.surrogates)
         tried = f"{d.candidates_tried:,}"
         yield (
@@ -86,10 +119,12 @@ def _of_all(diagnosis: Diagnosis) -> Iterator[tuple[str, str]]:
             term("evidence.searched", evidence=evidence, candidates=tried, level=f"{d.level:g}"),
         )
     beside = noise.smooth_fit(d)
-    if beside:
+    if beside and d.verdict != "unfit":
         yield term("label.compare"), beside
-    yield term("label.noise"), noise.noise_model(d.noise)
-    yield from rows(d.evidence, terminal=True)
+    if d.verdict != "unfit":
+        if world.noise_lines(d):
+            yield term("label.sensor"), noise.noise_model(d.noise)
+        yield from rows(d.evidence, terminal=True)
     for sentence in top.to_do(d):
         yield term("label.to_do"), sentence
     command = top.apply_command(d)

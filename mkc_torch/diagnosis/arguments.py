@@ -73,31 +73,53 @@ def check_numbers(level: float, surrogates: int, max_findings: int, seed: int) -
         )
 
 
-def checked_noise(noise: Mapping[str, float] | None, outputs: Sequence[str]) -> dict[str, float]:
-    """Sizes of outputs' white noise.
+BETWEEN = ("held", "linear", "smooth")
+"""What an input can do between two samples."""
 
-    Raises:
-        ValueError: a name that is no output, or a size that is not positive and finite.
+
+def checked_noise(noise: object, outputs: Sequence[str]) -> dict[str, float]:
+    """Declared sizes of the sensors' white noise, by output.
+
+    Example:
+        >>> checked_noise({"angle": 0.005}, ["angle", "rate"])
+        {'angle': 0.005}
+        >>> checked_noise({"x": 0.005}, ["angle"])
+        Traceback (most recent call last):
+        ValueError: Expected argument `noise` to name outputs of this simulation but got `x`; they are `angle`.
+    """
+    return {
+        name: checked_number(f"noise[{name!r}]", size, advice="the standard deviation of that sensor's white noise")
+        for name, size in _of_known("noise", noise, outputs, "outputs", '{"angle": 0.005}').items()
+    }
+
+
+def checked_between(between: object, inputs: Sequence[str]) -> dict[str, str]:
+    """What inputs of differential equations are declared to do between two samples.
+
+    Example:
+        >>> checked_between({"torque": "held"}, ["torque"])
+        {'torque': 'held'}
     """
     found = {}
-    for name, size in (noise or {}).items():
-        if name not in outputs:
-            raise ValueError(f"Expected `noise` to name outputs ({', '.join(outputs)}) but got `{name}`.")
-        found[name] = checked_number(f"noise of {name}", size, advice="it is a standard deviation")
+    for name, told_as in _of_known("between", between, inputs, "inputs in the equations", '{"torque": "held"}').items():
+        if not isinstance(told_as, str) or told_as not in BETWEEN:
+            raise ValueError(
+                f"Expected argument `between` to say one of {', '.join(BETWEEN)} of `{name}` but got {told_as!r}."
+            )
+        found[name] = told_as
     return found
 
 
-def checked_between(between: Mapping[str, str] | None, prepared: object) -> dict[str, str]:
-    """What inputs do between samples.
-
-    Raises:
-        ValueError: a name that is no input, or something that no input does.
-    """
-    inputs: Mapping[str, str] = getattr(prepared, "between", {})
-    for name, how in (between or {}).items():
-        if name not in inputs:
-            named = f"inputs ({', '.join(inputs)})" if inputs else "inputs, of which this simulation has none,"
-            raise ValueError(f"Expected `between` to name {named} but got `{name}`.")
-        if how not in ("held", "linear", "smooth"):
-            raise ValueError(f'Expected `between` of {name} to be "held", "linear" or "smooth" but got {how!r}.')
-    return dict(between or {})
+def _of_known(argument: str, given: object, names: Sequence[str], what: str, example: str) -> dict[str, object]:
+    """A mapping from names that the simulation has; None is an empty one."""
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise TypeError(f"Expected argument `{argument}` to be a dict such as {example} but got {told(given)}.")
+    for name in given:
+        if name not in names:
+            known = f"they are {', '.join(f'`{one}`' for one in names)}" if names else "it has none"
+            raise ValueError(
+                f"Expected argument `{argument}` to name {what} of this simulation but got `{name}`; {known}."
+            )
+    return dict(given)

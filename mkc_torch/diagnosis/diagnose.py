@@ -116,7 +116,8 @@ def diagnose(
         raise ValueError(
             f"{where}{len(prepared.time)} usable samples are too few for a diagnosis; it needs {fewest} at least."
         )
-    declared, fixed = checked_noise(noise, prepared.channels), checked_between(between, prepared)
+    declared = checked_noise(noise, prepared.channels)
+    fixed = checked_between(between, tuple(getattr(prepared, "between", ())))
     asked = Asked(level, surrogates, max_findings, seed, settings, declared)
     generator = torch.Generator().manual_seed(seed)
     if isinstance(prepared, PreparedDynamics):

@@ -106,7 +106,8 @@ def test_files_and_summary(stepped):
     content = content_of(folder)
     validate(content)
     assert (content["recording"], content["simulation"], content["verdict"]) == (path.stem, "magnetometer", "explained")
-    assert content["search"] == {"candidates": content["search"]["candidates"], "surrogates": 19, "seed": 5}
+    search = {"candidates": content["search"]["candidates"], "surrogates": 19, "seed": 5}
+    assert content["search"] == search | {"starts": content["search"]["starts"]}
     first = content["findings"][0]
     assert first["effect"] == "hard_iron_step"
     assert first["onset"] == pytest.approx(9.0, abs=0.2)
@@ -300,6 +301,12 @@ def test_usage_errors_exit_with_two(tmp_path):
         ((path, *out, *known, "--level", "nan"), "--level must be"),
         ((path, *out, *known, "--surrogates", "18"), "at least 19 at level 0.05"),
         ((path, *out, *known, "--seed", "-1"), "--seed"),
+        ((path, *out, *known, "--noise", "norm"), "--noise"),
+        ((path, *out, *known, "--noise", "norm=much"), "is no number"),
+        ((path, *out, *known, "--noise", "norm=0"), "must be above 0"),
+        ((path, *out, *known, "--noise", "norm=inf"), "must be above 0"),
+        ((path, *out, *known, "--noise", "norm=1", "--noise", "norm=2"), "given twice"),
+        ((path, *out, *known, "--between", "torque=stepped"), "known: held, linear, smooth"),
         ((path, *out, *known, "--unit", " "), "--unit is empty"),
         ((path, *out, *known, "--experiments", ""), "--experiments is empty"),
         ((path, *out, *known, "--columns", "experiment=a", "--experiments", "b"), "different columns"),

@@ -10,7 +10,15 @@ from rich.console import Console
 
 from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.diagnosis.result import Parameter, Region, Row, Told
-from tests.diagnosis.factory import make_diagnosis, with_evidence
+from tests.diagnosis.factory import (
+    graded,
+    make_diagnosis,
+    make_follows,
+    make_unfit,
+    make_world,
+    nearest,
+    with_evidence,
+)
 
 
 def shown(diagnosis, files=(), *, width=100, terminal=False):
@@ -26,7 +34,7 @@ def flat(text):
 
 def test_a_finding_in_a_dozen_lines():
     text = shown(make_diagnosis(1), ["out/flight_07/diagnosis.json"])
-    assert len(text.strip().splitlines()) <= 22
+    assert len(text.strip().splitlines()) <= 25
     for words in (
         "flight_07 against magnetometer",
         "Left out of the simulation: hard-iron step or current field (current)",
@@ -34,13 +42,15 @@ def test_a_finding_in_a_dozen_lines():
         "where from 41.3 s on; acts on mag_x, mag_y, mag_z",
         "driven by no recorded column",
         "how sure p = 0.005, the smallest that 199 surrogates can show",
-        "held out surely better on unseen blocks: residual 0.912 → 0.521 µT (43 % less), +0.312 nats a sample (95 %: "
+        "held out residual 0.912 → 0.521 µT (43 % less); surely better on unseen blocks; +0.312 nats a sample (95 %: "
         "0.281 to 0.350); 0 is no better",
+        "named hard-iron step: left out of the simulation",
+        "unexplained nothing",
         "or current field (current): this recording cannot tell",
         "compare a smooth correction by all recorded columns and by time reaches",
         "noise autoregressive: noise with a memory",
-        "to do Look for what changed at that time; use the calibration from after the step.",
-        "To tell hard-iron step from current field (current), record again: a step does not come at the same moment",
+        "If it is hard-iron step: look for what changed at that time; use the calibration from after the step.",
+        "to do To tell hard-iron step from current field (current), record again: a step does not come",
         "The model found here corrects for hard-iron step: confirm it on a second recording.",
         "mkc apply model.json NEW.csv --output corrected.csv",
         "warning 3 samples",
@@ -67,7 +77,11 @@ def test_nothing_found():
 
 def test_several_findings_are_numbered():
     text = shown(make_diagnosis(3))
-    for line in ("1  hard-iron step", "2  current field (current)", "3  an effect outside the catalogue (temperature)"):
+    for line in (
+        "1  hard-iron step: left out of the simulation",
+        "2  current field (current): left out of the simulation",
+        "3  an effect outside the catalogue (temperature): not confirmed on unseen blocks",
+    ):
         assert line in text.splitlines()
     assert "doubtful A curve has no size to compare." in flat(text)
     assert "together residual" in flat(text)
@@ -109,7 +123,7 @@ def test_what_any_test_of_evidence_says_has_a_line():
     of_finding = dataclasses.replace(made, findings=(with_evidence(made.findings[0], said),))
     for diagnosis in (with_evidence(made, said), of_finding):
         text = shown(diagnosis)
-        assert "left over   white" in text
+        assert "left over white" in flat(text)
         assert "in print" not in text
 
 
@@ -131,3 +145,54 @@ def test_a_list_of_many_numbers_is_told_by_its_largest():
         shown(dataclasses.replace(made, findings=(dataclasses.replace(made.findings[0], parameters=(slopes,)),)))
     )
     assert "size gradient up to c: 3.00 ± 0.10 µT/m and more, see the report" in text
+
+
+def answers(diagnosis):
+    """The first lines, up to what is left without a name."""
+    text = flat(shown(diagnosis, width=200))
+    return text[: text.index("unexplained") + 80] if "unexplained" in text else text
+
+
+def test_the_four_answers_stand_first():
+    quiet = make_diagnosis(0, simulation="Pendulum", world=make_world(pushes=(), forcing=()))
+    assert answers(quiet).startswith(
+        "flight_07 against Pendulum Nothing is missing that this recording could show. "
+        "follows angle follows to 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of its variation "
+        "noise What is left is the sensor's noise. Between samples `torque` is held. named nothing unexplained nothing"
+    )
+
+
+def test_what_pushes_is_located_before_any_finding():
+    pushed = make_diagnosis(0, simulation="Pendulum", verdict="unexplained", p_value=0.4, world=make_world())
+    told = answers(pushed)
+    assert "Pendulum Something unrecorded pushes the rate of `rate`, and no physics in the catalogue" in told
+    assert "noise Something unrecorded pushes the rate of `rate`: 0.228 ± 0.021 rad/s², for about 0.7 s" in told
+    assert "named nothing unexplained the rate of `rate`" in told
+
+
+def test_a_simulation_that_does_not_follow_names_nothing():
+    text = flat(shown(make_unfit(), width=200))
+    assert text.startswith(
+        "flight_07 against Pendulum The simulation does not follow the recording. follows angle: the"
+    )
+    assert "explains 12 % of the variation; its mean would be off by 0.350 rad, the simulation by 0.360 rad" in text
+    assert "why Another start reaches 0.006 rad" in text
+    assert "named nothing: physics is named only beside a simulation that follows" in text
+    for words in ("Use the simulation", "how sure", "compare", "unexplained"):
+        assert words not in text
+
+
+def test_what_is_only_nearest_or_not_confirmed_is_not_called_named():
+    made = make_diagnosis(1, verdict="unexplained")
+    for change, grade in ((nearest, "nearest in the catalogue"), (lambda f: graded(f, "not confirmed"), "not conf")):
+        text = flat(shown(dataclasses.replace(made, findings=(change(made.findings[0]),)), width=200))
+        assert f"named nothing surely; hard-iron step: {grade}" in text
+        assert "unexplained structure without a name" in text
+    shape = flat(shown(dataclasses.replace(made, findings=(nearest(made.findings[0]),)), width=200))
+    assert "likelier by 163 nats (p = 0.002 if the name were right); 0.0071 |x|^1.52 sign(x)" in shape
+
+
+def test_outputs_are_told_each_in_its_own_unit():
+    followed = (make_follows(), make_follows("rate", "rad/s", 0.03, 1.4, 0.02, floor_source="quantisation"))
+    text = flat(shown(make_diagnosis(0, world=make_world(follows=followed)), width=200))
+    assert "rate follows to 0.0300 rad/s; noise floor 0.0200 rad/s (the steps of its numbers)" in text

@@ -197,6 +197,27 @@ def test_columns_are_renamed_and_the_unit_is_the_magnetometers(thermistor, tmp_p
     assert "--unit is that of a magnetometer's columns" in flat(result.stderr.replace("│", " "))
 
 
+def test_noise_and_inputs_are_declared_by_name(thermistor, monkeypatch):
+    given = {}
+
+    def told(*_arguments, **options):
+        given.update(options)
+        raise ValueError("far enough")
+
+    source, table, output = thermistor
+    command = ("diagnose", table, "--simulation", source, "--output", output, "--surrogates", 19)
+    result = mkc(*command, "--noise", "voltage=0.01,other=2", "--noise", "third=1e-3", "--between", "temperature=held")
+    assert result.exit_code == 1
+    assert "they are `voltage`" in flat(result.stderr)
+    result = mkc(*command, "--noise", "voltage=0.01", "--between", "voltage=held")
+    assert "inputs in the equations of this simulation but got `voltage`; it has none" in flat(result.stderr)
+    monkeypatch.setattr("mkc_torch.cli.diagnosis_files.diagnose", told)
+    result = mkc(*command, "--noise", "voltage=0.01, other=2", "--noise", "third=1e-3", "--between", "temperature=held")
+    assert "far enough" in result.stderr
+    assert given["noise"] == {"voltage": 0.01, "other": 2.0, "third": 0.001}
+    assert given["between"] == {"temperature": "held"}
+
+
 def test_what_a_simulator_wrote(tmp_path):
     def signal(time):
         return torch.sin(1.1 * time) + 0.6 * torch.sin(2.7 * time + 1.0)

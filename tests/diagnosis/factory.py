@@ -7,6 +7,7 @@ import torch
 
 from mkc_torch.diagnosis.evidence import held_out_gain, remaining
 from mkc_torch.diagnosis.findings.advice import advice_of
+from mkc_torch.diagnosis.findings.worth import grade_of
 from mkc_torch.diagnosis.result import (
     Alternative,
     Candidate,
@@ -21,7 +22,7 @@ from mkc_torch.diagnosis.result import (
     Spread,
     Traces,
 )
-from mkc_torch.diagnosis.world import Curve
+from mkc_torch.diagnosis.world import Curve, Follows, Forcing, Push, Shape, World
 
 CHANNELS = ("norm", "turn_x", "turn_y", "turn_z")
 CATALOGUE = (
@@ -59,7 +60,7 @@ def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candi
         "seed": 0,
         "p_value": 0.005 if findings else 0.37,
         "verdict": "explained" if findings else "adequate",
-        "findings": tuple(f(names, has_time) for f in found),
+        "findings": tuple(graded(f(names, has_time)) for f in found),
         "baseline": Spread(-1.2345, before, (1.1,) * channels, (0.52,) * channels),
         "corrected": Spread(-0.9012, after, (math.inf,) * channels, (0.31,) * channels),
         "advice": (),
@@ -75,10 +76,72 @@ def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candi
     return diagnosis if "advice" in changes else dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
 
 
+def graded(finding, grade=None):
+    """A finding with the grade that its evidence gives it, or with another."""
+    return dataclasses.replace(finding, grade=grade or grade_of(finding))
+
+
 def with_evidence(thing, *said):
-    """A finding or a diagnosis of which these tests say that, and the others what they did."""
+    """A finding, graded, or a diagnosis of which these tests say that, and the others what they did."""
     new = {told.test for told in said}
-    return dataclasses.replace(thing, evidence=(*(told for told in thing.evidence if told.test not in new), *said))
+    kept = (told for told in thing.evidence if told.test not in new)
+    changed = dataclasses.replace(thing, evidence=(*kept, *said))
+    return graded(changed) if isinstance(changed, Finding) else changed
+
+
+def make_follows(output="angle", unit="rad", residual=0.0049, variation=0.35, floor=0.005, **changes):
+    """How a simulation follows an output."""
+    made = Follows(
+        output, unit, residual, variation, 1.0 - (residual / variation) ** 2, floor, "declared", variation, 0.021
+    )
+    return dataclasses.replace(made, **changes)
+
+
+LOST = (make_follows(residual=0.36, explained=0.12), make_follows("rate", "rad/s", 1.9, 1.4, 0.02))
+"""Of two outputs, neither followed."""
+
+PUSHED = Push("rate", at_rate=True, lasting=0.7, size=0.2284, standard_error=0.021, unit="rad/s²", nats=311.0)
+
+
+def make_forcing(samples=1800, push=PUSHED):
+    """The course of a push along a pendulum's run."""
+    time = torch.arange(samples, dtype=torch.float64) / 20.0
+    value = push.size * (torch.sin(1.1 * time) + 0.6 * torch.sin(3.7 * time + 1.0))
+    x = torch.linspace(-1.0, 1.0, 40, dtype=torch.float64)
+    curves = tuple(
+        Curve(name, unit, x, (slope * x).unsqueeze(-1), torch.full((40, 1), 0.05), (push.place,), push.unit)
+        for name, unit, slope in (("angle", "rad", 0.01), ("rate", "rad/s", -0.2), ("torque", "N m", 0.03))
+    )
+    sentences = (
+        "It is not white: it is correlated up to 0.7 s.",
+        "It goes along with none of the inputs, at no lag.",
+    )
+    band = torch.full_like(value, 0.09)
+    return Forcing(push.place, push.at_rate, push.unit, time, value, band, curves, sentences)
+
+
+def make_world(**changes):
+    """A pendulum that is followed, whose rate something pushes, and whose torque is held."""
+    world = World(
+        follows=(make_follows(),), pushes=(PUSHED,), between={"torque": "held"}, forcing=(make_forcing(),), starts=12
+    )
+    return dataclasses.replace(world, **changes)
+
+
+def make_unfit(**changes):
+    """A pendulum that does not follow its recording."""
+    reasons = (
+        "Another start reaches 0.006 rad: `gravity` = −9.81 with the other sign.",
+        "`damping` ends at its bound, 0.",
+    )
+    world = World(follows=LOST, reasons=reasons, starts=12)
+    return make_diagnosis(0, **{"simulation": "Pendulum", "samples": 400, "verdict": "unfit", "world": world} | changes)
+
+
+def nearest(finding, gain=163.0, formula="0.0071 |x|^1.52 sign(x)", curve=None):
+    """A finding whose name's shape is not the recording's."""
+    shape = Shape(gain, 0.002, curve or finding.curve, formula)
+    return dataclasses.replace(finding, grade="nearest in the catalogue", shape=shape)
 
 
 def make_traces(findings, channels, samples, has_time):

@@ -112,9 +112,9 @@ def test_explained_answers_what_where_how_sure_and_how_much_better():
     assert "offset change (3.214 ± 0.081, −1.104 ± 0.077, 0.325 ± 0.092) µT; onset 41.32 ± 0.14 s" in text
     assert "From 41.3 s on; acts on mag_x, mag_y, mag_z." in text
     assert "p = 0.005, the smallest that 199 surrogates can show" in text
-    assert "On data the fit had not seen, the residual is" in text
-    assert "What to do Look for what changed at that time; use the calibration from after the step." in text
-    assert "+0.312 nats a sample (95 %: 0.281 to 0.350); residual 0.912 → 0.521 µT (43 % less)" in text
+    assert "On data the fit had not seen: residual 0.912 → 0.521 µT (43 % less)." in text
+    assert "If it is hard-iron step: look for what changed at that time; use the calibration from after the" in text
+    assert "residual 0.912 → 0.521 µT (43 % less) surely better on unseen blocks; +0.312 nats a sample (95 %: " in text
     assert "offset drift 41.2 yes" in text
 
 
@@ -387,7 +387,7 @@ def test_warnings_name_effects_and_set_their_numbers():
     assert "Hard-iron step by load (onset −6.1 s): p = 4 × 10⁻⁵ at (−0.2, +0.9)." in text
 
 
-def test_candidates_are_in_the_order_that_is_told():
+def test_candidates_are_in_the_order_of_their_bars():
     weak = Candidate("current_field", ("current",), "", 253.0, 22.5, behind=0.0)
     strong = Candidate("driver_offset", ("motor_1",), "", 294.0, 24.2, behind=31.5)
     never = Candidate("cubic_nonlinearity", (), "", 1.0, 1.4, behind=math.inf)
@@ -397,7 +397,9 @@ def test_candidates_are_in_the_order_that_is_told():
     assert "behind the first, nats" in text
     assert "offset dependence (motor_1) 294 24.2 31.5" in text
     assert "not possible" in text
-    assert "ordered by how far each is behind the first one" in text
+    assert text.index("offset dependence (motor_1) 294") < text.index("current field (current) 253")
+    assert [bar.candidate for bar in bars((weak, strong, never))] == [strong, weak, never]
+    assert "by what each gains, which the bars show" in text
 
 
 def test_channels_of_a_compared_vector_are_explained():

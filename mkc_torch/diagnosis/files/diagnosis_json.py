@@ -1,4 +1,7 @@
-"""diagnosis.json: the text of a diagnosis, of the schema "mkc-diagnosis/1", and the check that it is one."""
+"""diagnosis.json: the text of a diagnosis, of the schema "mkc-diagnosis/2", and the check that a file is one.
+
+Files of "mkc-diagnosis/1" can still be checked.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +14,17 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
+from mkc_torch.diagnosis.files.world_json import follows_of, forcing_of, noise_of, remaining_of
 from mkc_torch.diagnosis.result import Diagnosis, Finding, HeldOut, Noise, Number, Parameter, Spread, Told
+from mkc_torch.diagnosis.world import Shape
 
-__all__ = ["SCHEMA", "DiagnosisFileError", "diagnosis_to_json", "json_schema", "validate"]
+__all__ = ["SCHEMA", "SCHEMAS", "DiagnosisFileError", "diagnosis_to_json", "json_schema", "validate"]
 
-SCHEMA = "mkc-diagnosis/1"
+SCHEMA = "mkc-diagnosis/2"
+"""That of what is written."""
+
+SCHEMAS = ("mkc-diagnosis/1", SCHEMA)
+"""Those that can be read."""
 
 Path = tuple[str | int, ...]
 
@@ -25,7 +34,7 @@ class DiagnosisFileError(ValueError):
 
 
 def diagnosis_to_json(diagnosis: Diagnosis) -> str:
-    """The diagnosis as JSON of the schema "mkc-diagnosis/1", checked against it. Needs the ``cli`` extra.
+    """The diagnosis as JSON of the schema "mkc-diagnosis/2", checked against it. Needs the ``cli`` extra.
 
     Numbers round-trip exactly. JSON has no infinity and no NaN: a bandwidth is the string "inf" where the density is
     Gaussian, and a standard error, a bound of an interval or a gap that is not known is null. Any other number that
@@ -42,10 +51,19 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "samples": d.samples,
         "level": d.level,
         "p_value": d.p_value,
-        "noise": _noise(d.noise),
-        "search": {"candidates": d.candidates_tried, "surrogates": d.surrogates, "seed": d.seed},
         "verdict": d.verdict,
+        "follows": follows_of(d.world),
+        "reasons": d.world.reasons,
+        "noise": _noise(d.noise) | noise_of(d.world),
+        "search": {
+            "candidates": d.candidates_tried,
+            "surrogates": d.surrogates,
+            "seed": d.seed,
+            "starts": d.world.starts,
+        },
         "findings": [_finding(f) for f in d.findings],
+        "forcing": forcing_of(d.world),
+        "remaining": remaining_of(d),
         "baseline": _spread(d.baseline),
         "corrected": _spread(d.corrected),
         "ceiling": None,
@@ -61,10 +79,10 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
 
 
 def validate(content: Mapping[str, Any]) -> None:
-    """Check the content of a diagnosis.json, as ``json.loads`` gives it. Needs the ``cli`` extra.
+    """Check the content of a diagnosis.json, as ``json.loads`` gives it, by its own schema. Needs the ``cli`` extra.
 
     Raises:
-        DiagnosisFileError: the content does not fit the schema, or contradicts itself.
+        DiagnosisFileError: the content does not fit the schema that it names, or contradicts itself.
 
     Example:
         >>> validate({"schema": "mkc-diagnosis/1"})
@@ -75,7 +93,9 @@ def validate(content: Mapping[str, Any]) -> None:
     from jsonschema.exceptions import best_match
 
     _refuse_not_finite(content)
-    error = best_match(Draft202012Validator(json_schema()).iter_errors(content))
+    named = content.get("schema") if isinstance(content, Mapping) else None
+    schema = json_schema(named if named in SCHEMAS else SCHEMA)
+    error = best_match(Draft202012Validator(schema).iter_errors(content))
     if error is not None:
         message = error.message if len(error.message) <= 200 else error.message[:199] + "…"
         raise DiagnosisFileError(f"this is no diagnosis: {_where(tuple(error.absolute_path))}: {message}.")
@@ -91,17 +111,21 @@ def validate(content: Mapping[str, Any]) -> None:
             if end < start:
                 place = _where(("findings", i, "intervals", k))
                 raise DiagnosisFileError(f"this is no diagnosis: {place} ends before it starts.")
+    for i, forcing in enumerate(content.get("forcing", ())):
+        if not len(forcing["time"]) == len(forcing["value"]) == len(forcing["band"]):
+            raise DiagnosisFileError(f"this is no diagnosis: {_where(('forcing', i))} has lists of different lengths.")
 
 
 @cache
-def json_schema() -> dict[str, Any]:
-    """The JSON Schema (draft 2020-12) of diagnosis.json, which is a file of this package.
+def json_schema(named: str = SCHEMA) -> dict[str, Any]:
+    """The JSON Schema (draft 2020-12) of diagnosis.json, or of one that older files have; a file of this package.
 
     Example:
-        >>> json_schema()["title"]
-        'mkc-diagnosis/1'
+        >>> json_schema()["title"], json_schema("mkc-diagnosis/1")["title"]
+        ('mkc-diagnosis/2', 'mkc-diagnosis/1')
     """
-    file = files("mkc_torch.diagnosis.files").joinpath("schema", "diagnosis.schema.json")
+    edition = named.rpartition("/")[2]
+    file = files("mkc_torch.diagnosis.files").joinpath("schema", f"diagnosis_{edition}.schema.json")
     schema: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     return schema
 
@@ -132,6 +156,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
     f = finding
     content = {
         "effect": f.effect,
+        "grade": f.grade,
         "drivers": f.drivers,
         "channels": f.channels,
         "intervals": f.intervals,
@@ -140,6 +165,7 @@ def _finding(finding: Finding) -> dict[str, Any]:
         "explanation": f.explanation,
         "parameters": [_parameter(p) for p in f.parameters],
         "p_value": f.p_value,
+        "shape": None if f.shape is None else _shape(f.shape),
         "alternatives": [
             {
                 "effect": a.effect,
@@ -189,6 +215,10 @@ def _json(value: Any) -> Any:
     return [_json(child) for child in value] if isinstance(value, (list, tuple)) else value
 
 
+def _shape(shape: Shape) -> dict[str, Any]:
+    return {"free_curve_gain": _known(shape.free_curve_gain), "p_value": shape.p_value, "formula": shape.formula}
+
+
 def _parameter(parameter: Parameter) -> dict[str, Any]:
     p = parameter
     told = {"name": p.name, "value": p.value, "standard_error": _known(p.standard_error), "unit": p.unit}
@@ -202,6 +232,11 @@ def _held_out(held_out: HeldOut) -> dict[str, Any]:
         "rmse_before": held_out.rmse_before,
         "rmse_after": held_out.rmse_after,
         "unit": held_out.unit,
+        "outputs": {
+            name: {"before": _known(one.before), "after": _known(one.after), "unit": one.unit}
+            for name, one in held_out.outputs.items()
+        },
+        "left": held_out.left,
     }
 
 

@@ -4,56 +4,111 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from mkc_torch.diagnosis.findings.worth import carries_over, change, confirmed, worth_correcting
+from mkc_torch._support.unit_text import tidy
+from mkc_torch.diagnosis.findings.following import follows_all
+from mkc_torch.diagnosis.findings.worth import carries_over, change, worth_correcting
 from mkc_torch.diagnosis.result import Alternative, Diagnosis, Finding
+from mkc_torch.diagnosis.world import Push
 from mkc_torch.effects import is_curve
 
 __all__ = ["advice_of", "nothing_shows"]
 
 
 def nothing_shows(diagnosis: Diagnosis) -> bool:
-    """Whether nothing speaks for structure: no finding, none that noise alone rarely makes, and none that remains."""
+    """Whether the simulation may be used as it is: it follows, and what is left is the sensor's noise."""
     d = diagnosis
-    return d.verdict == "adequate" and d.p_value > d.level and not d.remaining
+    quiet = bool(d.findings) or d.p_value > d.level
+    return d.verdict == "adequate" and quiet and not d.remaining and follows_all(d.world)
 
 
 def advice_of(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Sentences on what to do, the most important first; effects by their ids."""
     d = diagnosis
+    if d.verdict == "unfit":
+        return _mend_first(d)
     if nothing_shows(d):
-        return ("Use the simulation as it is, within what this recording covers.",)
+        return (_USE, *(_hold_back(f) for f in d.findings))
     advice = [sentence for finding in d.findings for sentence in _of(finding, alone=len(d.findings) == 1)]
-    if d.remaining:
-        advice.append(f"Find out what else goes along with {', '.join(d.remaining)}: something smooth remains there.")
-    elif not d.findings or d.verdict == "unexplained":
-        advice.append(
-            "Record again, for longer, with more columns that could drive what remains, such as temperature, current "
-            "and motion."
-        )
+    advice += _of_what_remains(d)
     use = [_called(f) for f in d.findings if carries_over(f)]
     if use:
         advice.append(f"The model found here corrects for {', '.join(use)}: confirm it on a second recording.")
     return tuple(dict.fromkeys(advice))
 
 
+def _mend_first(diagnosis: Diagnosis) -> tuple[str, ...]:
+    known = "what stands under the reasons" if diagnosis.world.reasons else "its signs, units, delays and start values"
+    return (f"Do not rely on this simulation yet: check {known}, then diagnose again.",)
+
+
+def _of_what_remains(diagnosis: Diagnosis) -> Iterator[str]:
+    d = diagnosis
+    rates = [push for push in d.world.pushes if push.at_rate]
+    if d.remaining:
+        yield f"Find out what else goes along with {', '.join(d.remaining)}: something smooth remains there."
+    elif d.verdict == "unexplained" and rates:
+        yield _find_what_pushes(rates[0])
+    elif d.verdict == "unexplained" and d.world.pushes:
+        yield (
+            f"Find out what moves the sensor of `{d.world.pushes[0].place}` slowly, such as warming up, and record it."
+        )
+    elif any(f.grade == "nearest in the catalogue" for f in d.findings):
+        return  # its curve is where to look
+    elif not d.findings or d.verdict == "unexplained":
+        yield (
+            "Record again, for longer, with more columns that could drive what remains, such as temperature, current "
+            "and motion."
+        )
+
+
+def _find_what_pushes(push: Push) -> str:
+    size = f"{push.size:.2g} {tidy(push.unit)}".rstrip()
+    return (
+        f"Look for what drives the rate of `{push.place}`, in the picture of what pushes it, and record it. Until then "
+        f"count on {size} there wherever the simulation predicts, as the process noise of a filter, say."
+    )
+
+
 def _of(finding: Finding, *, alone: bool) -> Iterator[str]:
     f = finding
-    what = _SWITCHED if f.comes_and_goes else f.advice if worth_correcting(f) else ""
-    if what:
-        yield what if alone else f"{_called(f)}: {what[:1].lower()}{what[1:]}"
+    near = [a for a in f.alternatives if not a.separable]
+    if f.grade == "nearest in the catalogue":
+        yield _by_its_curve(f)
+        return
     if not worth_correcting(f):
         yield _hold_back(f)
-    near = [a for a in f.alternatives if not a.separable]
+    elif not f.plausible:
+        yield f"The size of {f.effect} is not plausible: look for another cause before correcting it."
     if near:
         yield _tell_apart(f, near)
-    if not f.plausible:
-        yield f"The size of {f.effect} is not plausible: look for another cause before correcting it."
+    if f.plausible and worth_correcting(f):
+        what = _SWITCHED if f.comes_and_goes else f.advice
+        if what and near:
+            yield f"If it is {_called(f)}: {_small_letter(what)}"
+        elif what:
+            yield what if alone else f"{_called(f)}: {_small_letter(what)}"
+
+
+def _small_letter(sentence: str) -> str:
+    return f"{sentence[:1].lower()}{sentence[1:]}"
+
+
+def _by_its_curve(finding: Finding) -> str:
+    """What to do where the form that a name claims is not the recording's."""
+    f = finding
+    formula = f.shape.formula if f.shape is not None else ""
+    what = f"the formula {formula}" if formula else "the curve of the report"
+    of = f" of {', '.join(f.drivers)}" if f.drivers else ""
+    return (
+        f"Do not build {_called(f)} in: what this recording shows has another form. Look for physics with {what}{of}, "
+        "or use that within the range that was recorded."
+    )
 
 
 def _hold_back(finding: Finding) -> str:
     """Why not to correct for it."""
     f = finding
-    if confirmed(f) and f.held_out is not None:
+    if f.grade == "real but small" and f.held_out is not None:
         return (
             f"Leave {_called(f)} alone, unless means over many samples matter: it makes the residual of a sample "
             f"smaller by {max(100.0 * change(f.held_out), 0.0):.1f} % only."
@@ -64,6 +119,8 @@ def _hold_back(finding: Finding) -> str:
         f"longer{wider} and see whether it comes back."
     )
 
+
+_USE = "Use the simulation as it is, within what this recording covers."
 
 _SWITCHED = (
     "Look for something that is switched on and off, such as a heater, a lamp or a motor, and record it: the offset "

@@ -9,6 +9,7 @@ from mkc_torch.diagnosis.result import Finding, HeldOut
 from mkc_torch.diagnosis.world import Grade
 
 __all__ = [
+    "SMALL",
     "Confirmation",
     "carries_over",
     "change",
@@ -55,13 +56,21 @@ def confirmed(finding: Finding) -> bool:
 
 
 def change(held_out: HeldOut) -> float:
-    """Share by which a finding makes the residual smaller; 0 where that is not known.
+    """Share by which a finding makes the residual smaller, of the output where that is most; 0 where it is not known.
 
     Example:
         >>> round(change(HeldOut(0.3, (0.2, 0.4), 2.0, 1.5, "µT")), 3)
         0.25
+        >>> from mkc_torch.diagnosis.result import Sizes
+        >>> each = {"angle": Sizes(0.2, 0.1, "rad"), "speed": Sizes(3.0, 3.0, "rad/s")}
+        >>> change(HeldOut(0.3, (0.2, 0.4), 3.0, 3.0, "", each))
+        0.5
     """
-    before, after = held_out.rmse_before, held_out.rmse_after
+    each = [(one.before, one.after) for one in held_out.outputs.values()]
+    return max(_less(*pair) for pair in each or [(held_out.rmse_before, held_out.rmse_after)])
+
+
+def _less(before: float, after: float) -> float:
     return 1.0 - after / before if before > 0.0 and math.isfinite(after / before) else 0.0
 
 
@@ -70,9 +79,24 @@ def small(finding: Finding) -> bool:
     return finding.held_out is not None and change(finding.held_out) < SMALL
 
 
+def grade_of(finding: Finding) -> Grade:
+    """What a finding is worth by its evidence, as long as its shape is the recording's.
+
+    Example:
+        >>> from mkc_torch.diagnosis.result import Told
+        >>> held = HeldOut(0.02, (0.01, 0.03), 2.0, 1.96, "µT")
+        >>> seen = (Told("held_out", (held, "")),)
+        >>> grade_of(Finding("time_lag", (), (), (), None, "", "", (), 0.01, (), True, "", evidence=seen))
+        'real but small'
+    """
+    if not confirmed(finding):
+        return "not confirmed"
+    return "real but small" if small(finding) else "left out"
+
+
 def worth_correcting(finding: Finding) -> bool:
-    """Whether a simulation is clearly better with it."""
-    return confirmed(finding) and not small(finding)
+    """Whether a simulation is clearly better with it, in this form."""
+    return finding.grade == "left out"
 
 
 def carries_over(finding: Finding) -> bool:
@@ -81,10 +105,3 @@ def carries_over(finding: Finding) -> bool:
     What belongs to the place of this one, or comes and goes at times that nothing tells, is not.
     """
     return worth_correcting(finding) and finding.plausible and not (finding.placed or finding.comes_and_goes)
-
-
-def grade_of(finding: Finding) -> Grade:
-    """What a finding is worth by unseen blocks and its size; whether its name fits is another question."""
-    if not confirmed(finding):
-        return "not confirmed"
-    return "real but small" if small(finding) else "left out"

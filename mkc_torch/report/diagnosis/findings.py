@@ -6,27 +6,28 @@ import re
 import unicodedata
 from collections.abc import Collection, Sequence
 
-from mkc_torch.diagnosis.findings.worth import confirmation
-from mkc_torch.diagnosis.result import Alternative, Candidate, Finding, HeldOut, Region
+from mkc_torch.diagnosis.result import Alternative, Candidate, Finding, Region
+from mkc_torch.diagnosis.world import Grade
 from mkc_torch.effects import is_curve, words_of
 from mkc_torch.report.diagnosis.evidence import of_driver
-from mkc_torch.report.diagnosis.numbers import Clock
+from mkc_torch.report.diagnosis.numbers import Clock, probability
 from mkc_torch.report.words.numbers import number, size
 from mkc_torch.report.words.terms import term
 from mkc_torch.report.words.typesetting import plain, several, typeset
 
 __all__ = [
     "acts_on",
-    "better",
     "counted_from",
     "driven_by",
     "experiments",
     "finding_name",
+    "grade",
     "inseparable",
     "label_name",
     "region",
     "rivals",
     "role",
+    "shape",
     "unrecorded",
     "where",
     "with_drivers",
@@ -38,11 +39,11 @@ _AXES: dict[tuple[str, ...], str] = {
     ("x", "y", "z"): "finding.acts_on_axes",
     ("east", "north", "up"): "finding.acts_on_world",
 }
-_BETTER = {
-    "surely": "evidence.surely",
-    "probably": "evidence.probably",
-    "not shown": "evidence.not_shown",
-    "worse": "evidence.worse",
+_GRADES: dict[Grade, str] = {
+    "left out": "grade.left_out",
+    "real but small": "grade.small",
+    "not confirmed": "grade.not_confirmed",
+    "nearest in the catalogue": "grade.nearest",
 }
 _BOUNDS = {
     "below": "where.below",
@@ -221,14 +222,32 @@ def experiments(shares: Sequence[float]) -> str:
     return term("where.more_experiments", experiments=each, count=more) if more else each
 
 
-def better(held_out: HeldOut) -> str:
-    """Whether unseen blocks show that the finding makes it better.
+def grade(finding: Finding) -> str:
+    """What a finding is worth, in words.
 
     Example:
-        >>> better(HeldOut(0.3, (0.2, 0.4), 1.0, 0.8, "µT")), better(HeldOut(0.13, (-0.02, 0.28), 1.0, 0.9, "µT"))
-        ('surely better on unseen blocks', 'probably better on unseen blocks, not surely')
+        >>> grade(Finding("offset_drift", (), (), (), None, "", "", (), 0.01, (), True, "", grade="real but small"))
+        'real, but small beside the noise'
     """
-    return term(_BETTER[confirmation(held_out.log_likelihood_gain, held_out.confidence_interval)])
+    return term(_GRADES[finding.grade])
+
+
+def shape(finding: Finding) -> str:
+    """Whether the shape that a name claims is the recording's; empty where that was not asked.
+
+    Example:
+        >>> from mkc_torch.diagnosis.world import Shape
+        >>> right = Finding("linear_drag", (), (), (), None, "", "", (), 0.01, (), True, "", shape=Shape(1.2, 0.4))
+        >>> shape(right)
+        'a free curve of the same variables is not clearly better (p = 0.4)'
+    """
+    found = finding.shape
+    if found is None:
+        return ""
+    p = probability(found.p_value)
+    if finding.grade != "nearest in the catalogue":
+        return term("evidence.as_good", p=p)
+    return term("evidence.free_curve", nats=size(found.free_curve_gain), p=p)
 
 
 def inseparable(finding: Finding) -> tuple[Alternative, ...]:

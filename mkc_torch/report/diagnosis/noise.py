@@ -99,7 +99,7 @@ def held_out_rows(diagnosis: Diagnosis) -> list[tuple[str, list[str]]]:
         (
             name,
             [
-                size(s.rmse),
+                size(s.rmse) if _one_unit(diagnosis) else term("number.none"),
                 number(s.log_likelihood, 3),
                 several([bandwidth(v) for v in s.sigma]),
                 several([size(v) for v in s.d]),
@@ -110,9 +110,9 @@ def held_out_rows(diagnosis: Diagnosis) -> list[tuple[str, list[str]]]:
 
 
 def smooth_fit(diagnosis: Diagnosis) -> str:
-    """How far a smooth correction by all columns comes, beside the residual; empty where what was found is better."""
+    """How far a smooth correction by all columns comes, beside the residual; empty where that is not farther."""
     d = diagnosis
-    if d.ceiling is None or not _shown(d):
+    if d.ceiling is None or not d.ceiling.rmse < _CLEARLY * d.corrected.rmse or not _one_unit(d):
         return ""
     unit = plain(d.traces.unit)
     smooth = term("noise.smooth_reaches", residual=f"{size(d.ceiling.rmse)} {unit}".rstrip())
@@ -124,3 +124,8 @@ def _shown(diagnosis: Diagnosis) -> bool:
     """Whether the smooth correction says something that the findings do not."""
     d = diagnosis
     return d.ceiling is not None and (not d.findings or d.ceiling.rmse < _CLEARLY * d.corrected.rmse)
+
+
+def _one_unit(diagnosis: Diagnosis) -> bool:
+    """Whether one number can hold the residuals of all channels."""
+    return len(diagnosis.traces.channels) == 1 or bool(diagnosis.traces.unit)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from mkc_torch.diagnosis.result import Candidate, Diagnosis, HeldOut, Number, Parameter, Traces
+from mkc_torch.diagnosis.result import Candidate, HeldOut, Number, Parameter, Traces
 from mkc_torch.report.words.numbers import decimals, number, share, size
 from mkc_torch.report.words.terms import term
 from mkc_torch.report.words.typesetting import plain, superscript
@@ -25,7 +25,6 @@ __all__ = [
     "parameter_lines",
     "parameter_name",
     "probability",
-    "residual_sizes",
 ]
 
 _FEWEST_LARGE, _MOST_SMALL = 1e6, 1e-3  # beyond these a number is written with a power of ten
@@ -279,11 +278,6 @@ def improvement(before: float, after: float, unit: str) -> str:
         return f"{sizes} ({term('evidence.no_change')})"
     told = term("evidence.less" if less > 0 else "evidence.more", change=share(abs(less)))
     return f"{sizes} ({told})"
-
-
-def residual_sizes(diagnosis: Diagnosis) -> str:
-    """The root mean square of the residual on held-out blocks, before and after all findings."""
-    return improvement(diagnosis.baseline.rmse, diagnosis.corrected.rmse, diagnosis.traces.unit)
 
 
 def behind(candidate: Candidate) -> str:

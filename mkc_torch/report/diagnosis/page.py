@@ -11,7 +11,19 @@ from markupsafe import Markup
 
 from mkc_torch._parallel.fork import shared
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability
-from mkc_torch.report.diagnosis import evidence, findings, noise, numbers, pictures, verdict
+from mkc_torch.report.diagnosis import (
+    evidence,
+    findings,
+    forcing_pictures,
+    lead,
+    noise,
+    numbers,
+    pictures,
+    unseen,
+    verdict,
+    world,
+)
+from mkc_torch.report.diagnosis.panels import CURVE_COLORS
 from mkc_torch.report.rendering import render
 from mkc_torch.report.words.markup import marked, unbroken
 from mkc_torch.report.words.typesetting import several, typeset
@@ -19,6 +31,7 @@ from mkc_torch.report.words.typesetting import several, typeset
 __all__ = ["Bar", "Cell", "bars", "diagnosis_report", "heat_map"]
 
 _MOST_SHOWN = 12
+_MOST_FORCINGS = 3
 _FAINT, _CLEAR = (244, 196, 160), (214, 232, 244)  # inseparable, at right angles
 
 
@@ -48,13 +61,15 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
         HTML with its pictures in it.
     """
     d = diagnosis
-    count = len(d.findings)
+    count, driven = len(d.findings), min(len(d.world.forcing), _MOST_FORCINGS)
     works: list[Callable[[], str | None]] = [
         lambda: pictures.over_time(d) if len(d.traces.time) else None,
         *(partial(pictures.of_finding, d, i) for i in range(count)),
         *(partial(pictures.over_states, d, i) for i in range(count)),
+        *(partial(forcing_pictures.of_shape, d, i) for i in range(count)),
+        *(partial(forcing_pictures.of_forcing, d, i) for i in range(driven)),
     ]
-    time_figure, *drawn = shared(works)
+    time_figure, *drawn = (_markup(svg) for svg in shared(works))
     page = render(
         "diagnosis.html.j2",
         d=d,
@@ -64,17 +79,23 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
         numbers=numbers,
         noise=noise,
         top=verdict,
+        lead=lead.lead(d),
+        unseen=unseen,
+        world=world,
         several=several,
         typeset=typeset,
         marked=marked,
         notes=noise.channel_notes(d.traces.channels),
         numbered=pictures.numbered(d),
         clock=numbers.clock_of(d.traces),
-        time_figure=_markup(time_figure),
-        figures=[_markup(svg) for svg in drawn[:count]],
-        maps=[_markup(svg) for svg in drawn[count:]],
+        time_figure=time_figure,
+        figures=drawn[:count],
+        maps=drawn[count : 2 * count],
+        shapes=drawn[2 * count : 3 * count],
+        forced=drawn[3 * count :],
+        floors=pictures.floors(d),
         panels=[pictures.driver_panels(d, i) for i in range(len(d.findings))],
-        curve_colors=pictures.CURVE_COLORS,
+        curve_colors=CURVE_COLORS,
         bars=bars(d.candidates),
         heat=heat_map(d.separability),
         most=_MOST_SHOWN,
@@ -87,11 +108,11 @@ def _markup(svg: str | None) -> Markup | None:
 
 
 def bars(candidates: tuple[Candidate, ...]) -> list[Bar]:
-    """The best candidates with bars in proportion to their gain."""
-    best = max((c.log_likelihood_gain for c in candidates), default=0.0)
+    """The best candidates in the order of their gains, with bars in proportion to those."""
+    shown = sorted(candidates[:_MOST_SHOWN], key=lambda c: -c.log_likelihood_gain)
+    best = max((c.log_likelihood_gain for c in shown), default=0.0)
     return [
-        Bar(i, c, 100.0 * max(c.log_likelihood_gain, 0.0) / best if best > 0 else 0.0)
-        for i, c in enumerate(candidates[:_MOST_SHOWN], 1)
+        Bar(i, c, 100.0 * max(c.log_likelihood_gain, 0.0) / best if best > 0 else 0.0) for i, c in enumerate(shown, 1)
     ]
 
 

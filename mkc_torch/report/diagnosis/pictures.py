@@ -2,43 +2,34 @@
 
 from __future__ import annotations
 
-import warnings
+import math
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from torch import Tensor
 
 from mkc_torch.diagnosis.result import Diagnosis, Finding, Traces
-from mkc_torch.diagnosis.world import Curve
-from mkc_torch.report.drawing import BLUE, GREY, INK, ORANGE, SHADE, STYLE, svg
+from mkc_torch.report.diagnosis.panels import LEFT, MOST_LETTERS, Grid, array, draw_curve, named, short, style, title
+from mkc_torch.report.drawing import BLUE, GREY, INK, ORANGE, SHADE, svg
 from mkc_torch.report.words.terms import term
-from mkc_torch.report.words.typesetting import capital, plain
+from mkc_torch.report.words.typesetting import capital
 
-__all__ = ["CURVE_COLORS", "Panel", "driver_panels", "numbered", "of_finding", "over_states", "over_time"]
+__all__ = ["Panel", "driver_panels", "floors", "numbered", "of_finding", "over_states", "over_time"]
 
-CURVE_COLORS = (BLUE, ORANGE, "#009E73", "#A8558A", "#B58900", INK)
 _USED, _REJECTED, _DARK = "#7FB8DA", "#F2C7AA", "#9A4300"
-_WIDTH = 10.0  # inches, as wide as the page
 _MOST_POINTS = 5_000  # of a panel
 _MOST_ROWS, _MOST_ROWS_OF_ONE = 4, 3
 _MOST_BINS, _FEWEST_IN_A_BIN = 60, 12
 _MOST_LEVELS = 24  # of a driver that takes few values, such as a switch
-_MOST_LETTERS = 26
 _MOMENTS = ("table.before", "table.after")
 _CLOSE = 0.03  # of the axis: numbers nearer than this would overlap
 _MAP, _MAP_HEIGHT = 5.6, 3.4  # inches
 _NEVER = "#E3E3E3"
 # the pictures are transparent, so a ground of that colour would be lost
 _GAIN = LinearSegmentedColormap.from_list("gain", [ORANGE, "#FFFFFF", BLUE]).with_extremes(bad=_NEVER)
-_ROW, _LEFT, _RIGHT, _BETWEEN, _OWN_AXIS = 1.75, 0.72, 0.1, 0.3, 0.45  # inches
-# a name from a file may hold a dollar sign; a title of given height spares a layout of every panel
-_OWN_STYLE = {"text.parse_math": False, "axes.titley": 1.0, "axes.titlesize": 10.0, "axes.titlepad": 5.0}
 
 
 @dataclass(frozen=True)
@@ -65,25 +56,38 @@ def over_time(diagnosis: Diagnosis) -> str:
     """
     t, findings = diagnosis.traces, diagnosis.findings
     rows, columns = min(len(t.channels), _MOST_ROWS), 2 if findings else 1
-    above = numbered(diagnosis)
-    grid = _Grid(rows, columns, top=0.55 if above else 0.35, below=0.42)
-    with _style():
+    above, known = numbered(diagnosis), floors(diagnosis)
+    grid = Grid(rows, columns, top=0.55 if above else 0.35, below=0.42)
+    with style():
         figure = grid.figure()
         for row in range(rows):
             axes = [grid.axes(figure, row, column) for column in range(columns)]
             for ax in axes:
                 _mark(ax, findings)
-            _residual(axes, t, _array(t.time), row)
+            _residual(axes, t, array(t.time), row)
+            for ax in axes:
+                _floor(ax, known.get(t.channels[row]))
             if above and row == 0:
                 for ax in axes:
                     _number(ax, findings)
             for ax, moment in zip(axes, _MOMENTS if findings else ("label.residual",), strict=True):
-                _title(ax, _of_channel(moment, t.channels[row]), above=above and row == 0)
+                title(ax, _of_channel(moment, t.channels[row]), above=above and row == 0)
                 if row == rows - 1:
                     ax.set_xlabel(term("picture.time" if t.has_time else "unit.sample"))
                 else:
                     ax.tick_params(labelbottom=False)
         return svg(figure, "time", term("picture.about_time"))
+
+
+def floors(diagnosis: Diagnosis) -> dict[str, float]:
+    """The sensor's noise floor of each channel that is an output."""
+    return {one.output: one.noise_floor for one in diagnosis.world.follows if one.output in diagnosis.traces.channels}
+
+
+def _floor(ax: Any, size: float | None) -> None:
+    """The noise floor to either side of zero."""
+    for side in (-1.0, 1.0) if size is not None and math.isfinite(size) else ():
+        ax.axhline(side * (size or 0.0), color=GREY, lw=1.1, ls=":", zorder=6)
 
 
 def numbered(diagnosis: Diagnosis) -> bool:
@@ -100,18 +104,19 @@ def of_finding(diagnosis: Diagnosis, index: int) -> str | None:
         return None
     beside = curve is not None and len(panels) == 1
     above = int(curve is not None and not beside)
-    grid = _Grid(len(panels) + above, 3 if beside else 2, top=0.3, below=0.72)
-    with _style():
+    grid = Grid(len(panels) + above, 3 if beside else 2, top=0.3, below=0.72)
+    with style():
         figure = grid.figure()
         for row, panel in enumerate(panels, above):
             axes = [grid.axes(figure, row, column) for column in range(2)]
-            _residual(axes, t, _array(t.drivers[panel.driver]), panel.channel)
+            _residual(axes, t, array(t.drivers[panel.driver]), panel.channel)
             for ax, moment in zip(axes, _MOMENTS, strict=True):
-                _title(ax, _of_channel(moment, t.channels[panel.channel]))
-                ax.set_xlabel(_with_unit(panel.driver, t.driver_units.get(panel.driver, "")))
+                title(ax, _of_channel(moment, t.channels[panel.channel]))
+                ax.set_xlabel(named(panel.driver, t.driver_units.get(panel.driver, "")))
         if curve is not None:
             ax = grid.axes(figure, 0, 2) if beside else grid.axes(figure, 0, 0, wide=True)
-            _draw_curve(ax, curve, t.has_time, most=_MOST_LETTERS if beside else 3 * _MOST_LETTERS)
+            draw_curve(ax, curve, t.has_time, most=MOST_LETTERS if beside else 3 * MOST_LETTERS)
+            title(ax, term("picture.curve"))
         return svg(figure, f"finding{index + 1}", term("picture.about_finding", number=index + 1))
 
 
@@ -120,17 +125,17 @@ def over_states(diagnosis: Diagnosis, index: int) -> str | None:
     found = diagnosis.findings[index].map
     if found is None:
         return None
-    nats = _array(found.nats)
+    nats = array(found.nats)
     shown = np.sign(nats) * np.sqrt(np.abs(nats))  # by the root: a few cells hold most
     limit = float(np.nanmax(np.abs(shown)))
-    with _style():
+    with style():
         figure = Figure(figsize=(_MAP, _MAP_HEIGHT))
-        ax = figure.add_axes((_LEFT / _MAP, 0.5 / _MAP_HEIGHT, 0.72, 1.0 - 0.85 / _MAP_HEIGHT))
-        x, y = (_array(edge) for edge in found.edges)
+        ax = figure.add_axes((LEFT / _MAP, 0.5 / _MAP_HEIGHT, 0.72, 1.0 - 0.85 / _MAP_HEIGHT))
+        x, y = (array(edge) for edge in found.edges)
         drawn = ax.pcolormesh(x, y, shown.T, cmap=_GAIN, vmin=-limit, vmax=limit, rasterized=True)
         for axis, name, unit in zip((ax.xaxis, ax.yaxis), found.states, found.units, strict=True):
-            axis.set_label_text(_with_unit(name, unit))
-        _title(ax, term("picture.map"))
+            axis.set_label_text(named(name, unit))
+        title(ax, term("picture.map"))
         beside = figure.add_axes((0.86, 0.5 / _MAP_HEIGHT, 0.025, 1.0 - 0.85 / _MAP_HEIGHT))
         bar = figure.colorbar(drawn, cax=beside)
         beside.set_ylim(min(0.0, float(np.nanmin(shown))), limit)
@@ -154,47 +159,13 @@ def driver_panels(diagnosis: Diagnosis, index: int) -> list[Panel]:
     return [Panel(name, channel) for channel in acting for name in drivers][:most]
 
 
-@contextmanager
-def _style() -> Iterator[None]:
-    with matplotlib.rc_context(STYLE | _OWN_STYLE), warnings.catch_warnings():
-        # names in letters that the font for measuring lacks; the reader's browser has them
-        warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
-        yield
-
-
-@dataclass(frozen=True)
-class _Grid:
-    """Panels placed by hand, in inches: an automatic layout takes longer than all of the drawing."""
-
-    rows: int
-    columns: int
-    top: float
-    below: float
-
-    @property
-    def height(self) -> float:
-        last = 0.5 if self.rows else 0.0
-        return self.top + self.rows * _ROW + (self.rows - 1) * self.below + last
-
-    def figure(self) -> Figure:
-        return Figure(figsize=(_WIDTH, self.height))
-
-    def axes(self, figure: Figure, row: int, column: int, *, wide: bool = False) -> Any:
-        own = _OWN_AXIS if self.columns == 3 else 0.0  # the third panel has numbers and a name of its own
-        width = (_WIDTH - _LEFT - _RIGHT - own - (self.columns - 1) * _BETWEEN) / self.columns
-        left = _LEFT + column * (width + _BETWEEN) + (own if column == 2 else 0.0)
-        bottom = self.height - self.top - (row + 1) * _ROW - row * self.below
-        width = _WIDTH - _LEFT - _RIGHT if wide else width
-        return figure.add_axes((left / _WIDTH, bottom / self.height, width / _WIDTH, _ROW / self.height))
-
-
 def _residual(axes: Sequence[Any], t: Traces, x: np.ndarray, channel: int) -> None:
     """Draw samples, and the mean and size of those in use, before and, in a second panel, after."""
-    before, used = _array(t.before[:, channel]), _array(t.weight[:, channel]) >= 0.5
+    before, used = array(t.before[:, channel]), array(t.weight[:, channel]) >= 0.5
     limit, earlier, shown = _limit(before[used]), _binned(x[used], before[used]), _apart(x)
     marker = "o" if len(earlier.x) <= _MOST_LEVELS else ""
     for ax, after in zip(axes, (False, True), strict=False):
-        e = _array(t.after[:, channel]) if after else before
+        e = array(t.after[:, channel]) if after else before
         near = np.isfinite(x) & (np.abs(e) <= limit)
         ax.axhline(0.0, color=GREY, lw=0.7, zorder=1)
         for mask, color in ((near & ~used, _REJECTED), (near & used, _USED)):
@@ -209,7 +180,7 @@ def _residual(axes: Sequence[Any], t: Traces, x: np.ndarray, channel: int) -> No
         ax.margins(x=0.01)
         ax.locator_params(axis="y", nbins=5)
         ax.locator_params(axis="x", nbins=6)
-    axes[0].set_ylabel(_with_unit(term("label.residual"), t.unit))
+    axes[0].set_ylabel(named(term("label.residual"), t.unit))
     for ax in axes[1:]:
         ax.tick_params(labelleft=False)
 
@@ -297,37 +268,4 @@ def _onsets(finding: Finding) -> tuple[float, ...]:
 
 
 def _of_channel(key: str, channel: str) -> str:
-    return term("picture.of_channel", name=capital(term(key)), channel=_short(channel))
-
-
-def _title(ax: Any, text: str, *, above: bool = False) -> None:
-    ax.set_title(text, pad=18.0 if above else None)
-
-
-def _draw_curve(ax: Any, curve: Curve, has_time: bool, most: int) -> None:
-    x, value, band = _array(curve.x), _array(curve.value), _array(curve.band)
-    ax.axhline(0.0, color=GREY, lw=0.7, zorder=1)
-    for i in range(value.shape[1]):
-        color = CURVE_COLORS[i % len(CURVE_COLORS)]
-        ax.fill_between(x, value[:, i] - band[:, i], value[:, i] + band[:, i], color=color, alpha=0.18, lw=0)
-        ax.plot(x, value[:, i], color=color, lw=1.6)
-    ax.margins(x=0.01)
-    sampled = curve.driver == "time" and not has_time
-    ax.set_xlabel(term("unit.sample") if sampled else _with_unit(curve.driver, curve.unit, most))
-    ax.set_ylabel(_with_unit(term("finding.effect"), curve.value_unit))
-    _title(ax, term("picture.curve"))
-    ax.locator_params(axis="x", nbins=6)
-    ax.locator_params(axis="y", nbins=5)
-
-
-def _array(values: Tensor) -> np.ndarray:
-    return values.detach().cpu().numpy()
-
-
-def _with_unit(name: str, unit: str, most: int = _MOST_LETTERS) -> str:
-    return f"{_short(name, most)} ({_short(unit)})" if unit else _short(name, most)
-
-
-def _short(text: str, most: int = _MOST_LETTERS) -> str:
-    told = plain(text)
-    return told if len(told) <= most else told[: most - 1] + "…"
+    return term("picture.of_channel", name=capital(term(key)), channel=short(channel))

@@ -1,79 +1,79 @@
-"""What a diagnosis says at first sight: the headline, how large, where, how sure, how much better, and what to do."""
+"""What a diagnosis says at first sight: how it looks, the headline, what to do, and what was noticed."""
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Sequence
 from typing import Literal
 
 from mkc_torch.diagnosis.findings.advice import nothing_shows
-from mkc_torch.diagnosis.findings.worth import carries_over, confirmed, small, worth_correcting
+from mkc_torch.diagnosis.findings.following import follows_all
+from mkc_torch.diagnosis.findings.worth import carries_over, small, worth_correcting
 from mkc_torch.diagnosis.result import Diagnosis, Finding
-from mkc_torch.report.diagnosis.findings import (
-    acts_on,
-    better,
-    finding_name,
-    inseparable,
-    rivals,
-    unrecorded,
-    where,
-    with_names,
-)
-from mkc_torch.report.diagnosis.noise import noise_model, smooth_fit
-from mkc_torch.report.diagnosis.numbers import clock_of, evidence, gain, largest, residual_sizes
-from mkc_torch.report.words.numbers import share, size
+from mkc_torch.report.diagnosis.findings import finding_name, inseparable, rivals, unrecorded, with_names
+from mkc_torch.report.words.numbers import size
 from mkc_torch.report.words.terms import term
 from mkc_torch.report.words.typesetting import capital, plain, several
 
-__all__ = ["Tone", "apply_command", "chance", "headline", "lead", "to_do", "tone", "warned"]
+__all__ = ["Tone", "apply_command", "headline", "left_in_short", "left_open", "reasons", "to_do", "tone", "warned"]
 
 Tone = Literal["good", "found", "faint", "open"]
-"""Nothing is missing; something is, and it is named; nothing that is worth correcting; something is, without a name."""
+"""Nothing is missing; physics is, and it is named; nothing that is worth correcting; the simulation does not follow, or
+something without a name drives it."""
 
 
 def tone(diagnosis: Diagnosis) -> Tone:
     """How a headline looks."""
     d = diagnosis
-    if nothing_shows(d):
-        return "good"
-    if d.verdict == "unexplained" or not d.findings:
+    if d.verdict in ("unfit", "unexplained"):
         return "open"
-    return "found" if any(worth_correcting(f) for f in d.findings) else "faint"
+    if any(worth_correcting(f) for f in d.findings):
+        return "found"
+    if d.verdict == "adequate":
+        return "good" if nothing_shows(d) else "open"
+    return "faint" if d.findings else "open"
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """The verdict in a sentence or two, graded by what the findings are worth."""
+    """The verdict in a sentence or two, the findings by their grades."""
     d = diagnosis
+    if d.verdict == "unfit" or (d.verdict == "adequate" and not follows_all(d.world)):
+        return term("verdict.unfit")
     if nothing_shows(d):
-        return term("verdict.nothing")
-    return " ".join(filter(None, [_found(d.findings), _open(d)]))
+        real = [f for f in d.findings if f.grade != "not confirmed"]
+        return f"{term('verdict.not_worth')} {_found(real)}" if real else term("verdict.nothing")
+    told = [_found(d.findings), left_open(d)]
+    if not any(worth_correcting(f) for f in d.findings):
+        told.reverse()  # what is there comes before what it is not
+    return " ".join(filter(None, told))
 
 
 def _found(findings: Sequence[Finding]) -> str:
-    worth = [f for f in findings if worth_correcting(f)]
-    told = [term("verdict.left_out", findings=_names(worth, findings))] if worth else []
-    for reason in (_SMALL, _UNCONFIRMED, _BOTH):
-        of_it = [f for f in findings if f not in worth and _why(f) == reason]
+    told = []
+    for kind in (_LEFT_OUT, _NEAREST, _SMALL, _UNCONFIRMED, _BOTH):
+        of_it = [f for f in findings if _kind(f) == kind]
         if of_it:
-            told.append(term(reason, findings=_names(of_it, findings)))
+            told.append(term(kind, findings="; ".join(_named(f, alone=len(findings) == 1) for f in of_it)))
     return " ".join(told)
 
 
+_LEFT_OUT, _NEAREST = "verdict.left_out", "verdict.nearest"
 _SMALL, _UNCONFIRMED, _BOTH = "verdict.small", "verdict.unconfirmed", "verdict.unconfirmed_and_small"
 
 
-def _why(finding: Finding) -> str:
-    """Why a finding is not worth correcting."""
-    if confirmed(finding):
-        return _SMALL
-    return _BOTH if small(finding) else _UNCONFIRMED
+def _kind(finding: Finding) -> str:
+    """The sentence that a finding belongs to."""
+    if finding.grade == "not confirmed":
+        return _BOTH if small(finding) else _UNCONFIRMED
+    return {"left out": _LEFT_OUT, "real but small": _SMALL}.get(finding.grade, _NEAREST)
 
 
-def _names(some: Sequence[Finding], every: Sequence[Finding]) -> str:
-    return "; ".join(_or_a_rival(f, alone=len(every) == 1) for f in some)
-
-
-def _or_a_rival(finding: Finding, *, alone: bool) -> str:
+def _named(finding: Finding, *, alone: bool) -> str:
     name, others = finding_name(finding), inseparable(finding)
+    if finding.grade == "nearest in the catalogue":
+        gain = finding.shape.free_curve_gain if finding.shape is not None else math.nan
+        return term("verdict.nearest_one", finding=name, nats=size(gain)) if math.isfinite(gain) else name
     if not others:
         return name
     if not alone:
@@ -83,64 +83,47 @@ def _or_a_rival(finding: Finding, *, alone: bool) -> str:
     return term("verdict.or_many", finding=name, count=len(others))
 
 
-def _open(diagnosis: Diagnosis) -> str:
-    """What no finding accounts for."""
+def left_open(diagnosis: Diagnosis) -> str:
+    """What no finding accounts for; empty where there is nothing."""
     d = diagnosis
+    beside = any(worth_correcting(f) for f in d.findings)
+    if d.verdict == "unexplained" and d.world.pushes:
+        rates, places = _driven(d)
+        pair = ("verdict.pushed", "verdict.yet_pushed") if rates else ("verdict.slow", "verdict.yet_slow")
+        return term(pair[int(beside)], places=several(places))
     if d.remaining:
-        return term("verdict.yet_smooth" if d.findings else "verdict.smooth", columns=several(d.remaining))
+        return term("verdict.yet_smooth" if beside else "verdict.smooth", columns=several(d.remaining))
     if not d.findings and d.p_value <= d.level and d.verdict == "adequate":
         return term("verdict.unnamed")
     if d.verdict != "unexplained":
         return ""
     if any(unrecorded(f) for f in d.findings):
         return term("verdict.course_alone")
-    return term("verdict.yet_structure" if d.findings else "verdict.structure")
+    return term("verdict.yet_structure" if beside else "verdict.structure")
 
 
-def lead(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """How large, where, how sure, how much better: questions with their answers."""
+def _driven(diagnosis: Diagnosis) -> tuple[bool, list[str]]:
+    """The states whose rates something pushes, and whether there are any; else the outputs that it is added to."""
+    pushes = diagnosis.world.pushes
+    rates = [push.place for push in pushes if push.at_rate]
+    places = rates or [push.place for push in pushes]
+    return bool(rates), [f"`{plain(place)}`" for place in dict.fromkeys(places)]
+
+
+def left_in_short(diagnosis: Diagnosis) -> str:
+    """Where something is without a name, in a few words; empty where nothing is."""
     d = diagnosis
-    sure = (_label("label.how_sure"), chance(d.findings[0].p_value if d.findings else d.p_value, d))
-    if not d.findings:
-        unit = f" {plain(d.traces.unit)}" if d.traces.unit else ""
-        left = term("verdict.residual", residual=f"{size(d.baseline.rmse)}{unit}")
-        beside = smooth_fit(d)
-        rows = [sure, (_label("label.residual"), left), (_label("label.noise"), f"{capital(noise_model(d.noise))}.")]
-        return [*rows, (_label("label.for_comparison"), f"{capital(beside)}.")] if beside else rows
-    improved = term("verdict.improved", change=residual_sizes(d))
-    if len(d.findings) > 1:
-        return [sure, (_label("label.how_much_better"), f"{improved}.")]
-    f = d.findings[0]
-    told = [largest(p) for p in f.parameters[:2]]
-    large = [(_label("label.how_large"), "; ".join(told) + ".")] if told else []
-    acts = f"; {acts_on(f)}" if f.channels else ""
-    if f.held_out:
-        confirms = f": {better(f.held_out)}, {gain(f.held_out)}."
-    else:
-        confirms = f"; {term('evidence.not_measured')}: {f.held_out_note}."
-    return [
-        *large,
-        (_label("label.where"), f"{capital(where(f, clock_of(d.traces)))}{acts}."),
-        sure,
-        (_label("label.how_much_better"), f"{improved}{confirms}"),
-    ]
+    if not left_open(d):
+        return ""
+    if d.verdict == "unexplained" and d.world.pushes:
+        rates, places = _driven(d)
+        return term("world.rate_of", place=several(places)) if rates else several(places)
+    return several(d.remaining) if d.remaining else term("world.structure")
 
 
-def _label(key: str) -> str:
-    return capital(term(key))
-
-
-def chance(p_value: float, diagnosis: Diagnosis) -> str:
-    """What a p-value means, in a sentence."""
-    d = diagnosis
-    told = share(p_value)
-    return term(
-        "verdict.chance",
-        candidates=f"{d.candidates_tried:,}",
-        share=term("verdict.at_most", share=told) if p_value <= (1.0 + 1e-9) / (1 + d.surrogates) else told,
-        evidence=evidence(p_value, d.surrogates),
-        level=f"{d.level:g}",
-    )
+def reasons(diagnosis: Diagnosis) -> list[str]:
+    """Why the simulation does not follow, the most likely first."""
+    return [capital(with_names(sentence, ())) for sentence in diagnosis.world.reasons]
 
 
 def to_do(diagnosis: Diagnosis) -> list[str]:
@@ -150,9 +133,11 @@ def to_do(diagnosis: Diagnosis) -> list[str]:
 
 
 def warned(diagnosis: Diagnosis) -> list[str]:
-    """The warnings, effects in them by their names."""
-    ids = _ids(diagnosis)
-    return [capital(with_names(sentence, ids)) for sentence in diagnosis.warnings]
+    """The warnings by weight: what casts doubt on a finding or its driver first; effects in them by their names."""
+    d, ids = diagnosis, _ids(diagnosis)
+    doubted = {name for f in d.findings for name in (f.effect, *f.drivers)}
+    ordered = sorted(d.warnings, key=lambda sentence: doubted.isdisjoint(re.findall(r"\w+", sentence)))
+    return [capital(with_names(sentence, ids)) for sentence in ordered]
 
 
 def _ids(diagnosis: Diagnosis) -> set[str]:

@@ -48,20 +48,20 @@ def content():
 @pytest.mark.parametrize("channels", [1, 4])
 def test_diagnoses_of_every_size_are_written(findings, channels):
     content = written(make_diagnosis(findings, channels=channels, samples=300))
-    assert content["schema"] == "mkc-diagnosis/1"
+    assert content["schema"] == "mkc-diagnosis/2"
     assert len(content["findings"]) == findings
     assert len(content["noise"]["sigma"]) == channels
 
 
 def test_keys_are_those_of_the_format(content):
     assert set(content) == {
-        "schema", "recording", "simulation", "samples", "level", "p_value", "noise", "search", "verdict", "findings",
-        "baseline", "corrected", "ceiling", "advice", "warnings",
+        "schema", "recording", "simulation", "samples", "level", "p_value", "verdict", "follows", "reasons", "noise",
+        "search", "findings", "forcing", "remaining", "baseline", "corrected", "ceiling", "advice", "warnings",
     }  # fmt: skip
-    assert set(content["search"]) == {"candidates", "surrogates", "seed"}
+    assert set(content["search"]) == {"candidates", "surrogates", "seed", "starts"}
     assert set(content["findings"][0]) == {
-        "effect", "drivers", "channels", "intervals", "onset", "equation", "explanation", "parameters", "p_value",
-        "held_out", "held_out_note", "alternatives", "plausible", "plausibility", "advice",
+        "effect", "grade", "drivers", "channels", "intervals", "onset", "equation", "explanation", "parameters",
+        "p_value", "shape", "held_out", "held_out_note", "alternatives", "plausible", "plausibility", "advice",
     }  # fmt: skip
     assert set(content["baseline"]) == {"log_likelihood", "rmse", "sigma", "d"}
 
@@ -148,6 +148,8 @@ def test_what_a_new_test_says_stands_under_its_id_and_the_keys_keep_their_order(
         "rmse_before": 1.0,
         "rmse_after": 0.9,
         "unit": "µT",
+        "outputs": {},
+        "left": "",
     }
     expected = {"my_test": {"lag": 0.4, "by": [{"channel": "norm", "held_out": held_out}]}}
     assert content["evidence"] == content["findings"][0]["evidence"] == expected
@@ -235,7 +237,14 @@ def test_a_verdict_agrees_with_its_findings():
 
 
 BAD = [
-    (("schema",), "mkc-diagnosis/2"),
+    (("schema",), "mkc-diagnosis/3"),
+    (("follows",), {"angle": {"unit": "rad"}}),
+    (("noise", "between"), {"torque": "stepped"}),
+    (("search", "starts"), 0),
+    (("remaining", "white"), "yes"),
+    (("findings", 0, "grade"), "splendid"),
+    (("findings", 0, "shape"), {"free_curve_gain": 3.0}),
+    (("findings", 0, "held_out", "outputs"), {"angle": [0.2, 0.1]}),
     (("verdict",), "perhaps"),
     (("p_value",), 1.5),
     (("p_value",), None),

@@ -9,7 +9,7 @@ from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.result import Alternative
 from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
 from mkc_torch.effects.sensor.offset_drift import OffsetDrift
-from tests.diagnosis.factory import make_diagnosis, with_evidence
+from tests.diagnosis.factory import LOST, PUSHED, make_diagnosis, make_unfit, make_world, nearest, with_evidence
 
 
 def advised(findings=1, *, alternatives=(), **changes):
@@ -45,9 +45,59 @@ def test_what_comes_and_goes_is_to_be_looked_for_and_not_corrected():
     assert only.startswith("Look for something that is switched on and off")
 
 
+def test_what_a_rival_could_be_instead_is_done_only_once_it_is_told_apart():
+    drift = Alternative("offset_drift", (), 0.4, False, again=OffsetDrift.again)
+    apart, do, _model = advised(1, alternatives=(drift,))
+    assert apart.startswith("To tell hard_iron_step from offset_drift")
+    assert do.startswith("If it is hard_iron_step: look for what changed at that time")
+
+
+def test_what_is_not_plausible_is_not_built_in():
+    made = make_diagnosis(1, samples=50)
+    doubted = dataclasses.replace(made.findings[0], plausible=False, alternatives=())
+    (only,) = advice_of(dataclasses.replace(made, findings=(doubted,)))
+    assert only == "The size of hard_iron_step is not plausible: look for another cause before correcting it."
+
+
+@pytest.mark.parametrize(
+    ("formula", "told"), [("2 |x|^1.5 sign(x)", "the formula 2 |x|^1.5 sign(x)"), ("", "the curve")]
+)
+def test_what_is_only_nearest_is_not_built_in(formula, told):
+    made = make_diagnosis(1, samples=50)
+    heat = dataclasses.replace(
+        made.findings[0], effect="thermal_loss", advice="Add radiation with this coefficient.", alternatives=()
+    )
+    (only,) = advice_of(dataclasses.replace(made, findings=(nearest(heat, formula=formula),)))
+    assert only.startswith("Do not build thermal_loss in: what this recording shows has another form.")
+    assert told in only
+    assert "Add radiation" not in only
+
+
+def test_a_simulation_that_does_not_follow_is_mended_first():
+    (only,) = make_unfit().advice
+    assert only.startswith("Do not rely on this simulation yet: check what stands under the reasons")
+
+
+def test_a_contradiction_never_says_that_the_simulation_can_be_used():
+    lost = make_diagnosis(0, samples=50, world=make_world(follows=LOST, pushes=()))
+    assert lost.verdict == "adequate"
+    assert "Use the simulation as it is" not in " ".join(lost.advice)
+    followed = make_diagnosis(0, samples=50, world=make_world(pushes=()))
+    assert followed.advice == ("Use the simulation as it is, within what this recording covers.",)
+
+
+def test_what_pushes_a_state_is_looked_for_and_counted_on():
+    (only,) = make_diagnosis(0, samples=50, verdict="unexplained", world=make_world()).advice
+    assert only.startswith("Look for what drives the rate of `rate`")
+    assert "count on 0.23 rad/s² there" in only
+    slow = dataclasses.replace(PUSHED, place="angle", at_rate=False)
+    (only,) = make_diagnosis(0, samples=50, verdict="unexplained", world=make_world(pushes=(slow,))).advice
+    assert only.startswith("Find out what moves the sensor of `angle` slowly")
+
+
 def test_a_step_and_a_drift_are_told_apart_by_another_recording():
     drift = Alternative("offset_drift", (), 0.4, False, again=OffsetDrift.again)
-    sentence = advised(1, alternatives=(drift,))[1]
+    sentence = advised(1, alternatives=(drift,))[0]
     assert sentence == (
         "To tell hard_iron_step from offset_drift, record again: a step does not come at the same moment again; a "
         "warm-up comes again after a cold start."
@@ -57,7 +107,7 @@ def test_a_step_and_a_drift_are_told_apart_by_another_recording():
 
 def test_an_event_and_a_column_are_told_apart_by_another_course_of_the_column():
     current = Alternative("current_field", ("current",), 0.4, False)
-    assert advised(1, alternatives=(current,))[1] == (
+    assert advised(1, alternatives=(current,))[0] == (
         "To tell hard_iron_step from current_field (current), record again: a step does not come at the same moment "
         "again; what follows current goes along with it, so let that change at other times."
     )
@@ -74,14 +124,14 @@ def test_an_event_and_a_column_are_told_apart_by_another_course_of_the_column():
 def test_two_columns_are_told_apart_by_changing_one(rival, how):
     made = make_diagnosis(2, samples=50)
     current = dataclasses.replace(made.findings[1], alternatives=(rival,))
-    assert advice_of(dataclasses.replace(made, findings=(current,)))[1].endswith(how)
+    assert advice_of(dataclasses.replace(made, findings=(current,)))[0].endswith(how)
 
 
 def test_forces_are_told_apart_at_other_speeds():
     made = make_diagnosis(1, samples=50)
     rival = Alternative("stribeck_friction", (), 0.4, False, "rate of speed")
     first = dataclasses.replace(made.findings[0], effect="coulomb_friction", again="", alternatives=(rival,))
-    assert advice_of(dataclasses.replace(made, findings=(first,)))[1] == (
+    assert advice_of(dataclasses.replace(made, findings=(first,)))[0] == (
         "To tell coulomb_friction from stribeck_friction, record again at other speeds, loads and amplitudes."
     )
 

@@ -1,0 +1,98 @@
+"""What unseen blocks say of a finding: whether it is better there, why not if it seems so, and each output's sizes."""
+
+from __future__ import annotations
+
+import math
+
+from mkc_torch.diagnosis.findings.worth import SMALL, change, confirmation
+from mkc_torch.diagnosis.result import Diagnosis, HeldOut, Sizes
+from mkc_torch.diagnosis.world import World
+from mkc_torch.report.diagnosis.numbers import improvement
+from mkc_torch.report.words.numbers import size
+from mkc_torch.report.words.terms import term
+from mkc_torch.report.words.typesetting import plain
+
+__all__ = ["better", "left", "residual_of_all", "residuals"]
+
+_BETTER = {
+    "surely": "evidence.surely",
+    "probably": "evidence.probably",
+    "not shown": "evidence.not_shown",
+    "worse": "evidence.worse",
+}
+_WORSE = -0.01
+"""Share by which a residual is larger that goes with a likelier model, from which that is told."""
+
+
+def better(held_out: HeldOut) -> str:
+    """Whether unseen blocks show that the finding makes it better; where the residuals say otherwise, why.
+
+    Example:
+        >>> better(HeldOut(0.3, (0.2, 0.4), 1.0, 0.8, "µT")), better(HeldOut(0.01, (-0.1, 0.1), 1.0, 0.99, "µT"))
+        ('surely better on unseen blocks', 'not shown to be better on unseen blocks')
+        >>> better(HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "µT"))
+        'not shown to be better on unseen blocks: from block to block the gain differs by more than itself, so it ...'
+    """
+    kind = confirmation(held_out.log_likelihood_gain, held_out.confidence_interval)
+    told = term(_BETTER[kind])
+    reason = _reason(held_out, surely=kind == "surely")
+    return term("evidence.because", better=told, reason=reason) if reason else told
+
+
+def _reason(held_out: HeldOut, *, surely: bool) -> str:
+    """Why residuals and likelihood disagree; empty where they do not."""
+    if surely:
+        return term("evidence.in_the_tail") if change(held_out) < _WORSE else ""
+    if change(held_out) < SMALL:
+        return ""
+    return _within(held_out.left) or term("evidence.blocks_differ")
+
+
+def _within(sentence: str) -> str:
+    """A sentence as a part of another."""
+    return sentence[:1].lower() + sentence[1:].rstrip(".")
+
+
+def left(held_out: HeldOut) -> str:
+    """Of which blocks the free run leaves the recording's range; empty where none does or it was told as a reason."""
+    return "" if not held_out.left or _within(held_out.left) in better(held_out) else held_out.left
+
+
+def residuals(held_out: HeldOut, world: World) -> list[str]:
+    """The residual before and after, an output a line, each in its own unit and beside its noise floor.
+
+    Example:
+        >>> each = {"angle": Sizes(0.02, 0.01, "rad"), "rate": Sizes(0.3, 0.3, "rad/s")}
+        >>> residuals(HeldOut(0.3, (0.2, 0.4), 0.3, 0.3, "", each), World())
+        ['angle 0.0200 → 0.0100 rad (50 % less)', 'rate 0.300 → 0.300 rad/s (no change)']
+        >>> residuals(HeldOut(0.3, (0.2, 0.4), 0.9, 0.5, "µT"), World())
+        ['residual 0.900 → 0.500 µT (44 % less)']
+    """
+    if not held_out.outputs:
+        told = improvement(held_out.rmse_before, held_out.rmse_after, held_out.unit)
+        return [term("evidence.of_residual", change=told)]
+    return [_of_output(name, sizes, world) for name, sizes in held_out.outputs.items()]
+
+
+def _of_output(name: str, sizes: Sizes, world: World) -> str:
+    told = improvement(sizes.before, sizes.after, sizes.unit)
+    floor = next((one.noise_floor for one in world.follows if one.output == name), math.nan)
+    if math.isfinite(floor):
+        told = term("evidence.with_floor", change=told, floor=f"{size(floor)} {plain(sizes.unit)}".rstrip())
+    return term("evidence.one_size", output=plain(name), change=told)
+
+
+def residual_of_all(diagnosis: Diagnosis) -> list[str]:
+    """The same without any finding and with all; empty where outputs of several units have one number together."""
+    d = diagnosis
+    held = [f.held_out for f in d.findings if f.held_out is not None]
+    if len(held) == len(d.findings) and all(one.outputs for one in held) and held:
+        first, last = held[0].outputs, held[-1].outputs
+        both = {
+            name: Sizes(sizes.before, last[name].after, sizes.unit) for name, sizes in first.items() if name in last
+        }
+        return [_of_output(name, sizes, d.world) for name, sizes in both.items()]
+    if len(d.traces.channels) > 1 and not d.traces.unit:
+        return []
+    told = improvement(d.baseline.rmse, d.corrected.rmse, d.traces.unit)
+    return [term("evidence.of_residual", change=told)]

@@ -1,0 +1,62 @@
+"""What is declared of a sensor's noise and of an input's course, checked."""
+
+import math
+
+import pytest
+import torch
+
+from mkc_torch import Recording, diagnose
+from mkc_torch.diagnosis.arguments import checked_between, checked_noise
+from mkc_torch.simulation import Static
+
+
+@pytest.mark.parametrize(
+    ("noise", "error", "words"),
+    [
+        ({"angel": 0.1}, ValueError, r"got `angel`; they are `angle`, `rate`"),
+        ({"angle": 0.0}, ValueError, r"noise\['angle'\]"),
+        ({"angle": math.inf}, ValueError, r"noise\['angle'\]"),
+        ({"angle": math.nan}, ValueError, r"noise\['angle'\]"),
+        ({"angle": "0.1"}, TypeError, r"noise\['angle'\]"),
+        (0.1, TypeError, "to be a dict such as"),
+    ],
+)
+def test_noise_that_makes_no_sense_is_refused(noise, error, words):
+    with pytest.raises(error, match=words):
+        checked_noise(noise, ("angle", "rate"))
+
+
+@pytest.mark.parametrize(
+    ("between", "error", "words"),
+    [
+        ({"torque": "stepped"}, ValueError, "one of held, linear, smooth of `torque` but got 'stepped'"),
+        ({"torque": 1}, ValueError, "one of held, linear, smooth"),
+        ({"force": "held"}, ValueError, "they are `torque`"),
+        ("held", TypeError, "to be a dict such as"),
+    ],
+)
+def test_what_an_input_cannot_do_is_refused(between, error, words):
+    with pytest.raises(error, match=words):
+        checked_between(between, ("torque",))
+
+
+def test_a_simulation_without_inputs_says_so():
+    with pytest.raises(ValueError, match="got `torque`; it has none"):
+        checked_between({"torque": "held"}, ())
+
+
+def test_what_is_declared_is_kept_and_nothing_is_needed():
+    assert checked_noise({"angle": 1}, ("angle",)) == {"angle": 1.0}
+    assert checked_noise(None, ("angle",)) == checked_between(None, ()) == {}
+
+
+def test_a_diagnosis_checks_what_is_declared():
+    time = torch.arange(60) / 10.0
+    heat = torch.sin(time)
+    recording = Recording({"time": time, "temperature": heat, "voltage": 0.5 + heat})
+    line = Static(torch.nn.Linear(1, 1), inputs=("temperature",), outputs=("voltage",))
+    with pytest.raises(ValueError, match="they are `voltage`"):
+        diagnose(line, recording, noise={"temperature": 0.1})
+    # no equations, nothing between samples
+    with pytest.raises(ValueError, match="inputs in the equations of this simulation but got `temperature`; it has no"):
+        diagnose(line, recording, between={"temperature": "held"})

@@ -1,0 +1,278 @@
+"""How a page tells whether a simulation follows, what pushes it, and whether a name's shape is the recording's."""
+
+import dataclasses
+import math
+import re
+
+import pytest
+import torch
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("jinja2")
+
+from mkc_torch.diagnosis.evidence import held_out_gain
+from mkc_torch.diagnosis.result import HeldOut, Sizes
+from mkc_torch.report.diagnosis import unseen, world
+from mkc_torch.report.diagnosis import verdict as top
+from mkc_torch.report.diagnosis.page import diagnosis_report
+from tests.diagnosis.factory import (
+    LOST,
+    PUSHED,
+    graded,
+    make_diagnosis,
+    make_follows,
+    make_forcing,
+    make_unfit,
+    make_world,
+    nearest,
+    with_evidence,
+)
+from tests.report.test_calibration_report import parsed, text_of
+
+
+def pushed(**changes):
+    return make_diagnosis(
+        0, simulation="Pendulum", samples=200, verdict="unexplained", p_value=0.4, world=make_world(**changes)
+    )
+
+
+def with_first(diagnosis, change):
+    first, *rest = diagnosis.findings
+    return dataclasses.replace(diagnosis, findings=(change(first), *rest))
+
+
+def box_of(page):
+    """What stands in the box at the top."""
+    told = text_of(page[page.index('<div class="top') : page.index("</table>")] + "</table></div>")
+    return re.sub(" ([.,:])", r"\1", told)  # after code
+
+
+def test_the_box_says_how_each_output_is_followed_in_its_own_unit():
+    followed = (make_follows(), make_follows("rate", "rad/s", 0.031, 1.4, 0.02, floor_source="samples"))
+    quiet = make_diagnosis(0, samples=200, world=make_world(follows=followed, pushes=(), forcing=()))
+    page = diagnosis_report(quiet)
+    box = box_of(page)
+    assert "Nothing is missing that this recording could show." in box
+    assert "angle follows to 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of its variation" in box
+    assert "rate follows to 0.0310 rad/s; noise floor 0.0200 rad/s (estimated); explains 99.95 %" in box
+    assert "What is left is the sensor's noise. Between samples torque is held." in box
+    assert "µT" not in box.replace("reaches 0", "").split("For comparison")[0]
+    assert '<h1 class="good">' in page
+
+
+def test_an_output_that_hardly_varies_is_not_judged_by_its_share():
+    still = make_follows(residual=0.0051, variation=0.006, explained=0.2)
+    (line,) = world.output_lines(make_diagnosis(0, samples=50, world=make_world(follows=(still,))))
+    assert line == ("angle is off by 0.00510 rad; noise floor 0.00500 rad (declared); it hardly varies beyond that")
+
+
+def test_of_many_outputs_the_table_has_all():
+    many = tuple(make_follows(f"motor_{i}", "rad/s", last_value_predicts=math.nan) for i in range(9))
+    page = diagnosis_report(make_diagnosis(0, samples=100, world=make_world(follows=many, pushes=(), forcing=())))
+    assert "and 3 more outputs; see the table of all" in box_of(page)
+    assert "motor_8 0.00490 rad/s 0.00500 rad/s (declared) 0.350 rad/s 99.98 % 0.350 rad/s not known" in text_of(page)
+
+
+def test_a_simulation_that_does_not_follow_is_said_before_anything_else():
+    page = diagnosis_report(make_unfit())
+    box = box_of(page)
+    assert box.startswith("The simulation does not follow the recording.")
+    assert (
+        "angle: the simulation explains 12 % of the variation; its mean would be off by 0.350 rad, the simulation by "
+        "0.360 rad; noise floor 0.00500 rad (declared)"
+    ) in box
+    assert "Why Another start reaches 0.006 rad: gravity = −9.81 with the other sign. damping ends at its bound" in box
+    assert '<h1 class="bad">' in page
+    text = text_of(page)
+    for words in ("Use the simulation as it is", "Nothing is missing", "The candidates", "hard-iron", "tell apart"):
+        assert words not in text
+
+
+def test_one_colour_for_adequate_another_for_unfit_and_unexplained():
+    quiet = make_diagnosis(0, samples=50, world=make_world(pushes=(), forcing=()))
+    assert [top.tone(d) for d in (quiet, make_unfit(), pushed(), make_diagnosis(1, samples=50))] == [
+        "good", "open", "open", "found",
+    ]  # fmt: skip
+
+
+def test_what_pushes_is_the_first_picture_and_told_in_plain_words():
+    page = diagnosis_report(pushed())
+    parsed(page)
+    assert page.index("Course of the forcing over time") < page.index("Residual over time before and after")
+    box = box_of(page)
+    assert box.startswith("Something unrecorded pushes the rate of rate, and no physics in the catalogue explains it.")
+    assert "Something unrecorded pushes the rate of rate: 0.228 ± 0.021 rad/s², for about 0.7 s at a time." in box
+    assert "Noise without what pushes rate is less likely by 311 nats. No physics stands out beside it." in box
+    text = text_of(page)
+    assert "It is not white: it is correlated up to 0.7 s. It goes along with none of the inputs, at no lag." in text
+    for name in ("Over angle", "Over rate", "Over torque"):
+        assert name in text
+    assert "the rate of rate 0.228 ± 0.021 rad/s² 0.7 s 311" in text
+    assert "Nothing is missing" not in text
+
+
+@pytest.mark.parametrize("samples", [1, 2, 5000])
+@pytest.mark.parametrize("curves", [0, 1, 12])
+def test_a_forcing_of_any_length_with_any_number_of_curves(samples, curves):
+    forcing = make_forcing(samples)
+    forcing = dataclasses.replace(forcing, curves=tuple(forcing.curves[i % 3] for i in range(curves)))
+    page = diagnosis_report(pushed(forcing=(forcing,)))
+    assert page.count("<svg ") == 2
+    assert len(page) < 500_000
+
+
+def test_runs_are_not_joined_by_a_line():
+    from mkc_torch.report.diagnosis.forcing_pictures import _joined
+
+    time = torch.cat([torch.arange(5.0), torch.arange(5.0)]).numpy()
+    assert math.isnan(_joined(time, time)[5])
+    assert len(_joined(time, time)) == 11
+
+
+def test_something_slow_in_a_sensor_is_told_as_such():
+    slow = dataclasses.replace(PUSHED, place="angle", at_rate=False, unit="rad", size=0.012, standard_error=0.002)
+    text = text_of(diagnosis_report(pushed(pushes=(slow,), forcing=(make_forcing(200, slow),))))
+    assert "Something slow is added to angle beside the sensor's noise, and no physics" in text
+    assert "Something slow is added to angle beside its noise: 0.0120 ± 0.0020 rad, for about 0.7 s at a time." in text
+    assert "What is added to angle" in text
+
+
+def test_a_name_whose_shape_is_wrong_is_only_nearest_and_its_curve_is_drawn():
+    made = with_first(make_diagnosis(1, samples=200, verdict="unexplained"), nearest)
+    page = diagnosis_report(made)
+    assert top.headline(made) == (
+        "Structure remains that no effect in the catalogue accounts for. Nearest in the catalogue: hard-iron step "
+        "(a free curve of the same variables is likelier by 163 nats)."
+    )
+    text = text_of(page)
+    assert "Left out" not in text
+    assert "Nearest in the catalogue: hard-iron step" in text
+    assert "The free curve with its 95 % band, and the named form" in text
+    assert "The formula nearest to the free curve: 0.0071 |x|^1.52 sign(x) ." in text
+    assert "likelier by 163 nats (p = 0.002 if the name were right)" in text
+    assert page.index("The free curve beside the form of finding 1") < page.index("What finding 1 is, and")
+    parsed(page)
+    # of another driver than the named form: the free curve alone
+    curve = dataclasses.replace(made.findings[0].curve, driver="difference")
+    alone = with_first(made, lambda f: nearest(f, curve=curve, formula=""))
+    assert "The free curve, 95 % band" in text_of(diagnosis_report(alone))
+
+
+@pytest.mark.parametrize(
+    ("grade", "told"),
+    [
+        ("left out", "Left out of the simulation: hard-iron step"),
+        ("real but small", "Real, but small beside the noise: hard-iron step"),
+        ("not confirmed", "Found, but not confirmed on unseen blocks: hard-iron step"),
+    ],
+)
+def test_the_headline_is_by_grade_alone(grade, told):
+    made = with_first(make_diagnosis(1, samples=50), lambda f: graded(f, grade))
+    assert top.headline(made).startswith(told)
+
+
+def test_what_is_small_beside_an_adequate_simulation_is_said():
+    small = with_first(make_diagnosis(1, samples=50, verdict="adequate"), lambda f: graded(f, "real but small"))
+    assert top.headline(small).startswith("Nothing is missing that is worth correcting. Real, but small")
+    weak = with_first(small, lambda f: graded(f, "not confirmed"))
+    assert top.headline(weak) == "Nothing is missing that this recording could show."
+
+
+def test_smaller_and_not_shown_to_be_better_never_stand_together_without_the_reason():
+    left = "In 1 of 25 blocks the free run leaves the recording's range."
+    for held, reason in (
+        (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m"), "from block to block the gain differs by more than itself"),
+        (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m", left=left), left[1:].rstrip(".")),
+        (HeldOut(0.3, (0.2, 0.4), 1.0, 1.3, "m"), "in the tail"),
+    ):
+        assert reason in unseen.better(held)
+        assert unseen.left(held) == ""
+    assert unseen.left(HeldOut(0.3, (0.2, 0.4), 1.0, 0.5, "m", left=left)) == left
+    assert unseen.better(HeldOut(0.001, (-0.4, 0.4), 1.0, 0.99, "m")) == "not shown to be better on unseen blocks"
+
+
+def test_each_output_has_its_own_sizes_beside_its_floor():
+    held = HeldOut(
+        0.3, (0.2, 0.4), 15671.0, 0.661, "",
+        {"angle": Sizes(0.02, 0.0051, "rad"), "rate": Sizes(0.3, 0.1, "rad/s")},
+        "In 1 of 25 blocks the free run of the simulation alone leaves the recording's range.",
+    )  # fmt: skip
+    made = make_diagnosis(2, samples=200, channels=2, simulation="Motor", world=make_world(pushes=(), forcing=()))
+    traces = dataclasses.replace(made.traces, channels=("angle", "rate"), unit="")
+    made = dataclasses.replace(made, traces=traces, findings=tuple(
+        with_evidence(f, held_out_gain.said(held, "")) for f in made.findings
+    ))  # fmt: skip
+    for one in (made, dataclasses.replace(made, findings=made.findings[:1])):
+        text = text_of(diagnosis_report(one))
+        assert "angle 0.0200 → 0.00510 rad (74 % less), noise floor 0.00500 rad" in text
+        assert "rate 0.300 → 0.100 rad/s (67 % less)" in text
+        assert "15671" not in text
+        assert "n 1 of 25 blocks the free run of the simulation alone leaves" in text
+    # what is not told for each output has no number of all together
+    bare = dataclasses.replace(made, findings=tuple(dataclasses.replace(f, evidence=()) for f in made.findings))
+    assert unseen.residual_of_all(bare) == []
+
+
+def test_the_box_has_what_where_how_large_and_how_sure_of_each_of_several():
+    box = box_of(diagnosis_report(make_diagnosis(3, samples=4500)))
+    for words in (
+        "1 · Hard-iron step Left out of the simulation; not to be told from: current field (current).",
+        "offset change (3.214 ± 0.081, −1.104 ± 0.077, 0.325 ± 0.092) µT. From 41.3 s on; acts on mag_x",
+        "p = 0.005; surely better on unseen blocks: residual 0.912 → 0.521 µT (43 % less).",
+        "2 · Current field (current) Left out of the simulation. k (−0.170 ± 0.012",
+        "3 · An effect outside the catalogue (temperature) Not confirmed on unseen blocks.",
+    ):
+        assert words in box
+
+
+def test_warnings_come_after_the_findings_and_those_of_a_finding_first():
+    made = make_diagnosis(1, samples=200, warnings=("A column is empty.", "hard_iron_step may be a door."))
+    page = diagnosis_report(made)
+    assert top.warned(made) == ["Hard-iron step may be a door.", "A column is empty."]
+    assert page.index("What else it could be") < page.index("may be a door") < page.index("The statistician")
+
+
+def test_the_statisticians_numbers_are_one_click_below():
+    page = diagnosis_report(pushed(pushes=(PUSHED,)))
+    closed = re.findall(r"<details><summary>([^<]*)</summary>", page)
+    assert closed[:4] == [
+        "How the simulation follows", "What pushes it", "On data the fit had not seen",
+        "The noise that structure was tested against",
+    ]  # fmt: skip
+
+
+def test_the_noise_floor_lies_beside_the_residual_in_its_picture():
+    made = make_diagnosis(0, samples=200, world=make_world(follows=(make_follows("norm", "µT"),), pushes=()))
+    page = diagnosis_report(made)
+    assert "Dotted: the sensor's noise floor." in text_of(page)
+    without = diagnosis_report(dataclasses.replace(made, world=make_world(pushes=())))  # of no channel
+    assert "Dotted" not in without
+    assert page.count("stroke-dasharray") == without.count("stroke-dasharray") + 2
+
+
+def test_nats_are_explained_once_where_they_are_met():
+    told = "How much likelier one model is than another is told in nats"
+    for made in (make_diagnosis(3, samples=100, channels=2), pushed()):
+        page = diagnosis_report(made)
+        assert page.count(told) == 1
+        assert page.index(told) < page.index("<h2>")
+    assert told not in diagnosis_report(make_unfit())
+
+
+def test_names_of_the_world_are_escaped():
+    bad = "<b>x</b> & $a$"
+    push = dataclasses.replace(PUSHED, place=bad, unit=bad)
+    forcing = dataclasses.replace(make_forcing(50, push), sentences=(bad,))
+    hostile = make_world(
+        follows=(make_follows(bad, bad),), pushes=(push,), between={bad: "linear"}, forcing=(forcing,), reasons=(bad,)
+    )
+    for verdict in ("unfit", "unexplained"):
+        page = diagnosis_report(make_diagnosis(0, samples=100, verdict=verdict, world=hostile))
+        assert "<b>" not in page
+        parsed(page)
+
+
+def test_a_contradiction_is_not_called_nothing():
+    lost = make_diagnosis(0, samples=50, world=make_world(follows=LOST, pushes=(), forcing=()))
+    assert top.tone(lost) == "open"
+    assert top.headline(lost) == "The simulation does not follow the recording."
