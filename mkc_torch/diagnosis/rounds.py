@@ -16,7 +16,7 @@ from mkc_torch.diagnosis.evidence.unrecorded_cause import course_without, locate
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.grid import within_a_sample
-from mkc_torch.diagnosis.model.in_the_world import pushed
+from mkc_torch.diagnosis.model.in_the_world import first_samples, pushed
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.colour import correlation_time
@@ -100,7 +100,8 @@ def begun(base: FittedModel, terms: tuple[Term, ...], asked: Asked, generator: t
     """The first search, and its finding, if unseen blocks confirm it."""
     prepared = base.model.prepared
     correlation = max(correlation_time(one) for one in base.pseudo(asked.settings.noise)[0].unbind(1))
-    blocks = blocks_of(len(base.residual), math.ceil(correlation), asked.settings.confirmation)
+    confirmation = asked.settings.confirmation
+    blocks = blocks_of(len(base.residual), math.ceil(correlation), confirmation, first_samples(prepared))
     first = None
     with meanwhile([partial(held_out, base, blocks)], common_parts(prepared, ())) as judged:
         if terms:

@@ -56,7 +56,9 @@ class Evidence:
         return ((1.0 - self.left_out) / self.left_out * self.parameters.var(0, correction=0)).sqrt()
 
 
-def blocks_of(N: int, correlation: int, settings: ConfirmationSettings) -> HeldOutBlocks:
+def blocks_of(
+    N: int, correlation: int, settings: ConfirmationSettings, always: Bool[Tensor, " N"] | None = None
+) -> HeldOutBlocks:
     """Blocks in folds, twenty-five in five unless set otherwise.
 
     Between training and held-out samples lies a correlation time at least, but no more than half a block, so that
@@ -66,6 +68,8 @@ def blocks_of(N: int, correlation: int, settings: ConfirmationSettings) -> HeldO
         N: number of samples.
         correlation: integrated correlation time in samples.
         settings: how many, and what is left out beside them.
+        always: samples that all fits have, such as the first ones of each run, without which nobody knows the states
+            that it begins in; None for none.
     """
     folds = settings.folds
     count = folds * settings.blocks_per_fold
@@ -77,7 +81,8 @@ def blocks_of(N: int, correlation: int, settings: ConfirmationSettings) -> HeldO
     for k in range(folds):
         near = (fold == k).to(torch.float64).reshape(1, 1, -1)
         widened = torch.nn.functional.max_pool1d(near, 2 * gap + 1, stride=1, padding=gap)
-        train.append(widened.reshape(-1) == 0)
+        one = widened.reshape(-1) == 0
+        train.append(one if always is None else one | always)
     return HeldOutBlocks(block, fold, tuple(train))
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.model.at_once import at_once
@@ -27,6 +28,7 @@ __all__ = [
     "at_liberty",
     "beside_effects",
     "between_samples",
+    "first_samples",
     "freed",
     "in_the_world",
     "noise_around",
@@ -35,6 +37,9 @@ __all__ = [
 
 _ROUNDS = 2
 """Times that the noise is sought along a trajectory and the parameters are fitted under it."""
+
+_FIRST = 3
+"""Samples, for each state, that a run's first states are known by."""
 
 _STRONG = 10.0
 """Size of the pushes that a first observer is for, over that at which they move an output by its noise."""
@@ -67,20 +72,48 @@ def at_liberty(prepared: PreparedSimulation) -> PreparedSimulation:
     return prepared.observed(None) if isinstance(prepared, PreparedDynamics) else prepared
 
 
+def first_samples(prepared: PreparedSimulation) -> Tensor | None:
+    """The samples that a run's first states are known by; None where none are asked for."""
+    if not isinstance(prepared, PreparedDynamics):
+        return None
+    index = torch.arange(len(prepared.time))
+    first = torch.where(prepared.begins, index, 0).cummax(0).values
+    return index - first < _FIRST * len(prepared.system.states)
+
+
 def pushed(fit: FittedModel) -> bool:
     """Whether a fit is under more noise than the sensors' white one."""
     prepared = fit.model.prepared
     return isinstance(prepared, PreparedDynamics) and prepared.observer is not None
 
 
-def noise_around(fit: FittedModel, declared: Mapping[str, float], settings: NoiseSettings) -> NoiseOfTheWorld | None:
-    """The likeliest noise along a fit's trajectory; None where there is no trajectory, or are no states."""
+def noise_around(
+    fit: FittedModel,
+    declared: Mapping[str, float],
+    settings: NoiseSettings,
+    known: NoiseOfTheWorld | None = None,
+) -> NoiseOfTheWorld | None:
+    """The likeliest noise along a fit's trajectory; None where there is no trajectory, or are no states.
+
+    Args:
+        fit: along whose trajectory.
+        declared: standard deviation of the white noise of outputs that it is known of.
+        settings: of the noise.
+        known: a noise nearby, whose disturbances are given their sizes; None to seek them.
+    """
     prepared, model = fit.model.prepared, fit.model
     if not isinstance(prepared, PreparedDynamics):
         return None
     theta, changes = fit.parameters[: model.base], model.changes(fit.parameters)
     return likeliest_noise(
-        prepared, theta, changes, model.near, declared=declared, least=settings.pushed, most=settings.pushes
+        prepared,
+        theta,
+        changes,
+        model.near,
+        declared=declared,
+        least=settings.pushed,
+        most=settings.pushes,
+        known=None if known is None else known.disturbed,
     )
 
 
@@ -148,9 +181,11 @@ def in_the_world(
     return InTheWorld(free, *best, starts)
 
 
-def beside_effects(fit: FittedModel, declared: Mapping[str, float], settings: NoiseSettings) -> FittedModel:
+def beside_effects(
+    fit: FittedModel, around: NoiseOfTheWorld | None, declared: Mapping[str, float], settings: NoiseSettings
+) -> FittedModel:
     """A joint model under the pushes that are left beside its effects, or, where it is as likely, running freely."""
-    found = _under_noise(fit, noise_around(fit, declared, settings), declared, settings)
+    found = _under_noise(fit, noise_around(fit, declared, settings, around), declared, settings)
     best = fit if found is None else found[0]
     free = freed(best)
     if free is None:
@@ -197,7 +232,7 @@ def _under_noise(
             fit = fitted(model, fit.parameters, fit.bound, graduate=False)
         except NoFitError:
             break
-        under, noise = noise, noise_around(fit, declared, settings)
+        under, noise = noise, noise_around(fit, declared, settings, noise)
         if best is None or fit.log_likelihood > best[0].log_likelihood:
             same = noise is not None and (noise.observer is None) == (under.observer is None)
             best = fit, noise if same and noise is not None else under
@@ -281,7 +316,7 @@ def _holding(
         fit = fitted(JointModel(prepared, (), base.fit.model.near), base.fit.parameters, base.fit.bound)
     except NoFitError:
         return None
-    found = _under_noise(fit, noise_around(fit, declared, settings), declared, settings)
+    found = _under_noise(fit, noise_around(fit, declared, settings, base.noise), declared, settings)
     if found is None or (found[1].observer is None and free is None):
         return None
     if found[1].observer is None or (free is not None and free.log_likelihood > found[0].log_likelihood):

@@ -23,6 +23,7 @@ from mkc_torch.diagnosis.search.profiled import Profiled, profiled
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation.dynamics.noise import noise_of
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 __all__ = ["located_among_pushes"]
@@ -135,7 +136,9 @@ def _own(
 ) -> FittedModel:
     """The joint fit of a candidate, under the noise that it leaves."""
     fit = _fit_of(base, term, found, number)
-    return shape_fitted(beside_effects(fit, declared, settings.noise))
+    prepared = base.model.prepared
+    assert isinstance(prepared, PreparedDynamics)
+    return shape_fitted(beside_effects(fit, noise_of(prepared, declared), declared, settings.noise))
 
 
 def _by_own_noise(

@@ -17,16 +17,19 @@ from mkc_torch.simulation.dynamics.observer import Disturbance, Observer
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Disturbed", "disturbed", "models_of", "observer_of", "usual_size"]
+__all__ = ["Disturbed", "disturbed", "models_of", "observer_of", "resized", "usual_size"]
 
-_SIZES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+_SIZES = (0.1, 1.0, 10.0, 100.0)
 """Tried, over that at which a disturbance moves an output by as much as its white noise."""
 
-_LASTING = (0.004, 0.015, 0.06, 0.25)
+_LASTING = (0.004, 0.03, 0.25)
 """Time constants tried, as shares of the longest run."""
 
 _STRETCH, _BEFORE = 150, 50
 """Samples of a stretch that is filtered beside others, and before it, for the filter to find its way."""
+
+_SHARES = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01)
+"""Of known sizes, tried where an effect may have made some of a push needless."""
 
 _FINER = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.0)
 _ROUNDS = 3
@@ -42,6 +45,7 @@ class Disturbed:
         gains: nats by which each is needed beside those before it.
         sensor: (m,), standard deviation of each output's white noise.
         log_likelihood: in nats, robust, up to a constant.
+        declared: of which outputs the white noise is.
     """
 
     disturbances: tuple[Disturbance, ...]
@@ -49,6 +53,7 @@ class Disturbed:
     gains: tuple[float, ...]
     sensor: Float[Tensor, " m"]
     log_likelihood: float
+    declared: tuple[bool, ...]
 
 
 @dataclass(frozen=True)
@@ -98,9 +103,53 @@ def disturbed(
             break
         gains.append(more - value)
         best, value = _scaled(other, scale), more
-    errors = _errors(flow, best)
-    found = [Disturbance((*names, *channels)[place], place < p, lasting, size) for place, size, lasting in best.pushes]
-    return Disturbed(tuple(found), errors, tuple(gains), floor.new_tensor(best.sensor), value)
+    return _told(best, gains, flow, names, channels, floor, value)
+
+
+def resized(flow: Flow, names: Sequence[str], channels: Sequence[str], known: Disturbed, least: float) -> Disturbed:
+    """The same disturbances at the sizes that they have along another flow, without those that are needless there.
+
+    Args:
+        flow: of the trajectory.
+        names, channels: as of :func:`disturbed`.
+        known: the disturbances.
+        least: nats that each has to gain.
+    """
+    places = [*names, *channels]
+    pushes = tuple((_place(places, one, len(names)), one.size, one.lasting) for one in known.disturbances)
+    noise = _Noise(tuple(known.sensor.tolist()), pushes, known.declared)
+    tried = [replace(noise, pushes=tuple((a, share * s, t) for a, s, t in pushes)) for share in _SHARES]
+    values, scales = _likelihoods(flow, tried)
+    number = int(np.nan_to_num(values, nan=-np.inf).argmax())
+    best = _finer(flow, _scaled(tried[number], float(scales[number])))
+    value, scale = _exactly(flow, best)
+    best = _scaled(best, scale)
+    gains: list[float] = []
+    while best.pushes:
+        without = [replace(best, pushes=(*best.pushes[:d], *best.pushes[d + 1 :])) for d in range(len(best.pushes))]
+        less = [_white(flow, one) if not one.pushes else (one, _exactly(flow, one)[0]) for one in without]
+        gains = [value - other for _, other in less]
+        weakest = min(range(len(gains)), key=gains.__getitem__)
+        if gains[weakest] > least:
+            break
+        best, value = less[weakest][0], less[weakest][1]
+        gains = []
+    return _told(best, gains, flow, names, channels, known.sensor, value)
+
+
+def _told(
+    noise: _Noise,
+    gains: Sequence[float],
+    flow: Flow,
+    names: Sequence[str],
+    channels: Sequence[str],
+    like: Float[Tensor, " m"],
+    value: float,
+) -> Disturbed:
+    places, p = (*names, *channels), flow.rates
+    found = tuple(Disturbance(places[place], place < p, lasting, size) for place, size, lasting in noise.pushes)
+    sensor = like.new_tensor(noise.sensor)
+    return Disturbed(found, _errors(flow, noise), tuple(gains), sensor, value, noise.known)
 
 
 def _candidates(flow: Flow, known: _Noise, places: int) -> list[tuple[int, float, float]]:

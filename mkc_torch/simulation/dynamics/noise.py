@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mkc_torch.simulation.dynamics.disturbances import Disturbed, disturbed, models_of, observer_of
+from mkc_torch.simulation.dynamics.disturbances import Disturbed, disturbed, models_of, observer_of, resized
 from mkc_torch.simulation.dynamics.first_fit import floor_of
 from mkc_torch.simulation.dynamics.flow import flow_of
 from mkc_torch.simulation.dynamics.kalman import filtered, smoothed
@@ -20,7 +20,7 @@ from mkc_torch.simulation.protocol import Changes, Nearby
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["NoiseOfTheWorld", "Pushed", "likeliest_noise", "pushes_over_time"]
+__all__ = ["NoiseOfTheWorld", "Pushed", "likeliest_noise", "noise_of", "pushes_over_time"]
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ def likeliest_noise(
     declared: Mapping[str, float],
     least: float,
     most: int,
+    known: Disturbed | None = None,
 ) -> NoiseOfTheWorld | None:
     """The likeliest noise along a simulation's trajectory; None where there is no trajectory.
 
@@ -48,18 +49,31 @@ def likeliest_noise(
         theta, changes, near: of its trajectory.
         declared: standard deviation of the white noise of outputs that it is known of.
         least, most: nats that a disturbance has to gain, and how many there may be.
+        known: disturbances that are to be given their sizes; None to seek them.
     """
     flow = flow_of(prepared, theta, changes, near)
     if flow is None or not all(bool(np.isfinite(one).all()) for one in (flow.carried, flow.seen, flow.new, flow.shift)):
         return None
+    names, channels = prepared.pushable, prepared.channels
+    if known is not None and known.disturbances:
+        found = resized(flow, names, channels, known, least)
+        return NoiseOfTheWorld(found, observer_of(flow, found.disturbances, found.sensor, names, channels))
     floor = floor_of(prepared)
-    known = [name in declared for name in prepared.channels]
+    given = [name in declared for name in prepared.channels]
     sensor = floor.new_tensor(
         [declared.get(name, float(one)) for name, one in zip(prepared.channels, floor, strict=True)]
     )
-    names, channels = prepared.pushable, prepared.channels
-    found = disturbed(flow, names, channels, sensor, known, least, most)
+    found = disturbed(flow, names, channels, sensor, given, least, most)
     return NoiseOfTheWorld(found, observer_of(flow, found.disturbances, found.sensor, names, channels))
+
+
+def noise_of(prepared: Observable, declared: Mapping[str, float]) -> NoiseOfTheWorld | None:
+    """The noise that an observed simulation is under; None of one that runs freely."""
+    observer = prepared.observer
+    if observer is None:
+        return None
+    given = tuple(name in declared for name in prepared.channels)
+    return NoiseOfTheWorld(Disturbed(observer.disturbances, (), (), observer.sensor, 0.0, given), observer)
 
 
 @dataclass(frozen=True)
