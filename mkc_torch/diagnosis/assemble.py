@@ -104,7 +104,9 @@ def assembled(whole: Whole, answers: Answers) -> Diagnosis:
     )
     there = first is not None and first.p_value <= asked.level and not case.found
     structure = there or bool(diagnosis.remaining) or whole.cut or nameless(final.fit)
-    verdict = verdict_of(known, findings, structure=structure, white=_white(diagnosis), settings=settings.evidence)
+    # of a trajectory it has been asked for what pushes it
+    white = known.noise is not None or _white(diagnosis)
+    verdict = verdict_of(known, findings, structure=structure, white=white, settings=settings.evidence)
     diagnosis = replace(diagnosis, verdict=verdict)
     return replace(diagnosis, advice=advice_of(diagnosis))
 

@@ -118,7 +118,7 @@ def diagnose(
         )
     declared = checked_noise(noise, prepared.channels)
     fixed = checked_between(between, tuple(getattr(prepared, "between", ())))
-    asked = Asked(level, surrogates, max_findings, seed, settings, declared)
+    asked = Asked(level, surrogates, max_findings, seed, settings, declared, fixed)
     generator = torch.Generator().manual_seed(seed)
     if isinstance(prepared, PreparedDynamics):
         prepared = prepared.holding(fixed)

@@ -69,7 +69,7 @@ def around(base: InTheWorld, final: FittedModel, declared: Mapping[str, float], 
 
 def world_of(base: InTheWorld, final: FittedModel, known: Around, *, unfit: bool) -> World:
     """What is told of the world around."""
-    prepared = base.fit.model.prepared
+    prepared = final.model.prepared
     reasons: tuple[str, ...] = ()
     if unfit:
         fits = [base.fit] if base.free is None else [base.fit, base.free]

@@ -30,6 +30,7 @@ SHARES = (1.0, 0.4, 0.15, 0.05, 0.015, 0.0)
 """Of the pushes' sizes."""
 
 _SINGULAR = 1e-9
+"""Share of the largest eigenvalue below which a direction of a candidate is none."""
 
 
 @dataclass(frozen=True)
