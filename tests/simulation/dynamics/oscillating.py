@@ -34,8 +34,7 @@ def oscillator(**attributes):
 
 def theta_of(prepared):
     """The true parameters, with runs that begin at rest."""
-    n = len(prepared.parameter_names) - 2
-    return torch.tensor([STIFFNESS, DAMPING] + [0.0] * n, dtype=torch.float64)
+    return torch.tensor([STIFFNESS, DAMPING] + [0.0] * prepared.beginnings, dtype=torch.float64)
 
 
 def held(slope, step):
