@@ -98,7 +98,10 @@ def disturbed(
         other = _finer(flow, _scaled(tried[number], float(scales[number])))
         more, scale = _exactly(flow, other)
         # the others may have come nearer to their best as well
-        value = max(value, _exactly(flow, replace(other, pushes=other.pushes[:-1]))[0])
+        nearer = replace(other, pushes=other.pushes[:-1])
+        again, its_scale = _exactly(flow, nearer)
+        if again > value:
+            best, value = _scaled(nearer, its_scale), again
         if not more > value + least:
             break
         gains.append(more - value)
