@@ -1,4 +1,4 @@
-"""A driven pendulum that something unrecorded pushes, made by Runge and Kutta's steps of its own, and the fits to it."""
+"""A driven pendulum that something unrecorded pushes, made by steps of its own, and the fits to it."""
 
 import functools
 import math
