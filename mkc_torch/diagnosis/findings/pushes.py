@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -79,18 +80,30 @@ def _curve(
     """Mean of a push over parts of the range of what it may depend on, as many samples in each, with its band."""
     if float(values.std()) <= 1e-12 * float(values.abs().max().clamp(min=1e-300)):
         return None
-    order = values.argsort()
-    parts = order.tensor_split(min(_BINS, len(values) // 10))
-    step = float(prepared.time.diff().median())
-    # neighbours share a push that lasts
-    alike = max(1.0, 2.0 * push.lasting / step if step > 0 else 1.0)
+    parts = values.argsort().tensor_split(max(min(_BINS, len(values) // 10), 1))
     x = torch.stack([values[part].mean() for part in parts])
     y = torch.stack([course.value[part].mean() for part in parts])
-    spread = torch.stack([course.value[part].std() for part in parts])
-    count = torch.tensor([max(len(part) / alike, 1.0) for part in parts], dtype=y.dtype)
-    band = _NORMAL_95 * (spread.square() + push.size**2 * (count <= 1)).sqrt() / count.sqrt()
+    band = _NORMAL_95 * _error_of_means(course.value, parts)
     unit = prepared.system.units.get(name, prepared.recording.units[name] if name in prepared.recording else "")
     return Curve(name, unit, x, y.unsqueeze(-1), band.unsqueeze(-1), (f"rate of {push.place}",), push.unit)
+
+
+def _error_of_means(values: Float[Tensor, " N"], parts: Sequence[Tensor]) -> Float[Tensor, " parts"]:
+    """Standard errors of the means of some samples of a series each: neighbours are alike, as the series has it."""
+    N = len(values)
+    inside = torch.stack([values.new_zeros(N).index_fill(0, part, 1.0) for part in parts])
+    (alike, *pairs) = _lagged(torch.stack([values - values.mean(), *inside]))
+    # beyond where it first vanishes there is nothing but chance
+    memory = int((alike <= 0).long().argmax()) or N
+    count = inside.sum(-1)
+    of_pairs = torch.stack([one[0] * alike[0] + 2.0 * (one[1:memory] * alike[1:memory]).sum() for one in pairs])
+    return (of_pairs / N).clamp(min=0.0).sqrt() / count
+
+
+def _lagged(series: Float[Tensor, "k N"]) -> Float[Tensor, "k N"]:
+    """Sums of the products of each series with itself, so many samples later."""
+    N = series.shape[-1]
+    return torch.fft.irfft(torch.fft.rfft(series, n=2 * N).abs().square(), n=2 * N)[..., :N]
 
 
 def _sentences(push: Push, course: Pushed, prepared: PreparedDynamics) -> tuple[str, ...]:

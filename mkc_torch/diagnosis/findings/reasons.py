@@ -123,6 +123,9 @@ def _of_trials(prepared: PreparedDynamics, fits: Sequence[FittedModel], follows:
             parts = zip(follows, size.tolist(), strict=True)
             reach = ", ".join(f"{one.output} to {value:.3g} {one.unit}".rstrip() for one, value in parts)
             told.append(f"{trials[number].told(theta)} it follows {reach}.")
+    if told:
+        # with its sign turned round, say, an input matters that did not before
+        return told[:3]
     still = [
         (name, _size(_with_inputs(prepared, _still(prepared, number)), fits)[0])
         for number, name in enumerate(prepared.system.inputs)

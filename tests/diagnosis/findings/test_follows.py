@@ -1,0 +1,140 @@
+"""How well a simulation follows each output: sizes, shares, floors and what trivial predictions reach."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis.findings.follows import follows_of, misses, size_of
+from mkc_torch.simulation.protocol import Port
+from tests.diagnosis.factory import make_follows
+
+N = 4000
+TIME = torch.arange(N, dtype=torch.float64) / 50.0
+WAVE = torch.sin(TIME).unsqueeze(-1)
+
+
+def randn(*size, seed=0):
+    return torch.randn(*size, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def simulating(measured, channels=("angle",), unit="rad"):
+    return SimpleNamespace(measured=measured, channels=channels, unit=unit, ports={})
+
+
+def followed(measured, residual, declared=None, floor=None, **more):
+    return follows_of(simulating(measured, **more), residual, declared or {}, floor)
+
+
+def test_the_size_of_normal_noise_is_its_standard_deviation():
+    values = randn(N, 2) * torch.tensor([0.3, 20.0], dtype=torch.float64)
+    torch.testing.assert_close(size_of(values), torch.tensor([0.3, 20.0]).double(), rtol=0.04, atol=0.0)
+
+
+def test_of_an_outlier_five_standard_deviations_count():
+    values = randn(N, 1)
+    clean = float(size_of(values))
+    values[:40] = 1000.0
+    assert float(size_of(values)) == pytest.approx((clean**2 + 0.01 * 25.0) ** 0.5, rel=0.02)
+
+
+def test_the_size_of_a_series_that_rests_most_of_the_time_is_its_root_mean_square():
+    values = torch.zeros(N, 1).double()
+    values[:100] = 2.0
+    assert float(size_of(values)) == pytest.approx(2.0 * (100 / N) ** 0.5)
+    assert float(size_of(torch.zeros(N, 1).double())) == 0.0
+
+
+def test_an_offset_is_part_of_a_residual_and_no_variation():
+    one = followed(5.0 + WAVE, torch.full((N, 1), 0.1).double())[0]
+    assert one.residual == pytest.approx(0.1)
+    assert one.variation == pytest.approx(0.5**0.5, rel=0.02)
+
+
+@pytest.mark.parametrize(("size", "share"), [(0.1, 0.98), (0.5**0.5, 0.0), (1.0, -1.0)])
+def test_the_share_explained_is_of_squares_and_below_nothing_where_the_mean_is_better(size, share):
+    one = followed(WAVE, size * randn(N, 1))[0]
+    assert one.explained == pytest.approx(share, abs=0.08)
+
+
+def test_each_output_has_sizes_of_its_own_and_its_unit():
+    parts = {"angle": "rad", "speed": "rad/s"}
+    port = Port(("angle", "speed"), "", carries=("angle", "speed"), parts={k: k for k in parts}, part_units=parts)
+    prepared = simulating(torch.cat([WAVE, 100.0 * WAVE], -1), ("angle", "speed"), "")
+    prepared.ports = {"output": port}
+    one, other = follows_of(prepared, torch.cat([0.7 * WAVE, 10.0 * WAVE], -1), {}, None)
+    assert (one.output, one.unit, other.output, other.unit) == ("angle", "rad", "speed", "rad/s")
+    assert one.explained == pytest.approx(0.51, abs=0.01)
+    assert other.explained == pytest.approx(0.99, abs=0.01)
+    assert other.residual == pytest.approx(10.0 * 0.5**0.5, rel=0.02)
+    assert misses((one, other), 0.6) == (one,)
+
+
+def test_the_floor_is_what_is_new_from_sample_to_sample():
+    one = followed(WAVE, WAVE + 0.02 * randn(N, 1))[0]
+    assert one.floor_source == "samples"
+    assert one.noise_floor == pytest.approx(0.02, rel=0.1)
+
+
+def test_a_floor_that_was_estimated_is_taken():
+    one = followed(WAVE, 0.02 * randn(N, 1), floor=[0.007])[0]
+    assert (one.noise_floor, one.floor_source) == (pytest.approx(0.007), "samples")
+
+
+def test_a_recording_in_coarse_steps_has_the_floor_of_its_steps():
+    one = followed((WAVE * 20.0).round() / 20.0, 0.3 * WAVE, floor=[1e-4])[0]
+    assert one.floor_source == "quantisation"
+    assert one.noise_floor == pytest.approx(0.05 / 12.0**0.5)
+
+
+def test_steps_finer_than_the_noise_are_no_floor():
+    one = followed((WAVE * 20.0).round() / 20.0, 0.3 * WAVE, floor=[0.1])[0]
+    assert (one.noise_floor, one.floor_source) == (pytest.approx(0.1), "samples")
+
+
+def test_a_declared_floor_goes_before_what_samples_and_steps_say():
+    measured = (torch.cat([WAVE, WAVE], -1) * 20.0).round() / 20.0
+    one, other = followed(
+        measured, 0.3 * randn(N, 2), {"rate": 0.001}, floor=[0.1, 0.1], channels=("angle", "rate"), unit=""
+    )
+    assert (one.noise_floor, one.floor_source) == (pytest.approx(0.1), "samples")
+    assert (other.noise_floor, other.floor_source) == (0.001, "declared")
+
+
+def test_the_mean_and_the_last_value_predict_what_they_do():
+    one = followed(7.0 + WAVE, 0.1 * randn(N, 1))[0]
+    assert one.mean_predicts == pytest.approx(float(WAVE.std()), rel=0.02)
+    assert one.last_value_predicts == pytest.approx(float(WAVE.diff(dim=0).square().mean().sqrt()), rel=0.02)
+
+
+@pytest.mark.parametrize("lost", [None, torch.full((N, 1), torch.nan).double()])
+def test_a_run_that_is_lost_explains_nothing(lost):
+    one = followed(WAVE + 0.02 * randn(N, 1), lost)[0]
+    assert one.explained == 0.0
+    assert one.residual == one.variation == pytest.approx(0.5**0.5, rel=0.02)
+    # the recording's own samples are left to estimate its noise by
+    assert one.noise_floor == pytest.approx(0.02, rel=0.1)
+
+
+def test_an_output_that_never_moves_is_not_explained():
+    one = followed(torch.full((N, 1), 3.0).double(), 0.1 * randn(N, 1))[0]
+    assert (one.variation, one.explained) == (0.0, 0.0)
+
+
+def test_of_a_length_the_vector_varies():
+    turning = torch.cat([TIME.sin().unsqueeze(-1), TIME.cos().unsqueeze(-1), 0.0 * WAVE], -1) * 50.0
+    one = followed(turning, 0.5 * randn(N, 1), channels=("norm",), unit="µT")[0]
+    assert one.output == "norm"
+    assert one.variation == pytest.approx(50.0 / 3.0**0.5, rel=0.02)
+    assert one.explained > 0.99
+
+
+def test_a_simulation_without_a_recording_of_its_outputs_is_told_nothing_of():
+    assert follows_of(SimpleNamespace(channels=("gap",), unit="", ports={}), randn(N, 1), {}, None) == ()
+    assert followed(randn(N, 3), randn(N, 2), channels=("a", "b")) == ()
+
+
+def test_an_output_of_unknown_share_is_missed():
+    known = make_follows(explained=0.95)
+    assert misses((known, make_follows(explained=torch.nan)), 0.5)[0] is not known
+    assert misses((known,), 0.95) == ()

@@ -1,0 +1,151 @@
+"""What pushes a simulation that nobody recorded: its size, its course with a band, and what it goes along with."""
+
+import functools
+import math
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis.findings.pushes import forcing_of, pushes_of
+from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.simulation.dynamics.disturbances import Disturbed
+from mkc_torch.simulation.dynamics.first_fit import strong_observer
+from mkc_torch.simulation.dynamics.noise import NoiseOfTheWorld
+from mkc_torch.simulation.dynamics.observer import Disturbance
+from tests.diagnosis.pushed import NOISE, Pendulum, swung, swung_in_the_world
+
+TRUTH = {"white": Disturbance("rate", True, 0.0, 0.4), "slow": Disturbance("rate", True, 1.0, 0.3)}
+TRUTH["torque"] = Disturbance("rate", True, 0.6, 0.6)  # of the torque's duration, delayed
+WANDER = Disturbance("angle", False, 2.0, 0.01)
+
+
+def noise_of(*pushes, errors=None, gains=None):
+    sensor = torch.tensor([NOISE], dtype=torch.float64)
+    many = len(pushes)
+    known = Disturbed(pushes, errors or (0.1,) * many, gains or (50.0,) * many, sensor, 0.0, (False,))
+    return NoiseOfTheWorld(known, None)
+
+
+@functools.cache
+def at_the_truth(push, seed):
+    """A pendulum with its true parameters, along the recording."""
+    prepared = Pendulum().prepare(swung(push, seed)[0])
+    theta = torch.tensor([9.0, 0.15, 0.3, 0.0], dtype=torch.float64)
+    model = JointModel(prepared.observed(strong_observer(prepared, theta, 10.0)))
+    one, residual = theta.new_ones(1), model.residual(theta).detach()
+    return FittedModel(model, theta, one, one, one, residual, torch.ones_like(residual), 0.0, True)
+
+
+@functools.cache
+def forcing(push, seed):
+    (found,) = forcing_of(at_the_truth(push, seed), noise_of(TRUTH[push]))
+    return found, swung(push, seed)[1]
+
+
+def correlation(one, other):
+    return float(torch.corrcoef(torch.stack([one, other]))[0, 1])
+
+
+def test_a_push_of_a_rate_has_its_unit_and_one_of_an_output_that_of_the_output():
+    prepared = Pendulum().prepare(swung("white", 1)[0])
+    noise = noise_of(TRUTH["slow"], WANDER, errors=(0.2, 0.05), gains=(311.0, 12.0))
+    rate, angle = pushes_of(prepared, noise)
+    assert (rate.place, rate.at_rate, rate.lasting, rate.size, rate.nats) == ("rate", True, 1.0, 0.3, 311.0)
+    assert rate.unit == prepared.ports["rate of rate"].unit == "rad/s/s"
+    assert (angle.place, angle.at_rate, angle.unit, angle.nats) == ("angle", False, "rad", 12.0)
+    # errors are of the logarithm
+    assert (rate.standard_error, angle.standard_error) == (pytest.approx(0.06), pytest.approx(0.0005))
+
+
+def test_a_size_that_the_likelihood_does_not_bend_about_is_as_uncertain_as_it_is_large():
+    prepared = Pendulum().prepare(swung("white", 1)[0])
+    (push,) = pushes_of(prepared, noise_of(TRUTH["slow"], errors=(math.inf,)))
+    assert push.standard_error == push.size
+
+
+def test_without_pushes_nothing_is_told():
+    fit = at_the_truth("white", 1)
+    assert pushes_of(fit.model.prepared, noise_of()) == ()
+    assert forcing_of(fit, noise_of()) == ()
+
+
+@pytest.mark.parametrize("push", ["white", "slow", "torque"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_band_covers_the_course_that_was_drawn(push, seed):
+    found, true = forcing(push, seed)
+    assert found.time.shape == found.value.shape == found.band.shape == true.shape
+    covered = float(((found.value - true).abs() <= found.band).double().mean())
+    assert 0.9 <= covered <= 0.99
+
+
+@pytest.mark.parametrize(("push", "least", "share"), [("slow", 0.9, 0.4), ("white", 0.35, 1.0)])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_course_follows_what_lasts_and_little_of_what_does_not(push, least, share, seed):
+    """The band is told in the size of what it is of: nothing is known where it is 1.96 of it."""
+    found, true = forcing(push, seed)
+    assert correlation(found.value, true) > least
+    assert float(found.band.median()) / (1.96 * TRUTH[push].size) < share
+
+
+@pytest.mark.parametrize("push", ["white", "slow", "torque"])
+def test_whether_it_is_white_is_said(push):
+    first = forcing(push, 1)[0].sentences[0]
+    if push == "white":
+        assert first == "What pushes rate of rate is white: it is new at each sample."
+    else:
+        lasting = f"{TRUTH[push].lasting:.2g} s"
+        assert first == f"What pushes rate of rate is not white: it keeps its value for about {lasting}."
+
+
+@pytest.mark.parametrize("push", ["white", "slow"])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_push_by_itself_is_said_to_be_independent_of_the_input(push, seed):
+    assert forcing(push, seed)[0].sentences[1:] == ("It is independent of torque at every lag.",)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_push_that_goes_along_with_an_input_is_said_to_with_its_lag(seed):
+    (told,) = forcing("torque", seed)[0].sentences[1:]
+    assert told.startswith("It goes along with torque, 0.3 s after it (correlation 0.9")
+
+
+def test_it_is_told_along_each_state_and_input_with_units():
+    found, _ = forcing("torque", 1)
+    assert [(one.driver, one.unit, one.value_unit) for one in found.curves] == [
+        ("angle", "rad", "rad/s/s"),
+        ("rate", "rad/s", "rad/s/s"),
+        ("torque", "", "rad/s/s"),
+    ]
+    for one in found.curves:
+        assert one.channels == ("rate of rate",)
+        assert bool((one.x.diff() >= 0).all())
+        assert one.value.shape == one.band.shape == (len(one.x), 1)
+        assert bool((one.band > 0).all())
+
+
+@pytest.mark.parametrize("push", ["white", "slow"])
+def test_a_push_by_itself_is_nought_along_what_it_does_not_depend_on_within_the_band(push):
+    """Of 240 means with a band of 95 %; a course is smooth, so samples beside each other say little anew."""
+    known = [one for seed in (1, 2, 3, 4) for one in forcing(push, seed)[0].curves]
+    inside = torch.cat([one.value.abs() <= one.band for one in known]).double().mean()
+    assert 0.9 <= float(inside) <= 0.99
+
+
+@pytest.mark.parametrize("push", ["white", "slow"])
+def test_the_noise_of_a_fit_is_the_push_that_was_drawn(push):
+    world = swung_in_the_world(push)
+    first = pushes_of(world.fit.model.prepared, world.noise)[0]
+    true = TRUTH[push]
+    assert (first.place, first.at_rate, first.unit) == ("rate", True, "rad/s/s")
+    assert (first.lasting > 0.0) == (true.lasting > 0.0)
+    assert true.size / 2.0 < first.size < 2.0 * true.size
+    assert first.nats > 100.0
+    found = forcing_of(world.fit, world.noise)[0]
+    assert correlation(found.value, swung(push)[1]) > (0.9 if push == "slow" else 0.35)
+
+
+def test_nothing_pushes_where_nothing_does():
+    world = swung_in_the_world()
+    assert not world.pushed
+    assert pushes_of(world.fit.model.prepared, world.noise) == ()

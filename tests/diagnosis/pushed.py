@@ -1,0 +1,101 @@
+"""A driven pendulum that something unrecorded pushes, made by steps of its own, and the fits to it."""
+
+import functools
+import math
+
+import numpy as np
+import torch
+
+from mkc_torch import Recording
+from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.model.in_the_world import at_liberty, between_samples, simulation_in_the_world
+from mkc_torch.diagnosis.settings import NoiseSettings
+from mkc_torch.simulation import Dynamics, Parameter
+
+STEP, FINE, NOISE = 0.05, 4, 0.004
+
+
+class Pendulum(Dynamics):
+    """``rate' = torque - stiffness sin(angle) - damping rate``, driven by a torque that is held between samples."""
+
+    states = ("angle", "rate")
+    inputs = ("torque",)
+    outputs = ("angle",)
+    units = {"angle": "rad", "rate": "rad/s"}  # noqa: RUF012
+    parameters = {"stiffness": Parameter(7.0, lower=0.0), "damping": Parameter(0.3, lower=0.0)}  # noqa: RUF012
+    between = "held"
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"angle": x.rate, "rate": u.torque - p.stiffness * torch.sin(x.angle) - p.damping * x.rate}
+
+
+class UpsideDown(Pendulum):
+    """The angle taken from the wrong end: gravity drives it away."""
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"angle": x.rate, "rate": u.torque + p.stiffness * torch.sin(x.angle) - p.damping * x.rate}
+
+
+def walk(random, n, samples):
+    """A random course of variance one that forgets itself in so many steps."""
+    kept = math.exp(-1.0 / samples) if samples > 0 else 0.0
+    course = np.zeros(n)
+    for k in range(n):
+        course[k] = kept * course[max(k - 1, 0)] + math.sqrt(1.0 - kept**2) * random.standard_normal()
+    return course
+
+
+@functools.cache
+def swung(push="none", seed=0, N=500, drag=0.0, effect=1.0, late=0):
+    """A recording; ``push`` is "none", "white", "slow" or "torque", one that goes along with the torque.
+
+    Args:
+        push: white ones are new at each sample, of 0.4 rad/s²; slow ones last for 1 s, of 0.3 rad/s².
+        seed, N: of the draws, and their number.
+        drag: of the hidden quadratic drag, in 1/rad.
+        effect: of the torque, -1 for one of the other sign.
+        late: samples by which it acts later than it is recorded.
+    """
+    random = np.random.default_rng(seed)
+    torque = 1.5 * walk(random, N, 12)
+    acting = effect * np.concatenate([np.zeros(late), torque])[:N]
+    if push == "white":
+        pushed = 0.4 * random.standard_normal(N)
+    elif push == "slow":
+        pushed = 0.3 * walk(random, N, 1.0 / STEP)
+    else:
+        pushed = np.zeros(N) if push == "none" else 0.4 * np.concatenate([np.zeros(6), torque[:-6]])
+    x, h, angle = np.array([0.3, 0.0]), STEP / FINE, np.zeros(N)
+
+    def rate(x, k):
+        own = -9.0 * math.sin(x[0]) - 0.15 * x[1] - drag * x[1] * abs(x[1])
+        return np.array([x[1], acting[k] + pushed[k] + own])
+
+    for k in range(N):
+        angle[k] = x[0]
+        for _ in range(FINE):
+            a = rate(x, k)
+            b = rate(x + h / 2 * a, k)
+            c = rate(x + h / 2 * b, k)
+            x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c, k))
+    columns = {"time": STEP * np.arange(N), "torque": torque, "angle": angle + NOISE * random.standard_normal(N)}
+    recording = Recording({name: torch.from_numpy(one) for name, one in columns.items()}, name="swing")
+    return recording, torch.from_numpy(pushed)
+
+
+def in_the_world(recording, system=Pendulum):
+    """A simulation alone, fitted under the likeliest noise of the world."""
+    prepared = system().prepare(recording).holding({"torque": "held"})
+    world = simulation_in_the_world(prepared, {}, NoiseSettings())
+    return between_samples(world, {}, {"torque": "held"}, NoiseSettings())
+
+
+@functools.cache
+def swung_in_the_world(push="none", seed=0, N=500, drag=0.0):
+    """The same of a recording of :func:`swung`."""
+    return in_the_world(swung(push, seed, N, drag)[0])
+
+
+def candidates(world, effects):
+    """Terms for a search beside a world's fit."""
+    return candidate_terms(at_liberty(world.fit.model.prepared), (), effects)
