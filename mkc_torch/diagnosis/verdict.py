@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from mkc_torch.diagnosis.findings.follows import follows_of, misses
 from mkc_torch.diagnosis.findings.pushes import forcing_of, pushes_of
 from mkc_torch.diagnosis.findings.reasons import at_ends, reasons_of
+from mkc_torch.diagnosis.follows import follows_of, misses
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.in_the_world import InTheWorld, freed, noise_around
 from mkc_torch.diagnosis.result import Finding

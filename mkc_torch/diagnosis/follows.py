@@ -29,13 +29,12 @@ def size_of(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
 
     Huber, "Robust Statistics" (1981), 6.4.
     """
-    size = robust_scale(values)
+    size, whole = robust_scale(values), values.square().mean(0).sqrt()
     # of a series that rests most of the time the scale is 0
-    size = torch.where(size > 0, size, values.square().mean(0).sqrt())
+    rests = size == 0
     for _ in range(_ROUNDS):
-        inner = torch.minimum(values.square(), (_CORNER * size).square()).mean(0) / _EXPECTED
-        size = inner.sqrt()
-    return size
+        size = (torch.minimum(values.square(), (_CORNER * size).square()).mean(0) / _EXPECTED).sqrt()
+    return torch.where(rests, whole, size)
 
 
 def follows_of(
