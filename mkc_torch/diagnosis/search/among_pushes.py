@@ -85,6 +85,7 @@ def located_among_pushes(
         look,
         look.linearised,
         compared=fits,
+        longer=found.longer(level),
     )
 
 
