@@ -1,15 +1,24 @@
-"""Real recordings and published tables, which lie beside the project and are not part of it."""
+"""Real recordings, published tables and kept cases, which lie beside the project and are not part of it."""
 
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[2] / "shared" / "data"
+CASES = ROOT.parent / "cases"
 
 
 def shared_data(path: str) -> Path:
     """The file or folder ``path`` of the shared data; where it is absent the test is skipped, naming it."""
-    found = ROOT / path
+    return _there(ROOT / path)
+
+
+def shared_case(path: str) -> Path:
+    """The same of the cases, each a recording with a simulation of it, whose right answer is known."""
+    return _there(CASES / path)
+
+
+def _there(found: Path) -> Path:
     if not found.exists():
         pytest.skip(f"no data file {found}")
     return found

@@ -1,0 +1,137 @@
+"""Why a simulation does not follow: a sign turned round, an input that is late or idle, an end of a range."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis.findings import reasons
+from mkc_torch.diagnosis.findings.follows import follows_of
+from mkc_torch.diagnosis.findings.reasons import at_ends, reasons_of
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from tests.diagnosis.factory import make_follows
+from tests.diagnosis.line import Line
+from tests.diagnosis.pushed import NOISE, Pendulum, UpsideDown, swung
+
+N = 150
+
+
+@pytest.fixture(autouse=True)
+def _one_lag(monkeypatch):
+    """Others take their time."""
+    monkeypatch.setattr(reasons, "_LAGS", (5,))
+
+
+def at(recording, stiffness=9.0, damping=0.15, system=Pendulum):
+    """A pendulum with these parameters, fitted to nothing."""
+    prepared = system().prepare(recording)
+    theta = prepared.start().clone()
+    theta[:2] = torch.tensor([stiffness, damping], dtype=theta.dtype)
+    model = JointModel(prepared)
+    residual = model.residual(theta).detach()
+    one = theta.new_ones(1)
+    return FittedModel(model, theta, one, one, 3.0 * one, residual, torch.ones_like(residual), 0.0, True)
+
+
+def told_of(fit):
+    """Reasons, and the residual that the first of them says is reached."""
+    known = follows_of(fit.model.prepared, fit.residual, {}, None)
+    return reasons_of([fit], known)
+
+
+def reached(sentence):
+    return float(sentence.split(" it follows angle to ")[1].removesuffix(" rad."))
+
+
+def test_an_input_of_the_other_sign_is_told():
+    told = told_of(at(swung(effect=-1.0, N=N)[0]))
+    assert told[0].startswith("With the sign of `torque` turned round it follows angle to 0.00")
+    assert reached(told[0]) == pytest.approx(NOISE, rel=0.2)
+    # with its sign turned round it matters
+    assert not any("does not matter" in one for one in told)
+
+
+def test_an_input_that_acts_late_is_told_with_its_delay():
+    told = told_of(at(swung(late=5, N=N)[0]))
+    assert told[0].startswith("With `torque` late by 0.25 s it follows angle to 0.00")
+    assert reached(told[0]) == pytest.approx(NOISE, rel=0.2)
+
+
+def test_a_parameter_of_the_other_sign_is_told_though_its_range_forbids_it():
+    told = told_of(at(swung(N=N)[0], system=UpsideDown))
+    assert told[0].startswith("With `stiffness` = -")
+    assert ", which its range forbids, it follows angle to 0.00" in told[0]
+    value = float(told[0].split("`stiffness` = ")[1].split(",")[0])
+    assert value == pytest.approx(-9.0, abs=0.1)
+
+
+def test_an_input_that_does_nothing_does_not_matter():
+    recording, _ = swung(effect=0.0, N=N)
+    told = told_of(fitted(JointModel(Pendulum().prepare(recording)), torch.tensor([9.0, 0.15, 0.3, 0.0]).double()))
+    assert "`torque` does not matter: held at its mean the simulation follows angle as well." in told
+
+
+def test_an_input_that_acts_matters():
+    """With a fifth of the stiffness missing."""
+    told = told_of(at(swung(N=N)[0], stiffness=7.0))
+    assert not any("does not matter" in one for one in told)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "ends"),
+    [
+        ((0.0, 0.3), ("stiffness",)),
+        ((9.0, 0.0), ("damping",)),
+        ((0.0, 0.0), ("stiffness", "damping")),
+        ((9.0, 1e-4), ()),
+    ],
+)
+def test_parameters_at_an_end_of_their_range_are_named(parameters, ends):
+    assert at_ends(at(swung(N=N)[0], *parameters)) == ends
+
+
+def test_a_parameter_that_began_at_the_end_of_its_range_is_not():
+    fit = at(swung(N=N)[0], damping=0.0)
+    known = fit.model.prepared.known
+    known["damping"] = dataclasses.replace(known["damping"], value=0.0)
+    assert at_ends(fit) == ()
+
+
+def test_a_parameter_at_the_greatest_value_of_its_range_is_named():
+    fit = at(swung(N=N)[0], stiffness=9.0)
+    low, high = fit.model.prepared.bounds
+    fit.model.prepared.bounds = low, torch.where(torch.arange(len(high)) == 0, 9.0, high)
+    assert at_ends(fit) == ("stiffness",)
+
+
+def test_what_is_no_differential_equation_has_no_range_to_end_at_and_is_told_to_be_looked_over():
+    line = Line(100)
+    fit = fitted(JointModel(line), line.start())
+    assert at_ends(fit) == ()
+    (told,) = reasons_of([fit], (make_follows(),))
+    assert "signs, units and the order of columns" in told
+
+
+@pytest.fixture
+def _no_trials(monkeypatch):
+    monkeypatch.setattr(reasons, "_of_trials", lambda *_: [])
+
+
+@pytest.mark.usefixtures("_no_trials")
+def test_an_end_of_a_range_is_told_with_its_value():
+    (told,) = told_of(at(swung(N=N)[0], damping=0.0))
+    assert told.startswith("The fit drives `damping` to the end of its range, 0:")
+
+
+@pytest.mark.usefixtures("_no_trials")
+@pytest.mark.parametrize(("damping", "words"), [(1e-4, "nearly 0"), (30.0, "at 1e+02 times the value it began with")])
+def test_a_parameter_that_vanishes_or_runs_away_is_told(damping, words):
+    (told,) = told_of(at(swung(N=N)[0], damping=damping))
+    assert told.startswith(f"The free run follows best with `damping` {words}")
+
+
+@pytest.mark.usefixtures("_no_trials")
+def test_where_nothing_mends_it_that_is_said_with_what_to_compare():
+    (told,) = told_of(at(swung(N=N)[0]))
+    assert told.startswith("No other start, sign or delay of an input mends it: compare the recording's columns")

@@ -1,0 +1,184 @@
+"""Recordings whose right answer is known, real ones and simulated: what a diagnosis says of each.
+
+Those that take long are marked slow and left out unless they are asked for, ``pytest -m slow tests/diagnosis``.
+"""
+
+import functools
+import math
+
+import pytest
+
+from mkc_torch import Recording, diagnose
+from mkc_torch.simulation import load_simulation
+from tests.shared_data import shared_case
+
+AS_WRITTEN, CONFIRMED = "left out", ("left out", "real but small")
+INPUT, DRAG = "torque", ("linear_drag", "quadratic_drag", "power_law")
+
+slow = pytest.mark.slow
+
+
+@functools.cache
+def diagnosed(recording, simulation, between=None):
+    """Of files among the cases, once."""
+    path, (file, name) = shared_case(recording), simulation.split(":")
+    known = None if between is None else {INPUT: between}
+    return diagnose(load_simulation(f"{shared_case(file)}:{name}"), Recording.read(path), between=known)
+
+
+def pendulum(name, between=None):
+    return diagnosed(f"simulated/{name}/run.csv", "simulated/naive.py:Pendulum", between)
+
+
+def first(diagnosis, effect, channel):
+    """The first finding, which has to be this."""
+    found = diagnosis.findings[0]
+    assert (found.effect, found.channels) == (effect, (channel,))
+    return found
+
+
+def value(finding, name):
+    (one,) = [parameter for parameter in finding.parameters if parameter.name == name]
+    return one.value
+
+
+def confirmed(diagnosis):
+    return [one.effect for one in diagnosis.findings if one.grade in CONFIRMED]
+
+
+@pytest.mark.parametrize(
+    ("name", "between"),
+    [
+        ("held_input", None),
+        ("linear_input", None),
+        pytest.param("held_input", "linear", marks=slow),
+        pytest.param("linear_input", "held", marks=slow),
+    ],
+)
+def test_whatever_an_input_does_between_samples_is_no_physics(name, between):
+    diagnosis = pendulum(name, between)
+    assert diagnosis.findings == ()
+    if between is None:
+        assert diagnosis.verdict == "adequate"
+        assert diagnosis.world.between == {INPUT: name.removesuffix("_input")}
+        (angle,) = diagnosis.world.follows
+        assert angle.residual == pytest.approx(0.005, rel=0.1)
+        assert diagnosis.world.pushes == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "white"),
+    [
+        ("pushed_white", 0.5, True),
+        pytest.param("pushed_slowly", 0.2, False, marks=slow),
+        pytest.param("gusts", 0.5, False, marks=slow),
+    ],
+)
+def test_a_push_that_nobody_recorded_is_told_as_one_and_no_physics_is_left_out(name, size, white):
+    diagnosis = pendulum(name)
+    assert diagnosis.verdict == "unexplained"
+    assert confirmed(diagnosis) == []
+    push = diagnosis.world.pushes[0]
+    assert (push.place, push.at_rate) == ("rate", True)
+    assert size / 2.0 < push.size < 2.0 * size
+    assert 0.0 < push.standard_error < push.size
+    course = diagnosis.world.forcing[0]
+    assert course.value.shape == course.band.shape == course.time.shape == (750,)
+    assert ("is white" in course.sentences[0]) is white
+    assert course.sentences[1] == f"It is independent of {INPUT} at every lag."
+
+
+@slow
+@pytest.mark.parametrize("name", ["held_input", "linear_input", "pushed_slowly", "pushed_white", "gusts"])
+def test_gravity_of_the_wrong_sign_does_not_follow_and_is_named(name):
+    diagnosis = diagnosed(f"simulated/{name}/run.csv", "simulated/naive.py:UpsideDown")
+    assert diagnosis.verdict == "unfit"
+    assert diagnosis.findings == ()
+    assert "`stiffness`" in diagnosis.world.reasons[0]
+
+
+@slow
+def test_an_output_that_has_nothing_to_do_with_the_input_is_not_followed():
+    diagnosis = pendulum("unrelated")
+    assert diagnosis.verdict == "unfit"
+    assert diagnosis.findings == ()
+    assert diagnosis.world.reasons
+    (angle,) = diagnosis.world.follows
+    assert angle.explained < 0.5
+    assert angle.residual > angle.last_value_predicts
+
+
+def test_drag_of_a_car_that_rolls_out_is_what_would_explain_it():
+    diagnosis = diagnosed("coastdown/runs.csv", "coastdown/naive.py:Coast")
+    assert diagnosis.verdict in ("explained", "unexplained")
+    found = first(diagnosis, diagnosis.findings[0].effect, "rate of speed")
+    named = {found.effect, *(one.effect for one in found.alternatives if not one.separable)}
+    assert "quadratic_drag" in named
+    assert found.effect in DRAG
+    if found.effect == "quadratic_drag":
+        assert 0.0003 < value(found, "drag") < 0.0007
+    elif found.effect == "linear_drag":
+        # as much at the mean speed, 6 m/s, as the quadratic one
+        assert 0.0003 < value(found, "drag") / 8.0 < 0.0007
+
+
+@slow
+def test_natural_convection_is_a_power_of_the_difference_and_no_radiation():
+    diagnosis = diagnosed("heater/runs.csv", "heater/naive.py:Heater")
+    assert diagnosis.verdict == "explained"
+    found = first(diagnosis, "power_law", "rate of temp")
+    assert 1.4 < value(found, "exponent") < 1.6
+    assert "thermal_loss" not in [one.effect for one in diagnosis.findings]
+    assert "thermal_loss" not in [one.effect for one in found.alternatives if not one.separable]
+    after = found.held_out.outputs["temp"]
+    assert (after.unit, after.after) == ("°C", pytest.approx(0.2, abs=0.1))
+    assert after.before > 2.0
+
+
+@slow
+def test_the_ground_effect_of_a_hovering_vehicle_is_a_curve_of_its_height():
+    diagnosis = diagnosed("altitude/runs.csv", "altitude/naive.py:Altitude")
+    found = first(diagnosis, "unknown", "rate of climb")
+    assert found.curve is not None
+    assert found.curve.driver == "height"
+    height = found.held_out.outputs["height"]
+    assert (height.unit, height.after < 0.02 < 0.1 < height.before) == ("m", True)
+    # strong near the ground, and little above it
+    low, high = found.curve.x < 0.3, found.curve.x > 0.6
+    size = found.curve.value[:, 0] - found.curve.value[high, 0].mean()
+    assert float(size[low].max()) > 3.0 * float(size[high].abs().max())
+
+
+@slow
+def test_dry_friction_of_a_geared_motor_is_told_in_each_outputs_unit():
+    diagnosis = diagnosed("gear_motor/runs.csv", "gear_motor/naive.py:GearMotor")
+    found = first(diagnosis, "stribeck_friction", "rate of speed")
+    assert found.grade == AS_WRITTEN
+    sizes = found.held_out.outputs
+    assert {name: one.unit for name, one in sizes.items()} == {"angle": "rad", "speed": "rad/s"}
+    for one in sizes.values():
+        assert 0.0 < one.after < one.before < math.inf
+    assert sizes["angle"].before < 1.0
+    assert sizes["speed"].before < 20.0
+    assert [(one.output, one.unit) for one in diagnosis.world.follows] == [("angle", "rad"), ("speed", "rad/s")]
+    assert all(math.isfinite(one.value) for one in found.parameters)
+
+
+@slow
+def test_a_free_double_integrator_does_not_follow_a_ball_on_a_beam():
+    diagnosis = diagnosed("ball_beam/run.csv", "ball_beam/naive.py:Ball")
+    assert diagnosis.verdict == "unfit"
+    assert confirmed(diagnosis) == []
+    assert diagnosis.world.reasons
+    (position,) = diagnosis.world.follows
+    assert position.unit == "m"
+    assert 0.055 < position.residual < position.variation
+
+
+@slow
+def test_the_fit_of_two_tanks_is_found_and_the_rest_is_not_called_noise():
+    diagnosis = diagnosed("tanks/fit.csv", "tanks/naive.py:Tanks")
+    (level,) = diagnosis.world.follows
+    assert (level.unit, level.residual < 0.65) == ("V", True)
+    assert level.explained > 0.9
+    assert diagnosis.verdict in ("explained", "unexplained")
