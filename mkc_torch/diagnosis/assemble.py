@@ -34,7 +34,7 @@ from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
 __all__ = ["Whole", "assembled", "with_rest"]
 
-_HINTED = 0.3
+_HINTED = 0.15
 """p-value up to which the strongest candidate is told, though it does not count."""
 
 
