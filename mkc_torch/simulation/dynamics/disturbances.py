@@ -106,7 +106,12 @@ def disturbed(
             break
         gains.append(more - value)
         best, value = _scaled(other, scale), more
-    return _told(best, gains, flow, names, channels, floor, value)
+    found = _told(best, gains, flow, names, channels, floor, value)
+    if len(gains) < 2:
+        return found
+    # one may have stood for another that was found later
+    fewer = resized(flow, names, channels, found, least)
+    return fewer if len(fewer.disturbances) < len(gains) else found
 
 
 def resized(flow: Flow, names: Sequence[str], channels: Sequence[str], known: Disturbed, least: float) -> Disturbed:

@@ -81,17 +81,19 @@ class TestSought:
         assert np.mean(sizes) == pytest.approx(NOISE, rel=0.05)
 
     def test_the_standard_error_is_that_of_repeated_draws(self):
-        found = [sought(world(WHITE, seed=seed), most=1) for seed in range(12)]
+        found = [sought(world(WHITE, count=200, seed=seed), most=1) for seed in range(12)]
         sizes = np.log([one.disturbances[0].size for one in found])
         usual = np.mean([one.errors[0] for one in found])
         assert 0.5 < sizes.std(ddof=1) / usual < 1.6
 
-    def test_pushes_in_several_runs(self):
-        found = sought(world(SLOW, count=100, runs=4))
-        assert {(one.place, one.at_rate) for one in found.disturbances} == {("speed", True)}
-        sizes = zip(found.disturbances, found.errors, strict=True)
-        ((size, error),) = [(one.size, error) for one, error in sizes if one.lasting > 0.0]
-        assert abs(np.log(size / PUSH)) < 3.0 * error
+    @pytest.mark.parametrize("seed", [0, 3, 5])
+    def test_what_stood_for_another_that_was_found_later_is_dropped(self, seed):
+        """A white push is taken up first where a slow one is not yet tried at a time constant near its own."""
+        found = sought(world(SLOW, count=100, runs=4, seed=seed))
+        (one,), (error,) = found.disturbances, found.errors
+        assert (one.place, one.at_rate, one.lasting > 0.0) == ("speed", True, True)
+        assert abs(np.log(one.size / PUSH)) < 3.0 * error
+        assert found.gains[0] > 500.0
 
     def test_a_flow_on_which_outliers_do_not_count(self):
         along = world(WHITE)

@@ -82,7 +82,21 @@ def test_it_is_of_states_as_they_are_given_too():
     found = flow_along(prepared, theta, states)
     np.testing.assert_allclose(found.carried, expected.carried, atol=1e-8)
     np.testing.assert_allclose(found.new, (prepared.measured - states[prepared.rows, :1]).numpy())
-    np.testing.assert_allclose(found.spread, states[prepared.rows].std(0).numpy())
+
+
+def test_states_may_be_off_by_as_much_as_the_outputs_are():
+    prepared, theta, _ = world(300)
+    resting = flow_of(prepared, theta, {}, None)
+    np.testing.assert_allclose(resting.spread, prepared.guess[prepared.rows].std(0).numpy())
+    near = flow_along(prepared, theta, prepared.guess)
+    np.testing.assert_allclose(near.spread, 0.1 * resting.spread)
+    half = flow_along(prepared, theta, 0.5 * prepared.guess)
+    np.testing.assert_allclose(half.spread, 0.5 * resting.spread, rtol=0.02)
+    prepared.measured[::2] += 100.0
+    prepared.counts = torch.ones_like(prepared.counts)
+    prepared.counts[::2] = False
+    others = flow_along(prepared, theta, 0.5 * prepared.guess)
+    np.testing.assert_allclose(others.spread, half.spread, rtol=0.1)
 
 
 def test_there_is_none_where_there_is_no_trajectory():

@@ -213,8 +213,7 @@ class TestParts:
         models = together(MODELS["white push"], model(white=4.0), model(white=2.0, sensor=(0.15,)))
         along, random = flow(600), np.random.default_rng(2)
         along = answering(along, pushed(along, course(random, along, 0.0, 2.0)), 0.1 * random.standard_normal((600, 1)))
-        # a tenth of the spread is how far states are taken to be off
-        along = replace(along, spread=10.0 * pushed(along, course(random, along, 0.0, 2.0)).std(0))
+        along = replace(along, spread=pushed(along, course(random, along, 0.0, 2.0)).std(0))
         parts = along.in_parts(150, 100)
         assert parts.inside.tolist() == [False, True, True, True]
         values, _ = robust_likelihood(filtered(parts, models), parts.mine)

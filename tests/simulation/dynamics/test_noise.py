@@ -80,6 +80,17 @@ class TestLikeliest:
         left = prepared.observed(found.observer).residual(theta, {})
         assert float(left.std()) < 0.5 * float(prepared.residual(theta, {}).std())
 
+    @pytest.mark.parametrize("seed", range(4))
+    def test_a_push_that_takes_the_states_far_from_where_they_are_simulated(self, seed):
+        prepared, theta, _ = world(Disturbance("speed", True, 0.6, 20.0), seed=seed)
+        assert float(prepared.residual(theta, {}).std()) > 50.0 * NOISE
+        found = likeliest(prepared, theta).disturbed
+        (one,), (error,) = found.disturbances, found.errors
+        assert (one.place, one.at_rate) == ("speed", True)
+        assert 0.2 < one.lasting < 1.8
+        assert error < 0.2
+        assert abs(np.log(one.size / 20.0)) < 3.0 * error
+
     def test_nothing_and_no_observer_for_white_noise(self):
         prepared, theta, _ = world()
         found = likeliest(prepared, theta)
