@@ -1,42 +1,15 @@
 """The verdict follows from what is known of the whole recording, not from whether something was named."""
 
-import importlib
-from types import SimpleNamespace
-
 import numpy as np
-import pytest
 
 from mkc_torch import Recording, diagnose
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling
 
-module = importlib.import_module("mkc_torch.diagnosis.assemble")
-ASKED = SimpleNamespace(level=0.05)
-FINAL = SimpleNamespace(model=SimpleNamespace(terms=(SimpleNamespace(effect=SimpleNamespace(is_curve=False)),)))
-CURVE = SimpleNamespace(model=SimpleNamespace(terms=(SimpleNamespace(effect=SimpleNamespace(is_curve=True)),)))
-
 
 def in_units(recording, **units):
     return Recording(recording.columns, name=recording.name, units={**recording.units, **units})
-
-
-@pytest.mark.parametrize(
-    ("p_value", "found", "final", "left", "cut", "verdict"),
-    [
-        (0.2, 0, FINAL, (), False, "adequate"),
-        (None, 0, FINAL, (), False, "adequate"),
-        (0.05, 0, FINAL, (), False, "unexplained"),  # there is structure, and nothing that accounts for it
-        (0.2, 0, FINAL, ("temperature",), False, "unexplained"),
-        (0.01, 1, FINAL, (), False, "explained"),
-        (0.01, 1, CURVE, (), False, "unexplained"),
-        (0.01, 1, FINAL, ("temperature",), False, "unexplained"),
-        (0.01, 3, FINAL, (), True, "unexplained"),
-    ],
-)
-def test_a_verdict(p_value, found, final, left, cut, verdict):
-    first = None if p_value is None else SimpleNamespace(p_value=p_value)
-    assert module._verdict(first, (None,) * found, final, left, cut, ASKED) == verdict
 
 
 def test_more_than_was_asked_for_is_told_of():

@@ -12,7 +12,6 @@ from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation import Dynamics
 
 rounds = importlib.import_module("mkc_torch.diagnosis.rounds")
-ending_of = importlib.import_module("mkc_torch.diagnosis.evidence.after_the_search")
 
 
 EFFECTS = [effect for effect in CATALOGUE if effect.id in ("cubic_stiffness", "quadratic_drag")]
@@ -43,25 +42,22 @@ def recording():
 
 @pytest.fixture
 def diagnosed(recording, monkeypatch):
-    """A diagnosis whose search beside the first finding is the one given, and the trajectory that its
-    final fit begins with."""
+    """A diagnosis whose search beside the first finding is the one given."""
 
     def run(beside):
-        searches, begun, first = [], [], []
-        locate, estimate = rounds.locate, ending_of.estimate
+        searches, first = [], []
+        located = rounds._located
 
-        def search(base, terms, **options):
+        def search(base, terms, *others, **options):
             searches.append(base)
             if len(searches) == 1:
-                first.append(locate(base, terms, **options))
+                first.append(located(base, terms, *others, **options))
                 return first[0]
             return beside(base, first[0])
 
-        monkeypatch.setattr(rounds, "locate", search)
-        monkeypatch.setattr(
-            ending_of, "estimate", lambda fit, noise: begun.append(fit.model.near.states) or estimate(fit, noise)
-        )
-        return diagnose(Sled(), recording, effects=EFFECTS), searches, begun
+        monkeypatch.setattr(rounds, "_located", search)
+        monkeypatch.setattr(rounds, "_quiet", lambda *_: False)
+        return diagnose(Sled(), recording, effects=EFFECTS), searches
 
     return run
 
@@ -70,7 +66,7 @@ def test_a_search_that_fails_leaves_what_was_found(diagnosed):
     def fails(*_):
         raise NoFitError("No slope by damping.")
 
-    diagnosis, searches, _ = diagnosed(fails)
+    diagnosis, searches = diagnosed(fails)
     assert len(searches) == 2
     assert len(diagnosis.findings) == 1
     assert "The search beside what was found was given up. No slope by damping." in diagnosis.warnings
@@ -84,13 +80,15 @@ def test_a_bug_in_an_effect_is_no_search_that_fails(diagnosed):
         diagnosed(broken)
 
 
-def test_what_comes_after_begins_with_the_trajectory_of_what_was_found(diagnosed):
+def test_a_search_that_wanders_off_changes_nothing_of_what_was_found(diagnosed, recording):
     def wanders_off(base, first):
         base.model.residual(1.01 * base.parameters)
         return replace(first, p_value=1.0)
 
-    _, searches, (begun,) = diagnosed(wanders_off)
-    assert torch.equal(searches[1].model.near.states, begun)
+    diagnosis, searches = diagnosed(wanders_off)
+    assert len(searches) == 2
+    (finding,), (plain,) = diagnosis.findings, diagnose(Sled(), recording, effects=EFFECTS).findings
+    assert finding.parameters == plain.parameters
 
 
 def test_a_search_without_an_effect_of_a_possible_sign_finds_nothing(recording):
@@ -102,7 +100,7 @@ def test_a_search_without_an_effect_of_a_possible_sign_finds_nothing(recording):
 def test_what_drives_the_simulation_away_is_found_from_where_it_began(recording):
     """Without its spring the sled is fitted with a damping of thousands, and beside that no spring has its size."""
     diagnosis = diagnose(Sled(), recording, effects=EFFECTS)
-    assert float(diagnosis.baseline.d[0]) > 0.3
+    assert diagnosis.world.follows[0].explained < 0.5
     (finding,) = diagnosis.findings
     assert finding.effect == "cubic_stiffness"
     (stiffness,) = finding.parameters

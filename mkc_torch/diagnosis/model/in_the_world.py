@@ -167,6 +167,8 @@ def in_the_world(
     assert own is not None
     bound = None if free is None else free.bound
     works = [partial(_from_short, own, start, bound, declared, settings) for start in beside]
+    if beside and isinstance(own.prepared, PreparedDynamics):
+        works.append(partial(_from_given, own, own.prepared.given, bound, declared, settings))
     if free is not None and not works:
         works = [partial(_under_noise, free, noise, declared, settings)]
     tried = at_once(works, own.prepared)
@@ -291,6 +293,32 @@ def _from_short(
         return None
     if bound is None:
         fit = replace(fit, bound=settings.domain * fit.bound.maximum(fit.bound.mean()))
+    return _under_noise(fit, noise_around(fit, declared, settings), declared, settings)
+
+
+def _from_given(
+    model: JointModel,
+    start: Float[Tensor, " p"],
+    bound: Float[Tensor, " m"] | None,
+    declared: Mapping[str, float],
+    settings: NoiseSettings,
+) -> _Found | None:
+    """Fits under the noise that is around a user's own values: what is missing may drive any fit without it away."""
+    prepared = model.prepared
+    assert isinstance(prepared, PreparedDynamics)
+    observer = strong_observer(prepared, start, _STRONG)
+    if observer is None or bound is None:
+        return None
+    strong = prepared.observed(observer)
+    noise = likeliest_noise(
+        strong, start, {}, None, declared=declared, least=settings.pushed, most=settings.pushes, known=None
+    )
+    if noise is None or noise.observer is None:
+        return None
+    try:
+        fit = fitted(JointModel(prepared.observed(noise.observer)), start, bound, graduate=False)
+    except NoFitError:
+        return None
     return _under_noise(fit, noise_around(fit, declared, settings), declared, settings)
 
 

@@ -209,8 +209,10 @@ def usual_size(flow: Flow, place: int, lasting: float, sensor: Float[np.ndarray,
         age += flow.step[row]
         seen = flow.seen[row + 1] @ state
         power = power + seen**2 if lasting == 0.0 else np.maximum(power, seen**2)
-        most = max(most, float((np.sqrt(power) / sensor).max()))
-    return 1.0 / most if most > 0 else math.inf
+        # of an output without noise, and of a state that runs away, it is beyond all numbers
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            most = max(most, float((np.sqrt(power) / sensor).max()))
+    return 1.0 / most if 0.0 < most < math.inf else math.inf
 
 
 def _models(flow: Flow, noises: Sequence[_Noise]) -> Models:
