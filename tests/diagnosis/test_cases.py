@@ -118,8 +118,8 @@ def test_drag_of_a_car_that_rolls_out_is_what_would_explain_it():
     if found.effect == "quadratic_drag":
         assert 0.0003 < value(found, "drag") < 0.0007
     elif found.effect == "linear_drag":
-        # as much at the mean speed, 6 m/s, as the quadratic one
-        assert 0.0003 < value(found, "drag") / 8.0 < 0.0007
+        # about the mean speed, 5 m/s, its slope is that of the quadratic one, and rolling resistance takes the rest
+        assert 0.0003 < value(found, "drag") / 10.0 < 0.0007
 
 
 @slow

@@ -30,6 +30,7 @@ SHARES = (1.0, 0.4, 0.15, 0.05, 0.015, 0.0)
 """Of the pushes' sizes."""
 
 _SINGULAR = 1e-9
+"""Share of a candidate's squares that the simulation's own parameters leave, below which nothing is left of it."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ def profiled(
             norm = torch.linalg.vector_norm(whole, dim=0).clamp(min=1e-300)
             gram = (directions / norm).mT @ (directions / norm)
             inner = (directions / norm).mT @ left
-            inverse = torch.linalg.pinv(gram, hermitian=True, rtol=_SINGULAR)
+            inverse = torch.linalg.pinv(gram, hermitian=True, atol=_SINGULAR, rtol=_SINGULAR)
             solved = inverse @ inner
             if terms[number].effect.one_sided:
                 inner = torch.where((solved < 0).any(0), inner, 0.0)
@@ -125,7 +126,7 @@ def profiled(
                 against = torch.linalg.lstsq(own / size, (y[:, 0] - whole / norm @ solved[:, 0]).unsqueeze(-1)).solution
                 shift[number] = -against.squeeze(-1) / size
             best[number] = torch.maximum(best[number], value)
-            dof[number] = max(float(dof[number]), float(torch.linalg.matrix_rank(gram, rtol=_SINGULAR)))
+            dof[number] = max(float(dof[number]), float(torch.linalg.matrix_rank(gram, atol=_SINGULAR, rtol=_SINGULAR)))
     ratio = 2.0 * (best - null)
     # a gain is as rare as its numbers make it: Wilson and Hilferty's root makes them alike
     k = dof.clamp(min=1.0).unsqueeze(-1)
