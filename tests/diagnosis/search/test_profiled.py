@@ -13,7 +13,7 @@ from mkc_torch.effects import DYNAMICS
 from tests.diagnosis.pushed import at_the_truth, candidates, swung_in_the_world
 
 DRAWS = 49
-SEEDS = tuple(range(1, 7))
+SEEDS = tuple(range(1, 5))
 
 
 @functools.cache
@@ -38,25 +38,24 @@ def strongest(found, terms):
 
 @pytest.mark.parametrize("push", ["white", "slow"])
 def test_beside_pushes_from_which_nothing_is_missing_p_values_are_not_small(push):
-    """Of six recordings: two p-values below 0.05 come about by chance once in thirty times."""
+    """Of four recordings: two p-values below 0.05 come about by chance once in seventy times."""
     values = sorted(searched(push, seed).p_value for seed in SEEDS)
     assert values[1] > 0.05
-    assert 0.2 < values[3] <= 1.0
+    assert 0.2 < values[2] <= 1.0
 
 
 @functools.cache
-def hidden(push):
+def hidden():
     """A search beside the fit of a pendulum with quadratic drag that nobody told it of."""
-    fit = swung_in_the_world(push, drag=0.4).fit
+    fit = swung_in_the_world("slow", drag=0.4).fit
     terms = candidates(fit, DYNAMICS)
     tangents = tangents_of(fit.model, fit.parameters, NoiseSettings(), terms)
     parts = fit, terms, tangents, *fit.pseudo(NoiseSettings())
     return parts, profiled(*parts, DRAWS, torch.Generator().manual_seed(1))
 
 
-@pytest.mark.parametrize("push", ["white", "slow"])
-def test_drag_that_is_hidden_beside_pushes_is_beyond_all_draws_and_has_its_name(push):
-    (_, terms, *_), found = hidden(push)
+def test_drag_that_is_hidden_beside_pushes_is_beyond_all_draws_and_has_its_name():
+    (_, terms, *_), found = hidden()
     assert found.p_value == pytest.approx(1.0 / (1 + DRAWS))
     assert found.beyond > 3.0
     name, number = strongest(found, terms)
@@ -67,7 +66,7 @@ def test_drag_that_is_hidden_beside_pushes_is_beyond_all_draws_and_has_its_name(
 
 
 def test_the_observer_that_is_kept_is_for_the_pushes_that_a_candidate_leaves():
-    (fit, terms, *_), found = hidden("slow")
+    (fit, terms, *_), found = hidden()
     known = fit.model.prepared.observer.disturbances[0].size
     for number in range(len(terms)):
         share = float(found.share[number])
