@@ -34,6 +34,9 @@ from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
 __all__ = ["Whole", "assembled", "with_rest"]
 
+_HINTED = 0.15
+"""p-value up to which the strongest candidate is told, though it does not count."""
+
 
 @dataclass(frozen=True)
 class Whole:
@@ -104,7 +107,9 @@ def assembled(whole: Whole, answers: Answers) -> Diagnosis:
     )
     there = first is not None and first.p_value <= asked.level and not case.found
     structure = there or bool(diagnosis.remaining) or whole.cut or nameless(final.fit)
-    verdict = verdict_of(known, findings, structure=structure, white=_white(diagnosis), settings=settings.evidence)
+    # of a trajectory it has been asked for what pushes it
+    white = known.noise is not None or _white(diagnosis)
+    verdict = verdict_of(known, findings, structure=structure, white=white, settings=settings.evidence)
     diagnosis = replace(diagnosis, verdict=verdict)
     return replace(diagnosis, advice=advice_of(diagnosis))
 
@@ -130,6 +135,8 @@ def _white(diagnosis: Diagnosis) -> bool:
 def with_rest(diagnosis: Diagnosis, search: Search) -> Diagnosis:
     """With what the last search found that does not count, and why there was no other."""
     more = [_not_confirmed(search.unconfirmed)] if search.unconfirmed else []
+    if diagnosis.verdict == "unexplained" and not search.found and search.first is not None:
+        more += _short_of_the_level(search.first, diagnosis.level)
     if search.given_up:
         more.append(f"The search beside what was found was given up. {search.given_up}")
     if search.cut:
@@ -168,6 +175,19 @@ def _not_confirmed(located: Located) -> str:
         f"{what}: p = {located.p_value:.2g} after the whole search, but it does not predict blocks better that the fit "
         "has not seen, so it does not count as a finding."
     )
+
+
+def _short_of_the_level(first: Located, level: float) -> list[str]:
+    """What would explain what is left best, and how much more of the recording would show it."""
+    if not level < first.p_value <= _HINTED or not math.isfinite(first.longer):
+        return []
+    shape = described(first.term.effect, first.term.shape)
+    what = f"{called(first.term)} ({shape})" if shape else called(first.term)
+    return [
+        f"{what} would explain what is left best, but noise and pushes make as much of it by chance: p = "
+        f"{first.p_value:.2g}. A recording about {max(first.longer, 1.1):.2g} times as long would show it, if it is "
+        "that."
+    ]
 
 
 def _time_warnings(prepared: PreparedSimulation) -> tuple[str, ...]:

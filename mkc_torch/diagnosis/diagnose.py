@@ -21,7 +21,7 @@ from mkc_torch.diagnosis.assemble import Whole, assembled, with_rest
 from mkc_torch.diagnosis.evidence.after_the_search import answers_of, parts_ahead
 from mkc_torch.diagnosis.evidence.base import Case
 from mkc_torch.diagnosis.evidence.running_freely import running_freely
-from mkc_torch.diagnosis.findings.follows import misses
+from mkc_torch.diagnosis.follows import misses
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import FittedModel
@@ -118,7 +118,7 @@ def diagnose(
         )
     declared = checked_noise(noise, prepared.channels)
     fixed = checked_between(between, tuple(getattr(prepared, "between", ())))
-    asked = Asked(level, surrogates, max_findings, seed, settings, declared)
+    asked = Asked(level, surrogates, max_findings, seed, settings, declared, fixed)
     generator = torch.Generator().manual_seed(seed)
     if isinstance(prepared, PreparedDynamics):
         prepared = prepared.holding(fixed)

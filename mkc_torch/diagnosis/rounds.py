@@ -39,6 +39,7 @@ class Asked:
     seed: int
     settings: Settings
     declared: Mapping[str, float] = field(default_factory=dict)
+    fixed: Mapping[str, str] = field(default_factory=dict)
 
 
 def _holds(
@@ -143,6 +144,7 @@ def _located(
             surrogates=asked.surrogates,
             generator=generator,
             declared=asked.declared,
+            fixed=asked.fixed,
             settings=asked.settings,
         )
     return locate(
@@ -194,10 +196,9 @@ def _taken_up(
         return replace(over, unconfirmed=located)
     if len(search.found) == asked.max_findings:
         return replace(over, cut=True)
-    fit = located.fit
-    if same is None:
-        fit, after = simplified(fit, after, search.blocks, holds, asked.settings.naming)
-        paired = after
+    fit, simpler = simplified(located.fit, after, search.blocks, holds, asked.settings.naming)
+    paired = simpler if same is None or fit is not located.fit else paired
+    after = simpler
     found = (*search.found, replace(located, fit=fit))
     near = _near(located.fit, asked.settings)
     left = tuple(t for t in search.left if not _same(t, located.term, near, asked.settings))

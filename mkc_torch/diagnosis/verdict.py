@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from mkc_torch.diagnosis.findings.follows import follows_of, misses
 from mkc_torch.diagnosis.findings.pushes import forcing_of, pushes_of
 from mkc_torch.diagnosis.findings.reasons import at_ends, reasons_of
+from mkc_torch.diagnosis.follows import follows_of, misses
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.in_the_world import InTheWorld, freed, noise_around
 from mkc_torch.diagnosis.result import Finding
@@ -69,7 +69,7 @@ def around(base: InTheWorld, final: FittedModel, declared: Mapping[str, float], 
 
 def world_of(base: InTheWorld, final: FittedModel, known: Around, *, unfit: bool) -> World:
     """What is told of the world around."""
-    prepared = base.fit.model.prepared
+    prepared = final.model.prepared
     reasons: tuple[str, ...] = ()
     if unfit:
         fits = [base.fit] if base.free is None else [base.fit, base.free]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, scored
-from mkc_torch.diagnosis.findings.follows import units_of
+from mkc_torch.diagnosis.follows import units_of
 from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.fit import FittedModel, without_term

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks
-from mkc_torch.diagnosis.findings.follows import size_of
+from mkc_torch.diagnosis.follows import size_of
 from mkc_torch.diagnosis.result import Sizes
 from mkc_torch.simulation.protocol import PreparedSimulation
 

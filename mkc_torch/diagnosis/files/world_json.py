@@ -14,7 +14,10 @@ from mkc_torch.diagnosis.world import Forcing, Push, World
 __all__ = ["follows_of", "forcing_of", "noise_of", "remaining_of"]
 
 _MOST_POINTS = 500
+"""Of a course that are written."""
+
 _DIGITS = 5
+"""Significant ones of what is written of a course."""
 _TIME_DIGITS = 6
 """Decimals of a moment in s."""
 

@@ -20,7 +20,11 @@ if TYPE_CHECKING:
 __all__ = ["forcing_of", "pushes_of"]
 
 _BINS = 20
+"""Parts of a range that a push is averaged over."""
+
 _NORMAL_95 = 1.96
+"""Standard errors to either side that a 95 % interval reaches."""
+
 _PLAIN = 0.3
 """Correlation, of either sign, above which a push is said to go along with something, where it is beyond chance too."""
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.findings.follows import size_of
+from mkc_torch.diagnosis.follows import size_of
 from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 __all__ = ["at_ends", "reasons_of"]
 
 _NOUGHT, _AWAY, _AT_END = 1e-3, 30.0, 1e-6
+"""Times its first value at which a parameter is nearly 0, has run away, and is at an end of its range."""
+
 _MENDS = 0.5
 """Share of the residual to which a trial has to bring it to be told as the reason."""
 
@@ -33,6 +35,7 @@ _MATTERS = 0.97
 """Share of the residual without an input below which the input matters."""
 
 _LAGS = (2, 5, 20)
+"""Samples by which an input is tried late."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,10 @@ __all__ = ["nearest_power", "shape_of"]
 
 _POWERS = torch.arange(0.0, 4.001, 0.02, dtype=torch.float64)
 _POINTS = 60
+"""Points of a curve."""
+
 _NORMAL_95 = 1.96
+"""Standard errors to either side that a 95 % interval reaches."""
 
 
 def shape_of(fit: FittedModel, number: int, terms: Sequence[Term], settings: EvidenceSettings) -> Shape | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -16,7 +17,7 @@ from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import over_short_horizons, strong_observer
-from mkc_torch.simulation.dynamics.noise import NoiseOfTheWorld, likeliest_noise
+from mkc_torch.simulation.dynamics.noise import NoiseOfTheWorld, likeliest_noise, noise_of
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -27,6 +28,7 @@ __all__ = [
     "InTheWorld",
     "at_liberty",
     "beside_effects",
+    "between_beside_effects",
     "between_samples",
     "first_samples",
     "freed",
@@ -190,9 +192,37 @@ def beside_effects(
     free = freed(best)
     if free is None:
         return best
-    if pushed(best) and free.log_likelihood < best.log_likelihood - settings.pushed:
-        return best
-    return free
+    # parameters that were fitted beside a push can need it where those of the free run do not
+    left = noise_around(free, declared, settings)
+    if left is None or left.observer is None or free.log_likelihood > best.log_likelihood:
+        return free
+    return best
+
+
+def between_beside_effects(
+    fit: FittedModel, declared: Mapping[str, float], fixed: Mapping[str, str], settings: NoiseSettings
+) -> FittedModel:
+    """The same with inputs held or straight between samples, whichever is likelier now that the effects are there.
+
+    Without them another course between samples may have stood in for what they do.
+    """
+    prepared = fit.model.prepared
+    if not isinstance(prepared, PreparedDynamics):
+        return fit
+    for name, how in prepared.between.items():
+        for other in ("held", "linear"):
+            if name in fixed or other == how:
+                continue
+            moved = prepared.holding({name: other})
+            try:
+                under = fitted(JointModel(moved, fit.model.terms, fit.model.near), fit.parameters, fit.bound)
+            except NoFitError:
+                continue
+            found = beside_effects(under, noise_of(moved, declared), declared, settings)
+            if found.log_likelihood > fit.log_likelihood:
+                fit, prepared = found, found.model.prepared
+                assert isinstance(prepared, PreparedDynamics)
+    return fit
 
 
 def freed(fit: FittedModel) -> FittedModel | None:
@@ -200,11 +230,11 @@ def freed(fit: FittedModel) -> FittedModel | None:
     prepared = at_liberty(fit.model.prepared)
     if prepared is fit.model.prepared:
         return fit
-    try:
-        found = fitted(JointModel(prepared, fit.model.terms, fit.model.near), fit.parameters, fit.bound, graduate=False)
-    except NoFitError:
-        return None
-    return found
+    model, found = JointModel(prepared, fit.model.terms, fit.model.near), []
+    for graduate in (False, True):
+        with suppress(NoFitError):
+            found.append(fitted(model, fit.parameters, fit.bound, graduate=graduate))
+    return max(found, key=lambda one: one.log_likelihood) if found else None
 
 
 def _free(model: JointModel, start: Float[Tensor, " p"]) -> FittedModel | None:

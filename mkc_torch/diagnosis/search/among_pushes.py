@@ -12,7 +12,7 @@ from torch import Tensor
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
-from mkc_torch.diagnosis.model.in_the_world import beside_effects
+from mkc_torch.diagnosis.model.in_the_world import beside_effects, between_beside_effects
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, continuous
@@ -40,6 +40,7 @@ def located_among_pushes(
     surrogates: int,
     generator: torch.Generator,
     declared: Mapping[str, float],
+    fixed: Mapping[str, str],
     settings: Settings,
 ) -> Located:
     """The strongest candidate beside a fit under pushes.
@@ -51,6 +52,7 @@ def located_among_pushes(
         surrogates: draws of noise.
         generator: of the draws.
         declared: standard deviation of the white noise of outputs that it is known of.
+        fixed: what inputs do between samples that it is known of.
         settings: the numbers that decide.
 
     Raises:
@@ -72,6 +74,7 @@ def located_among_pushes(
         works = [partial(_own, base, terms[number], found, number, declared, settings) for number in chosen]
         fits = at_once(works, base.model.prepared, [terms[number] for number in chosen])
         best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer)
+        best = between_beside_effects(best, declared, fixed, settings.noise)
     return Located(
         best.model.terms[-1],
         best,
@@ -82,6 +85,7 @@ def located_among_pushes(
         look,
         look.linearised,
         compared=fits,
+        longer=found.longer(level),
     )
 
 
@@ -150,7 +154,7 @@ def _by_own_noise(
     prefer: Preference,
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
     """The likeliest of the fits, and the ranking with how far each is behind it; others are behind all of them."""
-    scores = [prefer.score(fit, base) for fit in fits]
+    scores = [prefer.score_with_shape(fit, base) for fit in fits]
     best = max(range(len(fits)), key=scores.__getitem__)
     behind: dict[Key, tuple[float, int]] = {}
     for number, score in zip(chosen, scores, strict=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -53,6 +54,7 @@ class Located:
         stretch: samples without which there is nothing, first and the one after the last, if they are few.
         compared: fits of the leading candidates, each under the noise of the world that it leaves; none where all are
             under the same.
+        longer: times as long a recording that would show it has to be, if it is there; infinite where nobody knows.
     """
 
     term: Term
@@ -65,6 +67,7 @@ class Located:
     beside_nothing: Linearised
     stretch: tuple[int, int] | None = None
     compared: Sequence[FittedModel] = ()
+    longer: float = math.inf
 
     @property
     def scene(self) -> Scene:

@@ -63,6 +63,10 @@ class Preference:
         score = gain - schwarz(fit) * fit.model.sizes[-1]
         return score - self.handicap(fit.model.terms[-1], gain)
 
+    def score_with_shape(self, fit: FittedModel, base: FittedModel) -> float:
+        """The same less Schwarz's penalty for the numbers of the shape that were fitted too."""
+        return self.score(fit, base) - schwarz(fit) * _fitted_numbers(fit.model.terms[-1])
+
     def by_innovations(self, one: FittedModel, other: FittedModel, price: float = AKAIKE) -> float:
         """Nats by which the other of two fits is preferred, their noise taken for coloured: as a joint fit does not.
 

@@ -30,7 +30,7 @@ SHARES = (1.0, 0.4, 0.15, 0.05, 0.015, 0.0)
 """Of the pushes' sizes."""
 
 _SINGULAR = 1e-9
-"""Share of a candidate's squares that the simulation's own parameters leave, below which nothing is left of it."""
+"""Share of a candidate's squares, or of their largest eigenvalue, below which a direction of it is none."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ class Profiled:
         shift: (C, p), by how much the simulation's parameters then move.
         p_value: of the strongest, after the whole search.
         beyond: nats by which it is beyond the strongest of the draws.
+        rarity: (1 + draws,), of the strongest candidate, of the recording and of each draw, in standard deviations.
         observers: for the pushes that each leaves.
     """
 
@@ -55,7 +56,13 @@ class Profiled:
     shift: Float[Tensor, "C p"]
     p_value: float
     beyond: float
+    rarity: Float[Tensor, " B"]
     observers: tuple[Observer | None, ...]
+
+    def longer(self, level: float) -> float:
+        """Times as long a recording has to be for its strongest candidate to be beyond the level, if it is there."""
+        own, needed = float(self.rarity[0]), float(torch.quantile(self.rarity[1:], 1.0 - level))
+        return (needed / own) ** 2 if own > 0.0 else torch.inf
 
 
 def profiled(
@@ -137,7 +144,7 @@ def profiled(
     beyond = 0.5 * float(strongest[0].clamp(min=0.0).square() - strongest[1:].amax().clamp(min=0.0).square())
     observers = {part: one.other if part > 0 else None for part, one in zip(SHARES, maps, strict=True)}
     kept = tuple(observers[min(SHARES, key=lambda part: abs(part - float(one)))] for one in share)
-    return Profiled(0.5 * ratio[:, 0], dof, share, tuple(gamma), shift, p_value, beyond, kept)
+    return Profiled(0.5 * ratio[:, 0], dof, share, tuple(gamma), shift, p_value, beyond, strongest, kept)
 
 
 def _orthonormal(columns: Float[Tensor, "M p"]) -> Float[Tensor, "M k"]:

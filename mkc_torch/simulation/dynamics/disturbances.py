@@ -98,12 +98,20 @@ def disturbed(
         other = _finer(flow, _scaled(tried[number], float(scales[number])))
         more, scale = _exactly(flow, other)
         # the others may have come nearer to their best as well
-        value = max(value, _exactly(flow, replace(other, pushes=other.pushes[:-1]))[0])
+        nearer = replace(other, pushes=other.pushes[:-1])
+        again, its_scale = _exactly(flow, nearer)
+        if again > value:
+            best, value = _scaled(nearer, its_scale), again
         if not more > value + least:
             break
         gains.append(more - value)
         best, value = _scaled(other, scale), more
-    return _told(best, gains, flow, names, channels, floor, value)
+    found = _told(best, gains, flow, names, channels, floor, value)
+    if len(gains) < 2:
+        return found
+    # one may have stood for another that was found later
+    fewer = resized(flow, names, channels, found, least)
+    return fewer if len(fewer.disturbances) < len(gains) else found
 
 
 def resized(flow: Flow, names: Sequence[str], channels: Sequence[str], known: Disturbed, least: float) -> Disturbed:

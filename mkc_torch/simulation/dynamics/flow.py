@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 __all__ = ["flow_along", "flow_of"]
 
+_ABOUT = 0.1
+"""Share of its spread by which a state may be off at least."""
+
 
 def flow_of(
     prepared: Observable,
@@ -66,8 +69,22 @@ def flow_along(
             value = after[:-1, states.shape[1] - len(prepared.lasting) + number]
             shift = shift + push[:, :, prepared.pushable.index(one.place)] * value.unsqueeze(-1)
     gap = torch.where(prepared.begins[1:], 0.0, prepared.time.diff())
-    arrays = (carry, push, C, new, shift, gap, prepared.counts.to(new.dtype), at[:, :n].std(0))
+    arrays = (carry, push, C, new, shift, gap, prepared.counts.to(new.dtype), _may_be_off(prepared, at[:, :n], new))
     return Flow(*(one.detach().cpu().numpy().astype(np.float64) for one in arrays))
+
+
+def _may_be_off(prepared: Observable, at: Float[Tensor, "N n"], new: Float[Tensor, "N m"]) -> Float[Tensor, " n"]:
+    """By how much states may be off along a trajectory: the share of their spread that the outputs are off by.
+
+    One that rests where something pushes has no spread of its own; a first guess of its states has.
+    """
+    used = prepared.counts.to(new.dtype)
+    total = used.sum(0).clamp(min=1.0)
+    level = (used * prepared.measured).sum(0) / total
+    off = (used * new.square()).sum(0) / total
+    whole = (used * (prepared.measured - level).square()).sum(0) / total
+    share = (off / whole.clamp(min=torch.finfo(new.dtype).tiny)).sqrt().amax().clamp(_ABOUT, 1.0)
+    return share * torch.maximum(at.std(0), prepared.guess[prepared.rows].std(0))
 
 
 def _between_samples(A: Tensor, G: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:

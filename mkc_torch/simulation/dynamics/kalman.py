@@ -34,7 +34,7 @@ class Flow:
         shift: (N-1, n), by how much more than its own states the trajectory had moved at the next sample.
         step: (N-1,), in s.
         counts: (N, m), 0 where a sample does not count.
-        spread: (n,), standard deviation of each state along the trajectory.
+        spread: (n,), by how much each state may be off where one begins within the trajectory.
     """
 
     carried: Float[np.ndarray, "N-1 n n"]
@@ -138,10 +138,6 @@ class Filtered:
     posterior: Float[np.ndarray, "L G B k k"]
 
 
-_ABOUT = 0.1
-"""Share of a state's spread by which it may be off where a stretch begins."""
-
-
 def filtered(flow: Parts, models: Models, *, keep: bool = False) -> Filtered:
     """Run the filters; ``keep`` for covariances and states too."""
     N, G, m = flow.new.shape
@@ -161,7 +157,7 @@ def filtered(flow: Parts, models: Models, *, keep: bool = False) -> Filtered:
     variance = models.sensor**2
     # where a stretch begins inside, its states are about where the trajectory has them
     own = np.arange(n)
-    P[..., own, own] = np.where(flow.inside[:, None, None], (_ABOUT * flow.spread) ** 2, 0.0)
+    P[..., own, own] = np.where(flow.inside[:, None, None], flow.spread**2, 0.0)
     standard, log_spread = np.zeros((N, G, B, m)), np.zeros((N, G, B, m))
     kept = (N, G, B, k, k) if keep else (0, G, B, k, k)
     priors, posteriors = np.zeros(kept), np.zeros(kept)

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.findings import reasons
-from mkc_torch.diagnosis.findings.follows import follows_of
 from mkc_torch.diagnosis.findings.reasons import at_ends, reasons_of
+from mkc_torch.diagnosis.follows import follows_of
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from tests.diagnosis.factory import make_follows

@@ -18,15 +18,23 @@ if TYPE_CHECKING:
 __all__ = ["follows_of", "misses", "size_of", "units_of"]
 
 _FAR = 5.0
-"""Robust standard deviations at which a residual's square ends: outliers do not count, a long way off still does."""
+"""Robust standard deviations from the median at which a value ends, for a mean that outliers do not move."""
+
+_CORNER, _EXPECTED, _ROUNDS = 2.5, 0.97764, 30
+"""Standard deviations at which a residual's square ends, and the mean of that of a normal variable."""
 
 
 def size_of(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
-    """Root mean square with squares that end far out."""
-    reach = _FAR * robust_scale(values)
+    """Standard deviation about 0 by Huber's proposal 2: a few outliers count as the edge, a broad misfit in full.
+
+    Huber, "Robust Statistics" (1981), 6.4.
+    """
+    size, whole = robust_scale(values), values.square().mean(0).sqrt()
     # of a series that rests most of the time the scale is 0
-    reach = torch.where(reach > 0, reach, values.abs().amax(0))
-    return values.clamp(-reach, reach).square().mean(0).sqrt()
+    rests = size == 0
+    for _ in range(_ROUNDS):
+        size = (torch.minimum(values.square(), (_CORNER * size).square()).mean(0) / _EXPECTED).sqrt()
+    return torch.where(rests, whole, size)
 
 
 def follows_of(

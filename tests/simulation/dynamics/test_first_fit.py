@@ -1,0 +1,104 @@
+"""First fits from parameters that are far off, over horizons so short that no trajectory gets lost."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch.simulation import Dynamics, Parameter
+from mkc_torch.simulation.dynamics.first_fit import floor_of, over_short_horizons, strong_observer
+from tests.simulation.dynamics.oscillating import flow, oscillator, recorded, theta_of
+from tests.simulation.dynamics.runge_kutta import runge_kutta
+
+STIFFNESS, DAMPING, FIRST, NOISE = 9.0, 0.15, (1.8, 0.4), 0.01
+ALONG = flow(400)
+
+
+class Pendulum(Dynamics):
+    states = ("angle", "speed")
+    parameters = {"stiffness": Parameter(1.0, lower=0.0), "damping": Parameter(1.0, lower=0.0)}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle) - p.damping * x.speed}
+
+
+def rate(_, y):
+    return np.array([y[1], -STIFFNESS * np.sin(y[0]) - DAMPING * y[1]])
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    """A pendulum that swings for twenty seconds, prepared."""
+    angle = runge_kutta(rate, FIRST, 0.05 * np.arange(400), parts=5)[:, 0]
+    return Pendulum().prepare(recorded(ALONG, angle=angle + NOISE * np.random.default_rng(0).standard_normal(400)))
+
+
+@pytest.mark.parametrize(("stiffness", "damping"), [(90.0, 1.5), (90.0, 0.015), (0.9, 1.5)])
+def test_parameters_ten_times_off_are_brought_home(pendulum, stiffness, damping):
+    guess = torch.cat([torch.tensor([stiffness, damping], dtype=torch.float64), pendulum.given[2:]])
+    found = over_short_horizons(pendulum, guess)
+    assert float(found[0]) == pytest.approx(STIFFNESS, rel=0.05)
+    assert float(found[1]) == pytest.approx(DAMPING, abs=0.1)
+    assert found[2:].tolist() == pytest.approx(FIRST, abs=0.15)
+    # a free run from there keeps step to the end
+    assert float(pendulum.residual(found, {}).abs().max()) < 0.5
+    assert float(pendulum.residual(guess, {}).abs().max()) > 1.5
+
+
+def test_bounds_are_kept(pendulum):
+    low, high = pendulum.bounds
+    bounds = low.clone(), high.clone()
+    bounds[0][1], bounds[1][0] = 0.3, 8.0
+    held = copy.copy(pendulum)
+    held.bounds = bounds
+    found = over_short_horizons(held, torch.cat([torch.tensor([2.0, 1.0]).double(), pendulum.given[2:]]))
+    assert float(found[0]) <= 8.0
+    assert float(found[1]) >= 0.3
+
+
+def test_there_is_none_where_no_rate_moves_an_output():
+    def output(self, time, x, u, p):  # noqa: ARG001
+        return {"position": 0.0 * x.position + p.stiffness}
+
+    prepared = oscillator(output=output).prepare(recorded(flow(30), position=np.sin(np.arange(30.0))))
+    assert over_short_horizons(prepared, theta_of(prepared)) is None
+    assert strong_observer(prepared, theta_of(prepared), 10.0) is None
+
+
+def test_there_is_none_where_the_equations_cannot_be_looked_at(pendulum):
+    nowhere = torch.tensor([np.nan, 1.0, *FIRST], dtype=torch.float64)
+    assert strong_observer(pendulum, nowhere, 10.0) is None
+    assert over_short_horizons(pendulum, nowhere) is None
+
+
+def test_a_stronger_observer_follows_a_recording_closer(pendulum):
+    guess = torch.tensor([30.0, 1.0, *FIRST], dtype=torch.float64)
+    left = []
+    for size in (1.0, 10.0, 100.0):
+        observer = strong_observer(pendulum, guess, size)
+        assert [(one.place, one.at_rate, one.lasting) for one in observer.disturbances] == [("speed", True, 0.0)]
+        predicted = pendulum.observed(observer).simulated(guess, {})
+        left.append(float((pendulum.measured - predicted).std()))
+    assert left[0] > 2.0 * left[1] > 10.0 * left[2]
+    sizes = [strong_observer(pendulum, guess, size).disturbances[0].size for size in (1.0, 7.0)]
+    assert sizes[1] == pytest.approx(7.0 * sizes[0])
+
+
+class TestFloor:
+    """White noise by third differences."""
+
+    @pytest.mark.parametrize("runs", [1, 4])
+    def test_of_a_smooth_course(self, runs):
+        time = np.tile(0.05 * np.arange(400 // runs), runs)
+        # where a run ends the level jumps
+        smooth = np.sin(time) + 100.0 * np.repeat(np.arange(runs), 400 // runs)
+        noise = np.random.default_rng(1).standard_normal(400)
+        prepared = oscillator(step=0.05).prepare(
+            recorded(flow(400 // runs, runs=runs), runs, position=smooth + 0.02 * noise)
+        )
+        assert floor_of(prepared).tolist() == pytest.approx([0.02], rel=0.15)
+
+    def test_never_nothing(self):
+        prepared = oscillator(step=0.05).prepare(recorded(flow(40), position=np.arange(40.0)))
+        assert floor_of(prepared).item() == pytest.approx(1e-6 * np.arange(40.0).std(ddof=1))
