@@ -22,6 +22,7 @@ def located(fit, draws=39, level=0.05):
         surrogates=draws,
         generator=torch.Generator().manual_seed(0),
         declared={},
+        fixed={},
         settings=FEW,
     )
 
