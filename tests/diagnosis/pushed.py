@@ -7,10 +7,16 @@ import numpy as np
 import torch
 
 from mkc_torch import Recording
+from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.in_the_world import at_liberty, between_samples, simulation_in_the_world
+from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.simulation import Dynamics, Parameter
+from mkc_torch.simulation.dynamics.disturbances import observer_of
+from mkc_torch.simulation.dynamics.first_fit import strong_observer
+from mkc_torch.simulation.dynamics.flow import flow_of
+from mkc_torch.simulation.dynamics.observer import Disturbance
 
 STEP, FINE, NOISE = 0.05, 4, 0.004
 
@@ -96,6 +102,23 @@ def swung_in_the_world(push="none", seed=0, N=500, drag=0.0):
     return in_the_world(swung(push, seed, N, drag)[0])
 
 
-def candidates(world, effects):
-    """Terms for a search beside a world's fit."""
-    return candidate_terms(at_liberty(world.fit.model.prepared), (), effects)
+@functools.cache
+def at_the_truth(push="white", seed=0):
+    """A pendulum of :func:`swung` with its true parameters, under the pushes that were drawn."""
+    prepared = Pendulum().prepare(swung(push, seed)[0])
+    theta = torch.tensor([9.0, 0.15, 0.3, 0.0], dtype=torch.float64)
+    prepared = prepared.observed(strong_observer(prepared, theta, 10.0))
+    flow = flow_of(prepared, theta, {}, None)
+    size, lasting = (0.4, 0.0) if push == "white" else (0.3, 1.0)
+    sensor = torch.tensor([NOISE], dtype=torch.float64)
+    pushes = (Disturbance("rate", True, lasting, size),)
+    observer = observer_of(flow, pushes, sensor, prepared.pushable, prepared.channels)
+    model = JointModel(prepared.observed(observer))
+    residual = model.residual(theta).detach()
+    d = residual.std(0)
+    return FittedModel(model, theta, d, torch.full_like(d, torch.inf), 20.0 * d, residual, residual * 0 + 1, 0.0, True)
+
+
+def candidates(fit, effects):
+    """Terms for a search beside a fit."""
+    return candidate_terms(at_liberty(fit.model.prepared), (), effects)

@@ -120,6 +120,8 @@ def _covariance(fit: FittedModel) -> Float[Tensor, "p p"]:
 def nearest_power(curve: Curve) -> str:
     """The power law that is nearest to a curve, beside a line and a constant that the simulation may have; as text."""
     x, y = curve.x, curve.value[:, 0]
+    if not bool(y.isfinite().all()):
+        return ""
     weight = 1.0 / curve.band[:, 0].clamp(min=float(curve.band.median().clamp(min=1e-300)))
     best: tuple[float, float, float] | None = None
     for power in _POWERS.tolist():

@@ -30,7 +30,7 @@ SHARES = (1.0, 0.4, 0.15, 0.05, 0.015, 0.0)
 """Of the pushes' sizes."""
 
 _SINGULAR = 1e-9
-"""Share of the largest eigenvalue below which a direction of a candidate is none."""
+"""Share of a candidate's squares, or of their largest eigenvalue, below which a direction of it is none."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def profiled(
             norm = torch.linalg.vector_norm(whole, dim=0).clamp(min=1e-300)
             gram = (directions / norm).mT @ (directions / norm)
             inner = (directions / norm).mT @ left
-            inverse = torch.linalg.pinv(gram, hermitian=True, rtol=_SINGULAR)
+            inverse = torch.linalg.pinv(gram, hermitian=True, atol=_SINGULAR, rtol=_SINGULAR)
             solved = inverse @ inner
             if terms[number].effect.one_sided:
                 inner = torch.where((solved < 0).any(0), inner, 0.0)
@@ -133,7 +133,7 @@ def profiled(
                 against = torch.linalg.lstsq(own / size, (y[:, 0] - whole / norm @ solved[:, 0]).unsqueeze(-1)).solution
                 shift[number] = -against.squeeze(-1) / size
             best[number] = torch.maximum(best[number], value)
-            dof[number] = max(float(dof[number]), float(torch.linalg.matrix_rank(gram, rtol=_SINGULAR)))
+            dof[number] = max(float(dof[number]), float(torch.linalg.matrix_rank(gram, atol=_SINGULAR, rtol=_SINGULAR)))
     ratio = 2.0 * (best - null)
     # a gain is as rare as its numbers make it: Wilson and Hilferty's root makes them alike
     k = dof.clamp(min=1.0).unsqueeze(-1)

@@ -1,0 +1,136 @@
+"""Whether a name's shape is the recording's: a free curve in its place is clearly better, or it is not."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from mkc_torch import Recording
+from mkc_torch.diagnosis.findings.shape import nearest_power, shape_of
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.settings import EvidenceSettings
+from mkc_torch.diagnosis.world import Curve
+from mkc_torch.effects.dynamics.linear_drag import LinearDrag
+from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
+from mkc_torch.effects.dynamics.unknown_rate import UnknownRate
+from mkc_torch.simulation import Dynamics, Parameter
+
+SEEDS = range(10)
+STEP, N, NOISE = 0.1, 300, 0.01
+
+
+class Boat(Dynamics):
+    """A boat that is pushed to and fro, in water that holds nothing."""
+
+    states = ("speed",)
+    inputs = ("thrust",)
+    outputs = ("speed",)
+    units = {"speed": "m/s", "thrust": "m/s²"}  # noqa: RUF012
+    parameters = {"gain": Parameter(1.0, lower=0.0)}  # noqa: RUF012
+    between = "held"
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"speed": p.gain * u.thrust}
+
+
+@functools.cache
+def sailed(power, seed):
+    """Against a drag of this power."""
+    random = np.random.default_rng(seed)
+    thrust = np.repeat(random.uniform(-1.5, 1.5, N // 10), 10)
+    time = STEP * np.arange(N)
+
+    def rate(t, v):
+        return thrust[min(int(t / STEP), N - 1)] - 0.4 * np.abs(v) ** power * np.sign(v)
+
+    exact = solve_ivp(rate, (0.0, time[-1]), [0.5], t_eval=time, rtol=1e-8, atol=1e-9, max_step=STEP)
+    columns = {"time": time, "thrust": thrust, "speed": exact.y[0] + NOISE * random.standard_normal(N)}
+    return Recording({name: torch.from_numpy(one) for name, one in columns.items()}, name="boat")
+
+
+def named(recording, effect):
+    """The fit with a name in it, and all candidates."""
+    prepared = Boat().prepare(recording)
+    curves = [UnknownRate("own")]
+    terms = candidate_terms(prepared, (), [effect, *curves])
+    (term,) = [one for one in terms if one.effect is effect]
+    model = JointModel(prepared, (term,))
+    start = torch.cat([prepared.start(), torch.full((1,), 0.3, dtype=torch.float64)])
+    return fitted(model, start), terms
+
+
+def shape(recording, effect, **settings):
+    fit, terms = named(recording, effect)
+    return shape_of(fit, 0, terms, EvidenceSettings(**settings))
+
+
+def test_a_name_of_the_right_shape_is_not_doubted_in_ten_draws():
+    found = [shape(sailed(2.0, seed), QuadraticDrag()) for seed in SEEDS]
+    assert [one.curve for one in found] == [None] * len(found)
+    assert [one.formula for one in found] == [""] * len(found)
+    assert min(one.p_value for one in found) > 0.01
+
+
+def test_a_name_of_another_shape_is_the_nearest_with_a_formula_that_is_neither_a_line_nor_a_cube():
+    found = shape(sailed(2.0, 0), LinearDrag())
+    assert found.p_value < 1e-6
+    assert found.free_curve_gain > 30.0
+    curve = found.curve
+    assert (curve.driver, curve.unit, curve.channels) == ("speed", "m/s", ("rate of speed",))
+    value, far = curve.value[:, 0], curve.x.abs()
+    inside = (far > 0.3) & (far < 0.85 * far.max())
+    true = -0.4 * curve.x * curve.x.abs()
+    torch.testing.assert_close(value[inside], true[inside], rtol=0.0, atol=0.1)
+    assert bool((curve.band > 0.0).all())
+    # polynomials read a square with a sign as something between it and a cube
+    assert 1.5 < float(found.formula.split("|^")[1].split()[0]) < 3.0
+    assert "sign(speed)" in found.formula
+
+
+def test_how_much_better_a_curve_has_to_be_is_set():
+    found = shape(sailed(2.0, 0), LinearDrag(), shape_nats=1e4)
+    assert found.free_curve_gain > 30.0
+    assert found.curve is None
+    assert shape(sailed(2.0, 0), LinearDrag(), shape_level=0.0).curve is None
+
+
+def test_a_curve_claims_no_shape_and_without_curves_there_is_nothing_to_compare_with():
+    fit, terms = named(sailed(2.0, 0), QuadraticDrag())
+    assert shape_of(fit, 0, [one for one in terms if not one.effect.is_curve], EvidenceSettings()) is None
+    curve = named(sailed(2.0, 0), QuadraticDrag())[1][-1]
+    assert curve.effect.is_curve
+    model = JointModel(fit.model.prepared, (curve,))
+    whole = torch.cat([fit.parameters[: model.base], torch.zeros(model.sizes[0]).double()])
+    nameless = dataclasses.replace(fit, model=model, parameters=whole)
+    assert shape_of(nameless, 0, terms, EvidenceSettings()) is None
+
+
+def curve_of(values, low=-2.0, driver="speed", band=0.01):
+    x = torch.linspace(low, 3.0, 60, dtype=torch.float64)
+    value = values(x).unsqueeze(-1)
+    return Curve(driver, "m/s", x, value, torch.full_like(value, band), ("rate of speed",), "m/s²")
+
+
+@pytest.mark.parametrize("power", [0.5, 1.5, 1.7, 2.0, 3.0])
+@pytest.mark.parametrize("low", [-2.0, 0.1])
+def test_a_power_law_is_read_off_exactly_beside_a_straight_line(power, low):
+    drawn = curve_of(lambda x: -0.7 * x.abs() ** power * x.sign() + 0.4 * x - 1.2, low)
+    assert nearest_power(drawn) == f"-0.7 |speed|^{power:.2g} sign(speed), beside a straight line"
+
+
+def test_where_a_curve_is_hardly_known_it_hardly_counts():
+    drawn = curve_of(lambda x: -0.7 * x * x.abs())
+    far = drawn.x > 2.0
+    value, band = drawn.value.clone(), drawn.band.clone()
+    value[far], band[far] = 50.0, 1e6
+    doubted = dataclasses.replace(drawn, value=value, band=band)
+    assert nearest_power(doubted) == nearest_power(drawn)
+
+
+def test_no_power_is_told_of_a_curve_without_a_value():
+    assert nearest_power(curve_of(lambda x: torch.full_like(x, torch.nan))) == ""
