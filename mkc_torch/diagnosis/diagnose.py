@@ -136,7 +136,7 @@ def diagnose(
         # one effect may be what it lacks to follow; what it lacks beside that is told once it follows
         asked = replace(asked, max_findings=min(max_findings, 1))
     hopeless = lost_from_the_start(world, declared, settings.evidence)
-    search = begun(base, () if hopeless else terms, asked, generator)
+    search = begun(base, () if hopeless else terms, asked, generator, world.free)
 
     def case(search: Search) -> Case:
         free = running_freely(base, world.free, search.found, search.evidence, search.blocks)

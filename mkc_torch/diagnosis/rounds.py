@@ -97,7 +97,13 @@ class Search:
         return self.first, *self.found, *fits, *(fit.model for fit in fits), self.blocks, *self.evidence, *pairs
 
 
-def begun(base: FittedModel, terms: tuple[Term, ...], asked: Asked, generator: torch.Generator) -> Search:
+def begun(
+    base: FittedModel,
+    terms: tuple[Term, ...],
+    asked: Asked,
+    generator: torch.Generator,
+    free: FittedModel | None = None,
+) -> Search:
     """The first search, and its finding, if unseen blocks confirm it."""
     prepared = base.model.prepared
     correlation = max(correlation_time(one) for one in base.pseudo(asked.settings.noise)[0].unbind(1))
@@ -106,7 +112,7 @@ def begun(base: FittedModel, terms: tuple[Term, ...], asked: Asked, generator: t
     first = None
     with meanwhile([partial(held_out, base, blocks)], common_parts(prepared, ())) as judged:
         if terms:
-            first = _located(base, terms, asked, generator)
+            first = _located(base, terms, asked, generator, free=free)
         [evidence] = judged()
     begun = Search(first, (), None, blocks, (evidence,), terms)
     if first is None:
@@ -134,7 +140,13 @@ def continued(search: Search, asked: Asked, generator: torch.Generator) -> Searc
 
 
 def _located(
-    fit: FittedModel, terms: tuple[Term, ...], asked: Asked, generator: torch.Generator, *, parts: bool = True
+    fit: FittedModel,
+    terms: tuple[Term, ...],
+    asked: Asked,
+    generator: torch.Generator,
+    *,
+    parts: bool = True,
+    free: FittedModel | None = None,
 ) -> Located:
     if pushed(fit):
         return located_among_pushes(
@@ -145,6 +157,7 @@ def _located(
             generator=generator,
             declared=asked.declared,
             fixed=asked.fixed,
+            free=free,
             settings=asked.settings,
         )
     return locate(

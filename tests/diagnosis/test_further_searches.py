@@ -7,12 +7,16 @@ import pytest
 import torch
 
 from mkc_torch import Recording, diagnose
+from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation import Dynamics
 
 rounds = importlib.import_module("mkc_torch.diagnosis.rounds")
 
+
+ANYWAY = replace(Settings(), evidence=replace(Settings().evidence, followed=0.0))
+"""For several findings of a simulation that follows by them alone."""
 
 EFFECTS = [effect for effect in CATALOGUE if effect.id in ("cubic_stiffness", "quadratic_drag")]
 
@@ -57,7 +61,7 @@ def diagnosed(recording, monkeypatch):
 
         monkeypatch.setattr(rounds, "_located", search)
         monkeypatch.setattr(rounds, "_quiet", lambda *_: False)
-        return diagnose(Sled(), recording, effects=EFFECTS), searches
+        return diagnose(Sled(), recording, effects=EFFECTS, settings=ANYWAY), searches
 
     return run
 
@@ -87,7 +91,7 @@ def test_a_search_that_wanders_off_changes_nothing_of_what_was_found(diagnosed, 
 
     diagnosis, searches = diagnosed(wanders_off)
     assert len(searches) == 2
-    (finding,), (plain,) = diagnosis.findings, diagnose(Sled(), recording, effects=EFFECTS).findings
+    (finding,), (plain,) = diagnosis.findings, diagnose(Sled(), recording, effects=EFFECTS, settings=ANYWAY).findings
     assert finding.parameters == plain.parameters
 
 

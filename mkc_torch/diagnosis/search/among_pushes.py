@@ -12,7 +12,7 @@ from torch import Tensor
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
-from mkc_torch.diagnosis.model.in_the_world import beside_effects, between_beside_effects
+from mkc_torch.diagnosis.model.in_the_world import beside_effects, between_beside_effects, noise_around, pushed
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, continuous
@@ -41,6 +41,7 @@ def located_among_pushes(
     generator: torch.Generator,
     declared: Mapping[str, float],
     fixed: Mapping[str, str],
+    free: FittedModel | None,
     settings: Settings,
 ) -> Located:
     """The strongest candidate beside a fit under pushes.
@@ -53,6 +54,7 @@ def located_among_pushes(
         generator: of the draws.
         declared: standard deviation of the white noise of outputs that it is known of.
         fixed: what inputs do between samples that it is known of.
+        free: the same as it runs freely; None where that loses the recording.
         settings: the numbers that decide.
 
     Raises:
@@ -71,7 +73,7 @@ def located_among_pushes(
     fits: Sequence[FittedModel] = ()
     if found.p_value <= level:
         chosen = _chosen(found, terms, settings.search.own_noise)
-        works = [partial(_own, base, terms[number], found, number, declared, settings) for number in chosen]
+        works = [partial(_own, base, free, terms[number], found, number, declared, settings) for number in chosen]
         fits = at_once(works, base.model.prepared, [terms[number] for number in chosen])
         best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer)
         best = between_beside_effects(best, declared, fixed, settings.noise)
@@ -136,13 +138,36 @@ def _inside(base: FittedModel, parameters: Tensor) -> Tensor:
 
 
 def _own(
-    base: FittedModel, term: Term, found: Profiled, number: int, declared: Mapping[str, float], settings: Settings
+    base: FittedModel,
+    free: FittedModel | None,
+    term: Term,
+    found: Profiled,
+    number: int,
+    declared: Mapping[str, float],
+    settings: Settings,
 ) -> FittedModel:
-    """The joint fit of a candidate, under the noise that it leaves."""
-    fit = _fit_of(base, term, found, number)
+    """The joint fit of a candidate, under the noise that it leaves.
+
+    Begun under the pushes, and from the free run: what a push has taken over is not always given back.
+    """
     prepared = base.model.prepared
     assert isinstance(prepared, PreparedDynamics)
-    return shape_fitted(beside_effects(fit, noise_of(prepared, declared), declared, settings.noise))
+    fit = _fit_of(base, term, found, number)
+    under = shape_fitted(beside_effects(fit, noise_of(prepared, declared), declared, settings.noise))
+    if free is None or not pushed(under):
+        return under
+    start = torch.cat([free.parameters, found.gamma[number]])
+    tried = [fitted_beside(free, free.model.with_term(term), one) for one in (start, _with_none(free, term))]
+    running = shape_fitted(max(tried, key=lambda one: one.log_likelihood))
+    left = noise_around(running, declared, settings.noise)
+    white = left is not None and left.observer is None
+    return running if white or running.log_likelihood > under.log_likelihood else under
+
+
+def _with_none(free: FittedModel, term: Term) -> Tensor:
+    """The parameters of a free run with nothing of an effect."""
+    size = free.model.with_term(term).size - free.model.size
+    return torch.cat([free.parameters, free.parameters.new_zeros(size)])
 
 
 def _by_own_noise(

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-__all__ = ["floor_of", "over_short_horizons"]
+__all__ = ["floor_of", "over_short_horizons", "strong_observer", "without_noise"]
 
 _CORRECTIONS = (100.0, 10.0)
 """Sizes of the pushes that the corrections are for, over that at which they move an output by its noise."""
@@ -58,6 +58,8 @@ def strong_observer(prepared: Observable, theta: Float[Tensor, " p"], size: floa
     if not all(bool(np.isfinite(one).all()) for one in (flow.carried, flow.pushed, flow.seen)):
         return None
     floor = floor_of(prepared)
+    if without_noise(floor):
+        return None
     sizes = [usual_size(flow, number, 0.0, floor.numpy()) for number in range(len(prepared.pushable))]
     pushes = tuple(
         Disturbance(name, True, 0.0, size * usual)
@@ -65,6 +67,11 @@ def strong_observer(prepared: Observable, theta: Float[Tensor, " p"], size: floa
         if np.isfinite(usual)
     )
     return observer_of(flow, pushes, floor, prepared.pushable, prepared.channels) if pushes else None
+
+
+def without_noise(floor: Float[Tensor, " m"]) -> bool:
+    """Whether an output has no noise at all, so that nothing can be weighed against it."""
+    return bool((floor.square() <= torch.finfo(floor.dtype).tiny).any())
 
 
 def floor_of(prepared: Observable) -> Float[Tensor, " m"]:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.simulation.dynamics.disturbances import Disturbed, disturbed, models_of, observer_of, resized
-from mkc_torch.simulation.dynamics.first_fit import floor_of
+from mkc_torch.simulation.dynamics.first_fit import floor_of, without_noise
 from mkc_torch.simulation.dynamics.flow import flow_of
 from mkc_torch.simulation.dynamics.kalman import filtered, smoothed
 from mkc_torch.simulation.dynamics.observer import Observable, Observer
@@ -59,6 +59,8 @@ def likeliest_noise(
         found = resized(flow, names, channels, known, least)
         return NoiseOfTheWorld(found, observer_of(flow, found.disturbances, found.sensor, names, channels))
     floor = floor_of(prepared)
+    if without_noise(floor):
+        return None
     given = [name in declared for name in prepared.channels]
     sensor = floor.new_tensor(
         [declared.get(name, float(one)) for name, one in zip(prepared.channels, floor, strict=True)]
