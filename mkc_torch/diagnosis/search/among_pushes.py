@@ -28,6 +28,9 @@ from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 __all__ = ["located_among_pushes"]
 
+_CURVES = 1
+"""Free curves that are fitted beside the leading candidates."""
+
 Kind = tuple[Key, str]
 """Of a candidate, and for a curve what it is over."""
 
@@ -41,7 +44,7 @@ def located_among_pushes(
     generator: torch.Generator,
     declared: Mapping[str, float],
     fixed: Mapping[str, str],
-    free: FittedModel | None,
+    free: FittedModel | None = None,
     settings: Settings,
 ) -> Located:
     """The strongest candidate beside a fit under pushes.
@@ -72,7 +75,7 @@ def located_among_pushes(
     best = _fit_of(base, terms[ranking[0].number], found, ranking[0].number)
     fits: Sequence[FittedModel] = ()
     if found.p_value <= level:
-        chosen = _chosen(found, terms, settings.search.own_noise)
+        chosen = _chosen(found, ranking, terms, settings.search.own_noise)
         works = [partial(_own, base, free, terms[number], found, number, declared, settings) for number in chosen]
         fits = at_once(works, base.model.prepared, [terms[number] for number in chosen])
         best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer)
@@ -103,15 +106,20 @@ def _ranked(found: Profiled, terms: tuple[Term, ...], prefer: Preference) -> tup
     return tuple(Ranked(n, float(found.gain[n]), float(score.max() - score[n])) for n in best.values())
 
 
-def _chosen(found: Profiled, terms: tuple[Term, ...], most: int) -> list[int]:
-    """The candidates that gain most, each at its best shape."""
+def _chosen(found: Profiled, ranking: Sequence[Ranked], terms: tuple[Term, ...], most: int) -> list[int]:
+    """The leading candidates, each at its best shape, and the curve that gains most over each thing at their places."""
     chosen: dict[Kind, int] = {}
-    for number in (found.gain - found.dof).argsort(descending=True).tolist():
-        term = terms[number]
-        chosen.setdefault((term.key, term.effect.along if term.effect.is_curve else ""), number)
-        if len(chosen) == most:
-            break
+    for one in ranking[:most]:
+        chosen[_kind(terms[one.number])] = one.number
+    places = {terms[number].port for number in chosen.values()}
+    curves = [n for n, term in enumerate(terms) if term.effect.is_curve and term.port in places]
+    for number in sorted(curves, key=lambda n: -float(found.gain[n]))[:_CURVES]:
+        chosen.setdefault(_kind(terms[number]), number)
     return list(chosen.values())
+
+
+def _kind(term: Term) -> Kind:
+    return term.key, term.effect.along if term.effect.is_curve else ""
 
 
 def _fit_of(base: FittedModel, term: Term, found: Profiled, number: int) -> FittedModel:
