@@ -231,7 +231,7 @@ class Buoy(Dynamics):
 
 
 def test_water_that_moves_along_is_named_and_sized():
-    time = np.arange(140) * 0.05
+    time = np.arange(400) * 0.05
     push = np.sin(1.3 * time) + np.sin(2.9 * time)
 
     def rate(t, y):
@@ -266,7 +266,10 @@ def test_a_ball_that_spins_is_named_and_sized():
 
     recording = measured(rate, [0.0, 1.0, 25.0, 8.0], np.arange(120) * 0.02, NOISE, seen=("x", "y"))
     rivals = among("magnus_lift", "coupling")
-    finding = explained(diagnose(Ball(), recording, effects=rivals, **QUICK), "magnus_lift")
+    diagnosis = diagnose(Ball(), recording, effects=rivals, **QUICK)
+    assert diagnosis.verdict == "unexplained"  # the lift is not the constant one of the catalogue
+    (finding,) = diagnosis.findings
+    assert (finding.effect, finding.grade) == ("magnus_lift", "left out")
     assert value(finding, "turning")[0] == pytest.approx(0.165, abs=0.02)
     assert finding.channels == ("rate of vx", "rate of vy")
 
@@ -334,13 +337,12 @@ def dropped(ball):
 
 
 def test_a_light_ball_is_braked_by_the_air():
+    """Each of a few short drops could have been pushed as well: the air is what would explain it best."""
     diagnosis = diagnose(Fall(), dropped("Whiffle_Ball_1"), **QUICK)
-    assert diagnosis.verdict == "explained"
-    (finding,) = diagnosis.findings
-    assert finding.effect in ("linear_drag", "quadratic_drag")
-    drag, error = value(finding, "drag")
-    assert drag > 10.0 * error
-    assert finding.held_out.rmse_after < 0.1 * finding.held_out.rmse_before
+    assert diagnosis.verdict == "unexplained"
+    assert diagnosis.world.pushes[0].place == "speed"
+    assert diagnosis.candidates[0].effect in ("linear_drag", "quadratic_drag")
+    assert any("drag" in warning and "times as long would show it" in warning for warning in diagnosis.warnings)
 
 
 def test_of_a_heavy_ball_nothing_is_said():
