@@ -47,9 +47,10 @@ def test_a_light_ball_is_slowed_by_air_and_its_other_drop_says_so(loaded, tmp_pa
 def test_nothing_is_found_on_a_heavy_ball(loaded):
     one, other = drops("Bowling_Ball")
     (proof,) = loaded("held_out").prove(loaded("falling_balls").Ball(), one, [other], max_findings=1)
-    assert proof.diagnosis.verdict == "adequate"
+    assert proof.diagnosis.verdict == "unexplained"  # its drops are not noise alone
+    assert proof.diagnosis.findings == ()
     before, after = proof.mean_absolute(proof.time - proof.time[0] > 1.0)
-    assert before == pytest.approx(after)
+    assert before == pytest.approx(after, rel=0.05)
 
 
 def test_the_number_of_the_run_is_no_output(loaded):
@@ -63,17 +64,11 @@ def test_the_number_of_the_run_is_no_output(loaded):
     assert proof.measured.shape == (len(both), 1)
 
 
-def test_the_heaters_lag_and_what_passes_between_them_are_named(loaded):
-    """A curve over the temperature gains more on the run it is fitted to, and makes the other one 4 °C worse."""
+def test_of_the_heaters_what_is_left_is_located_and_nothing_is_claimed(loaded):
+    """What is unrecorded there pushes both temperatures; no name is confirmed beside pushes as slow as these."""
     shared_data("dynamics/heaters/run_1s.csv")
     case = loaded("systems").heaters(shared_data("dynamics"))
     (proof,) = loaded("held_out").prove(case.system, case.train, list(case.tests.values()), max_findings=2)
-    lag, coupling = proof.diagnosis.findings
-    assert (lag.effect, coupling.effect) == ("sensor_lag", "coupling")
-    assert coupling.p_value <= 0.05
-    assert lag.region is None or lag.region.unit == "°C"
-    assert coupling.held_out.confidence_interval[0] > 0.0
-    assert [p.name for p in coupling.parameters] == ["exchange"]
-    before, after = proof.root_mean_square()
-    assert before > 1.5
-    assert after < 0.8
+    assert proof.diagnosis.verdict == "unexplained"
+    assert {push.place for push in proof.diagnosis.world.pushes} == {"temperature_1", "temperature_2"}
+    assert all(finding.grade == "not confirmed" for finding in proof.diagnosis.findings)
