@@ -28,7 +28,7 @@ from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 __all__ = ["located_among_pushes"]
 
-_CURVES = 1
+_CURVES = 2
 """Free curves that are fitted beside the leading candidates."""
 
 Kind = tuple[Key, str]

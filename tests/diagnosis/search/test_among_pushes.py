@@ -36,7 +36,7 @@ def test_drag_that_is_hidden_beside_pushes_is_named_and_sized():
     (drag,) = found.fit.model.gammas(found.fit.parameters)[-1].tolist()
     assert drag == pytest.approx(0.4, abs=0.15)
     # each of those that gain most is fitted, under its own noise
-    assert len(found.compared) == 3  # both, and a free curve
+    assert len(found.compared) == 4  # both, and a free curve over angle and one over rate
     assert any(one is found.fit for one in found.compared)
     assert found.fit.log_likelihood > base.log_likelihood
     # the ranking begins with it, each physics once
