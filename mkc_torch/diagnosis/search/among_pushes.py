@@ -66,7 +66,7 @@ def located_among_pushes(
     terms = tuple(terms)
     tangents = tangents_of(base.model, base.parameters, settings.noise, terms)
     values, counts = base.pseudo(settings.noise)
-    found = profiled(base, terms, tangents, values, counts, surrogates, generator)
+    found = profiled(base, terms, tangents, base.residual, counts, surrogates, generator)
     if found is None:
         raise NoFitError("The simulation's trajectory is lost at the fitted values.")
     prefer = Preference(terms, base.model.prepared, settings.naming)

@@ -19,7 +19,7 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.simulation.dynamics.observer import Observer
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
-from mkc_torch.simulation.dynamics.rescaled import rescaled
+from mkc_torch.simulation.dynamics.rescaled import rescaled, unclipped
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -69,7 +69,7 @@ def profiled(
     base: FittedModel,
     terms: Sequence[Term],
     tangents: Tangents,
-    values: Float[Tensor, "N m"],
+    residual: Float[Tensor, "N m"],
     counts: Float[Tensor, "N m"],
     draws: int,
     generator: torch.Generator,
@@ -80,21 +80,23 @@ def profiled(
         base: the fit.
         terms: candidates.
         tangents: of the fit's parameters and the candidates.
-        values, counts: its pseudo-residual, and what counts of it.
-        draws: of noise.
+        residual, counts: its innovations, and what counts of them.
+        draws: of noise, each with the innovations' sizes and signs of its own.
         generator: of the draws.
     """
     prepared, model = base.model.prepared, base.model
     assert isinstance(prepared, PreparedDynamics)
     theta, changes = base.parameters[: model.base], model.changes(base.parameters)
-    maps = rescaled(prepared, theta, changes, model.near, SHARES)
-    if not maps:
+    maps = rescaled(prepared, theta, changes, model.near, SHARES, counts)
+    linear = unclipped(prepared, theta, changes, model.near, counts)
+    if not maps or linear is None:
         return None
-    noise = torch.randn(*values.shape, draws, generator=generator, dtype=values.dtype)
+    values = linear[0](residual)
+    sign = 2.0 * torch.randint(2, (*values.shape, draws), generator=generator).to(values.dtype) - 1.0
     scale = (counts * values.square()).sum(0).div(counts.sum(0).clamp(min=1.0)).sqrt()
-    series = torch.cat([values.unsqueeze(-1), noise * scale.unsqueeze(-1)], -1)
+    series = torch.cat([values.unsqueeze(-1), sign * values.unsqueeze(-1)], -1)
     sizes = [one.shape[-1] for one in tangents.candidates]
-    columns = torch.cat([series, tangents.nuisance, *tangents.candidates], -1)
+    columns = torch.cat([series, linear[1](torch.cat([tangents.nuisance, *tangents.candidates], -1))], -1)
     C, B = len(terms), 1 + draws
     null, best = values.new_full((B,), -torch.inf), values.new_full((C, B), -torch.inf)
     share = values.new_zeros(C)

@@ -22,7 +22,7 @@ from mkc_torch.simulation.protocol import Answer, Changes, Nearby
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Correcting", "Disturbance", "Observable", "Observer"]
+__all__ = ["Correcting", "Disturbance", "Observable", "Observer", "clipped", "clipped_slope"]
 
 _CLIP = 4.0
 """Standard deviations of what is new in a sample beyond which it moves the states no further: it may be an outlier."""
@@ -80,6 +80,17 @@ class Observer:
         return torch.einsum("nij,nj->ni", self.white, new)
 
 
+def clipped(new: Float[Tensor, "N m"], spread: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
+    """What an observer takes of innovations of these standard deviations: a few of them at most."""
+    limit = _CLIP * spread
+    return limit * torch.tanh(new / limit)
+
+
+def clipped_slope(new: Float[Tensor, "N m"], spread: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
+    """The derivative of :func:`clipped` by the innovations."""
+    return 1.0 - torch.tanh(new / (_CLIP * spread)).square()
+
+
 @dataclass(frozen=True)
 class Correcting:
     """The jump of a trajectory's states at the samples.
@@ -100,15 +111,13 @@ class Correcting:
 
     def applied(self, states: Float[Tensor, "G n"]) -> Float[Tensor, "G n"]:
         at = states[self.rows]
-        limit = _CLIP * self.observer.spread
-        moved = limit * torch.tanh((self.measured - self.predict(at)) / limit)
+        moved = clipped(self.measured - self.predict(at), self.observer.spread)
         return states.index_put((self.rows,), at + self._spread_out(torch.einsum("nkm,nm->nk", self._gain, moved), at))
 
     def slope(self, states: Float[Tensor, "G n"]) -> Float[Tensor, "G n n"]:
         at = states[self.rows]
-        limit = _CLIP * self.observer.spread
-        given = torch.tanh((self.measured.detach() - self.predict(at).detach()) / limit)
-        C = slopes(self.predict, at) * (1.0 - given.square()).unsqueeze(-1)
+        slope = clipped_slope(self.measured.detach() - self.predict(at).detach(), self.observer.spread)
+        C = slopes(self.predict, at) * slope.unsqueeze(-1)
         n = states.shape[1]
         eye = torch.eye(n, dtype=states.dtype, device=states.device).expand(len(states), n, n)
         pulled = self._spread_out(-(self._gain @ C).movedim(1, -1), at).movedim(-1, 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,13 +13,13 @@ from torch import Tensor
 from mkc_torch.simulation.dynamics.disturbances import observer_of
 from mkc_torch.simulation.dynamics.flow import flow_of
 from mkc_torch.simulation.dynamics.kalman import Flow
-from mkc_torch.simulation.dynamics.observer import Disturbance, Observable, Observer
+from mkc_torch.simulation.dynamics.observer import Disturbance, Observable, Observer, clipped, clipped_slope
 from mkc_torch.simulation.protocol import Changes, Nearby
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Rescaled", "rescaled"]
+__all__ = ["Rescaled", "rescaled", "unclipped"]
 
 
 class Rescaled:
@@ -28,10 +29,14 @@ class Rescaled:
         flow: along the trajectory of the one.
         one, other: the observers, for pushes at the same places of the same duration.
         rates: names of the states that can be pushed.
+        slope: (N, m), of what the one is corrected by over its innovation; 1 where it is linear.
     """
 
-    def __init__(self, flow: Flow, one: Observer, other: Observer, rates: Sequence[str]) -> None:
+    def __init__(
+        self, flow: Flow, one: Observer, other: Observer, rates: Sequence[str], slope: Float[np.ndarray, "N m"]
+    ) -> None:
         self.other = other
+        self._slope = slope
         self._flow = flow
         self._n = flow.carried.shape[1]
         self._lasting = one.lasting
@@ -70,12 +75,17 @@ class Rescaled:
             new = self._back[row] @ given[row]
             left = new - self._seen[row] @ state
             out[row] = self._white[row] @ left
-            state = state + after[row] @ left - before[row] @ new
+            state = state + after[row] @ left - before[row] @ (self._slope[row][:, None] * new)
         return torch.from_numpy(out).reshape(values.shape)
 
 
 def rescaled(
-    prepared: Observable, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None, shares: Sequence[float]
+    prepared: Observable,
+    theta: Float[Tensor, " p"],
+    changes: Changes,
+    near: Nearby | None,
+    shares: Sequence[float],
+    counts: Float[Tensor, "N m"] | None = None,
 ) -> list[Rescaled]:
     """The maps to observers for these shares of an observer's pushes; none where there is no trajectory.
 
@@ -83,14 +93,63 @@ def rescaled(
         prepared: the observed simulation.
         theta, changes, near: of its trajectory.
         shares: of the pushes' sizes.
+        counts: 0 for samples that correct nothing; with them the maps are of what :func:`unclipped` gives.
     """
-    flow, one = flow_of(prepared, theta, changes, near), prepared.observer
-    if flow is None or one is None:
+    found = _along(prepared, theta, changes, near, counts)
+    if found is None:
         return []
-    found = []
+    flow, one = found
+    maps, linear = [], np.ones(one.spread.shape)
     for share in shares:
         pushes = tuple(Disturbance(d.place, d.at_rate, d.lasting, share * d.size) for d in one.disturbances)
         other = observer_of(flow, pushes, one.sensor, prepared.pushable, prepared.channels)
         assert other is not None
-        found.append(Rescaled(flow, one, other, prepared.pushable))
-    return found
+        maps.append(Rescaled(flow, one, other, prepared.pushable, linear))
+    return maps
+
+
+def unclipped(
+    prepared: Observable,
+    theta: Float[Tensor, " p"],
+    changes: Changes,
+    near: Nearby | None,
+    counts: Float[Tensor, "N m"],
+) -> tuple[Rescaled, Rescaled] | None:
+    """The maps to the same pushes' observer with no limit to its corrections: of innovations, and of their tangents.
+
+    An observer corrects by no more than a few standard deviations, so that an outlier does not carry it away, and by a
+    little less than its gain already at one of them, which adds up to much over a recording.
+
+    Args:
+        prepared, theta, changes, near, counts: as of :func:`rescaled`.
+    """
+    found = _along(prepared, theta, changes, near, counts)
+    if found is None or prepared.observer is None:
+        return None
+    flow, other = found
+    one = prepared.observer
+    new, spread = torch.from_numpy(flow.new), one.spread.double().cpu()
+    taken = torch.where(new == 0, 1.0, clipped(new, spread) / torch.where(new == 0, 1.0, new))
+    series, tangents = (
+        Rescaled(flow, one, other, prepared.pushable, slope.numpy()) for slope in (taken, clipped_slope(new, spread))
+    )
+    return series, tangents
+
+
+def _along(
+    prepared: Observable,
+    theta: Float[Tensor, " p"],
+    changes: Changes,
+    near: Nearby | None,
+    counts: Float[Tensor, "N m"] | None,
+) -> tuple[Flow, Observer] | None:
+    """The flow, and the observer of the same pushes along it with the samples that count."""
+    flow, one = flow_of(prepared, theta, changes, near), prepared.observer
+    if flow is None or one is None:
+        return None
+    if counts is None:
+        return flow, one
+    flow = replace(flow, counts=flow.counts * counts.double().cpu().numpy())
+    other = observer_of(flow, one.disturbances, one.sensor, prepared.pushable, prepared.channels)
+    assert other is not None
+    return flow, other
