@@ -22,6 +22,12 @@ __all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_beside", "withou
 _CLIP = 2.0
 """Robust standard deviations at which residuals are clipped where a fit is only begun with them."""
 
+_WIDE = 1.5
+"""Robust standard deviations of the residual beyond which a scale is suspected to be that of another one."""
+
+_NARROWER = 2
+"""Times that a fit with such a scale is begun again where it ended."""
+
 _SHARES = (1.0, 0.3, 0.1, 0.01, 0.0)
 """Of the size that an effect begins with, tried one after the other where the simulation has no finite answer."""
 
@@ -73,10 +79,31 @@ def fitted(
         rows: weights of the samples; 0 leaves one out.
         graduate: False for a start near the answer.
     """
+    found = _fit(model, _usable(model, start), bound, rows, graduate=graduate)
+    for _ in range(_NARROWER):
+        seen = found.residual if rows is None else found.residual[rows > 0]
+        if not bool((found.d > _WIDE * robust_scale(seen)).any()):
+            break
+        # a scale that suited the residuals where the fit began can hold on beside one that suits those of its end
+        again = _fit(found.model, found.parameters, found.bound, rows, graduate=False)
+        if not again.log_likelihood > found.log_likelihood:
+            break
+        found = again
+    return found
+
+
+def _fit(
+    model: JointModel,
+    start: Float[Tensor, " p"],
+    bound: Float[Tensor, " m"] | None,
+    rows: Float[Tensor, " N"] | None,
+    *,
+    graduate: bool,
+) -> FittedModel:
     way = model.continuation()
     found = nonlinear.fit(
         way,
-        _usable(model, start),
+        start,
         bound=bound,
         weight=rows,
         prior=model.prior,

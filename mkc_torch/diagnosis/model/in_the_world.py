@@ -68,6 +68,11 @@ class InTheWorld:
         """Whether more than the sensors' white noise is in it."""
         return self.noise is not None and self.noise.observer is not None
 
+    @property
+    def pushes(self) -> int:
+        """How many disturbances are in it."""
+        return 0 if self.noise is None else len(self.noise.disturbed.disturbances)
+
 
 def at_liberty(prepared: PreparedSimulation) -> PreparedSimulation:
     """The simulation as it runs freely."""
@@ -340,7 +345,7 @@ def between_samples(
         others = [one for one in ("held", "linear") if one != how] if name not in fixed else []
         works = [partial(_holding, base, name, other, declared, settings) for other in others]
         tried = [one for one in at_once(works, prepared) if one is not None]
-        base = max([base, *tried], key=lambda one: one.fit.log_likelihood)
+        base = max([base, *tried], key=lambda one: one.fit.log_likelihood - settings.pushed * one.pushes)
     return _with_sizes(base)
 
 
@@ -369,8 +374,10 @@ def _holding(
         if base.free is not None:
             model = JointModel(prepared.observed(None), (), base.free.model.near)
             free = fitted(model, base.free.parameters, base.free.bound, graduate=False)
-        if not base.pushed and free is not None:
-            return replace(in_the_world(free, declared, settings), starts=base.starts)
+        if free is not None:
+            running = replace(in_the_world(free, declared, settings), starts=base.starts)
+            if not (base.pushed and running.pushed):
+                return running
         fit = fitted(JointModel(prepared, (), base.fit.model.near), base.fit.parameters, base.fit.bound)
     except NoFitError:
         return None

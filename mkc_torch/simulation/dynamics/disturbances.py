@@ -244,7 +244,8 @@ def _exactly(flow: Flow, noise: _Noise) -> tuple[float, float]:
 
 
 def _by_parts(parts: Parts, flow: Flow, noises: Sequence[_Noise]) -> tuple[np.ndarray, np.ndarray]:
-    return robust_likelihood(filtered(parts, _models(flow, noises)), parts.mine, free=not any(noises[0].known))
+    found = filtered(parts, _models(flow, noises))
+    return robust_likelihood(found, parts.mine, flow.reach, free=not any(noises[0].known))
 
 
 @lru_cache(maxsize=2)

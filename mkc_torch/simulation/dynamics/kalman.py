@@ -7,7 +7,9 @@ Filtering", 1979, 6.4), and an innovation far outside of its distribution moves 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,8 +20,18 @@ if TYPE_CHECKING:
 __all__ = ["Filtered", "Flow", "Models", "filtered", "robust_likelihood", "smoothed"]
 
 _CLIP = 4.0
-_CORNER = 2.5
-_SCALINGS = 30
+_OUTLIERS = 0.05
+"""Share of the innovations that may be anywhere."""
+
+_SCALINGS = 100
+_SETTLED = 1e-9
+"""Share of a scale by which its last step moved it, at most."""
+
+_FAR = 700.0
+"""Nats beyond which an exponential is none."""
+
+_REACH = 20.0
+"""Robust standard deviations within which an outlier may be at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +61,14 @@ class Flow:
     @property
     def rates(self) -> int:
         return self.pushed.shape[-1]
+
+    @cached_property
+    def reach(self) -> Float[np.ndarray, " m"]:
+        """How far outliers of each output may be from the trajectory: as far as any of its samples."""
+        away = np.where(self.counts > 0, np.abs(self.new), 0.0)
+        used = [one[on > 0] for one, on in zip(away.T, self.counts.T, strict=True)]
+        usual = [_REACH * float(np.median(one)) / 0.6745 if len(one) else 0.0 for one in used]
+        return np.maximum(np.maximum(away.max(0), usual), 1e-300)
 
     def in_parts(self, length: int, before: int) -> Parts:
         """Stretches of so many samples, each with some before it in which a filter finds its way."""
@@ -201,27 +221,40 @@ def filtered(flow: Parts, models: Models, *, keep: bool = False) -> Filtered:
 
 
 def robust_likelihood(
-    found: Filtered, counts: Float[np.ndarray, "L G m"], *, free: bool = True
+    found: Filtered,
+    counts: Float[np.ndarray, "L G m"],
+    reach: Float[np.ndarray, " m"],
+    *,
+    free: bool = True,
 ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"]]:
-    """Log-likelihood of each model by Huber's density for innovations, and its scale: profiled out if free, else one.
+    """Log-likelihood of each model with a few outliers among the innovations, and its scale: profiled out, or one.
 
-    Huber, "Robust Statistics" (1981), 4.5 and 7.7.
+    An innovation is normal, or anywhere within the reach of its output, whatever the model: so an outlier, or a burst
+    of them, speaks for no model. (A contaminated normal density: Tukey 1960; Huber, "Robust Statistics", 1981, 1.1.)
+
+    Args:
+        found: of the filters.
+        counts: which innovations count.
+        reach: how far from what is predicted an outlier may be.
+        free: whether the scale is profiled out.
     """
     B = found.standard.shape[2]
     used = counts > 0
-    z = np.abs(found.standard).swapaxes(2, 3)[used].T  # (B, samples that count)
-    spread = found.log_spread.swapaxes(2, 3)[used].sum(0)
-    total = float(used.sum())
-    scale = np.maximum(np.median(z, -1) / 0.6745, 1e-300) if free else np.ones(B)
+    square = np.square(found.standard.swapaxes(2, 3)[used].T)  # (B, samples that count)
+    spread = found.log_spread.swapaxes(2, 3)[used].T
+    tail = math.log(math.sqrt(0.5 * math.pi) * _OUTLIERS / (1.0 - _OUTLIERS)) - np.log(reach)
+    # of an outlier's density over the normal one's at its middle
+    odds = np.broadcast_to(tail, counts.shape)[used] + spread
+    scale = np.maximum(np.sqrt(np.median(square, -1)) / 0.6745, 1e-300) if free else np.ones(B)
     for _ in range(_SCALINGS if free else 0):
-        ratio = z / scale[:, None]
-        # the scale at which Huber's density is likeliest
-        inner = ratio * np.minimum(ratio, _CORNER)
-        scale = scale * np.sqrt(np.maximum(inner.sum(-1) / total, 1e-12))
-    ratio = z / scale[:, None]
-    rho = np.where(ratio <= _CORNER, 0.5 * ratio**2, _CORNER * ratio - 0.5 * _CORNER**2)
-    value = -rho.sum(-1) - spread - total * np.log(scale)
-    return value, scale
+        away = np.clip(odds + np.log(scale)[:, None] + 0.5 * square / scale[:, None] ** 2, None, _FAR)
+        inner = 1.0 / (1.0 + np.exp(away))
+        before, scale = scale, np.sqrt(np.maximum((inner * square).sum(-1) / inner.sum(-1), 1e-300))
+        if np.abs(scale / before - 1.0).max() < _SETTLED:
+            break
+    log = np.log(scale)[:, None]
+    normal = -0.5 * square / scale[:, None] ** 2 - log - spread
+    return np.logaddexp(normal, odds - spread).sum(-1), scale
 
 
 def smoothed(

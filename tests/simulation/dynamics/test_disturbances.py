@@ -145,7 +145,7 @@ class TestSought:
         assert found.sensor.tolist() == pytest.approx([0.01, 0.2], rel=0.35)
         # of what is returned, but for what counts as far out
         models = models_of(along, found.disturbances, found.sensor, RATES, ("position", "speed"))
-        (value,), (scale,) = robust_likelihood(filtered(along.whole, models), along.whole.mine)
+        (value,), (scale,) = robust_likelihood(filtered(along.whole, models), along.whole.mine, along.reach)
         assert value == pytest.approx(found.log_likelihood, abs=0.05)
         assert scale == pytest.approx(1.0, abs=0.01)
 

@@ -96,7 +96,7 @@ def test_innovations_have_the_likelihood_of_all_samples_together(kind, seen, run
     used = counts[:, :, None] > 0
     assert (found.standard[used] ** 2).sum() / TINY**2 == pytest.approx(exponent, rel=1e-6)
     assert -found.log_spread[used].sum() == pytest.approx(spread, rel=1e-9)
-    value, scale = robust_likelihood(found, counts, free=False)
+    value, scale = robust_likelihood(found, counts, np.full(len(seen), np.inf), free=False)
     assert value[0] == pytest.approx(spread - 0.5 * TINY**2 * exponent, rel=1e-9)
     assert scale[0] == 1.0
 
@@ -216,40 +216,47 @@ class TestParts:
         along = replace(along, spread=pushed(along, course(random, along, 0.0, 2.0)).std(0))
         parts = along.in_parts(150, 100)
         assert parts.inside.tolist() == [False, True, True, True]
-        values, _ = robust_likelihood(filtered(parts, models), parts.mine)
-        expected, _ = robust_likelihood(filtered(along.whole, models), along.whole.mine)
+        values, _ = robust_likelihood(filtered(parts, models), parts.mine, along.reach)
+        expected, _ = robust_likelihood(filtered(along.whole, models), along.whole.mine, along.reach)
         np.testing.assert_allclose(values, expected, atol=0.01)
         assert np.ptp(expected) > 10.0
 
 
 class TestRobust:
-    """Huber's likelihood of innovations."""
+    """The likelihood of innovations a few of which may be anywhere."""
 
-    @staticmethod
-    def of(standard, log_spread=0.0):
+    REACH = 40.0
+
+    @classmethod
+    def of(cls, standard, log_spread=0.0):
         z = np.asarray(standard)[:, None, None, None]
         matrix, vector = np.zeros((0, 1, 1, 1, 1)), np.zeros((0, 1, 1, 1))
         found = Filtered(z, np.full(z.shape, log_spread), matrix, vector, vector, matrix)
-        return robust_likelihood(found, np.ones((*z.shape[:2], 1)))
+        return robust_likelihood(found, np.ones((*z.shape[:2], 1)), np.array([cls.REACH]))
 
     def test_the_scale_is_the_likeliest(self):
         z = np.random.default_rng(0).standard_t(3, 400)
-        value, scale = self.of(z)
+        (value,), (scale,) = self.of(z)
 
         def at(one):
-            ratio = np.abs(z) / one
-            return -np.where(ratio < 2.5, ratio**2 / 2, 2.5 * ratio - 2.5**2 / 2).sum() - 400 * np.log(one)
+            normal = np.exp(-0.5 * (z / one) ** 2) / (np.sqrt(2.0 * np.pi) * one)
+            density = 0.95 * normal + 0.05 / (2.0 * self.REACH)
+            return np.log(density * np.sqrt(2.0 * np.pi) / 0.95).sum()
 
-        assert value[0] == pytest.approx(at(scale[0]), rel=1e-12)
-        assert at(scale[0]) >= max(at(scale[0] * factor) for factor in (0.9, 0.99, 0.999, 1.001, 1.01, 1.1))
+        assert value == pytest.approx(at(scale), rel=1e-12)
+        assert at(scale) >= max(at(scale * factor) for factor in (0.9, 0.99, 0.999, 1.001, 1.01, 1.1))
 
-    def test_the_scale_is_one_for_normal_innovations_and_few_outliers_change_it_by_little(self):
+    def test_the_scale_is_one_for_normal_innovations_and_outliers_change_it_by_little(self):
         z = np.random.default_rng(1).standard_normal(4000)
         assert self.of(z)[1][0] == pytest.approx(1.0, abs=0.04)
-        z[::50] = 1e4
-        assert self.of(z)[1][0] > 3.0
-        z[::50] = 8.0
-        assert self.of(z)[1][0] < 1.25
+        z[::20] = 30.0
+        assert self.of(z)[1][0] == pytest.approx(1.0, abs=0.05)
+
+    def test_an_outlier_speaks_for_no_model(self):
+        """Of two that have it at 10 and at 40 standard deviations neither is likelier for it."""
+        z = np.random.default_rng(1).standard_normal(400)
+        near, far = np.append(z, 10.0), np.append(z, 40.0)
+        assert self.of(near)[0] == pytest.approx(self.of(far)[0], abs=1e-6)
 
     @given(factor=st.floats(1e-3, 1e3))
     @settings(max_examples=20, deadline=None, derandomize=True)
