@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Literal
 
+import torch
+
 from mkc_torch.diagnosis.result import Finding, HeldOut
 from mkc_torch.diagnosis.world import Grade
 
@@ -16,6 +18,7 @@ __all__ = [
     "confirmation",
     "confirmed",
     "grade_of",
+    "sizeless",
     "small",
     "worth_correcting",
 ]
@@ -50,9 +53,25 @@ def confirmation(gain: float, interval: tuple[float, float]) -> Confirmation:
 
 
 def confirmed(finding: Finding) -> bool:
-    """Whether unseen blocks surely confirm it; of an event that cannot be held out the search alone has to."""
+    """Whether unseen blocks surely confirm it; of an event that cannot be held out the search alone has to.
+
+    One without a size is none, whatever the blocks show: something that came with it, such as another noise, made the
+    difference.
+    """
+    if sizeless(finding):
+        return False
     held = finding.held_out
     return held is None or confirmation(held.log_likelihood_gain, held.confidence_interval) == "surely"
+
+
+def sizeless(finding: Finding) -> bool:
+    """Whether each of its numbers is as well 0, within one standard error; of what has no standard errors, never."""
+    known = [
+        (torch.as_tensor(one.value), torch.as_tensor(one.standard_error))
+        for one in finding.parameters
+        if one.standard_error is not None
+    ]
+    return bool(known) and all(bool((value.abs() < error).all()) for value, error in known)
 
 
 def change(held_out: HeldOut) -> float:

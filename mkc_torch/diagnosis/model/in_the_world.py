@@ -14,6 +14,7 @@ from torch import Tensor
 from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import over_short_horizons, strong_observer
@@ -225,7 +226,7 @@ def between_beside_effects(
                 under = fitted(JointModel(moved, fit.model.terms, fit.model.near), fit.parameters, fit.bound)
             except NoFitError:
                 continue
-            found = beside_effects(under, noise_of(moved, declared), declared, settings)
+            found = beside_effects(shape_fitted(under), noise_of(moved, declared), declared, settings)
             if found.log_likelihood > fit.log_likelihood:
                 fit, prepared = found, found.model.prepared
                 assert isinstance(prepared, PreparedDynamics)

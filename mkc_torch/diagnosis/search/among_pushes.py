@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.at_once import at_once
-from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_beside
 from mkc_torch.diagnosis.model.in_the_world import beside_effects, between_beside_effects, noise_around, pushed
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shaped import shape_fitted
@@ -80,10 +81,11 @@ def located_among_pushes(
         fits = at_once(works, base.model.prepared, [terms[number] for number in chosen])
         best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer)
         best = between_beside_effects(best, declared, fixed, settings.noise)
+    needless = bool(fits) and _needless(base, best, declared, settings)
     return Located(
         best.model.terms[-1],
         best,
-        found.p_value,
+        1.0 if needless else found.p_value,
         found.beyond,
         ranking,
         look.noise,
@@ -170,6 +172,25 @@ def _own(
     left = noise_around(running, declared, settings.noise)
     white = left is not None and left.observer is None
     return running if white or running.log_likelihood > under.log_likelihood else under
+
+
+def _needless(base: FittedModel, best: FittedModel, declared: Mapping[str, float], settings: Settings) -> bool:
+    """Whether the noise that was found beside an effect does as much without it.
+
+    A candidate that only led to a likelier noise is no finding: its size is nothing, or anything.
+    """
+    prepared, own = best.model.prepared, base.model.size
+    if not pushed(best):
+        return False
+    assert isinstance(prepared, PreparedDynamics)
+    model = JointModel(prepared, base.model.terms, base.model.near)
+    try:
+        without = fitted(model, best.parameters[:own], base.bound, graduate=False)
+    except NoFitError:
+        return False
+    bare = beside_effects(without, noise_of(prepared, declared), declared, settings.noise)
+    price = 0.5 * (best.model.size - own) * math.log(len(base.residual))
+    return best.log_likelihood - bare.log_likelihood < price
 
 
 def _with_none(free: FittedModel, term: Term) -> Tensor:

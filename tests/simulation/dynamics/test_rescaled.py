@@ -7,7 +7,7 @@ import torch
 from mkc_torch.simulation.dynamics.disturbances import observer_of
 from mkc_torch.simulation.dynamics.flow import flow_of
 from mkc_torch.simulation.dynamics.observer import Disturbance
-from mkc_torch.simulation.dynamics.rescaled import rescaled
+from mkc_torch.simulation.dynamics.rescaled import rescaled, unclipped
 from tests.simulation.dynamics.oscillating import course, flow, oscillator, pushed, recorded, theta_of
 
 NOISE = 0.01
@@ -105,3 +105,50 @@ def test_there_is_none_of_a_free_run():
     watched, theta = world(DISTURBANCES["white push"])
     assert rescaled(watched.observed(None), theta, {}, None, (1.0, 0.5)) == []
     assert len(rescaled(watched, theta, {}, None, (1.0, 0.5))) == 2
+
+
+class TestUnclipped:
+    """Innovations of their usual size, which an observer takes a little less of than its gains say."""
+
+    @staticmethod
+    def loud():
+        """An oscillator as noisy as its observer has it, with one outlier."""
+        along, random = flow(200), np.random.default_rng(3)
+        states = pushed(along, course(random, along, 0.0, 1.0)) + NOISE * random.standard_normal((200, 2))
+        states[150, 0] += 30.0 * NOISE
+        prepared = oscillator(step=0.025).prepare(recorded(along, 1, position=states[:, 0], speed=states[:, 1]))
+        theta = theta_of(prepared)
+        watched = prepared.observed(observer(prepared, theta, DISTURBANCES["white push"], 1.0))
+        counts = torch.ones_like(watched.measured)
+        counts[150] = 0.0
+        return watched, theta, counts
+
+    def test_no_share_is_the_free_run_s_residual(self):
+        watched, theta, counts = self.loud()
+        innovations, free = watched.residual(theta, {}), watched.observed(None).residual(theta, {})
+        series, _ = unclipped(watched, theta, {}, None, counts)
+        (none,) = rescaled(watched, theta, {}, None, (0.0,), counts)
+        scale = float(free.abs().median())
+        torch.testing.assert_close(none(series(innovations)), free, rtol=0.0, atol=1e-4 * scale)
+        assert float((none(innovations) - free).abs().max()) > 0.1 * scale
+
+    def test_tangents_by_the_first_states_are_those_of_the_free_run(self):
+        watched, theta, counts = self.loud()
+        free = watched.observed(None)
+        theirs, expected = (torch.func.jacfwd(lambda t, w=w: w.residual(t, {}))(theta) for w in (watched, free))
+        _, tangents = unclipped(watched, theta, {}, None, counts)
+        (none,) = rescaled(watched, theta, {}, None, (0.0,), counts)
+        for k in (2, 3):
+            scale = float(expected[..., k].abs().max())
+            torch.testing.assert_close(none(tangents(theirs))[..., k], expected[..., k], rtol=0.0, atol=1e-3 * scale)
+
+    def test_what_does_not_count_corrects_nothing(self):
+        watched, theta, counts = self.loud()
+        counts[100] = 0.0
+        (whole,) = rescaled(watched, theta, {}, None, (1.0,), counts)
+        assert float(whole.other.gain[100].abs().max()) == 0.0
+        assert float(watched.observer.gain[100].abs().max()) > 0.0
+
+    def test_there_is_none_of_a_free_run(self):
+        watched, theta, counts = self.loud()
+        assert unclipped(watched.observed(None), theta, {}, None, counts) is None

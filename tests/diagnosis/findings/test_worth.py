@@ -1,0 +1,32 @@
+"""What a finding is worth."""
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis.findings.worth import grade_of, sizeless
+from mkc_torch.diagnosis.result import Finding, HeldOut, Parameter, Told
+
+SURE = (Told("held_out", (HeldOut(0.3, (0.2, 0.4), 2.0, 1.0, "µT"), "")),)
+
+
+def finding(*numbers):
+    parameters = tuple(Parameter(f"number {k}", value, error, "") for k, (value, error) in enumerate(numbers))
+    return Finding("coupling", (), (), (), None, "", "", parameters, 0.01, (), True, "", evidence=SURE)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "none"),
+    [
+        (((0.3, 0.1),), False),
+        (((0.0, 0.1),), True),
+        (((0.0, 0.1), (0.5, 0.1)), False),
+        (((0.0, 0.1), (12.0, None)), True),
+        (((12.0, None),), False),
+        (((torch.tensor([0.1, 0.2]), torch.tensor([0.3, 0.3])),), True),
+        (((torch.tensor([0.1, 0.9]), torch.tensor([0.3, 0.3])),), False),
+    ],
+)
+def test_what_has_no_size_is_not_confirmed_whatever_blocks_show(numbers, none):
+    found = finding(*numbers)
+    assert sizeless(found) is none
+    assert grade_of(found) == ("not confirmed" if none else "left out")
