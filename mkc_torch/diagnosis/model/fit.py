@@ -22,7 +22,7 @@ __all__ = ["FittedModel", "clipped_residual", "fitted", "fitted_beside", "withou
 _CLIP = 2.0
 """Robust standard deviations at which residuals are clipped where a fit is only begun with them."""
 
-_WIDE = 1.5
+_WIDE = 1.2
 """Robust standard deviations of the residual beyond which a scale is suspected to be that of another one."""
 
 _NARROWER = 2
