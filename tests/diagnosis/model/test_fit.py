@@ -1,0 +1,36 @@
+"""Fits of a joint model."""
+
+import numpy as np
+import torch
+
+from mkc_torch import Recording
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.simulation import Dynamics, Parameter
+
+NOISE = 0.002
+
+
+class Decay(Dynamics):
+    states = ("level",)
+    parameters = {"rate": Parameter(0.5, lower=0.0)}  # noqa: RUF012
+    step = 0.05
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"level": -p.rate * x.level}
+
+
+def test_a_scale_is_that_of_the_residuals_where_a_fit_ends():
+    """From a start whose residuals are as wide as the bursts of outliers, beside a domain far wider than either."""
+    random, time = np.random.default_rng(0), np.arange(300) * 0.02
+    level = np.exp(-0.7 * time) + NOISE * random.standard_normal(300)
+    for first in range(20, 300, 60):
+        level[first : first + 3] += NOISE * random.uniform(5.0, 50.0, 3) * random.choice([-1.0, 1.0], 3)
+    prepared = Decay().prepare(Recording({"time": torch.from_numpy(time), "level": torch.from_numpy(level)}))
+    model, bound = JointModel(prepared), torch.tensor([300.0 * NOISE], dtype=torch.float64)
+    start = torch.tensor([0.72, 1.0], dtype=torch.float64)
+    found = fitted(model, start, bound, graduate=False)
+    assert abs(float(found.parameters[0]) - 0.7) < 0.005
+    assert 0.5 * NOISE < float(found.d) < 1.5 * NOISE
+    again = fitted(model, found.parameters, bound)
+    assert abs(again.log_likelihood - found.log_likelihood) < 1.0
