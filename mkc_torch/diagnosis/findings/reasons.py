@@ -190,8 +190,13 @@ def _size(
     prepared: PreparedDynamics, fits: Sequence[FittedModel], *, thorough: bool = False
 ) -> tuple[Tensor | None, Tensor | None]:
     """The smallest residual of a changed simulation from a few starts, and its parameters."""
-    short = over_short_horizons(prepared, prepared.given) if thorough else None
-    starts = [fits[0].parameters[: len(prepared.parameter_names)] if short is None else short]
+    starts = [fits[0].parameters[: len(prepared.parameter_names)]]
+    if thorough:
+        ends, begun = at_ends(fits[0]), prepared.given.clone()
+        for number, name in enumerate(prepared.known):
+            begun[number] = -begun[number] if name in ends else begun[number]
+        found = [over_short_horizons(prepared, one) for one in (prepared.given, begun)]
+        starts = [one for one in found if one is not None] or starts
     best: tuple[Tensor | None, Tensor | None] = None, None
     for start in starts:
         try:
