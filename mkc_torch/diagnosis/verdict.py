@@ -15,27 +15,22 @@ from mkc_torch.diagnosis.settings import EvidenceSettings, NoiseSettings
 from mkc_torch.diagnosis.world import Follows, Verdict, World
 from mkc_torch.simulation.dynamics.noise import NoiseOfTheWorld
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
-from mkc_torch.simulation.magnetometer.view import View
 
 __all__ = ["Around", "alone", "around", "lost_from_the_start", "verdict_of", "world_of"]
 
 
 @dataclass(frozen=True)
 class Around:
-    """What stands around a simulation's fits: how it follows alone and corrected, and the noise that is left.
-
-    ``sensor`` says that it is the simulation of a sensor, and runs through no states.
-    """
+    """What stands around a simulation's fits: how it follows alone and corrected, and the noise that is left."""
 
     follows: tuple[Follows, ...]
     corrected: tuple[Follows, ...]
     ends: tuple[str, ...]
     noise: NoiseOfTheWorld | None
-    sensor: bool = False
 
     def unfit(self, settings: EvidenceSettings) -> bool:
         """Whether the simulation does not follow, and no finding makes it follow with parameters that it allows."""
-        if not misses(self.follows, settings.sensed if self.sensor else settings.followed):
+        if not misses(self.follows, settings.followed):
             return False
         return not self.corrected or bool(self.ends) or bool(misses(self.corrected, settings.mended))
 
@@ -69,8 +64,7 @@ def around(base: InTheWorld, final: FittedModel, declared: Mapping[str, float], 
         free = freed(final)
         floor = [one.noise_floor for one in follows]
         corrected = () if free is None else follows_of(free.model.prepared, free.residual, declared, floor)
-    sensor = isinstance(final.model.prepared, View)
-    return Around(follows, corrected, at_ends(final), left, sensor)
+    return Around(follows, corrected, at_ends(final), left)
 
 
 def world_of(base: InTheWorld, final: FittedModel, known: Around, *, unfit: bool) -> World:

@@ -115,10 +115,3 @@ def test_a_finding_beside_a_parameter_at_the_end_of_its_range_does_not_rescue():
     assert verdict(around(LOST, corrected=(FOLLOWING,), ends=("stiffness",)), FIRST) == "unfit"
     # an end alone is no misfit
     assert verdict(around(FOLLOWING, ends=("stiffness",))) == "adequate"
-
-
-@pytest.mark.parametrize(("explained", "unfit"), [(0.89, True), (0.91, False)])
-def test_a_sensor_has_to_follow_more_closely_than_a_run_does(explained, unfit):
-    known = Around((make_follows(explained=explained),), (), (), None, sensor=True)
-    assert known.unfit(EvidenceSettings()) is unfit
-    assert not around(make_follows(explained=explained)).unfit(EvidenceSettings())
