@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,9 @@ _FAR = 5.0
 
 _CORNER, _EXPECTED, _ROUNDS = 2.5, 0.97764, 30
 """Standard deviations at which a residual's square ends, and the mean of that of a normal variable."""
+
+_LENGTH = (3.0 - 8.0 / math.pi) ** 0.5
+"""Standard deviation of the length of a vector of three independent standard normal numbers (Maxwell's)."""
 
 
 def size_of(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
@@ -56,8 +60,8 @@ def follows_of(
         return ()
     own = known - known.median(0).values
     if len(prepared.channels) == 1 and known.shape[1] > 1:
-        # a length is compared, and the vector varies
-        variation = size_of(own).square().mean().sqrt().reshape(1)
+        # a length is compared, and the vector varies: readings scattered alike in all directions leave that much of it
+        variation = _LENGTH * size_of(own).square().mean().sqrt().reshape(1)
         recorded = torch.linalg.vector_norm(known, dim=-1, keepdim=True)
     elif known.shape[1] == len(prepared.channels):
         variation, recorded = size_of(known - _middle(known)), known

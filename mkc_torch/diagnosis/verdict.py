@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from mkc_torch.diagnosis.findings.pushes import forcing_of, pushes_of
-from mkc_torch.diagnosis.findings.reasons import at_ends, reasons_of
+from mkc_torch.diagnosis.findings.reasons import at_ends, reasons_of, wrong_turns
 from mkc_torch.diagnosis.follows import follows_of, misses
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.in_the_world import InTheWorld, freed, noise_around
@@ -21,15 +21,21 @@ __all__ = ["Around", "alone", "around", "lost_from_the_start", "verdict_of", "wo
 
 @dataclass(frozen=True)
 class Around:
-    """What stands around a simulation's fits: how it follows alone and corrected, and the noise that is left."""
+    """What stands around a simulation's fits: how it follows alone and corrected, and the noise that is left.
+
+    ``lost`` says that no finding can make it follow: its recorded turns are wrong.
+    """
 
     follows: tuple[Follows, ...]
     corrected: tuple[Follows, ...]
     ends: tuple[str, ...]
     noise: NoiseOfTheWorld | None
+    lost: bool = False
 
     def unfit(self, settings: EvidenceSettings) -> bool:
         """Whether the simulation does not follow, and no finding makes it follow with parameters that it allows."""
+        if self.lost:
+            return True
         if not misses(self.follows, settings.followed):
             return False
         return not self.corrected or bool(self.ends) or bool(misses(self.corrected, settings.mended))
@@ -44,7 +50,9 @@ def alone(base: InTheWorld, declared: Mapping[str, float]) -> tuple[Follows, ...
 
 
 def lost_from_the_start(base: InTheWorld, declared: Mapping[str, float], settings: EvidenceSettings) -> bool:
-    """Whether nothing is to be searched: it does not follow, and its own parameters are where they cannot be."""
+    """Whether nothing is to be searched: it does not follow, and its turns or parameters are what they cannot be."""
+    if wrong_turns(base.fit.model.prepared):
+        return True
     return bool(misses(alone(base, declared), settings.followed)) and bool(at_ends(base.fit))
 
 
@@ -64,7 +72,7 @@ def around(base: InTheWorld, final: FittedModel, declared: Mapping[str, float], 
         free = freed(final)
         floor = [one.noise_floor for one in follows]
         corrected = () if free is None else follows_of(free.model.prepared, free.residual, declared, floor)
-    return Around(follows, corrected, at_ends(final), left)
+    return Around(follows, corrected, at_ends(final), left, bool(wrong_turns(final.model.prepared)))
 
 
 def world_of(base: InTheWorld, final: FittedModel, known: Around, *, unfit: bool) -> World:

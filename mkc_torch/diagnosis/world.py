@@ -41,7 +41,8 @@ class Follows:
     Attributes:
         output, unit: which.
         residual: robust size of recording less simulation.
-        variation: robust size of the output about its median.
+        variation: robust size of the output about its mean; of a length, what readings scattered as widely, and alike
+            in all directions, would leave.
         explained: share of the variation's square that the simulation explains; below 0 where it is worse than none.
         noise_floor: size of the sensor's white noise; ``floor_source`` says whether it was "declared", or estimated
             from what is new from one of the "samples" to the next, or from the steps of the recording's numbers,

@@ -122,12 +122,15 @@ def test_an_output_that_never_moves_is_not_explained():
     assert (one.variation, one.explained) == (0.0, 0.0)
 
 
-def test_of_a_length_the_vector_varies():
-    turning = torch.cat([TIME.sin().unsqueeze(-1), TIME.cos().unsqueeze(-1), 0.0 * WAVE], -1) * 50.0
-    one = followed(turning, 0.5 * randn(N, 1), channels=("norm",), unit="µT")[0]
+def test_of_a_length_varies_what_scattered_readings_would_leave():
+    scattered = 30.0 * randn(N, 3)
+    left = torch.linalg.vector_norm(scattered, dim=-1, keepdim=True)
+    one = followed(scattered, left - left.mean(), channels=("norm",), unit="µT")[0]
     assert one.output == "norm"
-    assert one.variation == pytest.approx(50.0 / 3.0**0.5, rel=0.02)
-    assert one.explained > 0.99
+    assert one.variation == pytest.approx(float(left.std()), rel=0.03)
+    assert one.explained == pytest.approx(0.0, abs=0.08)
+    turning = torch.cat([TIME.sin().unsqueeze(-1), TIME.cos().unsqueeze(-1), 0.0 * WAVE], -1) * 50.0
+    assert followed(turning, 0.5 * randn(N, 1), channels=("norm",), unit="µT")[0].explained > 0.99
 
 
 def test_a_simulation_without_a_recording_of_its_outputs_is_told_nothing_of():

@@ -19,11 +19,12 @@ from mkc_torch.diagnosis.world import Follows
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.first_fit import over_short_horizons
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["at_ends", "reasons_of"]
+__all__ = ["at_ends", "reasons_of", "wrong_turns"]
 
 _NOUGHT, _AWAY, _AT_END = 1e-3, 30.0, 1e-6
 """Times its first value at which a parameter is nearly 0, has run away, and is at an end of its range."""
@@ -64,6 +65,11 @@ def at_ends(fit: FittedModel) -> tuple[str, ...]:
     return tuple(found)
 
 
+def wrong_turns(prepared: PreparedSimulation) -> str:
+    """What is wrong with the recorded turns that a sensor is compared by; empty where nothing is."""
+    return getattr(prepared, "wrong_turns", "")
+
+
 def reasons_of(fits: Sequence[FittedModel], follows: Sequence[Follows]) -> tuple[str, ...]:
     """Sentences, the most likely reason first.
 
@@ -72,6 +78,8 @@ def reasons_of(fits: Sequence[FittedModel], follows: Sequence[Follows]) -> tuple
         follows: how it follows each output.
     """
     prepared = fits[0].model.prepared
+    if turns := wrong_turns(prepared):
+        return (turns,)
     if not isinstance(prepared, PreparedDynamics):
         return ("Look at signs, units and the order of columns: what is compared may be another quantity.",)
     prepared = prepared.observed(None)

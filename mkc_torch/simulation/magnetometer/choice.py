@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from torch import Tensor
 
@@ -17,7 +18,7 @@ from mkc_torch.simulation.magnetometer.misfit import left_by_attitude, left_by_g
 from mkc_torch.simulation.magnetometer.norm import NormView
 from mkc_torch.simulation.magnetometer.view import GYRO, QUATERNION, View
 
-__all__ = ["chosen_view"]
+__all__ = ["asked_view", "chosen_view"]
 
 V = TypeVar("V", bound=View)
 
@@ -51,6 +52,23 @@ def chosen_view(recording: Recording) -> NormView | AttitudeView | GyroView:
     return _length_or_gyroscope(recording)
 
 
+def asked_view(recording: Recording, use: str) -> NormView | AttitudeView | GyroView:
+    """The attitude's view, the gyroscope's or the length's, as it is asked for.
+
+    Turns that leave far more of the field than its length does are told in the view's ``wrong_turns``.
+
+    Raises:
+        NotIdentifiableError: that view does not determine the sensor.
+    """
+    if use == "norm":
+        return NormView(prepared(recording))
+    if use == "attitude":
+        usable = prepared(with_attitude(recording))
+        return _compared_by_attitude(usable, AttitudeView(usable), _length(usable)).told()
+    usable = prepared(recording.finite(*GYRO))
+    return _compared_by_gyroscope(usable, GyroView(usable), _length(usable)).told()
+
+
 def _attitude_or_length(recording: Recording) -> NormView | AttitudeView:
     usable = prepared(with_attitude(recording))
     length = _length(usable)
@@ -61,13 +79,7 @@ def _attitude_or_length(recording: Recording) -> NormView | AttitudeView:
             raise
         # an attitude that stands still says nothing of a sensor that turns
         return _warned(length, f"The attitude is left out, for it does not turn as the field does. {error}")
-    unbent = view.measured @ _matrix(view, length).mT
-    left = min(_left(view), left_by_attitude(unbent, view.to_world, stretches(view.time)))
-
-    def mend() -> Mend | None:
-        return mend_of_attitude(_calibrated(view, length), view.time, usable.stack(*QUATERNION), left)
-
-    return _settled("attitude", view, length, left, mend)
+    return _compared_by_attitude(usable, view, length).settled()
 
 
 def _length_or_gyroscope(recording: Recording) -> NormView | GyroView:
@@ -81,6 +93,67 @@ def _length_or_gyroscope(recording: Recording) -> NormView | GyroView:
         if length is None:
             raise
         return length
+    return _compared_by_gyroscope(usable, view, length).settled()
+
+
+@dataclass(frozen=True)
+class _Compared(Generic[V]):
+    """A view by turns beside the length; what both leave."""
+
+    what: str
+    view: V
+    length: NormView | None
+    left: float
+    mend: Callable[[], Mend | None]
+
+    def settled(self) -> V | NormView:
+        """The view, or the length where the view's turns are wrong; with a warning of turns that are."""
+        fault = self.fault()
+        if not fault:
+            return self.view
+        if self.length is None:
+            return _warned(
+                self.view,
+                f"The {self.what} hardly explains the field, but its length alone does not determine the sensor "
+                f"either: {fault}",
+            )
+        return _warned(self.length, f"The {self.what} is left out and the field's length is compared alone: {fault}")
+
+    def told(self) -> V:
+        """The view, which knows what is wrong with its turns."""
+        fault = self.fault()
+        self.view.wrong_turns = fault[:1].upper() + fault[1:]
+        return self.view
+
+    def fault(self) -> str:
+        """What is wrong with the turns, as sentences; empty where nothing is."""
+        known, unit = self.view if self.length is None else self.length, self.view.unit
+        most = USELESS * known.strength
+        if self.length is not None and self.left < TIMES_THE_LENGTH * _left(self.length):
+            return ""
+        if self.left < (most if self.length is None else DOUBTFUL * known.strength):
+            return ""
+        reason = self.mend()
+        if reason is None and self.left < most:
+            return ""
+        beside = "" if self.length is None else f", of the length {_two(_left(self.length))} {unit}"
+        return (
+            f"with the {self.what} {_two(self.left)} {unit} of the field of {_two(known.strength)} {unit} are left in "
+            f"each axis{beside}. {_reason(self.what, reason, unit)}"
+        )
+
+
+def _compared_by_attitude(usable: Recording, view: AttitudeView, length: NormView | None) -> _Compared[AttitudeView]:
+    unbent = view.measured @ _matrix(view, length).mT
+    left = min(_left(view), left_by_attitude(unbent, view.to_world, stretches(view.time)))
+
+    def mend() -> Mend | None:
+        return mend_of_attitude(_calibrated(view, length), view.time, usable.stack(*QUATERNION), left)
+
+    return _Compared("attitude", view, length, left, mend)
+
+
+def _compared_by_gyroscope(usable: Recording, view: GyroView, length: NormView | None) -> _Compared[GyroView]:
     unbent = view.measured @ _matrix(view, length).mT
     left = min(_left(view), left_by_gyroscope(unbent, view.turned, view.window, stretches(view.time)))
 
@@ -88,31 +161,7 @@ def _length_or_gyroscope(recording: Recording) -> NormView | GyroView:
         rate = usable.stack(*GYRO)
         return mend_of_gyroscope(_calibrated(view, length), view.time, rate, view.window, view.first, left)
 
-    return _settled("gyroscope", view, length, left, mend)
-
-
-def _settled(what: str, view: V, length: NormView | None, left: float, mend: Callable[[], Mend | None]) -> V | NormView:
-    """The view, or the length where the view's turns are wrong; with a warning of turns that are."""
-    if length is None:
-        if left < USELESS * view.strength:
-            return view
-        return _warned(
-            view,
-            f"The {what} hardly explains the field, but its length alone does not determine the sensor either: with "
-            f"the {what} {_two(left)} {view.unit} of {_two(view.strength)} {view.unit} are left in each axis, so what "
-            f"is found here need not hold. {_reason(what, mend(), view.unit)}",
-        )
-    if left < TIMES_THE_LENGTH * _left(length) or left < DOUBTFUL * length.strength:
-        return view
-    reason = mend()
-    if reason is None and left < USELESS * length.strength:
-        return view
-    return _warned(
-        length,
-        f"The {what} is left out and the field's length is compared alone: with the {what} {_two(left)} {length.unit} "
-        f"of the field of {_two(length.strength)} {length.unit} are left in each axis, of the length "
-        f"{_two(_left(length))} {length.unit}. {_reason(what, reason, length.unit)}",
-    )
+    return _Compared("gyroscope", view, length, left, mend)
 
 
 def _length(recording: Recording) -> NormView | None:

@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from mkc_torch.calibration.calibrate import prepared
 from mkc_torch.recording.recording import Recording
-from mkc_torch.simulation.magnetometer.attitude import AttitudeView, with_attitude
-from mkc_torch.simulation.magnetometer.choice import chosen_view
+from mkc_torch.simulation.magnetometer.attitude import AttitudeView
+from mkc_torch.simulation.magnetometer.choice import asked_view, chosen_view
 from mkc_torch.simulation.magnetometer.correction import MagnetometerCorrection
 from mkc_torch.simulation.magnetometer.gyro import GyroView
 from mkc_torch.simulation.magnetometer.norm import NormView
@@ -68,12 +67,9 @@ class Magnetometer:
             raise ValueError(f"Expected argument `use` to be 'attitude', 'gyro', 'norm' or None but got {self.use!r}.")
         if self.use is None:
             return chosen_view(recording)
-        if self.use == "attitude":
-            return AttitudeView(prepared(with_attitude(recording)))
         if self.use == "gyro":
             recording["time"]
-            return GyroView(prepared(recording.finite(*GYRO)))
-        return NormView(prepared(recording))
+        return asked_view(recording, self.use)
 
     def correction(self, state: Mapping[str, Any], recording: Recording) -> MagnetometerCorrection:
         """The calibrated sensor on a new recording; see :class:`mkc_torch.simulation.Correction`."""

@@ -46,6 +46,8 @@ class View(ClosedForm):
     ports: dict[str, Port]
     strength: float
     bounds: tuple[Tensor, Tensor] | None = None
+    wrong_turns: str = ""
+    """What is wrong with the turns that it is compared by, as sentences; empty where nothing is."""
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording

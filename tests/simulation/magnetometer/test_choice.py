@@ -122,9 +122,28 @@ def test_wrong_turns_are_told_of_where_the_length_determines_nothing():
     assert "degrees per second" in wrong.warnings[0]
 
 
-def test_a_view_that_is_asked_for_is_taken():
-    recording = changed(tumbling(N, noise=0.5), **quaternions(turns(TIME - 0.5)), **rates(-body_rate(TIME)))
-    assert [Magnetometer(use=use).prepare(recording).view for use in ("attitude", "gyro")] == ["attitude", "gyro"]
+def test_a_view_that_is_asked_for_is_taken_and_knows_what_is_wrong_with_its_turns():
+    table = changed(tumbling(N, noise=0.5), **quaternions(turns(TIME - 0.5)), **rates(-body_rate(TIME)))
+    views = [Magnetometer(use=use).prepare(table) for use in ("attitude", "gyro", "norm")]
+    assert [view.view for view in views] == ["attitude", "gyro", "norm"]
+    late, turned_round, none = (view.wrong_turns for view in views)
+    assert late.startswith("With the attitude")
+    assert "seems to be late by 0.5 s" in late
+    assert "of the length 0.5 µT" in turned_round
+    assert "The rates seem to have the other sign" in turned_round
+    assert none == ""
+
+
+def test_right_turns_have_nothing_wrong():
+    table = changed(tumbling(N, noise=0.5, sensor=STEP), **quaternions(turns(TIME)), **rates(body_rate(TIME)))
+    assert [Magnetometer(use=use).prepare(table).wrong_turns for use in ("attitude", "gyro")] == ["", ""]
+
+
+def test_a_simulation_whose_turns_are_wrong_is_unfit_and_says_why():
+    table = changed(tumbling(N, noise=0.5, sensor=STEP), **rates(-body_rate(TIME)))
+    found = diagnose(Magnetometer(use="gyro"), table, surrogates=19)
+    assert (found.verdict, found.findings) == ("unfit", ())
+    assert "The rates seem to have the other sign" in found.world.reasons[0]
 
 
 def test_a_part_starts_the_length_where_all_samples_do_not():
