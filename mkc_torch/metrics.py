@@ -16,6 +16,7 @@ except ModuleNotFoundError as error:
 
 from mkc_torch._support.arguments import refuse_bad_batch
 from mkc_torch.density.normalizer import log_partition
+from mkc_torch.losses._checks import checked_weight
 from mkc_torch.losses._energy_sums import energy_sums
 from mkc_torch.losses.mkc import MKCLoss, checked_loss
 
@@ -99,7 +100,7 @@ class MKCNegativeLogLikelihood(Metric):
             if weight is None:
                 weights, counts = torch.ones_like(error), None
             else:
-                weights, counts = loss._checked_weight(weight, error, axis)
+                weights, counts = checked_weight(weight, error, axis)
                 error = torch.where(counts, error, 0.0)
             refuse_bad_batch(input, target, counts, error)
             kappa, d, bound = (t.double() for t in (loss.kappa, loss.d, loss.bound))

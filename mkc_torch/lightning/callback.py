@@ -232,6 +232,7 @@ class MKCExpectationMaximization(Callback):
                     f"Expected one MKCExpectationMaximization for the loss `{name}` but got two; "
                     "give each callback the name of another loss, or remove one."
                 )
+        loss.settle()  # the E-step finds d, in the bound that there is
         self._owned = OwnedLoss.of(name, loss, self._collect)
         if self._progress is None or self._progress.histogram.bound.shape != loss.bound.shape:
             self._progress = Progress(ResidualHistogram(loss.bound))

@@ -7,11 +7,22 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import refuse_not_real
+from mkc_torch._support.arguments import refuse_bad_weight, refuse_not_real
 
-__all__ = ["Reduction", "checked_axis", "refuse_no_dimension", "refuse_other_reduction", "refuse_other_shapes"]
+__all__ = [
+    "Reduction",
+    "checked_axis",
+    "checked_weight",
+    "refuse_no_dimension",
+    "refuse_other_reduction",
+    "refuse_other_shapes",
+    "shortly",
+]
 
 Reduction = Literal["none", "mean", "sum"]
+
+_SHOWN = 6
+"""Channels whose numbers are shown."""
 
 
 def refuse_other_reduction(reduction: str) -> None:
@@ -46,6 +57,35 @@ def checked_axis(input: Tensor, channel_dim: int) -> int:
     if not -input.dim() <= channel_dim < input.dim():
         raise ValueError(f"Expected a dimension {channel_dim} for the channels but got {tuple(input.shape)}.")
     return channel_dim % input.dim()
+
+
+def checked_weight(weight: Tensor, input: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+    """Weights of the shape of the input, and which of them count.
+
+    A weight of each sample has no dimension for the channels; one of each element may have size 1 where it is the same.
+    """
+    refuse_bad_weight(weight)
+    samples = input.shape[:axis] + input.shape[axis + 1 :]
+    if weight.shape == samples and weight.shape != input.shape:
+        weight = weight.unsqueeze(axis)
+    elif weight.dim() != input.dim() or any(
+        size not in (1, whole) for size, whole in zip(weight.shape, input.shape, strict=True)
+    ):
+        raise ValueError(
+            f"Expected argument `weight` of shape {tuple(input.shape)}, with 1 where it is the same for all, or "
+            f"{tuple(samples)} but got {tuple(weight.shape)}."
+        )
+    weight = weight.expand(input.shape)
+    counts = weight if weight.dtype == torch.bool else weight != 0
+    return weight.to(input.dtype), counts
+
+
+def shortly(values: Tensor) -> str:
+    """A number where all are alike, or the first few."""
+    numbers = [f"{value:.4g}" for value in values.tolist()]
+    if len(set(numbers)) == 1:
+        return numbers[0]
+    return f"[{', '.join(numbers[:_SHOWN])}{', …' if len(numbers) > _SHOWN else ''}]"
 
 
 def at_least_float32(value: Tensor) -> torch.dtype:

@@ -15,11 +15,11 @@ from mkc_torch.losses._checks import (
     Reduction,
     at_least_float32,
     checked_axis,
+    checked_weight,
     refuse_no_dimension,
     refuse_other_reduction,
     refuse_other_shapes,
 )
-from mkc_torch.losses.mkc import MKCLoss
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -135,7 +135,7 @@ class HeteroscedasticMKCLoss(_WideBuffers):
         error = input - target
         sigma, d, bound = sigma.to(dtype), d.to(dtype), self.bound.to(dtype)
         if weight is not None:
-            weight, counts = MKCLoss._checked_weight(weight, error, axis)
+            weight, counts = checked_weight(weight, error, axis)
             error = torch.where(counts, error, 0.0)
             # what only masked elements use gives way to a value in range
             sigma = torch.where(counts.to(dtype).sum_to_size(sigma.shape) > 0, sigma, 1.0)

@@ -2,30 +2,36 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor, nn
 
-from mkc_torch._support.arguments import as_numbers, refuse_bad_batch, refuse_bad_weight, told
+from mkc_torch._support.arguments import as_numbers, refuse_bad_batch, told
 from mkc_torch.density.energy import KAPPA_MAX, as_computed, energy, inverse_square
 from mkc_torch.density.normalizer import log_partition
 from mkc_torch.losses._checks import (
     Reduction,
     at_least_float32,
     checked_axis,
+    checked_weight,
     refuse_no_dimension,
     refuse_other_reduction,
     refuse_other_shapes,
+    shortly,
 )
+from mkc_torch.losses._curves import Curves
 from mkc_torch.losses._energy_sums import energy_sums
+from mkc_torch.losses._following import Following
+from mkc_torch.losses._follows_residuals import FollowsResiduals
+from mkc_torch.losses._state_dict import logit_of_kappa, logit_of_scale, translate
+from mkc_torch.losses._watch import Watch
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["DEFAULT_BOUND_IN_D", "DEFAULT_D_MIN_IN_D", "NEAR_FLOOR", "WATCH_EVERY", "MKCLoss", "checked_loss"]
+__all__ = ["DEFAULT_BOUND_IN_D", "DEFAULT_D_MIN_IN_D", "MKCLoss", "checked_loss"]
 
 DEFAULT_BOUND_IN_D = 100.0
 """Half-width of the domain, in units of the initial d, where no bound is given."""
@@ -34,35 +40,37 @@ DEFAULT_D_MIN_IN_D = 1e-3
 """Floor under d, in units of the initial d, where none is given."""
 
 
-WATCH_EVERY = 64
-"""Forward passes in training after which a scale near its floor is looked for; a look waits for an accelerator."""
-
-NEAR_FLOOR = 2.0
-"""Times the floor below which a scale counts as collapsed."""
-
-
-class MKCLoss(nn.Module):
+class MKCLoss(FollowsResiduals, Curves, nn.Module):
     """Multi-kernel correntropy loss with a bandwidth σ and a scale d for each channel.
 
     With anything learned it is the negative log-likelihood of (17) of Li et al. (2023), ``energy + log_normalizer``;
     with σ and d fixed it is the paper's loss, ``energy = σ² (1 - exp(-e² / (2 d² σ²)))``, e being input less target.
     Learning un-normalised σ and d is refused: the energy alone is smallest at σ → 0 or d → ∞, whatever the data.
 
+    Without a ``d`` the scales are taken from the residuals and follow them while the network learns, robustly and for
+    each channel, so that targets of any unit and offset need no tuning. The value is then the same likelihood; the
+    gradient by the input, in training, is that of a loss chosen for its robustness: at first one sharper than the
+    absolute value, later Welsch's of the widest bandwidth at which the estimated variance is within a tenth of the
+    smallest. σ and d then describe the noise. With given numbers the gradient is the likelihood's own.
+
     Args:
         num_channels: m, the size of the channel dimension.
         sigma: initial or fixed bandwidths in [0.05, inf], a number or (m,). ``inf`` is the Gaussian; a σ that is to be
             learned must start finite, since its gradient is 0 at ``inf``.
-        d: initial or fixed scales > 0 in the unit of the target, a number or (m,).
-        bound: half-width a of the domain of the errors, in the unit of the target, a number or (m,). None means 100
-            times the initial d and stays there while d is learned. The likelihood of σ depends on it: a physical bound
+        d: initial or fixed scales > 0 in the unit of the target, a number or (m,); "auto" takes them from the
+            residuals of each forward pass in training, and ``learn_d`` is then a factor beside that.
+        bound: half-width a of the domain of the errors, in the unit of the target, a number or (m,). "auto" means half
+            the range of the residuals and no less than ten scales where ``d`` is "auto"; with a given d, as None, 100
+            times that d, and it stays there while d is learned. The likelihood of σ depends on it: a physical bound
             is better, and likelihoods compare only at equal bounds. Errors beyond it keep a finite loss and gradient.
         learn_sigma: whether σ is a parameter.
         learn_d: whether d is a parameter; it stays in [d_min, bound].
         normalize: whether to add the log-normaliser; None does so if anything is learned.
-        channel_dim: the dimension of the input that holds the channels.
+        channel_dim: the dimension of the input that holds the channels, 1 for (N, C, H, W); None for the last. An input
+            of four dimensions or more whose second and last both have size m is refused until one is named.
         reduction: "none", "mean" (over elements, weighted where weights are given) or "sum".
-        d_min: floor under d, a number or (m,); None means a thousandth of the initial d. The likelihood of a network
-            that interpolates its targets grows without limit as d → 0.
+        d_min: floor under d, a number or (m,); None means a thousandth of the initial d, or of the spread of the first
+            residuals. The likelihood of a network that interpolates its targets grows without limit as d → 0.
 
     Attributes:
         sigma, d: current values (m,), differentiable; assign to set them.
@@ -73,7 +81,8 @@ class MKCLoss(nn.Module):
         ValueError: an argument out of range, or learning asked for with ``normalize=False``.
 
     Warns:
-        UserWarning: once, when a learned d has come near its floor in training: the network may fit every point.
+        UserWarning: once each, in training: a d near its floor, for the network may fit every point; a share of the
+            errors beyond a given bound; σ and d that get gradients and that no optimiser moves.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (9) and (17).
@@ -97,12 +106,12 @@ class MKCLoss(nn.Module):
         num_channels: int,
         *,
         sigma: float | Float[Tensor, " m"] = 3.0,
-        d: float | Float[Tensor, " m"] = 1.0,
-        bound: float | Float[Tensor, " m"] | None = None,
+        d: float | Float[Tensor, " m"] | Literal["auto"] = "auto",
+        bound: float | Float[Tensor, " m"] | Literal["auto"] | None = "auto",
         learn_sigma: bool = True,
         learn_d: bool = True,
         normalize: bool | None = None,
-        channel_dim: int = -1,
+        channel_dim: int | None = None,
         reduction: Reduction = "mean",
         d_min: float | Float[Tensor, " m"] | None = None,
     ) -> None:
@@ -110,7 +119,7 @@ class MKCLoss(nn.Module):
         if isinstance(num_channels, bool) or not isinstance(num_channels, int) or num_channels < 1:
             raise ValueError(f"Expected argument `num_channels` to be a positive integer but got {num_channels!r}.")
         refuse_other_reduction(reduction)
-        refuse_no_dimension(channel_dim)
+        refuse_no_dimension(-1 if channel_dim is None else channel_dim)
         learned = learn_sigma or learn_d
         if normalize is None:
             normalize = learned
@@ -119,29 +128,34 @@ class MKCLoss(nn.Module):
                 "Expected `learn_sigma=False, learn_d=False` with `normalize=False`: without the normaliser the loss "
                 "is smallest at sigma -> 0 or d -> inf, whatever the data. Drop `normalize=False` to learn them."
             )
-        self._forwards, self._told_of_floor = 0, False
+        self._watch, self._has_begun, self._turned = Watch(), False, False
         self.num_channels = num_channels
         self.normalize = normalize
-        self.channel_dim = channel_dim
+        self.channel_dim, self._named_dim = -1 if channel_dim is None else channel_dim, channel_dim is not None
         self.reduction = reduction
-        d = self._per_channel("d", d, low=0.0)
         kappa = inverse_square(self._sigma_in_range(sigma))
-        half_width = DEFAULT_BOUND_IN_D * d if bound is None else self._per_channel("bound", bound, low=0.0)
+        followed, own_bound = _is_auto(d), not (bound is None or _is_auto(bound))
+        self.following = Following(num_channels) if followed else None
+        self._own_bound = own_bound or not followed
+        self._own_floor = d_min is not None or not followed
+        d = torch.ones(num_channels) if _is_auto(d) else self._per_channel("d", d, low=0.0)
+        half_width = self._per_channel("bound", bound, low=0.0) if own_bound else DEFAULT_BOUND_IN_D * d
         floor = DEFAULT_D_MIN_IN_D * d if d_min is None else self._per_channel("d_min", d_min, low=0.0)
-        if not bool((half_width > d).all()):
+        if not followed and not bool((half_width > d).all()):
             raise ValueError(f"Expected argument `bound` to exceed `d` but got {half_width.tolist()} and {d.tolist()}.")
-        if learn_d and not bool((floor < d).all()):
+        if not followed and learn_d and not bool((floor < d).all()):
             raise ValueError(f"Expected argument `d_min` below `d` but got {floor.tolist()} and {d.tolist()}.")
         self.register_buffer("bound", half_width)
         self.register_buffer("d_min", floor)
         self.register_buffer("fixed_kappa", None if learn_sigma else kappa)
-        self.register_buffer("fixed_d", None if learn_d else d)
+        self.register_buffer("fixed_d", None if learn_d or followed else d)
         self.raw_kappa = nn.Parameter(torch.empty_like(kappa)) if learn_sigma else None
-        self.raw_d = nn.Parameter(torch.empty_like(d)) if learn_d else None
+        self.raw_d = nn.Parameter(torch.zeros_like(d)) if learn_d else None
         self._set_kappa(kappa)
-        self._set_d(d)
+        if not followed:
+            self._set_d(d)
 
-    def _per_channel(self, name: str, value: float | Tensor, *, low: float) -> Tensor:
+    def _per_channel(self, name: str, value: object, *, low: float) -> Tensor:
         (t,) = as_computed(as_numbers(name, value).detach())
         if t.dim() > 1 or (t.dim() == 1 and t.shape[0] not in (1, self.num_channels)):
             raise ValueError(
@@ -175,8 +189,7 @@ class MKCLoss(nn.Module):
                     "Expected a finite `sigma` with `learn_sigma=True` but got inf, where its gradient is 0; "
                     "start large, at 10 say, or pass `learn_sigma=False`."
                 )
-            # a hair inside the range, where the gradient is not 0
-            self.raw_kappa.copy_(torch.logit((kappa.double() / KAPPA_MAX).clamp(max=1.0 - 1e-6)))
+            self.raw_kappa.copy_(logit_of_kappa(kappa))
         elif self.fixed_kappa is not None:
             self.fixed_kappa.copy_(kappa)
 
@@ -191,7 +204,9 @@ class MKCLoss(nn.Module):
 
     @property
     def d(self) -> Float[Tensor, " m"]:
-        """Scales in the unit of the target; assign a number or (m,) in (d_min, bound) to set them."""
+        """Scales in the unit of the target; assign a number or (m,) in (d_min, bound) to set them, where given."""
+        if self.following is not None:
+            return self._followed_d(self.following.state)
         if self.raw_d is None:
             assert self.fixed_d is not None
             return self.fixed_d
@@ -199,6 +214,11 @@ class MKCLoss(nn.Module):
 
     @d.setter
     def d(self, value: float | Tensor) -> None:
+        if self.following is not None:
+            raise ValueError(
+                f"Expected a loss with a given `d` to set it but got one that takes d from the residuals, d={value}; "
+                "make it with `d=` and `bound=`."
+            )
         d = self._per_channel("d", as_numbers("d", value, self.bound.dtype), low=0.0).to(self.bound)
         if self.raw_d is not None and not bool(((d > self.d_min) & (d < self.bound)).all()):
             raise ValueError(
@@ -209,8 +229,7 @@ class MKCLoss(nn.Module):
     @torch.no_grad()
     def _set_d(self, d: Tensor) -> None:
         if self.raw_d is not None:
-            low, high = self.d_min.double(), self.bound.double()
-            self.raw_d.copy_(torch.logit((d.double() - low) / (high - low)))
+            self.raw_d.copy_(logit_of_scale(d, self.d_min, self.bound))
         elif self.fixed_d is not None:
             self.fixed_d.copy_(d)
 
@@ -224,12 +243,22 @@ class MKCLoss(nn.Module):
         super()._apply(keep, recurse)  # type: ignore[no-untyped-call]
         return self
 
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        translate(
+            state_dict,
+            prefix,
+            learns_kappa=self.raw_kappa is not None,
+            learns_d=self.raw_d is not None,
+            follows=self.following is not None,
+        )
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
     def log_normalizer(self) -> Float[Tensor, " m"]:
         """``log(d Z)`` of each channel: what the negative log-likelihood adds to the energy."""
-        return self._log_normalizer(self.kappa, self.d)
+        return self._log_normalizer(self.kappa, self.d, self.bound)
 
-    def _log_normalizer(self, kappa: Tensor, d: Tensor) -> Float[Tensor, " m"]:
-        bound = self.bound
+    @staticmethod
+    def _log_normalizer(kappa: Tensor, d: Tensor, bound: Tensor) -> Float[Tensor, " m"]:
         if not kappa.dtype == d.dtype == bound.dtype:
             kappa, d, bound = as_computed(kappa, d, bound)
         return torch.log(d) + log_partition(kappa, bound / d)
@@ -274,17 +303,25 @@ class MKCLoss(nn.Module):
                 for an accelerator, nor are they seen in compiled code or under vmap: there a NaN comes out as NaN.
         """
         axis = self._checked_axis(input, target)
-        if not torch.compiler.is_compiling():
-            self._watch_scale()
         dtype = torch.promote_types(at_least_float32(input), at_least_float32(target))
         input, wanted = input.to(dtype), target.to(dtype)
         error: Tensor | None = None  # of a whole batch laid out only where it is needed
         if weight is not None:
-            weight, counts = self._checked_weight(weight, input, axis)
+            weight, counts = checked_weight(weight, input, axis)
             error = torch.where(counts, input - wanted, 0.0)
         refuse_bad_batch(input, wanted, None if weight is None else counts, error)
-        kappa, d = self.kappa, self.d
-        norm = self._log_normalizer(kappa, d).to(dtype) if self.normalize else None
+        if not torch.compiler.is_compiling():
+            self._look(input, wanted, error, axis)
+        kappa, d, bound = self.kappa, self.d, self.bound
+        pull: Tensor | None = None
+        if self.following is not None:
+            error = input - wanted if error is None else error
+            state = self._state(error, weight, axis)
+            d, bound = self._followed_d(state), self._domain(state)[0]
+            if self.training and self.raw_kappa is not None and torch.is_grad_enabled():
+                pull = self._pull(error, weight, axis, state)
+                error = error.detach()
+        norm = self._log_normalizer(kappa, d, bound).to(dtype) if self.normalize else None
         kappa, d = (p.to(torch.promote_types(p.dtype, dtype)) for p in (kappa, d))
         if self.reduction == "none":
             shape = [1] * input.dim()
@@ -293,11 +330,13 @@ class MKCLoss(nn.Module):
             loss = energy(error / d.view(shape), kappa.view(shape))
             if norm is not None:
                 loss = loss + norm.view(shape)
+            loss = loss if pull is None else loss + (pull - pull.detach())
             return loss if weight is None else weight * loss
         if error is None:
             total = energy_sums(input.to(kappa.dtype), kappa, d, None, axis, target=wanted.to(kappa.dtype)).sum()
         else:
             total = energy_sums(error.to(kappa.dtype), kappa, d, weight, axis).sum()
+        total = total if pull is None else total + (pull - pull.detach())
         elements = float(input.numel()) if weight is None else weight.sum()
         if norm is not None:
             if weight is None:
@@ -311,61 +350,52 @@ class MKCLoss(nn.Module):
             return total / torch.where(elements > 0, elements, 1.0)
         return total / elements
 
-    def _watch_scale(self) -> None:
-        if self.raw_d is None or not self.training or self._told_of_floor or not torch.is_grad_enabled():
+    def _look(self, input: Tensor, wanted: Tensor, error: Tensor | None, axis: int) -> None:
+        if not self.training or not torch.is_grad_enabled() or not self._watch.is_due():
             return
-        self._forwards += 1
-        if self._forwards % WATCH_EVERY:
-            return
-        with torch.no_grad():
-            near = self.d < NEAR_FLOOR * self.d_min
         try:
-            channels = near.nonzero().flatten().tolist()
+            self._watch.optimiser((self.raw_kappa, self.raw_d))
+            if self.raw_d is not None:
+                self._watch.floor(self.d.detach(), self.d_min)
+            if self.following is None or self._own_bound:
+                self._watch.bound(input - wanted if error is None else error, self.bound, axis)
+            if self.following is not None:
+                self._turned = bool((self.following.turned >= 1.0).all())
         except RuntimeError:  # under vmap there is no one value
             return
-        if channels:
-            self._told_of_floor = True
-            scales, floors = self.d.detach()[channels].tolist(), self.d_min[channels].tolist()
-            warnings.warn(
-                f"The scale d of channel {', '.join(map(str, channels))} fell to {scales}, next to its floor {floors}. "
-                "The network may fit every point, noise included, and the likelihood grows without limit as d -> 0: "
-                "watch a validation set, regularise, or raise `d_min` to the precision of the targets. If the targets "
-                "are that precise, start with a smaller `d`.",
-                stacklevel=3,
-            )
 
     def _checked_axis(self, input: Tensor, target: Tensor) -> int:
         refuse_other_shapes(input, target)
         axis = checked_axis(input, self.channel_dim)
-        if input.shape[axis] != self.num_channels:
-            mend = "; give each sample a dimension for its channel, unsqueeze(-1)" if self.num_channels == 1 else ""
+        m = self.num_channels
+        if input.shape[axis] != m:
+            mend = "; give each sample a dimension for its channel, unsqueeze(-1)" if m == 1 else ""
+            if input.dim() > 2 and input.shape[1] == m:
+                mend = "; give the loss `channel_dim=1` where the channels are the second dimension, (N, C, ...)"
             raise ValueError(
-                f"Expected {self.num_channels} channels in dimension {self.channel_dim} but got {tuple(input.shape)}"
-                f"{mend}."
+                f"Expected {m} channels in dimension {self.channel_dim} but got {tuple(input.shape)}{mend}."
+            )
+        if not self._named_dim and input.dim() > 3 and input.shape[1] == m:
+            raise ValueError(
+                f"Expected argument `channel_dim` to be named for an input of shape {tuple(input.shape)}, whose second "
+                f"and last dimension both have size {m}: 1 for (N, C, ...), -1 for channels last."
             )
         return axis
 
-    @staticmethod
-    def _checked_weight(weight: Tensor, input: Tensor, axis: int) -> tuple[Tensor, Tensor]:
-        refuse_bad_weight(weight)
-        samples = input.shape[:axis] + input.shape[axis + 1 :]
-        if weight.shape == samples and weight.shape != input.shape:
-            weight = weight.unsqueeze(axis)
-        elif weight.shape != input.shape:
-            raise ValueError(
-                f"Expected argument `weight` of shape {tuple(input.shape)} or {tuple(samples)} "
-                f"but got {tuple(weight.shape)}."
-            )
-        weight = weight.expand(input.shape)
-        counts = weight if weight.dtype == torch.bool else weight != 0
-        return weight.to(input.dtype), counts
-
-    def extra_repr(self) -> str:
+    def __repr__(self) -> str:
         learned = [n for n, p in (("sigma", self.raw_kappa), ("d", self.raw_d)) if p is not None]
+        with torch.no_grad():
+            sigma, d, bound = (shortly(values) for values in (self.sigma, self.d, self.bound))
+        if self.following is not None:
+            d, bound = f"auto: {d}", bound if self._own_bound else f"auto: {bound}"
         return (
-            f"{self.num_channels}, learns={learned}, normalize={self.normalize}, channel_dim={self.channel_dim}, "
-            f"reduction={self.reduction!r}"
+            f"MKCLoss({self.num_channels}, sigma={sigma}, d={d}, bound={bound}, learns={learned}, "
+            f"normalize={self.normalize}, channel_dim={self.channel_dim}, reduction={self.reduction!r})"
         )
+
+
+def _is_auto(value: object) -> bool:
+    return isinstance(value, str) and value == "auto"
 
 
 def checked_loss(loss: nn.Module) -> MKCLoss:

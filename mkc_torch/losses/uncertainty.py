@@ -11,7 +11,7 @@ from torch import Tensor
 from mkc_torch._support.arguments import DIVERGED, checked_number, refuse_bad_batch, refuse_not_finite, seems_finite
 from mkc_torch.density.distribution import SIGMA_MIN, MKCDistribution
 from mkc_torch.functional import mkc_weight
-from mkc_torch.losses._checks import at_least_float32
+from mkc_torch.losses._checks import at_least_float32, checked_weight
 from mkc_torch.losses.mkc import MKCLoss, checked_loss
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ def beyond_bound(
     loss = checked_loss(loss)
     axis = loss._checked_axis(input, target)
     error = _error(input, target)
-    weights, counts = loss._checked_weight(torch.ones_like(error) if weight is None else weight, error, axis)
+    weights, counts = checked_weight(torch.ones_like(error) if weight is None else weight, error, axis)
     refuse_bad_batch(input, target, counts, torch.where(counts, error, 0.0))
     beyond = counts & (error.abs() > _along(loss.bound, input, axis))
     others = [i for i in range(error.dim()) if i != axis]

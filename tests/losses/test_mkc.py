@@ -249,7 +249,7 @@ def test_half_precision_inputs_give_a_float32_loss(dtype, reduction):
 
 
 def test_sums_of_half_precision_do_not_overflow():
-    loss = MKCLoss(1, sigma=INF, reduction="sum", **FIXED)
+    loss = MKCLoss(1, sigma=INF, d=1.0, reduction="sum", **FIXED)
     x = torch.full((1000, 1), 200.0, dtype=torch.float16)
     assert loss(x, -x).item() == pytest.approx(1000 * 0.5 * 400**2, rel=1e-6)
 
@@ -338,9 +338,20 @@ def test_state_dict_of_another_number_of_channels_is_refused():
         MKCLoss(3).load_state_dict(MKCLoss(1).state_dict())
 
 
-def test_state_dict_of_a_fixed_loss_is_refused_by_a_learned_one():
+@pytest.mark.parametrize("learned", [{}, {"learn_d": False}, {"learn_sigma": False}], ids=["both", "sigma", "d"])
+def test_a_learned_loss_loads_into_a_fixed_one_and_back(learned):
+    loss, fixed, again = made(**learned), made(sigma=9.0, d=0.3, **FIXED), made(sigma=9.0, d=0.3, **learned)
+    fixed.load_state_dict(loss.state_dict())
+    again.load_state_dict(fixed.state_dict())
+    for other in (fixed, again):
+        for name in ("sigma", "d", "bound", "d_min"):
+            found = getattr(other, name).double()
+            torch.testing.assert_close(found, getattr(loss, name).double(), rtol=1e-5, atol=0.0)
+
+
+def test_a_fixed_gaussian_cannot_be_learned_on():
     with pytest.raises(RuntimeError, match="raw_kappa"):
-        made().load_state_dict(made(**FIXED).state_dict())
+        made().load_state_dict(made(sigma=INF, **FIXED).state_dict())
 
 
 # --- sigma, d and their bounds
@@ -423,6 +434,7 @@ def test_d_setter_refuses_what_is_not_between_its_bounds(value):
     torch.testing.assert_close(loss.d, torch.tensor(D, dtype=torch.float64))
 
 
+@pytest.mark.filterwarnings("ignore:Of the errors of channel")
 def test_bounds_hold_after_violent_steps():
     for seed in range(3):
         loss = made(dtype=torch.float32, d_min=0.01)
@@ -554,15 +566,16 @@ def test_parameters_of_the_density_are_recovered_from_samples():
         ({"sigma": torch.ones(2, 1)}, ValueError, r"`sigma` to be a number or of shape \(2,\) but got \(2, 1\)"),
         ({"sigma": INF}, ValueError, "finite `sigma` with `learn_sigma=True` but got inf, where its gradient is 0"),
         ({"sigma": torch.tensor([1.0, INF])}, ValueError, "finite `sigma` with `learn_sigma=True`"),
+        ({"d": "automatic"}, TypeError, "`d` to be a number, or a tensor of them, but got 'automatic'"),
         ({"d": 0.0}, ValueError, r"`d` to be positive and finite but got 0\.0"),
         ({"d": INF}, ValueError, "`d` to be positive and finite"),
         ({"d": NAN}, ValueError, "`d` to be positive and finite"),
         ({"d": torch.ones(3)}, ValueError, r"`d` to be a number or of shape \(2,\) but got \(3,\)"),
         ({"bound": 0.0}, ValueError, "`bound` to be positive and finite"),
         ({"bound": INF}, ValueError, "`bound` to be positive and finite"),
-        ({"bound": 1.0}, ValueError, "`bound` to exceed `d`"),
+        ({"bound": 1.0, "d": 1.0}, ValueError, "`bound` to exceed `d`"),
         ({"d_min": 0.0}, ValueError, "`d_min` to be positive and finite"),
-        ({"d_min": 1.0}, ValueError, "`d_min` below `d`"),
+        ({"d_min": 1.0, "d": 1.0}, ValueError, "`d_min` below `d`"),
         ({"normalize": False}, ValueError, "without the normaliser the loss is smallest at sigma -> 0 or d -> inf"),
         ({"normalize": False, "learn_d": False}, ValueError, "without the normaliser"),
         ({"normalize": False, "learn_sigma": False}, ValueError, "without the normaliser"),
@@ -610,10 +623,30 @@ def test_an_empty_batch_is_refused(reduction):
         MKCLoss(2, reduction=reduction)(torch.zeros(0, 2), torch.zeros(0, 2))
 
 
-@pytest.mark.parametrize("shape", [(2,), (1, 2), (4, 1), (3,), ()])
+@pytest.mark.parametrize("shape", [(2,), (3, 2), (4, 1, 1), (3,), ()])
 def test_weights_of_another_shape_are_refused(shape):
-    with pytest.raises(ValueError, match=r"`weight` of shape \(4, 2\) or \(4,\) but got"):
+    with pytest.raises(ValueError, match=r"`weight` of shape \(4, 2\), with 1 where .*, or \(4,\) but got"):
         MKCLoss(2)(torch.zeros(4, 2), torch.zeros(4, 2), torch.ones(shape))
+
+
+@pytest.mark.parametrize("shape", [(2, 1, 4, 5), (1, 1, 4, 5), (2, 3, 1, 1), (2, 4, 5)])
+def test_weights_of_an_image_are_those_of_all_its_elements(shape):
+    loss = made(channel_dim=1)
+    x, y = data(2, 3, 4, 5)
+    weight = torch.rand(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    whole = (weight.unsqueeze(1) if weight.dim() == 3 else weight).expand(2, 3, 4, 5)
+    torch.testing.assert_close(loss(x, y, weight), loss(x, y, whole))
+
+
+def test_channels_in_the_second_dimension_are_asked_for():
+    x = torch.zeros(2, 3, 4, 5)
+    with pytest.raises(ValueError, match=r"3 channels in dimension -1 but got \(2, 3, 4, 5\); .*`channel_dim=1`"):
+        MKCLoss(3)(x, x)
+    square = torch.zeros(2, 3, 4, 3)
+    with pytest.raises(ValueError, match=r"`channel_dim` to be named for an input of shape \(2, 3, 4, 3\)"):
+        MKCLoss(3)(square, square)
+    for named in (1, -1):
+        assert math.isfinite(MKCLoss(3, channel_dim=named)(square, square + 1.0).item())
 
 
 @pytest.mark.parametrize("dtype", [torch.int64, torch.int32])
@@ -630,9 +663,17 @@ def test_integer_weights_count(dtype):
     [({}, "['sigma', 'd']"), ({"learn_d": False}, "['sigma']"), ({"learn_sigma": False}, "['d']"), (FIXED, "[]")],
 )
 def test_repr_says_what_is_learned(options, learned):
-    text = repr(MKCLoss(3, channel_dim=1, reduction="sum", **options))
+    text = repr(MKCLoss(3, d=2.0, channel_dim=1, reduction="sum", **options))
     normalize = options != FIXED
-    assert text == f"MKCLoss(3, learns={learned}, normalize={normalize}, channel_dim=1, reduction='sum')"
+    assert text == (
+        f"MKCLoss(3, sigma=3, d=2, bound=200, learns={learned}, normalize={normalize}, channel_dim=1, reduction='sum')"
+    )
+
+
+def test_repr_shows_the_numbers_of_each_channel_and_which_are_followed():
+    assert "sigma=[0.7, 3, 20], d=[0.5, 1, 2], bound=[9, 40, 1000]" in repr(made())
+    assert "d=auto: 1, bound=auto: 100" in repr(MKCLoss(2))
+    assert "d=[1, 2, 3, 4, 5, 6, …]" in repr(MKCLoss(9, d=torch.arange(1.0, 10.0)))
 
 
 # --- transforms of whole modules
@@ -730,7 +771,7 @@ def interpolating(loss, steps=300):
 
 
 def test_a_network_that_fits_every_point_is_warned_of_once():
-    loss = MKCLoss(1)
+    loss = MKCLoss(1, d=1.0)
     with pytest.warns(UserWarning, match=r"scale d of channel 0 fell to .* next to its floor .*`d_min`") as told:
         interpolating(loss)
     assert len(told) == 1
@@ -849,13 +890,13 @@ def test_parameters_that_are_no_numbers_are_refused_by_name(name):
     for value in ("a", [[1.0], [1.0, 2.0]], 1j):
         with pytest.raises(TypeError, match=f"`{name}` to be a number, or a tensor of them, but got"):
             MKCLoss(2, **{name: value})
-    loss = MKCLoss(2)
+    loss = MKCLoss(2, d=1.0)
     if name in ("sigma", "d"):
         with pytest.raises(TypeError, match=f"`{name}` to be a number, or a tensor of them, but got 'a'"):
             setattr(loss, name, "a")
 
 
-@pytest.mark.parametrize("value", ["last", 1.0, None, True])
+@pytest.mark.parametrize("value", ["last", 1.0, True])
 def test_a_channel_dim_that_is_no_whole_number_is_refused(value):
     with pytest.raises(ValueError, match="`channel_dim` to be a whole number but got"):
         MKCLoss(2, channel_dim=value)

@@ -1,0 +1,98 @@
+"""What a loss does that takes d and bound from its residuals."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from mkc_torch.losses._checks import Reduction
+from mkc_torch.losses._following import Followed, Following, steered, steered_each
+from mkc_torch.losses._state_dict import logit_of_scale, ratio_of
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["FollowsResiduals"]
+
+
+class FollowsResiduals(nn.Module):
+    """The part of an MKCLoss that has a :class:`Following`; one with a given d has none."""
+
+    following: Following | None
+    bound: Tensor
+    d_min: Tensor
+    raw_d: nn.Parameter | None
+    fixed_d: Tensor | None
+    reduction: Reduction
+    _own_bound: bool
+    _own_floor: bool
+    _has_begun: bool
+    _turned: bool
+
+    @torch.no_grad()
+    def settle(self) -> None:
+        """Stop following the residuals: d and bound stay at what they are, as if they had been given.
+
+        For an optimiser that needs the same function at every call, L-BFGS say, or to compare likelihoods.
+
+        Example:
+            >>> from mkc_torch import MKCLoss
+            >>> loss = MKCLoss(1)
+            >>> _ = loss(torch.tensor([[-1.0], [1.0], [3.0]]), torch.zeros(3, 1))
+            >>> loss.settle()
+            >>> loss.following is None, float(loss.bound) >= 10.0 * float(loss.d)
+            (True, True)
+        """
+        if self.following is None:
+            return
+        d = self._followed_d(self.following.state)
+        d = torch.minimum(torch.maximum(d, self.d_min * (1.0 + 1e-6)), 0.5 * self.bound)
+        self.following, self._own_bound, self._own_floor = None, True, True
+        if self.raw_d is None:
+            self.fixed_d = d
+        else:
+            self.raw_d.copy_(logit_of_scale(d, self.d_min, self.bound))
+
+    def _followed_d(self, state: Followed) -> Float[Tensor, " m"]:
+        scale = state.scale
+        if self.raw_d is not None:
+            scale = scale * ratio_of(self.raw_d)
+        bound, floor = self._domain(state)
+        return torch.minimum(torch.maximum(scale, floor), 0.5 * bound)
+
+    def _domain(self, state: Followed) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
+        """Bound and floor of d."""
+        return self.bound if self._own_bound else state.bound, self.d_min if self._own_floor else state.floor
+
+    def _state(self, error: Tensor, weight: Tensor | None, axis: int) -> Followed:
+        """What is known with this batch; kept in training, but under transforms of functions, which have no state."""
+        assert self.following is not None
+        compiled = torch.compiler.is_compiling()
+        if not compiled and torch._C._functorch.is_functorch_wrapped_tensor(error):
+            return self.following.state
+        learning = self.training and torch.is_grad_enabled()
+        if not learning and (compiled or self._begun()):
+            return self.following.state
+        state = self.following.after(error, weight, axis)
+        if learning:
+            self.following.keep(state)
+            bound, floor = self._domain(state)
+            with torch.no_grad():
+                self.bound.copy_(bound)
+                self.d_min.copy_(floor)
+        return state
+
+    def _begun(self) -> bool:
+        """Whether there has been a batch to take the scale from."""
+        assert self.following is not None
+        if not self._has_begun:
+            self._has_begun = bool(self.following.seen > 0)
+        return self._has_begun
+
+    def _pull(self, error: Tensor, weight: Tensor | None, axis: int, state: Followed) -> Tensor:
+        """What the network learns by: of each element, or summed."""
+        if self.reduction == "none":
+            return steered_each(error, axis, state)
+        return steered(error, weight, axis, state, turned=self._turned).sum()
