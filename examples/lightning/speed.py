@@ -63,8 +63,9 @@ def main() -> None:
     losses = {
         "HuberLoss": nn.HuberLoss(),
         "GaussianNLLLoss, learned variance": LearnedGaussianNLL(4),
-        "MKCLoss, sigma and d fixed": MKCLoss(4, learn_sigma=False, learn_d=False),
-        "MKCLoss, learned": MKCLoss(4),
+        "MKCLoss, sigma and d fixed": MKCLoss(4, d=1.0, learn_sigma=False, learn_d=False),
+        "MKCLoss, learned": MKCLoss(4, d=1.0),
+        "MKCLoss, as it comes": MKCLoss(4),
     }
     for title, rows, times in (("4 million elements", 1_000_000, 1), ("a batch of 256 x 4", 256, 200)):
         found = measured(losses, rows, times, options.rounds, device)

@@ -19,7 +19,7 @@ from mkc_torch.losses._energy_sums import energy_sums
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Followed", "Following", "steered", "steered_each"]
+__all__ = ["SEARCH_EVERY", "Followed", "Following", "steered", "steered_each"]
 
 _QUANTILE, _NORMAL = 0.4, 0.5244005
 """Of the absolute residuals, and what it is of a standard normal variable. Below one half it stays among the right
@@ -30,6 +30,12 @@ _RECENT, _FEWEST, _IN_ALL = 1024, 64, 1 << 16
 
 _RATE, _FADES = 0.1, 0.999
 """Share of what is new in each batch, and what stays of the widest residual."""
+
+_ROWS = 1 << 16
+"""Residuals of a batch and channel that its range is taken from, evenly chosen."""
+
+SEARCH_EVERY = 4
+"""Batches after which the bandwidth is looked for again: a search costs more than a small batch."""
 
 _BANDWIDTHS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 16.0, 64.0)
 _TOLERANCE = 1.1
@@ -100,7 +106,9 @@ class Following(nn.Module):
 
     @property
     def state(self) -> Followed:
-        return Followed(*(getattr(self, name) for name in Followed._fields))
+        """What is known; of its own memory where a gradient may need it, for the next batch changes the buffers."""
+        known = Followed(*(getattr(self, name) for name in Followed._fields))
+        return Followed(*known[:3], *(value.clone() for value in known[3:]))
 
     @torch.no_grad()
     def keep(self, state: Followed) -> None:
@@ -108,69 +116,78 @@ class Following(nn.Module):
             getattr(self, name).copy_(value)
 
     @torch.no_grad()
-    def after(self, error: Tensor, weight: Tensor | None, axis: int) -> Followed:
+    def after(
+        self, input: Tensor, target: Tensor | None, weight: Tensor | None, axis: int, *, search: bool = True
+    ) -> Followed:
         """The state after a batch, with nothing kept of it.
 
         Args:
-            error: input less target, finite; 0 where it does not count.
+            input: predictions, or where there is no target errors, which are 0 where they do not count; finite.
+            target: what the predictions should be.
             weight: of each element; None for 1.
             axis: of the channels.
+            search: look for the bandwidth as well.
         """
-        old, others = self.state, [i for i in range(error.dim()) if i != axis]
-        error = error.detach().to(old.recent.dtype)
-        recent, counts = self._remembered(error, weight, axis)
-        size, known = recent.abs(), counts.sum(-1) > 0
-        at = _quantile(size, counts, _QUANTILE) / _NORMAL
+        old, first = self.state, self.seen == 0
+        rows = self._rows(input, axis) if target is None else self._rows(input, axis) - self._rows(target, axis)
+        recent, counts = self._remembered(rows, None if weight is None else self._rows(weight, axis))
+        size, total = recent.abs(), counts.sum(-1, keepdim=True).clamp(min=_TINY)
+        share = counts / total
+        at = _quantile(size, share, _QUANTILE) / _NORMAL
         # of targets that most residuals hit exactly
-        at = torch.where(at > 0, at, (size * counts).sum(-1) / counts.sum(-1).clamp(min=_TINY))
-        known = known & (at > 0)
-        first = old.seen == 0
+        at = torch.where(at > 0, at, (size * share).sum(-1))
+        known = at > 0
         rate = torch.clamp(1.0 / (old.seen + 1.0), min=_RATE)
         new = torch.where(known, at.clamp(min=_TINY).log(), old.log_scale)
         log_scale = torch.where(first, new, old.log_scale + rate * (new - old.log_scale))
-        bandwidth, better = _least_variance((recent / log_scale.exp().unsqueeze(-1))[:, ::2], counts[:, ::2])
-        log_bandwidth = bandwidth.log()
-        log_bandwidth = torch.where(
-            first, log_bandwidth, old.log_bandwidth + rate * (log_bandwidth - old.log_bandwidth)
-        )
-        late = (old.seen >= _BEFORE) & better & known
-        far = 0.5 * (error.amax(others) - error.amin(others)) if others else error.abs()
-        total = counts.sum(-1, keepdim=True).clamp(min=_TINY)
-        middle = (recent * counts).sum(-1, keepdim=True) / total
-        spread = ((recent - middle).abs() * counts / total).sum(-1)
+        far = 0.5 * (rows.amax(0) - rows.amin(0))
+        middle = (recent * share).sum(-1, keepdim=True)
+        spread = ((recent - middle).abs() * share).sum(-1)
         # an offset widens the scale, targets that are wrong by far the spread
         floor = _FLOOR * torch.where(spread > 0, torch.minimum(spread, log_scale.exp()), log_scale.exp())
-        state = Followed(
-            recent,
-            counts,
-            old.seen + 1.0,
-            log_scale,
-            log_bandwidth,
-            torch.where(late, old.turned + _STEP, old.turned).clamp(max=1.0),
-            torch.where(first, far, torch.maximum(far, _FADES * old.far)),
-            torch.where(first, floor, old.floor),
+        state = old._replace(
+            recent=recent,
+            counts=counts,
+            seen=old.seen + 1.0,
+            log_scale=log_scale,
+            far=torch.where(first, far, torch.maximum(far, _FADES * old.far)),
+            floor=torch.where(first, floor, old.floor),
         )
-        return _alike(state)
+        return _alike(_turning(state, old, known) if search else state)
 
-    def _remembered(self, error: Tensor, weight: Tensor | None, axis: int) -> tuple[Tensor, Tensor]:
+    def _rows(self, values: Tensor, axis: int) -> Float[Tensor, "n m"]:
+        """Samples by channels, evenly chosen."""
+        rows = values.detach().movedim(axis, -1)
+        rows = rows.reshape(-1, rows.shape[-1])
+        return rows[:: max(1, len(rows) // _ROWS)].to(self.recent.dtype)
+
+    def _remembered(
+        self, rows: Float[Tensor, "n m"], weight: Float[Tensor, "n m"] | None
+    ) -> tuple[Float[Tensor, "m L"], Float[Tensor, "m L"]]:
         """The recent residuals with those of a batch, evenly chosen, at the end."""
-        channels, length = self.recent.shape
-        rows = error.movedim(axis, -1).reshape(-1, channels)
+        length = self.recent.shape[-1]
         step = max(1, len(rows) // length)
         chosen = rows[::step][:length].mT
-        if weight is None:
-            told = torch.ones_like(chosen)
-        else:
-            told = weight.detach().to(chosen.dtype).movedim(axis, -1).reshape(-1, channels)[::step][:length].mT
+        told = torch.ones_like(chosen) if weight is None else weight[::step][:length].mT
         count = chosen.shape[-1]
-        return (
-            torch.cat([self.recent[:, count:], chosen], -1),
-            torch.cat([self.counts[:, count:], told], -1),
-        )
+        return torch.cat([self.recent[:, count:], chosen], -1), torch.cat([self.counts[:, count:], told], -1)
+
+
+def _turning(state: Followed, old: Followed, known: Tensor) -> Followed:
+    """The state with the bandwidth looked for, and with less of the first loss where the other one is better."""
+    scaled = (state.recent / state.scale.unsqueeze(-1))[:, ::2]
+    bandwidth, better = _least_variance(scaled, state.counts[:, ::2])
+    rate = torch.clamp(SEARCH_EVERY / (old.seen + 1.0), min=1.0 - (1.0 - _RATE) ** SEARCH_EVERY, max=1.0)
+    late = (old.seen >= _BEFORE) & better & known
+    return state._replace(
+        log_bandwidth=old.log_bandwidth + rate * (bandwidth.log() - old.log_bandwidth),
+        turned=torch.where(late, old.turned + SEARCH_EVERY * _STEP, old.turned).clamp(max=1.0),
+    )
 
 
 def steered(
-    error: Float[Tensor, "*shape"],
+    input: Float[Tensor, "*shape"],
+    target: Float[Tensor, "*shape"] | None,
     weight: Tensor | None,
     axis: int,
     state: Followed,
@@ -180,17 +197,19 @@ def steered(
     """The sums, of each channel, of the loss by which a network learns; its gradient is that of a likelihood in size.
 
     Args:
-        error: input less target.
+        input: predictions, or errors where there is no target.
+        target: what the predictions should be.
         weight: of each element; None for 1.
         axis: of the channels.
         state: after this batch.
         turned: whether the first loss has no part any more.
     """
-    dtype = error.dtype
+    dtype = input.dtype
     scale, bandwidth = state.scale.to(dtype), state.log_bandwidth.exp().to(dtype)
-    late = energy_sums(error, bandwidth.pow(-2), scale, weight, axis)
+    late = energy_sums(input, bandwidth.pow(-2), scale, weight, axis, target=target)
     if turned:
         return late
+    error = input if target is None else input - target
     shape = [1] * error.dim()
     shape[axis] = -1
     early = _first_loss(error / scale.view(shape))
@@ -214,7 +233,7 @@ def steered_each(error: Tensor, axis: int, state: Followed) -> Tensor:
 
 def _first_loss(z: Tensor) -> Tensor:
     """``2 c² ((1 + (z / c)²)^(1/4) - 1)``: z² / 2 near 0, and the root of the residual far away."""
-    return 2.0 * _SHARP**2 * ((1.0 + (z / _SHARP).square()).pow(0.25) - 1.0)
+    return 2.0 * _SHARP**2 * ((1.0 + (z / _SHARP).square()).sqrt().sqrt() - 1.0)
 
 
 def _quantile(values: Float[Tensor, "m L"], counts: Float[Tensor, "m L"], share: float) -> Float[Tensor, " m"]:

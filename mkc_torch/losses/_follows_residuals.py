@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mkc_torch.losses._checks import Reduction
-from mkc_torch.losses._following import Followed, Following, steered, steered_each
+from mkc_torch.losses._following import SEARCH_EVERY, Followed, Following, steered, steered_each
 from mkc_torch.losses._state_dict import logit_of_scale, ratio_of
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ class FollowsResiduals(nn.Module):
     _own_floor: bool
     _has_begun: bool
     _turned: bool
+    _passes: int
 
     @torch.no_grad()
     def settle(self) -> None:
@@ -66,17 +67,21 @@ class FollowsResiduals(nn.Module):
         """Bound and floor of d."""
         return self.bound if self._own_bound else state.bound, self.d_min if self._own_floor else state.floor
 
-    def _state(self, error: Tensor, weight: Tensor | None, axis: int) -> Followed:
+    def _state(self, input: Tensor, target: Tensor | None, weight: Tensor | None, axis: int) -> Followed:
         """What is known with this batch; kept in training, but under transforms of functions, which have no state."""
         assert self.following is not None
         compiled = torch.compiler.is_compiling()
-        if not compiled and torch._C._functorch.is_functorch_wrapped_tensor(error):
+        if not compiled and torch._C._functorch.is_functorch_wrapped_tensor(input):
             return self.following.state
         learning = self.training and torch.is_grad_enabled()
         if not learning and (compiled or self._begun()):
             return self.following.state
-        state = self.following.after(error, weight, axis)
+        # compiled code is one for all batches
+        search = compiled or self._passes % SEARCH_EVERY == 0
+        state = self.following.after(input, target, weight, axis, search=search)
         if learning:
+            if not compiled:
+                self._passes += 1
             self.following.keep(state)
             bound, floor = self._domain(state)
             with torch.no_grad():
@@ -91,8 +96,8 @@ class FollowsResiduals(nn.Module):
             self._has_begun = bool(self.following.seen > 0)
         return self._has_begun
 
-    def _pull(self, error: Tensor, weight: Tensor | None, axis: int, state: Followed) -> Tensor:
+    def _pull(self, input: Tensor, target: Tensor | None, weight: Tensor | None, axis: int, state: Followed) -> Tensor:
         """What the network learns by: of each element, or summed."""
         if self.reduction == "none":
-            return steered_each(error, axis, state)
-        return steered(error, weight, axis, state, turned=self._turned).sum()
+            return steered_each(input if target is None else input - target, axis, state)
+        return steered(input, target, weight, axis, state, turned=self._turned).sum()

@@ -128,7 +128,7 @@ class MKCLoss(FollowsResiduals, Curves, nn.Module):
                 "Expected `learn_sigma=False, learn_d=False` with `normalize=False`: without the normaliser the loss "
                 "is smallest at sigma -> 0 or d -> inf, whatever the data. Drop `normalize=False` to learn them."
             )
-        self._watch, self._has_begun, self._turned = Watch(), False, False
+        self._watch, self._has_begun, self._turned, self._passes = Watch(), False, False, 0
         self.num_channels = num_channels
         self.normalize = normalize
         self.channel_dim, self._named_dim = -1 if channel_dim is None else channel_dim, channel_dim is not None
@@ -315,12 +315,12 @@ class MKCLoss(FollowsResiduals, Curves, nn.Module):
         kappa, d, bound = self.kappa, self.d, self.bound
         pull: Tensor | None = None
         if self.following is not None:
-            error = input - wanted if error is None else error
-            state = self._state(error, weight, axis)
+            first, second = (input, wanted) if error is None else (error, None)
+            state = self._state(first, second, weight, axis)
             d, bound = self._followed_d(state), self._domain(state)[0]
             if self.training and self.raw_kappa is not None and torch.is_grad_enabled():
-                pull = self._pull(error, weight, axis, state)
-                error = error.detach()
+                pull = self._pull(first, second, weight, axis, state)
+                input, error = input.detach(), None if error is None else error.detach()
         norm = self._log_normalizer(kappa, d, bound).to(dtype) if self.normalize else None
         kappa, d = (p.to(torch.promote_types(p.dtype, dtype)) for p in (kappa, d))
         if self.reduction == "none":
