@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
-from peers import MKC_EM, MKC_JOINT, Regression, losses, mean_and_error, perceptron, quiet, train
+from peers import MKC_AUTO, MKC_EM, MKC_JOINT, Regression, losses, mean_and_error, perceptron, quiet, train
 from sklearn.datasets import load_diabetes, make_friedman1
 from sklearn.linear_model import HuberRegressor
 from torch import Tensor, nn
@@ -140,7 +140,7 @@ def report(title: str, bad: Outcomes, good: Outcomes, share: float) -> None:
         columns = [mean_and_error([o.error for o in bad[name]]), ratio(bad, name, ORACLE), ratio(good, name, "MSE")]
         digits = (2, 3, 3)
         print(f"{name:26}" + "".join(f"{m:10.{k}f} ± {e:.{k}f}" for k, (m, e) in zip(digits, columns, strict=True)))
-    for name in (MKC_EM, MKC_JOINT):
+    for name in (MKC_EM, MKC_JOINT, MKC_AUTO):
         own = [o.criterion for o in bad[name] if isinstance(o.criterion, MKCLoss)]
         sigma, d = (torch.stack([getattr(c, key).detach() for c in own]).median() for key in ("sigma", "d"))
         found, mistaken = (mean_and_error([getattr(o, key) for o in bad[name]])[0] for key in ("found", "mistaken"))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 
 import torch
-from peers import MKC_EM, MKC_JOINT, Regression, losses, perceptron, quiet, train
+from peers import MKC_AUTO, MKC_EM, MKC_JOINT, Regression, losses, perceptron, quiet, train
 from torch import Tensor
 
 from mkc_torch import MKCLoss
@@ -65,7 +65,7 @@ def table(share: float, seeds: int, epochs: int) -> None:
         both = float(each.square().mean().sqrt())
         reference = reference or both
         print(f"{name:14} {float(each[0]):14.4f} {float(each[1]):14.4f} {both / reference:15.3f}")
-        if name in (MKC_EM, MKC_JOINT):
+        if name in (MKC_EM, MKC_JOINT, MKC_AUTO):
             own = [m.criterion for m in modules if isinstance(m.criterion, MKCLoss)]
             sigma, d = (torch.stack([getattr(c, key).detach() for c in own]).median(0).values for key in ("sigma", "d"))
             print(f"{'':14} sigma {sigma[0]:.3g}, {sigma[1]:.3g}; d {d[0]:.3g}, {d[1]:.3g}")

@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader, TensorDataset
 from mkc_torch import MKCLoss
 from mkc_torch.lightning.callback import MKCExpectationMaximization
 
-MKC_EM, MKC_JOINT = "MKC, EM", "MKC, joint"
+MKC_EM, MKC_JOINT, MKC_AUTO = "MKC, EM", "MKC, joint", "MKC, as it comes"
 
 
 class LearnedGaussianNLL(nn.Module):
@@ -91,7 +91,8 @@ def losses(num_channels: int, bound: float) -> dict[str, Callable[[], nn.Module]
         "Student t": lambda: StudentTNLL(num_channels),
         "adaptive": lambda: AdaptiveLoss(num_channels),
         MKC_EM: lambda: MKCLoss(num_channels, bound=bound, learn_sigma=False, learn_d=False, normalize=True),
-        MKC_JOINT: lambda: MKCLoss(num_channels, bound=bound),
+        MKC_JOINT: lambda: MKCLoss(num_channels, d=1.0, bound=bound),
+        MKC_AUTO: lambda: MKCLoss(num_channels),
     }
 
 

@@ -67,7 +67,7 @@ def explained(diagnosis, effect):
     return finding
 
 
-@pytest.mark.parametrize(("size", "seed"), [(0.2, 0), (0.05, 2)])
+@pytest.mark.parametrize(("size", "seed"), [(0.2, 0), pytest.param(0.05, 2, marks=pytest.mark.slow)])
 def test_air_drag_is_named_and_sized(size, seed):
     """Of a body whose flow turns laminar at small speeds."""
     recording = swung(lambda _, v: -size * v * math.hypot(v, 0.1), seed)
@@ -79,6 +79,7 @@ def test_air_drag_is_named_and_sized(size, seed):
     assert finding.held_out.rmse_before > 1.2 * NOISE
 
 
+@pytest.mark.slow
 def test_dry_friction_is_named_and_sized():
     """With a jump that is smoothed by another function."""
     diagnosis = diagnose(Pendulum(), swung(lambda _, v: -0.3 * 2.0 / math.pi * math.atan(v / 0.002)), **QUICK)

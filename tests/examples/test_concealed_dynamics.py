@@ -66,6 +66,7 @@ def test_the_number_of_the_run_is_no_output(loaded):
     assert proof.measured.shape == (len(both), 1)
 
 
+@pytest.mark.slow
 def test_of_the_heaters_what_is_left_is_located(loaded):
     """What is unrecorded there pushes both temperatures; beside pushes as slow as these only a delay is claimed."""
     shared_data("dynamics/heaters/run_1s.csv")
