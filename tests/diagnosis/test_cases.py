@@ -109,7 +109,7 @@ def test_an_output_that_has_nothing_to_do_with_the_input_is_not_followed():
     assert angle.residual > angle.last_value_predicts
 
 
-@pytest.mark.slow
+@slow
 def test_drag_of_a_car_that_rolls_out_is_what_would_explain_it():
     diagnosis = diagnosed("coastdown/runs.csv", "coastdown/naive.py:Coast")
     assert diagnosis.verdict in ("explained", "unexplained")
