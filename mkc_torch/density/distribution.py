@@ -23,6 +23,13 @@ _CHUNK = 1 << 16
 _MAX_ITERATIONS = 200
 
 
+class _Finite(constraints.Constraint):
+    """Above 0 and below infinity: a flat tail without an end has no density."""
+
+    def check(self, value: Tensor) -> Tensor:
+        return (value > 0.0) & (value < torch.inf)
+
+
 class MKCDistribution(Distribution):
     """Heavy-tailed errors with a Gaussian head on a bounded domain, (17) of Li et al. (2023).
 
@@ -32,7 +39,7 @@ class MKCDistribution(Distribution):
     Args:
         sigma: bandwidth in [0.05, inf], dimensionless.
         d: scale > 0, in the unit of the values.
-        bound: half-width of the domain > 0, in the unit of the values.
+        bound: half-width of the domain, above 0 and finite, in the unit of the values.
         loc: centre.
         validate_args: as in every torch distribution; False leaves the values of all arguments unseen.
 
@@ -58,7 +65,7 @@ class MKCDistribution(Distribution):
     arg_constraints = {  # noqa: RUF012
         "sigma": constraints.greater_than_eq(SIGMA_MIN),
         "d": constraints.positive,
-        "bound": constraints.positive,
+        "bound": _Finite(),
         "loc": constraints.real,
     }
     has_rsample = True

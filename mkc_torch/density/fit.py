@@ -353,6 +353,12 @@ def fit_density(
             f"Expected argument `error` to be finite but got {int((~torch.isfinite(error)).sum())} values that are "
             "not; leave those residuals out."
         )
+    most = torch.finfo(error.dtype).max ** 0.4
+    if not bool((error.abs() <= most).all()):
+        raise ValueError(
+            f"Expected argument `error` within {most:.1g}, beyond which squares overflow, but got "
+            f"{float(error.abs().max()):.2g}; divide by a unit near its scale, or leave out what cannot be right."
+        )
     checked_whole("max_iter", max_iter, 1, "100 is ample")
     checked_number("tol", tol, ends="[)", advice="1e-12 suits float64")
     shape = (*error.shape[:-2], error.shape[-1])

@@ -101,7 +101,7 @@ def _entropy(
     dims = _dimensions(residual, dim)
     count: Tensor | float
     if weight is None:
-        count = float(math.prod(residual.shape[d] for d in dims))
+        count = float(math.prod([residual.shape[d] for d in dims]))
     else:
         if not torch.compiler.is_compiling():
             _refuse_shares(weight, residual.shape, dims)

@@ -337,7 +337,7 @@ class MKCLoss(FollowsResiduals, Curves, nn.Module):
         else:
             total = energy_sums(error.to(kappa.dtype), kappa, d, weight, axis).sum()
         total = total if pull is None else total + (pull - pull.detach())
-        elements = float(input.numel()) if weight is None else weight.sum()
+        elements = input.numel() if weight is None else weight.sum()
         if norm is not None:
             if weight is None:
                 total = total + norm.sum() * (elements / self.num_channels)

@@ -514,3 +514,9 @@ def test_repr_names_the_parameters():
     text = repr(MKCDistribution(2.0, 1.0, 5.0))
     assert text.startswith("MKCDistribution(")
     assert all(name in text for name in ("sigma: 2.0", "d: 1.0", "bound: 5.0", "loc: 0.0"))
+
+
+@pytest.mark.parametrize("bound", [math.inf, 0.0, -1.0, math.nan])
+def test_a_domain_without_an_end_is_refused(bound):
+    with pytest.raises(ValueError, match="parameter bound"):
+        MKCDistribution(2.0, 1.0, bound)

@@ -495,3 +495,11 @@ def test_barrons_line_has_the_published_likelihood():
     assert -float(fit.log_likelihood_) / 50 == pytest.approx(-1.702394, abs=1e-6)
     wide = MKCRegression(bound=10.0).fit(X, y)
     assert -float(wide.log_likelihood_) / 50 == pytest.approx(-1.469973, abs=1e-6)
+
+
+@pytest.mark.parametrize(("dtype", "size"), [(torch.float64, 1e300), (torch.float32, 1e20)])
+def test_residuals_whose_squares_overflow_are_refused(dtype, size):
+    error = torch.linspace(-1.0, 1.0, 50, dtype=dtype).unsqueeze(-1)
+    error[3] = size
+    with pytest.raises(ValueError, match=r"`error` within .*, beyond which squares overflow, but got 1e\+"):
+        fit_density(error)

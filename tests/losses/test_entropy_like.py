@@ -144,6 +144,14 @@ def test_compiled_loss_equals_eager():
         torch.testing.assert_close(*slopes, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
+def test_compiled_without_weights_it_is_one_graph():
+    torch.compiler.reset()
+    x, y = sample(0, 20, 1), sample(1, 20, 1)
+    torch.testing.assert_close(torch.compile(LELoss(), fullgraph=True, backend="eager")(x, y), LELoss()(x, y))
+    torch.testing.assert_close(torch.compile(entropy_like, fullgraph=True, backend="eager")(x), entropy_like(x))
+
+
 # weights
 
 

@@ -900,3 +900,26 @@ def test_parameters_that_are_no_numbers_are_refused_by_name(name):
 def test_a_channel_dim_that_is_no_whole_number_is_refused(value):
     with pytest.raises(ValueError, match="`channel_dim` to be a whole number but got"):
         MKCLoss(2, channel_dim=value)
+
+
+class Criterion(nn.Module):
+    """A loss as the last step of a graph."""
+
+    def __init__(self, loss):
+        super().__init__()
+        self.loss = loss
+
+    def forward(self, x, y):
+        return self.loss(x, y)
+
+
+@pytest.mark.parametrize("options", [{"d": 1.0}, {"d": 1.0, **FIXED}, {}], ids=["learned", "fixed", "as it comes"])
+def test_an_exported_loss_takes_batches_of_any_size(options):
+    module = Criterion(MKCLoss(2, **options))
+    x, y = data(8, 2, dtype=torch.float32)
+    module(x, y)
+    module.eval()
+    size = torch.export.Dim("samples", min=2)
+    program = torch.export.export(module, (x, y), dynamic_shapes={"x": {0: size}, "y": {0: size}})
+    x, y = data(5, 2, dtype=torch.float32)
+    torch.testing.assert_close(program.module()(x, y), module(x, y))
