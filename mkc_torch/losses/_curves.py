@@ -30,9 +30,8 @@ class Curves:
 
         Example:
             >>> from mkc_torch import MKCLoss
-            >>> MKCLoss(1, sigma=2.0, d=1.0, bound=9.0).rho(torch.tensor([[0.0], [100.0]])).detach()
-            tensor([[0.],
-                    [4.]])
+            >>> MKCLoss(1, sigma=2.0, d=1.0, bound=9.0).rho(torch.tensor([[0.0], [100.0]])).round().tolist()
+            [[0.0], [4.0]]
         """
         z, kappa, _ = self._standardised(error)
         return energy(z, kappa)

@@ -24,7 +24,7 @@ from mkc_torch.losses._checks import (
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["HeteroscedasticMKCLoss", "MKCHead", "MKCHeadOutput"]
+__all__ = ["HeteroscedasticMKCLoss", "MKCConvHead", "MKCHead", "MKCHeadOutput"]
 
 KAPPA_MIN = 1e-6
 """Least ``1 / sigma²`` that a head gives; beyond, the gradients of σ leave the range of float32."""
@@ -293,6 +293,37 @@ class MKCHead(_WideBuffers):
 
     def extra_repr(self) -> str:
         return f"{self.in_features}, {self.num_channels}, bound={self.bound.tolist()}, d_min={self.d_min.tolist()}"
+
+
+class MKCConvHead(MKCHead):
+    """An :class:`MKCHead` at every place of an image or a series, channels second: a convolution of kernel size 1.
+
+    Args:
+        in_features: number of feature maps; the other arguments are those of :class:`MKCHead`.
+
+    Example:
+        >>> head = MKCConvHead(5, 2, bound=50.0, d_min=1e-3)
+        >>> prediction, sigma, d = head(torch.randn(3, 5, 8, 8))
+        >>> prediction.shape, float(HeteroscedasticMKCLoss(50.0, channel_dim=1)(prediction, prediction, sigma, d)) > 0.0
+        (torch.Size([3, 2, 8, 8]), True)
+    """
+
+    def forward(self, features: Float[Tensor, "N n *places"]) -> MKCHeadOutput:
+        """Predictions, σ and d at each place, each (N, m, *places).
+
+        Args:
+            features: feature maps, (N, n, *places).
+
+        Raises:
+            TypeError: integer or complex features, or what is no tensor.
+            ValueError: another number of feature maps.
+        """
+        refuse_not_real("features", features)
+        if features.dim() < 2 or features.shape[1] != self.in_features:
+            raise ValueError(
+                f"Expected argument `features` of shape (N, {self.in_features}, ...) but got {tuple(features.shape)}."
+            )
+        return MKCHeadOutput(*(values.movedim(-1, 1) for values in super().forward(features.movedim(1, -1))))
 
 
 def _positive(name: str, value: float | Tensor, num_channels: int | None = None) -> Tensor:

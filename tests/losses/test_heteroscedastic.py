@@ -6,7 +6,7 @@ from torch import nn
 from torch.autograd import gradcheck, gradgradcheck
 from torch.func import grad, vmap
 
-from mkc_torch import HeteroscedasticMKCLoss, MKCHead, MKCLoss
+from mkc_torch import HeteroscedasticMKCLoss, MKCConvHead, MKCHead, MKCLoss
 from mkc_torch.functional import mkc_nll
 from mkc_torch.losses import heteroscedastic as module
 
@@ -382,3 +382,22 @@ def test_another_number_of_features_is_refused():
         MKCHead(5, 2, bound=50.0, d_min=1e-3)(torch.zeros(4, 5).numpy())
     with pytest.raises(TypeError, match="`d_min` to be a number"):
         MKCHead(5, 2, bound=50.0, d_min="small")
+
+
+def test_a_head_of_images_is_the_head_at_every_place():
+    torch.manual_seed(0)
+    head = MKCConvHead(5, 2, bound=50.0, d_min=1e-3)
+    nn.init.normal_(head.scales.weight)
+    plain = MKCHead(5, 2, bound=50.0, d_min=1e-3)
+    plain.load_state_dict(head.state_dict())
+    features = torch.randn(3, 5, 4, 6)
+    for found, expected in zip(head(features), plain(features.movedim(1, -1)), strict=True):
+        assert found.shape == (3, 2, 4, 6)
+        torch.testing.assert_close(found, expected.movedim(-1, 1))
+    kernel = nn.functional.conv2d(features, head.location.weight[:, :, None, None], head.location.bias)
+    torch.testing.assert_close(head(features).location, kernel)
+    target = torch.randn(3, 2, 4, 6)
+    HeteroscedasticMKCLoss(50.0, channel_dim=1)(head(features).location, target, *head(features)[1:]).backward()
+    assert head.scales.weight.grad.abs().sum() > 0
+    with pytest.raises(ValueError, match=r"`features` of shape \(N, 5, \.\.\.\) but got \(3, 4, 5\)"):
+        head(torch.zeros(3, 4, 5))
