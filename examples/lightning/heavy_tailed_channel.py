@@ -57,18 +57,18 @@ def errors(module: Regression) -> Tensor:
 def table(share: float, seeds: int, epochs: int) -> None:
     """Print the losses side by side."""
     print(f"\n{share:.0%} one-sided outliers in the second channel, {seeds} seeds, {epochs} epochs")
-    print(f"{'loss':14} {'clean channel':>14} {'dirty channel':>14} {'both, over MSE':>15}")
+    print(f"{'loss':16} {'clean channel':>14} {'dirty channel':>14} {'both, over MSE':>15}")
     reference = 0.0
     for name in LOSSES:
         modules = [trained(name, share, seed, epochs) for seed in range(seeds)]
         each = torch.stack([errors(m) for m in modules]).square().mean(0).sqrt()
         both = float(each.square().mean().sqrt())
         reference = reference or both
-        print(f"{name:14} {float(each[0]):14.4f} {float(each[1]):14.4f} {both / reference:15.3f}")
+        print(f"{name:16} {float(each[0]):14.4f} {float(each[1]):14.4f} {both / reference:15.3f}")
         if name in (MKC_EM, MKC_JOINT, MKC_AUTO):
             own = [m.criterion for m in modules if isinstance(m.criterion, MKCLoss)]
             sigma, d = (torch.stack([getattr(c, key).detach() for c in own]).median(0).values for key in ("sigma", "d"))
-            print(f"{'':14} sigma {sigma[0]:.3g}, {sigma[1]:.3g}; d {d[0]:.3g}, {d[1]:.3g}")
+            print(f"{'':16} sigma {sigma[0]:.3g}, {sigma[1]:.3g}; d {d[0]:.3g}, {d[1]:.3g}")
 
 
 def curve(path: str, seeds: int, epochs: int) -> None:
@@ -82,12 +82,12 @@ def curve(path: str, seeds: int, epochs: int) -> None:
             torch.stack([errors(trained(name, share, seed, epochs)) for seed in range(seeds)]).square().mean().sqrt()
             for share in SHARES
         ]
-        print(f"{name:14} " + " ".join(f"{float(v):8.4f}" for v in values))
+        print(f"{name:16} " + " ".join(f"{float(v):8.4f}" for v in values))
         axes.semilogy([100.0 * s for s in SHARES], [float(v) for v in values], "o-", label=name)
     axes.set_xlabel("one-sided outliers in one of two channels (%)")
     axes.set_ylabel("error against the clean function")
     axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     figure.savefig(path, dpi=150)
 
 
