@@ -289,8 +289,8 @@ class MKCLoss(FollowsResiduals, Curves, nn.Module):
             input: predictions, any shape whose ``channel_dim`` has size m.
             target: targets of the same shape; nothing is broadcast.
             weight: non-negative weights, or a boolean mask that is True where an element counts; of the shape of the
-                input, or that shape without the channel dimension. What an element of weight 0 or False holds, NaN
-                included, reaches neither the value nor a gradient.
+                input, of size 1 where it is the same, or that shape without the channel dimension. What an element of
+                weight 0 or False holds, NaN included, reaches neither the value nor a gradient.
 
         Returns:
             A scalar, or for reduction "none" the shape of the input with 0 where masked; float32 at least. The mean is
@@ -319,8 +319,8 @@ class MKCLoss(FollowsResiduals, Curves, nn.Module):
             state = self._state(first, second, weight, axis)
             d, bound = self._followed_d(state), self._domain(state)[0]
             if self.training and self.raw_kappa is not None and torch.is_grad_enabled():
-                pull = self._pull(first, second, weight, axis, state)
-                input, error = input.detach(), None if error is None else error.detach()
+                pull = self._pull(first, second, None if weight is None else weight.detach(), axis, state)
+                input, wanted, error = input.detach(), wanted.detach(), None if error is None else error.detach()
         norm = self._log_normalizer(kappa, d, bound).to(dtype) if self.normalize else None
         kappa, d = (p.to(torch.promote_types(p.dtype, dtype)) for p in (kappa, d))
         if self.reduction == "none":

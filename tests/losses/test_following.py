@@ -163,6 +163,21 @@ def test_elements_and_sums_pull_alike(reduction):
     torch.testing.assert_close(*slopes)
 
 
+def test_a_weight_is_judged_by_the_likelihood():
+    x, y = torch.randn(2, 40, 1, generator=generator())
+    weight, loss = torch.ones(40, 1, requires_grad=True), MKCLoss(1, reduction="sum")
+    (slope,) = torch.autograd.grad(loss(x, y, weight), weight)
+    torch.testing.assert_close(slope, mkc_nll(x - y, loss.sigma, loss.d, loss.bound).detach(), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("reduction", ["none", "mean"])
+def test_a_target_is_pulled_as_hard_as_its_prediction_the_other_way(reduction):
+    x, y = (t.requires_grad_() for t in torch.randn(2, 40, 1, generator=generator()).unbind(0))
+    loss = MKCLoss(1, reduction=reduction)
+    by_input, by_target = torch.autograd.grad(loss(x, y).sum(), (x, y))
+    torch.testing.assert_close(by_input, -by_target)
+
+
 @given(exponent=st.floats(-6.0, 6.0), seed=st.integers(0, 99))
 @settings(max_examples=20, deadline=None)
 def test_scale_domain_and_pull_have_the_unit_of_the_target(exponent, seed):
