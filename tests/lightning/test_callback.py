@@ -974,3 +974,25 @@ def test_without_lightning_the_error_says_what_to_install(monkeypatch):
     spec = importlib.util.spec_from_file_location("without_lightning", path)
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'mkc-torch\[lightning\]'"):
         spec.loader.exec_module(importlib.util.module_from_spec(spec))
+
+
+def test_a_loss_that_follows_the_residuals_is_settled_and_fitted():
+    error = drawn(400, 2)
+    module = Replay(d="auto")
+    trainer_of(MKCExpectationMaximization()).fit(module, loader(error))
+    given = Replay()
+    trainer_of(MKCExpectationMaximization()).fit(given, loader(error))
+    assert module.criterion.following is None
+    torch.testing.assert_close(module.criterion.d, given.criterion.d)
+    torch.testing.assert_close(module.criterion.sigma, given.criterion.sigma)
+
+
+def test_a_loss_as_it_comes_trains_a_network_whatever_becomes_of_sigma_and_d():
+    torch.manual_seed(0)
+    x = torch.randn(400, 3)
+    y = 1000.0 * (x @ torch.tensor([[1.0], [-2.0], [0.5]])) + 10.0 * torch.randn(400, 1)
+    y[::5] += 1e5
+    module = Regression(lr=30.0, sigma=3.0, d="auto", bound="auto", learn_sigma=True, learn_d=True)
+    with pytest.warns(UserWarning, match="no optimiser seems to have them"):
+        trainer_of(max_epochs=60).fit(module, loader(x, y))
+    torch.testing.assert_close(module.net.weight[0].detach(), torch.tensor([1e3, -2e3, 500.0]), rtol=0.05, atol=0.0)
