@@ -27,6 +27,11 @@ SMALL = {
     "mkc challenge --worlds --family dynamics --output worlds_of_dynamics": (
         "--per-world 1 --hidden-per-world 0 --only white --workers 1"
     ),
+    "mkc challenge --worlds --family dynamics --per-world 15 --hidden-per-world 8 --seed 8608 --output worlds": (
+        "--per-world 1 --hidden-per-world 0 --only white --workers 1"
+    ),
+    "mkc challenge --worlds --family magnetometer --per-world 15 --hidden-per-world 5 --seed 7302 "
+    "--output worlds_of_sensors": "--per-world 1 --hidden-per-world 0 --only white --duration 15 --workers 1",
     "mkc challenge --seed 9421 --workers 2 --output proof": "--seed 1 --cases 0 --empty 1 --duration 10 --workers 1",
     "mkc challenge --family dynamics --seed 7741 --workers 2 --output proof_of_dynamics": (
         "--seed 1 --cases 0 --empty 1 --workers 1"
@@ -38,6 +43,7 @@ EXAMPLES = {
     "examples/paper/density.py": "",
     "examples/calibration/passing_magnet.py": "RECORDING.csv --output picture.png",
     "examples/calibration/least_squares_beside.py": "RECORDING.csv ANOTHER.csv",
+    "examples/lightning/any_unit.py": "--help",
     # minutes each, on recordings that are not part of the project
     "examples/concealed_physics/dynamics/heaters.py": "--help",
     "examples/concealed_physics/dynamics/silverbox.py": "--help",

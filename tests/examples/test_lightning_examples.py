@@ -141,3 +141,41 @@ def test_losses_are_timed_in_turns():
     found = speed.measured(losses, rows=8, times=1, rounds=2, device=torch.device("cpu"))
     assert set(found) == set(losses)
     assert all(value > 0.0 for value in found.values())
+
+
+@pytest.fixture(scope="module")
+def wrong_targets():
+    pytest.importorskip("sklearn")
+    return loaded("wrong_targets")
+
+
+@pytest.mark.parametrize("kind", ["permuted", "uniform", "one-sided", "factor 1000", "stuck"])
+def test_a_share_of_the_targets_is_wrong_and_no_other(wrong_targets, kind):
+    target = torch.rand(200, 1, generator=torch.Generator().manual_seed(0)) + 1.0
+    new, wrong = wrong_targets.spoilt(target, kind, 0.3, torch.Generator().manual_seed(1))
+    assert int(wrong.sum()) == 60
+    assert torch.equal(new[~wrong], target[~wrong])
+    assert int((new[wrong] != target[wrong]).sum()) >= 55
+    if kind == "permuted":
+        assert torch.equal(new[wrong].sort(0).values, target[wrong].sort(0).values)
+
+
+def test_wrong_targets_leaves_no_row_out(wrong_targets, tmp_path):
+    pytest.importorskip("matplotlib")
+    arguments = ["--tables", "diabetes", "--shares", "0", "0.3", "--seeds", "1", "--steps", "120", "--no-cleaner"]
+    wrong_targets.main([*arguments, "--output", str(tmp_path)])
+    lines = (tmp_path / "wrong_targets.md").read_text(encoding="utf-8").splitlines()
+    rows = [line for line in lines if line.startswith("| diabetes")]
+    assert [row.split("|")[2].strip() for row in rows] == ["none", *wrong_targets.KINDS]
+    assert any(line.startswith("| average rank") for line in lines)
+    assert (tmp_path / "wrong_targets.png").stat().st_size > 10_000
+    names = [name.strip() for name in lines[0].split("|")[4:-1]]
+    errors = dict(zip(names, map(float, rows[4].split("|")[4:-1]), strict=True))  # factor 1000
+    assert errors["MKC, as it comes"] < 1.2 < errors["MSE"]
+
+
+def test_an_error_of_a_cleaner_is_that_of_rows_held_out(wrong_targets):
+    pytest.importorskip("cleanlab")
+    told = wrong_targets.outcomes("diabetes", "one-sided", 0.2, 0, steps=100, cleaner=True)
+    assert 0.3 < told[wrong_targets.CLEANER].error < 5.0
+    assert told[wrong_targets.MKC].precision > 0.6
