@@ -246,6 +246,18 @@ def test_a_batch_that_is_masked_throughout_changes_no_scale():
     torch.testing.assert_close(loss.d.detach(), before)
 
 
+def test_the_network_begins_with_a_loss_sharper_than_the_absolute_value_and_ends_where_far_errors_pull_at_nothing():
+    error = torch.randn(200, 1, generator=generator())
+    error[0], error[1] = 20.0, 80.0
+    loss, leaf = MKCLoss(1), error.clone().requires_grad_()
+    (early,) = torch.autograd.grad(loss(leaf, torch.zeros(200, 1)), leaf)
+    assert float(early[0] / early[1]) == pytest.approx(2.0, rel=1e-3)
+    loss.following.turned.fill_(1.0)
+    loss.following.log_bandwidth.fill_(0.0)
+    (late,) = torch.autograd.grad(loss(leaf, torch.zeros(200, 1)), leaf)
+    assert float(late[1].abs()) < 1e-6 * float(early[1].abs())
+
+
 # --- state
 
 
