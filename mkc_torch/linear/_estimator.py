@@ -91,6 +91,6 @@ class LinearEstimator(Fitted):
         self._single_channel = layer.single_channel
         self.coef_ = layer.coef
         self.weights_ = layer.weights
-        self.covariance_ = layer.covariance
+        self.covariance_, self.dof_ = layer.covariance, layer.dof
         self.converged_ = layer.converged
         self.differentiable_ = layer.differentiable

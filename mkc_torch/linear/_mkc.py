@@ -57,6 +57,13 @@ def mean_energy(problem: LinearProblem, residual: Tensor, kappa: Tensor, d: Tens
     return ((weight * e).sum(-2) / weight.sum(-2)).sum(-1)
 
 
+def values_left(problem: LinearProblem) -> Float[Tensor, " B"]:
+    """Degrees of freedom: values of any weight less coefficients."""
+    weight = problem.sample_weight
+    used = problem.total_weight().sum(-1) if weight is None else (weight > 0).sum((-2, -1)).to(weight.dtype)
+    return used - problem.num_coefficients
+
+
 def coefficient_covariance(
     problem: LinearProblem,
     beta: Float[Tensor, "B n"],
@@ -76,12 +83,9 @@ def coefficient_covariance(
     if problem.sample_weight is not None:
         psi = psi * problem.sample_weight
     score = torch.matmul(psi.unsqueeze(-2), problem.basis).squeeze(-2)
-    used = (
-        problem.total_weight().sum(-1) if problem.sample_weight is None else (problem.sample_weight > 0).sum((-2, -1))
-    )
-    left = used - problem.num_coefficients
-    dof = used / left.clamp(min=1)
-    in_basis = sandwich(curvature, score, dof.to(score.dtype), kind, bandwidth)
+    left = values_left(problem)
+    dof = (left + problem.num_coefficients) / left.clamp(min=1)
+    in_basis = sandwich(curvature, score, dof, kind, bandwidth)
     covariance = torch.matmul(torch.matmul(problem.to_coef, in_basis), problem.to_coef.mT)
     # as many coefficients as values leave nothing to tell errors from
     return problem.restore(torch.where((left > 0)[:, None, None], covariance, torch.inf))

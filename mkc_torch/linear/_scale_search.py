@@ -80,6 +80,12 @@ def relative_precision(scale: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batc
     return (ratio.amin(-1, keepdim=True) / ratio).square()
 
 
+def rounding_scale(problem: LinearProblem) -> Float[Tensor, "B m"]:
+    """A scale that stands for 0: where a fit is exact, its rounding errors keep weight 1 and the others lose theirs."""
+    magnitude = problem.Y.abs().amax(-2)
+    return 1e3 * torch.finfo(problem.Y.dtype).eps * torch.where(magnitude > 0, magnitude, 1.0)
+
+
 def _step(problem: LinearProblem, beta: Tensor, rule: ScaleRule) -> tuple[Tensor, Tensor]:
     """Coefficients after one concentration step, and the objective before it."""
     residual = problem.residual(beta)

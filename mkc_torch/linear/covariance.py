@@ -13,12 +13,20 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 CovarianceKind = Literal["sandwich", "hac"]
+RobustCovarianceKind = Literal["sandwich", "hac", "homoscedastic"]
 
 
 def checked_kind(kind: CovarianceKind) -> CovarianceKind:
     """``kind``, or a clear error."""
     if kind not in ("sandwich", "hac"):
         raise ValueError(f"Expected argument `covariance` to be 'sandwich' or 'hac' but got {kind!r}.")
+    return kind
+
+
+def checked_robust_kind(kind: RobustCovarianceKind) -> RobustCovarianceKind:
+    """``kind``, or a clear error."""
+    if kind not in ("sandwich", "hac", "homoscedastic"):
+        raise ValueError(f"Expected argument `covariance` to be 'sandwich', 'hac' or 'homoscedastic' but got {kind!r}.")
     return kind
 
 

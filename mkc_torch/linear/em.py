@@ -20,10 +20,16 @@ from mkc_torch.density.fit import (
     newton_step,
     refuse_narrow_bound,
 )
-from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._implicit.at_rest import Rest
 from mkc_torch.linear._implicit.layer import Given, fit_layer, wanted
-from mkc_torch.linear._mkc import channel_parameter, coefficient_covariance, fixed_point_step, kernel_weight
+from mkc_torch.linear._inference import Inference
+from mkc_torch.linear._mkc import (
+    channel_parameter,
+    coefficient_covariance,
+    fixed_point_step,
+    kernel_weight,
+    values_left,
+)
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import RobustStart, Start, checked_start, robust_start
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
@@ -162,7 +168,7 @@ class _Known:
         )
 
 
-class MKCRegression(LinearEstimator):
+class MKCRegression(Inference):
     """Linear regression with learned bandwidths and scales, MKC-EM: Algorithm 3 of the paper.
 
     Maximises the likelihood of the MKC density over the coefficients and, for each channel, σ and d. An E-step is a
@@ -368,4 +374,5 @@ class MKCRegression(LinearEstimator):
         self.exact_fit_ = problem.restore(begin.exact)
         self.n_iter_ = len(maximum.history) - 1
         self.converged_ = problem.restore(maximum.converged | begin.exact)
+        self.dof_ = problem.restore(values_left(problem))
         self.covariance_ = coefficient_covariance(problem, maximum.beta, kappa, d, self.covariance, self.bandwidth)

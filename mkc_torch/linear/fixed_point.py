@@ -17,15 +17,16 @@ from mkc_torch._support.arguments import (
     refuse_out_of_range,
     told,
 )
-from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._implicit.at_rest import Rest
 from mkc_torch.linear._implicit.layer import Given, fit_layer, wanted
+from mkc_torch.linear._inference import Inference
 from mkc_torch.linear._mkc import (
     channel_parameter,
     coefficient_covariance,
     fixed_point_step,
     kernel_weight,
     mean_energy,
+    values_left,
 )
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import Start, checked_start, robust_start
@@ -116,7 +117,7 @@ class _End(NamedTuple):
     history: list[Tensor]
 
 
-class FixedPointLinear(LinearEstimator):
+class FixedPointLinear(Inference):
     """Linear regression under the MKC loss (13) with given σ and d by the fixed point (15): Algorithm 1 of the paper.
 
     The loss has many local minima when ``h = σ d`` is small, and leverage points can make the lowest a wrong one. The
@@ -226,6 +227,7 @@ class FixedPointLinear(LinearEstimator):
         self.history_ = torch.stack([problem.restore(h) for h in end.history])
         self.n_iter_ = len(end.history) - 1
         self.converged_ = problem.restore(end.converged)
+        self.dof_ = problem.restore(values_left(problem))
         self.covariance_ = coefficient_covariance(problem, end.beta, end.kappa, end.d, self.covariance, self.bandwidth)
 
     def _fit_as_layer(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None) -> FixedPointLinear:

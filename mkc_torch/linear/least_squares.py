@@ -7,12 +7,13 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number
 from mkc_torch.linear._estimator import LinearEstimator
-from mkc_torch.linear._mkc import coefficient_covariance
+from mkc_torch.linear._inference import Inference
+from mkc_torch.linear._mkc import coefficient_covariance, values_left
 from mkc_torch.linear._problem import canonical_shapes, linear_problem
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 
 
-class LeastSquares(LinearEstimator):
+class LeastSquares(Inference):
     """Ordinary or weighted least squares, (5) and (7) of Li et al. (2023).
 
     Args:
@@ -54,6 +55,7 @@ class LeastSquares(LinearEstimator):
         ones = torch.ones_like(problem.Y)
         beta = problem.weighted_fit(ones)
         self._set_common(problem, beta, ones)
+        self.dof_ = problem.restore(values_left(problem))
         unit = torch.ones_like(problem.Y[:, 0])
         self.covariance_ = coefficient_covariance(
             problem, beta, torch.zeros_like(unit), unit, self.covariance, self.bandwidth

@@ -12,11 +12,13 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole
 from mkc_torch._support.order_statistic import order_statistic
-from mkc_torch.linear._estimator import LinearEstimator
+from mkc_torch.linear._inference import RobustInference
+from mkc_torch.linear._influence import influence, m_scale_influence, scores
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.linear._psi import TUNING_95, PsiName, Tuning, checked_tuning, psi_weight
+from mkc_torch.linear._psi import TUNING_95, Psi, PsiName, Tuning, checked_tuning
 from mkc_torch.linear._robust_start import checked_start, robust_start
-from mkc_torch.linear._scale_search import relative_precision
+from mkc_torch.linear._scale_search import relative_precision, rounding_scale
+from mkc_torch.linear.covariance import RobustCovarianceKind
 from mkc_torch.linear.least_absolute_deviations import LeastAbsoluteDeviations
 
 if TYPE_CHECKING:
@@ -52,12 +54,6 @@ def proposal_2(
     expected = inside - 2.0 * k * density + k * k * (1.0 - inside)
     left = (problem.total_weight() - problem.coefficients_per_channel).clamp(min=1.0)
     return torch.sqrt(square.sum(-2) / (left * expected))
-
-
-def rounding_scale(problem: LinearProblem) -> Float[Tensor, "B m"]:
-    """A scale that stands for 0: where a fit is exact, its rounding errors keep weight 1 and the others lose theirs."""
-    magnitude = problem.Y.abs().amax(-2)
-    return 1e3 * torch.finfo(problem.Y.dtype).eps * torch.where(magnitude > 0, magnitude, 1.0)
 
 
 @dataclass(frozen=True)
@@ -125,7 +121,7 @@ def check_iterations(max_iter: int, tol: float) -> None:
     checked_number("tol", tol, 0.0, 1.0, advice="1e-10 suits float64")
 
 
-class MEstimator(LinearEstimator):
+class MEstimator(RobustInference):
     """M-estimator of regression: the coefficients with ``Σ ψ(r / scale) x = 0``, (18) of Indiveri (2009).
 
     Iteratively reweighted least squares, the scale taken anew from the residuals before every step. With m channels
@@ -143,10 +139,14 @@ class MEstimator(LinearEstimator):
         start: "lad", "lts", "s", "least_squares" or coefficients (*, n); default "lad" for "huber", else "lts".
         max_iter: steps at most.
         tol: converged when a step moves the fitted values by less than this share of the scale, in root mean square.
+        covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors are alike
+            at every X and no outlier lies far out in X. A "mad" is taken for known, which it may be where errors are
+            symmetric; "proposal2" enters with its own error.
+        bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
         seed: of the starts "lts" and "s".
 
     Attributes, after ``fit``:
-        coef_: (*, n).
+        coef_, covariance_, dof_: (*, n), (*, n, n), (*,); they and ``scale_`` have derivatives by X and Y.
         scale_: (*, m), m being 1 for one channel; of an exact fit the rounding error of Y.
         weights_: ψ(z) / z, 1 at z = 0, (*, N, m).
         n_iter_, converged_: steps made, and whether they had come to rest, (*,).
@@ -180,6 +180,8 @@ class MEstimator(LinearEstimator):
         start: MStart | Tensor | None = None,
         max_iter: int = 500,
         tol: float = 1e-10,
+        covariance: RobustCovarianceKind = "sandwich",
+        bandwidth: float | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -195,6 +197,7 @@ class MEstimator(LinearEstimator):
         self.start = start
         self.max_iter = max_iter
         self.tol = tol
+        self._set_covariance(covariance, bandwidth)
         self.seed = checked_whole("seed", seed)
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> MEstimator:
@@ -215,6 +218,7 @@ class MEstimator(LinearEstimator):
         beta = self._start(problem, X, Y, sample_weight)
         clip = tuning[0] if name == "huber" else TUNING_95["huber"][0]
 
+        psi = Psi(name, tuning)
         first = median_scale(problem, problem.residual(beta))
         exact = first <= rounding_scale(problem)
 
@@ -228,13 +232,27 @@ class MEstimator(LinearEstimator):
             problem,
             beta,
             first,
-            psi_weight(name, tuning),
+            psi.weight,
             next_scale,
             max_iter=self.max_iter,
             tol=self.tol,
         )
         self._set_common(problem, found.beta, found.weight)
         self.scale_ = problem.restore(found.scale)
+        equation = scores(problem, found.beta, found.scale, psi)
+        of_scale = None
+        if self.scale == "proposal2":
+            inside = equation.z.abs() < clip
+            square = equation.z.square()
+            of_scale = m_scale_influence(problem, square.clamp(max=clip * clip), 2.0 * square * inside)
+        self._infer(
+            problem,
+            found.beta,
+            found.weight,
+            equation,
+            lambda share: influence(problem, equation, of_scale, share),
+            psi.ratio(),
+        )
         self.n_iter_ = problem.restore(found.n_iter)
         self.converged_ = problem.restore(found.converged)
         return self

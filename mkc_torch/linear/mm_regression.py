@@ -7,17 +7,19 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole
-from mkc_torch.linear._estimator import LinearEstimator
+from mkc_torch.linear._inference import RobustInference
+from mkc_torch.linear._influence import influence, scores
 from mkc_torch.linear._problem import linear_problem
-from mkc_torch.linear._psi import bisquare_for_efficiency, psi_weight
+from mkc_torch.linear._psi import Psi, bisquare_for_efficiency
+from mkc_torch.linear.covariance import RobustCovarianceKind
 from mkc_torch.linear.m_estimator import check_iterations, reweight
-from mkc_torch.linear.s_regression import check_breakdown, check_starts, minimise_m_scale
+from mkc_torch.linear.s_regression import check_breakdown, check_starts, m_scale_equation, minimise_m_scale
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-class MMRegression(LinearEstimator):
+class MMRegression(RobustInference):
     """MM-estimator of regression with Tukey's bisquare: an M-estimate near an S-estimate, at the scale of that.
 
     From the coefficients of :class:`SRegression` iteratively reweighted least squares descends to the next minimum of
@@ -30,10 +32,13 @@ class MMRegression(LinearEstimator):
         starts: number of elemental starts of the S-estimate; see :class:`SRegression` for how many it takes.
         max_iter: steps at most after the S-estimate.
         tol: converged when a step moves the fitted values by less than this share of the scale, in root mean square.
+        covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors are alike
+            at every X and no outlier lies far out in X.
+        bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
         seed: of the elemental starts.
 
     Attributes, after ``fit``:
-        coef_: (*, n).
+        coef_, covariance_, dof_: (*, n), (*, n, n), (*,); they and ``scale_`` have derivatives by X and Y.
         scale_: (*, m), m being 1 for one channel: that of the S-estimate; of an exact fit the rounding error of Y.
         weights_: bisquare weights in [0, 1], (*, N, m).
         n_iter_, converged_: steps made after the S-estimate, and whether they had come to rest, (*,).
@@ -66,6 +71,8 @@ class MMRegression(LinearEstimator):
         starts: int = 500,
         max_iter: int = 500,
         tol: float = 1e-10,
+        covariance: RobustCovarianceKind = "sandwich",
+        bandwidth: float | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -78,6 +85,7 @@ class MMRegression(LinearEstimator):
         self.starts = starts
         self.max_iter = max_iter
         self.tol = tol
+        self._set_covariance(covariance, bandwidth)
         self.seed = checked_whole("seed", seed)
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> MMRegression:
@@ -87,16 +95,20 @@ class MMRegression(LinearEstimator):
         """
         problem = linear_problem(X, Y, sample_weight)
         start = minimise_m_scale(problem, breakdown=self.breakdown, starts=self.starts, seed=self.seed)
-        found = reweight(
-            problem,
-            start.beta,
-            start.scale,
-            psi_weight("tukey", (bisquare_for_efficiency(self.efficiency),)),
-            max_iter=self.max_iter,
-            tol=self.tol,
-        )
+        psi = Psi("tukey", (bisquare_for_efficiency(self.efficiency),))
+        found = reweight(problem, start.beta, start.scale, psi.weight, max_iter=self.max_iter, tol=self.tol)
         self._set_common(problem, found.beta, found.weight)
         self.scale_ = problem.restore(found.scale)
+        equation = scores(problem, found.beta, found.scale, psi)
+        _, of_scale = m_scale_equation(problem, start.beta, start.scale, self.breakdown)
+        self._infer(
+            problem,
+            found.beta,
+            found.weight,
+            equation,
+            lambda share: influence(problem, equation, of_scale, share),
+            psi.ratio(),
+        )
         self.n_iter_ = problem.restore(found.n_iter)
         self.converged_ = problem.restore(found.converged)
         return self

@@ -11,13 +11,15 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole, told
 from mkc_torch.linear._estimator import LinearEstimator
+from mkc_torch.linear._inference import RobustInference
+from mkc_torch.linear._influence import Scores, influence
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import residual_scale
-from mkc_torch.linear._scale_search import relative_precision
+from mkc_torch.linear._scale_search import relative_precision, rounding_scale
+from mkc_torch.linear.covariance import RobustCovarianceKind
 from mkc_torch.linear.least_median_of_squares import LeastMedianOfSquares
-from mkc_torch.linear.least_trimmed_squares import LeastTrimmedSquares
-from mkc_torch.linear.m_estimator import rounding_scale
-from mkc_torch.linear.s_regression import SRegression, check_starts
+from mkc_torch.linear.least_trimmed_squares import LeastTrimmedSquares, default_coverage, trimmed_equation
+from mkc_torch.linear.s_regression import SRegression, check_starts, m_scale_equation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -29,7 +31,7 @@ _STARTS: dict[str, Callable[..., LinearEstimator]] = {
 }
 
 
-class ReweightedLeastSquares(LinearEstimator):
+class ReweightedLeastSquares(RobustInference):
     """Least squares with the weights 0 and 1 that two looks at the residuals of a robust fit give, (26)-(29).
 
     Values beyond ``threshold`` times a first scale are left out of the second, and those beyond ``threshold`` times
@@ -44,11 +46,17 @@ class ReweightedLeastSquares(LinearEstimator):
         start: robust fit of the first residuals: "lts", "lms", "s", or an estimator of this package.
         threshold: residuals above so many scales are rejected, at least 1.
         starts: number of random starts of "lts", "lms" and "s"; default theirs.
+        covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors are alike
+            at every X and no outlier lies far out in X.
+        bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
         seed: of those.
 
     Attributes, after ``fit``:
         coef_: (*, n); its gradient is that of least squares on the values that count.
         scale_: (*, m), m being 1 for one channel: (27) of the values that count, degrees of freedom taken off.
+        covariance_, dof_: (*, n, n), (*,); what "lts" or "s" passes on of its own error is in it (He & Portnoy,
+            "Reweighted LS estimators converge at the same rate as the initial estimator", Annals of Statistics 20
+            (1992), for Gaussian good errors); of other starts, which have none that is known, it is not.
         weights_: 1 for the values that count, 0 for those rejected, (*, N, m).
         start_: the robust fit.
 
@@ -77,6 +85,8 @@ class ReweightedLeastSquares(LinearEstimator):
         *,
         threshold: float = 2.5,
         starts: int | None = None,
+        covariance: RobustCovarianceKind = "sandwich",
+        bandwidth: float | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -91,6 +101,7 @@ class ReweightedLeastSquares(LinearEstimator):
         self.start = start
         self.threshold = threshold
         self.starts = starts
+        self._set_covariance(covariance, bandwidth)
         self.seed = checked_whole("seed", seed)
 
     def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> ReweightedLeastSquares:
@@ -107,8 +118,36 @@ class ReweightedLeastSquares(LinearEstimator):
         weight = self._keep(residual, second)
         beta = problem.weighted_fit(weight * relative_precision(second).unsqueeze(-2))
         self._set_common(problem, beta, weight)
-        self.scale_ = problem.restore(_kept_scale(problem, problem.residual(beta), weight))
+        scale = _kept_scale(problem, problem.residual(beta), weight)
+        self.scale_ = problem.restore(scale)
+        self._infer_from(problem, beta, weight, torch.maximum(scale, floor))
         return self
+
+    def _infer_from(self, problem: LinearProblem, beta: Tensor, weight: Tensor, scale: Tensor) -> None:
+        z = problem.residual(beta) / scale.unsqueeze(-2)
+        equation = Scores(z * weight, weight, z, scale)
+        inside, edge = _gaussian_edge(self.threshold)
+
+        def influence_of(share: Tensor | None) -> Tensor:
+            moved = influence(problem, equation, None, share)
+            start = self._start_influence(problem, share)
+            return moved if start is None else moved + edge / inside * start
+
+        self._infer(problem, beta, weight, equation, influence_of, inside / (inside - edge))
+
+    def _start_influence(self, problem: LinearProblem, share: Tensor | None) -> Tensor | None:
+        """What each sample moves the start's coefficients by, in the basis, where that is known."""
+        start = self.start_
+        beta = problem.in_basis(start.coef_)
+        if isinstance(start, LeastTrimmedSquares):
+            h = default_coverage(problem) if start.h is None else start.h
+            kept = start.weights_.reshape(problem.Y.shape)
+            return influence(problem, trimmed_equation(problem, beta, kept, h / problem.num_samples), None, share)
+        if isinstance(start, SRegression):
+            scale = start.scale_.reshape(-1, problem.num_channels)
+            equation, of_scale = m_scale_equation(problem, beta, scale, start.breakdown)
+            return influence(problem, equation, of_scale, share)
+        return None
 
     def _keep(self, residual: Tensor, scale: Tensor) -> Float[Tensor, "B N m"]:
         return (residual.abs() <= self.threshold * scale.unsqueeze(-2)).to(residual.dtype)
@@ -118,6 +157,12 @@ class ReweightedLeastSquares(LinearEstimator):
             return self.start
         kind = _STARTS[self.start]
         return kind(seed=self.seed) if self.starts is None else kind(starts=self.starts, seed=self.seed)
+
+
+def _gaussian_edge(threshold: float) -> tuple[float, float]:
+    """The share of a Gaussian within ±threshold, and 2 c φ(c): what its mean within moves by, a unit of the edges'."""
+    density = math.exp(-0.5 * threshold**2) / math.sqrt(2.0 * math.pi)
+    return math.erf(threshold / math.sqrt(2.0)), 2.0 * threshold * density
 
 
 def _kept_scale(problem: LinearProblem, residual: Tensor, weight: Tensor) -> Float[Tensor, "B m"]:

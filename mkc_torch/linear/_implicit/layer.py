@@ -49,7 +49,7 @@ class Given(NamedTuple):
 
 @dataclass(frozen=True)
 class Layer:
-    """A differentiable fit in the user's batch dimensions; ``covariance`` and ``extras`` are constants."""
+    """A differentiable fit in the user's batch dimensions; ``covariance``, ``dof`` and ``extras`` are constants."""
 
     coef: Float[Tensor, "*batch n"]
     weights: Float[Tensor, "*batch N m"]
@@ -58,6 +58,7 @@ class Layer:
     bound: Float[Tensor, "*batch m"]
     log_likelihood: Float[Tensor, " *batch"] | None
     covariance: Float[Tensor, "*batch n n"]
+    dof: Float[Tensor, " *batch"]
     differentiable: Bool[Tensor, " *batch"]
     converged: Bool[Tensor, " *batch"]
     extras: tuple[Tensor, ...]
@@ -219,6 +220,11 @@ class _Solve(torch.autograd.Function):
         return found, (0,) * len(found)
 
 
+def _values_left(values: CanonicalShapes) -> Tensor:
+    used = torch.ones_like(values.Y) if values.sample_weight is None else (values.sample_weight > 0).to(values.Y.dtype)
+    return used.sum((-2, -1)) - values.X.shape[-1]
+
+
 def _differentiable(values: CanonicalShapes, given: Given, found: _Found, extras: tuple[Tensor, ...]) -> Layer:
     """The solution again, in plain torch from the data: found values, derivatives by two chord steps of Newton."""
     rows = torch.matmul(values.X.flatten(-3, -2), found.to_coef)
@@ -260,6 +266,7 @@ def _differentiable(values: CanonicalShapes, given: Given, found: _Found, extras
         bound=torch.exp(log_bound),
         log_likelihood=log_likelihood,
         covariance=found.covariance,
+        dof=_values_left(values),
         differentiable=found.cause == 0,
         converged=found.converged,
         extras=extras,

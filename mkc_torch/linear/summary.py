@@ -1,0 +1,182 @@
+"""Table of a regression's coefficients, for a terminal, a notebook and a program."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+LIGHT = 0.1
+"""A weight below this is told of: the fit all but leaves the value out. Nothing decides by it."""
+
+_KINDS = {
+    "sandwich": "the sandwich",
+    "hac": "the sandwich of a time series",
+    "homoscedastic": "Huber's formula for errors that are alike at every X",
+}
+
+_FACTS = ("scale", "robust R²")
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """One row: the estimate, its standard error, the p-value of 0, and the interval."""
+
+    name: str
+    value: float
+    standard_error: float
+    p_value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a robust regression found.
+
+    Attributes:
+        title: the estimator.
+        coefficients: rows of the table.
+        level: of the intervals.
+        num_values, num_light: values given, and how many of them have a weight below 0.1.
+        scale, r_squared: of each channel; empty where the estimator has none.
+        dof: degrees of freedom left.
+        kind: of the covariance.
+    """
+
+    title: str
+    coefficients: tuple[Coefficient, ...]
+    level: float
+    num_values: int
+    num_light: int
+    scale: tuple[float, ...]
+    r_squared: tuple[float, ...]
+    dof: float
+    kind: str
+
+    @classmethod
+    def of(
+        cls,
+        title: str,
+        names: Sequence[str] | None,
+        columns: tuple[Tensor, Tensor, Tensor, Tensor],
+        *,
+        level: float,
+        light: tuple[int, int],
+        scale: Sequence[float],
+        r_squared: Sequence[float],
+        dof: float,
+        kind: str,
+    ) -> Summary:
+        """From the columns of the table: coefficients, standard errors, p-values (n,) and intervals (n, 2)."""
+        value, error, p_value, interval = (c.detach().cpu().double().tolist() for c in columns)
+        names = [f"x{k}" for k in range(len(value))] if names is None else list(names)
+        if len(names) != len(value):
+            raise ValueError(
+                f"Expected argument `names` to hold {len(value)} names but got {len(names)}; one for each coefficient."
+            )
+        rows = zip(names, value, error, p_value, interval, strict=True)
+        coefficients = tuple(Coefficient(str(n), v, e, p, *ends) for n, v, e, p, ends in rows)
+        return cls(title, coefficients, level, *light, tuple(scale), tuple(r_squared), dof, kind)
+
+    @property
+    def heading(self) -> str:
+        light = f", {self.num_light} with a weight below {LIGHT:g}" if self.num_light else ""
+        return f"{self.title} of {self.num_values} values{light}"
+
+    @property
+    def footing(self) -> str:
+        facts = [
+            f"{word} {', '.join(f'{v:.4g}' for v in values)}"
+            for word, values in zip(_FACTS, (self.scale, self.r_squared), strict=True)
+            if values
+        ]
+        return ", ".join([*facts, f"{self.dof:g} degrees of freedom", f"standard errors by {_KINDS[self.kind]}"])
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        return ("", "coefficient", "std. error", "p-value", f"{100 * self.level:g} % interval")
+
+    @property
+    def rows(self) -> list[tuple[str, ...]]:
+        """The cells as text, coefficients and intervals to the decimals that the standard error makes sense of."""
+        return [_cells(c) for c in self.coefficients]
+
+    def __str__(self) -> str:
+        table = [self.columns, *self.rows]
+        width = [max(len(row[k]) for row in table) for k in range(len(self.columns))]
+        lines = (
+            "   ".join([row[0].ljust(width[0]), *(c.rjust(w) for c, w in zip(row[1:], width[1:], strict=True))])
+            for row in table
+        )
+        return "\n".join([self.heading, "", *lines, "", self.footing])
+
+    def __rich__(self) -> Table:
+        from rich import box
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(title=self.heading, caption=self.footing, box=box.SIMPLE_HEAD, title_justify="left")
+        table.add_column(self.columns[0])
+        for column in self.columns[1:]:
+            table.add_column(column, justify="right", no_wrap=True)
+        for name, *cells in self.rows:
+            # a name may hold brackets, which are no markup
+            table.add_row(Text(name), *cells)
+        return table
+
+    def _repr_html_(self) -> str:
+        head = "".join(f"<th>{html.escape(c)}</th>" for c in self.columns)
+        body = "".join(
+            f"<tr><th>{html.escape(name)}</th>{''.join(f'<td>{c}</td>' for c in cells)}</tr>"
+            for name, *cells in self.rows
+        )
+        return (
+            f"<table><caption>{html.escape(self.heading)}</caption><thead><tr>{head}</tr></thead>"
+            f"<tbody>{body}</tbody></table><p>{html.escape(self.footing)}</p>"
+        )
+
+
+def _cells(c: Coefficient) -> tuple[str, ...]:
+    decimals = _decimals(c.standard_error)
+    return (
+        c.name,
+        _fixed(c.value, decimals),
+        f"{c.standard_error:.4g}",
+        f"{c.p_value:.2g}",
+        f"{_fixed(c.low, decimals)} to {_fixed(c.high, decimals)}",
+    )
+
+
+def _decimals(error: float) -> int | None:
+    """Decimals that show three digits of a standard error; None where a plain number is too long for them."""
+    if not 0.0 < error < math.inf:
+        return None
+    decimals = 2 - math.floor(math.log10(error))
+    return max(decimals, 0) if decimals <= 8 else None
+
+
+def _fixed(value: float, decimals: int | None) -> str:
+    return f"{value:.6g}" if decimals is None or abs(value) >= 1e9 else f"{value:.{decimals}f}"
+
+
+def one_problem(problem: tuple[int, ...], batch: tuple[int, ...]) -> tuple[int, ...]:
+    """The index of one problem of a batch.
+
+    Raises:
+        IndexError: none is chosen, or there is no such one.
+    """
+    fits = len(problem) == len(batch) and all(-size <= k < size for k, size in zip(problem, batch, strict=True))
+    if not fits:
+        raise IndexError(
+            f"Expected argument `problem` to be the index of one problem of the batch {batch} but got {problem}; "
+            "a summary is of one."
+        )
+    return problem
