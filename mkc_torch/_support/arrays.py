@@ -18,11 +18,13 @@ from mkc_torch._support.arguments import refuse_no_tensor
 __all__ = [
     "ArrayLike",
     "Data",
+    "absent",
     "as_tensor",
     "as_tensors",
     "column_names",
     "is_array",
     "is_frame",
+    "numbers_of",
     "refuse_other_columns",
     "series_of",
 ]
@@ -89,14 +91,14 @@ def as_tensor(name: str, value: Data, *, like: Tensor | None = None, missing: fl
     if like is not None:
         return as_tensor(name, value, missing=missing).to(like)
     if is_frame(value):
-        columns = [_numbers(name, label, series, missing) for label, series in series_of(value)]
+        columns = [numbers_of(_where(name, label), series, missing) for label, series in series_of(value)]
         shape = (len(value), 0)  # type: ignore[arg-type]
         return torch.from_numpy(np.stack(columns, axis=-1) if columns else np.empty(shape))
     if not is_array(value):
         refuse_no_tensor(name, value, "a tensor or an array")
     # a Series has the name of its column
     label = getattr(value, "name", None) if hasattr(value, "to_numpy") else None
-    return torch.from_numpy(_numbers(name, label, value, missing))
+    return torch.from_numpy(numbers_of(_where(name, label), value, missing))
 
 
 def as_tensors(**values: Data) -> tuple[Tensor, ...]:
@@ -156,13 +158,22 @@ def series_of(frame: Any) -> Iterator[tuple[Any, Any]]:
         yield from ((name, frame[name]) for name in frame.columns)
 
 
-def _numbers(name: str, label: object, value: Any, missing: float | None) -> np.ndarray:
-    """An array of float32 or float64 that torch can share, from an array or one column of a frame."""
-    where = f"argument `{name}`" if label in (None, "") else f"column `{label}` of argument `{name}`"
+def numbers_of(where: str, value: Any, missing: float | None = None) -> np.ndarray:
+    """An array of float32 or float64 that torch can share, from an array or one column of a frame.
+
+    Args:
+        where: it stands, for errors: "argument `X`" say.
+        value: what gives itself as a NumPy array.
+        missing: what stands where it has no value; None refuses it then.
+
+    Raises:
+        TypeError: no real numbers.
+        ValueError: values are missing.
+    """
     array = np.asarray(value.to_numpy() if hasattr(value, "to_numpy") else value)
-    absent = _absent(value)
-    if absent is not None and absent.any():
-        array = _filled(where, array, absent, missing)
+    gone = absent(value)
+    if gone is not None and gone.any():
+        array = _filled(where, array, gone, missing)
     elif array.dtype.kind not in _NUMBERS:
         raise TypeError(f"Expected {where} to hold real numbers but got {_told_of(array)}.")
     dtype = np.float32 if array.dtype == np.float32 else np.float64
@@ -170,22 +181,22 @@ def _numbers(name: str, label: object, value: Any, missing: float | None) -> np.
     return np.require(array.astype(dtype, copy=False), requirements=["C", "W"])
 
 
-def _filled(where: str, array: np.ndarray, absent: np.ndarray, missing: float | None) -> np.ndarray:
+def _filled(where: str, array: np.ndarray, gone: np.ndarray, missing: float | None) -> np.ndarray:
     """The numbers of a column that lacks some, in float64, with ``missing`` in their place."""
-    present = array[~absent]
+    present = array[~gone]
     if present.dtype.kind not in _NUMBERS and not _all_numbers(present):
         raise TypeError(f"Expected {where} to hold real numbers but got {_told_of(present)}.")
     if missing is None:
         raise ValueError(
-            f"Expected {where} to have a value everywhere but got {int(absent.sum())} missing of {absent.size}; drop "
+            f"Expected {where} to have a value everywhere but got {int(gone.sum())} missing of {gone.size}; drop "
             "those rows, or fill them."
         )
     filled = np.full(array.shape, missing, dtype=np.float64)
-    filled[~absent] = present.astype(np.float64)
+    filled[~gone] = present.astype(np.float64)
     return filled
 
 
-def _absent(value: Any) -> np.ndarray | None:
+def absent(value: Any) -> np.ndarray | None:
     """Where a column has no value; None if it is of a kind that always has one."""
     if isinstance(value, np.ma.MaskedArray):
         return np.ma.getmaskarray(value)
@@ -193,8 +204,12 @@ def _absent(value: Any) -> np.ndarray | None:
         return None
     for method in ("is_null", "isna"):
         if hasattr(value, method):
-            return np.asarray(getattr(value, method)().to_numpy(), dtype=bool)
+            return np.asarray(getattr(value, method)(), dtype=bool)
     return None
+
+
+def _where(name: str, label: object) -> str:
+    return f"argument `{name}`" if label in (None, "") else f"column `{label}` of argument `{name}`"
 
 
 def _all_numbers(array: np.ndarray) -> bool:
