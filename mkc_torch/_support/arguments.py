@@ -43,7 +43,7 @@ DIVERGED = "The network has diverged, or what it was given holds NaN: lower the 
 
 
 def told(value: object) -> str:
-    """What a value is, as an error tells it: classes and what has no text of one line by their names, long values shortened."""
+    """What a value is, as an error tells it: shortened, or by name if it is a class or has no text of one line."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     text, kind = reprlib.repr(value), type(value).__name__

@@ -153,7 +153,5 @@ def test_a_frame_is_written_as_a_recording(tmp_path):
 
 def test_a_frame_in_the_place_of_a_recording_is_told_how_to_become_one():
     frame = pd.DataFrame({"time": [0.0, 0.1]})
-    with pytest.raises(
-        TypeError, match=r"`recording` to be a Recording but got a DataFrame; make one, Recording\(recording\)"
-    ):
+    with pytest.raises(TypeError, match=r"but got a DataFrame; make one, Recording\(recording\)"):
         diagnose(Magnetometer(), frame)
