@@ -20,6 +20,7 @@ from sklearn.linear_model import Lasso as SklearnLasso
 from torch import Tensor
 
 from mkc_torch import EllipsoidFit, Recording
+from mkc_torch._support.arrays import Data
 from mkc_torch.linear import FixedPointLinear, LeastAbsoluteDeviations, LeastSquares, MKCRegression, Ridge
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.recording.demonstration import simulated_recording
@@ -32,7 +33,8 @@ class Lasso(LinearEstimator):
         super().__init__()
         self.alpha = alpha
 
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> Lasso:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> Lasso:
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         model = SklearnLasso(alpha=self.alpha, fit_intercept=False, max_iter=100_000)
         model.fit(X.squeeze(-2).numpy(), Y.squeeze(-1).numpy(), sample_weight=sample_weight)
         self.coef_ = torch.from_numpy(model.coef_)

@@ -43,11 +43,11 @@ DIVERGED = "The network has diverged, or what it was given holds NaN: lower the 
 
 
 def told(value: object) -> str:
-    """What a value is, as an error tells it: classes and what has no text by their names, long values shortened."""
+    """What a value is, as an error tells it: shortened, or by name if it is a class or has no text of one line."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     text, kind = reprlib.repr(value), type(value).__name__
-    if not text.startswith("<"):
+    if not text.startswith("<") and "\n" not in text:
         return text
     return f"an {kind}" if kind[0] in "AEIOUaeiou" else f"a {kind}"
 

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, refuse_bad_weight, refuse_not_real, refuse_other_type
+from mkc_torch._support.arrays import Data, as_tensor
 from mkc_torch._support.order_statistic import order_statistic, robust_scale
 from mkc_torch.calibration.coverage import Coverage, coverage
 from mkc_torch.calibration.ellipsoid import (
@@ -135,24 +136,27 @@ class EllipsoidFit(Fitted):
         self.max_scatter = checked_number("max_scatter", max_scatter, ends="(]", advice=f"{MAX_SCATTER:g} is usual")
 
     def fit(
-        self, points: Float[Tensor, "*batch N 3"], sample_weight: Float[Tensor, "*batch N"] | None = None
+        self, points: Float[Tensor, "*batch N 3"] | Data, sample_weight: Float[Tensor, "*batch N"] | Data | None = None
     ) -> EllipsoidFit:
         """Fit an ellipsoid to points.
 
         Args:
-            points: (*, N, 3) with N >= 9, in any unit of length or field.
+            points: (*, N, 3) with N >= 9, in any unit of length or field; a tensor, a NumPy array or a DataFrame, of
+                which :meth:`calibrate` then takes one with the same columns alone.
             sample_weight: non-negative weights (*, N); 0 leaves a point out.
 
         Raises:
-            TypeError: not a floating tensor.
+            TypeError: not a floating tensor, or an array of something else than real numbers.
             ValueError: wrong shape, too few or non-finite points.
             NotIdentifiableError: the points lie on a plane, cover too few directions (the message names those that are
                 missing), or draw no surface: they scatter about it by more than ``max_scatter``.
         """
         self._forget()
-        points, weight = _prepared(points, sample_weight)
+        weight = None if sample_weight is None else as_tensor("sample_weight", sample_weight)
+        used, weight = _prepared(as_tensor("points", points), weight)
+        self._keep_columns_of(points)
         try:
-            self._fit(points, weight)
+            self._fit(used, weight)
         except NotIdentifiableError:
             self._forget()
             raise
@@ -221,15 +225,17 @@ class EllipsoidFit(Fitted):
             bandwidth=getattr(self.estimator, "bandwidth", None),
         )
 
-    def calibrate(self, points: Float[Tensor, "*batch M 3"]) -> Float[Tensor, "*batch M 3"]:
+    def calibrate(self, points: Float[Tensor, "*batch M 3"] | Data) -> Float[Tensor, "*batch M 3"]:
         """``calibration_matrix_ @ (p - center_)`` of each point: the field in the unit of the points.
 
         Raises:
             NotFittedError: before ``fit``.
-            TypeError: not a floating tensor.
-            ValueError: another shape, or other batch dimensions than those of the fit.
+            TypeError: not a floating tensor, or an array of something else than real numbers.
+            ValueError: another shape, or other batch dimensions or columns than those of the fit.
         """
         matrix = self.calibration_matrix_
+        self._refuse_other_columns("points", points)
+        points = as_tensor("points", points, like=matrix)
         _refuse_no_points(points)
         common_batch("points", points.shape[:-2], "calibration_matrix_", matrix.shape[:-2])
         return torch.einsum("...ij,...kj->...ki", self.calibration_matrix_, points - self.center_.unsqueeze(-2))
@@ -363,7 +369,7 @@ def _refuse_no_points(points: Tensor) -> None:
     if points.dim() < 2 or points.shape[-1] != 3:
         mend = "; a point is a row, so try points.mT" if points.dim() > 1 and points.shape[-2] == 3 else ""
         if points.shape == (3,):
-            mend = "; one point is points.unsqueeze(0)"
+            mend = "; one point is points[None]"
         raise ValueError(f"Expected argument `points` of shape (*, N, 3) but got {tuple(points.shape)}{mend}.")
 
 

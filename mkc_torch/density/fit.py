@@ -15,8 +15,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import as_numbers, checked_number, checked_whole, refuse_bad_weight, refuse_not_real
+from mkc_torch._support.arguments import (
+    as_numbers,
+    checked_number,
+    checked_whole,
+    refuse_not_finite,
+    refuse_not_real,
+)
+from mkc_torch._support.arrays import Data, as_tensor
 from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.density._full_weight import full_weight
 from mkc_torch.density.energy import KAPPA_MAX, SIGMA_LEAST, energy_value
 from mkc_torch.density.normalizer import head_rule, integrate, log_partition_value, tail_density
 
@@ -298,12 +306,12 @@ def refuse_narrow_bound(bound: Tensor, scale: Tensor) -> None:
 
 
 def fit_density(
-    error: Float[Tensor, "*batch N m"],
+    error: Float[Tensor, "*batch N m"] | Data,
     *,
     sigma: float | Float[Tensor, " m"] | None = None,
     d: float | Float[Tensor, " m"] | None = None,
     bound: float | Float[Tensor, " m"] | None = None,
-    weight: Float[Tensor, "*batch N m"] | None = None,
+    weight: Float[Tensor, "*batch N m"] | Data | None = None,
     d_min: float | Float[Tensor, " m"] | None = None,
     max_iter: int = 100,
     tol: float = 1e-12,
@@ -311,7 +319,7 @@ def fit_density(
     """Maximum-likelihood σ and d of residuals, all channels and batches at once.
 
     Args:
-        error: residuals (*, N, m), centred as the fit left them.
+        error: residuals (*, N, m), centred as the fit left them; a tensor, a NumPy array or a DataFrame.
         sigma: keeps σ at this value in [0.05, inf] (``inf``: Gaussian) and fits d alone, Remark 7 of the paper.
         d: keeps d at this value and fits σ alone, Remark 6.
         bound: half-width of the domain, in the unit of ``error``, at least two robust scales of them; default by
@@ -326,7 +334,7 @@ def fit_density(
         The fit, with the domain it was made on: likelihoods compare only on the same domain.
 
     Raises:
-        TypeError: residuals or weights that are no real tensor, or a parameter that is no number.
+        TypeError: residuals or weights that are no real numbers, or a parameter that is no number.
         ValueError: fewer than two residuals, non-finite ones, a parameter out of range, or shapes that do not fit.
 
     References:
@@ -339,20 +347,17 @@ def fit_density(
         >>> bool(fit.sigma > 8), round(float(fit.d), 1)
         (True, 1.0)
     """
+    error = as_tensor("error", error)
     refuse_not_real("error", error)
     if error.dtype in (torch.float16, torch.bfloat16):
         raise TypeError(f"Expected argument `error` of dtype float32 or float64 but got {error.dtype}; use .float().")
     if error.dim() < 2 or error.shape[-2] < 2 or error.shape[-1] == 0:
-        mend = "; one channel is error.unsqueeze(-1)" if error.dim() == 1 and len(error) > 1 else ""
+        mend = "; one channel is error[:, None]" if error.dim() == 1 and len(error) > 1 else ""
         raise ValueError(
             f"Expected argument `error` of shape (*, N >= 2, m) with a channel at least but got {tuple(error.shape)}"
             f"{mend}."
         )
-    if not bool(torch.isfinite(error).all()):
-        raise ValueError(
-            f"Expected argument `error` to be finite but got {int((~torch.isfinite(error)).sum())} values that are "
-            "not; leave those residuals out."
-        )
+    refuse_not_finite("error", error, "Leave those residuals out")
     most = torch.finfo(error.dtype).max ** 0.4
     if not bool((error.abs() <= most).all()):
         raise ValueError(
@@ -379,7 +384,7 @@ def fit_density(
 
     normalised = None
     if weight is not None:
-        weight = _full_weight(weight, error)
+        weight = full_weight(as_tensor("weight", weight), error)
         normalised = weight / weight.sum(-2, keepdim=True)
     scale = robust_scale(error, weight)
     tiny = torch.finfo(error.dtype).tiny ** 0.5
@@ -426,25 +431,3 @@ def fit_density(
         converged=still >= 2,
         n_iter=n_iter,
     )
-
-
-def _full_weight(weight: Tensor, error: Float[Tensor, "*batch N m"]) -> Float[Tensor, "*batch N m"]:
-    refuse_bad_weight(weight)
-    try:
-        # weights (N,) of as many channels as samples would be taken for those of channels
-        full = weight.to(error).expand_as(error) if weight.dim() > 1 else None
-    except RuntimeError:
-        full = None
-    if full is None:
-        mend = "; one weight a sample is weight.unsqueeze(-1)" if weight.dim() == 1 else ""
-        raise ValueError(
-            f"Expected argument `weight` of shape {tuple(error.shape)} or {(error.shape[-2], 1)} but got "
-            f"{tuple(weight.shape)}{mend}."
-        )
-    total = full.sum(-2)
-    if not bool((torch.isfinite(total) & (total > 0)).all()):
-        raise ValueError(
-            "Expected argument `weight` to be finite, >= 0 and positive somewhere in every channel but got channels "
-            f"of the sums {total.tolist()}."
-        )
-    return full

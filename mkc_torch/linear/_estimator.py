@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import refuse_not_real
+from mkc_torch._support.arrays import (
+    Data,
+    as_tensor,
+    as_tensors,
+    column_names,
+    is_frame,
+    refuse_other_columns,
+)
+from mkc_torch.linear._parameters import Parametrised
 from mkc_torch.linear._problem import common_batch
 
 if TYPE_CHECKING:
@@ -24,48 +32,63 @@ class NotFittedError(AttributeError):
     """A result was asked for before ``fit``."""
 
 
-class Fitted:
+class Fitted(Parametrised):
     """Results have names that end in an underscore and exist after ``fit``; a repr shows the parameters."""
 
     _fit_takes = "X, Y"
-
-    def __repr__(self) -> str:
-        names = [p for p in inspect.signature(type(self).__init__).parameters if p != "self"]
-        return f"{type(self).__name__}({', '.join(f'{p}={getattr(self, p)!r}' for p in names)})"
 
     def __getattr__(self, name: str) -> Any:
         if name.endswith("_") and not name.startswith("_"):
             raise NotFittedError(f"{type(self).__name__} has no `{name}` yet; call fit({self._fit_takes}) first.")
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
+    def _keep_columns_of(self, value: object) -> None:
+        """The names of the columns of a data frame as ``feature_names_in_``, scikit-learn's name for them."""
+        names = column_names(value)
+        self.__dict__.pop("feature_names_in_", None)
+        if names is not None:
+            self.feature_names_in_ = names
+
+    def _refuse_other_columns(self, name: str, value: object) -> None:
+        refuse_other_columns(name, value, self.__dict__.get("feature_names_in_"))
+
 
 class LinearEstimator(Fitted):
     """Base of the linear estimators: ``fit(X, Y, sample_weight=None)`` returns the estimator itself.
+
+    ``fit`` and ``predict`` take tensors, NumPy arrays and DataFrames or Series of pandas and polars; results are
+    tensors. Arrays of float32 stay so, other numbers become float64, and beside a tensor its dtype and device.
 
     Attributes, after ``fit`` (``*`` are batch dimensions):
         coef_: coefficients (*, n).
         weights_: the weight in [0, 1] with which each value entered the fit, (*, N, m); m is 1 for
             one channel given as (*, N).
+        feature_names_in_: names of the columns of X, where it was a DataFrame with such; ``predict`` then refuses one
+            with others.
     """
 
     coef_: Float[Tensor, "*batch n"]
     weights_: Float[Tensor, "*batch N m"]
+    feature_names_in_: tuple[str, ...]
 
     def __init__(self) -> None:
         """No parameters; an estimator with some sets each under its own name."""
 
-    def fit(self: Self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> Self:
+    def fit(self: Self, X: Data, Y: Data, sample_weight: Data | None = None) -> Self:
         raise NotImplementedError
 
-    def predict(self, X: Float[Tensor, "*batch N m n"]) -> Float[Tensor, "*batch N m"]:
+    def predict(self, X: Float[Tensor, "*batch N m n"] | Data) -> Float[Tensor, "*batch N m"]:
         """``X coef_`` for X of the shape given to ``fit``: (*, N, m, n) or, for one channel, (*, N, n).
 
         Raises:
             NotFittedError: before ``fit``.
-            TypeError: X is no floating tensor, or of another dtype or device than the coefficients.
-            ValueError: X has another number of columns, or other batch dimensions.
+            TypeError: X is no floating tensor, or of another dtype or device than the coefficients, or an array of
+                something else than real numbers.
+            ValueError: X has another number of columns, columns of other names, or other batch dimensions.
         """
         n = self.coef_.shape[-1]
+        self._refuse_other_columns("X", X)
+        X = as_tensor("X", X, like=self.coef_)
         refuse_not_real("X", X)
         if X.dtype != self.coef_.dtype or X.device != self.coef_.device:
             raise TypeError(
@@ -81,6 +104,16 @@ class LinearEstimator(Fitted):
         common_batch("X", X.shape[: -1 - samples], "coef_", self.coef_.shape[:-1])
         coef = self.coef_.reshape(*self.coef_.shape[:-1], *(1 for _ in range(samples - 1)), -1, 1)
         return torch.matmul(X, coef).squeeze(-1)
+
+    def _tensors(self, X: Data, Y: Data, sample_weight: Data | None) -> tuple[Tensor, Tensor, Tensor | None]:
+        """What ``fit`` is given, as tensors; every ``fit`` begins with it."""
+        x, y = as_tensors(X=X, Y=Y)
+        weight = None if sample_weight is None else as_tensor("sample_weight", sample_weight)
+        self._keep_columns_of(X)
+        # a frame of one column is one channel, as a Series is
+        if is_frame(Y) and x.dim() == 2 and y.shape[-1] == 1:
+            y = y.squeeze(-1)
+        return x, y, weight
 
     def _set_common(self, problem: LinearProblem, beta: Tensor, weights: Tensor) -> None:
         self._single_channel = problem.single_channel

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_not_real
+from mkc_torch._support.arrays import Data, as_tensor
 from mkc_torch._support.student_t import fisher_tail, student_quantile, student_tails
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._goodness import robust_r_squared
@@ -85,7 +86,7 @@ class Inference(LinearEstimator):
         half = self._quantile(level).unsqueeze(-1) * self.standard_error_
         return torch.stack([self.coef_ - half, self.coef_ + half], -1)
 
-    def mean_interval(self, X: Tensor, level: float = 0.95) -> Float[Tensor, "*batch N m 2"]:
+    def mean_interval(self, X: Data, level: float = 0.95) -> Float[Tensor, "*batch N m 2"]:
         """Interval of the fitted value at each row of X, of the shape of ``predict(X)`` with two ends last.
 
         Args:
@@ -164,7 +165,7 @@ class Inference(LinearEstimator):
         """
         interval = self.confidence_interval(level)
         at = one_problem(problem, tuple(self.dof_.shape))
-        names = getattr(self, "feature_names_in_", None) if names is None else names
+        names = self.__dict__.get("feature_names_in_") if names is None else names
         weights, squared = self.weights_[at], getattr(self, "r_squared_", None)
         return Summary.of(
             title=type(self).__name__,
@@ -183,9 +184,10 @@ class Inference(LinearEstimator):
         return student_quantile(level, self.dof_.clamp(min=1.0)).to(self.coef_.dtype)
 
     def _around(
-        self, X: Tensor, level: float, scale: Float[Tensor, "*batch m"] | None = None
+        self, X: Data, level: float, scale: Float[Tensor, "*batch m"] | None = None
     ) -> Float[Tensor, "*batch N m 2"]:
         quantile, fitted = self._quantile(level), self.predict(X)
+        X = as_tensor("X", X, like=self.coef_)
         dims = 1 if self._single_channel else 2
         covariance = self.covariance_.unsqueeze(-3) if dims == 2 else self.covariance_
         variance = (torch.matmul(X, covariance) * X).sum(-1)
@@ -247,7 +249,7 @@ class RobustInference(Inference):
         self.dof_ = problem.restore(degrees_of_freedom(problem))
         self.r_squared_ = problem.restore(robust_r_squared(problem, beta, weight, ratio))
 
-    def prediction_interval(self, X: Tensor, level: float = 0.95) -> Float[Tensor, "*batch N m 2"]:
+    def prediction_interval(self, X: Data, level: float = 0.95) -> Float[Tensor, "*batch N m 2"]:
         """Interval of a new observation at each row of X, of the shape of ``predict(X)`` with two ends last.
 
         It holds ``level`` of the good observations: their errors are taken for Gaussian ones of ``scale_``. Outliers

@@ -225,7 +225,7 @@ def laid_out(
 def _mend(X: Tensor, Y: Tensor) -> str:
     """What to do about shapes that do not fit, where it is plain."""
     if X.dim() == 1 and X.shape == Y.shape:
-        return "; one column is X.unsqueeze(-1)"
+        return "; one column is X[:, None]"
     if X.dim() == Y.dim() > 1 and X.shape[:-1] == Y.shape[:-1] and Y.shape[-1] == 1:
         return "; one channel is Y.squeeze(-1)"
     if X.dim() > 1 and Y.dim() > 0 and X.shape[-1] == Y.shape[-1]:

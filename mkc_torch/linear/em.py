@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_out_of_range
+from mkc_torch._support.arrays import Data
 from mkc_torch.density.energy import SIGMA_LEAST
 from mkc_torch.density.fit import (
     DensityState,
@@ -270,7 +271,7 @@ class MKCRegression(Inference):
         self.bandwidth = checked_bandwidth(bandwidth)
         self.seed = checked_whole("seed", seed)
 
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> MKCRegression:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> MKCRegression:
         """Fit ``Y ~ X coef``.
 
         Args:
@@ -282,6 +283,7 @@ class MKCRegression(Inference):
             ValueError: a parameter out of range or of the wrong shape, or bad input as in :meth:`LeastSquares.fit`.
             NotDifferentiableError: when a derivative is taken of a fit that has none, in the backward pass.
         """
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         if wanted(X, Y, sample_weight, self.sigma, self.d, self.bound):
             return self._fit_as_layer(X, Y, sample_weight)
         self.__dict__.pop("differentiable_", None)

@@ -17,6 +17,7 @@ from mkc_torch._support.arguments import (
     refuse_out_of_range,
     told,
 )
+from mkc_torch._support.arrays import Data
 from mkc_torch.linear._implicit.at_rest import Rest
 from mkc_torch.linear._implicit.layer import Given, fit_layer, wanted
 from mkc_torch.linear._inference import Inference
@@ -199,7 +200,7 @@ class FixedPointLinear(Inference):
         self.bandwidth = checked_bandwidth(bandwidth)
         self.seed = checked_whole("seed", seed)
 
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> FixedPointLinear:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> FixedPointLinear:
         """Fit ``Y ~ X coef``.
 
         Args:
@@ -211,6 +212,7 @@ class FixedPointLinear(Inference):
             ValueError: σ or d not positive or of the wrong shape, or bad input as in :meth:`LeastSquares.fit`.
             NotDifferentiableError: when a derivative is taken of a fit that has none, in the backward pass.
         """
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         if wanted(X, Y, sample_weight, self.sigma, self.d, self.noise_covariance):
             return self._fit_as_layer(X, Y, sample_weight)
         self.__dict__.pop("differentiable_", None)

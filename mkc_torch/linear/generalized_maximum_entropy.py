@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_complex
+from mkc_torch._support.arrays import Data
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import CanonicalShapes, canonical_shapes
 
@@ -77,7 +78,7 @@ class GeneralizedMaximumEntropy(LinearEstimator):
         self.max_iter = checked_whole("max_iter", max_iter, 1, "200 is ample")
 
     @torch.no_grad()
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> GeneralizedMaximumEntropy:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> GeneralizedMaximumEntropy:
         """Fit ``Y ~ X coef``, in float64 whatever the dtype of the data.
 
         Args:
@@ -93,6 +94,7 @@ class GeneralizedMaximumEntropy(LinearEstimator):
             ValueError: shapes do not fit, values are not finite, or no coefficients within their supports explain Y
                 with errors within theirs.
         """
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         given = canonical_shapes(X, Y, sample_weight)
         N, m, n = given.X.shape[-3:]
         B = given.batch.numel()

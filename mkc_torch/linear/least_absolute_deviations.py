@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole
+from mkc_torch._support.arrays import Data
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import linear_problem, solve_gram
 
@@ -58,7 +59,7 @@ class LeastAbsoluteDeviations(LinearEstimator):
         self.tol = checked_number("tol", tol, 0.0, 1.0, advice="1e-9 suits float64")
         self.max_iter = checked_whole("max_iter", max_iter, 1, "100 is ample")
 
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> LeastAbsoluteDeviations:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> LeastAbsoluteDeviations:
         """Fit ``Y ~ X coef``.
 
         Args:
@@ -74,6 +75,7 @@ class LeastAbsoluteDeviations(LinearEstimator):
             ValueError: shapes do not fit, values are not finite, there are fewer values than coefficients.
             RankDeficientError: columns of X are linearly dependent.
         """
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         problem = linear_problem(X, Y, sample_weight)
         # conditioning near the optimum is beyond float32
         rows = problem.basis.flatten(-3, -2).double()

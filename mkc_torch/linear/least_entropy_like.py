@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_complex, refuse_no_tensor, seems_finite
+from mkc_torch._support.arrays import Data
 from mkc_torch._support.trust_region import Minima, Quadratic, minimise
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._precision import in_double
@@ -105,7 +106,7 @@ class LeastEntropyLike(LinearEstimator):
         self.max_iter = checked_whole("max_iter", max_iter, 1, "200 is ample")
 
     @torch.no_grad()
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> LeastEntropyLike:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> LeastEntropyLike:
         """Fit ``Y ~ X coef``, in float64 whatever the dtype of the data.
 
         Args:
@@ -122,6 +123,7 @@ class LeastEntropyLike(LinearEstimator):
                 values H is 0, whichever they are), weights total at most 1, or a start has another shape.
             RankDeficientError: columns of X are linearly dependent.
         """
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         problem = in_double(linear_problem(X, Y, sample_weight))
         _check_counts(problem)
         least_squares = _least_squares(problem)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_whole
+from mkc_torch._support.arrays import Data
 from mkc_torch.linear._chebyshev import equal_heights, minimax
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._problem import LinearProblem, linear_problem
@@ -85,12 +86,13 @@ class LeastMedianOfSquares(LinearEstimator):
         self.seed = checked_whole("seed", seed)
 
     @torch.no_grad()
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> LeastMedianOfSquares:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> LeastMedianOfSquares:
         """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. A weight of 2 is a sample that occurs twice.
 
         Raises:
             ValueError: ``h`` outside [p + 1, N], or bad input as in :meth:`LeastSquares.fit`.
         """
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         problem = linear_problem(X, Y, sample_weight)
         N, p = problem.num_samples, problem.coefficients_per_channel
         fewest = min(p + 1, N)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number
+from mkc_torch._support.arrays import Data
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._inference import Inference
 from mkc_torch.linear._mkc import coefficient_covariance, values_left
@@ -34,7 +34,7 @@ class LeastSquares(Inference):
         self.covariance = checked_kind(covariance)
         self.bandwidth = checked_bandwidth(bandwidth)
 
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> LeastSquares:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> LeastSquares:
         """Fit ``Y ~ X coef``.
 
         Args:
@@ -51,6 +51,7 @@ class LeastSquares(Inference):
                 coefficients.
             RankDeficientError: columns of X are linearly dependent.
         """
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         problem = linear_problem(X, Y, sample_weight)
         ones = torch.ones_like(problem.Y)
         beta = problem.weighted_fit(ones)
@@ -84,8 +85,9 @@ class Ridge(LinearEstimator):
     def __init__(self, alpha: float = 1.0) -> None:
         self.alpha = checked_number("alpha", alpha, ends="[)", advice="0 is least squares")
 
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> Ridge:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> Ridge:
         """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. Dependent columns are allowed for alpha > 0."""
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         values = canonical_shapes(X, Y, sample_weight)
         rows, target = values.X.flatten(-3, -2), values.Y.flatten(-2)
         if values.sample_weight is not None:

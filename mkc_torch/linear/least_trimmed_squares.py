@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_whole
+from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._inference import RobustInference
 from mkc_torch.linear._influence import Scores, influence
@@ -205,12 +206,13 @@ class LeastTrimmedSquares(RobustInference):
         self.starts = checked_whole("starts", starts, 1, "500 is usual")
         self.seed = checked_whole("seed", seed)
 
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> LeastTrimmedSquares:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> LeastTrimmedSquares:
         """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. A weight of 2 is a sample that occurs twice.
 
         Raises:
             ValueError: ``h`` outside [p + 1, N], or bad input as in :meth:`LeastSquares.fit`.
         """
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         problem = linear_problem(X, Y, sample_weight)
         N, p = problem.num_samples, problem.coefficients_per_channel
         h = default_coverage(problem) if self.h is None else self.h

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole
+from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._inference import RobustInference
 from mkc_torch.linear._influence import influence, m_scale_influence, scores
@@ -200,13 +201,14 @@ class MEstimator(RobustInference):
         self._set_covariance(covariance, bandwidth)
         self.seed = checked_whole("seed", seed)
 
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> MEstimator:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> MEstimator:
         """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. A weight of 2 is a sample that occurs twice.
 
         Raises:
             ValueError: fewer than 2 p samples for "mad", a start of the wrong shape, or bad input as in
                 :meth:`LeastSquares.fit`.
         """
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         name, tuning = checked_tuning(self.psi, self.tuning)
         problem = linear_problem(X, Y, sample_weight)
         p, N = problem.coefficients_per_channel, _fewest_samples(problem)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import as_numbers, checked_whole, refuse_out_of_range
+from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch._support.trust_region import Quadratic, minimise
 from mkc_torch.linear._estimator import LinearEstimator
@@ -107,7 +108,7 @@ class MinimumEntropy(LinearEstimator):
         self.seed = checked_whole("seed", seed)
 
     @torch.no_grad()
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> MinimumEntropy:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> MinimumEntropy:
         """Fit ``Y ~ X coef``, in float64 whatever the dtype of the data.
 
         Args:
@@ -123,6 +124,7 @@ class MinimumEntropy(LinearEstimator):
             ValueError: shapes do not fit, values are not finite, there are fewer values than coefficients.
             RankDeficientError: columns of X are linearly dependent.
         """
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         given = linear_problem(X, Y, sample_weight)
         begin = robust_start(given, self.start, seed=self.seed)
         problem = in_double(given)

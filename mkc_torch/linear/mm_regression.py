@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole
+from mkc_torch._support.arrays import Data
 from mkc_torch.linear._inference import RobustInference
 from mkc_torch.linear._influence import influence, scores
 from mkc_torch.linear._problem import linear_problem
@@ -88,11 +89,12 @@ class MMRegression(RobustInference):
         self._set_covariance(covariance, bandwidth)
         self.seed = checked_whole("seed", seed)
 
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> MMRegression:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> MMRegression:
         """Fit ``Y ~ X coef``; shapes and errors as in :meth:`LeastSquares.fit`.
 
         A weight of 2 is a sample that occurs twice.
         """
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         problem = linear_problem(X, Y, sample_weight)
         start = minimise_m_scale(problem, breakdown=self.breakdown, starts=self.starts, seed=self.seed)
         psi = Psi("tukey", (bisquare_for_efficiency(self.efficiency),))

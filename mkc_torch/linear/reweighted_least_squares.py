@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole, told
+from mkc_torch._support.arrays import Data
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._inference import RobustInference
 from mkc_torch.linear._influence import Scores, influence
@@ -104,11 +105,12 @@ class ReweightedLeastSquares(RobustInference):
         self._set_covariance(covariance, bandwidth)
         self.seed = checked_whole("seed", seed)
 
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> ReweightedLeastSquares:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> ReweightedLeastSquares:
         """Fit ``Y ~ X coef``; shapes and errors as in :meth:`LeastSquares.fit`.
 
         A weight of 2 is a sample that occurs twice, but for the small-sample factors of the first scale.
         """
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         problem = linear_problem(X, Y, sample_weight)
         self.start_ = self._robust().fit(X, Y, sample_weight)
         residual = problem.residual(problem.in_basis(self.start_.coef_)).detach()

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole
+from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._inference import RobustInference
 from mkc_torch.linear._influence import Scores, influence, m_scale_influence, scores, weighed
@@ -210,8 +211,9 @@ class SRegression(RobustInference):
         self._set_covariance(covariance, bandwidth)
         self.seed = checked_whole("seed", seed)
 
-    def fit(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None = None) -> SRegression:
+    def fit(self, X: Data, Y: Data, sample_weight: Data | None = None) -> SRegression:
         """Fit ``Y ~ X coef``; shapes as in :meth:`LeastSquares.fit`. A weight of 2 is a sample that occurs twice."""
+        X, Y, sample_weight = self._tensors(X, Y, sample_weight)
         problem = linear_problem(X, Y, sample_weight)
         minimum = minimise_m_scale(problem, breakdown=self.breakdown, starts=self.starts, seed=self.seed)
         self._set_common(problem, minimum.beta, minimum.weight)

@@ -7,17 +7,19 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch._support.arrays import ArrayLike, Data, is_frame
 from mkc_torch._support.files import write_atomically
 from mkc_torch.recording.formats import check_ending, encoded, read_table
 from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, counted, listed
 from mkc_torch.recording.formats.cells import as_numbers, missing_warning, numbered, renamed, text_error
 from mkc_torch.recording.formats.csv import SEPARATORS
+from mkc_torch.recording.given_columns import EXPERIMENT, checked_columns, columns_of_frame
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -41,7 +43,9 @@ DEFAULT_UNITS: Mapping[str, str] = MappingProxyType(
 )
 """The units of the columns whose names have a meaning."""
 
-_EXPERIMENT = "experiment"
+_ASKED = {*DEFAULT_UNITS, EXPERIMENT}
+"""Columns that are wanted wherever they are, so that text in them is an error."""
+
 _GAP = 10.0  # in median intervals
 
 
@@ -51,7 +55,8 @@ class Recording:
     It does not change: each operation gives a new recording, and says in ``warnings`` what it dropped.
 
     Args:
-        columns: name to values, 1-D tensors of one length >= 1; they are copied to the CPU as float64.
+        columns: name to values, 1-D tensors or NumPy arrays of one length >= 1, which are copied to the CPU as float64;
+            or a DataFrame, as :meth:`from_frame` takes it.
         name: what the recording is called in messages and reports; a file's is its stem.
         units: units of columns, beside or instead of the default ones: ``time`` s; ``mag_*`` and ``field_*`` µT;
             ``gyro_*`` rad/s; ``accel_*`` m/s²; ``position_*`` m; ``q_*`` 1; ``temperature`` °C; ``current`` A.
@@ -71,7 +76,7 @@ class Recording:
 
     def __init__(
         self,
-        columns: Mapping[str, Tensor],
+        columns: Mapping[str, Data] | ArrayLike,
         *,
         name: str = "",
         units: Mapping[str, str] | None = None,
@@ -79,12 +84,15 @@ class Recording:
         labels: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         units, labels = units or {}, labels or {}
-        _check_columns(columns, name)
+        if is_frame(columns):
+            frame = columns_of_frame(columns, {}, _ASKED, name)
+            columns, labels, warnings = frame.columns, frame.labels | dict(labels), (*frame.warnings, *warnings)
+        given = checked_columns(cast("Mapping[str, Data]", columns), name)
         for column in (*units, *labels):
-            if column not in columns:
-                raise _missing(column, columns, name)
-        copies = {key: values.detach().to("cpu", torch.float64, copy=True) for key, values in columns.items()}
-        known = {key: DEFAULT_UNITS.get(key, "") for key in columns}
+            if column not in given:
+                raise _missing(column, given, name)
+        copies = {key: values.detach().to("cpu", torch.float64, copy=True) for key, values in given.items()}
+        known = {key: DEFAULT_UNITS.get(key, "") for key in given}
         self._columns = copies
         self._units = known | dict(units)
         self._labels = {key: tuple(values) for key, values in labels.items()}
@@ -117,14 +125,14 @@ class Recording:
         path = Path(path)
         table = read_table(path)
         taken, warnings = renamed(table, columns or {}, path)
-        asked = set(columns or {}) | set(DEFAULT_UNITS) | {_EXPERIMENT}
+        asked = set(columns or {}) | _ASKED
         values: dict[str, Tensor] = {}
         labels: dict[str, list[str]] = {}
         for name, series in taken.items():
             numbers, bad = as_numbers(series)
             if bad.any():
                 missing = numbers.is_null() & ~bad
-                if name == _EXPERIMENT:
+                if name == EXPERIMENT:
                     numbers, labels[name] = numbered(series)
                 elif name not in asked and (bad | missing).all():
                     warnings.append(f"Column `{name}` holds no numbers and is left out.")
@@ -138,6 +146,39 @@ class Recording:
             known = ", ".join(SEPARATORS.values())
             raise RecordingError(f"{path}: no column holds numbers; separators can be {known}.")
         return cls(values, name=path.stem, warnings=warnings, labels=labels)
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: ArrayLike,
+        *,
+        columns: Mapping[str, str] | None = None,
+        name: str = "",
+        units: Mapping[str, str] | None = None,
+    ) -> Recording:
+        """The columns of a DataFrame of pandas or polars, with the rules of :meth:`read`.
+
+        Missing values become NaN. Columns without numbers that nobody asked for are left out, which ``warnings`` tells;
+        in the column ``experiment`` text is numbered, and ``labels`` has it. An index that has a name, such as
+        ``time``, is a column too.
+
+        Args:
+            frame: the table.
+            columns: for each name a column is to get, the name it has in the frame: ``{"mag_x": "mx"}``.
+            name, units: as of a recording; units by the new names.
+
+        Raises:
+            RecordingError: a frame without rows or numbers, columns of the same name or of none, or text or times where
+                numbers are needed.
+            MissingColumnError: ``columns`` names a column that the frame does not have, or ``units`` one of neither.
+
+        Example:
+            >>> import pandas as pd
+            >>> Recording.from_frame(pd.DataFrame({"mx": [20, 21]}), columns={"mag_x": "mx"})["mag_x"]
+            tensor([20., 21.], dtype=torch.float64)
+        """
+        found = columns_of_frame(frame, columns or {}, _ASKED, name)
+        return cls(found.columns, name=name, units=units, warnings=found.warnings, labels=found.labels)
 
     @property
     def columns(self) -> Mapping[str, Tensor]:
@@ -300,19 +341,19 @@ class Recording:
             >>> [(label, len(part), part.names) for label, part in table.experiments().items()]
             [('1', 2, ('time',)), ('2', 1, ('time',))]
         """
-        if _EXPERIMENT not in self:
+        if EXPERIMENT not in self:
             return {self._name: self}
         group = torch.from_numpy(self._experiment_numbers())
         parts = {}
         for number in range(int(group.max()) + 1):
             part = self.rows(group == number)
-            label = self._experiment_label(part[_EXPERIMENT][0].item())
+            label = self._experiment_label(part[EXPERIMENT][0].item())
             parts[label] = Recording(
-                {key: values for key, values in part.columns.items() if key != _EXPERIMENT},
+                {key: values for key, values in part.columns.items() if key != EXPERIMENT},
                 name=f"{self._name}/{label}" if self._name else label,
-                units={key: unit for key, unit in self._units.items() if key != _EXPERIMENT},
+                units={key: unit for key, unit in self._units.items() if key != EXPERIMENT},
                 warnings=self._warnings,
-                labels={key: values for key, values in self._labels.items() if key != _EXPERIMENT},
+                labels={key: values for key, values in self._labels.items() if key != EXPERIMENT},
             )
         return parts
 
@@ -329,13 +370,13 @@ class Recording:
 
     def _experiment_numbers(self) -> np.ndarray:
         """For each sample 0, 1, … in the order in which the experiments first appear."""
-        if _EXPERIMENT not in self:
+        if EXPERIMENT not in self:
             return np.zeros(len(self), dtype=np.int64)
-        _, first, inverse = np.unique(self[_EXPERIMENT].numpy(), return_index=True, return_inverse=True)
+        _, first, inverse = np.unique(self[EXPERIMENT].numpy(), return_index=True, return_inverse=True)
         return np.argsort(np.argsort(first))[inverse]
 
     def _experiment_label(self, value: float) -> str:
-        known = self._labels.get(_EXPERIMENT, ())
+        known = self._labels.get(EXPERIMENT, ())
         if value.is_integer() and 0 <= value < len(known):
             return known[int(value)]
         return str(int(value)) if value.is_integer() else repr(value)
@@ -350,8 +391,8 @@ class Recording:
         if not count:
             return []
         where = ""
-        if _EXPERIMENT in self:
-            values = self[_EXPERIMENT].numpy()[self._experiment_numbers() == group[longest]]
+        if EXPERIMENT in self:
+            values = self[EXPERIMENT].numpy()[self._experiment_numbers() == group[longest]]
             where = f" in experiment {self._experiment_label(float(values[0]))}"
         return [
             f"The time has {counted(count, 'gap')} of more than {_GAP:g} median intervals ({median:.4g} s); "
@@ -361,7 +402,7 @@ class Recording:
 
 def write_table(
     path: str | os.PathLike[str],
-    columns: Mapping[str, Tensor],
+    columns: Mapping[str, Data] | ArrayLike,
     *,
     labels: Mapping[str, Sequence[str]] | None = None,
     overwrite: bool = False,
@@ -370,7 +411,7 @@ def write_table(
 
     Args:
         path: the target; its ending says the format, ``.csv``, ``.tsv``, ``.txt`` (a CSV) or ``.parquet``.
-        columns: name to values, 1-D tensors of one length; ``recording.columns`` for a recording.
+        columns: as :class:`Recording` takes them; ``recording.columns`` for a recording.
         labels: of columns of whole numbers 0, 1, …, what each stands for and is written instead; ``recording.labels``.
         overwrite: replace an existing file.
 
@@ -386,8 +427,8 @@ def write_table(
         name: np.array(known[name])[values.long().numpy()] if name in known else values.numpy()
         for name, values in table.columns.items()
     }
-    if _EXPERIMENT in told and _EXPERIMENT not in known:
-        told[_EXPERIMENT] = _whole(told[_EXPERIMENT])
+    if EXPERIMENT in told and EXPERIMENT not in known:
+        told[EXPERIMENT] = _whole(told[EXPERIMENT])
     data = encoded(path, told)
     write_atomically(path, data, overwrite=overwrite)
 
@@ -396,26 +437,6 @@ def _whole(numbers: np.ndarray) -> np.ndarray:
     """Numbers of experiments, 1 and not 1.0, where all of them are whole."""
     whole = np.isfinite(numbers) & (np.abs(numbers) < 2**53) & (numbers == np.round(numbers))
     return numbers.astype(np.int64) if whole.all() else numbers
-
-
-def _check_columns(columns: Mapping[str, Tensor], name: str) -> None:
-    where = f"{name}: " if name else ""
-    if not columns:
-        raise RecordingError(f"{where}a recording needs at least one column.")
-    for key, values in columns.items():
-        if not isinstance(key, str) or not key or key != key.strip() or any(end in key for end in "\r\n"):
-            raise RecordingError(f"{where}{key!r} cannot name a column: one line of text, no spaces around it.")
-        if not isinstance(values, Tensor) or values.is_complex():
-            got = f"a tensor of {values.dtype}" if isinstance(values, Tensor) else type(values).__name__
-            raise RecordingError(f"{where}expected column `{key}` to be a real tensor but got {got}.")
-        if values.dim() != 1:
-            raise RecordingError(f"{where}expected column `{key}` to have shape (N,) but got {tuple(values.shape)}.")
-    lengths = {key: len(values) for key, values in columns.items()}
-    if len(set(lengths.values())) > 1:
-        told = ", ".join(f"`{key}` {length}" for key, length in lengths.items())
-        raise RecordingError(f"{where}the columns differ in length: {told}.")
-    if not all(lengths.values()):
-        raise RecordingError(f"{where}the columns hold no samples.")
 
 
 def _missing(name: str, present: Iterable[str], recording: str) -> MissingColumnError:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import refuse_other_type
+from mkc_torch._support.arrays import is_frame
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.recording.recording import Recording
 
@@ -345,4 +346,6 @@ def refuse_no_recording(name: str, value: object) -> None:
     advice = "make one, Recording({'time': ..., ...}), or read it, Recording.read('REC.csv')"
     if isinstance(value, (str, os.PathLike)):
         advice = f"read it, Recording.read({os.fspath(value)!r})"
+    elif is_frame(value):
+        advice = f"make one, Recording({name})"
     refuse_other_type(name, value, Recording, "a Recording", advice)

@@ -639,7 +639,7 @@ def test_points_that_are_not_finite_are_refused(bad):
         EllipsoidFit().fit(points)
 
 
-@pytest.mark.parametrize("points", [torch.ones(20, 3, dtype=torch.int64), [[1.0, 2.0, 3.0]], np.ones((20, 3))])
+@pytest.mark.parametrize("points", [torch.ones(20, 3, dtype=torch.int64), [[1.0, 2.0, 3.0]], np.full((20, 3), "x")])
 def test_what_is_no_floating_tensor_is_refused(points):
     with pytest.raises(TypeError, match="`points`"):
         EllipsoidFit().fit(points)
@@ -666,7 +666,6 @@ def test_an_unfitted_ellipsoid_asks_for_points():
         (-torch.ones(20), ValueError, "`sample_weight` to be >= 0 and finite but got -1"),
         (torch.full((20,), math.nan), ValueError, "`sample_weight` to be >= 0 and finite but got nan"),
         ([1.0] * 20, TypeError, r"`sample_weight` .* got list; make a tensor of it, torch\.as_tensor\(sample_weight\)"),
-        (np.ones(20), TypeError, r"`sample_weight` .* got ndarray; make a tensor"),
         (torch.ones(19), ValueError, r"`sample_weight` of shape \(20,\) but got \(19,\); it has one weight for each"),
     ],
 )
@@ -678,9 +677,9 @@ def test_weights_that_are_none_are_refused(weight, error, message):
 def test_points_to_calibrate_are_looked_at():
     fit = EllipsoidFit().fit(surface(100))
     for points, error, message in (
-        (surface(20).numpy(), TypeError, r"`points` .* got ndarray; make a tensor of it"),
+        (surface(20).tolist(), TypeError, r"`points` .* got list; make a tensor of it"),
         (surface(20).mT, ValueError, r"\(\*, N, 3\) but got \(3, 20\); a point is a row, so try points\.mT"),
-        (surface(20)[0], ValueError, r"\(\*, N, 3\) but got \(3,\); one point is points\.unsqueeze\(0\)"),
+        (surface(20)[0], ValueError, r"\(\*, N, 3\) but got \(3,\); one point is points\[None\]"),
         (surface(20)[:, :2], ValueError, r"\(\*, N, 3\) but got \(20, 2\)\."),
     ):
         with pytest.raises(error, match=message):
@@ -812,3 +811,32 @@ def test_two_perpendicular_circles_are_refused_at_any_noise_or_come_out_right(se
     else:
         assert seed == 2  # one of six, whose planes happen to lie so that scatter tells one ellipsoid from the others
         torch.testing.assert_close(fit.semi_axes_, torch.tensor([1.0, 1.0, 5.0]).double(), rtol=0.12, atol=0.0)
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+def test_arrays_and_frames_are_fitted_as_tensors_of_the_same_numbers_are(library):
+    library = pytest.importorskip(library)
+    points = surface(100)
+    weight = torch.ones(100)
+    weight[:20] = 0.0
+    want = EllipsoidFit().fit(points, weight)
+    got = EllipsoidFit().fit(points.numpy(), weight.numpy())
+    assert torch.equal(got.center_, want.center_)
+    names = ["mag_x", "mag_y", "mag_z"]
+    frame = library.DataFrame(dict(zip(names, points.numpy().T, strict=True)))
+    got.fit(frame, library.Series(weight.numpy()))
+    assert torch.equal(got.center_, want.center_)
+    assert got.feature_names_in_ == tuple(names)
+    assert torch.equal(got.calibrate(frame), want.calibrate(points))
+    with pytest.raises(ValueError, match=r"`points` with the columns of the fit, `mag_x`, .* but got `mag_z`"):
+        got.calibrate(frame[names[::-1]])
+    with pytest.raises(AttributeError):
+        got.fit(points).feature_names_in_  # noqa: B018
+
+
+def test_a_point_of_no_weight_can_be_anything_in_an_array_too():
+    points = surface(100).numpy().copy()
+    points[3] = np.nan
+    weight = np.ones(100)
+    weight[3] = 0.0
+    assert bool(EllipsoidFit().fit(points, weight).center_.isfinite().all())

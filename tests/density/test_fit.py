@@ -418,7 +418,7 @@ def test_weights_that_are_negative_or_all_zero_are_refused(weight):
 def test_weights_of_another_shape_are_refused_with_how_to_reshape_them():
     error = normal(0, 10, 10)
     with pytest.raises(
-        ValueError, match=r"`weight` of shape \(10, 10\) or \(10, 1\) but got \(10,\); .*unsqueeze\(-1\)"
+        ValueError, match=r"`weight` of shape \(10, 10\) or \(10, 1\) but got \(10,\); .*weight\[:, None\]"
     ):
         fit_density(error, weight=torch.ones(10))
     with pytest.raises(ValueError, match=r"`weight` of shape \(10, 10\) or \(10, 1\) but got \(3, 10\)\."):
@@ -432,7 +432,7 @@ def test_weights_of_another_shape_are_refused_with_how_to_reshape_them():
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        (np.zeros((10, 1)), r"`error` .* got ndarray; make a tensor of it, torch\.as_tensor\(error\)"),
+        ([[0.0]] * 10, r"`error` .* got list; make a tensor of it, torch\.as_tensor\(error\)"),
         (torch.zeros(10, 1, dtype=torch.int64), r"`error` .* got torch\.int64; convert it, .*error\.double\(\)"),
         (torch.zeros(10, 1).half(), r"`error` of dtype float32 or float64 but got torch\.float16; use \.float"),
         (torch.zeros(10, 1) + 0j, r"`error` .* got torch\.complex64"),
@@ -444,7 +444,7 @@ def test_residuals_of_another_kind_are_refused_with_how_to_convert_them(error, m
 
 
 def test_a_channel_without_a_dimension_is_told_how_to_get_one():
-    with pytest.raises(ValueError, match=r"but got \(1000,\); one channel is error\.unsqueeze\(-1\)"):
+    with pytest.raises(ValueError, match=r"but got \(1000,\); one channel is error\[:, None\]"):
         fit_density(torch.zeros(1000))
     with pytest.raises(ValueError, match=r"with a channel at least but got \(10, 0\)"):
         fit_density(torch.zeros(10, 0))
@@ -503,3 +503,17 @@ def test_residuals_whose_squares_overflow_are_refused(dtype, size):
     error[3] = size
     with pytest.raises(ValueError, match=r"`error` within .*, beyond which squares overflow, but got 1e\+"):
         fit_density(error)
+
+
+def test_arrays_and_frames_are_fitted_as_tensors_of_the_same_numbers_are():
+    error = torch.randn(200, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weight = torch.ones(200, 1)
+    weight[:50] = 0.0
+    want = fit_density(error, weight=weight)
+    frame = pytest.importorskip("pandas").DataFrame(error.numpy(), columns=["a", "b"])
+    for values in (error.numpy(), frame):
+        got = fit_density(values, weight=weight.numpy())
+        assert torch.equal(got.sigma, want.sigma)
+        assert torch.equal(got.d, want.d)
+    with pytest.raises(TypeError, match=r"column `b` of argument `error` .* text"):
+        fit_density(frame.assign(b="x"))

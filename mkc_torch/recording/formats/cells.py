@@ -22,7 +22,9 @@ from mkc_torch.recording.formats.base import (
 __all__ = ["as_numbers", "missing_warning", "numbered", "renamed", "text_error"]
 
 
-def renamed(table: Table, columns: Mapping[str, str], path: Path) -> tuple[dict[str, Any], list[str]]:
+def renamed(
+    table: Table, columns: Mapping[str, str], path: Path | str, what: str = "file"
+) -> tuple[dict[str, Any], list[str]]:
     """The named columns under their new names, and sentences about those left out."""
     warnings = []
     repeated = [name for name, count in Counter(table.names).items() if name and count > 1]
@@ -35,13 +37,13 @@ def renamed(table: Table, columns: Mapping[str, str], path: Path) -> tuple[dict[
     for new, old in sources.items():
         if old not in present:
             raise MissingColumnError(
-                f"{path}: there is no column `{old}` to be `{new}`; the file has {listed(present)}."
+                f"{path}: there is no column `{old}` to be `{new}`; the {what} has {listed(present)}."
             )
     names: dict[str, Any] = {}
     for name, series in present.items():
         new_names = [new for new, old in sources.items() if old == name]
         if not new_names and name in sources:
-            warnings.append(f"Column `{name}` of the file is left out: `{sources[name]}` takes its name.")
+            warnings.append(f"Column `{name}` of the {what} is left out: `{sources[name]}` takes its name.")
         elif not new_names:
             new_names = [name]
         names |= dict.fromkeys(new_names, series)
