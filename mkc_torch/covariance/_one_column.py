@@ -21,6 +21,7 @@ def smallest_variance(values: Float[Tensor, "B N"], h: int) -> Bool[Tensor, "B N
     ordered, order = values.sort(-1)
     # values beyond this lie in no such window, for it holds the median; clipped, they cost the sums no digits
     reach = 2.0 * math.sqrt(2.0 * h) * values.abs().kthvalue(h, dim=-1, keepdim=True).values
+    reach = torch.where(reach > 0, reach, 1.0)  # h equal values
     ordered = torch.maximum(torch.minimum(ordered, reach), -reach)
     first, second = (torch.nn.functional.pad(power.cumsum(-1), (1, 0)) for power in (ordered, ordered.square()))
     total, squares = first[:, h:] - first[:, :-h], second[:, h:] - second[:, :-h]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 try:
     from matplotlib import pyplot
@@ -15,9 +16,7 @@ except ImportError as error:
 from mkc_torch.covariance._picture_labels import Box, free_place, ranges, together
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
-    from mkc_torch.covariance.outlier_map import OutlierMap
+    from jaxtyping import Float, Int
 
 # Okabe and Ito's colours, told apart with any colour vision, and by shape; in the order of SampleKind
 _LOOK = (
@@ -31,19 +30,28 @@ _LETTERS = 8.0
 """Size of a label, in points."""
 
 
-def draw(outliers: OutlierMap, ax: Any, labels: int) -> Any:
+class Places(NamedTuple):
+    """Where the samples of one problem lie: distances across, residuals up."""
+
+    x: Float[Tensor, N]
+    y: Float[Tensor, N]
+    kind: Int[Tensor, N]
+    x_cutoff: float
+    y_cutoff: float
+
+
+def draw(places: Places, ax: Any, labels: int) -> Any:
     """Draw a map of one problem into axes, made where there are none."""
     if ax is None:
         _, ax = pyplot.subplots(figsize=(7.0, 4.5), layout="constrained")
-    x, y = (values.detach().cpu().double() for values in (outliers.distances, outliers.residuals))
-    kinds = outliers.kind.cpu()
+    x, y, kinds = places.x, places.y, places.kind
     for kind, (name, colour, marker) in enumerate(_LOOK):
         mine = kinds == kind
         text = f"{int(mine.sum())} {name}{'s' if kind and int(mine.sum()) != 1 else ''}"
         ax.scatter(x[mine].numpy(), y[mine].numpy(), s=20, c=colour, marker=marker, linewidths=0, zorder=3, label=text)
-    _limit(outliers, ax, x, y)
-    _tint(outliers, ax)
-    _label(outliers, ax, x, y, labels)
+    _limit(places, ax)
+    _tint(places, ax)
+    _label(places, ax, labels)
     ax.set_xlabel("robust distance of the predictors")
     ax.set_ylabel("standardised residual")
     # below the name of the axis, where a title is not in its way
@@ -58,18 +66,19 @@ def draw(outliers: OutlierMap, ax: Any, labels: int) -> Any:
     return ax
 
 
-def _limit(outliers: OutlierMap, ax: Any, x: Tensor, y: Tensor) -> None:
+def _limit(places: Places, ax: Any) -> None:
     """Limits that leave room for labels, whatever the cutoffs are."""
-    ax.set_xlim(0.0, 1.1 * max(float(x.max()), 1.4 * outliers.distance_cutoff))
-    beyond = 1.4 * outliers.residual_cutoff
+    x, y = places.x, places.y
+    ax.set_xlim(0.0, 1.1 * max(float(x.max()), 1.4 * places.x_cutoff))
+    beyond = 1.4 * places.y_cutoff
     low, high = min(float(y.min()), -beyond), max(float(y.max()), beyond)
     ax.set_ylim(low - 0.08 * (high - low), high + 0.08 * (high - low))
 
 
-def _tint(outliers: OutlierMap, ax: Any) -> None:
+def _tint(places: Places, ax: Any) -> None:
     """Each region in a shade of the colour of its points, and the cutoffs between them as lines."""
     (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
-    c, r = outliers.distance_cutoff, outliers.residual_cutoff
+    c, r = places.x_cutoff, places.y_cutoff
     for kind, across, up in (
         (1, (left, c), (r, high)),
         (1, (left, c), (low, -r)),
@@ -84,9 +93,10 @@ def _tint(outliers: OutlierMap, ax: Any) -> None:
     ax.axhline(r, **style)
 
 
-def _label(outliers: OutlierMap, ax: Any, x: Tensor, y: Tensor, labels: int) -> None:
+def _label(places: Places, ax: Any, labels: int) -> None:
     """The indices of the outermost samples, as far as there is room; those that lie together get one label."""
-    far, large = x / outliers.distance_cutoff, y.abs() / outliers.residual_cutoff
+    x, y = places.x, places.y
+    far, large = x / places.x_cutoff, y.abs() / places.y_cutoff
     outer = (torch.maximum(far, large) > 1.0).nonzero().flatten()
     if outer.numel() == 0 or labels == 0:
         return

@@ -74,14 +74,15 @@ class OutlierMap:
             ValueError: the map is of a batch of problems.
         """
         # pictures are an extra
-        from mkc_torch.covariance._outlier_picture import draw
+        from mkc_torch.covariance._outlier_picture import Places, draw
 
         if self.residuals.dim() != 1:
             raise ValueError(
                 f"Expected the map of one problem but this one has shape {tuple(self.residuals.shape)}; make one of "
                 "the problem's own fit and data."
             )
-        return draw(self, ax, labels)
+        x, y = (values.detach().cpu().double() for values in (self.distances, self.residuals))
+        return draw(Places(x, y, self.kind.cpu(), self.distance_cutoff, self.residual_cutoff), ax, labels)
 
 
 def outlier_map(

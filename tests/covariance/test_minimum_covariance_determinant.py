@@ -92,7 +92,9 @@ def test_estimates_are_those_of_scikit_learn_but_for_the_correction_for_few_samp
     peer = MinCovDet(random_state=0).fit(X.numpy())
     h, k = int(peer.raw_support_.sum()), int(peer.support_.sum())
     fit = MCD(h=h, consistency="cutoff").fit(X)
-    small = {which: small_sample_factor(N, p, 0.5, reweighted=which) for which in (False, True)}
+    half = (N + p + 1) // 2
+    fraction = 0.5 + 0.5 * (h - half) / (N - half)  # it rounds up
+    small = {which: small_sample_factor(N, p, fraction, reweighted=which) for which in (False, True)}
     # it divides by the number of samples
     if name in ("stackloss", "salinity", "wood"):
         assert fit.support_.tolist() == peer.raw_support_.tolist()
