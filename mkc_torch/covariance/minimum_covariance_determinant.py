@@ -28,10 +28,11 @@ if TYPE_CHECKING:
 class MinimumCovarianceDeterminant(Fitted):
     """Location and scatter of the h samples whose covariance has the smallest determinant, then reweighted.
 
-    Up to N - h samples may be anything. The search is FastMCD: two concentration steps from ``starts`` random sets of
-    p + 1 samples, the best of them to convergence; beyond 1500 samples the first steps see 1500 of them. Up to 200
-    samples, those that count are then exchanged one by one. One column is solved exactly. What comes out turns and
-    stretches with the data (affine equivariance).
+    Up to N - h samples may be as far out as they like; a tight cluster that is less far can own the smallest
+    determinant, the more easily the more columns there are. The search is FastMCD: two concentration steps from
+    ``starts`` random sets of p + 1 samples, the best of them to convergence; beyond 1500 samples the first steps see
+    1500 of them. Up to 200 samples, those that count are then exchanged one by one. One column is solved exactly. What
+    comes out turns and stretches with the data (affine equivariance).
 
     The covariance of the h samples is made consistent for Gaussian data, and its determinant unbiased for few of them.
     The reweighting step takes mean and covariance of all samples within the ``cutoff`` quantile of the distances, and
