@@ -23,7 +23,7 @@ def moments_of(
     """
     number = counts.sum(-1, keepdim=True).to(points.dtype)
     counts = counts.unsqueeze(-1)
-    # no weight of 0 is multiplied by an outlier's square, which may be infinite
+    # what does not count is out before anything is squared
     error = torch.where(counts, points - centre.unsqueeze(-2), 0.0)
     shift = error.sum(-2) / number
     error = torch.where(counts, error - shift.unsqueeze(-2), 0.0)

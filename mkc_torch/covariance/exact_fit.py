@@ -45,7 +45,7 @@ class ExactFitError(ValueError):
         self._involved = tuple(range(p) if involved is None else involved)
         on, N = int(samples.sum()), samples.shape[0]
         where = f" of problem {problem}" if problem else ""
-        above = f", or, if the samples off it matter, take `h` above {on}" if on < N else ""
+        above = f", or, if the samples off it matter, take `h` well above {on}" if on < N else ""
         super().__init__(
             f"Expected samples in general position but {on} of {N}{where} lie on the hyperplane {self._equation()}, "
             f"so that the scatter is singular; leave out one of these columns{above}. The error has `normal`, `offset` "

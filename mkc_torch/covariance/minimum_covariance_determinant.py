@@ -136,7 +136,7 @@ class MinimumCovarianceDeterminant(Fitted):
         Raises:
             TypeError: X is neither a real floating tensor nor an array of numbers.
             ValueError: a value is not finite, samples are too few, or ``h`` is out of range.
-            ExactFitError: h samples lie on a hyperplane.
+            ExactFitError: h samples lie on a hyperplane, or those that the reweighting leaves do.
         """
         sample = checked_sample("X", X)
         N, p = sample.shape
@@ -230,6 +230,8 @@ def _reweighted(
         raise ValueError(
             f"Expected argument `cutoff` to leave more than {p} samples but only {min(number)} are within it; raise it."
         )
+    # those of the support that lie off a plane can be far by the others
+    refuse_exact_fit(sample, counts)
     mean, covariance = moments_of(sample.points, counts, sample.centre)
     small = small_sample_factor(N, p, fraction, reweighted=True)
     factor = [consistency_factor(share or k / N, p) * small if k < N else 1.0 for k in number]

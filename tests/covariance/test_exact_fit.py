@@ -40,12 +40,12 @@ def test_the_plane_is_told(dtype):
     assert (error.problem, error.columns) == ((), (0, 1, 2))
     again = pickle.loads(pickle.dumps(error))
     assert str(again) == str(error)
-    assert "take `h` above 40" in str(error)
+    assert "take `h` well above 40" in str(error)
 
 
 def test_a_plane_of_fewer_than_h_samples_is_none():
     X = on_a_plane()
-    assert torch.isfinite(MCD(h=41).fit(X).covariance_).all()
+    assert float(torch.linalg.eigvalsh(MCD(h=50).fit(X).covariance_).min()) > 0.01
     with pytest.raises(ExactFitError):
         MCD(h=40).fit(X)
     assert torch.isfinite(MCD().fit(on_a_plane(on=20)).distances_).all()
@@ -75,6 +75,13 @@ def test_a_column_of_equal_values_is_told():
         ExactFitError, match=r"30 of 30 lie on the hyperplane 1·x0 = 7, .* leave out one of these columns\."
     ):
         MCD().fit(X)
+
+
+def test_a_plane_that_the_reweighting_leaves_is_told():
+    X = on_a_plane()
+    assert torch.isfinite(MCD(h=41, reweight=False).fit(X).distances_).all()
+    with pytest.raises(ExactFitError, match="40 of 60"):  # the one sample off it is far by the others
+        MCD(h=41).fit(X)
 
 
 @pytest.mark.parametrize("p", [1, 3])

@@ -117,6 +117,15 @@ def test_the_optimum_is_that_of_all_subsets(seed, N, p, h):
     assert float(MCD(h=h).fit(X).objective_) == pytest.approx(float(subsets(X, h)), abs=1e-9)
 
 
+@pytest.mark.parametrize("far", [1e3, 1e9, 1e70])
+def test_far_values_cost_one_column_no_digits(far):
+    values = sample(0, 41, 1)
+    values[:10] = -far * (1.0 + values[:10].abs())
+    ordered = values.flatten().sort().values
+    least = torch.stack([ordered[i : i + 23].var() for i in range(19)]).min()
+    assert float(MCD(h=23).fit(values).objective_) == pytest.approx(float(least.log()), abs=1e-12)
+
+
 @pytest.mark.parametrize("name", SETS)
 def test_every_seed_finds_one_optimum(name):
     X = SETS[name]()
@@ -168,6 +177,15 @@ def test_forty_percent_of_far_outliers_leave_it(p, far):
     torch.testing.assert_close(fit.location_, clean.mean(0), atol=0.25, rtol=0)
     size = torch.linalg.eigvals(torch.linalg.solve(covariance(clean), fit.covariance_)).real
     assert 0.4 < float(size.min()) <= float(size.max()) < 1.6
+
+
+def test_a_tight_cluster_that_owns_the_smallest_determinant_is_found_as_such():
+    X = sample(0, 200, 4)
+    X[:80] = 30.0 + 0.1 * sample(1, 80, 4)
+    fit = MCD().fit(X)
+    clean = MCD(h=fit.h_).fit(X[80:])
+    assert fit.support_[:80].all()
+    assert float(fit.objective_) < float(clean.objective_)
 
 
 def test_the_share_that_is_left_is_a_larger_correction_than_the_cutoff():
