@@ -18,7 +18,7 @@ FLOORS = (
     {"functional"},
     {"losses"},
     {"lightning", "linear", "metrics"},
-    {"nonlinear"},
+    {"covariance", "nonlinear"},
     {"calibration", "effects"},
     {"simulation"},
     {"challenge", "diagnosis"},

@@ -1,0 +1,199 @@
+"""The h points whose covariance has the smallest determinant, by concentration steps from many elemental starts.
+
+Rousseeuw & Van Driessen, "A fast algorithm for the minimum covariance determinant estimator", Technometrics 41 (1999)
+212-223. A step takes mean and covariance of the h points that are closest by the distances of the last ones; by their
+theorem 1 the determinant never rises.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from mkc_torch.covariance._exchange import exchange
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+
+_CHUNK = 1 << 20
+"""Values worked on at once."""
+
+_SCREENING_SAMPLES = 1500
+
+FAR = 1e4
+"""A set of standardised points with a deviation above it has outliers among them."""
+
+_EXCHANGE_SAMPLES = 200
+"""A sample of no more points has more local minima than concentration steps leave, or than their rank tells apart."""
+
+_EXCHANGED = 20
+"""Of how many supports a point is then exchanged for another."""
+
+
+class Ellipsoids(NamedTuple):
+    """Mean, whitening matrix W with distance ``|W (x - mean)|``, and log determinant (-inf if singular), a stack."""
+
+    mean: Float[Tensor, "B S p"]
+    whitening: Float[Tensor, "B S p p"]
+    log_determinant: Float[Tensor, "B S"]
+
+    def at(self, index: Int[Tensor, "B S_"]) -> Ellipsoids:
+        """The ellipsoids at ``index`` of each problem's stack."""
+        batch = torch.arange(index.shape[0], device=index.device).unsqueeze(-1)
+        return Ellipsoids(*(part[batch, index] for part in self))
+
+
+@dataclass(frozen=True)
+class Support:
+    """Which points count, the number of steps, and whether they had come to rest."""
+
+    counts: Bool[Tensor, "B N"]
+    n_iter: int
+    converged: Bool[Tensor, B]
+
+
+def singular_below(dtype: torch.dtype) -> float:
+    """The variance that a column has left given others, as a share of its own, below which it is lost in rounding."""
+    return 512.0 * torch.finfo(dtype).eps
+
+
+def _ellipsoids(points: Float[Tensor, "B S k p"]) -> Ellipsoids:
+    """Ellipsoids of sets of standardised points; a flat one is given a little thickness, and stays flat.
+
+    A set with far outliers looks flat too, for they leave the others no digits. With its thickness it is still larger
+    than any set without them.
+    """
+    mean = points.mean(-2)
+    error = points - mean.unsqueeze(-2)
+    covariance = torch.matmul(error.mT, error) / (points.shape[-2] - 1)
+    limit = singular_below(points.dtype)
+    deviation = covariance.diagonal(dim1=-2, dim2=-1).sqrt().clamp(min=limit)
+    shape = covariance / deviation.unsqueeze(-1) / deviation.unsqueeze(-2)
+    factor, info = torch.linalg.cholesky_ex(shape)
+    flat = (info > 0) | ~(factor.diagonal(dim1=-2, dim2=-1).amin(-1).square() > limit)
+    if flat.any():
+        eye = torch.eye(shape.shape[-1], dtype=shape.dtype, device=shape.device)
+        factor[flat] = torch.linalg.cholesky_ex(shape[flat] + 10.0 * limit * eye).L
+    eye = torch.eye(shape.shape[-1], dtype=shape.dtype, device=shape.device)
+    whitening = torch.linalg.solve_triangular(factor, eye, upper=False) / deviation.unsqueeze(-2)
+    pivots = factor.diagonal(dim1=-2, dim2=-1) * deviation
+    flat = flat & (deviation.amax(-1) < FAR)
+    return Ellipsoids(mean, whitening, torch.where(flat, -math.inf, 2.0 * pivots.log().sum(-1)))
+
+
+def _closest(points: Float[Tensor, "B N p"], ellipsoids: Ellipsoids, h: int) -> Int[Tensor, "B S h"]:
+    """The h points of smallest distance, in no order."""
+    error = points.unsqueeze(1) - ellipsoids.mean.unsqueeze(-2)
+    distance = torch.matmul(error, ellipsoids.whitening.mT).square().sum(-1)
+    return distance.topk(h, dim=-1, largest=False, sorted=False).indices
+
+
+def _taken(points: Float[Tensor, "B N p"], index: Int[Tensor, "#B S k"]) -> Float[Tensor, "B S k p"]:
+    batch = torch.arange(points.shape[0], device=points.device).view(-1, 1, 1)
+    return points[batch, index]
+
+
+def _step(points: Float[Tensor, "B N p"], ellipsoids: Ellipsoids, h: int) -> Ellipsoids:
+    """One concentration step of every ellipsoid, few of them at once."""
+    size = max(1, _CHUNK // points.numel())
+    parts = zip(*(part.split(size, dim=1) for part in ellipsoids), strict=True)
+    moved = [_ellipsoids(_taken(points, _closest(points, Ellipsoids(*part), h))) for part in parts]
+    return Ellipsoids(*(torch.cat(part, dim=1) for part in zip(*moved, strict=True)))
+
+
+def _starts(points: Float[Tensor, "B N p"], count: int, generator: torch.Generator) -> Ellipsoids:
+    """Ellipsoids of ``count`` random sets of p + 1 points, and that of all points."""
+    N, p = points.shape[-2:]
+    keys = torch.rand(count, N, generator=generator, dtype=torch.float64).to(points.device)
+    elemental = _ellipsoids(_taken(points, keys.topk(p + 1, dim=-1).indices.unsqueeze(0)))
+    whole = _ellipsoids(points.unsqueeze(1))
+    return Ellipsoids(*(torch.cat(both, dim=1) for both in zip(elemental, whole, strict=True)))
+
+
+def concentrate(
+    points: Float[Tensor, "B N p"], h: int, *, starts: int = 500, max_iter: int = 100, seed: int = 0
+) -> Support:
+    """Two steps from every start on at most 1500 points, then the best candidates to convergence on all of them.
+
+    Up to 200 points the best supports are then improved by exchanging one point for another.
+
+    Args:
+        points: standardised.
+        h: how many count.
+        starts: number of random sets of p + 1 points.
+        max_iter: steps at most.
+        seed: of the random sets; every problem has the same, so that its result does not depend on the others.
+    """
+    per_problem = min(points.shape[-2], _SCREENING_SAMPLES) * points.shape[-1]
+    parts = points.split(max(1, _CHUNK // (per_problem * 100)))
+    found = [_concentrate(part, h, starts, max_iter, seed) for part in parts]
+    return Support(
+        counts=torch.cat([f.counts for f in found]),
+        n_iter=max(f.n_iter for f in found),
+        converged=torch.cat([f.converged for f in found]),
+    )
+
+
+def _concentrate(points: Float[Tensor, "B N p"], h: int, starts: int, max_iter: int, seed: int) -> Support:
+    generator = torch.Generator().manual_seed(seed)
+    N = points.shape[-2]
+    small, few = points, h
+    if N > _SCREENING_SAMPLES:
+        keep = torch.randperm(N, generator=generator)[:_SCREENING_SAMPLES].sort().values
+        small, few = points[:, keep.to(points.device)], max(1, round(h / N * _SCREENING_SAMPLES))
+    found = _starts(small, starts, generator)
+    for _ in range(2):
+        found = _step(small, found, few)
+    candidates = min(50 if N <= _EXCHANGE_SAMPLES else 10, starts + 1)
+    found = found.at(found.log_determinant.topk(candidates, dim=1, largest=False).indices)
+    found, n_iter, moving = _converged(points, found, h, max_iter)
+    if N > _EXCHANGE_SAMPLES:
+        best = found.log_determinant.argmin(1, keepdim=True)
+        index = _closest(points, found.at(best), h)
+        moving = moving.gather(1, best)
+    else:
+        index = _exchanged(points, found, h)
+        # an exchange that has ended is at rest
+        moving = torch.zeros_like(moving[:, :1])
+    counts = torch.zeros(points.shape[:2], dtype=torch.bool, device=points.device)
+    return Support(counts.scatter_(1, index.squeeze(1), True), n_iter, ~moving.squeeze(1))
+
+
+def _converged(
+    points: Float[Tensor, "B N p"], found: Ellipsoids, h: int, max_iter: int
+) -> tuple[Ellipsoids, int, Bool[Tensor, "B S"]]:
+    """Steps from ellipsoids of any points until no determinant falls, their number, and what was still moving."""
+    tolerance = 1e2 * torch.finfo(points.dtype).eps
+    # what holds of a part of the points need not hold of all
+    found = found._replace(log_determinant=torch.full_like(found.log_determinant, math.inf))
+    moving = torch.ones_like(found.log_determinant, dtype=torch.bool)
+    n_iter = 0
+    while n_iter < max_iter and moving.any():
+        n_iter += 1
+        going = torch.nonzero(moving.any(0)).flatten()
+        moved = _step(points, Ellipsoids(*(part[:, going] for part in found)), h)
+        falls = moving[:, going] & (found.log_determinant[:, going] - moved.log_determinant > tolerance)
+        for part, new in zip(found, moved, strict=True):
+            part[:, going] = torch.where(falls.view(*falls.shape, *(1,) * (new.dim() - 2)), new, part[:, going])
+        moving[:, going] = falls
+    return found, n_iter, moving
+
+
+def _exchanged(points: Float[Tensor, "B N p"], found: Ellipsoids, h: int) -> Int[Tensor, "B 1 h"]:
+    """The best support after an exchange in the best few that differ."""
+    value, order = found.log_determinant.sort(dim=1)
+    same = torch.nn.functional.pad(value.diff(dim=1) < 1e-9, (1, 0))
+    value, few = torch.where(same, math.inf, value).topk(min(_EXCHANGED, value.shape[1]), dim=1, largest=False)
+    index = _closest(points, found.at(order.gather(1, few)), h)
+    counts = torch.zeros(*few.shape, points.shape[-2], dtype=torch.bool, device=points.device).scatter_(2, index, True)
+    differs = value < math.inf
+    problem, _ = differs.nonzero(as_tuple=True)
+    counts[differs] = exchange(points[problem], counts[differs])
+    index = counts.nonzero()[:, -1].reshape(index.shape)
+    best = _ellipsoids(_taken(points, index)).log_determinant.argmin(1).view(-1, 1, 1)
+    return index.gather(1, best.expand(-1, 1, h))
