@@ -1,0 +1,38 @@
+"""Student's t and Fisher's F against scipy."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import special, stats
+
+from mkc_torch._support.student_t import fisher_tail, incomplete_beta, student_quantile, student_tails
+
+
+def f64(value: float) -> torch.Tensor:
+    return torch.tensor(value, dtype=torch.float64)
+
+
+@given(st.floats(0.05, 1e5), st.floats(0.05, 1e3), st.floats(0.0, 1.0))
+def test_incomplete_beta(a, b, x):
+    expected = special.betainc(a, b, x)
+    assert float(incomplete_beta(f64(a), f64(b), f64(x))) == pytest.approx(expected, rel=1e-8, abs=1e-12)
+
+
+@given(st.floats(0.5, 1e5), st.floats(0.01, 0.999))
+def test_quantile_and_tails_are_inverse_and_those_of_scipy(freedom, level):
+    t = student_quantile(level, f64(freedom))
+    assert float(t) == pytest.approx(stats.t.ppf(0.5 + 0.5 * level, freedom), rel=1e-8)
+    assert float(student_tails(t, f64(freedom))) == pytest.approx(1 - level, rel=1e-8)
+
+
+@pytest.mark.parametrize("f", [0.0, 0.3, 2.0, 40.0])
+@pytest.mark.parametrize("under", [3.0, 90.0, 1e9])
+def test_fisher(f, under):
+    expected = stats.f.sf(f, 4, under)
+    assert float(fisher_tail(f64(f), torch.tensor(4), f64(under))) == pytest.approx(expected, rel=1e-4, abs=1e-12)
+
+
+def test_far_tails_are_not_lost():
+    assert float(student_tails(f64(30.0), f64(50.0))) == pytest.approx(2 * stats.t.sf(30.0, 50), rel=1e-9)
+    assert float(student_tails(f64(torch.inf), f64(5.0))) == 0.0
