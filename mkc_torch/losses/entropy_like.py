@@ -34,6 +34,7 @@ from mkc_torch._support.arguments import (
 from mkc_torch._support.trust_region import Quadratic, minimise
 from mkc_torch.density.energy import as_computed
 from mkc_torch.losses._checks import refuse_other_reduction, refuse_other_shapes
+from mkc_torch.losses._entropy_curves import EntropyCurves
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -179,7 +180,7 @@ def _refuse_shares(weight: Tensor, shape: torch.Size, dims: tuple[int, ...]) -> 
         )
 
 
-class LELoss(nn.Module):
+class LELoss(EntropyCurves, nn.Module):
     """H of the errors of a batch, (40)-(42) of Indiveri (2009): least where few errors are large and most are small.
 
     It knows no scale, so a network that is trained on it alone is determined up to what leaves the relative errors as

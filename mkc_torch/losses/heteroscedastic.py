@@ -20,6 +20,7 @@ from mkc_torch.losses._checks import (
     refuse_other_reduction,
     refuse_other_shapes,
 )
+from mkc_torch.losses._curves import SampleCurves
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -51,7 +52,7 @@ class _WideBuffers(nn.Module):
         return self
 
 
-class HeteroscedasticMKCLoss(_WideBuffers):
+class HeteroscedasticMKCLoss(SampleCurves, _WideBuffers):
     """Negative log-likelihood of the MKC density with a bandwidth σ and a scale d for every element.
 
     σ and d come from a network, :class:`MKCHead` say, beside the prediction: noise that differs from place to place is

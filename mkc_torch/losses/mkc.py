@@ -21,7 +21,7 @@ from mkc_torch.losses._checks import (
     refuse_other_shapes,
     shortly,
 )
-from mkc_torch.losses._curves import Curves
+from mkc_torch.losses._curves import ChannelCurves
 from mkc_torch.losses._energy_sums import energy_sums
 from mkc_torch.losses._following import Following
 from mkc_torch.losses._follows_residuals import FollowsResiduals
@@ -40,7 +40,7 @@ DEFAULT_D_MIN_IN_D = 1e-3
 """Floor under d, in units of the initial d, where none is given."""
 
 
-class MKCLoss(FollowsResiduals, Curves, nn.Module):
+class MKCLoss(FollowsResiduals, ChannelCurves, nn.Module):
     """Multi-kernel correntropy loss with a bandwidth σ and a scale d for each channel.
 
     With anything learned it is the negative log-likelihood of (17) of Li et al. (2023), ``energy + log_normalizer``;
