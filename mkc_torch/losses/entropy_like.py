@@ -101,7 +101,10 @@ def _entropy(
         raise ValueError(f"Expected at least one residual but got shape {tuple(residual.shape)}.")
     dims = _dimensions(residual, dim)
     count: Tensor | float
-    if weight is None:
+    if weight is None and torch.compiler.is_compiling():
+        # a number would fix the size of the batch
+        count = torch.ones_like(residual).sum(dims)
+    elif weight is None:
         count = float(math.prod([residual.shape[d] for d in dims]))
     else:
         if not torch.compiler.is_compiling():
