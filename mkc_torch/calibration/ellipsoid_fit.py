@@ -64,8 +64,8 @@ of the fit. A ball of noise scatters by half."""
 
 LENT_UNSURE, LENT_UNSURE_OF_ONE = 0.1, 4.0
 """How far the information that noise seems to lend may differ from what is computed, as a share of it: because the
-noise is not quite alike in all directions, and by chance, over the root of the number of points. Two circles have 1.8
-standard deviations of chance there (60 draws of 2000 points, planes at 30° to 90°, noise of 8 and 14 %)."""
+noise is not quite alike in all directions, and by chance, over the root of the number of points. The standard
+deviation of that chance is 1.7 to 1.8 where two circles of 1000 points each lend it all, at noise of 8 and 14 %."""
 
 _UNEVEN = 10.0
 """Bias over the square of the scatter, each as a share, above which it is the directions that are missing: an even
