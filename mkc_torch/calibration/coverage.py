@@ -71,7 +71,7 @@ def fibonacci_sphere(count: int, *, dtype: torch.dtype = torch.float64) -> Float
     return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), z], -1)
 
 
-def _tangents(directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 9"]:
+def tangents(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 9"]:
     """First-order change of the norm with the centre and the shape: the functions u_i and u_i u_j on the sphere."""
     x, y, z = directions.unbind(-1)
     root2 = math.sqrt(2.0)
@@ -81,8 +81,21 @@ def _tangents(directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 9"]:
 @lru_cache(maxsize=1)
 def _even_information() -> Float[Tensor, "9 9"]:
     """Cholesky factor of the information of an evenly covered sphere."""
-    rows = _tangents(fibonacci_sphere(20_000))
+    rows = tangents(fibonacci_sphere(20_000))
     return torch.linalg.cholesky(rows.mT @ rows / rows.shape[0])
+
+
+def least_information(moment: Float[Tensor, "9 9"]) -> tuple[float, Float[Tensor, " 9"]]:
+    """Of the worst-determined combination of centre and shape, as a share of even coverage, and that combination.
+
+    Args:
+        moment: mean product of the :func:`tangents`.
+    """
+    even = _even_information()
+    half = torch.linalg.solve_triangular(even, moment.detach().double().cpu(), upper=False)
+    relative = torch.linalg.solve_triangular(even, half.mT, upper=False)
+    values, vectors = torch.linalg.eigh(relative)
+    return float(values[0]), torch.linalg.solve_triangular(even.mT, vectors[:, :1], upper=True).squeeze(-1)
 
 
 def coverage(directions: Float[Tensor, "N 3"]) -> Coverage:
@@ -109,9 +122,8 @@ def coverage(directions: Float[Tensor, "N 3"]) -> Coverage:
     for part in unit.split(4096):
         nearest = torch.maximum(nearest, (grid @ part.mT).amax(-1))
     angle = torch.rad2deg(torch.acos(nearest.clamp(-1.0, 1.0)))
-    rows = _tangents(unit)
-    half = torch.linalg.solve_triangular(_even_information(), rows.mT @ rows / rows.shape[0], upper=False)
-    relative = torch.linalg.solve_triangular(_even_information(), half.mT, upper=False)
+    rows = tangents(unit)
+    information, _ = least_information(rows.mT @ rows / rows.shape[0])
     gaps: list[Gap] = []
     left = angle.clone()
     while float(left.max()) > GAP_DEGREES:
@@ -123,5 +135,5 @@ def coverage(directions: Float[Tensor, "N 3"]) -> Coverage:
     return Coverage(
         fraction=float((angle < NEAR_DEGREES).double().mean()),
         gaps=tuple(gaps),
-        information=float(torch.linalg.eigvalsh(relative)[0].clamp(min=0.0)),
+        information=max(information, 0.0),
     )

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import checked_number, refuse_bad_weight, refuse_not_real, refuse_other_type
+from mkc_torch._support.arguments import checked_number, refuse_other_type
 from mkc_torch._support.arrays import Data, as_tensor
 from mkc_torch._support.order_statistic import order_statistic, robust_scale
-from mkc_torch.calibration.coverage import Coverage, coverage
+from mkc_torch.calibration.coverage import Coverage, coverage, least_information, tangents
 from mkc_torch.calibration.ellipsoid import (
     Ellipsoid,
     axes_of,
@@ -31,6 +31,8 @@ from mkc_torch.calibration.ellipsoid import (
     sampson_distance,
     symmetric_root,
 )
+from mkc_torch.calibration.ellipsoid_errors import derived_slopes
+from mkc_torch.calibration.noise_effect import Bias, algebraic_rows, bias_by_noise, distance_rows, moments_of
 from mkc_torch.calibration.not_identifiable import (
     NotIdentifiableError,
     middle_of,
@@ -38,6 +40,7 @@ from mkc_torch.calibration.not_identifiable import (
     told_of_equal,
     told_of_flat,
 )
+from mkc_torch.calibration.points import MIN_POINTS, prepared, refuse_no_points
 from mkc_torch.linear import MKCRegression, RankDeficientError
 from mkc_torch.linear._estimator import Fitted, LinearEstimator
 from mkc_torch.linear._problem import common_batch
@@ -49,20 +52,25 @@ if TYPE_CHECKING:
 
 __all__ = ["MAX_SCATTER", "MAX_STANDARD_ERROR", "MIN_INFORMATION", "MIN_POINTS", "EllipsoidFit"]
 
-MIN_POINTS = 9
 MIN_INFORMATION = 0.003
 """Least information, as a share of even coverage, that identifies an ellipsoid."""
 
 MAX_STANDARD_ERROR = 0.05
-"""Largest standard error of the centre or a semi-axis, as a share of the radius, that identifies an ellipsoid."""
+"""Largest standard error of the centre or a semi-axis, as a share of the radius, that identifies an ellipsoid; the bias
+by noise counts in it."""
 
 MAX_SCATTER = 0.2
 """Largest scatter of the points about the surface, as a share of its shortest semi-axis: the square of it is the bias
 of the fit. A ball of noise scatters by half."""
 
-LENT_BY_NOISE = 5.0
-"""Information that points on two circles, which determine no ellipsoid, seem to have by their scatter alone, over its
-square as a share of the shortest semi-axis: 1 to 7 by how their planes lie; from 5 on, they come out."""
+LENT_UNSURE, LENT_UNSURE_OF_ONE = 0.1, 4.0
+"""How far the information that noise seems to lend may differ from what is computed, as a share of it: because the
+noise is not quite alike in all directions, and by chance, over the root of the number of points. The standard
+deviation of that chance is 1.7 to 1.8 where two circles of 1000 points each lend it all, at noise of 8 and 14 %."""
+
+_UNEVEN = 10.0
+"""Bias over the square of the scatter, each as a share, above which it is the directions that are missing: an even
+coverage has 4 to 5."""
 
 _EXACT = 1e4
 """Roundings by which a point may be off a surface that it is on."""
@@ -94,7 +102,9 @@ class EllipsoidFit(Fitted):
         weights_: (*, N), the weight in [0, 1] with which each point entered.
         center_se_, semi_axes_se_, calibration_matrix_se_: standard errors of the same shapes, where the estimator
             has a ``covariance_``; infinite where nine points leave none to tell errors from. After a finish they are
-            those of the finish, of the estimator's kind ("sandwich" where it has none).
+            those of the finish, of the estimator's kind ("sandwich" where it has none). They hold the bias by the
+            noise of the points, as the root of the sum of squares, so that intervals reach over it; but for
+            ``max_scatter=inf``, where it is no noise that moves the points.
         coverage_: one :class:`mkc_torch.calibration.coverage.Coverage`, or a list of them, of the points in use.
         root_se_: standard errors of ``calibration_matrix_ / radius_``, which makes the ellipsoid a unit sphere.
         estimator_: the fitted estimator; its residual is algebraic, about twice the relative error of the norm.
@@ -149,11 +159,12 @@ class EllipsoidFit(Fitted):
             TypeError: not a floating tensor, or an array of something else than real numbers.
             ValueError: wrong shape, too few or non-finite points.
             NotIdentifiableError: the points lie on a plane, cover too few directions (the message names those that are
-                missing), or draw no surface: they scatter about it by more than ``max_scatter``.
+                missing), cover them by their noise alone, draw no surface, for they scatter about it by more than
+                ``max_scatter``, or their noise draws the result aside by more than a standard error may be.
         """
         self._forget()
         weight = None if sample_weight is None else as_tensor("sample_weight", sample_weight)
-        used, weight = _prepared(as_tensor("points", points), weight)
+        used, weight = prepared(as_tensor("points", points), weight)
         self._keep_columns_of(points)
         try:
             self._fit(used, weight)
@@ -198,13 +209,12 @@ class EllipsoidFit(Fitted):
             local = ellipsoid_from_root(parameters)
             self._refuse_unbounded(local, points)
         self._keep(points, Ellipsoid(origin.squeeze(-2) + scale * local.center, local.shape / size.square()))
-        if covariance is not None:
-            self._standard_errors(local, scale, parameters, covariance, ellipsoid_of)
-        self._refuse_uncovered(self.calibrate(points), weight)
+        in_use = self._in_use(weight)
         scatter = self._scatter(self.calibrate(points), weight)
-        self._refuse_scattered(self.calibrate(points), scatter)
-        if self.max_scatter < math.inf:
-            self._refuse_lent(self.calibrate(points), scatter)
+        noise = self._noise(scatter, in_use)
+        bias = self._bias((points - origin) / size, scale, noise, parameters, weight)
+        errors = self._errors(local, scale, parameters, covariance, ellipsoid_of, bias)
+        self._refuse_undetermined(points, in_use, scatter, noise, errors)
 
     def _finished(self, local: Ellipsoid, points: Tensor, scale: Tensor, weight: Tensor | None) -> NonlinearFit:
         """The maximum of the likelihood of the distances that is nearest to an ellipsoid, all in local coordinates."""
@@ -236,7 +246,7 @@ class EllipsoidFit(Fitted):
         matrix = self.calibration_matrix_
         self._refuse_other_columns("points", points)
         points = as_tensor("points", points, like=matrix)
-        _refuse_no_points(points)
+        refuse_no_points(points)
         common_batch("points", points.shape[:-2], "calibration_matrix_", matrix.shape[:-2])
         return torch.einsum("...ij,...kj->...ki", self.calibration_matrix_, points - self.center_.unsqueeze(-2))
 
@@ -247,10 +257,12 @@ class EllipsoidFit(Fitted):
         if not bool(bounded.all()):
             index = int((~bounded).nonzero()[0, 0])
             vectors = (points - middle_of(points)).reshape(-1, *points.shape[-2:])[index]
-            where = f"Problem {index}: " if points.dim() > 2 else ""
             seen = " They are seen from the middle of the samples, for the centre is not known; the gaps may be wider."
             raise not_identifiable(
-                f"{where}Not identifiable: the quadric that fits the points is no ellipsoid.", vectors, seen=seen
+                f"{_problem(index, points.dim() > 2)}Not identifiable: the quadric that fits the points is no "
+                "ellipsoid.",
+                vectors,
+                seen=seen,
             )
 
     def _keep(self, points: Tensor, ellipsoid: Ellipsoid) -> None:
@@ -261,65 +273,93 @@ class EllipsoidFit(Fitted):
         self.coef_ = coefficients_from_ellipsoid(ellipsoid)
         self.residual_ = torch.linalg.vector_norm(self.calibrate(points), dim=-1) - self.radius_.unsqueeze(-1)
 
-    def _standard_errors(
+    def _errors(
         self,
         local: Ellipsoid,
         scale: Tensor,
         parameters: Tensor,
-        covariance: Tensor,
+        covariance: Tensor | None,
         ellipsoid_of: Callable[[Tensor], Ellipsoid],
-    ) -> None:
-        """First-order propagation from the parameters; the calibration matrix W solves dW W + W dW = dA₁."""
+        bias: Bias | None,
+    ) -> tuple[list[float], list[float]]:
+        """Keep the standard errors; the largest of centre and semi-axes over the radius, without the bias and with it.
 
-        def quantities(theta: Tensor) -> Tensor:
-            center, shape = ellipsoid_of(theta)
-            axes = torch.linalg.eigvalsh(shape).flip(-1).rsqrt()
-            return torch.cat([center, axes, shape.flatten()])
+        The bias enters as a standard error, so that an interval reaches over it.
+        """
+        slopes = derived_slopes(local, parameters, ellipsoid_of)
+        aside = alone = total = torch.zeros_like(slopes[..., 0])
 
-        jacobian = torch.func.vmap(torch.func.jacrev(quantities))(parameters.reshape(-1, 9))
-        root = symmetric_root(local.shape).reshape(-1, 3, 3)
-        eye = torch.eye(3, dtype=root.dtype, device=root.device)
-        lyapunov = torch.stack([torch.kron(w, eye) + torch.kron(eye, w) for w in root])
-        d_root = torch.linalg.solve(lyapunov, jacobian[:, 6:])
-        # the matrix is radius · root, and the radius is det(A₁)^(-1/6)
-        inverse = torch.linalg.inv(local.shape.reshape(-1, 3, 3)).flatten(1)
-        d_log_radius = -torch.einsum("bi,bij->bj", inverse, jacobian[:, 6:]) / 6.0
-        radius = torch.linalg.det(local.shape.reshape(-1, 3, 3)).pow(-1 / 6)
-        d_matrix = radius[:, None, None] * (d_root + root.flatten(1).unsqueeze(-1) * d_log_radius.unsqueeze(1))
-        rows = torch.cat([jacobian[:, :6], d_matrix, d_root], 1)
-        variance = torch.einsum("bij,bjk,bik->bi", rows, covariance.reshape(-1, 9, 9), rows)
-        errors = variance.nan_to_num(torch.inf).clamp(min=0.0).sqrt().reshape(*scale.shape[:-1], 24)
-        self.center_se_ = errors[..., :3] * scale
-        self.semi_axes_se_ = errors[..., 3:6] * scale
-        self.calibration_matrix_se_ = errors[..., 6:15].unflatten(-1, (3, 3))
-        self.root_se_ = errors[..., 15:].unflatten(-1, (3, 3)) / scale.unsqueeze(-1)
+        def spread(rows: Tensor, covariance: Tensor) -> Tensor:
+            variance = torch.einsum("bij,bjk,bik->bi", rows, covariance.reshape(-1, 9, 9), rows)
+            return torch.where(variance.isnan(), torch.inf, variance).clamp(min=0.0)
 
-    def _refuse_uncovered(self, field: Tensor, weight: Tensor | None) -> None:
+        if bias is not None:
+            aside = torch.einsum("bij,bj->bi", slopes, bias.offset)
+        if covariance is not None:
+            alone = total = spread(slopes, covariance)
+            if bias is not None:
+                total = spread(slopes @ bias.growth, covariance)
+        total = total + aside.square()
+        if covariance is not None:
+            kept = total.sqrt().reshape(*scale.shape[:-1], 24)
+            self.center_se_ = kept[..., :3] * scale
+            self.semi_axes_se_ = kept[..., 3:6] * scale
+            self.calibration_matrix_se_ = kept[..., 6:15].unflatten(-1, (3, 3))
+            self.root_se_ = kept[..., 15:].unflatten(-1, (3, 3)) / scale.unsqueeze(-1)
+        share = (scale / self.radius_.unsqueeze(-1)).reshape(-1).detach()
+        first, second = (share * one[:, :6].amax(-1).sqrt() for one in (alone, total))
+        return first.tolist(), second.tolist()
+
+    def _in_use(self, weight: Tensor | None) -> Tensor:
+        """Points that count, (*, N)."""
         # which of the points on the surface itself a trimmed fit keeps is a matter of rounding
-        on_it = self.residual_.abs() <= _EXACT * torch.finfo(field.dtype).eps * self.radius_.unsqueeze(-1)
-        in_use = (self.weights_ >= 0.5) | on_it
-        if weight is not None:
-            in_use = in_use & (weight > 0)
-        flat = field.detach().reshape(-1, *field.shape[-2:])
-        directions = [f[use] for f, use in zip(flat, in_use.reshape(flat.shape[0], -1), strict=True)]
+        eps = torch.finfo(self.residual_.dtype).eps
+        in_use = (self.weights_ >= 0.5) | (self.residual_.abs() <= _EXACT * eps * self.radius_.unsqueeze(-1))
+        return in_use if weight is None else in_use & (weight > 0)
+
+    def _bias(
+        self, points: Tensor, scale: Tensor, noise: Tensor | None, parameters: Tensor, weight: Tensor | None
+    ) -> Bias | None:
+        """Of the parameters, by the noise of the points, which are in the parameters' coordinates."""
+        if noise is None:
+            return None
+        near = points.reshape(-1, *points.shape[-2:])
+        theta = parameters.reshape(-1, 9)
+        share = self.weights_ if weight is None else self.weights_ * weight
+        rows = algebraic_rows(theta) if self.finish is None else distance_rows(theta)
+        return bias_by_noise(moments_of(rows, near, share.reshape(near.shape[:2]), noise / scale.reshape(-1)))
+
+    def _refuse_undetermined(
+        self,
+        points: Tensor,
+        in_use: Tensor,
+        scatter: Tensor,
+        noise: Tensor | None,
+        errors: tuple[list[float], list[float]],
+    ) -> None:
+        field = self.calibrate(points).detach()
+        flat = field.reshape(-1, *field.shape[-2:])
+        directions = [f[use] for f, use in zip(flat, in_use.reshape(flat.shape[:2]), strict=True)]
         found = [coverage(d) for d in directions]
         self.coverage_: Coverage | list[Coverage] = found[0] if field.dim() == 2 else found
-        largest = self._largest_standard_error()
         for index, one in enumerate(found):
-            where = f"Problem {index}: " if field.dim() > 2 else ""
+            where = _problem(index, field.dim() > 2)
             if one.information < MIN_INFORMATION:
                 raise not_identifiable(
                     f"{where}Not identifiable: too few directions are covered to tell the offset from the shape "
                     f"({one.information:.1e} of the information of an even coverage; {MIN_INFORMATION:g} is needed).",
                     directions[index],
                 )
-            if largest is not None and MAX_STANDARD_ERROR < float(largest[index]) < math.inf:
+            if MAX_STANDARD_ERROR < errors[0][index] < math.inf:
                 raise not_identifiable(
                     f"{where}Not identifiable: the centre or a semi-axis has a standard error of "
-                    f"{100.0 * float(largest[index]):.0f} % of the radius, more than "
-                    f"{100.0 * MAX_STANDARD_ERROR:.0f} %.",
+                    f"{100.0 * errors[0][index]:.0f} % of the radius, more than {100.0 * MAX_STANDARD_ERROR:.0f} %.",
                     directions[index],
                 )
+        self._refuse_scattered(field, scatter)
+        if noise is not None:
+            self._refuse_lent(points, in_use, scatter, noise, directions)
+            self._refuse_biased(scatter.tolist(), errors[1], directions)
 
     @torch.no_grad()
     def _scatter(self, field: Tensor, weight: Tensor | None) -> Tensor:
@@ -329,80 +369,64 @@ class EllipsoidFit(Fitted):
         used = None if weight is None else (weight > 0).to(field).unsqueeze(-1)
         return (robust_scale(distance, used) / self.semi_axes_[..., :1]).reshape(-1)
 
-    def _refuse_lent(self, field: Tensor, scatter: Tensor) -> None:
+    def _noise(self, scatter: Tensor, in_use: Tensor) -> Tensor | None:
+        """Standard deviation of the points, in their unit, for each problem; None where something else moves them."""
+        if self.max_scatter == math.inf:
+            return None
+        count = in_use.reshape(len(scatter), -1).sum(-1).to(scatter)
+        # nine coefficients go along with the noise of as many points
+        free = (count / (count - MIN_POINTS).clamp(min=1.0)).sqrt()
+        return scatter * self.semi_axes_[..., 0].detach().reshape(-1) * free
+
+    @torch.no_grad()
+    def _refuse_lent(
+        self, points: Tensor, in_use: Tensor, scatter: Tensor, noise: Tensor, directions: list[Tensor]
+    ) -> None:
         """Refuse directions that seem to be covered because the points scatter: the ellipsoid is that of the noise."""
-        found = self.coverage_ if isinstance(self.coverage_, list) else [self.coverage_]
-        for index, one in enumerate(found):
-            lent = LENT_BY_NOISE * float(scatter[index]) ** 2
-            if one.information < MIN_INFORMATION + lent:
-                where = f"Problem {index}: " if field.dim() > 2 else ""
+        flat = points.reshape(-1, *points.shape[-2:])
+        use = in_use.reshape(flat.shape[:2]).to(flat)
+        center, root = self.center_.reshape(-1, 1, 3), (self.calibration_matrix_ / self.radius_[..., None, None])
+        root = root.reshape(-1, 3, 3)
+        moments = moments_of(lambda p: tangents((p - center) @ root), flat, use, noise)
+        for index, count in enumerate(use.sum(-1).tolist()):
+            least, along = least_information(moments.found[index] - moments.lent[index])
+            lent = float(along @ moments.lent[index].double().cpu() @ along)
+            needed = MIN_INFORMATION + (LENT_UNSURE + LENT_UNSURE_OF_ONE * count**-0.5) * max(lent, 0.0)
+            if least < needed:
                 raise not_identifiable(
-                    f"{where}Not identifiable: too few directions are covered for points that scatter about the "
-                    f"ellipsoid by {100.0 * float(scatter[index]):.0f} % of its shortest semi-axis "
-                    f"({one.information:.1e} of the information of an even coverage; {MIN_INFORMATION + lent:.1e} is "
-                    "needed, for the scatter alone seems to cover as much).",
-                    field.detach().reshape(-1, *field.shape[-2:])[index],
+                    f"{_problem(index, points.dim() > 2)}Not identifiable: too few directions are covered for points "
+                    f"that scatter about the ellipsoid by {100.0 * float(scatter[index]):.0f} % of its shortest "
+                    f"semi-axis. Less what the scatter alone seems to cover, {least:.1e} of the information of an even "
+                    f"coverage is left; {needed:.1e} is needed.",
+                    directions[index],
+                )
+
+    def _refuse_biased(self, scatter: list[float], errors: list[float], directions: list[Tensor]) -> None:
+        """Refuse what the noise draws aside by more than a standard error may be."""
+        for index, (wide, error) in enumerate(zip(scatter, errors, strict=True)):
+            if MAX_STANDARD_ERROR < error < math.inf:
+                even = error <= _UNEVEN * wide**2
+                what = "there is too much noise in" if even else "too few directions are covered for"
+                less = "" if self.finish else '; finish="maximum_likelihood" has less of it'
+                raise not_identifiable(
+                    f"{_problem(index, len(errors) > 1)}Not identifiable: {what} points that scatter about the "
+                    f"ellipsoid by {100.0 * wide:.0f} % of its shortest semi-axis. With the bias by that, the centre "
+                    f"or a semi-axis has an error of {100.0 * error:.0f} % of the radius, more than "
+                    f"{100.0 * MAX_STANDARD_ERROR:.0f} %{less}.",
+                    directions[index],
                 )
 
     def _refuse_scattered(self, field: Tensor, scatter: Tensor) -> None:
         """Refuse a surface that the points do not draw: that of a ball of noise is as wide as the noise."""
         wide = (scatter > self.max_scatter).nonzero().flatten()
         if len(wide) > 0:
-            where = f"Problem {int(wide[0])}: " if field.dim() > 2 else ""
             raise NotIdentifiableError(
-                f"{where}Not identifiable: the points draw no surface. They scatter about the ellipsoid by "
-                f"{100.0 * float(scatter[wide[0]]):.0f} % of its shortest semi-axis, more than "
+                f"{_problem(int(wide[0]), field.dim() > 2)}Not identifiable: the points draw no surface. They scatter "
+                f"about the ellipsoid by {100.0 * float(scatter[wide[0]]):.0f} % of its shortest semi-axis, more than "
                 f"{100.0 * self.max_scatter:.0f} %, as the noise of a sensor that hardly turns does. Turn the sensor "
                 "through all directions."
             )
 
-    def _largest_standard_error(self) -> Tensor | None:
-        """Of centre and semi-axes as a share of the radius, for each problem; infinite where it is unknown."""
-        if "center_se_" not in self.__dict__:
-            return None
-        errors = torch.cat([self.center_se_, self.semi_axes_se_], -1).amax(-1) / self.radius_
-        return errors.detach().reshape(-1)
 
-
-def _refuse_no_points(points: Tensor) -> None:
-    refuse_not_real("points", points)
-    if points.dim() < 2 or points.shape[-1] != 3:
-        mend = "; a point is a row, so try points.mT" if points.dim() > 1 and points.shape[-2] == 3 else ""
-        if points.shape == (3,):
-            mend = "; one point is points[None]"
-        raise ValueError(f"Expected argument `points` of shape (*, N, 3) but got {tuple(points.shape)}{mend}.")
-
-
-def _prepared(points: Tensor, sample_weight: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Checked points and weights; what a point of weight 0 holds is replaced, so that it can be anything."""
-    _refuse_no_points(points)
-    if points.dtype in (torch.float16, torch.bfloat16):
-        raise TypeError(f"Expected argument `points` of dtype float32 or float64 but got {points.dtype}; use .float().")
-    weight = None
-    if sample_weight is not None:
-        refuse_bad_weight(sample_weight, "sample_weight")
-        if sample_weight.shape != points.shape[:-1] and sample_weight.shape != points.shape[-2:-1]:
-            raise ValueError(
-                f"Expected argument `sample_weight` of shape {tuple(points.shape[:-1])} "
-                f"but got {tuple(sample_weight.shape)}; it has one weight for each point."
-            )
-        weight = sample_weight.to(points).expand(points.shape[:-1])
-    count = points.shape[-2] if weight is None else int((weight > 0).sum(-1).min())
-    if count < MIN_POINTS:
-        raise ValueError(
-            f"Expected at least {MIN_POINTS} points, one for each coefficient of an ellipsoid, but got {count}; record "
-            "more, in all directions."
-        )
-    finite = torch.isfinite(points)
-    if weight is not None:
-        finite = finite | (weight == 0).unsqueeze(-1)
-    if not bool(finite.all()):
-        first = tuple((~finite).nonzero()[0].tolist())
-        raise ValueError(
-            f"Expected argument `points` to be finite but got {points[first].item()} at index {first} "
-            f"({int((~finite).sum())} such values); drop those points."
-        )
-    if weight is None:
-        return points, None
-    first_used = (weight > 0).to(torch.int64).argmax(-1)[..., None, None].expand(*points.shape[:-2], 1, 3)
-    return torch.where((weight > 0).unsqueeze(-1), points, points.gather(-2, first_used)), weight
+def _problem(index: int, several: bool) -> str:
+    return f"Problem {index}: " if several else ""

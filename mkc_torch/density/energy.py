@@ -34,7 +34,9 @@ def as_computed(*values: object) -> tuple[Tensor, ...]:
             raise TypeError(f"Expected real values but got a tensor of dtype {t.dtype}; pass real and imaginary parts.")
         if t.is_floating_point():
             dtype = torch.promote_types(dtype, t.dtype)
-    device = next((t.device for t in tensors if t.dim() > 0), tensors[0].device if tensors else None)
+    # a scalar tensor follows the others' device; written so that every supported torch.compile traces it
+    leading = [t for t in tensors if t.dim() > 0] or tensors
+    device = leading[0].device if leading else None
     return tuple(v.to(dtype) if isinstance(v, Tensor) else _as_tensor(v, dtype, device) for v in values)
 
 

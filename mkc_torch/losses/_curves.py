@@ -1,25 +1,55 @@
-"""What a loss does with a residual: its value, its pull, and the weight of the residual beside least squares."""
+"""What a loss does with a residual: its value, its pull, and the weight of the residual.
+
+Every loss has ``rho``, ``influence``, the derivative of it, ``weight``, the influence over that of the loss it takes
+the place of, and ``plot``; what they are functions of differs and stands with each.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import refuse_not_real
-from mkc_torch.density.energy import energy, energy_dz
+from mkc_torch._support.arguments import checked_number, refuse_not_real
+from mkc_torch.density.energy import SIGMA_LEAST, energy, energy_dz
+from mkc_torch.functional import mkc_energy, mkc_weight
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Curves"]
+__all__ = ["ChannelCurves", "Curves", "SampleCurves"]
 
-_REACH, _POINTS = 6.0, 401
+_REACH, _LEAST_REACH, _LONGEST_REACH, _POINTS = 3.0, 6.0, 20.0, 401
+"""Of a picture: bandwidths to each side, where the weight is 1 %, and the fewest and most scales; points."""
+
+_OF_ERRORS = "error, in the unit of the target"
 
 
 class Curves:
-    """Methods of a loss with ``kappa`` and ``d`` of each channel."""
+    """The picture of a loss's curves."""
+
+    @staticmethod
+    def _drawn(
+        axes: Any, x: Float[Tensor, " P"], curves: dict[str, Float[Tensor, " P"]], xlabel: str, title: str
+    ) -> Any:
+        """Each curve over x in a colour of its own, on axes or those of a new figure; needs matplotlib."""
+        if axes is None:
+            from matplotlib.figure import Figure
+
+            axes = Figure(figsize=(6.4, 4.0), layout="constrained").add_subplot()
+        for name, values in curves.items():
+            axes.plot(x.tolist(), values.tolist(), label=name)
+        axes.axhline(0.0, color="0.8", linewidth=0.8, zorder=0)
+        axes.set_xlabel(xlabel)
+        axes.set_title(title, fontsize="medium")
+        axes.legend(frameon=False)
+        return axes
+
+
+class ChannelCurves(Curves):
+    """Of a loss with ``kappa`` and ``d`` of each channel, over errors whose last dimension is the channels'."""
 
     kappa: Any
     d: Any
@@ -56,6 +86,8 @@ class Curves:
     def plot(self, channel: int = 0, axes: Any = None) -> Any:
         """Draw value, pull and weight of a channel over the error, and give the axes back; needs matplotlib.
 
+        The value is drawn as a share of σ², which it tends to, and for σ = ∞ as it is.
+
         Args:
             channel: which, from 0.
             axes: matplotlib's, or None for a new figure.
@@ -64,35 +96,108 @@ class Curves:
             ValueError: there is no such channel.
             ModuleNotFoundError: matplotlib is not installed; the extra ``cli`` has it.
         """
-        if not 0 <= channel < self.num_channels:
-            raise ValueError(f"Expected argument `channel` in [0, {self.num_channels}) but got {channel}.")
-        from matplotlib.figure import Figure
-
-        axes = Figure(layout="constrained").add_subplot() if axes is None else axes
+        if isinstance(channel, bool) or not isinstance(channel, int) or not 0 <= channel < self.num_channels:
+            raise ValueError(
+                f"Expected argument `channel` in [0, {self.num_channels}) but got {channel!r}; 0 is the first."
+            )
         with torch.no_grad():
-            d = self.d
-            reach = _REACH * float(d[channel])
-            error = torch.zeros(_POINTS, self.num_channels, dtype=d.dtype, device=d.device)
-            error[:, channel] = torch.linspace(-reach, reach, _POINTS, dtype=d.dtype, device=d.device)
-            x = error[:, channel].tolist()
-            for name, values in (
-                ("value", self.rho(error)),
-                ("pull, times d", self.influence(error) * d),
-                ("weight", self.weight(error)),
-            ):
-                axes.plot(x, values[:, channel].tolist(), label=name)
-        axes.set_xlabel("error, in the unit of the target")
-        axes.legend()
-        return axes
+            kappa, d = self.kappa[channel], self.d[channel]
+            sigma = float(kappa) ** -0.5 if kappa > 0 else math.inf
+            error = _errors(sigma, d).unsqueeze(-1).expand(-1, self.num_channels)
+            values, pulls, weights = (
+                one[:, channel] for one in (self.rho(error), self.influence(error), self.weight(error))
+            )
+            title = f"{type(self).__name__}, channel {channel}: σ = {sigma:.3g}, d = {float(d):.3g}"
+            return self._drawn(axes, error[:, channel], _shown(values, pulls, weights, sigma, d), _OF_ERRORS, title)
 
     def _standardised(self, error: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         refuse_not_real("error", error)
         if error.dim() == 0 or error.shape[-1] != self.num_channels:
             raise ValueError(
                 f"Expected argument `error` with {self.num_channels} channels in its last dimension but got "
-                f"{tuple(error.shape)}."
+                f"{tuple(error.shape)}; one channel is error.unsqueeze(-1)."
             )
         kappa, d = self.kappa, self.d
         dtype = torch.promote_types(error.dtype, d.dtype)
         kappa, d = kappa.to(dtype), d.to(dtype)
         return error.to(dtype) / d, kappa.expand(error.shape), d
+
+
+class SampleCurves(Curves):
+    """Of a loss whose σ and d come with each error; all three broadcast."""
+
+    def rho(
+        self, error: Float[Tensor, "*batch"], sigma: float | Float[Tensor, "*batch"], d: float | Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """The energy ``σ² (1 - exp(-e² / (2 d² σ²)))`` of errors.
+
+        Args:
+            error: less the normaliser, which no error has a part in.
+            sigma: bandwidths in [0.05, inf].
+            d: scales, in the unit of the errors.
+
+        Raises:
+            TypeError, ValueError: an argument of another kind, or out of range.
+
+        Example:
+            >>> from mkc_torch import HeteroscedasticMKCLoss
+            >>> loss = HeteroscedasticMKCLoss(bound=50.0)
+            >>> loss.rho(torch.tensor([1.0, 1.0]), sigma=2.0, d=torch.tensor([1.0, 0.01]))  # noise of 1 and of 0.01
+            tensor([0.4700, 4.0000])
+        """
+        return mkc_energy(*_sampled(error, sigma, d))
+
+    def influence(
+        self, error: Float[Tensor, "*batch"], sigma: float | Float[Tensor, "*batch"], d: float | Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """The derivative of :meth:`rho` by the error, in one over the unit of the target; arguments as there."""
+        error, sigma, d = _sampled(error, sigma, d)
+        return error / d * mkc_weight(error, sigma, d) / d
+
+    def weight(
+        self, error: Float[Tensor, "*batch"], sigma: float | Float[Tensor, "*batch"], d: float | Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch"]:
+        """The pull beside that of least squares of the same d, in [0, 1]; arguments as for :meth:`rho`."""
+        return mkc_weight(*_sampled(error, sigma, d))
+
+    def plot(self, sigma: float = 3.0, d: float = 1.0, axes: Any = None) -> Any:
+        """Draw value, pull and weight over the error of a sample, and give the axes back; needs matplotlib.
+
+        The value is drawn as a share of σ², which it tends to, and for σ = ∞ as it is.
+
+        Args:
+            sigma, d: of the sample.
+            axes: matplotlib's, or None for a new figure.
+
+        Raises:
+            TypeError, ValueError: σ or d is no number, or out of range.
+            ModuleNotFoundError: matplotlib is not installed; the extra ``cli`` has it.
+        """
+        checked_number("sigma", sigma, SIGMA_LEAST, math.inf, "[]", "3 is usual")
+        checked_number("d", d, advice="1 draws errors in scales")
+        scale = torch.tensor(d, dtype=torch.float64)
+        error = _errors(sigma, scale)
+        value, pull, weight = (one(error, sigma, d) for one in (self.rho, self.influence, self.weight))
+        title = f"{type(self).__name__}: σ = {sigma:.3g}, d = {d:.3g}"
+        return self._drawn(axes, error, _shown(value, pull, weight, sigma, scale), _OF_ERRORS, title)
+
+
+def _errors(sigma: float, d: Float[Tensor, ""]) -> Float[Tensor, " P"]:
+    reach = _LEAST_REACH if sigma == math.inf else min(max(_LEAST_REACH, _REACH * sigma), _LONGEST_REACH)
+    return d * torch.linspace(-reach, reach, _POINTS, dtype=d.dtype, device=d.device)
+
+
+def _sampled(error: Tensor, sigma: float | Tensor, d: float | Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    refuse_not_real("error", error)
+    like = torch.promote_types(error.dtype, torch.float32)
+    return error.to(like), torch.as_tensor(sigma, dtype=like), torch.as_tensor(d, dtype=like)
+
+
+def _shown(value: Tensor, pull: Tensor, weight: Tensor, sigma: float, d: Tensor) -> dict[str, Tensor]:
+    """What a picture shows, all of about one size."""
+    bounded = sigma < math.inf
+    return {
+        "value / σ²" if bounded else "value": value / sigma**2 if bounded else value,
+        "pull · d": pull * d,
+        "weight": weight,
+    }

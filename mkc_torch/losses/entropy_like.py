@@ -34,6 +34,7 @@ from mkc_torch._support.arguments import (
 from mkc_torch._support.trust_region import Quadratic, minimise
 from mkc_torch.density.energy import as_computed
 from mkc_torch.losses._checks import refuse_other_reduction, refuse_other_shapes
+from mkc_torch.losses._entropy_curves import EntropyCurves
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -100,7 +101,10 @@ def _entropy(
         raise ValueError(f"Expected at least one residual but got shape {tuple(residual.shape)}.")
     dims = _dimensions(residual, dim)
     count: Tensor | float
-    if weight is None:
+    if weight is None and torch.compiler.is_compiling():
+        # a number would fix the size of the batch
+        count = torch.ones_like(residual).sum(dims)
+    elif weight is None:
         count = float(math.prod([residual.shape[d] for d in dims]))
     else:
         if not torch.compiler.is_compiling():
@@ -179,7 +183,7 @@ def _refuse_shares(weight: Tensor, shape: torch.Size, dims: tuple[int, ...]) -> 
         )
 
 
-class LELoss(nn.Module):
+class LELoss(EntropyCurves, nn.Module):
     """H of the errors of a batch, (40)-(42) of Indiveri (2009): least where few errors are large and most are small.
 
     It knows no scale, so a network that is trained on it alone is determined up to what leaves the relative errors as

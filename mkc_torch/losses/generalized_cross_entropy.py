@@ -19,6 +19,7 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import as_numbers, checked_number, checked_whole, refuse_no_tensor, refuse_not_real
 from mkc_torch.losses._checks import Reduction, at_least_float32, refuse_other_reduction
+from mkc_torch.losses._label_curves import LabelCurves
 from mkc_torch.losses.heteroscedastic import _WideBuffers
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ _PROBABILITY_SLACK = 0.02
 """How far probabilities may sum to something else than 1: those of bfloat16 do, by rounding."""
 
 
-class GeneralizedCrossEntropyLoss(_WideBuffers):
+class GeneralizedCrossEntropyLoss(LabelCurves, _WideBuffers):
     """Cross-entropy that wrong labels cannot pull at: ``σ² (1 - p^(1/σ²))``, p being the probability of the label.
 
     It takes the place of :class:`torch.nn.CrossEntropyLoss` and at σ = ∞ is the same in value and gradient. The default

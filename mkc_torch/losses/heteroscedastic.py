@@ -20,6 +20,8 @@ from mkc_torch.losses._checks import (
     refuse_other_reduction,
     refuse_other_shapes,
 )
+from mkc_torch.losses._curves import SampleCurves
+from mkc_torch.losses._logistic import logistic
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -51,7 +53,7 @@ class _WideBuffers(nn.Module):
         return self
 
 
-class HeteroscedasticMKCLoss(_WideBuffers):
+class HeteroscedasticMKCLoss(SampleCurves, _WideBuffers):
     """Negative log-likelihood of the MKC density with a bandwidth σ and a scale d for every element.
 
     σ and d come from a network, :class:`MKCHead` say, beside the prediction: noise that differs from place to place is
@@ -283,10 +285,8 @@ class MKCHead(_WideBuffers):
         # in half precision a step of the raw d would be a step of a few per cent of d
         with torch.autocast(features.device.type, enabled=False):
             dtype = at_least_float32(self.scales.weight)
-            raw = nn.functional.linear(
-                features.to(dtype), self.scales.weight.to(dtype), self.scales.bias.to(dtype)
-            ).sigmoid()
-            raw_kappa, raw_d = raw.split(self.num_channels, -1)
+            raw = nn.functional.linear(features.to(dtype), self.scales.weight.to(dtype), self.scales.bias.to(dtype))
+            raw_kappa, raw_d = logistic(raw).split(self.num_channels, -1)
             sigma = (KAPPA_MIN + (KAPPA_MAX - KAPPA_MIN) * raw_kappa).rsqrt()
             d = self.d_min + (self.bound - self.d_min) * raw_d
         return MKCHeadOutput(location, sigma, d)

@@ -21,10 +21,11 @@ from mkc_torch.losses._checks import (
     refuse_other_shapes,
     shortly,
 )
-from mkc_torch.losses._curves import Curves
+from mkc_torch.losses._curves import ChannelCurves
 from mkc_torch.losses._energy_sums import energy_sums
 from mkc_torch.losses._following import Following
 from mkc_torch.losses._follows_residuals import FollowsResiduals
+from mkc_torch.losses._logistic import logistic
 from mkc_torch.losses._state_dict import logit_of_kappa, logit_of_scale, translate
 from mkc_torch.losses._watch import Watch
 
@@ -40,7 +41,7 @@ DEFAULT_D_MIN_IN_D = 1e-3
 """Floor under d, in units of the initial d, where none is given."""
 
 
-class MKCLoss(FollowsResiduals, Curves, nn.Module):
+class MKCLoss(FollowsResiduals, ChannelCurves, nn.Module):
     """Multi-kernel correntropy loss with a bandwidth σ and a scale d for each channel.
 
     With anything learned it is the negative log-likelihood of (17) of Li et al. (2023), ``energy + log_normalizer``;
@@ -179,7 +180,7 @@ class MKCLoss(FollowsResiduals, Curves, nn.Module):
         if self.raw_kappa is None:
             assert self.fixed_kappa is not None
             return self.fixed_kappa
-        return KAPPA_MAX * torch.sigmoid(self.raw_kappa)
+        return KAPPA_MAX * logistic(self.raw_kappa)
 
     @torch.no_grad()
     def _set_kappa(self, kappa: Tensor) -> None:
@@ -210,7 +211,7 @@ class MKCLoss(FollowsResiduals, Curves, nn.Module):
         if self.raw_d is None:
             assert self.fixed_d is not None
             return self.fixed_d
-        return self.d_min + (self.bound - self.d_min) * torch.sigmoid(self.raw_d)
+        return self.d_min + (self.bound - self.d_min) * logistic(self.raw_d)
 
     @d.setter
     def d(self, value: float | Tensor) -> None:

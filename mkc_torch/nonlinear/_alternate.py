@@ -13,7 +13,7 @@ from mkc_torch.nonlinear._descent import damped_step
 from mkc_torch.nonlinear._problem import Point, Problem
 from mkc_torch.nonlinear._quadratic import Penalty, positive, prior_value, quadratic_about
 
-__all__ = ["alternated", "gaussian_candidate", "likelihood_of"]
+__all__ = ["Maximum", "alternated", "gaussian_candidate", "likelihood_of"]
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def likelihood_of(problem: Problem, residual: Tensor) -> _Likelihood:
 
 
 @dataclass(frozen=True)
-class _Maximum:
+class Maximum:
     point: Point
     state: DensityState
     value: Tensor  # mean negative log-likelihood and prior, in nats per sample
@@ -55,7 +55,7 @@ def alternated(
     tol: float,
     exact: bool = True,
     penalty: Penalty | None = None,
-) -> _Maximum:
+) -> Maximum:
     """E-steps on (σ, d) and damped steps on θ in turn, until they bring less than ``tol`` nats and promise no more."""
     eps = torch.finfo(point.theta.dtype).eps
     share = likelihood.total / likelihood.total.mean(-1, keepdim=True)
@@ -96,12 +96,12 @@ def alternated(
         damping, stepped, point = found.damping, found.quiet, found.point
         if found.tired:
             point = problem.refreshed(point)
-    return _Maximum(point, state, previous, done, n_iter, penalty)
+    return Maximum(point, state, previous, done, n_iter, penalty)
 
 
 def gaussian_candidate(
-    problem: Problem, likelihood: _Likelihood, maximum: _Maximum, *, max_iter: int, tol: float
-) -> _Maximum:
+    problem: Problem, likelihood: _Likelihood, maximum: Maximum, *, max_iter: int, tol: float
+) -> Maximum:
     """Where a Gaussian density at weighted least squares is likelier than what was found, go on from there instead."""
     state = maximum.state
     point = problem.refreshed(maximum.point)
@@ -157,7 +157,7 @@ def gaussian_candidate(
             penalty.multiplier.index_copy(0, index, again.penalty.multiplier[won]),
             penalty.rho.index_copy(0, index, again.penalty.rho[won]),
         )
-    return _Maximum(
+    return Maximum(
         point=point.write(index, winner),
         state=replace(state, **merged),
         value=maximum.value.index_copy(0, index, again.value[won]),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,15 +14,17 @@ from mkc_torch._support.forward_mode import Residual
 from mkc_torch.density.energy import SIGMA_LEAST
 from mkc_torch.density.fit import DensityState, domain_rule, initial_state
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
-from mkc_torch.nonlinear._alternate import alternated, gaussian_candidate, likelihood_of
+from mkc_torch.nonlinear._alternate import Maximum, alternated, gaussian_candidate, likelihood_of
 from mkc_torch.nonlinear._arguments import per_channel, prepared, refuse_out_of_reach
 from mkc_torch.nonlinear._covariance import parameter_covariance
+from mkc_torch.nonlinear._explained import explained
 from mkc_torch.nonlinear._graduated import LEAST_SCALE, graduated, residual_scale
-from mkc_torch.nonlinear._problem import Constraint, Point, kernel_weights, shaped_jacobian
+from mkc_torch.nonlinear._problem import Constraint, Point, Problem, kernel_weights, shaped_jacobian
+from mkc_torch.nonlinear._starts import at_each, drawn, likeliest
 from mkc_torch.nonlinear.prior import GaussianPrior
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
 __all__ = ["NonlinearFit", "fit"]
 
@@ -42,7 +44,11 @@ class NonlinearFit:
             constraints, and infinite for parameters that the residual does not determine.
         jacobian: of the residual at ``theta``, (*, N, m, p).
         n_iter: trial steps made.
-        converged: (*,).
+        converged: whether it came to rest, (*,). That is a minimum, and not always the one looked for: see ``agreeing``
+            and :meth:`explained`.
+        starts: how many starts were made.
+        agreeing: how many of them ended at this minimum, (*,), or at others that are as likely to 0.01 nats of all
+            residuals. One of many says that there may be a better one: make more starts.
 
     Example:
         >>> generator = torch.Generator().manual_seed(0)
@@ -63,6 +69,8 @@ class NonlinearFit:
     jacobian: Float[Tensor, "*batch N m p"]
     n_iter: int
     converged: Bool[Tensor, " *batch"]
+    starts: int
+    agreeing: Int[Tensor, " *batch"]
 
     def standard_error(self) -> Float[Tensor, "*batch p"]:
         """Square root of the diagonal of ``covariance``, in the units of the parameters.
@@ -73,6 +81,31 @@ class NonlinearFit:
         if self.covariance is None:
             raise ValueError("Expected a fit with a covariance but it was made with covariance=None; name a kind.")
         return self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
+
+    def explained(self, target: Float[Tensor, "*batch N m"]) -> Float[Tensor, "*batch m"]:
+        """Share of the targets' scatter that the fit explains, robustly: 1 less the square of the ratio of the scales.
+
+        The scales are of the residuals about 0 and of the targets about their median, 1.4826 times the median absolute
+        value; weights have no say. Below 0.8 a model that should describe its targets does not: the fit came to rest at
+        another minimum. A robust fit chooses the half that it likes, and a wrong one explains up to 0.69 of that (sines
+        of unknown frequency, noise of 0.1, one target in ten wrong by far: 239 wrong ends, 61 right ones above 0.97).
+
+        Args:
+            target: what the residual is of, (N,), (N, m) or (*, N, m).
+
+        Raises:
+            TypeError, ValueError: no real tensor, of another shape, not finite where it counts, or targets of which
+                more than half are equal.
+
+        Example:
+            >>> x = torch.linspace(0.0, 6.0, 60, dtype=torch.float64)
+            >>> y = torch.sin(5.0 * x)
+            >>> residual = lambda k: (y - torch.sin(k * x)).unsqueeze(-1)
+            >>> far, near = (fit(residual, torch.tensor([at], dtype=torch.float64)) for at in (2.0, 4.8))
+            >>> bool(far.converged), bool(far.explained(y) < 0.8), bool(near.explained(y) > 0.99)
+            (True, True, True)
+        """
+        return explained(self.residual, target)
 
 
 @torch.no_grad()
@@ -96,6 +129,8 @@ def fit(
     jacobian: Literal["forward", "reverse"] = "forward",
     covariance: CovarianceKind | None = "sandwich",
     bandwidth: float | None = None,
+    starts: int = 1,
+    seed: int = 0,
 ) -> NonlinearFit:
     """Parameters, bandwidths and scales of a residual by maximum likelihood of the MKC density: MKC-EM.
 
@@ -121,9 +156,14 @@ def fit(
         covariance: "sandwich" for independent samples, "hac" for a time series, None for none. The curvature is the
             objective's, without the residual's second derivatives; the scores of a sample's channels are summed.
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
+        starts: where a residual has many minima, fits from so many starts at once, of which the likeliest is kept, all
+            judged on one domain: ``start`` and others drawn evenly between ``lower`` and ``upper``, or over the prior
+            where a bound is missing. The result says how many agree. It takes as many times the memory.
+        seed: of the starts.
 
     Raises:
-        TypeError, ValueError: as :func:`minimise`.
+        TypeError, ValueError: as :func:`minimise`; or several starts are asked for, and a parameter has neither two
+            bounds nor a prior.
         NoFitError: the residual or its slope is not finite at ``start``, or the head of the density does not fit in the
             domain.
 
@@ -155,11 +195,43 @@ def fit(
         inequality=inequality,
         jacobian=jacobian,
     )
-    fixed_sigma = None
-    if sigma is not None:
-        fixed_sigma = per_channel("sigma", sigma, point.residual, problem.batch, infinite=True, least=SIGMA_LEAST)
-    fixed_d = None if d is None else per_channel("d", d, point.residual, problem.batch, infinite=False)
-    fixed_bound = None if bound is None else per_channel("bound", bound, point.residual, problem.batch, infinite=False)
+    like, size = point.residual, problem.batch
+    given = _Given(
+        None if sigma is None else per_channel("sigma", sigma, like, size, infinite=True, least=SIGMA_LEAST),
+        None if d is None else per_channel("d", d, like, size, infinite=False),
+        None if bound is None else per_channel("bound", bound, like, size, infinite=False),
+    )
+    if checked_whole("starts", starts, 1, "32 is usual where there are many minima") == 1:
+        found = _from_start(problem, point, given, graduate=graduate, max_iter=max_iter, tol=tol)
+        return _told(problem, found, kind, bandwidth)
+    places = drawn(problem, point.theta, starts, checked_whole("seed", seed, 0))
+    many, at = at_each(problem, places)
+    ends = _from_start(
+        many, at, given.of_each(starts)._replace(bound=None), graduate=graduate, max_iter=max_iter, tol=tol
+    )
+    at, reach = ends.point, torch.exp(ends.state.log_bound)
+    theta, left, reach = (one.unflatten(0, places.shape[:2]) for one in (at.theta, at.residual, reach))
+    best, agreeing = likeliest(problem, theta, left, reach, given=given.bound, sigma=given.sigma, d=given.d)
+    point = problem.at(theta[torch.arange(len(best), device=best.device), best])
+    found = _from_start(problem, point, given, graduate=False, max_iter=max_iter, tol=tol)
+    told = _told(problem, found, kind, bandwidth)
+    return replace(told, n_iter=ends.n_iter + found.n_iter, starts=starts, agreeing=problem.restore(agreeing))
+
+
+class _Given(NamedTuple):
+    """What is not learned, (B, m) each."""
+
+    sigma: Tensor | None
+    d: Tensor | None
+    bound: Tensor | None
+
+    def of_each(self, starts: int) -> _Given:
+        return _Given(*(None if one is None else one.repeat_interleave(starts, 0) for one in self))
+
+
+def _from_start(problem: Problem, point: Point, given: _Given, *, graduate: bool, max_iter: int, tol: float) -> Maximum:
+    """The maximum that a start leads to, with the steps of the whole way."""
+    fixed_sigma, fixed_d, fixed_bound = given
     steps = 0
     if graduate:
         point, steps = graduated(problem, point, max_iter)
@@ -203,6 +275,10 @@ def fit(
     maximum = alternated(problem, likelihood, point, state, max_iter=max_iter, tol=tol, penalty=penalty)
     if state.free_kappa and state.free_d:
         maximum = gaussian_candidate(problem, likelihood, maximum, max_iter=max_iter, tol=tol)
+    return replace(maximum, n_iter=steps + maximum.n_iter)
+
+
+def _told(problem: Problem, maximum: Maximum, kind: CovarianceKind | None, bandwidth: float | None) -> NonlinearFit:
     point = problem.refreshed(maximum.point)
     kappa, scale = maximum.state.kappa, torch.exp(maximum.state.log_d)
     found = None
@@ -218,6 +294,8 @@ def fit(
         residual=problem.restore(point.residual),
         covariance=found,
         jacobian=shaped_jacobian(problem, point),
-        n_iter=steps + maximum.n_iter,
+        n_iter=maximum.n_iter,
         converged=problem.restore(maximum.converged),
+        starts=1,
+        agreeing=problem.restore(torch.ones_like(maximum.converged, dtype=torch.int64)),
     )

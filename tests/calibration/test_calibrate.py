@@ -240,8 +240,8 @@ def test_times_in_milliseconds_are_told_of():
 
 
 def test_much_scatter_is_warned_of():
-    (warning,) = calibrate(recorded(noisy_ellipsoid(2000, noise=5.5))).warnings
-    assert "scatters by 11 % of the radius" in warning
+    (warning,) = calibrate(recorded(noisy_ellipsoid(2000, noise=5.1))).warnings
+    assert "scatters by 10 % of the radius" in warning
     assert "mkc diagnose" in warning
 
 

@@ -71,7 +71,7 @@ def test_robustbase(name):
     residuals = y - X @ start.coef_.numpy(), y - X @ fit.coef_.numpy()
     # robustbase takes the scale's equation to hold for the mean, which has N - p there: its variance is a little less
     theirs = croux(X, *residuals, scale, centred=False)
-    # robustbase mends what has no root; of two searches it has kept the residuals of another start than the one it tells
+    # where it has no root, robustbase mends it
     if np.linalg.eigvalsh(theirs)[0] >= 0 and table["error"] is not None:
         np.testing.assert_allclose(np.sqrt(np.diag(theirs)), table["error"], rtol=1.5e-3)
     N, n = X.shape

@@ -1,0 +1,47 @@
+"""First-order errors of centre, semi-axes and calibration matrix from those of the parameters of an ellipsoid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.calibration.ellipsoid import Ellipsoid, symmetric_root
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["derived_slopes"]
+
+
+def derived_slopes(
+    local: Ellipsoid, parameters: Float[Tensor, "*batch 9"], ellipsoid_of: Callable[[Tensor], Ellipsoid]
+) -> Float[Tensor, "B 24 9"]:
+    """Derivatives by the parameters of the centre, the semi-axes, the calibration matrix and it less its radius.
+
+    Args:
+        local: the ellipsoid, in the coordinates of the parameters.
+        parameters: of each problem.
+        ellipsoid_of: the ellipsoid of the parameters of one problem.
+    """
+
+    def quantities(theta: Tensor) -> Tensor:
+        center, shape = ellipsoid_of(theta)
+        axes = torch.linalg.eigvalsh(shape).flip(-1).rsqrt()
+        return torch.cat([center, axes, shape.flatten()])
+
+    jacobian = torch.func.vmap(torch.func.jacrev(quantities))(parameters.reshape(-1, 9))
+    shape = local.shape.reshape(-1, 3, 3)
+    root = symmetric_root(shape)
+    eye = torch.eye(3, dtype=root.dtype, device=root.device)
+    # the root W solves dW W + W dW = dA₁
+    lyapunov = torch.stack([torch.kron(w, eye) + torch.kron(eye, w) for w in root])
+    d_root = torch.linalg.solve(lyapunov, jacobian[:, 6:])
+    # the matrix is radius · root, and the radius is det(A₁)^(-1/6)
+    inverse = torch.linalg.inv(shape).flatten(1)
+    d_log_radius = -torch.einsum("bi,bij->bj", inverse, jacobian[:, 6:]) / 6.0
+    radius = torch.linalg.det(shape).pow(-1 / 6)
+    d_matrix = radius[:, None, None] * (d_root + root.flatten(1).unsqueeze(-1) * d_log_radius.unsqueeze(1))
+    return torch.cat([jacobian[:, :6], d_matrix, d_root], 1)

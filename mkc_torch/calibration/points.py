@@ -1,0 +1,57 @@
+"""Points in space and their weights, checked."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.arguments import refuse_bad_weight, refuse_not_real
+
+__all__ = ["MIN_POINTS", "prepared", "refuse_no_points"]
+
+MIN_POINTS = 9
+"""One for each coefficient of an ellipsoid."""
+
+
+def refuse_no_points(points: Tensor) -> None:
+    refuse_not_real("points", points)
+    if points.dim() < 2 or points.shape[-1] != 3:
+        mend = "; a point is a row, so try points.mT" if points.dim() > 1 and points.shape[-2] == 3 else ""
+        if points.shape == (3,):
+            mend = "; one point is points[None]"
+        raise ValueError(f"Expected argument `points` of shape (*, N, 3) but got {tuple(points.shape)}{mend}.")
+
+
+def prepared(points: Tensor, sample_weight: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Checked points and weights; what a point of weight 0 holds is replaced, so that it can be anything."""
+    refuse_no_points(points)
+    if points.dtype in (torch.float16, torch.bfloat16):
+        raise TypeError(f"Expected argument `points` of dtype float32 or float64 but got {points.dtype}; use .float().")
+    weight = None
+    if sample_weight is not None:
+        refuse_bad_weight(sample_weight, "sample_weight")
+        if sample_weight.shape != points.shape[:-1] and sample_weight.shape != points.shape[-2:-1]:
+            raise ValueError(
+                f"Expected argument `sample_weight` of shape {tuple(points.shape[:-1])} "
+                f"but got {tuple(sample_weight.shape)}; it has one weight for each point."
+            )
+        weight = sample_weight.to(points).expand(points.shape[:-1])
+    count = points.shape[-2] if weight is None else int((weight > 0).sum(-1).min())
+    if count < MIN_POINTS:
+        raise ValueError(
+            f"Expected at least {MIN_POINTS} points, one for each coefficient of an ellipsoid, but got {count}; record "
+            "more, in all directions."
+        )
+    finite = torch.isfinite(points)
+    if weight is not None:
+        finite = finite | (weight == 0).unsqueeze(-1)
+    if not bool(finite.all()):
+        first = tuple((~finite).nonzero()[0].tolist())
+        raise ValueError(
+            f"Expected argument `points` to be finite but got {points[first].item()} at index {first} "
+            f"({int((~finite).sum())} such values); drop those points."
+        )
+    if weight is None:
+        return points, None
+    first_used = (weight > 0).to(torch.int64).argmax(-1)[..., None, None].expand(*points.shape[:-2], 1, 3)
+    return torch.where((weight > 0).unsqueeze(-1), points, points.gather(-2, first_used)), weight

@@ -1,0 +1,91 @@
+"""What generalized cross-entropy does with a label, over the probability that the network gives it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.arguments import refuse_not_real, refuse_out_of_range
+from mkc_torch.losses._curves import Curves
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["LabelCurves"]
+
+_POINTS = 401
+
+
+class LabelCurves(Curves):
+    """Of a loss with one ``kappa`` = 1/σ²."""
+
+    kappa: Tensor
+
+    def rho(self, probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """The loss of a label that the network gives this probability: ``σ² (1 - p^(1/σ²))``.
+
+        Args:
+            probability: p in [0, 1] of the label, any shape.
+
+        Raises:
+            TypeError, ValueError: no real tensor, or out of range.
+
+        Example:
+            >>> from mkc_torch import GeneralizedCrossEntropyLoss
+            >>> GeneralizedCrossEntropyLoss(sigma=1.0).rho(torch.tensor([0.0, 0.25, 1.0]))
+            tensor([1.0000, 0.7500, 0.0000])
+        """
+        p, kappa = self._given(probability)
+        deviance = 0.0 - torch.log(p)
+        own = torch.where(kappa > 0, kappa, 1.0)
+        return torch.where(kappa > 0, -torch.expm1(-own * deviance) / own, deviance)
+
+    def influence(self, probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """The derivative of :meth:`rho` by the probability, ``-p^(1/σ² - 1)``: -∞ at p = 0 where σ > 1."""
+        p, kappa = self._given(probability)
+        return -p.pow(kappa - 1.0)
+
+    def weight_at(self, probability: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """The pull on a label beside that of cross-entropy, ``p^(1/σ²)``, in [0, 1].
+
+        ``weight`` holds the weights of the classes, as in torch; ``inlier_weight`` is this of logits and labels.
+
+        Example:
+            >>> from mkc_torch import GeneralizedCrossEntropyLoss
+            >>> GeneralizedCrossEntropyLoss(sigma=0.5**0.5).weight_at(torch.tensor([0.1, 0.9]))
+            tensor([0.0100, 0.8100])
+        """
+        p, kappa = self._given(probability)
+        return p.pow(kappa)
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw value, pull and weight over the probability of the label, and give the axes back; needs matplotlib.
+
+        The pull is that on the label's logit, ``p^(1/σ²) (1 - p)``; cross-entropy's, ``1 - p``, stands beside it.
+
+        Args:
+            axes: matplotlib's, or None for a new figure.
+
+        Raises:
+            ModuleNotFoundError: matplotlib is not installed; the extra ``cli`` has it.
+        """
+        with torch.no_grad():
+            p = torch.linspace(0.0, 1.0, _POINTS, dtype=torch.float64, device=self.kappa.device)
+            # cross-entropy's value has no end at 0
+            value = self.rho(p) if bool(self.kappa > 0) else self.rho(p.clamp(min=1.0 / _POINTS))
+            curves = {
+                "value": value,
+                "pull on the logit": self.weight_at(p) * (1.0 - p),
+                "pull of cross-entropy": 1.0 - p,
+                "weight": self.weight_at(p),
+            }
+            title = f"{type(self).__name__}: σ = {float(self.kappa) ** -0.5 if self.kappa > 0 else torch.inf:.3g}"
+            return self._drawn(axes, p, curves, "probability of the label", title)
+
+    def _given(self, probability: Tensor) -> tuple[Tensor, Tensor]:
+        refuse_not_real("probability", probability)
+        refuse_out_of_range("probability", probability, 0.0, 1.0, "[]", "logits go through softmax first")
+        p = probability.to(torch.promote_types(probability.dtype, torch.float32))
+        return p, self.kappa.to(p.dtype)

@@ -1,0 +1,42 @@
+"""How much of its targets a fit explains."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch._support.arguments import refuse_not_finite, refuse_not_real
+from mkc_torch._support.order_statistic import order_statistic, robust_scale
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["explained"]
+
+
+def explained(residual: Float[Tensor, "*batch N m"], target: Tensor) -> Float[Tensor, "*batch m"]:
+    """1 less the square of the ratio of the robust scales of residuals and targets.
+
+    Args:
+        residual: of the fit.
+        target: (N,), (N, m) or (*, N, m).
+    """
+    refuse_not_real("target", target)
+    shape = residual.shape
+    given = target.unsqueeze(-1) if target.shape == shape[-2:-1] else target
+    if given.shape not in (shape, shape[-2:]) and given.shape != (*shape[-2:-1], 1):
+        raise ValueError(
+            f"Expected argument `target` of shape {tuple(shape)}, {tuple(shape[-2:])} or ({shape[-2]},), as the "
+            f"residual has, but got {tuple(target.shape)}; give what the residual is of."
+        )
+    refuse_not_finite("target", given, "The scale is that of all targets")
+    given = given.to(residual).expand(shape)
+    middle = order_statistic(given, None, 0.5 * shape[-2]).unsqueeze(-2)
+    whole = robust_scale(given - middle)
+    if not bool((whole > 0).all()):
+        raise ValueError(
+            "Expected argument `target` to scatter but got targets of which more than half are equal; there is nothing "
+            "to explain."
+        )
+    return 1.0 - (robust_scale(residual) / whole).square()

@@ -1,0 +1,118 @@
+"""Losses and heads in ONNX, run by another runtime on batches of other sizes."""
+
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from mkc_torch import GeneralizedCrossEntropyLoss, HeteroscedasticMKCLoss, LELoss, MKCConvHead, MKCHead, MKCLoss
+
+pytest.importorskip("onnx")
+pytest.importorskip("onnxscript")
+runtime = pytest.importorskip("onnxruntime")
+
+# the exporter's own
+pytestmark = pytest.mark.filterwarnings("ignore")
+
+RTOL = 4e-6
+"""Rounding of float32 over the thirty operations between features and σ."""
+
+
+class Criterion(nn.Module):
+    def __init__(self, loss, outputs=2):
+        super().__init__()
+        self.net, self.loss = nn.Linear(5, outputs), loss
+
+    def forward(self, x, y):
+        return self.loss(self.net(x), y)
+
+
+class Predicted(nn.Module):
+    """A network with a head, and its likelihood where there are targets."""
+
+    def __init__(self):
+        super().__init__()
+        self.body, self.head = nn.Linear(5, 8), MKCHead(8, 2, bound=50.0, d_min=1e-3, sigma_init=100.0)
+        self.loss = HeteroscedasticMKCLoss(bound=50.0)
+        with torch.no_grad():
+            self.head.scales.weight.normal_(0.0, 4.0)
+
+    def forward(self, x, y):
+        prediction, sigma, d = self.head(self.body(x).tanh())
+        return prediction, sigma, d, self.loss(prediction, y, sigma, d)
+
+
+def batch(count, labels=False):
+    generator = torch.Generator().manual_seed(count)
+    x = torch.randn(count, 5, generator=generator)
+    if labels:
+        return x, torch.randint(0, 3, (count,), generator=generator)
+    return x, 3.0 * torch.randn(count, 2, generator=generator)
+
+
+def refuse_other(module, make, sizes=(1, 3, 17)):
+    """Fail where the exported module gives something else than the module, on batches of other sizes."""
+    module.eval()
+    size = torch.export.Dim("samples", min=1)
+    given = make(4)
+    program = torch.onnx.export(module, given, dynamo=True, dynamic_shapes=[{0: size}] * len(given), verbose=False)
+    session = runtime.InferenceSession(program.model_proto.SerializeToString())
+    for count in sizes:
+        given = make(count)
+        found = session.run(None, {i.name: v.numpy() for i, v in zip(session.get_inputs(), given, strict=True)})
+        with torch.no_grad():
+            expected = module(*given)
+        for one, other in zip(found, expected if isinstance(expected, tuple) else (expected,), strict=True):
+            torch.testing.assert_close(torch.from_numpy(one), other, rtol=RTOL, atol=1e-7)
+
+
+def trained(loss):
+    torch.manual_seed(0)
+    module = Criterion(loss)
+    for count in range(20, 26):
+        module(*batch(count)).backward()
+    return module
+
+
+def test_a_head_and_its_likelihood():
+    torch.manual_seed(0)
+    module = Predicted()
+    # widths of which a sigmoid with seven digits behind the point has none
+    assert float(module(*batch(17))[1].max()) > 500.0
+    refuse_other(module, batch)
+
+
+def test_a_head_at_every_place_of_an_image():
+    torch.manual_seed(0)
+    refuse_other(
+        MKCConvHead(3, 2, bound=50.0, d_min=1e-3),
+        lambda count: (torch.randn(count, 3, 4, 5, generator=torch.Generator().manual_seed(count)),),
+    )
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"d": 1.0, "bound": 50.0, "sigma": 200.0, "reduction": "none"},
+        {"d": 1.0, "bound": 50.0, "sigma": math.inf, "learn_sigma": False, "learn_d": False, "reduction": "sum"},
+    ],
+    ids=["learned", "fixed"],
+)
+def test_a_loss_of_given_numbers(options):
+    torch.manual_seed(0)
+    refuse_other(Criterion(MKCLoss(2, **options)), batch)
+
+
+@pytest.mark.parametrize("settled", [False, True])
+def test_a_loss_that_follows_its_residuals_before_and_after_it_has_settled(settled):
+    module = trained(MKCLoss(2))
+    if settled:
+        module.loss.settle()
+    refuse_other(module, batch)
+
+
+def test_the_losses_of_labels_and_without_a_scale():
+    torch.manual_seed(0)
+    refuse_other(Criterion(GeneralizedCrossEntropyLoss(), 3), lambda count: batch(count, labels=True))
+    refuse_other(Criterion(LELoss()), batch, sizes=(2, 3, 17))

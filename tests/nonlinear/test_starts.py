@@ -1,0 +1,144 @@
+"""Residuals of many minima: many starts, of which the likeliest is kept, and what a fit explains."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from mkc_torch.nonlinear import GaussianPrior, fit
+
+LOW, HIGH = torch.tensor([0.5]).double(), torch.tensor([8.5]).double()
+
+
+def wave(seed: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """x, sin(kx) with noise of 0.1 and one value in ten wrong by far, k, and a start anywhere."""
+    generator = torch.Generator().manual_seed(seed)
+    draw = torch.rand(62, generator=generator, dtype=torch.float64)
+    x, k, start = 6.0 * draw[:60], 1.0 + 7.0 * draw[60:61], 0.5 + 8.0 * draw[61:]
+    y = torch.sin(k * x) + 0.1 * torch.randn(60, generator=generator, dtype=torch.float64)
+    y[:6] += 5.0 * torch.randn(6, generator=generator, dtype=torch.float64)
+    return x, y, k, start
+
+
+X, Y, K, START = (torch.stack(part) for part in zip(*(wave(seed) for seed in range(20)), strict=True))
+DATA = {"x": X, "y": Y}
+
+
+def off(theta: Tensor, data: dict[str, Tensor]) -> Tensor:
+    return (data["y"] - torch.sin(theta * data["x"])).unsqueeze(-1)
+
+
+def one(seed: int):
+    return lambda theta: off(theta, {"x": X[seed], "y": Y[seed]})
+
+
+@pytest.fixture(scope="module")
+def many():
+    return fit(off, START, data=DATA, lower=LOW, upper=HIGH, starts=32)
+
+
+@pytest.fixture(scope="module")
+def single():
+    return fit(off, START, data=DATA, lower=LOW, upper=HIGH)
+
+
+def test_thirty_two_starts_find_what_one_does_not(many, single):
+    assert int(((single.theta - K).abs() < 0.05).sum()) <= 8
+    assert bool(single.converged.all())
+    assert int(((many.theta - K).abs() < 0.05).sum()) >= 19
+    assert bool(((many.agreeing >= 1) & (many.agreeing <= 20)).all())
+    assert many.starts == 32
+    assert single.starts == 1
+    assert single.agreeing.tolist() == [1] * 20
+
+
+def test_what_a_fit_explains_tells_the_right_minimum_from_another(many, single):
+    right = (single.theta - K).abs().squeeze(-1) < 0.05
+    share = single.explained(Y.unsqueeze(-1)).squeeze(-1)
+    assert float(share[~right].max()) < 0.8
+    assert float(share[right].min()) > 0.9
+    assert float(many.explained(Y.unsqueeze(-1)).min()) > 0.9
+
+
+def test_the_result_is_that_of_a_fit_from_the_best_end(many):
+    again = fit(off, many.theta, data=DATA, lower=LOW, upper=HIGH, graduate=False)
+    torch.testing.assert_close(many.theta, again.theta, rtol=1e-6, atol=0)
+    torch.testing.assert_close(many.standard_error(), again.standard_error(), rtol=1e-3, atol=0)
+    torch.testing.assert_close(many.log_likelihood, again.log_likelihood, rtol=0, atol=1e-6)
+
+
+def test_a_batch_is_a_loop_and_a_seed_gives_the_same(many):
+    for seed in (2, 7):
+        alone = fit(one(seed), START[seed], lower=LOW, upper=HIGH, starts=32)
+        torch.testing.assert_close(alone.theta, many.theta[seed], rtol=1e-6, atol=0)
+        assert alone.agreeing.dim() == 0
+
+
+def test_a_domain_and_a_density_that_are_given_are_kept():
+    found = fit(one(3), START[3], lower=LOW, upper=HIGH, starts=32, bound=12.0, sigma=2.0, d=0.1)
+    assert float((found.theta - K[3]).abs()) < 0.05
+    assert (float(found.bound), float(found.sigma), float(found.d)) == pytest.approx((12.0, 2.0, 0.1))
+
+
+def test_a_prior_says_where_to_draw_what_has_no_bounds():
+    prior = GaussianPrior(torch.tensor([4.5]), torch.tensor([0.2]))
+    found = fit(one(3), START[3], prior=prior, starts=32)
+    assert float((found.theta - K[3]).abs()) < 0.05
+
+
+def test_weights_count_in_which_end_is_best():
+    weight = torch.ones(60).double()
+    weight[:6] = 0.0
+    spoiled = {"x": X[4], "y": torch.where(weight > 0, Y[4], math.nan)}
+    found = fit(lambda k: off(k, spoiled), START[4], weight=weight, lower=LOW, upper=HIGH, starts=32)
+    assert float((found.theta - K[4]).abs()) < 0.05
+
+
+def test_a_start_where_the_residual_is_not_finite_is_left_out():
+    x = torch.linspace(0.1, 3.0, 40, dtype=torch.float64)
+    y = torch.sqrt(2.0 * x)
+
+    def root(theta):
+        return (y - torch.sqrt(theta * x)).unsqueeze(-1)
+
+    found = fit(root, torch.tensor([1.0]).double(), lower=torch.tensor([-9.0]), upper=torch.tensor([9.0]), starts=8)
+    assert float(found.theta) == pytest.approx(2.0)
+
+
+def test_one_minimum_is_where_every_start_ends():
+    x = torch.linspace(0.0, 3.0, 50, dtype=torch.float64)
+    y = 2.0 * torch.exp(-1.5 * x) + 0.02 * torch.randn(50, generator=torch.Generator().manual_seed(0)).double()
+    box = {"lower": torch.tensor([0.5, 0.5]), "upper": torch.tensor([4.0, 3.0])}
+    found = fit(lambda a: (y - a[0] * torch.exp(-a[1] * x)).unsqueeze(-1), torch.ones(2).double(), starts=8, **box)
+    assert int(found.agreeing) == found.starts == 8
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"starts": 4}, r"`lower` and `upper`, or `prior`, for every parameter with `starts`=4 .* parameters \[0\]"),
+        ({"starts": 4, "lower": LOW}, r"neither for the parameters \[0\]"),
+        ({"starts": 0}, "`starts` to be a whole number of at least 1 but got 0"),
+        ({"starts": 2.5}, "`starts` to be a whole number"),
+        ({"starts": 4, "lower": LOW, "upper": HIGH, "seed": -1}, "`seed` to be a whole number of at least 0"),
+    ],
+)
+def test_bad_starts_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        fit(one(0), START[0], **options)
+
+
+@pytest.mark.parametrize(
+    ("target", "error", "message"),
+    [
+        (torch.ones(59), ValueError, r"`target` of shape \(60, 1\).*\(60,\)"),
+        (torch.ones(60), ValueError, "`target` to scatter"),
+        (torch.full((60,), math.nan), ValueError, "`target` to be finite"),
+        ([1.0] * 60, TypeError, "`target` to be"),
+    ],
+)
+def test_targets_that_are_none_are_refused(target, error, message):
+    found = fit(one(0), K[0], covariance=None)
+    with pytest.raises(error, match=message):
+        found.explained(target)
