@@ -46,7 +46,12 @@ class Scores:
     def by_scale(self, problem: LinearProblem) -> Float[Tensor, "B m n"]:
         """What the equation loses when the logarithm of a channel's scale grows."""
         part = weighed(problem, (self.slope * self.z + self.psi) * self.scale.unsqueeze(-2) * self.precision())
-        return torch.einsum("bkc,bkcn->bcn", part, problem.basis.expand(part.shape[0], -1, -1, -1))
+        return _summed(problem, part)
+
+
+def _summed(problem: LinearProblem, values: Float[Tensor, "B N m"]) -> Float[Tensor, "B m n"]:
+    """``Σ value x`` of each channel."""
+    return torch.einsum("bkc,bkcn->bcn", values, problem.basis.expand(values.shape[0], -1, -1, -1))
 
 
 def scores(problem: LinearProblem, beta: Float[Tensor, "B n"], scale: Float[Tensor, "B m"], psi: Psi) -> Scores:
@@ -69,25 +74,42 @@ def shares(problem: LinearProblem, *, in_time: bool) -> Float[Tensor, "B N m"] |
     return w if w is None or in_time else w.clamp(min=torch.finfo(w.dtype).tiny).sqrt()
 
 
+@dataclass(frozen=True)
+class ScaleInfluence:
+    """What moves the logarithm of each channel's scale: each sample, counted once, and the coefficients if they do."""
+
+    of_samples: Float[Tensor, "B N m"]
+    of_coefficients: Float[Tensor, "B m n"] | None = None
+
+
 def m_scale_influence(
-    problem: LinearProblem, rho: Float[Tensor, "B N m"], pull: Float[Tensor, "B N m"]
-) -> Float[Tensor, "B N m"]:
-    """What each sample, counted once, moves the logarithm of a scale with ``Σ ρ(r / s) = const`` by.
+    problem: LinearProblem,
+    rho: Float[Tensor, "B N m"],
+    slope: Float[Tensor, "B N m"],
+    z: Float[Tensor, "B N m"],
+    scale: Float[Tensor, "B m"] | None = None,
+) -> ScaleInfluence:
+    """What moves a scale with ``Σ ρ(z) = const``, z = r / s.
 
     Args:
         problem: the regression.
-        rho: ρ of the standardised residuals.
-        pull: ``ρ'(z) z``.
+        rho, slope: ρ and ρ' of the standardised residuals.
+        z: standardised residuals.
+        scale: where the residuals are those of the coefficients, which then move it too, unless it is at its minimum.
     """
     total = problem.total_weight().unsqueeze(-2)
     centre = weighed(problem, rho).sum(-2, keepdim=True) / total
-    return (rho - centre) / weighed(problem, pull).sum(-2, keepdim=True).clamp(min=torch.finfo(rho.dtype).eps)
+    pull = weighed(problem, slope * z).sum(-2, keepdim=True).clamp(min=torch.finfo(rho.dtype).eps)
+    of_samples = (rho - centre) / pull
+    if scale is None:
+        return ScaleInfluence(of_samples)
+    return ScaleInfluence(of_samples, -_summed(problem, weighed(problem, slope) / (pull * scale.unsqueeze(-2))))
 
 
 def influence(
     problem: LinearProblem,
     equation: Scores,
-    scale_influence: Float[Tensor, "B N m"] | None = None,
+    of_scale: ScaleInfluence | None = None,
     share: Float[Tensor, "B N m"] | None = None,
 ) -> Float[Tensor, "B N n"]:
     """What each sample moves the coefficients in the basis by.
@@ -95,16 +117,21 @@ def influence(
     Args:
         problem: the regression.
         equation: that of the coefficients.
-        scale_influence: what each sample moves the logarithms of the scales by; None for known scales.
+        of_scale: what moves the logarithms of the scales; None for known scales.
         share: what a sample's influence is multiplied by, from :func:`shares`; 1 by default.
     """
     values = equation.psi * equation.scale.unsqueeze(-2) * equation.precision()
     values = values if share is None else values * share
     moved = torch.matmul(values.unsqueeze(-2), problem.basis).squeeze(-2)
-    if scale_influence is not None:
-        part = scale_influence if share is None else scale_influence * share
-        moved = moved - torch.matmul(part, equation.by_scale(problem))
-    return torch.matmul(moved, torch.linalg.pinv(equation.hessian(problem), hermitian=True))
+    hessian = equation.hessian(problem)
+    if of_scale is not None:
+        by_scale = equation.by_scale(problem)
+        part = of_scale.of_samples if share is None else of_scale.of_samples * share
+        moved = moved - torch.matmul(part, by_scale)
+        if of_scale.of_coefficients is not None:
+            inverse = torch.linalg.pinv(hessian + torch.matmul(by_scale.mT, of_scale.of_coefficients))
+            return torch.matmul(moved, inverse.mT)
+    return torch.matmul(moved, torch.linalg.pinv(hessian, hermitian=True))
 
 
 def homoscedastic(problem: LinearProblem, equation: Scores) -> Float[Tensor, "B n n"]:

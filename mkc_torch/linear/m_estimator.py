@@ -246,7 +246,8 @@ class MEstimator(RobustInference):
         if self.scale == "proposal2":
             inside = equation.z.abs() < clip
             square = equation.z.square()
-            of_scale = m_scale_influence(problem, square.clamp(max=clip * clip), 2.0 * square * inside)
+            slope = 2.0 * equation.z * inside
+            of_scale = m_scale_influence(problem, square.clamp(max=clip * clip), slope, equation.z, found.scale)
         self._infer(
             problem,
             found.beta,

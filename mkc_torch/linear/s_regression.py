@@ -13,7 +13,7 @@ from mkc_torch._support.arguments import checked_number, checked_whole
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._inference import RobustInference
-from mkc_torch.linear._influence import Scores, influence, m_scale_influence, scores, weighed
+from mkc_torch.linear._influence import ScaleInfluence, Scores, influence, m_scale_influence, scores, weighed
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._psi import BISQUARE_50, Psi, bisquare_for_breakdown, bisquare_rho, bisquare_weight
 from mkc_torch.linear._scale_search import ScaleMinimum, minimise_scale, rounding_scale
@@ -134,12 +134,12 @@ def _newton_step(problem: LinearProblem, beta: Tensor, scale: Tensor, c: float) 
 
 def m_scale_equation(
     problem: LinearProblem, beta: Float[Tensor, "B n"], scale: Float[Tensor, "B m"], breakdown: float
-) -> tuple[Scores, Float[Tensor, "B N m"]]:
-    """The estimating equation of an S-estimate, and what each sample moves the logarithms of its scales by."""
+) -> tuple[Scores, ScaleInfluence]:
+    """The estimating equation of an S-estimate, and what moves its scales, which are at their least."""
     c = bisquare_of(breakdown)
     at = scores(problem, beta, torch.maximum(scale, rounding_scale(problem)), Psi("tukey", (c,)))
     u = at.z / c
-    return at, m_scale_influence(problem, bisquare_rho(u), 6.0 * u.square() * bisquare_weight(u))
+    return at, m_scale_influence(problem, bisquare_rho(u), 6.0 * u * bisquare_weight(u) / c, at.z)
 
 
 def check_breakdown(breakdown: float) -> None:

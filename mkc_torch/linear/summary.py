@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.console import Group
 
 LIGHT = 0.1
 """A weight below this is told of: the fit all but leaves the value out. Nothing decides by it."""
@@ -118,19 +118,20 @@ class Summary:
         )
         return "\n".join([self.heading, "", *lines, "", self.footing])
 
-    def __rich__(self) -> Table:
+    def __rich__(self) -> Group:
         from rich import box
+        from rich.console import Group
         from rich.table import Table
         from rich.text import Text
 
-        table = Table(title=self.heading, caption=self.footing, box=box.SIMPLE_HEAD, title_justify="left")
+        table = Table(box=box.SIMPLE_HEAD)
         table.add_column(self.columns[0])
         for column in self.columns[1:]:
             table.add_column(column, justify="right", no_wrap=True)
         for name, *cells in self.rows:
             # a name may hold brackets, which are no markup
             table.add_row(Text(name), *cells)
-        return table
+        return Group(Text(self.heading), table, Text(self.footing))
 
     def _repr_html_(self) -> str:
         head = "".join(f"<th>{html.escape(c)}</th>" for c in self.columns)

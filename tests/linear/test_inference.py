@@ -1,0 +1,345 @@
+"""Standard errors, intervals and tests: identities, influence by refitting, coverage, derivatives."""
+
+import io
+import pickle
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from torch import Tensor
+
+from mkc_torch.linear import (
+    FixedPointLinear,
+    LeastAbsoluteDeviations,
+    LeastSquares,
+    LeastTrimmedSquares,
+    MEstimator,
+    MKCRegression,
+    MMRegression,
+    ReweightedLeastSquares,
+    SRegression,
+)
+from mkc_torch.linear._estimator import NotFittedError
+from mkc_torch.linear._inference import Inference, RobustInference
+
+ROBUST = [
+    MMRegression(),
+    SRegression(),
+    MEstimator(),
+    MEstimator("hampel", scale="proposal2"),
+    MEstimator("andrews"),
+    MEstimator("welsch"),
+    LeastTrimmedSquares(),
+    ReweightedLeastSquares(),
+    ReweightedLeastSquares("s"),
+]
+ALL = [*ROBUST, LeastSquares(), FixedPointLinear(sigma=3.0), MKCRegression()]
+
+
+def label(estimator: Inference) -> str:
+    return repr(estimator)[:30]
+
+
+def sample(seed: int, *shape: int) -> Tensor:
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def line(seed: int, N: int, n: int = 3, *batch: int, outliers: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Gaussian errors around coefficients 1, 2, …; outliers lie far out in X and on one side."""
+    X = torch.cat([torch.ones(*batch, N, 1, dtype=torch.float64), sample(seed, *batch, N, n - 1)], -1)
+    y = torch.matmul(X, torch.arange(1.0, n + 1.0, dtype=torch.float64)) + sample(seed + 1, *batch, N)
+    wrong = int(outliers * N)
+    X[..., :wrong, 1], y[..., :wrong] = 8.0 + X[..., :wrong, 1], -20.0 + y[..., :wrong]
+    return X, y
+
+
+def set_to(estimator: Inference, **parameters: object) -> Inference:
+    return type(estimator)(**(estimator.get_params() | parameters))
+
+
+@pytest.mark.parametrize("estimator", ALL, ids=label)
+def test_what_follows_from_the_covariance_has_the_shapes_of_the_batch(estimator):
+    X, y = line(0, 40, 3, 2, 2)
+    fit = set_to(estimator).fit(X, y)
+    assert fit.covariance_.shape == (2, 2, 3, 3)
+    assert fit.dof_.shape == (2, 2)
+    assert bool((fit.dof_ == 37).all())
+    torch.testing.assert_close(fit.standard_error_.square(), fit.covariance_.diagonal(dim1=-2, dim2=-1))
+    assert fit.p_value_.shape == (2, 2, 3)
+    ends = fit.confidence_interval(0.9)
+    assert ends.shape == (2, 2, 3, 2)
+    torch.testing.assert_close(ends.mean(-1), fit.coef_)
+    assert fit.mean_interval(X).shape == (2, 2, 40, 2)
+    single = set_to(estimator).fit(X[1, 0], y[1, 0])
+    torch.testing.assert_close(single.covariance_, fit.covariance_[1, 0], rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("covariance", ["sandwich", "hac", "homoscedastic"])
+@pytest.mark.parametrize("estimator", ROBUST, ids=label)
+def test_units_and_mixtures_of_columns_go_through(estimator, covariance):
+    X, y = line(2, 60, outliers=0.1)
+    mix = torch.tensor([[1.0, 0.5, 0.0], [0.0, 30.0, 1.0], [0.0, 2.0, -0.01]], dtype=torch.float64)
+    one = set_to(estimator, covariance=covariance, bandwidth=4.0).fit(X, y)
+    other = set_to(one).fit(X @ mix, 1e3 * y)
+    back = mix @ other.covariance_ @ mix.mT / 1e6
+    # the searches start elsewhere, and end at half of the digits
+    torch.testing.assert_close(back, one.covariance_, rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close(other.r_squared_, one.r_squared_, rtol=1e-4, atol=1e-4)
+
+
+def test_with_nothing_rejected_they_are_those_of_least_squares():
+    X, y = line(4, 50)
+    N, n = X.shape
+    plain = LeastSquares().fit(X, y)
+    residual = y - X @ plain.coef_
+    classical = residual.square().sum() / (N - n) * torch.linalg.inv(X.mT @ X)
+    explained = (1 - residual.square().sum() / (y - y.mean()).square().sum()).reshape(1)
+    for estimator in (
+        MEstimator(tuning=1e6),
+        MEstimator("welsch", 1e8),
+        LeastTrimmedSquares(h=N),
+        ReweightedLeastSquares(threshold=50.0),
+    ):
+        torch.testing.assert_close(set_to(estimator).fit(X, y).covariance_, plain.covariance_, rtol=1e-6, atol=0.0)
+        same = set_to(estimator, covariance="homoscedastic").fit(X, y)
+        torch.testing.assert_close(same.covariance_, classical, rtol=1e-6, atol=0.0)
+        torch.testing.assert_close(same.r_squared_, explained, rtol=1e-6, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    "estimator", [MMRegression(), SRegression(), MEstimator("tukey", scale="proposal2")], ids=label
+)
+def test_the_influence_is_what_a_little_more_weight_of_a_sample_moves(estimator):
+    """Oracle of the scale's part too: the errors are skew, so that the scale moves the intercept."""
+    N, step = 60, 1e-4
+    X = torch.cat([torch.ones(N, 1, dtype=torch.float64), sample(6, N, 1)], -1)
+    y = X.sum(-1) + torch.exp(0.8 * sample(7, N))
+    weight = torch.ones(N, N, dtype=torch.float64) + step * torch.eye(N, dtype=torch.float64)
+    plain = set_to(estimator).fit(X, y)
+    moved = (set_to(estimator).fit(X.expand(N, N, 2), y.expand(N, N), weight).coef_ - plain.coef_) / step
+    moved = moved - moved.mean(0)  # the scale's denominator N - p grows with each
+    by_refitting = moved.mT @ moved * N / (N - 2)
+    torch.testing.assert_close(plain.covariance_, by_refitting, rtol=0.03, atol=1e-5)
+
+
+@pytest.mark.parametrize("covariance", ["sandwich", "homoscedastic"])
+@pytest.mark.parametrize(
+    "estimator", [e for e in ROBUST if not isinstance(e, (LeastTrimmedSquares, ReweightedLeastSquares))], ids=label
+)
+def test_a_weight_of_two_is_a_sample_that_occurs_twice(estimator, covariance):
+    X, y = line(8, 50, outliers=0.1)
+    weight = torch.ones(50, dtype=torch.float64)
+    weight[::4] = 2.0
+    weight[1] = 0.0
+    repeated = torch.arange(50).repeat_interleave(weight.long())
+    weighted = set_to(estimator, covariance=covariance).fit(X, y, weight)
+    twice = set_to(weighted).fit(X[repeated], y[repeated])
+    torch.testing.assert_close(weighted.covariance_, twice.covariance_, rtol=1e-3, atol=1e-7)
+    torch.testing.assert_close(weighted.dof_, twice.dof_)
+    torch.testing.assert_close(weighted.r_squared_, twice.r_squared_, rtol=1e-4, atol=0.0)
+
+
+@pytest.mark.parametrize("estimator", ROBUST, ids=label)
+def test_a_series_of_no_lags_is_the_sandwich_and_a_slow_one_is_less_certain(estimator):
+    X, y = line(10, 400, 2)
+    plain = set_to(estimator).fit(X, y)
+    none = set_to(estimator, covariance="hac", bandwidth=0.0).fit(X, y)
+    torch.testing.assert_close(none.covariance_, plain.covariance_)
+    slow = y + 3.0 * torch.sin(torch.arange(400.0) / 30.0)
+    independent, series = set_to(estimator).fit(X, slow), set_to(estimator, covariance="hac").fit(X, slow)
+    assert float(series.standard_error_[0]) > 1.3 * float(independent.standard_error_[0])
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.1, 0.2])
+@pytest.mark.parametrize(
+    "estimator", [MMRegression(starts=40), MEstimator("tukey"), ReweightedLeastSquares(starts=40)], ids=label
+)
+def test_intervals_cover(estimator, outliers):
+    """400 draws of 100 samples, outliers far out in X; of 95 % with a deviation of chance of 0.6 %."""
+    X, y = line(12, 100, 3, 400, outliers=outliers)
+    interval = set_to(estimator).fit(X, y).confidence_interval()
+    truth = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    covered = ((interval[..., 0] <= truth) & (truth <= interval[..., 1])).double().mean()
+    least = 0.90 if isinstance(estimator, ReweightedLeastSquares) else 0.93
+    assert least <= float(covered) <= 0.97
+
+
+def test_predictions_of_good_values_are_covered():
+    X, y = line(14, 200, 3, 100, outliers=0.1)
+    fit = MMRegression(starts=40).fit(X, y)
+    new_X, new_y = line(99, 200, 3, 100)
+    interval = fit.prediction_interval(new_X)
+    inside = (interval[..., 0] <= new_y) & (new_y <= interval[..., 1])
+    # the scale of the S-estimate is that of the good values and a tenth more, for the outliers
+    assert 0.95 <= float(inside.double().mean()) <= 0.985
+    mean = fit.mean_interval(new_X)
+    truth = torch.matmul(new_X, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+    held = (mean[..., 0] <= truth) & (truth <= mean[..., 1])
+    assert 0.92 <= float(held.double().mean()) <= 0.97
+
+
+@pytest.mark.parametrize("covariance", ["sandwich", "hac", "homoscedastic"])
+@pytest.mark.parametrize("channels", [1, 2])
+@pytest.mark.parametrize(
+    "estimator",
+    [MMRegression(starts=50), SRegression(starts=50), MEstimator(), MEstimator("welsch", scale="proposal2")],
+    ids=label,
+)
+def test_standard_errors_have_the_derivatives_of_the_fit(estimator, channels, covariance):
+    X, Y = 1.0 + sample(16, 30, channels, 3), sample(17, 30, channels)
+    estimator = set_to(estimator, covariance=covariance, bandwidth=3.0)
+
+    def results(X: Tensor, Y: Tensor) -> tuple[Tensor, ...]:
+        fit = estimator.fit(X, Y)
+        return fit.coef_, fit.standard_error_, fit.scale_, fit.r_squared_
+
+    inputs = (X.requires_grad_(), Y.requires_grad_())
+    assert torch.autograd.gradcheck(results, inputs, fast_mode=True, atol=1e-5)
+
+
+@pytest.mark.parametrize("estimator", [LeastTrimmedSquares(starts=50), ReweightedLeastSquares(starts=50)], ids=label)
+def test_standard_errors_of_what_counts_have_derivatives(estimator):
+    X, y = line(18, 40, outliers=0.1)
+
+    def results(X: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+        fit = estimator.fit(X, y)
+        return fit.coef_, fit.standard_error_, fit.scale_
+
+    assert torch.autograd.gradcheck(results, (X.requires_grad_(), y.requires_grad_()), fast_mode=True, atol=1e-5)
+
+
+def test_wald_of_one_coefficient_is_the_square_of_its_t():
+    fit = MMRegression().fit(*line(20, 60))
+    one = fit.wald_test([1])
+    torch.testing.assert_close(one.statistic, (fit.coef_[1] / fit.standard_error_[1]).square())
+    torch.testing.assert_close(one.p_value, fit.p_value_[1])
+    assert one.restrictions == 1
+    same = fit.wald_test(torch.tensor([0.0, 5.0, 0.0]))
+    torch.testing.assert_close(same.p_value, one.p_value)
+    assert float(fit.wald_test([0, 1, -1], value=fit.coef_).p_value) == pytest.approx(1.0)
+
+
+def test_p_values_are_uniform_where_the_restrictions_hold():
+    X, y = line(22, 80, 4, 400)
+    test = MMRegression(starts=40).fit(X, y).wald_test([2, 3], value=torch.tensor([3.0, 4.0]))
+    assert 0.02 <= float((test.p_value < 0.05).double().mean()) <= 0.09
+    assert 0.44 <= float((test.p_value < 0.5).double().mean()) <= 0.58
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([3],), "numbers below 3 but got 3"),
+        (([0.5],), "whole number of at least -3"),
+        (([1, 1],), "independent but got 2 of rank 1"),
+        ((torch.ones(2, 4),), r"of shape \(q, 3\) but got \(2, 4\)"),
+        (([0, 1], torch.ones(3)), r"of shape \(2,\) but got \(3,\)"),
+    ],
+)
+def test_restrictions_that_are_none_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        MMRegression().fit(*line(24, 30)).wald_test(*arguments)
+
+
+def test_a_table_for_people():
+    X, y = line(26, 60, outliers=0.1)
+    frame = pd.DataFrame(X.numpy(), columns=["one", "heat <b>", "[red]drift"])
+    fit = MMRegression().fit(frame, pd.Series(y.numpy()))
+    summary = fit.summary(level=0.9)
+    text = str(summary)
+    assert text.splitlines()[0] == "MMRegression of 60 values, 6 with a weight below 0.1"
+    assert "90 % interval" in text
+    assert [row.name for row in summary.coefficients] == ["one", "heat <b>", "[red]drift"]
+    assert summary.coefficients[1].value == float(fit.coef_[1])
+    assert summary.coefficients[1].low == float(fit.confidence_interval(0.9)[1, 0])
+    page = summary._repr_html_()
+    assert "heat &lt;b&gt;" in page
+    assert page.count("<tr>") == 4
+    console = pytest.importorskip("rich.console").Console(width=200, record=True, file=io.StringIO())
+    console.print(summary)
+    drawn = console.export_text()
+    assert "[red]drift" in drawn
+    assert "standard errors by the sandwich" in drawn
+    assert fit.summary(["a", "b", "c"]).coefficients[2].name == "c"
+    with pytest.raises(ValueError, match="hold 3 names but got 2"):
+        fit.summary(["a", "b"])
+
+
+def test_a_table_is_of_one_problem():
+    fit = SRegression(starts=50).fit(*line(28, 40, 3, 2, 2))
+    assert fit.summary(problem=(1, -1)).coefficients[0].value == float(fit.coef_[1, 1, 0])
+    for problem in ((), (1,), (2, 0)):
+        with pytest.raises(IndexError, match=r"index of one problem of the batch \(2, 2\)"):
+            fit.summary(problem=problem)
+
+
+def test_tables_of_estimators_without_scale_or_share():
+    text = str(LeastSquares().fit(*line(30, 40)).summary())
+    assert "scale" not in text
+    assert "37 degrees of freedom" in text
+
+
+@pytest.mark.parametrize("estimator", ROBUST, ids=label)
+def test_an_exact_fit_is_certain_and_holds_no_nan(estimator):
+    X, _ = line(32, 40)
+    y = X @ torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    y[:5] += 30.0
+    fit = set_to(estimator).fit(X, y)
+    assert bool((fit.standard_error_ < 1e-6).all())
+    assert bool(torch.isfinite(fit.p_value_).all())
+    flat = set_to(estimator).fit(X, torch.zeros(40, dtype=torch.float64))
+    assert bool(torch.isfinite(flat.covariance_).all())
+    assert not bool(torch.isnan(flat.r_squared_).any())
+    assert str(flat.summary())
+
+
+def test_as_many_coefficients_as_values_leave_nothing_to_tell_errors_from():
+    X, y = line(34, 3)
+    assert bool(torch.isinf(SRegression().fit(X, y).covariance_).all())
+
+
+@pytest.mark.parametrize("estimator", ROBUST, ids=label)
+def test_a_fit_in_single_precision_and_one_kept_on_disk(estimator):
+    X, y = line(36, 80, outliers=0.1)
+    double = set_to(estimator).fit(X, y)
+    single = set_to(estimator).fit(X.float(), y.float())
+    assert single.standard_error_.dtype == torch.float32
+    torch.testing.assert_close(single.standard_error_.double(), double.standard_error_, rtol=0.02, atol=0.0)
+    again = pickle.loads(pickle.dumps(double))
+    assert torch.equal(again.confidence_interval(), double.confidence_interval())
+
+
+def test_no_constant_column_and_the_share_is_around_zero():
+    X, y = sample(38, 50, 2), 3.0 + sample(39, 50)
+    fit = MEstimator(tuning=1e6).fit(X, y)
+    residual = y - X @ fit.coef_
+    expected = 1 - residual.square().sum() / y.square().sum()
+    torch.testing.assert_close(fit.r_squared_, expected.reshape(1), rtol=1e-6, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    "estimator", [MMRegression, SRegression, MEstimator, LeastTrimmedSquares, ReweightedLeastSquares]
+)
+def test_arguments(estimator):
+    with pytest.raises(ValueError, match="`covariance` to be 'sandwich', 'hac' or 'homoscedastic' but got 'iid'"):
+        estimator(covariance="iid")
+    with pytest.raises(ValueError, match="`bandwidth`"):
+        estimator(bandwidth=-1.0)
+    with pytest.raises(ValueError, match="`level`"):
+        estimator().fit(*line(40, 30)).confidence_interval(95.0)
+    with pytest.raises(NotFittedError):
+        estimator().standard_error_  # noqa: B018
+    with pytest.raises(NotFittedError):
+        estimator().summary()
+
+
+def test_an_estimator_without_covariance_has_none_of_it():
+    assert not isinstance(LeastAbsoluteDeviations(), Inference)
+    assert issubclass(MMRegression, RobustInference)
+
+
+def test_intervals_of_arrays():
+    X, y = line(42, 40)
+    fit = MMRegression().fit(X.numpy(), y.numpy())
+    torch.testing.assert_close(fit.prediction_interval(np.asarray(X)), fit.prediction_interval(X))
