@@ -101,7 +101,9 @@ def test_with_nothing_rejected_they_are_those_of_least_squares():
         LeastTrimmedSquares(h=N),
         ReweightedLeastSquares(threshold=50.0),
     ):
-        torch.testing.assert_close(set_to(estimator).fit(X, y).covariance_, plain.covariance_, rtol=1e-6, atol=0.0)
+        small = (1.0 + 4.0 * n / N) ** 2 if isinstance(estimator, ReweightedLeastSquares) else 1.0
+        expected = small * plain.covariance_
+        torch.testing.assert_close(set_to(estimator).fit(X, y).covariance_, expected, rtol=1e-6, atol=0.0)
         same = set_to(estimator, covariance="homoscedastic").fit(X, y)
         torch.testing.assert_close(same.covariance_, classical, rtol=1e-6, atol=0.0)
         torch.testing.assert_close(same.r_squared_, explained, rtol=1e-6, atol=0.0)
@@ -156,13 +158,12 @@ def test_a_series_of_no_lags_is_the_sandwich_and_a_slow_one_is_less_certain(esti
     "estimator", [MMRegression(starts=40), MEstimator("tukey"), ReweightedLeastSquares(starts=40)], ids=label
 )
 def test_intervals_cover(estimator, outliers):
-    """400 draws of 100 samples, outliers far out in X; of 95 % with a deviation of chance of 0.6 %."""
-    X, y = line(12, 100, 3, 400, outliers=outliers)
+    """300 draws of 100 samples, outliers far out in X; 95 % with a deviation of chance of 0.7 %."""
+    X, y = line(12, 100, 3, 300, outliers=outliers)
     interval = set_to(estimator).fit(X, y).confidence_interval()
     truth = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     covered = ((interval[..., 0] <= truth) & (truth <= interval[..., 1])).double().mean()
-    least = 0.90 if isinstance(estimator, ReweightedLeastSquares) else 0.93
-    assert least <= float(covered) <= 0.97
+    assert 0.925 <= float(covered) <= 0.975
 
 
 def test_predictions_of_good_values_are_covered():
@@ -221,7 +222,7 @@ def test_wald_of_one_coefficient_is_the_square_of_its_t():
 
 
 def test_p_values_are_uniform_where_the_restrictions_hold():
-    X, y = line(22, 80, 4, 400)
+    X, y = line(22, 80, 4, 300)
     test = MMRegression(starts=40).fit(X, y).wald_test([2, 3], value=torch.tensor([3.0, 4.0]))
     assert 0.02 <= float((test.p_value < 0.05).double().mean()) <= 0.09
     assert 0.44 <= float((test.p_value < 0.5).double().mean()) <= 0.58
