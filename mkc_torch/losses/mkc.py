@@ -23,7 +23,7 @@ from mkc_torch.losses._checks import (
 )
 from mkc_torch.losses._curves import Curves
 from mkc_torch.losses._energy_sums import energy_sums
-from mkc_torch.losses._following import Following
+from mkc_torch.losses._following import Followed, Following
 from mkc_torch.losses._follows_residuals import FollowsResiduals
 from mkc_torch.losses._state_dict import logit_of_kappa, logit_of_scale, translate
 from mkc_torch.losses._watch import Watch
@@ -136,6 +136,7 @@ class MKCLoss(FollowsResiduals, Curves, nn.Module):
         kappa = inverse_square(self._sigma_in_range(sigma))
         followed, own_bound = _is_auto(d), not (bound is None or _is_auto(bound))
         self.following = Following(num_channels) if followed else None
+        self.__dict__["_guide"] = None  # no part of the state_dict
         self._own_bound = own_bound or not followed
         self._own_floor = d_min is not None or not followed
         d = torch.ones(num_channels) if _is_auto(d) else self._per_channel("d", d, low=0.0)
@@ -314,13 +315,18 @@ class MKCLoss(FollowsResiduals, Curves, nn.Module):
             self._look(input, wanted, error, axis)
         kappa, d, bound = self.kappa, self.d, self.bound
         pull: Tensor | None = None
+        steered: Followed | None = None
+        learning = self.training and torch.is_grad_enabled()
         if self.following is not None:
-            first, second = (input, wanted) if error is None else (error, None)
-            state = self._state(first, second, weight, axis)
+            state = self._state(input, wanted, error, weight, axis)
             d, bound = self._followed_d(state), self._domain(state)[0]
-            if self.training and self.raw_kappa is not None and torch.is_grad_enabled():
-                pull = self._pull(first, second, None if weight is None else weight.detach(), axis, state)
-                input, wanted, error = input.detach(), wanted.detach(), None if error is None else error.detach()
+            steered = state if learning and self.raw_kappa is not None else None
+        elif learning:
+            steered = self._guided(input, wanted, error, weight, axis)
+        if steered is not None:
+            first, second = (input, wanted) if error is None else (error, None)
+            pull = self._pull(first, second, None if weight is None else weight.detach(), axis, steered)
+            input, wanted, error = input.detach(), wanted.detach(), None if error is None else error.detach()
         norm = self._log_normalizer(kappa, d, bound).to(dtype) if self.normalize else None
         kappa, d = (p.to(torch.promote_types(p.dtype, dtype)) for p in (kappa, d))
         if self.reduction == "none":
