@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +23,8 @@ class FollowsResiduals(nn.Module):
 
     following: Following | None
     _guide: Following | None
+    kappa: Any
+    d: Any
     bound: Tensor
     d_min: Tensor
     raw_d: nn.Parameter | None
