@@ -51,7 +51,8 @@ class MKCLoss(FollowsResiduals, Curves, nn.Module):
     each channel, so that targets of any unit and offset need no tuning. The value is then the same likelihood; the
     gradient by the input, in training, is that of a loss chosen for its robustness: at first one sharper than the
     absolute value, later Welsch's of the widest bandwidth at which the estimated risk, variance and shrinkage of the
-    predictions, is within a tenth of the smallest. σ and d then describe the noise. With given numbers the gradient is the likelihood's own.
+    predictions, is within a tenth of the smallest. σ and d then describe the noise. With given numbers the gradient is
+    the likelihood's own.
 
     Args:
         num_channels: m, the size of the channel dimension.
