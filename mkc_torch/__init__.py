@@ -14,6 +14,7 @@ __all__ = [
     "EllipsoidFit",
     "GeneralizedCrossEntropyLoss",
     "HeteroscedasticMKCLoss",
+    "KernelsFit",
     "LELoss",
     "MKCConvHead",
     "MKCDistribution",
@@ -24,6 +25,7 @@ __all__ = [
     "beyond_bound",
     "diagnose",
     "fit_density",
+    "fit_kernels",
     "functional",
     "graduated_sigma",
     "inlier_weight",
@@ -36,7 +38,7 @@ __all__ = [
 if TYPE_CHECKING:
     from mkc_torch import functional, linear
     from mkc_torch.calibration import EllipsoidFit, NotIdentifiableError
-    from mkc_torch.density import DensityFit, MKCDistribution, fit_density
+    from mkc_torch.density import DensityFit, KernelsFit, MKCDistribution, fit_density, fit_kernels
     from mkc_torch.diagnosis.diagnose import diagnose
     from mkc_torch.diagnosis.result import Diagnosis
     from mkc_torch.losses import (
@@ -57,7 +59,7 @@ if TYPE_CHECKING:
 else:
     _HOMES = {
         "calibration": ("EllipsoidFit", "NotIdentifiableError"),
-        "density": ("DensityFit", "MKCDistribution", "fit_density"),
+        "density": ("DensityFit", "KernelsFit", "MKCDistribution", "fit_density", "fit_kernels"),
         "diagnosis": ("Diagnosis", "diagnose"),
         "losses": (
             "GeneralizedCrossEntropyLoss",

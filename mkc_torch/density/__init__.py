@@ -2,6 +2,7 @@
 
 from mkc_torch.density.distribution import MKCDistribution
 from mkc_torch.density.fit import DensityFit, fit_density
+from mkc_torch.density.many_kernels import KernelsFit, fit_kernels
 from mkc_torch.density.robustness import (
     bandwidth_for_efficiency,
     breakdown_point,
@@ -14,12 +15,14 @@ from mkc_torch.density.robustness import (
 
 __all__ = [
     "DensityFit",
+    "KernelsFit",
     "MKCDistribution",
     "bandwidth_for_efficiency",
     "breakdown_point",
     "error_bound",
     "error_bound_slope",
     "fit_density",
+    "fit_kernels",
     "gaussian_breakdown",
     "gaussian_efficiency",
     "least_bandwidth",

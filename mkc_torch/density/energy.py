@@ -95,7 +95,7 @@ class _EnergyWithTangent(_Energy):
 def energy_value(z: Tensor, kappa: Tensor) -> Tensor:
     """:func:`energy` where nothing is differentiated, without an autograd function's own cost."""
     q = 0.5 * z * z
-    x = kappa * q
+    x = 0.5 * kappa * z * z  # 0 times a square that overflows is no number
     divisor = torch.where(kappa > 0, kappa, 1.0)
     if not torch.compiler.is_compiling():
         return torch.where(x > 0, -torch.expm1(-x) / divisor, q)

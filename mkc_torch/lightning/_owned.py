@@ -12,6 +12,8 @@ from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
 
 from mkc_torch.density.energy import KAPPA_MAX
+from mkc_torch.lightning._pace import set_pace
+from mkc_torch.losses._following import Following
 from mkc_torch.losses.mkc import MKCLoss
 
 if TYPE_CHECKING:
@@ -43,8 +45,15 @@ class OwnedLoss:
             parameter.requires_grad_(False)
         return cls(name, loss, loss.register_forward_hook(hook, with_kwargs=True), learned)
 
+    def guide(self, guide: Following | None, trainer: Trainer) -> None:
+        """Lets the loss follow a guide at the pace of this training."""
+        if guide is not None:
+            set_pace(guide, trainer)
+        self.loss.follow_guide(guide)
+
     def release(self) -> None:
         self.handle.remove()
+        self.loss.follow_guide(None)
         for parameter in self.learned:
             parameter.requires_grad_(True)
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mkc_torch.lightning._owned import OwnedLoss
 from mkc_torch.lightning.residual_histogram import ResidualHistogram
+from mkc_torch.losses._following import Following
 from mkc_torch.losses.mkc import MKCLoss
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ class Progress:
     share_beyond: Float[Tensor, " m"] = field(init=False)
     last_epoch: int = -1
     warned: set[tuple[str, int]] = field(default_factory=set)
+    guide: Following | None = None
 
     def __post_init__(self) -> None:
         unknown = torch.full(self.histogram.bound.shape, torch.nan, dtype=torch.float64)
@@ -106,6 +108,7 @@ class Progress:
             "log_likelihood": self.log_likelihood,
             "share_beyond": self.share_beyond,
             "last_epoch": self.last_epoch,
+            "guide": None if self.guide is None else self.guide.state_dict(),
             "warned": [[kind, channel] for kind, channel in sorted(self.warned)],
         }
 
@@ -119,4 +122,7 @@ class Progress:
         self.start_d, self.log_likelihood = state["start_d"], state["log_likelihood"]
         self.share_beyond = state["share_beyond"]
         self.last_epoch = state["last_epoch"]
+        if state.get("guide") is not None:
+            self.guide = Following(len(self.start_d))
+            self.guide.load_state_dict(state["guide"])
         self.warned = {(kind, channel) for kind, channel in state["warned"]}

@@ -18,6 +18,7 @@ from mkc_torch.functional import mkc_nll
 from mkc_torch.lightning._owned import SIGMA_CAP, OwnedLoss
 from mkc_torch.lightning._progress import MIN_RESIDUALS, Progress
 from mkc_torch.lightning.residual_histogram import ResidualHistogram
+from mkc_torch.losses._following import Following
 from mkc_torch.losses.mkc import MKCLoss
 
 if TYPE_CHECKING:
@@ -63,6 +64,8 @@ class MKCExpectationMaximization(Callback):
             E-step of a channel is not damped.
         anneal_epochs: T epochs after the warm-up over which σ comes down from large values: in the t-th, t/T of the
             likeliest 1/σ² is used, and d fitted for it. None: all of it from the start.
+        graduated: whether the network begins with a loss sharper than the absolute value and goes over to the
+            likelihood, no wider than its residuals speak for; else the likelihood's gradient moves it throughout.
         residuals: ``(pl_module, batch) -> (input, target)`` or ``(input, target, weight)``, as for the loss. If given,
             each E-step makes a pass over the training data, the module in evaluation mode and without gradients,
             instead of taking the training steps' residuals. A loader's random order draws from its own generator if it
@@ -112,6 +115,7 @@ class MKCExpectationMaximization(Callback):
         warmup_epochs: int = 0,
         damping: float = 0.0,
         anneal_epochs: int | None = None,
+        graduated: bool = True,
         residuals: Residuals | None = None,
         log: bool = True,
     ) -> None:
@@ -136,6 +140,7 @@ class MKCExpectationMaximization(Callback):
         self.warmup_epochs = warmup_epochs
         self.damping = damping
         self.anneal_epochs = anneal_epochs
+        self.graduated = graduated
         self.residuals = residuals
         self._logs = log  # the trainer puts a method in the place of an attribute `log`
         self._owned: OwnedLoss | None = None
@@ -161,6 +166,8 @@ class MKCExpectationMaximization(Callback):
             self._take(trainer, pl_module)
         owned, progress = self._running()
         owned.refuse_optimised(trainer)
+        if self.graduated and progress.guide is None:
+            progress.guide = Following(owned.loss.num_channels)
         if self._restored is not None:
             progress.load_state_dict(self._restored)
             self._restored = None
@@ -172,7 +179,11 @@ class MKCExpectationMaximization(Callback):
     @override
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step == 0:
-            self._progress = Progress(ResidualHistogram(self._running()[0].loss.bound))
+            loss = self._running()[0].loss
+            guide = Following(loss.num_channels) if self.graduated else None
+            self._progress = Progress(ResidualHistogram(loss.bound), guide=guide)
+        owned, progress = self._running()
+        owned.guide(progress.guide if self.graduated else None, trainer)
         self._step = trainer.global_step
         if self.residuals is not None and self.every_n_steps is not None:
             _refuse_persistent_workers(trainer)

@@ -24,6 +24,7 @@ _SERIES_BELOW = {torch.float32: 0.02, torch.float64: 1e-3}
 """Of x = kappa z^2 / 2: below, three terms of the series lose fewer digits than a difference of exponentials."""
 
 _LEAST = {torch.float32: 2.0**-100, torch.float64: 2.0**-800}
+"""The kappa that a smaller one counts as, for x of common z has its digits there; 0 alone is exact."""
 
 _LARGE, _PIECE, _ROW = 1 << 19, 1 << 18, 256
 """Elements from which a batch is worked through in pieces that stay in the cache, how many a piece has, and about how
@@ -105,30 +106,33 @@ class _EnergySums(torch.autograd.Function):
         by_kappa: bool,
         by_d: bool,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        # a power of two that small scales exactly, and at kappa = 0 leaves z^2 / 2
         positive = kappa.clamp(min=_LEAST[input.dtype])
+        own = torch.where(kappa > 0, positive, 0.0)
         plain = weight is None and _large(input, axis) and (target is None or _large(target, axis))
         if plain and not (by_kappa and _nearly_gaussian(kappa)):
-            sums, pull, stretch = _in_pieces(input, target, positive, d, stretched=by_kappa or by_d)
+            sums, pull, stretch = _in_pieces(input, target, own, d, stretched=by_kappa or by_d)
             return sums, pull, (0.5 * stretch - sums) / positive, -stretch / d
         error = _error(input, target)
         z = error / _shaped(d, error.dim(), axis)
-        square = z * z
-        minus_x = square * _shaped(-0.5 * positive, error.dim(), axis)
+        minus_x = (z * _shaped(-0.5 * own, error.dim(), axis)) * z  # 0 times a square that overflows is no number
         if by_kappa:
             minus_x = minus_x.clamp(min=-1e4)  # exp(-1e4) is 0 already, and no product with it is NaN
         inlier = torch.exp(minus_x)
         pull, value = z * inlier, torch.expm1(minus_x)
         if weight is not None:
             pull, value = pull * weight, value * weight
-        sums = -_summed(value, axis) / positive
+        if _nearly_gaussian(kappa):
+            half = -0.5 * z * z if weight is None else -0.5 * z * z * weight
+            sums = -_summed(torch.where(_shaped(own == 0, z.dim(), axis), half, value), axis) / _divisor(own)
+        else:
+            sums = -_summed(value, axis) / positive
         stretch = _summed(z * pull, axis) if by_d or by_kappa else torch.zeros_like(sums)
         curve = torch.zeros_like(sums)
         if by_kappa:
             # sum(z^2 exp(-x) / 2 - energy) / kappa, digit by digit where little of the difference would be left
             curve = (0.5 * stretch - sums) / positive
             if _nearly_gaussian(kappa):
-                curve = _curve(square, minus_x, value, kappa, weight, axis)
+                curve = _curve(z * z, minus_x, value, kappa, weight, axis)
         return sums, pull, curve, -stretch / d
 
     @staticmethod
@@ -199,6 +203,11 @@ class _EnergySums(torch.autograd.Function):
         return _summed(change, ctx.axis), None, None, None
 
 
+def _divisor(kappa: Tensor) -> Tensor:
+    """Kappa, and 1 where it is 0 and the sums are those of z^2 / 2."""
+    return torch.where(kappa > 0, kappa, 1.0)
+
+
 def _large(values: Tensor, axis: int) -> bool:
     """Whether this is a plain tensor in the memory of the CPU, rows of channels, too large for the cache."""
     return (
@@ -232,6 +241,7 @@ def _in_pieces(
     pull = torch.empty_like(input)
     whole = len(input.view(-1, m)) // repeats * repeats
     value, stretch = kappa.new_zeros(m, dtype=torch.float64), kappa.new_zeros(m, dtype=torch.float64)
+    exact = bool((kappa == 0).any())
     for r, rows in ((repeats, slice(whole)), (1, slice(whole, None))):
         scale, half, size = d.repeat(r), (-0.5 * kappa).repeat(r), max(_PIECE // (r * m), 1)
 
@@ -241,12 +251,13 @@ def _in_pieces(
         wanted = repeat(None) if target is None else pieces(target)
         for piece, other, pulled in zip(pieces(input), wanted, pieces(pull), strict=False):
             z = piece / scale if other is None else (piece - other).div_(scale)
-            minus = (z * z).mul_(half).expm1_()
-            value += minus.sum(0).double().view(r, m).sum(0)
+            minus = (z * half).mul_(z).expm1_()
+            worth = torch.where(half < 0, minus, -0.5 * z * z) if exact else minus
+            value += worth.sum(0).double().view(r, m).sum(0)
             torch.mul(z, minus.add_(1.0), out=pulled)
             if stretched:
                 stretch += z.mul_(pulled).sum(0).double().view(r, m).sum(0)
-    return (-value / kappa).to(kappa.dtype), pull, stretch.to(kappa.dtype)
+    return (-value / _divisor(kappa)).to(kappa.dtype), pull, stretch.to(kappa.dtype)
 
 
 def _nearly_gaussian(kappa: Tensor) -> bool:

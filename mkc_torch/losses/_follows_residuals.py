@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from mkc_torch.losses._checks import Reduction
-from mkc_torch.losses._following import SEARCH_EVERY, Followed, Following, steered, steered_each
+from mkc_torch.losses._following import SEARCH_EVERY, Followed, Following
 from mkc_torch.losses._state_dict import logit_of_scale, ratio_of
+from mkc_torch.losses._steering import late_of, limited, steered, steered_each
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -18,9 +19,12 @@ __all__ = ["FollowsResiduals"]
 
 
 class FollowsResiduals(nn.Module):
-    """The part of an MKCLoss that has a :class:`Following`; one with a given d has none."""
+    """The part of an MKCLoss that has a :class:`Following`; one with a given d has none, but may be guided by one."""
 
     following: Following | None
+    _guide: Following | None
+    kappa: Any
+    d: Any
     bound: Tensor
     d_min: Tensor
     raw_d: nn.Parameter | None
@@ -56,6 +60,14 @@ class FollowsResiduals(nn.Module):
         else:
             self.raw_d.copy_(logit_of_scale(d, self.d_min, self.bound))
 
+    def follow_guide(self, guide: Following | None) -> None:
+        """Let the network learn by the first loss, and then by the likelihood no wider than a guide's bandwidth.
+
+        None ends this. The value, σ, d and the bound stay the likelihood's; a guide is no part of the ``state_dict``.
+        """
+        self.__dict__["_guide"] = guide
+        self._turned, self._passes = False, 0 if guide is None else int(guide.seen)
+
     def _followed_d(self, state: Followed) -> Float[Tensor, " m"]:
         scale = state.scale
         if self.raw_d is not None:
@@ -67,7 +79,7 @@ class FollowsResiduals(nn.Module):
         """Bound and floor of d."""
         return self.bound if self._own_bound else state.bound, self.d_min if self._own_floor else state.floor
 
-    def _state(self, input: Tensor, target: Tensor | None, weight: Tensor | None, axis: int) -> Followed:
+    def _state(self, input: Tensor, target: Tensor, error: Tensor | None, weight: Tensor | None, axis: int) -> Followed:
         """What is known with this batch; kept in training, but under transforms of functions, which have no state."""
         assert self.following is not None
         compiled = torch.compiler.is_compiling()
@@ -78,7 +90,7 @@ class FollowsResiduals(nn.Module):
             return self.following.state
         # compiled code is one for all batches
         search = compiled or self._passes % SEARCH_EVERY == 0
-        state = self.following.after(input, target, weight, axis, search=search)
+        state = self.following.after(input, target, weight, axis, error=error, search=search)
         if learning:
             if not compiled:
                 self._passes += 1
@@ -96,8 +108,25 @@ class FollowsResiduals(nn.Module):
             self._has_begun = bool(self.following.seen > 0)
         return self._has_begun
 
+    def _guided(
+        self, input: Tensor, target: Tensor, error: Tensor | None, weight: Tensor | None, axis: int
+    ) -> Followed | None:
+        """What a guide knows with this batch, if there is one and the network learns."""
+        compiled = torch.compiler.is_compiling()
+        if self._guide is None or (not compiled and torch._C._functorch.is_functorch_wrapped_tensor(input)):
+            return None
+        if self._guide.seen.device != input.device:
+            self._guide.to(input.device)
+        search = compiled or self._passes % SEARCH_EVERY == 0
+        state = self._guide.after(input, target, weight, axis, error=error, search=search)
+        if not compiled:
+            self._passes += 1
+        self._guide.keep(state)
+        return state
+
     def _pull(self, input: Tensor, target: Tensor | None, weight: Tensor | None, axis: int, state: Followed) -> Tensor:
         """What the network learns by: of each element, or summed."""
+        late = late_of(state) if self._guide is None else limited(state, self.kappa.detach(), self.d.detach())
         if self.reduction == "none":
-            return steered_each(input if target is None else input - target, axis, state)
-        return steered(input, target, weight, axis, state, turned=self._turned).sum()
+            return steered_each(input if target is None else input - target, axis, state, late)
+        return steered(input, target, weight, axis, state, late, turned=self._turned).sum()

@@ -23,7 +23,7 @@ from mkc_torch.losses._checks import (
 )
 from mkc_torch.losses._curves import ChannelCurves
 from mkc_torch.losses._energy_sums import energy_sums
-from mkc_torch.losses._following import Following
+from mkc_torch.losses._following import Followed, Following
 from mkc_torch.losses._follows_residuals import FollowsResiduals
 from mkc_torch.losses._logistic import logistic
 from mkc_torch.losses._state_dict import logit_of_kappa, logit_of_scale, translate
@@ -51,8 +51,9 @@ class MKCLoss(FollowsResiduals, ChannelCurves, nn.Module):
     Without a ``d`` the scales are taken from the residuals and follow them while the network learns, robustly and for
     each channel, so that targets of any unit and offset need no tuning. The value is then the same likelihood; the
     gradient by the input, in training, is that of a loss chosen for its robustness: at first one sharper than the
-    absolute value, later Welsch's of the widest bandwidth at which the estimated variance is within a tenth of the
-    smallest. σ and d then describe the noise. With given numbers the gradient is the likelihood's own.
+    absolute value, later Welsch's of the widest bandwidth at which the estimated risk, variance and shrinkage of the
+    predictions, is within a tenth of the smallest. σ and d then describe the noise. With given numbers the gradient is
+    the likelihood's own.
 
     Args:
         num_channels: m, the size of the channel dimension.
@@ -137,6 +138,7 @@ class MKCLoss(FollowsResiduals, ChannelCurves, nn.Module):
         kappa = inverse_square(self._sigma_in_range(sigma))
         followed, own_bound = _is_auto(d), not (bound is None or _is_auto(bound))
         self.following = Following(num_channels) if followed else None
+        self.__dict__["_guide"] = None  # no part of the state_dict
         self._own_bound = own_bound or not followed
         self._own_floor = d_min is not None or not followed
         d = torch.ones(num_channels) if _is_auto(d) else self._per_channel("d", d, low=0.0)
@@ -315,13 +317,18 @@ class MKCLoss(FollowsResiduals, ChannelCurves, nn.Module):
             self._look(input, wanted, error, axis)
         kappa, d, bound = self.kappa, self.d, self.bound
         pull: Tensor | None = None
+        steered: Followed | None = None
+        learning = self.training and torch.is_grad_enabled()
         if self.following is not None:
-            first, second = (input, wanted) if error is None else (error, None)
-            state = self._state(first, second, weight, axis)
+            state = self._state(input, wanted, error, weight, axis)
             d, bound = self._followed_d(state), self._domain(state)[0]
-            if self.training and self.raw_kappa is not None and torch.is_grad_enabled():
-                pull = self._pull(first, second, None if weight is None else weight.detach(), axis, state)
-                input, wanted, error = input.detach(), wanted.detach(), None if error is None else error.detach()
+            steered = state if learning and self.raw_kappa is not None else None
+        elif learning:
+            steered = self._guided(input, wanted, error, weight, axis)
+        if steered is not None:
+            first, second = (input, wanted) if error is None else (error, None)
+            pull = self._pull(first, second, None if weight is None else weight.detach(), axis, steered)
+            input, wanted, error = input.detach(), wanted.detach(), None if error is None else error.detach()
         norm = self._log_normalizer(kappa, d, bound).to(dtype) if self.normalize else None
         kappa, d = (p.to(torch.promote_types(p.dtype, dtype)) for p in (kappa, d))
         if self.reduction == "none":

@@ -67,6 +67,7 @@ TESTED = {
     "examples/lightning/bursty_series.py": "test_lightning_examples.py",
     "examples/lightning/speed.py": "test_lightning_examples.py",
     "examples/lightning/noisy_labels.py": "test_noisy_labels.py",
+    "examples/density/heavy_tails.py": "test_heavy_tails.py",
     "examples/concealed_physics/magnetometer/real_recordings.py": "test_real_recordings.py",
     "examples/concealed_physics/dynamics/falling_balls.py": "test_concealed_dynamics.py",
     "examples/concealed_physics/dynamics/baselines.py": "test_dynamics_baselines.py",

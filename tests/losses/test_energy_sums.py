@@ -84,6 +84,32 @@ def test_a_gaussian_channel_is_half_the_squared_error_to_the_bit():
     torch.testing.assert_close(out, (0.5 * error.detach().square()).sum(0), rtol=1e-6, atol=0.0)
 
 
+@pytest.mark.parametrize("size", [1e8, 1e14, 1.8e19])
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("rows", [1, _LARGE // 2 + 1])
+def test_a_gaussian_channel_is_so_as_far_as_single_precision_holds_the_square(size, weighted, rows):
+    error = torch.zeros(rows, 2)
+    error[0] = torch.tensor([size, 3.0])
+    weight = torch.ones_like(error) if weighted else None
+    leaf = error.requires_grad_()
+    sums = energy_sums(leaf, torch.tensor([0.0, 1.0]), torch.ones(2), weight)
+    (pull,) = torch.autograd.grad(sums.sum(), leaf)
+    assert sums[0].item() == pytest.approx(0.5 * size**2, rel=1e-6)
+    assert sums[1].item() == pytest.approx(1.0 - math.exp(-4.5), rel=1e-6)
+    assert pull[0, 0].item() == pytest.approx(size, rel=1e-6)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("by_kappa", [False, True])
+def test_beyond_that_it_is_infinite_and_pulls_as_it_should(weighted, by_kappa):
+    leaf = torch.tensor([[1e30], [2.0]], requires_grad=True)
+    weight = torch.ones(2, 1) if weighted else None
+    sums = energy_sums(leaf, torch.zeros(1, requires_grad=by_kappa), torch.ones(1), weight)
+    (pull,) = torch.autograd.grad(sums, leaf)
+    assert sums.item() == math.inf
+    torch.testing.assert_close(pull, leaf.detach())
+
+
 @pytest.mark.parametrize("size", [1e10, 1e19, 1e30])
 def test_an_error_whose_square_overflows_pulls_at_nothing(size):
     error = torch.tensor([[0.5], [size]], requires_grad=True)

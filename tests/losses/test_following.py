@@ -125,6 +125,19 @@ def test_half_of_the_targets_may_be_wrong(kind):
     assert error < absolute
 
 
+def test_half_of_the_targets_may_be_permuted_among_each_other():
+    errors = []
+    for seed in (3, 4):
+        x, truth, y = sampled(seed)
+        rows = torch.randperm(N, generator=generator(seed))[: N // 2]
+        y[rows] = y[rows.roll(1)]
+        losses = MKCLoss(1), nn.L1Loss(), nn.MSELoss()
+        errors.append([off(trained(loss, x, y, seed), x, truth) for loss in losses])
+    ours, absolute, squares = torch.tensor(errors).mean(0).tolist()
+    assert ours < absolute
+    assert ours < 0.9 * squares
+
+
 def test_sigma_and_d_describe_the_noise():
     x, _, y = sampled(noise=0.3)
     clean, heavy = MKCLoss(1), MKCLoss(1)

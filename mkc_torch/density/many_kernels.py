@@ -1,0 +1,191 @@
+"""Several kernels on one channel: a tail that thins out as far errors do, where a single kernel's is flat.
+
+The energy is Σ_j θ_j (1 - exp(-e² / (2 h_j²))), one kernel for each of a ladder of bandwidths and one of infinite
+bandwidth, e². A single kernel of depth θ = σ² and bandwidth h = σ d is the MKC density. A continuum of kernels is a
+Student-t's, since log(1 + e²) = ∫ (1 - exp(-t e²)) exp(-t) / t dt. In the depths θ ≥ 0 the density is an exponential
+family, so its likelihood has one maximum: no start, and no bandwidth to choose.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mkc_torch._support.arguments import as_numbers, refuse_not_real
+from mkc_torch._support.order_statistic import robust_scale
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["KernelsFit", "fit_kernels"]
+
+_NARROWEST, _RATIO = 0.5, 2.0
+"""The least bandwidth in robust scales, and of each to the one before: octaves. Set on draws of Cauchy's
+and Gauss's distribution."""
+
+_LEAST_ERROR = 0.02
+"""In robust scales: smaller errors count as this, for errors of exactly 0 would make the density a spike."""
+
+_NODES = 400
+"""Of the normaliser's quadrature, evenly in asinh(error): for 1e8 scales an error of 1e-9 nats."""
+
+_RULE = np.polynomial.legendre.leggauss(_NODES)
+
+_BARRIERS = tuple(10.0**-k for k in range(1, 10))
+"""Of -μ Σ log θ, which keeps depths positive, one after the other: the last costs 1e-8 nats."""
+
+_STEPS, _REST = 50, 1e-10
+"""Of Newton's method for each barrier at most, and the decrease in nats below which it rests."""
+
+
+@dataclass(frozen=True)
+class KernelsFit:
+    """The density of errors that :func:`fit_kernels` found.
+
+    Attributes:
+        bandwidth: of the kernels, in the unit of the errors, ``inf`` last, (J,) for each channel.
+        depth: how deep each kernel makes the energy, in nats, (J,) for each channel; at most so much of it is lost far
+            from 0. That of the infinite bandwidth is of ``(e / bound)² / 2``.
+        bound: half-width of the domain, (m,).
+        log_likelihood: mean, in nats per error, (m,); compare only at equal bounds.
+    """
+
+    bandwidth: tuple[Float[Tensor, " J"], ...]
+    depth: tuple[Float[Tensor, " J"], ...]
+    bound: Float[Tensor, " m"]
+    log_normalizer: Float[Tensor, " m"]
+    log_likelihood: Float[Tensor, " m"]
+
+    def energy(self, error: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
+        """What the negative log-density is above its value at 0; beyond the bound as on it."""
+        size = torch.minimum(error.abs().to(self.bound), self.bound)
+        channels = zip(size.unbind(-1), self.bandwidth, self.depth, self.bound, strict=True)
+        return torch.stack([_features(e, h, a) @ depth for e, h, depth, a in channels], -1)
+
+    def log_prob(self, error: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
+        """The log-density of errors."""
+        return -self.energy(error) - self.log_normalizer
+
+
+def fit_kernels(error: Float[Tensor, "N m"], *, bound: float | Float[Tensor, " m"] | None = None) -> KernelsFit:
+    """The likeliest depths of a ladder of kernels, for residuals whose tails thin out: delays, returns, claims.
+
+    Where wrong values lie evenly anywhere, :func:`mkc_torch.fit_density` has the same density in two numbers.
+
+    Args:
+        error: residuals (N, m), centred as the fit left them.
+        bound: half-width of the domain; by default the largest of the errors in size.
+
+    Raises:
+        TypeError: residuals that are no real tensor.
+        ValueError: fewer than two residuals, non-finite ones, more than half of a channel's equal to 0, or a bound
+            below four robust scales of them.
+
+    Example:
+        >>> u = (torch.arange(4000, dtype=torch.float64) + 0.5) / 4000
+        >>> cauchy = torch.tan(math.pi * (u - 0.5)).unsqueeze(-1)
+        >>> fit = fit_kernels(cauchy)
+        >>> far = fit.log_prob(torch.tensor([[10.0], [100.0]], dtype=torch.float64)).exp()
+        >>> bool((far[0] / far[1]).log10().round() == 2)  # as the square of the error
+        True
+    """
+    refuse_not_real("error", error)
+    if error.dim() != 2 or len(error) < 2 or error.shape[1] == 0 or not bool(torch.isfinite(error).all()):
+        raise ValueError(
+            f"Expected argument `error` of shape (N >= 2, m), finite throughout, but got {tuple(error.shape)}; one "
+            "channel is error.unsqueeze(-1), and residuals that are not finite must be left out."
+        )
+    error = error.detach().double()
+    scale = robust_scale(error, None)
+    if not bool((scale > 0).all()):
+        raise ValueError(
+            f"Expected argument `error` with a robust scale above 0 but got {scale.tolist()}: half of a channel's "
+            "residuals are 0, which is no density."
+        )
+    largest = error.abs().amax(0)
+    half_width = torch.maximum(largest, 4.0 * scale) if bound is None else as_numbers("bound", bound).double()
+    half_width = half_width.to(error.device).expand_as(scale)
+    if not bool((half_width >= 4.0 * scale).all()):
+        raise ValueError(
+            f"Expected argument `bound` to be at least four robust scales of the residuals, {(4.0 * scale).tolist()}, "
+            f"but got {bound}; it is the half-width of the domain that errors can lie in."
+        )
+    found = [_fitted(*channel) for channel in zip(error.unbind(-1), scale, half_width, strict=True)]
+    bandwidth, depth, log_normalizer, log_likelihood = zip(*found, strict=True)
+    return KernelsFit(bandwidth, depth, half_width, torch.stack(log_normalizer), torch.stack(log_likelihood))
+
+
+def _fitted(error: Float[Tensor, " N"], scale: Tensor, bound: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Bandwidths, depths, log-normaliser and mean log-likelihood of one channel."""
+    octaves = math.floor(math.log(float(bound / scale) / _NARROWEST, _RATIO))
+    ladder = [_NARROWEST * float(scale) * _RATIO**k for k in range(octaves + 1)]
+    bandwidth = error.new_tensor([*ladder, math.inf])
+    size = torch.minimum(error.abs().clamp(min=_LEAST_ERROR * float(scale)), bound)
+    # and one error more at the bound: where none was seen, the likeliest tail would be none at all
+    mean = _features(torch.cat([size, bound.unsqueeze(0)]), bandwidth, bound).mean(0)
+    nodes, weights = _quadrature(scale, bound)
+    basis = _features(nodes, bandwidth, bound)
+    depth = torch.full_like(mean, 0.5)
+    for barrier in _BARRIERS:
+        for _ in range(_STEPS):
+            depth, decrease = _newton_step(depth, mean, basis, weights, barrier)
+            if decrease < _REST:
+                break
+    log_normalizer = _log_normalizer(depth, basis, weights)
+    own = _features(size, bandwidth, bound).mean(0)
+    return bandwidth, depth, log_normalizer, -(own @ depth) - log_normalizer
+
+
+def _features(size: Float[Tensor, " N"], bandwidth: Float[Tensor, " J"], bound: Tensor) -> Float[Tensor, "N J"]:
+    """``1 - exp(-e² / (2 h²))`` of each kernel; of the infinite one ``(e / bound)² / 2``."""
+    finite = -torch.expm1(-0.5 * (size.unsqueeze(-1) / bandwidth[:-1]).square())
+    return torch.cat([finite, 0.5 * (size / bound).square().unsqueeze(-1)], -1)
+
+
+def _quadrature(scale: Tensor, bound: Tensor) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
+    """Nodes in (0, bound), dense near 0 and evenly in the logarithm far away, and weights for both signs."""
+    x, w = (torch.from_numpy(v).to(bound) for v in _RULE)
+    near = 0.1 * scale
+    reach = torch.asinh(bound / near)
+    place = 0.5 * (x + 1.0) * reach
+    return near * place.sinh(), near * place.cosh() * reach * w
+
+
+def _log_normalizer(depth: Tensor, basis: Tensor, weights: Tensor) -> Tensor:
+    return torch.log(weights @ torch.exp(-basis @ depth))
+
+
+def _newton_step(
+    depth: Float[Tensor, " J"],
+    mean: Float[Tensor, " J"],
+    basis: Float[Tensor, "K J"],
+    weights: Float[Tensor, " K"],
+    barrier: float,
+) -> tuple[Float[Tensor, " J"], float]:
+    """The depths after a step on the mean negative log-likelihood with its barrier, and by how much that fell."""
+
+    def value(at: Tensor) -> Tensor:
+        return mean @ at + _log_normalizer(at, basis, weights) - barrier * at.log().sum()
+
+    density = weights * torch.exp(-basis @ depth)
+    density = density / density.sum()
+    expected = density @ basis
+    centred = basis - expected
+    gradient = mean - expected - barrier / depth
+    hessian = (centred * density.unsqueeze(-1)).mT @ centred + torch.diag(barrier / depth.square())
+    # in units of the depths, where the barrier's part is the same for all
+    step = -depth * torch.linalg.solve(hessian * torch.outer(depth, depth), depth * gradient)
+    shrinks = step < 0
+    length = min(1.0, 0.95 * float((depth / -step)[shrinks].min())) if bool(shrinks.any()) else 1.0
+    before, slope = value(depth), gradient @ step
+    while length > 1e-12:
+        after = value(depth + length * step)
+        if after <= before + 1e-4 * length * slope:
+            return depth + length * step, float(before - after)
+        length *= 0.5
+    return depth, 0.0

@@ -1,0 +1,111 @@
+"""Several kernels on one channel: what they hold, held-out likelihood, the normaliser, and what is refused."""
+
+import math
+
+import pytest
+import torch
+from scipy import stats
+
+from mkc_torch import MKCDistribution, fit_density, fit_kernels
+
+
+def drawn(seed, freedom, count=4000):
+    return torch.as_tensor(stats.t(freedom).rvs(count, random_state=seed)).unsqueeze(-1)
+
+
+def mixed(seed, count=4000):
+    g = torch.Generator().manual_seed(seed)
+    error = torch.randn(count, 1, generator=g, dtype=torch.float64)
+    error[: count // 5] = 40.0 * torch.rand(count // 5, 1, generator=g, dtype=torch.float64) - 20.0
+    return error
+
+
+def of_one_kernel(learned, other, bound):
+    fit = fit_density(learned, bound=bound)
+    return float(MKCDistribution(fit.sigma, fit.d, fit.bound).log_prob(other).mean())
+
+
+@pytest.mark.parametrize("freedom", [1.0, 1.5, 3.0])
+@pytest.mark.parametrize("seed", [10, 11])
+def test_a_tail_that_thins_out_is_held_out_as_by_its_own_density_and_far_better_than_a_flat_one(freedom, seed):
+    learned, other = drawn(seed, freedom), drawn(seed + 100, freedom)
+    bound = 1.001 * float(torch.cat([learned, other]).abs().max())
+    several = float(fit_kernels(learned, bound=bound).log_prob(other).mean())
+    truth = float(stats.t(freedom).logpdf(other).mean())
+    assert several == pytest.approx(truth, abs=5e-3)
+    assert several > of_one_kernel(learned, other, bound) + (0.02 if freedom < 3.0 else 0.005)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_wrong_values_anywhere_and_none_at_all_are_described_as_by_one_kernel(seed):
+    normal = torch.randn(4000, 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    for error, bound in ((mixed(seed), 20.0), (normal, 10.0)):
+        order = torch.randperm(4000, generator=torch.Generator().manual_seed(seed))
+        learned, other = error[order[:2000]], error[order[2000:]]
+        one = of_one_kernel(learned, other, bound)
+        assert float(fit_kernels(learned, bound=bound).log_prob(other).mean()) == pytest.approx(one, abs=0.01)
+
+
+def test_the_density_integrates_to_one_over_its_domain():
+    error = torch.cat([drawn(0, 1.0), mixed(1)], -1)
+    fit = fit_kernels(error)
+    for k in range(2):
+        place = torch.linspace(0.0, math.asinh(1e3 * float(fit.bound[k])), 100_001, dtype=torch.float64)
+        size = (place.sinh() / 1e3).unsqueeze(-1).expand(-1, 2)
+        mass = torch.trapezoid(fit.log_prob(size)[:, k].exp(), size[:, k])
+        assert 2.0 * float(mass) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_no_other_depths_are_likelier():
+    error = drawn(3, 2.0, 500)
+    fit = fit_kernels(error, bound=60.0)
+    # the fit counts one error more at the bound
+    counted = torch.cat([error, fit.bound.unsqueeze(0)])
+
+    def likelihood(depth):
+        size = torch.linspace(0.0, 60.0, 60_001, dtype=torch.float64).unsqueeze(-1)
+        other = type(fit)(fit.bandwidth, (depth,), fit.bound, fit.log_normalizer, fit.log_likelihood)
+        norm = torch.log(2.0 * torch.trapezoid(torch.exp(-other.energy(size))[:, 0], size[:, 0]))
+        return float(-(other.energy(counted).mean() + norm))
+
+    best = likelihood(fit.depth[0])
+    for seed in range(20):
+        stretch = 0.3 * torch.randn(len(fit.depth[0]), generator=torch.Generator().manual_seed(seed)).double()
+        assert likelihood(fit.depth[0] * stretch.exp() + 0.01 * stretch.abs()) < best + 1e-6
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_another_unit_changes_the_density_by_that_unit_alone(unit):
+    error = drawn(2, 2.0, 1000)
+    one, other = fit_kernels(error), fit_kernels(unit * error)
+    torch.testing.assert_close(one.log_prob(error), other.log_prob(unit * error) + math.log(unit))
+    assert float(one.log_likelihood) == pytest.approx(float(one.log_prob(error).mean()), abs=1e-3)
+
+
+def test_channels_are_fitted_apart():
+    both = torch.cat([drawn(0, 1.0), 7.0 * drawn(1, 5.0)], -1)
+    fit = fit_kernels(both)
+    for k in range(2):
+        alone = fit_kernels(both[:, k : k + 1])
+        torch.testing.assert_close(fit.log_prob(both)[:, k], alone.log_prob(both[:, k : k + 1])[:, 0])
+
+
+def test_residuals_that_are_hit_exactly_do_not_make_a_spike():
+    error = drawn(0, 3.0)
+    error[:1200] = 0.0
+    assert float(fit_kernels(error).log_prob(torch.zeros(1, 1)).exp()) < 100.0
+
+
+@pytest.mark.parametrize(
+    ("error", "bound", "match"),
+    [
+        (torch.zeros(5), None, r"shape \(N >= 2, m\)"),
+        (torch.zeros(1, 1), None, r"shape \(N >= 2, m\)"),
+        (torch.tensor([[1.0], [math.nan]]), None, "not finite must be left out"),
+        (torch.tensor([[0.0], [0.0], [0.0], [1.0]]), None, "a robust scale above 0"),
+        (torch.tensor([[-1.0], [1.0], [2.0]]), 3.0, "at least four robust scales"),
+    ],
+)
+def test_what_has_no_density_is_refused(error, bound, match):
+    with pytest.raises(ValueError, match=match):
+        fit_kernels(error, bound=bound)
