@@ -9,7 +9,11 @@ import argparse
 import itertools
 import statistics
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +100,7 @@ def spoilt(target: Tensor, kind: str, share: float, generator: torch.Generator) 
     wrong, new = torch.zeros(len(target), dtype=torch.bool), target.clone()
     wrong[rows] = True
     drawn = torch.rand(count, 1, generator=generator)
-    if kind == "permuted":
+    if kind in ("permuted", "none"):
         new[rows] = target[rows[torch.randperm(count, generator=generator)]]
     elif kind == "uniform":
         new[rows] = target.mean() + size * (20.0 * drawn - 10.0)
@@ -184,6 +188,12 @@ def outcomes(name: str, kind: str, share: float, seed: int, *, steps: int, clean
     return told
 
 
+def row(case: tuple[str, str, float], *, seeds: int, steps: int, cleaner: bool) -> list[dict[str, Outcome]]:
+    """Of one table, kind and share, over the seeds."""
+    table, kind, share = case
+    return [outcomes(table, kind, share, seed, steps=steps, cleaner=cleaner) for seed in range(seeds)]
+
+
 def page(rows: dict[tuple[str, str, float], list[dict[str, Outcome]]]) -> str:
     """Every row, and the average ranks."""
     names = list(next(iter(rows.values()))[0])
@@ -240,19 +250,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--no-cleaner", action="store_true", help="leave cleanlab out: it takes most of the time")
+    parser.add_argument("--workers", type=int, default=2, help="processes, each in one thread")
     parser.add_argument("--output", type=Path, default=Path("wrong_targets"))
     chosen = parser.parse_args(arguments)
     chosen.output.mkdir(parents=True, exist_ok=True)
+    cases = [
+        (table, kind if share else "none", share)
+        for table, share, kind in itertools.product(chosen.tables, chosen.shares, KINDS)
+        if share or kind == KINDS[0]
+    ]
+    run = partial(row, seeds=chosen.seeds, steps=chosen.steps, cleaner=not chosen.no_cleaner)
     rows: dict[tuple[str, str, float], list[dict[str, Outcome]]] = {}
-    for table, share, kind in itertools.product(chosen.tables, chosen.shares, KINDS):
-        if share == 0.0 and kind != KINDS[0]:
-            continue
-        rows[table, kind if share else "none", share] = [
-            outcomes(table, kind, share, seed, steps=chosen.steps, cleaner=not chosen.no_cleaner)
-            for seed in range(chosen.seeds)
-        ]
-        print(page(dict([list(rows.items())[-1]])).splitlines()[2], flush=True)
-        (chosen.output / "wrong_targets.md").write_text(page(rows), encoding="utf-8")
+    pool = None
+    if chosen.workers > 1:
+        pool = ProcessPoolExecutor(chosen.workers, get_context("spawn"), torch.set_num_threads, (1,))
+    with pool or nullcontext():
+        answers = map(run, cases) if pool is None else pool.map(run, cases)
+        for case, runs in zip(cases, answers, strict=True):
+            rows[case] = runs
+            print(page({case: runs}).splitlines()[2], flush=True)
+            (chosen.output / "wrong_targets.md").write_text(page(rows), encoding="utf-8")
     picture(chosen.output / "wrong_targets.png", rows)
 
 
