@@ -19,7 +19,7 @@ from mkc_torch.losses._bandwidth import choice
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["BEFORE", "SEARCH_EVERY", "Followed", "Following"]
+__all__ = ["BEFORE", "SEARCH_EVERY", "Followed", "Following", "bound_of", "scale_of"]
 
 _QUANTILE, _NORMAL = 0.4, 0.5244005
 """Of the absolute residuals, and what it is of a standard normal variable. Below one half it stays among the right
@@ -60,15 +60,15 @@ class Followed(NamedTuple):
     far: Float[Tensor, " m"]
     floor: Float[Tensor, " m"]
 
-    @property
-    def scale(self) -> Float[Tensor, " m"]:
-        """Robust standard deviation about 0 of the recent residuals."""
-        return self.log_scale.exp()
 
-    @property
-    def bound(self) -> Float[Tensor, " m"]:
-        """Half the range of the residuals, and no less than ten scales."""
-        return torch.maximum(self.far, _TEN_SCALES * self.scale)
+def scale_of(state: Followed) -> Float[Tensor, " m"]:
+    """Robust standard deviation about 0 of the recent residuals."""
+    return state.log_scale.exp()
+
+
+def bound_of(state: Followed) -> Float[Tensor, " m"]:
+    """Half the range of the residuals, and no less than ten scales."""
+    return torch.maximum(state.far, _TEN_SCALES * scale_of(state))
 
 
 class Following(nn.Module):
@@ -112,12 +112,22 @@ class Following(nn.Module):
     @property
     def state(self) -> Followed:
         """What is known; of its own memory where a gradient may need it, for the next batch changes the buffers."""
-        known = Followed(*(getattr(self, name) for name in Followed._fields))
-        return Followed(*known[:4], *(value.clone() for value in known[4:]))
+        # each by its name, which compiled code of older torch can follow
+        return Followed(
+            recent=self.recent,
+            predicted=self.predicted,
+            counts=self.counts,
+            seen=self.seen,
+            log_scale=self.log_scale.clone(),
+            log_bandwidth=self.log_bandwidth.clone(),
+            turned=self.turned.clone(),
+            far=self.far.clone(),
+            floor=self.floor.clone(),
+        )
 
     @torch.no_grad()
     def keep(self, state: Followed) -> None:
-        for name, value in state._asdict().items():
+        for name, value in zip(Followed._fields, state, strict=True):
             getattr(self, name).copy_(value)
 
     @torch.no_grad()
@@ -161,12 +171,14 @@ class Following(nn.Module):
         spread = ((recent - middle).abs() * share).sum(-1)
         # an offset widens the scale, targets that are wrong by far the spread
         floor = _FLOOR * torch.where(spread > 0, torch.minimum(spread, log_scale.exp()), log_scale.exp())
-        state = old._replace(
+        state = Followed(
             recent=recent,
             predicted=predicted,
             counts=counts,
             seen=old.seen + 1.0,
             log_scale=log_scale,
+            log_bandwidth=old.log_bandwidth,
+            turned=old.turned,
             far=torch.where(first, far, torch.maximum(far, _FADES * old.far)),
             floor=torch.where(first, floor, old.floor),
         )
@@ -187,14 +199,21 @@ class Following(nn.Module):
 
     def _turning(self, state: Followed, old: Followed, known: Tensor) -> Followed:
         """The state with the bandwidth looked for; less of the first loss where another is better, more where not."""
-        scaled = state.recent / state.scale.unsqueeze(-1)
+        scaled = state.recent / scale_of(state).unsqueeze(-1)
         found = choice(*(values[:, -_OF_SEARCH:] for values in (scaled, state.predicted, state.counts)))
         rate = torch.clamp(SEARCH_EVERY / (old.seen + 1.0), min=1.0 - (1.0 - _RATE) ** SEARCH_EVERY, max=1.0)
         step = torch.where(found.better, SEARCH_EVERY * self.step, -SEARCH_EVERY * self.step)
         late = (old.seen >= self.alone) & known
-        return state._replace(
+        return Followed(
+            recent=state.recent,
+            predicted=state.predicted,
+            counts=state.counts,
+            seen=state.seen,
+            log_scale=state.log_scale,
             log_bandwidth=old.log_bandwidth + rate * (found.bandwidth.log() - old.log_bandwidth),
             turned=torch.where(late, old.turned + step, old.turned).clamp(0.0, 1.0),
+            far=state.far,
+            floor=state.floor,
         )
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mkc_torch.losses._checks import Reduction
-from mkc_torch.losses._following import SEARCH_EVERY, Followed, Following
+from mkc_torch.losses._following import SEARCH_EVERY, Followed, Following, bound_of, scale_of
 from mkc_torch.losses._state_dict import logit_of_scale, ratio_of
 from mkc_torch.losses._steering import late_of, limited, steered, steered_each
 
@@ -69,7 +69,7 @@ class FollowsResiduals(nn.Module):
         self._turned, self._passes = False, 0 if guide is None else int(guide.seen)
 
     def _followed_d(self, state: Followed) -> Float[Tensor, " m"]:
-        scale = state.scale
+        scale = scale_of(state)
         if self.raw_d is not None:
             scale = scale * ratio_of(self.raw_d)
         bound, floor = self._domain(state)
@@ -77,7 +77,7 @@ class FollowsResiduals(nn.Module):
 
     def _domain(self, state: Followed) -> tuple[Float[Tensor, " m"], Float[Tensor, " m"]]:
         """Bound and floor of d."""
-        return self.bound if self._own_bound else state.bound, self.d_min if self._own_floor else state.floor
+        return self.bound if self._own_bound else bound_of(state), self.d_min if self._own_floor else state.floor
 
     def _state(self, input: Tensor, target: Tensor, error: Tensor | None, weight: Tensor | None, axis: int) -> Followed:
         """What is known with this batch; kept in training, but under transforms of functions, which have no state."""

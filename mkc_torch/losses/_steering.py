@@ -10,7 +10,7 @@ from torch import Tensor
 from mkc_torch.density.energy import energy
 from mkc_torch.losses._energy_sums import energy_sums
 from mkc_torch.losses._first_loss import first_loss
-from mkc_torch.losses._following import Followed
+from mkc_torch.losses._following import Followed, scale_of
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -30,13 +30,13 @@ class Late(NamedTuple):
 
 def late_of(state: Followed) -> Late:
     """That of the bandwidth found."""
-    return Late(torch.exp(-2.0 * state.log_bandwidth), state.scale)
+    return Late(torch.exp(-2.0 * state.log_bandwidth), scale_of(state))
 
 
 def limited(state: Followed, kappa: Float[Tensor, " m"], d: Float[Tensor, " m"]) -> Late:
     """That of a likelihood, but no wider than the bandwidth found."""
     widest = state.log_bandwidth.exp()
-    least = torch.where(widest < _AS_GOOD_AS_NONE, (d / (widest * state.scale)).square(), 0.0)
+    least = torch.where(widest < _AS_GOOD_AS_NONE, (d / (widest * scale_of(state))).square(), 0.0)
     return Late(torch.maximum(kappa, least), d)
 
 
@@ -62,7 +62,7 @@ def steered(
         turned: whether the first loss has no part any more.
     """
     dtype = input.dtype
-    scale = state.scale.to(dtype)
+    scale = scale_of(state).to(dtype)
     after = energy_sums(input, late.kappa.to(dtype), late.d.to(dtype), weight, axis, target=target)
     if turned:
         return after
@@ -80,5 +80,5 @@ def steered_each(error: Tensor, axis: int, state: Followed, late: Late) -> Tenso
     """The same for each element, without weights."""
     shape = [1] * error.dim()
     shape[axis] = -1
-    kappa, d, scale, share = (one.to(error.dtype).view(shape) for one in (*late, state.scale, state.turned))
+    kappa, d, scale, share = (one.to(error.dtype).view(shape) for one in (*late, scale_of(state), state.turned))
     return share * energy(error / d, kappa) + (1.0 - share) * first_loss(error / scale)
