@@ -41,7 +41,8 @@ class MKCDistribution(Distribution):
         d: scale > 0, in the unit of the values.
         bound: half-width of the domain, above 0 and finite, in the unit of the values.
         loc: centre.
-        validate_args: as in every torch distribution; False leaves the values of all arguments unseen.
+        validate_args: False leaves the values of all arguments unseen. By default they are looked at, but in compiled
+            code; torch's own default is switched off for the whole process by the first ``torch.compile``.
 
     The parameters broadcast. ``rsample`` and ``icdf`` are differentiable once in all four by implicit differentiation
     of the distribution function.
@@ -81,7 +82,8 @@ class MKCDistribution(Distribution):
         for name, value in (("sigma", sigma), ("d", d), ("bound", bound), ("loc", loc)):
             as_numbers(name, value)
         self.sigma, self.d, self.bound, self.loc = torch.broadcast_tensors(*as_computed(sigma, d, bound, loc))
-        super().__init__(self.sigma.shape, validate_args=validate_args)
+        validated = not torch.compiler.is_compiling() if validate_args is None else validate_args
+        super().__init__(self.sigma.shape, validate_args=validated)
 
     def expand(self, batch_shape: _Shape, _instance: MKCDistribution | None = None) -> MKCDistribution:
         """The same distribution with its batch dimensions broadcast to ``batch_shape``."""

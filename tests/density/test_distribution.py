@@ -516,7 +516,9 @@ def test_repr_names_the_parameters():
     assert all(name in text for name in ("sigma: 2.0", "d: 1.0", "bound: 5.0", "loc: 0.0"))
 
 
+@pytest.mark.parametrize("default", [True, False])
 @pytest.mark.parametrize("bound", [math.inf, 0.0, -1.0, math.nan])
-def test_a_domain_without_an_end_is_refused(bound):
+def test_a_domain_without_an_end_is_refused_whatever_torch_has_for_a_default(bound, default, monkeypatch):
+    monkeypatch.setattr(torch.distributions.Distribution, "_validate_args", default)
     with pytest.raises(ValueError, match="parameter bound"):
         MKCDistribution(2.0, 1.0, bound)
