@@ -244,8 +244,12 @@ class RobustInference(Inference):
         equation: Scores,
         influence_of: Callable[[Tensor | None], Tensor],
         ratio: float,
+        widening: Float[Tensor, " B"] | None = None,
     ) -> None:
-        self.covariance_ = robust_covariance(problem, equation, influence_of, self.covariance, self.bandwidth)
+        covariance = robust_covariance(problem, equation, influence_of, self.covariance, self.bandwidth)
+        if widening is not None:
+            covariance = covariance * problem.restore(widening.square())[..., None, None]
+        self.covariance_ = covariance
         self.dof_ = problem.restore(degrees_of_freedom(problem))
         self.r_squared_ = problem.restore(robust_r_squared(problem, beta, weight, ratio))
 

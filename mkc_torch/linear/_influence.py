@@ -192,6 +192,11 @@ def robust_covariance(
     return problem.restore(torch.where((left > 0)[:, None, None], covariance, torch.inf))
 
 
+def coefficients_a_value(problem: LinearProblem) -> Float[Tensor, " B"]:
+    """n / N over all channels: what corrections for small samples grow with."""
+    return problem.num_coefficients / problem.total_weight().sum(-1)
+
+
 def degrees_of_freedom(problem: LinearProblem) -> Float[Tensor, " B"]:
     """Values less coefficients, where a weight counts how often a value occurs."""
     return problem.total_weight().sum(-1) - problem.num_coefficients

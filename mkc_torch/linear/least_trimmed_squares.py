@@ -15,7 +15,7 @@ from mkc_torch._support.arguments import checked_whole
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._inference import RobustInference
-from mkc_torch.linear._influence import Scores, influence
+from mkc_torch.linear._influence import Scores, coefficients_a_value, influence
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._scale_search import minimise_scale, relative_precision, rounding_scale
 from mkc_torch.linear.covariance import RobustCovarianceKind
@@ -135,6 +135,14 @@ def trimmed_equation(
     return Scores(z * weight, weight * slope.unsqueeze(-2), z, scale)
 
 
+_SMALL_SAMPLE = 26.0
+"""Standard errors grow by the square of this times the share trimmed times the coefficients a value.
+
+From Gaussian draws of 2, 4 and 8 coefficients with 10 to 80 samples each and half of them trimmed, whose errors are
+2.8, 1.4, 1.0 and 0.9 times what large samples let expect, for the fit was chosen to make its residuals small.
+"""
+
+
 class LeastTrimmedSquares(RobustInference):
     """Least sum of the h smallest squared residuals, (24) of Indiveri (2009).
 
@@ -161,7 +169,7 @@ class LeastTrimmedSquares(RobustInference):
     Attributes, after ``fit``:
         coef_: (*, n); its gradient is that of least squares on the values that count.
         covariance_, dof_: (*, n, n), (*,); the asymptotic covariance (Butler, "Nonparametric interval and point
-            prediction using data trimmed by a Grubbs-type outlier rule", 1982), good from 40 samples a coefficient on.
+            prediction using data trimmed by a Grubbs-type outlier rule", 1982), widened in small samples.
         scale_: (*, m), m being 1 for one channel: trimmed root mean square, made consistent for Gaussian residuals.
         objective_: (*, m): sum of the h smallest squared residuals.
         weights_: 1 for the values that count, else 0, (*, N, m).
@@ -241,6 +249,7 @@ class LeastTrimmedSquares(RobustInference):
             equation,
             lambda share: influence(problem, equation, None, share),
             gaussian_consistency(h / N) ** 2,
+            1.0 + (_SMALL_SAMPLE * (N - h) / N * coefficients_a_value(problem)).square(),
         )
         self.exact_ = problem.num_channels == 1 and (h == N or _few_choices(problem, h))
         self.n_iter_ = n_iter

@@ -13,7 +13,7 @@ from mkc_torch._support.arguments import checked_number, checked_whole, told
 from mkc_torch._support.arrays import Data
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._inference import RobustInference
-from mkc_torch.linear._influence import Scores, influence
+from mkc_torch.linear._influence import Scores, coefficients_a_value, influence
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._robust_start import residual_scale
 from mkc_torch.linear._scale_search import relative_precision, rounding_scale
@@ -129,15 +129,14 @@ class ReweightedLeastSquares(RobustInference):
         z = problem.residual(beta) / scale.unsqueeze(-2)
         equation = Scores(z * weight, weight, z, scale)
         inside, edge = _gaussian_edge(self.threshold)
-        few = (problem.num_coefficients / problem.total_weight().sum(-1))[:, None, None]
 
         def influence_of(share: Tensor | None) -> Tensor:
             moved = influence(problem, equation, None, share)
             start = self._start_influence(problem, share)
-            moved = moved if start is None else moved + edge / inside * start
-            return (1.0 + _SMALL_SAMPLE * few) * moved
+            return moved if start is None else moved + edge / inside * start
 
-        self._infer(problem, beta, weight, equation, influence_of, inside / (inside - edge))
+        wider = 1.0 + _SMALL_SAMPLE * coefficients_a_value(problem)
+        self._infer(problem, beta, weight, equation, influence_of, inside / (inside - edge), wider)
 
     def _start_influence(self, problem: LinearProblem, share: Tensor | None) -> Tensor | None:
         """What each sample moves the start's coefficients by, in the basis, where that is known."""
@@ -164,7 +163,7 @@ class ReweightedLeastSquares(RobustInference):
 
 
 _SMALL_SAMPLE = 4.0
-"""Standard errors grow by this times the coefficients a value: which values count was chosen by the same values.
+"""Standard errors grow by this times the coefficients a value, for which values count was chosen by the same values.
 
 From Gaussian draws of 2, 4 and 8 coefficients with 10 to 80 samples each, whose errors are 1.4, 1.2, 1.1 and 1.0 times
 what large samples let expect.

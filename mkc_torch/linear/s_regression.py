@@ -13,7 +13,15 @@ from mkc_torch._support.arguments import checked_number, checked_whole
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._inference import RobustInference
-from mkc_torch.linear._influence import ScaleInfluence, Scores, influence, m_scale_influence, scores, weighed
+from mkc_torch.linear._influence import (
+    ScaleInfluence,
+    Scores,
+    coefficients_a_value,
+    influence,
+    m_scale_influence,
+    scores,
+    weighed,
+)
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._psi import BISQUARE_50, Psi, bisquare_for_breakdown, bisquare_rho, bisquare_weight
 from mkc_torch.linear._scale_search import ScaleMinimum, minimise_scale, rounding_scale
@@ -150,6 +158,14 @@ def check_starts(starts: int) -> None:
     checked_whole("starts", starts, 1, "500 is usual")
 
 
+_SMALL_SAMPLE = 12.0
+"""Standard errors grow by this times the breakdown point times the coefficients a value.
+
+The fit was chosen to make its residuals small. From Gaussian draws of 2, 4 and 8 coefficients with 10 to 80 samples
+each at a breakdown point of 1/2, whose errors are 2.2, 1.5, 1.2 and 1.07 times what large samples let expect.
+"""
+
+
 class SRegression(RobustInference):
     """S-estimator of regression with Tukey's bisquare.
 
@@ -226,6 +242,7 @@ class SRegression(RobustInference):
             equation,
             lambda share: influence(problem, equation, of_scale, share),
             Psi("tukey", (bisquare_of(self.breakdown),)).ratio(),
+            1.0 + _SMALL_SAMPLE * self.breakdown * coefficients_a_value(problem),
         )
         self.n_iter_ = minimum.n_iter
         self.converged_ = problem.restore(minimum.converged)
