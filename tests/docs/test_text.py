@@ -22,6 +22,7 @@ MANUAL = {
     "loss.md",
     "measured.md",
     "own_simulation.md",
+    "wrong_targets.md",
 }
 COMMON = {"--version", "--help"}
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -81,7 +81,7 @@ def test_robustbase(name):
     np.testing.assert_allclose(error, ours, rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize("name", list(TABLES)[::2])
 def test_statsmodels(name):
     statsmodels = pytest.importorskip("statsmodels.robust.resistant_linear_model")
     regression = pytest.importorskip("statsmodels.robust.robust_linear_model")
