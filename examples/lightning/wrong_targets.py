@@ -159,7 +159,9 @@ def outcomes(name: str, kind: str, share: float, seed: int, *, steps: int, clean
     held, rows = order[: round(HELD_OUT * len(y))], order[round(HELD_OUT * len(y)) :]
     target, wrong = spoilt(y[rows], kind, share, generator)
     middle = target.median()
-    unit = 1.4826 * (target - middle).abs().median().clamp(min=1e-9)
+    apart = (target - middle).abs()
+    # half of the targets may be stuck at one value
+    unit = 1.4826 * apart.median() if apart.median() > 0 else apart.mean()
     target, truth = (target - middle) / unit, (y[held] - middle) / unit
 
     def error(prediction: Tensor) -> float:
