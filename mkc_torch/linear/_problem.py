@@ -79,20 +79,28 @@ class LinearProblem:
         if self.sample_weight is not None:
             stack = stack * self.sample_weight.unsqueeze(1)
         n = self.num_coefficients
-        gram = stack.new_zeros(*stack.shape[:2], n * n)
+        # the half of the symmetric products that differs
+        i, j = torch.triu_indices(n, n, device=stack.device)
+        half = stack.new_zeros(*stack.shape[:2], i.shape[0])
         moment = stack.new_zeros(*stack.shape[:2], n)
+        one_target = self.basis.shape[0] == self.Y.shape[0]
         step = max(1, _CHUNK // (n * n * self.num_channels * self.basis.shape[0]))
         for first in range(0, self.num_samples, step):
             part = slice(first, first + step)
             rows = self.basis[:, part].flatten(-3, -2)
-            outer = (rows.unsqueeze(-1) * rows.unsqueeze(-2)).flatten(-2)
+            y = self.Y[:, part].flatten(-2)
             w = stack[:, :, part].flatten(-2)
-            wy = w * self.Y[:, part].flatten(-2).unsqueeze(1)
-            if rows.shape[0] == 1:
-                rows, outer = rows[0], outer[0]
-            gram += torch.matmul(w, outer)
-            moment += torch.matmul(wy, rows)
-        gram = gram.unflatten(-1, (n, n))
+            outer = rows[..., i] * rows[..., j]
+            if one_target:
+                # both sums in one product
+                both = torch.matmul(w, torch.cat([outer, rows * y.unsqueeze(-1)], dim=-1))
+                half, moment = half + both[..., : i.shape[0]], moment + both[..., i.shape[0] :]
+            else:
+                half = half + torch.matmul(w, outer[0])
+                moment = moment + torch.matmul(w * y.unsqueeze(1), rows[0])
+        place = torch.zeros(n, n, dtype=torch.int64, device=stack.device)
+        place[i, j] = place[j, i] = torch.arange(i.shape[0], device=stack.device)
+        gram = half[..., place]
         return (gram, moment) if weight.dim() == 4 else (gram.squeeze(1), moment.squeeze(1))
 
     def total_weight(self) -> Float[Tensor, "B m"]:

@@ -22,11 +22,13 @@ if TYPE_CHECKING:
 
 
 class ScaleRule(Protocol):
-    """A robust scale of residuals (B, S, N, m)."""
+    """A robust scale of residuals (B, S, N, m); ``near`` is one that it is near to, where that is known."""
 
-    def scale(self, problem: LinearProblem, residual: Tensor) -> Float[Tensor, "B S m"]: ...
+    def scale(self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None) -> Float[Tensor, "B S m"]: ...
 
-    def weighed(self, problem: LinearProblem, residual: Tensor) -> tuple[Float[Tensor, "B S m"], Tensor]:
+    def weighed(
+        self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None
+    ) -> tuple[Float[Tensor, "B S m"], Tensor]:
         """The scale, and the weights in [0, 1] of a step that lowers it, (B, S, N, m)."""
         ...
 
@@ -86,51 +88,55 @@ def rounding_scale(problem: LinearProblem) -> Float[Tensor, "B m"]:
     return 1e3 * torch.finfo(problem.Y.dtype).eps * torch.where(magnitude > 0, magnitude, 1.0)
 
 
-def _step(problem: LinearProblem, beta: Tensor, rule: ScaleRule) -> tuple[Tensor, Tensor]:
-    """Coefficients after one concentration step, and the objective before it."""
-    residual = problem.residual(beta)
-    scale, weight = rule.weighed(problem, residual)
-    objective = _log_product(scale)
-    share = weight if problem.sample_weight is None else weight * problem.sample_weight.unsqueeze(1)
-    spread = (share * residual.square()).sum(-2).sqrt()  # the gradient of log(scale) has its square below
-    return problem.weighted_fit(weight * relative_precision(spread).unsqueeze(-2)), objective
+@dataclass(frozen=True)
+class Search:
+    """How the minimum is looked for.
 
-
-def _best(problem: LinearProblem, beta: Tensor, rule: ScaleRule, count: int) -> Tensor:
-    scale = rule.scale(problem, problem.residual(beta))
-    order = _log_product(scale).topk(min(count, beta.shape[1]), dim=1, largest=False).indices
-    return beta.gather(1, order.unsqueeze(-1).expand(-1, -1, beta.shape[-1]))
-
-
-def minimise_scale(
-    problem: LinearProblem,
-    screening: ScaleRule,
-    final: ScaleRule,
-    *,
-    starts: int = 500,
-    candidates: int = 10,
-    screening_steps: int = 2,
-    max_iter: int = 100,
-    seed: int = 0,
-) -> ScaleMinimum:
-    """A few steps from every start on at most 1500 samples, then the best candidates to convergence on all of them.
-
-    Args:
-        problem: the regression.
-        screening: scale rule for the many starts, which may be approximate.
-        final: exact scale rule.
-        starts: number of elemental starts; least squares is one more.
-        candidates: how many are followed to convergence.
-        screening_steps: steps before the candidates are chosen.
-        max_iter: steps at most.
-        seed: of the elemental starts.
+    ``starts`` elemental sets, least squares being one more, make ``screening_steps`` steps each with a rule that may be
+    approximate. The best ``candidates`` of them go on with the exact rule until a step lowers the logarithm of the
+    scale by less than ``tolerance``, or ``max_iter`` steps; after as many as ``narrowing`` says, only so many go on.
     """
-    per_problem = min(problem.num_samples, _SCREENING_SAMPLES) * problem.num_channels * (starts + 1)
+
+    screening: ScaleRule
+    final: ScaleRule
+    starts: int = 500
+    candidates: int = 10
+    screening_steps: int = 2
+    narrowing: tuple[tuple[int, int], ...] = ()
+    tolerance: float = 0.0
+    max_iter: int = 100
+    seed: int = 0
+
+
+def _step(problem: LinearProblem, beta: Tensor, rule: ScaleRule, near: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Coefficients after one concentration step, and the scale before it."""
+    residual = problem.residual(beta)
+    scale, weight = rule.weighed(problem, residual, near)
+    if problem.num_channels > 1:
+        share = weight if problem.sample_weight is None else weight * problem.sample_weight.unsqueeze(1)
+        spread = (share * residual.square()).sum(-2).sqrt()  # the gradient of log(scale) has its square below
+        weight = weight * relative_precision(spread).unsqueeze(-2)
+    return problem.weighted_fit(weight), scale
+
+
+def _of_starts(values: Float[Tensor, "B S k"], index: Float[Tensor, "B K"]) -> Float[Tensor, "B K k"]:
+    return values.gather(1, index.unsqueeze(-1).expand(-1, -1, values.shape[-1]))
+
+
+def _best(
+    problem: LinearProblem, beta: Tensor, near: Tensor | None, rule: ScaleRule, count: int
+) -> tuple[Tensor, Tensor]:
+    """The coefficients of the ``count`` smallest scales, and these."""
+    scale = rule.scale(problem, problem.residual(beta), near)
+    order = _log_product(scale).topk(min(count, beta.shape[1]), dim=1, largest=False).indices
+    return _of_starts(beta, order), _of_starts(scale, order)
+
+
+def minimise_scale(problem: LinearProblem, search: Search) -> ScaleMinimum:
+    """A few steps from every start on at most 1500 samples, then the best candidates to rest on all of them."""
+    per_problem = min(problem.num_samples, _SCREENING_SAMPLES) * problem.num_channels * (search.starts + 1)
     parts = torch.arange(problem.Y.shape[0], device=problem.Y.device).split(max(1, _CHUNK // per_problem))
-    found = [
-        _minimise(problem.select(i), screening, final, starts, candidates, screening_steps, max_iter, seed)
-        for i in parts
-    ]
+    found = [_minimise(problem.select(i) if len(parts) > 1 else problem, search) for i in parts]
     return ScaleMinimum(
         beta=torch.cat([f.beta for f in found]),
         scale=torch.cat([f.scale for f in found]),
@@ -140,41 +146,67 @@ def minimise_scale(
     )
 
 
-def _minimise(
-    problem: LinearProblem,
-    screening: ScaleRule,
-    final: ScaleRule,
-    starts: int,
-    candidates: int,
-    screening_steps: int,
-    max_iter: int,
-    seed: int,
-) -> ScaleMinimum:
-    generator = torch.Generator().manual_seed(seed)
+_RAW_COEFFICIENTS = 3
+"""Fits through up to so many values are good enough to be ranked as they are."""
+
+_RAW_SHARE = 3
+"""One in so many of the starts goes on where fits are ranked as they are."""
+
+
+def _screened(problem: LinearProblem, search: Search) -> tuple[Float[Tensor, "B S n"], Float[Tensor, "B S m"] | None]:
+    """The candidates, and their scales where they were screened on all samples."""
+    generator = torch.Generator().manual_seed(search.seed)
     small = problem
     if problem.num_samples > _SCREENING_SAMPLES:
         keep = torch.randperm(problem.num_samples, generator=generator)[:_SCREENING_SAMPLES].sort().values
         small = problem.select_samples(keep.to(problem.Y.device))
-    beta = elemental_starts(small, starts, generator)
-    for _ in range(screening_steps):
-        beta, _ = _step(small, beta, screening)
-    beta = _best(small, beta, screening, candidates)
+    beta = elemental_starts(small, search.starts, generator)
+    near: Tensor | None = None
+    if search.screening_steps and problem.num_coefficients <= _RAW_COEFFICIENTS:
+        kept = max(search.candidates, -(-beta.shape[1] // _RAW_SHARE))
+        beta, near = _best(small, beta, None, search.screening, kept)
+    for _ in range(search.screening_steps):
+        beta, near = _step(small, beta, search.screening, near)
+    beta, near = _best(small, beta, near, search.screening, search.candidates)
+    return beta, near if small is problem else None
 
-    tolerance = 1e2 * torch.finfo(beta.dtype).eps
+
+def _minimise(problem: LinearProblem, search: Search) -> ScaleMinimum:
+    beta, near = _screened(problem, search)
+    return descend(problem, beta, near, search)
+
+
+def descend(
+    problem: LinearProblem, beta: Float[Tensor, "B S n"], near: Float[Tensor, "B S m"] | None, search: Search
+) -> ScaleMinimum:
+    """Steps from every candidate to rest, and the best end of them."""
+    tolerance = max(search.tolerance, 1e2 * torch.finfo(beta.dtype).eps)
+    narrowing = dict(search.narrowing)
     objective = beta.new_full(beta.shape[:2], math.inf)
+    scale = beta.new_zeros(*beta.shape[:2], problem.num_channels) if near is None else near
     moving = torch.ones_like(objective, dtype=torch.bool)
     n_iter = 0
-    while n_iter < max_iter and moving.any():
+    while n_iter < search.max_iter and moving.any():
+        if n_iter in narrowing and narrowing[n_iter] < beta.shape[1]:
+            order = objective.topk(narrowing[n_iter], dim=1, largest=False).indices
+            beta, scale = _of_starts(beta, order), _of_starts(scale, order)
+            objective, moving = objective.gather(1, order), moving.gather(1, order)
         n_iter += 1
         going = torch.nonzero(moving.any(0)).flatten()
-        here = beta[:, going]
-        proposal, before = _step(problem, here, final)
+        every = going.shape[0] == beta.shape[1]
+        here = beta if every else beta[:, going]
+        known = n_iter > 1 or near is not None
+        proposal, now = _step(problem, here, search.final, (scale if every else scale[:, going]) if known else None)
+        before = _log_product(now)
         falls = objective[:, going] - before > tolerance
         objective[:, going] = torch.minimum(objective[:, going], before)
-        beta[:, going] = torch.where(falls.unsqueeze(-1), proposal, here)
+        beta, scale = (
+            beta.index_copy(1, going, torch.where(falls.unsqueeze(-1), proposal, here)),
+            scale.index_copy(1, going, now),
+        )
         moving[:, going] = falls
     residual = problem.residual(beta)
-    scale, weight = final.weighed(problem, residual)
+    scale, weight = search.final.weighed(problem, residual, scale)
     best = _log_product(scale).argmin(1)
     batch = torch.arange(beta.shape[0], device=beta.device)
     return ScaleMinimum(beta[batch, best], scale[batch, best], weight[batch, best], n_iter, ~moving[batch, best])
