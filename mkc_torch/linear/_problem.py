@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,29 +80,42 @@ class LinearProblem:
         if self.sample_weight is not None:
             stack = stack * self.sample_weight.unsqueeze(1)
         n = self.num_coefficients
-        # the half of the symmetric products that differs
-        i, j = torch.triu_indices(n, n, device=stack.device)
-        half = stack.new_zeros(*stack.shape[:2], i.shape[0])
-        moment = stack.new_zeros(*stack.shape[:2], n)
-        one_target = self.basis.shape[0] == self.Y.shape[0]
+        sums: Tensor | None = None
         step = max(1, _CHUNK // (n * n * self.num_channels * self.basis.shape[0]))
         for first in range(0, self.num_samples, step):
             part = slice(first, first + step)
-            rows = self.basis[:, part].flatten(-3, -2)
-            y = self.Y[:, part].flatten(-2)
             w = stack[:, :, part].flatten(-2)
-            outer = rows[..., i] * rows[..., j]
-            if one_target:
-                # both sums in one product
-                both = torch.matmul(w, torch.cat([outer, rows * y.unsqueeze(-1)], dim=-1))
-                half, moment = half + both[..., : i.shape[0]], moment + both[..., i.shape[0] :]
-            else:
-                half = half + torch.matmul(w, outer[0])
-                moment = moment + torch.matmul(w * y.unsqueeze(1), rows[0])
-        place = torch.zeros(n, n, dtype=torch.int64, device=stack.device)
-        place[i, j] = place[j, i] = torch.arange(i.shape[0], device=stack.device)
-        gram = half[..., place]
+            products, own_targets = self._products if step >= self.num_samples else self._products_of(part)
+            more = torch.matmul(w, products if own_targets else products[0])
+            if not own_targets:
+                rows, y = self.basis[0, part].flatten(-3, -2), self.Y[:, part].flatten(-2)
+                more = torch.cat([more, torch.matmul(w * y.unsqueeze(1), rows)], dim=-1)
+            sums = more if sums is None else sums + more
+        assert sums is not None
+        gram, moment = sums[..., _symmetric(n, sums.device)[2]], sums[..., -n:]
         return (gram, moment) if weight.dim() == 4 else (gram.squeeze(1), moment.squeeze(1))
+
+    @property
+    def _products(self) -> tuple[Tensor, bool]:
+        """Those of all samples, kept while no derivative is taken: every step of an estimator asks for them."""
+        kept: tuple[Tensor, bool] | None = self.__dict__.get("_kept_products")
+        if kept is None:
+            kept = self._products_of(slice(None))
+            if not (kept[0].requires_grad or torch._C._functorch.is_functorch_wrapped_tensor(kept[0])):
+                self.__dict__["_kept_products"] = kept
+        return kept
+
+    def _products_of(self, part: slice) -> tuple[Float[Tensor, "#B Nm k"], bool]:
+        """The products of each row with itself, a half of each symmetric matrix; and with its target, where it has one.
+
+        Whether the targets are in it comes second: rows that serve several problems have several.
+        """
+        rows = self.basis[:, part].flatten(-3, -2)
+        i, j, _ = _symmetric(self.num_coefficients, rows.device)
+        outer = rows[..., i] * rows[..., j]
+        if self.basis.shape[0] != self.Y.shape[0]:
+            return outer, False
+        return torch.cat([outer, rows * self.Y[:, part].flatten(-2).unsqueeze(-1)], dim=-1), True
 
     def total_weight(self) -> Float[Tensor, "B m"]:
         """Sum of the sample weights of each channel; the number of samples where none are given."""
@@ -142,6 +156,17 @@ class LinearProblem:
             Y=self.Y[:, index],
             sample_weight=None if self.sample_weight is None else self.sample_weight[:, index],
         )
+
+
+@lru_cache(maxsize=64)
+def _symmetric(n: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows and columns of the upper half of an n × n matrix, and where in the half each of its entries lies."""
+    # what is kept outlives an inference mode that it is made in
+    with torch.inference_mode(False):
+        i, j = torch.triu_indices(n, n, device=device)
+        place = torch.zeros(n, n, dtype=torch.int64, device=device)
+        place[i, j] = place[j, i] = torch.arange(i.shape[0], device=device)
+        return i, j, place
 
 
 def solve_gram(gram: Float[Tensor, "*batch n n"], moment: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:

@@ -9,7 +9,8 @@ S-regression estimates", 2006).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import torch
@@ -33,7 +34,7 @@ class ScaleRule(Protocol):
         ...
 
 
-_CHUNK = 1 << 19
+_CHUNK = 1 << 18
 """Residuals worked on at once, few enough to stay in a processor's cache."""
 
 _SCREENING_SAMPLES = 1500
@@ -93,13 +94,15 @@ class Search:
     """How the minimum is looked for.
 
     ``starts`` elemental sets, least squares being one more, make ``screening_steps`` steps each with a rule that may be
-    approximate. The best ``candidates`` of them go on with the exact rule until a step lowers the logarithm of the
-    scale by less than ``tolerance``, or ``max_iter`` steps; after as many as ``narrowing`` says, only so many go on.
+    approximate; one in ``raw`` of them does, where they are ranked before. The best ``candidates`` go on with the exact
+    rule: of each of ``narrowing`` so many steps, after which so many candidates are left. The last go on until a step
+    lowers the logarithm of the scale by less than ``tolerance``, or ``max_iter`` steps.
     """
 
     screening: ScaleRule
     final: ScaleRule
     starts: int = 500
+    raw: int = 1
     candidates: int = 10
     screening_steps: int = 2
     narrowing: tuple[tuple[int, int], ...] = ()
@@ -132,29 +135,72 @@ def _best(
     return _of_starts(beta, order), _of_starts(scale, order)
 
 
-def minimise_scale(problem: LinearProblem, search: Search) -> ScaleMinimum:
-    """A few steps from every start on at most 1500 samples, then the best candidates to rest on all of them."""
-    per_problem = min(problem.num_samples, _SCREENING_SAMPLES) * problem.num_channels * (search.starts + 1)
-    parts = torch.arange(problem.Y.shape[0], device=problem.Y.device).split(max(1, _CHUNK // per_problem))
-    found = [_minimise(problem.select(i) if len(parts) > 1 else problem, search) for i in parts]
-    return ScaleMinimum(
+@dataclass(frozen=True)
+class _Found:
+    """Candidates with their scales, where these are known, and whether and when they came to rest."""
+
+    beta: Float[Tensor, "B S n"]
+    scale: Float[Tensor, "B S m"] | None
+    rest: Float[Tensor, "B S"]
+    n_iter: int = 0
+
+    def of_starts(self, index: Tensor) -> _Found:
+        scale = None if self.scale is None else _of_starts(self.scale, index)
+        return replace(self, beta=_of_starts(self.beta, index), scale=scale, rest=self.rest.gather(1, index))
+
+    def select(self, index: Tensor) -> _Found:
+        scale = None if self.scale is None else self.scale[index]
+        return replace(self, beta=self.beta[index], scale=scale, rest=self.rest[index])
+
+    def narrowed(self, count: int) -> _Found:
+        """The ``count`` candidates of the smallest scales."""
+        if self.scale is None or count >= self.beta.shape[1]:
+            return self
+        return self.of_starts(_log_product(self.scale).topk(count, dim=1, largest=False).indices)
+
+
+def _in_parts(problem: LinearProblem, values: int, work: Callable[[LinearProblem, Tensor], _Found]) -> _Found:
+    """``work`` on so many problems at once that ``values`` of each stay in the cache."""
+    every = torch.arange(problem.Y.shape[0], device=problem.Y.device)
+    parts = every.split(max(1, _CHUNK // values))
+    if len(parts) == 1:
+        return work(problem, every)
+    found = [work(problem.select(part), part) for part in parts]
+    scales = [f.scale for f in found if f.scale is not None]
+    return _Found(
         beta=torch.cat([f.beta for f in found]),
-        scale=torch.cat([f.scale for f in found]),
-        weight=torch.cat([f.weight for f in found]),
+        scale=torch.cat(scales) if scales else None,
+        rest=torch.cat([f.rest for f in found]),
         n_iter=max(f.n_iter for f in found),
-        converged=torch.cat([f.converged for f in found]),
     )
 
 
-_RAW_COEFFICIENTS = 3
-"""Fits through up to so many values are good enough to be ranked as they are."""
+def minimise_scale(problem: LinearProblem, search: Search) -> ScaleMinimum:
+    """A few steps from every start on at most 1500 samples, then the best candidates to rest on all of them."""
+    size = problem.num_samples * problem.num_channels
+    screened = min(size, _SCREENING_SAMPLES * problem.num_channels) * (search.starts + 1)
+    found = _in_parts(problem, screened, lambda some, _: _screened(some, search))
+    for steps, left in search.narrowing:
+        short = replace(search, max_iter=min(steps, search.max_iter))
+        found = _descended(problem, found, short).narrowed(left)
+    return _ended(problem, _descended(problem, found, search), search)
 
-_RAW_SHARE = 3
-"""One in so many of the starts goes on where fits are ranked as they are."""
+
+def descend(problem: LinearProblem, beta: Float[Tensor, "B n"], search: Search) -> ScaleMinimum:
+    """Steps from coefficients to rest."""
+    alone = beta.unsqueeze(1)
+    found = _Found(alone, None, torch.zeros(alone.shape[:2], dtype=torch.bool, device=beta.device))
+    return _ended(problem, _descended(problem, found, search), search)
 
 
-def _screened(problem: LinearProblem, search: Search) -> tuple[Float[Tensor, "B S n"], Float[Tensor, "B S m"] | None]:
-    """The candidates, and their scales where they were screened on all samples."""
+def _ended(problem: LinearProblem, found: _Found, search: Search) -> ScaleMinimum:
+    best = found.narrowed(1)
+    scale, weight = search.final.weighed(problem, problem.residual(best.beta), best.scale)
+    return ScaleMinimum(best.beta[:, 0], scale[:, 0], weight[:, 0], found.n_iter, best.rest[:, 0])
+
+
+def _screened(problem: LinearProblem, search: Search) -> _Found:
+    """The candidates, with their scales where they were screened on all samples."""
     generator = torch.Generator().manual_seed(search.seed)
     small = problem
     if problem.num_samples > _SCREENING_SAMPLES:
@@ -162,51 +208,50 @@ def _screened(problem: LinearProblem, search: Search) -> tuple[Float[Tensor, "B 
         small = problem.select_samples(keep.to(problem.Y.device))
     beta = elemental_starts(small, search.starts, generator)
     near: Tensor | None = None
-    if search.screening_steps and problem.num_coefficients <= _RAW_COEFFICIENTS:
-        kept = max(search.candidates, -(-beta.shape[1] // _RAW_SHARE))
-        beta, near = _best(small, beta, None, search.screening, kept)
+    if search.raw > 1:
+        beta, near = _best(small, beta, None, search.screening, max(search.candidates, beta.shape[1] // search.raw))
     for _ in range(search.screening_steps):
         beta, near = _step(small, beta, search.screening, near)
     beta, near = _best(small, beta, near, search.screening, search.candidates)
-    return beta, near if small is problem else None
+    rest = torch.zeros(beta.shape[:2], dtype=torch.bool, device=beta.device)
+    return _Found(beta, near if small is problem else None, rest)
 
 
-def _minimise(problem: LinearProblem, search: Search) -> ScaleMinimum:
-    beta, near = _screened(problem, search)
-    return descend(problem, beta, near, search)
+def _descended(problem: LinearProblem, found: _Found, search: Search) -> _Found:
+    """Steps from every candidate that is not at rest."""
+    values = problem.num_samples * problem.num_channels * found.beta.shape[1]
+    return _in_parts(problem, values, lambda some, part: _descend(some, found.select(part), search))
 
 
-def descend(
-    problem: LinearProblem, beta: Float[Tensor, "B S n"], near: Float[Tensor, "B S m"] | None, search: Search
-) -> ScaleMinimum:
-    """Steps from every candidate to rest, and the best end of them."""
-    tolerance = max(search.tolerance, 1e2 * torch.finfo(beta.dtype).eps)
-    narrowing = dict(search.narrowing)
-    objective = beta.new_full(beta.shape[:2], math.inf)
-    scale = beta.new_zeros(*beta.shape[:2], problem.num_channels) if near is None else near
-    moving = torch.ones_like(objective, dtype=torch.bool)
-    n_iter = 0
-    while n_iter < search.max_iter and moving.any():
-        if n_iter in narrowing and narrowing[n_iter] < beta.shape[1]:
-            order = objective.topk(narrowing[n_iter], dim=1, largest=False).indices
-            beta, scale = _of_starts(beta, order), _of_starts(scale, order)
-            objective, moving = objective.gather(1, order), moving.gather(1, order)
+def _descend(problem: LinearProblem, found: _Found, search: Search) -> _Found:
+    """As :func:`_descended`, of one part; problems whose candidates are all at rest leave it."""
+    tolerance = max(search.tolerance, 1e2 * torch.finfo(found.beta.dtype).eps)
+    beta, near, moving = found.beta.clone(), found.scale, ~found.rest
+    objective = torch.full(beta.shape[:2], math.inf, dtype=beta.dtype, device=beta.device)
+    scale = beta.new_zeros(*beta.shape[:2], problem.num_channels) if near is None else near.clone()
+    active = torch.arange(beta.shape[0], device=beta.device)
+    some, n_iter = problem, 0
+    while n_iter < search.max_iter:
+        awake = moving[active]
+        left = awake.any(1)
+        if 2 * int(left.sum()) <= active.shape[0]:
+            active, awake = active[left], awake[left]
+            if active.numel() == 0:
+                break
+            some = problem.select(active)
+        going = awake.any(0).nonzero().squeeze(-1)
+        at = (active.unsqueeze(-1), going)
         n_iter += 1
-        going = torch.nonzero(moving.any(0)).flatten()
-        every = going.shape[0] == beta.shape[1]
-        here = beta if every else beta[:, going]
-        known = n_iter > 1 or near is not None
-        proposal, now = _step(problem, here, search.final, (scale if every else scale[:, going]) if known else None)
+        here = beta[at]
+        known = scale[at] if near is not None or n_iter > 1 else None
+        proposal, now = _step(some, here, search.final, known)
         before = _log_product(now)
-        falls = objective[:, going] - before > tolerance
-        objective[:, going] = torch.minimum(objective[:, going], before)
-        beta, scale = (
-            beta.index_copy(1, going, torch.where(falls.unsqueeze(-1), proposal, here)),
-            scale.index_copy(1, going, now),
-        )
-        moving[:, going] = falls
-    residual = problem.residual(beta)
-    scale, weight = search.final.weighed(problem, residual, scale)
-    best = _log_product(scale).argmin(1)
-    batch = torch.arange(beta.shape[0], device=beta.device)
-    return ScaleMinimum(beta[batch, best], scale[batch, best], weight[batch, best], n_iter, ~moving[batch, best])
+        falls = (objective[at] - before > tolerance) & awake[:, going]
+        objective[at] = torch.minimum(objective[at], before)
+        beta[at] = torch.where(falls.unsqueeze(-1), proposal, here)
+        scale[at] = now
+        moving[at] = falls
+    if n_iter and bool(moving.any()):
+        # of the last step's coefficients
+        scale = search.final.scale(problem, problem.residual(beta), scale)
+    return _Found(beta, scale, ~moving, found.n_iter + n_iter)

@@ -50,11 +50,11 @@ class TrimmedScale:
     def _count(self, problem: LinearProblem) -> int:
         return max(1, round(self.fraction * problem.num_samples))
 
-    def scale(self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None) -> Float[Tensor, "B S m"]:
+    def scale(self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None) -> Float[Tensor, "B S m"]:
         return self.weighed(problem, residual)[0]
 
     def weighed(
-        self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None
+        self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None
     ) -> tuple[Float[Tensor, "B S m"], Tensor]:
         square = residual.square()
         h = self._count(problem)
@@ -75,12 +75,12 @@ class QuantileScale:
 
     fraction: float
 
-    def scale(self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None) -> Float[Tensor, "B S m"]:
+    def scale(self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None) -> Float[Tensor, "B S m"]:
         h = max(1, round(self.fraction * problem.num_samples))
         return order_statistic(residual.abs(), stacked(problem.sample_weight), h)
 
     def weighed(
-        self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None
+        self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None
     ) -> tuple[Float[Tensor, "B S m"], Tensor]:
         scale = self.scale(problem, residual)
         return scale, self.weight(residual, scale)

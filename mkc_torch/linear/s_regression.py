@@ -88,8 +88,11 @@ _EXACT = 30
 _SCREENING = 1
 """Newton's steps for the scale of one of many fits."""
 
-_NARROWING = ((3, 5), (12, 2))
-"""After so many steps, only so many candidates go on."""
+_NARROWING = ((4, 5), (8, 2))
+"""After so many steps more, only so many candidates go on."""
+
+_RAW_COEFFICIENTS, _RAW = 3, 3
+"""Fits through up to so many values are good enough to be ranked as they are, and one in so many of them to go on."""
 
 _NEAR = 1e-7
 """Steps end where the logarithm of the scale falls by less, and Newton's take over."""
@@ -113,6 +116,7 @@ def minimise_m_scale(
         MScale(_SCREENING, c, breakdown),
         final,
         starts=starts_worth_drawing(starts, problem.num_coefficients),
+        raw=_RAW if problem.num_coefficients <= _RAW_COEFFICIENTS else 1,
         narrowing=_NARROWING,
         tolerance=_NEAR,
         max_iter=max_iter,
@@ -139,7 +143,7 @@ def _brought_to_rest(problem: LinearProblem, found: ScaleMinimum, search: Search
         return found
     index = far.nonzero().squeeze(-1)
     some = problem.select(index)
-    more = descend(some, found.beta[index].unsqueeze(1), None, replace(search, tolerance=0.0))
+    more = descend(some, found.beta[index], replace(search, tolerance=0.0))
     more, _ = _polished(some, more, rule)
     return ScaleMinimum(
         found.beta.index_copy(0, index, more.beta),
