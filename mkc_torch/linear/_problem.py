@@ -101,7 +101,9 @@ class LinearProblem:
         kept: tuple[Tensor, bool] | None = self.__dict__.get("_kept_products")
         if kept is None:
             kept = self._products_of(slice(None))
-            if not (kept[0].requires_grad or torch._C._functorch.is_functorch_wrapped_tensor(kept[0])):
+            # those made without gradients are of no use with them
+            derived = self.basis.requires_grad or self.Y.requires_grad
+            if not (derived or torch._C._functorch.is_functorch_wrapped_tensor(kept[0])):
                 self.__dict__["_kept_products"] = kept
         return kept
 

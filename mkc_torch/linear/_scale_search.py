@@ -34,7 +34,7 @@ class ScaleRule(Protocol):
         ...
 
 
-_CHUNK = 1 << 18
+_CHUNK = 1 << 16
 """Residuals worked on at once, few enough to stay in a processor's cache."""
 
 _SCREENING_SAMPLES = 1500
@@ -53,17 +53,27 @@ class ScaleMinimum:
 
 def elemental_starts(problem: LinearProblem, count: int, generator: torch.Generator) -> Float[Tensor, "B count+1 n"]:
     """Coefficients through ``count`` random sets of n values, and the least-squares ones."""
-    n, B = problem.num_coefficients, problem.Y.shape[0]
+    return _fits_through(problem, _drawn(problem, count, generator))
+
+
+def _drawn(problem: LinearProblem, count: int, generator: torch.Generator) -> Tensor:
+    """The numbers of the values of each set, (count, n); where weights say which can be, random keys of all values."""
     values = problem.num_samples * problem.num_channels
-    keys = torch.rand(count, values, generator=generator, dtype=torch.float64).to(problem.Y.device)
+    keys = torch.rand(count, values, generator=generator, dtype=torch.float64)
+    if problem.sample_weight is None:
+        keys = keys.topk(problem.num_coefficients, dim=-1).indices
+    return keys.to(problem.Y.device)
+
+
+def _fits_through(problem: LinearProblem, drawn: Tensor) -> Float[Tensor, "B count+1 n"]:
+    n, B = problem.num_coefficients, problem.Y.shape[0]
     rows = problem.basis.flatten(-3, -2)
     y = problem.Y.flatten(-2)
     if problem.sample_weight is None:
-        index = keys.topk(n, dim=-1).indices
-        chosen, target = rows[:, index], y[:, index]
+        chosen, target = rows[:, drawn], y[:, drawn]
     else:
         used = (problem.sample_weight > 0).flatten(-2).unsqueeze(1)
-        index = torch.where(used, keys, -1.0).topk(n, dim=-1).indices
+        index = torch.where(used, drawn, -1.0).topk(n, dim=-1).indices
         batch = torch.arange(B, device=y.device).view(B, 1, 1)
         chosen, target = rows.expand(B, -1, -1)[batch, index], y[batch, index]
     solution, info = torch.linalg.solve_ex(chosen.expand(B, -1, -1, -1), target)
@@ -179,10 +189,21 @@ def minimise_scale(problem: LinearProblem, search: Search) -> ScaleMinimum:
     """A few steps from every start on at most 1500 samples, then the best candidates to rest on all of them."""
     size = problem.num_samples * problem.num_channels
     screened = min(size, _SCREENING_SAMPLES * problem.num_channels) * (search.starts + 1)
-    found = _in_parts(problem, screened, lambda some, _: _screened(some, search))
+    generator = torch.Generator().manual_seed(search.seed)
+    some_samples: Tensor | None = None
+    if problem.num_samples > _SCREENING_SAMPLES:
+        keep = torch.randperm(problem.num_samples, generator=generator)[:_SCREENING_SAMPLES].sort().values
+        some_samples = keep.to(problem.Y.device)
+    small = problem if some_samples is None else problem.select_samples(some_samples)
+    drawn = _drawn(small, search.starts, generator)
+    found = _in_parts(small, screened, lambda some, _: _screened(some, drawn, search))
+    if some_samples is not None:
+        found = replace(found, scale=None)
     for steps, left in search.narrowing:
-        short = replace(search, max_iter=min(steps, search.max_iter))
+        short = replace(search, final=search.screening, max_iter=min(steps, search.max_iter))
         found = _descended(problem, found, short).narrowed(left)
+    # what an approximate scale says of rest is not the last word
+    found = replace(found, rest=torch.zeros_like(found.rest))
     return _ended(problem, _descended(problem, found, search), search)
 
 
@@ -199,22 +220,17 @@ def _ended(problem: LinearProblem, found: _Found, search: Search) -> ScaleMinimu
     return ScaleMinimum(best.beta[:, 0], scale[:, 0], weight[:, 0], found.n_iter, best.rest[:, 0])
 
 
-def _screened(problem: LinearProblem, search: Search) -> _Found:
-    """The candidates, with their scales where they were screened on all samples."""
-    generator = torch.Generator().manual_seed(search.seed)
-    small = problem
-    if problem.num_samples > _SCREENING_SAMPLES:
-        keep = torch.randperm(problem.num_samples, generator=generator)[:_SCREENING_SAMPLES].sort().values
-        small = problem.select_samples(keep.to(problem.Y.device))
-    beta = elemental_starts(small, search.starts, generator)
+def _screened(problem: LinearProblem, drawn: Tensor, search: Search) -> _Found:
+    beta = _fits_through(problem, drawn)
     near: Tensor | None = None
     if search.raw > 1:
-        beta, near = _best(small, beta, None, search.screening, max(search.candidates, beta.shape[1] // search.raw))
+        beta, near = _best(problem, beta, None, search.screening, max(search.candidates, beta.shape[1] // search.raw))
     for _ in range(search.screening_steps):
-        beta, near = _step(small, beta, search.screening, near)
-    beta, near = _best(small, beta, near, search.screening, search.candidates)
-    rest = torch.zeros(beta.shape[:2], dtype=torch.bool, device=beta.device)
-    return _Found(beta, near if small is problem else None, rest)
+        beta, now = _step(problem, beta, search.screening, near)
+        # fits that were not ranked fall too far for a scale to be near to the last
+        near = None if near is None else now
+    beta, near = _best(problem, beta, near, search.screening, search.candidates)
+    return _Found(beta, near, torch.zeros(beta.shape[:2], dtype=torch.bool, device=beta.device))
 
 
 def _descended(problem: LinearProblem, found: _Found, search: Search) -> _Found:

@@ -53,9 +53,9 @@ class MScale:
 
     def _rest(self, square: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:
         """``1 - (r / (c s))²``, 0 from where that is 1: its square is the weight, its cube 1 - ρ."""
-        size = (self.c * scale.clamp(min=torch.finfo(scale.dtype).tiny)).unsqueeze(-2)
-        # dividing twice, since the square of a scale of 0 is none
-        return (1.0 - square / size / size).clamp(min=0.0)
+        # the square of the least size still has an inverse
+        size = self.c * scale.clamp(min=torch.finfo(scale.dtype).tiny ** 0.5)
+        return torch.mul(square, -size.pow(-2).unsqueeze(-2)).add_(1.0).clamp_(min=0.0)
 
     def _solved(
         self, problem: LinearProblem, residual: Tensor, square: Tensor, near: Tensor | None
@@ -76,7 +76,8 @@ class MScale:
             # Newton's method in log(scale), kept within a factor of two
             step = ((total - outside - target) / slope.clamp(min=tiny)).clamp(min=-0.7, max=0.7)
             scale = scale * torch.exp(torch.where(scale > 0, step, 0.0))
-            if bool((step.abs() < 1e-13).all()):
+            # the next error is about the square of this step
+            if bool((step.abs() < 0.5 * torch.finfo(step.dtype).eps ** 0.5).all()):
                 return scale
         # a scale that fell to nothing is not near to where it was
         return scale if near is None or self.steps < _EXACT else self._solved(problem, residual, square, None)
@@ -85,7 +86,7 @@ class MScale:
 _EXACT = 30
 """Newton's steps that solve for the scale to rounding."""
 
-_SCREENING = 1
+_SCREENING = 2
 """Newton's steps for the scale of one of many fits."""
 
 _NARROWING = ((4, 5), (8, 2))
@@ -126,9 +127,10 @@ def minimise_m_scale(
         found = _brought_to_rest(problem, minimise_scale(problem, search), search)
     if not (problem.basis.requires_grad or problem.Y.requires_grad):
         return found
-    along = final.scale(problem, problem.residual(found.beta).unsqueeze(1)).squeeze(1)
+    # one step from the solution has its derivative
+    along = final.scale(problem, problem.residual(found.beta).unsqueeze(1), found.scale.unsqueeze(1)).squeeze(1)
     beta = found.beta - _newton_step(problem, found.beta, along, c)
-    scale, weight = final.weighed(problem, problem.residual(beta).unsqueeze(1))
+    scale, weight = final.weighed(problem, problem.residual(beta).unsqueeze(1), found.scale.unsqueeze(1))
     return replace(found, beta=beta, scale=scale.squeeze(1), weight=weight.squeeze(1))
 
 
