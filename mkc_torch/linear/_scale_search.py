@@ -103,16 +103,17 @@ def rounding_scale(problem: LinearProblem) -> Float[Tensor, "B m"]:
 class Search:
     """How the minimum is looked for.
 
-    ``starts`` elemental sets, least squares being one more, make ``screening_steps`` steps each with a rule that may be
-    approximate; one in ``raw`` of them does, where they are ranked before. The best ``candidates`` go on with the exact
-    rule: of each of ``narrowing`` so many steps, after which so many candidates are left. The last go on until a step
-    lowers the logarithm of the scale by less than ``tolerance``, or ``max_iter`` steps.
+    ``starts`` elemental sets, least squares being one more, make ``screening_steps`` steps each; one in ``raw`` of them
+    does where ``ranking`` orders them before. The best ``candidates`` go on: of each of ``narrowing`` so many steps,
+    after which so many candidates are left. All that may be approximate. The last go on with the exact rule until a
+    step lowers the logarithm of the scale by less than ``tolerance``, or ``max_iter`` steps.
     """
 
     screening: ScaleRule
     final: ScaleRule
     starts: int = 500
-    raw: int = 1
+    ranking: ScaleRule | None = None
+    raw: int = 3
     candidates: int = 10
     screening_steps: int = 2
     narrowing: tuple[tuple[int, int], ...] = ()
@@ -223,8 +224,8 @@ def _ended(problem: LinearProblem, found: _Found, search: Search) -> ScaleMinimu
 def _screened(problem: LinearProblem, drawn: Tensor, search: Search) -> _Found:
     beta = _fits_through(problem, drawn)
     near: Tensor | None = None
-    if search.raw > 1:
-        beta, near = _best(problem, beta, None, search.screening, max(search.candidates, beta.shape[1] // search.raw))
+    if search.ranking is not None:
+        beta, near = _best(problem, beta, None, search.ranking, max(search.candidates, beta.shape[1] // search.raw))
     for _ in range(search.screening_steps):
         beta, now = _step(problem, beta, search.screening, near)
         # fits that were not ranked fall too far for a scale to be near to the last
@@ -256,7 +257,8 @@ def _descend(problem: LinearProblem, found: _Found, search: Search) -> _Found:
                 break
             some = problem.select(active)
         going = awake.any(0).nonzero().squeeze(-1)
-        at = (active.unsqueeze(-1), going)
+        all_move = active.shape[0] == beta.shape[0] and going.shape[0] == beta.shape[1]
+        at = ... if all_move else (active.unsqueeze(-1), going)
         n_iter += 1
         here = beta[at]
         known = scale[at] if near is not None or n_iter > 1 else None

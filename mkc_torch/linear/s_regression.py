@@ -35,7 +35,7 @@ class MScale:
     breakdown: float = 0.5
 
     def scale(self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None) -> Float[Tensor, "B S m"]:
-        return self._solved(problem, residual, residual.square(), near)
+        return self._solved(problem, residual, residual.square() if self.steps else residual, near)
 
     def weighed(
         self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None
@@ -86,14 +86,17 @@ class MScale:
 _EXACT = 30
 """Newton's steps that solve for the scale to rounding."""
 
-_SCREENING = 2
+_RANKED = 3
+"""Fits through up to so many values are good enough to be ranked as they are, by the quantile that s begins at."""
+
+_SCREENING, _SCREENING_RANKED = 2, 1
 """Newton's steps for the scale of one of many fits."""
 
-_NARROWING = ((4, 5), (8, 2))
-"""After so many steps more, only so many candidates go on."""
+_CANDIDATES = 10
+"""Fits that go on after the screening."""
 
-_RAW_COEFFICIENTS, _RAW = 3, 3
-"""Fits through up to so many values are good enough to be ranked as they are, and one in so many of them to go on."""
+_NARROWING, _NARROWING_RANKED = ((4, 5), (8, 2)), ((3, 4), (5, 2))
+"""After so many steps more, only so many candidates go on."""
 
 _NEAR = 1e-7
 """Steps end where the logarithm of the scale falls by less, and Newton's take over."""
@@ -113,12 +116,14 @@ def minimise_m_scale(
     """S-regression with Tukey's bisquare on a checked problem; the result has the derivatives of the minimum."""
     c = bisquare_of(breakdown)
     final = MScale(_EXACT, c, breakdown)
+    ranked = problem.num_coefficients <= _RANKED
     search = Search(
-        MScale(_SCREENING, c, breakdown),
+        MScale(_SCREENING_RANKED if ranked else _SCREENING, c, breakdown),
         final,
         starts=starts_worth_drawing(starts, problem.num_coefficients),
-        raw=_RAW if problem.num_coefficients <= _RAW_COEFFICIENTS else 1,
-        narrowing=_NARROWING,
+        ranking=MScale(0, c, breakdown) if ranked else None,
+        candidates=_CANDIDATES,
+        narrowing=_NARROWING_RANKED if ranked else _NARROWING,
         tolerance=_NEAR,
         max_iter=max_iter,
         seed=seed,
