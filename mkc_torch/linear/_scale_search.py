@@ -222,7 +222,17 @@ def _ended(problem: LinearProblem, found: _Found, search: Search) -> ScaleMinimu
 
 
 def _screened(problem: LinearProblem, drawn: Tensor, search: Search) -> _Found:
+    """The candidates; the starts of a large problem are worked on so many at once that they stay in the cache."""
     beta = _fits_through(problem, drawn)
+    at_once = max(search.candidates, _CHUNK // (problem.num_samples * problem.num_channels))
+    found = [_screened_part(problem, part, search) for part in beta.split(at_once, dim=1)]
+    beta, scale = (torch.cat(parts, dim=1) for parts in zip(*found, strict=True))
+    rest = torch.zeros(beta.shape[:2], dtype=torch.bool, device=beta.device)
+    return _Found(beta, scale, rest).narrowed(search.candidates)
+
+
+def _screened_part(problem: LinearProblem, beta: Float[Tensor, "B S n"], search: Search) -> tuple[Tensor, Tensor]:
+    """The best of some starts, and their scales."""
     near: Tensor | None = None
     if search.ranking is not None:
         beta, near = _best(problem, beta, None, search.ranking, max(search.candidates, beta.shape[1] // search.raw))
@@ -230,8 +240,7 @@ def _screened(problem: LinearProblem, drawn: Tensor, search: Search) -> _Found:
         beta, now = _step(problem, beta, search.screening, near)
         # fits that were not ranked fall too far for a scale to be near to the last
         near = None if near is None else now
-    beta, near = _best(problem, beta, near, search.screening, search.candidates)
-    return _Found(beta, near, torch.zeros(beta.shape[:2], dtype=torch.bool, device=beta.device))
+    return _best(problem, beta, near, search.screening, search.candidates)
 
 
 def _descended(problem: LinearProblem, found: _Found, search: Search) -> _Found:

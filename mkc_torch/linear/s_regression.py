@@ -248,12 +248,13 @@ class SRegression(RobustInference):
 
     Starts go through n values each, and one through clean values is enough: at a share ε of outliers ``starts`` of them
     miss with probability ``(1 - (1 - ε)^n)^starts``, which is 1e-6 at ε = 0.45 and 4e-4 at 0.5 for the default and
-    n = 6. Take more for more coefficients.
+    n = 6. Take more for more coefficients. Of few coefficients no more are drawn than miss with probability
+    1e-9 at ε = 0.5: 73 for n = 2 and 156 for n = 3.
 
     Args:
         breakdown: share of outliers the estimator withstands, 0.01 to 0.5. At Gaussian residuals 0.5 has efficiency
             0.287, 0.25 has 0.759; :class:`MMRegression` has both.
-        starts: number of elemental starts.
+        starts: number of elemental starts at most.
         covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors are alike
             at every X and no outlier lies far out in X.
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
