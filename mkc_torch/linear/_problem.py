@@ -173,16 +173,33 @@ def _symmetric(n: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
 
 def solve_gram(gram: Float[Tensor, "*batch n n"], moment: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
     """Solve positive semi-definite systems: Cholesky, and the pseudo-inverse where the weights removed a direction."""
-    factor, info = torch.linalg.cholesky_ex(gram)
-    solution = torch.cholesky_solve(moment.unsqueeze(-1), factor).squeeze(-1)
-    pivots = factor.diagonal(dim1=-2, dim2=-1)
+    if gram.shape[-1] == 2 and not (gram.requires_grad or moment.requires_grad):
+        solution, least, most = _solve_two(gram, moment)
+    else:
+        factor, info = torch.linalg.cholesky_ex(gram)
+        solution = torch.cholesky_solve(moment.unsqueeze(-1), factor).squeeze(-1)
+        pivots = factor.diagonal(dim1=-2, dim2=-1)
+        least, most = torch.where(info > 0, 0.0, pivots.amin(-1)), pivots.amax(-1)
     eps = torch.finfo(gram.dtype).eps
-    weak = (info > 0) | ~(pivots.amin(-1) > (gram.shape[-1] * eps) ** 0.5 * pivots.amax(-1))
+    # what has no factor has a pivot of 0 or NaN here
+    weak = ~(least > (gram.shape[-1] * eps) ** 0.5 * most)
     if weak.any():
         inverse = torch.linalg.pinv(gram[weak], hermitian=True, rtol=gram.shape[-1] * eps)
         repaired = torch.matmul(inverse, moment[weak].unsqueeze(-1)).squeeze(-1)
         solution = solution.masked_scatter(weak.unsqueeze(-1), repaired)
     return solution
+
+
+def _solve_two(gram: Float[Tensor, "*batch 2 2"], moment: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor, Tensor]:
+    """Cholesky's solution of many systems of two equations, all at once, and the smaller and the larger pivot."""
+    first = gram[..., 0, 0].sqrt()
+    below = gram[..., 0, 1] / first
+    second = (gram[..., 1, 1] - below * below).sqrt()
+    x, y = moment.unbind(-1)
+    x = x / first
+    y = (y - below * x) / (second * second)
+    x = (x - below * y) / first
+    return torch.stack([x, y], -1), torch.minimum(first, second), torch.maximum(first, second)
 
 
 def _check_finite(name: str, value: Tensor) -> None:

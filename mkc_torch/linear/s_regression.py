@@ -140,32 +140,38 @@ def minimise_m_scale(
 
 
 def _brought_to_rest(problem: LinearProblem, found: ScaleMinimum, search: Search) -> ScaleMinimum:
-    """Newton's steps, and where they do not end at rest, the steps of the search to the last digit before them."""
+    """Newton's steps, and where they do not end at rest, more of the search to the last digit and Newton's again."""
     rule = search.final
     assert isinstance(rule, MScale)
     found, moved = _polished(problem, found, rule)
     # a minimum moves by less than rounding does to the gradient
-    far = ~(moved < 1e2 * torch.finfo(moved.dtype).eps ** 0.5)
-    if not bool(far.any()):
-        return found
-    index = far.nonzero().squeeze(-1)
-    some = problem.select(index)
-    more = descend(some, found.beta[index], replace(search, tolerance=0.0))
-    more, _ = _polished(some, more, rule)
-    return ScaleMinimum(
-        found.beta.index_copy(0, index, more.beta),
-        found.scale.index_copy(0, index, more.scale),
-        found.weight.index_copy(0, index, more.weight),
-        found.n_iter + more.n_iter,
-        found.converged.index_copy(0, index, more.converged),
-    )
+    at_most = 1e2 * torch.finfo(moved.dtype).eps ** 0.5
+    index = (~(moved < at_most)).nonzero().squeeze(-1)
+    left = search.max_iter
+    while index.numel() > 0 and left > 0:
+        some = problem.select(index)
+        more = descend(some, found.beta[index], replace(search, tolerance=0.0, max_iter=min(_BETWEEN, left)))
+        more, moved = _polished(some, more, rule)
+        rest = more.converged | (moved < at_most)
+        found = ScaleMinimum(
+            found.beta.index_copy(0, index, more.beta),
+            found.scale.index_copy(0, index, more.scale),
+            found.weight.index_copy(0, index, more.weight),
+            found.n_iter + more.n_iter,
+            found.converged.index_copy(0, index, rest),
+        )
+        index, left = index[~rest], left - _BETWEEN
+    return found
+
+
+_BETWEEN = 40
+"""Steps of the search before Newton's are tried again."""
 
 
 def _polished(problem: LinearProblem, found: ScaleMinimum, rule: MScale) -> tuple[ScaleMinimum, Float[Tensor, " B"]]:
     """Newton's steps from near the minimum, each of which halves the digits that are wrong, and the last one's length.
 
-    The length is the root mean square of what it moves the fitted values by, in scales; infinite where the step is not
-    taken.
+    The length is the root mean square of what it moves the fitted values by, in scales; infinite where it is too long.
     """
     moved = found.beta.new_full(found.beta.shape[:1], math.inf)
     for _ in range(_POLISH):
@@ -176,8 +182,10 @@ def _polished(problem: LinearProblem, found: ScaleMinimum, rule: MScale) -> tupl
         tiny = torch.finfo(beta.dtype).tiny
         rise = (scale.clamp(min=tiny) / found.scale.clamp(min=tiny)).log().sum(-1)
         length = torch.linalg.vector_norm(step, dim=-1) / (problem.num_samples**0.5 * found.scale.amin(-1))
-        taken = (rise <= 16 * torch.finfo(beta.dtype).eps) & (length < _LONGEST)
-        moved, better = torch.where(taken, length, torch.inf), taken.unsqueeze(-1)
+        short = length < _LONGEST
+        # of a step to rest, what the scale rises by is rounding
+        moved = torch.where(short, length, torch.inf)
+        better = ((rise <= 16 * torch.finfo(beta.dtype).eps) & short).unsqueeze(-1)
         found = replace(
             found,
             beta=torch.where(better, beta, found.beta),
