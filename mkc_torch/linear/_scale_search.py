@@ -35,7 +35,10 @@ class ScaleRule(Protocol):
 
 
 _CHUNK = 1 << 16
-"""Residuals worked on at once, few enough to stay in a processor's cache."""
+"""Residuals of one problem worked on at once, few enough to stay in a processor's cache."""
+
+_BATCH = 1 << 18
+"""Residuals of many problems worked on at once: so many that the calls themselves take little beside."""
 
 _SCREENING_SAMPLES = 1500
 
@@ -173,7 +176,7 @@ class _Found:
 def _in_parts(problem: LinearProblem, values: int, work: Callable[[LinearProblem, Tensor], _Found]) -> _Found:
     """``work`` on so many problems at once that ``values`` of each stay in the cache."""
     every = torch.arange(problem.Y.shape[0], device=problem.Y.device)
-    parts = every.split(max(1, _CHUNK // values))
+    parts = every.split(max(1, _BATCH // values))
     if len(parts) == 1:
         return work(problem, every)
     found = [work(problem.select(part), part) for part in parts]
