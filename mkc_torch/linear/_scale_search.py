@@ -269,8 +269,8 @@ def _descend(problem: LinearProblem, found: _Found, search: Search) -> _Found:
                 break
             some = problem.select(active)
         going = awake.any(0).nonzero().squeeze(-1)
-        all_move = active.shape[0] == beta.shape[0] and going.shape[0] == beta.shape[1]
-        at = ... if all_move else (active.unsqueeze(-1), going)
+        # copies, not views: what is written below may be part of a derivative
+        at = (active.unsqueeze(-1), going)
         n_iter += 1
         here = beta[at]
         known = scale[at] if near is not None or n_iter > 1 else None
