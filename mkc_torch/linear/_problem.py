@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,21 +80,44 @@ class LinearProblem:
         if self.sample_weight is not None:
             stack = stack * self.sample_weight.unsqueeze(1)
         n = self.num_coefficients
-        gram = stack.new_zeros(*stack.shape[:2], n * n)
-        moment = stack.new_zeros(*stack.shape[:2], n)
+        sums: Tensor | None = None
         step = max(1, _CHUNK // (n * n * self.num_channels * self.basis.shape[0]))
         for first in range(0, self.num_samples, step):
             part = slice(first, first + step)
-            rows = self.basis[:, part].flatten(-3, -2)
-            outer = (rows.unsqueeze(-1) * rows.unsqueeze(-2)).flatten(-2)
             w = stack[:, :, part].flatten(-2)
-            wy = w * self.Y[:, part].flatten(-2).unsqueeze(1)
-            if rows.shape[0] == 1:
-                rows, outer = rows[0], outer[0]
-            gram += torch.matmul(w, outer)
-            moment += torch.matmul(wy, rows)
-        gram = gram.unflatten(-1, (n, n))
+            products, own_targets = self._products if step >= self.num_samples else self._products_of(part)
+            more = torch.matmul(w, products if own_targets else products[0])
+            if not own_targets:
+                rows, y = self.basis[0, part].flatten(-3, -2), self.Y[:, part].flatten(-2)
+                more = torch.cat([more, torch.matmul(w * y.unsqueeze(1), rows)], dim=-1)
+            sums = more if sums is None else sums + more
+        assert sums is not None
+        gram, moment = sums[..., _symmetric(n, sums.device)[2]], sums[..., -n:]
         return (gram, moment) if weight.dim() == 4 else (gram.squeeze(1), moment.squeeze(1))
+
+    @property
+    def _products(self) -> tuple[Tensor, bool]:
+        """Those of all samples, kept while no derivative is taken: every step of an estimator asks for them."""
+        kept: tuple[Tensor, bool] | None = self.__dict__.get("_kept_products")
+        if kept is None:
+            kept = self._products_of(slice(None))
+            # those made without gradients are of no use with them
+            derived = self.basis.requires_grad or self.Y.requires_grad
+            if not (derived or torch._C._functorch.is_functorch_wrapped_tensor(kept[0])):
+                self.__dict__["_kept_products"] = kept
+        return kept
+
+    def _products_of(self, part: slice) -> tuple[Float[Tensor, "#B Nm k"], bool]:
+        """The products of each row with itself, a half of each symmetric matrix; and with its target, where it has one.
+
+        Whether the targets are in it comes second: rows that serve several problems have several.
+        """
+        rows = self.basis[:, part].flatten(-3, -2)
+        i, j, _ = _symmetric(self.num_coefficients, rows.device)
+        outer = rows[..., i] * rows[..., j]
+        if self.basis.shape[0] != self.Y.shape[0]:
+            return outer, False
+        return torch.cat([outer, rows * self.Y[:, part].flatten(-2).unsqueeze(-1)], dim=-1), True
 
     def total_weight(self) -> Float[Tensor, "B m"]:
         """Sum of the sample weights of each channel; the number of samples where none are given."""
@@ -136,18 +160,46 @@ class LinearProblem:
         )
 
 
+@lru_cache(maxsize=64)
+def _symmetric(n: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows and columns of the upper half of an n × n matrix, and where in the half each of its entries lies."""
+    # what is kept outlives an inference mode that it is made in
+    with torch.inference_mode(False):
+        i, j = torch.triu_indices(n, n, device=device)
+        place = torch.zeros(n, n, dtype=torch.int64, device=device)
+        place[i, j] = place[j, i] = torch.arange(i.shape[0], device=device)
+        return i, j, place
+
+
 def solve_gram(gram: Float[Tensor, "*batch n n"], moment: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
     """Solve positive semi-definite systems: Cholesky, and the pseudo-inverse where the weights removed a direction."""
-    factor, info = torch.linalg.cholesky_ex(gram)
-    solution = torch.cholesky_solve(moment.unsqueeze(-1), factor).squeeze(-1)
-    pivots = factor.diagonal(dim1=-2, dim2=-1)
+    if gram.shape[-1] == 2 and not (gram.requires_grad or moment.requires_grad):
+        solution, least, most = _solve_two(gram, moment)
+    else:
+        factor, info = torch.linalg.cholesky_ex(gram)
+        solution = torch.cholesky_solve(moment.unsqueeze(-1), factor).squeeze(-1)
+        pivots = factor.diagonal(dim1=-2, dim2=-1)
+        least, most = torch.where(info > 0, 0.0, pivots.amin(-1)), pivots.amax(-1)
     eps = torch.finfo(gram.dtype).eps
-    weak = (info > 0) | ~(pivots.amin(-1) > (gram.shape[-1] * eps) ** 0.5 * pivots.amax(-1))
+    # what has no factor has a pivot of 0 or NaN here
+    weak = ~(least > (gram.shape[-1] * eps) ** 0.5 * most)
     if weak.any():
         inverse = torch.linalg.pinv(gram[weak], hermitian=True, rtol=gram.shape[-1] * eps)
         repaired = torch.matmul(inverse, moment[weak].unsqueeze(-1)).squeeze(-1)
         solution = solution.masked_scatter(weak.unsqueeze(-1), repaired)
     return solution
+
+
+def _solve_two(gram: Float[Tensor, "*batch 2 2"], moment: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor, Tensor]:
+    """Cholesky's solution of many systems of two equations, all at once, and the smaller and the larger pivot."""
+    first = gram[..., 0, 0].sqrt()
+    below = gram[..., 0, 1] / first
+    second = (gram[..., 1, 1] - below * below).sqrt()
+    x, y = moment.unbind(-1)
+    x = x / first
+    y = (y - below * x) / (second * second)
+    x = (x - below * y) / first
+    return torch.stack([x, y], -1), torch.minimum(first, second), torch.maximum(first, second)
 
 
 def _check_finite(name: str, value: Tensor) -> None:

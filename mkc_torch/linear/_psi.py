@@ -130,8 +130,13 @@ class Psi:
 
     def ratio(self) -> float:
         """``E w / E w z²`` at Gaussian residuals: 1.2076 for the bisquare at 95 % efficiency."""
-        kinks = (math.pi * self.tuning[0],) if self.name == "andrews" else self.tuning
-        return _gaussian_mean(self.weight, kinks) / _gaussian_mean(lambda z: z.square() * self.weight(z), kinks)
+        return _ratio(self)
+
+
+@lru_cache
+def _ratio(psi: Psi) -> float:
+    kinks = (math.pi * psi.tuning[0],) if psi.name == "andrews" else psi.tuning
+    return _gaussian_mean(psi.weight, kinks) / _gaussian_mean(lambda z: z.square() * psi.weight(z), kinks)
 
 
 def checked_tuning(name: str, tuning: float | Tuning | None) -> tuple[PsiName, Tuning]:

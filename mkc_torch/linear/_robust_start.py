@@ -12,7 +12,7 @@ from torch import Tensor
 from mkc_torch._support.arguments import refuse_complex, seems_finite, told
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._problem import LinearProblem
-from mkc_torch.linear._scale_search import minimise_scale
+from mkc_torch.linear._scale_search import Search, minimise_scale
 from mkc_torch.linear.least_trimmed_squares import QuantileScale, TrimmedScale, default_coverage
 from mkc_torch.linear.s_regression import minimise_m_scale
 
@@ -81,8 +81,7 @@ def _trimmed_start(problem: LinearProblem, seed: int) -> Float[Tensor, "B n"]:
     fraction = default_coverage(problem) / problem.num_samples
     # fits through up to three values are good enough to be ranked as they are
     steps = 0 if problem.num_coefficients <= 3 else 2
-    return minimise_scale(
-        problem,
+    search = Search(
         TrimmedScale(fraction) if steps else QuantileScale(fraction),
         TrimmedScale(fraction),
         starts=elemental_count(problem.num_coefficients),
@@ -90,7 +89,8 @@ def _trimmed_start(problem: LinearProblem, seed: int) -> Float[Tensor, "B n"]:
         screening_steps=steps,
         max_iter=4,
         seed=seed,
-    ).beta
+    )
+    return minimise_scale(problem, search).beta
 
 
 def robust_start(problem: LinearProblem, method: Start | Tensor = "lts", *, seed: int = 0) -> RobustStart:

@@ -17,7 +17,7 @@ from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._inference import RobustInference
 from mkc_torch.linear._influence import Scores, coefficients_a_value, influence
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.linear._scale_search import minimise_scale, relative_precision, rounding_scale
+from mkc_torch.linear._scale_search import Search, minimise_scale, relative_precision, rounding_scale
 from mkc_torch.linear.covariance import RobustCovarianceKind
 
 if TYPE_CHECKING:
@@ -50,10 +50,12 @@ class TrimmedScale:
     def _count(self, problem: LinearProblem) -> int:
         return max(1, round(self.fraction * problem.num_samples))
 
-    def scale(self, problem: LinearProblem, residual: Tensor) -> Float[Tensor, "B S m"]:
+    def scale(self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None) -> Float[Tensor, "B S m"]:
         return self.weighed(problem, residual)[0]
 
-    def weighed(self, problem: LinearProblem, residual: Tensor) -> tuple[Float[Tensor, "B S m"], Tensor]:
+    def weighed(
+        self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None
+    ) -> tuple[Float[Tensor, "B S m"], Tensor]:
         square = residual.square()
         h = self._count(problem)
         weight = stacked(problem.sample_weight)
@@ -73,11 +75,13 @@ class QuantileScale:
 
     fraction: float
 
-    def scale(self, problem: LinearProblem, residual: Tensor) -> Float[Tensor, "B S m"]:
+    def scale(self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None) -> Float[Tensor, "B S m"]:
         h = max(1, round(self.fraction * problem.num_samples))
         return order_statistic(residual.abs(), stacked(problem.sample_weight), h)
 
-    def weighed(self, problem: LinearProblem, residual: Tensor) -> tuple[Float[Tensor, "B S m"], Tensor]:
+    def weighed(
+        self, problem: LinearProblem, residual: Tensor, _near: Tensor | None = None
+    ) -> tuple[Float[Tensor, "B S m"], Tensor]:
         scale = self.scale(problem, residual)
         return scale, self.weight(residual, scale)
 
@@ -263,7 +267,8 @@ class LeastTrimmedSquares(RobustInference):
         N = problem.num_samples
         # a small sample has more local minima than a rank after two steps tells apart
         candidates = 200 if N <= _EXCHANGE_SAMPLES else 10
-        found = minimise_scale(problem, rule, rule, starts=self.starts, candidates=candidates, seed=self.seed)
+        search = Search(rule, rule, starts=self.starts, candidates=candidates, seed=self.seed)
+        found = minimise_scale(problem, search)
         beta = found.beta
         if _plain(problem) and h < N <= _EXCHANGE_SAMPLES:
             beta = _exchange(problem, beta, h)

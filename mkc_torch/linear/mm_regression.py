@@ -30,7 +30,7 @@ class MMRegression(RobustInference):
     Args:
         efficiency: at Gaussian residuals, 0.3 to 0.99; c is 4.685 for 0.95.
         breakdown: of the S-estimate, 0.01 to 0.5.
-        starts: number of elemental starts of the S-estimate; see :class:`SRegression` for how many it takes.
+        starts: number of elemental starts of the S-estimate at most; see :class:`SRegression` for how many it takes.
         max_iter: steps at most after the S-estimate.
         tol: converged when a step moves the fitted values by less than this share of the scale, in root mean square.
         covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors are alike

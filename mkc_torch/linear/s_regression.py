@@ -24,7 +24,7 @@ from mkc_torch.linear._influence import (
 )
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._psi import BISQUARE_50, Psi, bisquare_for_breakdown, bisquare_rho, bisquare_weight
-from mkc_torch.linear._scale_search import ScaleMinimum, minimise_scale, rounding_scale
+from mkc_torch.linear._scale_search import ScaleMinimum, Search, descend, minimise_scale, rounding_scale
 from mkc_torch.linear.covariance import RobustCovarianceKind
 
 if TYPE_CHECKING:
@@ -42,33 +42,80 @@ class MScale:
     c: float = BISQUARE_50
     breakdown: float = 0.5
 
-    def scale(self, problem: LinearProblem, residual: Tensor) -> Float[Tensor, "B S m"]:
-        weight = problem.sample_weight
-        w = None if weight is None else weight.unsqueeze(1)
-        p = problem.coefficients_per_channel
-        N = problem.num_samples
-        target = self.breakdown * (problem.total_weight().unsqueeze(1) - p).clamp(min=1.0)
-        # the quantile that is 0 just where s is, so that a fit through p values does not start at 0
-        rank = min(N, math.ceil(N - self.breakdown * max(N - p, 0) - 1e-9))
-        scale = 1.4826 * order_statistic(residual.abs(), w, rank)
-        tiny = torch.finfo(residual.dtype).tiny
-        for _ in range(self.steps):
-            u = residual / (self.c * scale.clamp(min=tiny)).unsqueeze(-2)
-            rho, slope = bisquare_rho(u), 6.0 * u.square().clamp(max=1.0) * bisquare_weight(u)
-            if w is not None:
-                rho, slope = w * rho, w * slope
-            # Newton's method in log(scale), kept within a factor of two
-            excess = rho.sum(-2) - target
-            step = (excess / slope.sum(-2).clamp(min=tiny)).clamp(min=-0.7, max=0.7)
-            scale = scale * torch.exp(torch.where(scale > 0, step, 0.0))
-            if bool((step.abs() < 1e-13).all()):
-                break
-        return scale
+    def scale(self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None) -> Float[Tensor, "B S m"]:
+        return self._solved(problem, residual, residual.square() if self.steps else residual, near)
 
-    def weighed(self, problem: LinearProblem, residual: Tensor) -> tuple[Float[Tensor, "B S m"], Tensor]:
-        scale = self.scale(problem, residual)
+    def weighed(
+        self, problem: LinearProblem, residual: Tensor, near: Tensor | None = None
+    ) -> tuple[Float[Tensor, "B S m"], Tensor]:
+        square = residual.square()
+        scale = self._solved(problem, residual, square, near)
+        return scale, self._rest(square, scale).square()
+
+    def _first(self, problem: LinearProblem, residual: Tensor) -> Float[Tensor, "B S m"]:
+        """A scale to begin at, from the quantile that is 0 just where s is: a fit through p values has none of 0."""
+        w = None if problem.sample_weight is None else problem.sample_weight.unsqueeze(1)
+        N, p = problem.num_samples, problem.coefficients_per_channel
+        rank = min(N, math.ceil(N - self.breakdown * max(N - p, 0) - 1e-9))
+        return 1.4826 * order_statistic(residual.abs(), w, rank)
+
+    def _rest(self, square: Tensor, scale: Tensor) -> Float[Tensor, "B S N m"]:
+        """``1 - (r / (c s))²``, 0 from where that is 1: its square is the weight, its cube 1 - ρ."""
+        # the square of the least size still has an inverse
+        size = self.c * scale.clamp(min=torch.finfo(scale.dtype).tiny ** 0.5)
+        return torch.mul(square, -size.pow(-2).unsqueeze(-2)).add_(1.0).clamp_(min=0.0)
+
+    def _solved(
+        self, problem: LinearProblem, residual: Tensor, square: Tensor, near: Tensor | None
+    ) -> Float[Tensor, "B S m"]:
+        w = None if problem.sample_weight is None else problem.sample_weight.unsqueeze(1)
+        total = problem.total_weight().unsqueeze(1)
+        target = self.breakdown * (total - problem.coefficients_per_channel).clamp(min=1.0)
         tiny = torch.finfo(residual.dtype).tiny
-        return scale, bisquare_weight(residual / (self.c * scale.clamp(min=tiny)).unsqueeze(-2))
+        scale = self._first(problem, residual) if near is None else near
+        for _ in range(self.steps):
+            rest = self._rest(square, scale)
+            second = rest.square()
+            third = rest * second
+            if w is not None:
+                second, third = w * second, w * third
+            outside = third.sum(-2)
+            slope = 6.0 * (second.sum(-2) - outside)
+            # Newton's method in log(scale), kept within a factor of two
+            step = ((total - outside - target) / slope.clamp(min=tiny)).clamp(min=-0.7, max=0.7)
+            scale = scale * torch.exp(torch.where(scale > 0, step, 0.0))
+            # the next error is about the square of this step
+            if bool((step.abs() < 0.5 * torch.finfo(step.dtype).eps ** 0.5).all()):
+                return scale
+        # a scale that fell to nothing is not near to where it was
+        return scale if near is None or self.steps < _EXACT else self._solved(problem, residual, square, None)
+
+
+_EXACT = 30
+"""Newton's steps that solve for the scale to rounding."""
+
+_RANKED = 3
+"""Fits through up to so many values are good enough to be ranked as they are, by the quantile that s begins at."""
+
+_SCREENING, _SCREENING_RANKED = 2, 1
+"""Newton's steps for the scale of one of many fits."""
+
+_CANDIDATES = 10
+"""Fits that go on after the screening."""
+
+_NARROWING, _NARROWING_RANKED = ((4, 5), (8, 2)), ((3, 4), (5, 2))
+"""After so many steps more, only so many candidates go on."""
+
+_NEAR = 1e-7
+"""Steps end where the logarithm of the scale falls by less, and Newton's take over."""
+
+_MISSED = 1e-9
+"""No more starts are drawn than all miss with this probability where half of the values are outliers."""
+
+
+def starts_worth_drawing(starts: int, num_coefficients: int) -> int:
+    """``starts``, or as many as make :data:`_MISSED` where that is fewer."""
+    return min(starts, math.ceil(math.log(_MISSED) / math.log1p(-(0.5**num_coefficients))))
 
 
 def minimise_m_scale(
@@ -76,28 +123,76 @@ def minimise_m_scale(
 ) -> ScaleMinimum:
     """S-regression with Tukey's bisquare on a checked problem; the result has the derivatives of the minimum."""
     c = bisquare_of(breakdown)
-    screening, final = MScale(2, c, breakdown), MScale(30, c, breakdown)
+    final = MScale(_EXACT, c, breakdown)
+    ranked = problem.num_coefficients <= _RANKED
+    search = Search(
+        MScale(_SCREENING_RANKED if ranked else _SCREENING, c, breakdown),
+        final,
+        starts=starts_worth_drawing(starts, problem.num_coefficients),
+        ranking=MScale(0, c, breakdown) if ranked else None,
+        candidates=_CANDIDATES,
+        narrowing=_NARROWING_RANKED if ranked else _NARROWING,
+        tolerance=_NEAR,
+        max_iter=max_iter,
+        seed=seed,
+    )
     with torch.no_grad():
-        found = minimise_scale(problem, screening, final, starts=starts, max_iter=max_iter, seed=seed)
-        found = _polished(problem, found, final)
+        found = _brought_to_rest(problem, minimise_scale(problem, search), search)
     if not (problem.basis.requires_grad or problem.Y.requires_grad):
         return found
-    along = final.scale(problem, problem.residual(found.beta).unsqueeze(1)).squeeze(1)
+    # one step from the solution has its derivative
+    along = final.scale(problem, problem.residual(found.beta).unsqueeze(1), found.scale.unsqueeze(1)).squeeze(1)
     beta = found.beta - _newton_step(problem, found.beta, along, c)
-    scale, weight = final.weighed(problem, problem.residual(beta).unsqueeze(1))
+    scale, weight = final.weighed(problem, problem.residual(beta).unsqueeze(1), found.scale.unsqueeze(1))
     return replace(found, beta=beta, scale=scale.squeeze(1), weight=weight.squeeze(1))
 
 
-def _polished(problem: LinearProblem, found: ScaleMinimum, rule: MScale) -> ScaleMinimum:
-    """Newton's steps from where steps that lower the scale no longer do: they halve the digits that are wrong."""
+def _brought_to_rest(problem: LinearProblem, found: ScaleMinimum, search: Search) -> ScaleMinimum:
+    """Newton's steps, and where they do not end at rest, more of the search to the last digit and Newton's again."""
+    rule = search.final
+    assert isinstance(rule, MScale)
+    found, moved = _polished(problem, found, rule)
+    # a minimum moves by less than rounding does to the gradient
+    at_most = 1e2 * torch.finfo(moved.dtype).eps ** 0.5
+    index = (~(moved < at_most)).nonzero().squeeze(-1)
+    left = search.max_iter
+    while index.numel() > 0 and left > 0:
+        some = problem.select(index)
+        more = descend(some, found.beta[index], replace(search, tolerance=0.0, max_iter=min(_BETWEEN, left)))
+        more, moved = _polished(some, more, rule)
+        rest = more.converged | (moved < at_most)
+        found = ScaleMinimum(
+            found.beta.index_copy(0, index, more.beta),
+            found.scale.index_copy(0, index, more.scale),
+            found.weight.index_copy(0, index, more.weight),
+            found.n_iter + more.n_iter,
+            found.converged.index_copy(0, index, rest),
+        )
+        index, left = index[~rest], left - _BETWEEN
+    return found
+
+
+_BETWEEN = 40
+"""Steps of the search before Newton's are tried again."""
+
+
+def _polished(problem: LinearProblem, found: ScaleMinimum, rule: MScale) -> tuple[ScaleMinimum, Float[Tensor, " B"]]:
+    """Newton's steps from near the minimum, each of which halves the digits that are wrong, and the last one's length.
+
+    The length is the root mean square of what it moves the fitted values by, in scales; infinite where it is too long.
+    """
+    moved = found.beta.new_full(found.beta.shape[:1], math.inf)
     for _ in range(_POLISH):
         step = _newton_step(problem, found.beta, found.scale, rule.c)
         beta = found.beta - step
-        scale, weight = rule.weighed(problem, problem.residual(beta).unsqueeze(1))
+        scale, weight = rule.weighed(problem, problem.residual(beta).unsqueeze(1), found.scale.unsqueeze(1))
         scale, weight = scale.squeeze(1), weight.squeeze(1)
         tiny = torch.finfo(beta.dtype).tiny
         rise = (scale.clamp(min=tiny) / found.scale.clamp(min=tiny)).log().sum(-1)
-        short = torch.linalg.vector_norm(step, dim=-1) < 1e-3 * problem.num_samples**0.5 * found.scale.amin(-1)
+        length = torch.linalg.vector_norm(step, dim=-1) / (problem.num_samples**0.5 * found.scale.amin(-1))
+        short = length < _LONGEST
+        # of a step to rest, what the scale rises by is rounding
+        moved = torch.where(short, length, torch.inf)
         better = ((rise <= 16 * torch.finfo(beta.dtype).eps) & short).unsqueeze(-1)
         found = replace(
             found,
@@ -105,11 +200,14 @@ def _polished(problem: LinearProblem, found: ScaleMinimum, rule: MScale) -> Scal
             scale=torch.where(better, scale, found.scale),
             weight=torch.where(better.unsqueeze(-1), weight, found.weight),
         )
-    return found
+    return found, moved
 
 
-_POLISH = 2
-"""Newton's steps after the search, which ends at half of the digits."""
+_POLISH = 3
+"""Newton's steps after the search, which ends at a quarter of the digits."""
+
+_LONGEST = 1e-2
+"""Of Newton's steps, in scales: from further away they may lead to a saddle."""
 
 
 def bisquare_of(breakdown: float) -> float:
@@ -174,12 +272,13 @@ class SRegression(RobustInference):
 
     Starts go through n values each, and one through clean values is enough: at a share ε of outliers ``starts`` of them
     miss with probability ``(1 - (1 - ε)^n)^starts``, which is 1e-6 at ε = 0.45 and 4e-4 at 0.5 for the default and
-    n = 6. Take more for more coefficients.
+    n = 6. Take more for more coefficients. Of few coefficients no more are drawn than miss with probability
+    1e-9 at ε = 0.5: 73 for n = 2 and 156 for n = 3.
 
     Args:
         breakdown: share of outliers the estimator withstands, 0.01 to 0.5. At Gaussian residuals 0.5 has efficiency
             0.287, 0.25 has 0.759; :class:`MMRegression` has both.
-        starts: number of elemental starts.
+        starts: number of elemental starts at most.
         covariance: "sandwich" for independent samples, "hac" for a time series, "homoscedastic" where errors are alike
             at every X and no outlier lies far out in X.
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.

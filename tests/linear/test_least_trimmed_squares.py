@@ -308,3 +308,18 @@ def test_the_seed_chooses_the_starts():
     # weights, so that no exchange finishes what the starts began
     found = {float(LeastTrimmedSquares(starts=4, seed=s).fit(X[0], y[0], torch.ones(300)).objective_) for s in range(8)}
     assert len(found) > 1
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_order_statistic_is_that_of_torch_in_any_layout_and_under_any_transform(channels, dtype):
+    values = torch.randn(channels, 9, 4, generator=torch.Generator().manual_seed(5)).to(dtype).movedim(0, -1)
+    expected = values.kthvalue(3, dim=-2).values
+    assert torch.equal(order_statistic(values, None, 3), expected)
+    assert torch.equal(order_statistic(values.mT.contiguous().mT, None, 2.5), expected)
+    assert torch.equal(torch.func.vmap(lambda v: order_statistic(v, None, 3))(values), expected)
+    tangent = torch.func.jvp(lambda v: order_statistic(v, None, 3), (values,), (2.0 * values,))[1]
+    assert torch.equal(tangent, 2.0 * expected)
+    leaf = values.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(order_statistic(leaf, None, 3).sum(), leaf)
+    assert torch.equal(gradient, (values == expected.unsqueeze(-2)).to(dtype))

@@ -11,7 +11,7 @@ from torch import Tensor
 from mkc_torch.linear import LeastSquares, SRegression
 from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear._psi import BISQUARE_50, bisquare_for_breakdown, bisquare_rho, bisquare_weight
-from mkc_torch.linear.s_regression import MScale
+from mkc_torch.linear.s_regression import MScale, starts_worth_drawing
 from tests.literature import DATA_SETS, REFERENCE
 
 WITH_SCALE = [n for n in REFERENCE if REFERENCE[n].mm is not None]
@@ -253,3 +253,38 @@ def test_one_seed_gives_one_result():
     X, y = sample(0, 30, 4), sample(1, 30)
     one, other = SRegression(starts=3, seed=5).fit(X, y), SRegression(starts=3, seed=5).fit(X, y)
     assert torch.equal(one.coef_, other.coef_)
+
+
+@pytest.mark.parametrize(("n", "drawn"), [(1, 30), (2, 73), (3, 156), (4, 322), (5, 500), (6, 500), (12, 500)])
+def test_no_more_starts_are_drawn_than_are_worth_it(n, drawn):
+    """1e-9 is the largest probability to miss at 50 % outliers where fewer than asked for are drawn."""
+    assert starts_worth_drawing(500, n) == drawn
+    assert drawn == 500 or (1 - 0.5**n) ** drawn <= 1e-9 < (1 - 0.5**n) ** (drawn - 1)
+    assert starts_worth_drawing(7, n) == 7
+
+
+@pytest.mark.parametrize("off", [1e-9, 0.3, 1.0, 1.1, 1e9])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_scale_does_not_depend_on_where_it_begins(off, dtype):
+    X, y = sample(50, 40, 2).to(dtype), sample(51, 3, 40).to(dtype)
+    problem = linear_problem(X, y)
+    residual = problem.Y.unsqueeze(1)
+    rule = MScale(30)
+    scale = rule.scale(problem, residual)
+    again, weight = rule.weighed(problem, residual, off * scale)
+    tolerance = 8 * torch.finfo(dtype).eps
+    torch.testing.assert_close(again, scale, rtol=tolerance, atol=0.0)
+    expected = bisquare_weight(residual / (BISQUARE_50 * scale.unsqueeze(-2)))
+    torch.testing.assert_close(weight, expected, rtol=0.0, atol=100 * tolerance)
+
+
+def test_many_problems_in_one_call_are_fitted_as_each_alone():
+    """More than are worked on at once, some of which come to rest long before others."""
+    X, y = sample(52, 150, 40, 2), sample(53, 150, 40)
+    y[::3, :15] = 50.0 + X[::3, :15, 0]
+    together = SRegression().fit(X, y)
+    assert bool(together.converged_.all())
+    for i in range(0, 150, 13):
+        alone = SRegression().fit(X[i], y[i])
+        torch.testing.assert_close(together.coef_[i], alone.coef_, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(together.scale_[i], alone.scale_, rtol=1e-12, atol=0.0)
