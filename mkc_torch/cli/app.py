@@ -1,13 +1,13 @@
 """The commands of ``mkc``, one a file, each a function that typer makes a command of.
 
-What takes long to import, and not every command needs, is imported where it is used.
+What takes long to import, torch before all, is imported where a command has understood its options, so that help and
+mistakes are answered at once.
 """
 
 from typing import Annotated
 
 import typer
 
-from mkc_torch import __version__
 from mkc_torch.cli.apply import apply
 from mkc_torch.cli.calibrate import calibrate
 from mkc_torch.cli.challenge import challenge
@@ -27,6 +27,8 @@ app = typer.Typer(
 
 def _say_version(asked: bool) -> None:
     if asked:
+        from mkc_torch import __version__
+
         typer.echo(f"mkc {__version__}")
         raise typer.Exit
 
