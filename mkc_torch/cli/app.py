@@ -4,9 +4,10 @@ What takes long to import, torch before all, is imported where a command has und
 mistakes are answered at once.
 """
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from mkc_torch.cli.apply import apply
 from mkc_torch.cli.calibrate import calibrate
@@ -16,7 +17,19 @@ from mkc_torch.cli.diagnose import diagnose
 
 __all__ = ["app"]
 
+
+class _Commands(TyperGroup):
+    """The commands; which one is asked for, and how it is asked for help, is known without pydantic."""
+
+    def get_help_option(self, ctx: Any) -> Any:
+        option = super().get_help_option(ctx)
+        if option is not None:
+            option.default = False  # None is checked by pydantic, which takes longer to import than all the rest
+        return option
+
+
 app = typer.Typer(
+    cls=_Commands,
     help="Find what a simulation lacks, calibrate, apply. `mkc demo` shows it, no file needed.",
     no_args_is_help=True,
     add_completion=False,
