@@ -10,6 +10,8 @@ pytest.importorskip("polars")
 
 from mkc_torch.cli import diagnosis_request
 from mkc_torch.diagnosis import arguments
+from mkc_torch.recording.demonstration import simulated_recording
+from mkc_torch.recording.recording import write_table
 
 REFUSING = """
 import sys
@@ -57,6 +59,18 @@ def test_so_do_mistakes(mistake):
 def test_work_does_need_them(tmp_path):
     done = answered("demo", "--output", str(tmp_path / "demo"))
     assert "was loaded" in done.stderr
+
+
+def test_a_calibration_loads_no_compiler(tmp_path):
+    path = tmp_path / "a.csv"
+    write_table(path, simulated_recording()[0].columns)
+    code = (
+        "import sys, torch; there = set(sys.modules); from mkc_torch.cli.app import app; app(standalone_mode=False); "
+        "print('loaded', sorted({'torch._dynamo', 'sympy'} & (set(sys.modules) - there)))"
+    )
+    arguments = ("calibrate", str(path), "--output", str(tmp_path / "out"))
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
+    assert done.stdout.endswith("loaded []\n"), done.stdout + done.stderr
 
 
 def test_what_the_command_line_knows_of_a_diagnosis_is_true():
