@@ -47,8 +47,10 @@ def calibrate(
         raise typer.BadParameter("--unit is empty; name the unit, such as counts.")
     refuse_same_names(recordings)
     with loading():
+        from mkc_torch._parallel.processes import keep_memory
         from mkc_torch.cli.calibration_files import calibrate_file
         from mkc_torch.cli.calibration_summary import show
+    keep_memory()
     console, failed, left = out(), 0, list(recordings)
     with progress(len(recordings)) as step, interrupts_told(lambda: not_written(left, output)):
         for path in recordings:

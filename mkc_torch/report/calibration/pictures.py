@@ -198,7 +198,7 @@ def _covered(lon: np.ndarray, lat: np.ndarray, directions: Tensor) -> np.ndarray
     grid = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], -1).reshape(-1, 3)
     unit = torch.nn.functional.normalize(_thinned(directions).float(), dim=-1)
     nearest = torch.full((len(grid),), -1.0)
-    for part in unit.split(2048):
+    for part in unit.split(256):  # what is compared stays in the cache
         nearest = torch.maximum(nearest, (torch.from_numpy(grid).float() @ part.mT).amax(-1))
     return (nearest.numpy() > np.cos(np.radians(NEAR_DEGREES))).astype(float).reshape(lon.shape)
 
