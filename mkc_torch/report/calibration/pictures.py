@@ -130,7 +130,10 @@ def coverage_map(found: Coverage, directions: Tensor) -> str:
         if not covered.all():
             ax.contourf(lon, lat, covered, levels=[-0.5, 0.5], colors="none", hatches=["///"])
         unit = torch.nn.functional.normalize(_thinned(directions), dim=-1).numpy()
-        ax.plot(*_lon_lat(unit), ".", ms=1.3, color=BLUE, alpha=0.6, rasterized=True)
+        # projected here, or the lines between them, which nobody draws, would be projected too, at 75 places each
+        place = ax.transProjection.transform(np.stack(_lon_lat(unit), -1))
+        on_page = ax.transAffine + ax.transAxes
+        ax.plot(*place.T, ".", ms=1.3, color=BLUE, alpha=0.6, rasterized=True, transform=on_page)
         for name, vector in (
             ("+x", (1, 0, 0)), ("+y", (0, 1, 0)), ("+z", (0, 0, 1)), ("−y", (0, -1, 0)), ("−z", (0, 0, -1)),
         ):  # fmt: skip
