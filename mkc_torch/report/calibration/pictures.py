@@ -121,7 +121,7 @@ def coverage_map(found: Coverage, directions: Tensor) -> str:
     """The sphere of directions in the sensor's axes, Mollweide: covered, not covered, samples, axes and gaps."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 4.6), layout="constrained")
-        ax = figure.add_subplot(projection="mollweide")
+        ax: Any = figure.add_subplot(projection="mollweide")
         lon, lat = np.meshgrid(np.radians(np.linspace(-180, 180, 121)), np.radians(np.linspace(-90, 90, 61)))
         covered = _covered(lon, lat, directions)
         ax.set_facecolor("#FFFFFF")
