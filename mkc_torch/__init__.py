@@ -1,12 +1,9 @@
 """Multi-kernel correntropy in PyTorch: robust likelihoods, regression and sensor calibration."""
 
 from importlib import import_module
-from importlib.metadata import version
 from importlib.util import find_spec
 from pkgutil import iter_modules
 from typing import TYPE_CHECKING
-
-__version__ = version("mkc-torch")
 
 __all__ = [
     "DensityFit",
@@ -56,6 +53,8 @@ if TYPE_CHECKING:
         predictive_interval,
     )
     from mkc_torch.recording import Recording
+
+    __version__: str
 else:
     _HOMES = {
         "calibration": ("EllipsoidFit", "NotIdentifiableError"),
@@ -80,6 +79,11 @@ else:
 
     def __getattr__(name):
         # torch takes seconds to import; until then the command line has to be able to say that it was interrupted
+        if name == "__version__":
+            from importlib.metadata import version
+
+            globals()[name] = version("mkc-torch")
+            return globals()[name]
         home = next((room for room, names in _HOMES.items() if name in names), None)
         if home is not None:
             value = getattr(import_module(f"{__name__}.{home}"), name)

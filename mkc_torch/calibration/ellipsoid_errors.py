@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.calibration.ellipsoid import Ellipsoid, symmetric_root
+from mkc_torch.linear._implicit.layer import wanted
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -30,9 +31,9 @@ def derived_slopes(
     def quantities(theta: Tensor) -> Tensor:
         center, shape = ellipsoid_of(theta)
         axes = torch.linalg.eigvalsh(shape).flip(-1).rsqrt()
-        return torch.cat([center, axes, shape.flatten()])
+        return torch.cat([center, axes, shape.flatten(-2)], -1)
 
-    jacobian = torch.func.vmap(torch.func.jacrev(quantities))(parameters.reshape(-1, 9))
+    jacobian = _jacobian(quantities, parameters.reshape(-1, 9))
     shape = local.shape.reshape(-1, 3, 3)
     root = symmetric_root(shape)
     eye = torch.eye(3, dtype=root.dtype, device=root.device)
@@ -45,3 +46,17 @@ def derived_slopes(
     radius = torch.linalg.det(shape).pow(-1 / 6)
     d_matrix = radius[:, None, None] * (d_root + root.flatten(1).unsqueeze(-1) * d_log_radius.unsqueeze(1))
     return torch.cat([jacobian[:, :6], d_matrix, d_root], 1)
+
+
+def _jacobian(function: Callable[[Tensor], Tensor], theta: Float[Tensor, "B p"]) -> Float[Tensor, "B q p"]:
+    """Derivatives of each problem's values, of a function that takes all problems at once."""
+    if wanted(theta):
+        return torch.func.vmap(torch.func.jacrev(function))(theta)
+    # the same numbers to the last digit; torch.func, and a gradient that is given, would load torch's compiler and
+    # sympy, which takes longer than a calibration
+    with torch.inference_mode(False), torch.enable_grad():
+        width = function(theta[0]).shape[-1]
+        leaf = theta.unsqueeze(1).repeat(1, width, 1).requires_grad_()
+        values = function(leaf).diagonal(dim1=-2, dim2=-1).sum()
+        (slopes,) = torch.autograd.grad(values, leaf, create_graph=True)
+    return slopes.detach()

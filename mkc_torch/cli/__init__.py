@@ -6,6 +6,7 @@ import io
 import os
 import signal
 import sys
+from collections.abc import Callable
 from importlib.util import find_spec
 from types import FrameType
 
@@ -26,16 +27,13 @@ def main() -> None:
     missing = next((name for name in _EXTRA if find_spec(name) is None), None)
     if missing is not None:
         sys.exit(f'mkc: {missing} is not installed; install the command line with `pip install "mkc-torch[cli]"`.')
-    from mkc_torch._parallel.fork import allow_copies
-    from mkc_torch._parallel.processes import keep_modules
     from mkc_torch.cli.app import app
+    from mkc_torch.cli.loading import when_loaded
 
-    keep_modules()
-    allow_copies()
+    when_loaded(lambda: _begin(usual))
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a pipe's encoding may lack σ and ±
-    signal.signal(signal.SIGINT, usual)
     try:
         app(prog_name="mkc")
     except KeyboardInterrupt:  # a second one, while the first was being dealt with
@@ -46,6 +44,16 @@ def main() -> None:
         # what streams still hold would fail again when Python ends
         os.write(2, f"mkc: what it says could not be written: {error.strerror}.\n".encode())
         os._exit(1)
+
+
+def _begin(usual: Callable[[int, FrameType | None], object] | int | None) -> None:
+    """Make the process the command's own, now that it has loaded what it needs."""
+    from mkc_torch._parallel.fork import allow_copies
+    from mkc_torch._parallel.processes import keep_modules
+
+    keep_modules()
+    allow_copies()
+    signal.signal(signal.SIGINT, usual)
 
 
 def _quit(_signal: int, _frame: FrameType | None) -> None:

@@ -1,13 +1,14 @@
 """The commands of ``mkc``, one a file, each a function that typer makes a command of.
 
-What takes long to import, and not every command needs, is imported where it is used.
+What takes long to import, torch before all, is imported where a command has understood its options, so that help and
+mistakes are answered at once.
 """
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
-from mkc_torch import __version__
 from mkc_torch.cli.apply import apply
 from mkc_torch.cli.calibrate import calibrate
 from mkc_torch.cli.challenge import challenge
@@ -16,7 +17,19 @@ from mkc_torch.cli.diagnose import diagnose
 
 __all__ = ["app"]
 
+
+class _Commands(TyperGroup):
+    """The commands; which one is asked for, and how it is asked for help, is known without pydantic."""
+
+    def get_help_option(self, ctx: Any) -> Any:
+        option = super().get_help_option(ctx)
+        if option is not None:
+            option.default = False  # None is checked by pydantic, which takes longer to import than all the rest
+        return option
+
+
 app = typer.Typer(
+    cls=_Commands,
     help="Find what a simulation lacks, calibrate, apply. `mkc demo` shows it, no file needed.",
     no_args_is_help=True,
     add_completion=False,
@@ -27,6 +40,8 @@ app = typer.Typer(
 
 def _say_version(asked: bool) -> None:
     if asked:
+        from mkc_torch import __version__
+
         typer.echo(f"mkc {__version__}")
         raise typer.Exit
 

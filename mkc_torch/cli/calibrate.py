@@ -8,25 +8,18 @@ from typing import Annotated
 
 import typer
 
-from mkc_torch._support.files import claim_folder, write_atomically
-from mkc_torch.calibration.calibrate import Calibration
-from mkc_torch.calibration.calibrate import calibrate as fit
-from mkc_torch.calibration.not_identifiable import NotIdentifiableError
-from mkc_torch.cli.calibration_summary import show
 from mkc_torch.cli.console import (
     FAILURES,
     complain,
     err,
-    folder_removed_on_failure,
     interrupts_told,
     not_written,
     out,
     parsed_columns,
     progress,
     refuse_same_names,
-    with_unit,
 )
-from mkc_torch.recording.recording import Recording
+from mkc_torch.cli.loading import loading
 
 
 def calibrate(
@@ -53,13 +46,19 @@ def calibrate(
     if not unit.strip():
         raise typer.BadParameter("--unit is empty; name the unit, such as counts.")
     refuse_same_names(recordings)
+    with loading():
+        from mkc_torch._parallel.processes import keep_memory
+        from mkc_torch.cli.calibration_files import calibrate_file
+        from mkc_torch.cli.calibration_summary import show
+    keep_memory()
     console, failed, left = out(), 0, list(recordings)
     with progress(len(recordings)) as step, interrupts_told(lambda: not_written(left, output)):
         for path in recordings:
             step(f"calibrating {path.name}")
             try:
-                recording = with_unit(Recording.read(path, columns=names), unit)
-                calibration, files = calibrate_into(output / path.stem, recording, field_strength, force=force)
+                calibration, files = calibrate_file(
+                    path, output / path.stem, columns=names, unit=unit, field_strength=field_strength, force=force
+                )
             except FAILURES as error:
                 failed += 1
                 with step.aside():
@@ -72,25 +71,3 @@ def calibrate(
     if len(recordings) > 1 and failed:
         err().print(f"mkc: {failed} of {len(recordings)} recordings were not calibrated.", soft_wrap=True)
     raise typer.Exit(1 if failed else 0)
-
-
-def calibrate_into(
-    folder: Path, recording: Recording, field_strength: float | None, *, force: bool
-) -> tuple[Calibration, list[Path]]:
-    """Write calibration.json and report.html of a recording; where it is refused, the report alone says why."""
-    from mkc_torch.report import calibration_report, refusal_report
-
-    report, result = folder / "report.html", folder / "calibration.json"
-    claim_folder(folder, overwrite=force, files=(report.name, result.name))
-    with folder_removed_on_failure(folder):
-        try:
-            calibration = fit(recording, field_strength=field_strength)
-        except NotIdentifiableError as error:
-            page = refusal_report(recording, error)
-            write_atomically(report, page, overwrite=force)
-            result.unlink(missing_ok=True)  # an old one beside a new refusal would be taken for its result
-            raise NotIdentifiableError(f"{error} See {report}.", error.coverage, error.directions) from None
-        page = calibration_report(calibration, recording)
-        write_atomically(result, calibration.to_json(), overwrite=force)
-        write_atomically(report, page, overwrite=force)
-    return calibration, [result, report]

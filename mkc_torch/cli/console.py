@@ -10,14 +10,16 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event, RLock, Thread
+from typing import TYPE_CHECKING
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from mkc_torch.recording.recording import Recording
 from mkc_torch.report.words.terms import term
-from mkc_torch.simulation.load import SimulationFileError
+
+if TYPE_CHECKING:
+    from mkc_torch.recording.recording import Recording
 
 FAILURES = (ValueError, OSError, ImportError, RuntimeError)
 """What bad input, a full disk or a numerical breakdown raises."""
@@ -84,6 +86,8 @@ def sentence_of(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         where = f"{error.filename} " if error.filename else ""
         return term("command.no_file", file=where, reason=error.strerror.lower())
+    from mkc_torch.simulation.load import SimulationFileError
+
     if isinstance(error, SimulationFileError):
         return str(error)
     return " ".join(str(error).split())
@@ -135,6 +139,8 @@ def parsed_pairs(option: str, texts: Sequence[str], example: str) -> dict[str, s
 
 def with_unit(recording: Recording, unit: str) -> Recording:
     """The recording with its magnetometer in a unit of the user's own."""
+    from mkc_torch.recording.recording import Recording
+
     own = {name: unit for name in ("mag_x", "mag_y", "mag_z") if name in recording}
     return Recording(
         recording.columns,

@@ -3,51 +3,14 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-import torch
 import typer
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
-from mkc_torch._parallel.processes import keep_memory, one_thread
-from mkc_torch._support.files import claim_folder, write_atomically
-from mkc_torch._support.order_statistic import robust_scale
-from mkc_torch.calibration.calibrate import Calibration, Vector, calibrate
-from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
-from mkc_torch.cli import diagnosis_summary
-from mkc_torch.cli.calibration_summary import show
+from mkc_torch._support.files import claim_folder
 from mkc_torch.cli.console import FAILURES, complain, folder_removed_on_failure, interrupts_told, out, progress
-from mkc_torch.cli.diagnosis_files import WRITTEN, write_diagnosis
-from mkc_torch.diagnosis import Diagnosis, diagnose
-from mkc_torch.linear import LeastSquares
-from mkc_torch.recording.demonstration import FIELD_PER_AMPERE, Truth, concealed_recording, simulated_recording
-from mkc_torch.recording.kept_columns import write_beside
-from mkc_torch.recording.recording import Recording, write_table
-from mkc_torch.report.diagnosis.numbers import measured
-from mkc_torch.report.words.numbers import number
-from mkc_torch.report.words.terms import term
-from mkc_torch.simulation import Magnetometer
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from mkc_torch.report import Comparison
-
-_NOTE = (
-    "SIMULATED: no sensor recorded this. A program turned a sensor with a known offset and known gains through all "
-    "directions for 90 s while a loudspeaker was carried past it, so the truth can stand beside the result."
-)
-_CONCEALED_NOTE = (
-    "SIMULATED: no sensor recorded this. A program turned the same sensor for 60 s beside a cable, whose current adds "
-    f"{measured(FIELD_PER_AMPERE, None, 'µT/A')[0]} to the field, and made one sample in twenty an outlier. The "
-    "diagnosis was not told."
-)
-_FILES = ("recording.csv", "calibration.json", "report.html", "concealed.csv", "second.csv", "corrected.csv")
-_CONCEALED = "concealed"
+from mkc_torch.cli.loading import loading
 
 
 def demo(
@@ -55,12 +18,24 @@ def demo(
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
     """Calibrate, diagnose and correct embedded SIMULATED sensors and compare with the truth; needs no file."""
+    with loading():
+        from mkc_torch._parallel.processes import keep_memory, one_thread
+        from mkc_torch.cli.demonstration import (
+            CONCEALED,
+            FILES,
+            calibrate_simulated,
+            correct_second,
+            diagnose_simulated,
+            show_calibration,
+            show_diagnosis,
+        )
+        from mkc_torch.cli.diagnosis_files import WRITTEN
     one_thread()
     keep_memory()
     console = out()
     try:
-        claim_folder(output, overwrite=force, files=_FILES)
-        place = claim_folder(output / _CONCEALED, overwrite=force, files=WRITTEN)
+        claim_folder(output, overwrite=force, files=FILES)
+        place = claim_folder(output / CONCEALED, overwrite=force, files=WRITTEN)
         with (
             interrupts_told(lambda: _written(output)),
             folder_removed_on_failure(output),
@@ -68,20 +43,20 @@ def demo(
             progress(1) as step,
         ):
             step("calibrating a simulated sensor")
-            calibration, rows, files = _calibrate(output, force=force)
+            calibration, rows, files = calibrate_simulated(output, force=force)
             with step.aside():
-                _show_calibration(console, calibration, rows, files)
+                show_calibration(console, calibration, rows, files)
             step("diagnosing a simulated sensor beside a cable")
-            diagnosis, found = _diagnose(output, force=force)
+            diagnosis, found = diagnose_simulated(output, force=force)
             step("correcting a second recording of it")
-            second = _correct(output, diagnosis, force=force)
+            second = correct_second(output, diagnosis, force=force)
             with step.aside():
-                _show_diagnosis(console, diagnosis, found, second)
+                show_diagnosis(console, diagnosis, found, second)
     except FAILURES as error:
         complain(output, error)
         raise typer.Exit(1) from None
-    console.print(f"\nNext: open {files[-1]} and {output / _CONCEALED / 'report.html'}, or", soft_wrap=True)
-    for model, table in (("calibration.json", "recording.csv"), (f"{_CONCEALED}/model.json", "second.csv")):
+    console.print(f"\nNext: open {files[-1]} and {output / CONCEALED / 'report.html'}, or", soft_wrap=True)
+    for model, table in (("calibration.json", "recording.csv"), (f"{CONCEALED}/model.json", "second.csv")):
         command = shlex.join(["mkc", "apply", str(output / model), str(output / table), "--output", "corrected.csv"])
         console.print(f"  {command}", soft_wrap=True)
 
@@ -89,109 +64,3 @@ def demo(
 def _written(output: Path) -> str:
     """What an interrupt left."""
     return f"{output} may be incomplete." if output.is_dir() else f"nothing was written to {output}."
-
-
-def _calibrate(folder: Path, *, force: bool) -> tuple[Calibration, list[Comparison], list[Path]]:
-    from mkc_torch.report import calibration_report
-
-    recording, truth = simulated_recording()
-    calibration = calibrate(recording)
-    rows = _comparison(recording, truth, calibration)
-    files = [folder / name for name in _FILES[:3]]
-    page = calibration_report(calibration, recording, note=_NOTE, comparison=rows)
-    write_table(files[0], recording.columns, overwrite=force)
-    write_atomically(files[1], calibration.to_json(), overwrite=force)
-    write_atomically(files[2], page, overwrite=force)
-    return calibration, rows, files
-
-
-def _comparison(recording: Recording, truth: Truth, calibration: Calibration) -> list[Comparison]:
-    from mkc_torch.report import Comparison
-
-    squares = EllipsoidFit(LeastSquares()).fit(recording.magnetometer())
-    return [
-        Comparison("truth", truth.center, truth.semi_axes),
-        Comparison("least squares", _vector(squares.center_.tolist()), _vector(squares.semi_axes_.tolist())),
-        Comparison("MKC-EM", calibration.center, calibration.semi_axes),
-    ]
-
-
-def _vector(values: list[float]) -> Vector:
-    x, y, z = values
-    return x, y, z
-
-
-def _diagnose(folder: Path, *, force: bool) -> tuple[Diagnosis, list[Path]]:
-    recording = concealed_recording()
-    diagnosis = diagnose(Magnetometer(), recording)
-    write_table(folder / "concealed.csv", recording.columns, overwrite=force)
-    files = write_diagnosis(diagnosis, folder / _CONCEALED, force=force, note=_CONCEALED_NOTE)
-    return diagnosis, [folder / "concealed.csv", *files]
-
-
-@dataclass(frozen=True)
-class _Second:
-    """How far the length of a second recording's field scatters, and the files."""
-
-    calibrated: float
-    corrected: float
-    files: list[Path]
-
-
-def _correct(folder: Path, diagnosis: Diagnosis, *, force: bool) -> _Second:
-    """Correct another recording by the model, and by what a calibration of the first one alone makes of it."""
-    second = concealed_recording(seed=1)
-    assert diagnosis.model is not None
-    corrected = diagnosis.model(second)
-    files = [folder / "second.csv", folder / "corrected.csv"]
-    write_table(files[0], second.columns, overwrite=force)
-    field = {name: values for name, values in corrected.items() if name not in second.columns}
-    write_beside(files[0], files[1], field, overwrite=force)
-    alone = calibrate(concealed_recording()).apply(second)
-    return _Second(_scatter(alone), _scatter(corrected), files)
-
-
-def _scatter(field: dict[str, Tensor]) -> float:
-    length = torch.linalg.vector_norm(torch.stack([field[f"field_{axis}"] for axis in "xyz"], -1), dim=-1)
-    return float(robust_scale((length - length.median()).unsqueeze(-1)))
-
-
-def _show_calibration(console: Console, calibration: Calibration, rows: list[Comparison], files: list[Path]) -> None:
-    told = "1  Calibrate. SIMULATED sensor: turned by hand for 90 s while a loudspeaker is carried past it."
-    console.print(Text(told, style="bold"))
-    show(console, calibration, files)
-    console.print()
-    console.print(_table(rows))
-
-
-def _table(rows: list[Comparison]) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
-    table.add_column("µT, SIMULATED")
-    offsets = [term("table.offset_of", axis=axis) for axis in "xyz"]
-    for name in (*offsets, *(term("table.semi_axis", number=i) for i in (1, 2, 3))):
-        table.add_column(name, justify="right")
-    table.add_column("largest error", justify="right")
-    truth = (*rows[0].center, *rows[0].semi_axes)
-    for row in rows:
-        values = (*row.center, *row.semi_axes)
-        worst = max(abs(v - t) for v, t in zip(values, truth, strict=True))
-        table.add_row(row.name, *(number(v, 2) for v in values), "" if row is rows[0] else number(worst, 2))
-    return table
-
-
-def _show_diagnosis(console: Console, diagnosis: Diagnosis, files: list[Path], second: _Second) -> None:
-    told = "2  Diagnose. SIMULATED sensor beside a cable, whose field, below the noise, was left out."
-    console.print(Text(f"\n{told}", style="bold"))
-    diagnosis_summary.show(console, diagnosis, files)
-    table = Table.grid(padding=(0, 3, 0, 0))
-    table.add_row("truth", Text(*measured(FIELD_PER_AMPERE, None, "µT/A, SIMULATED")))
-    for found in (p for f in diagnosis.findings for p in f.parameters if p.name == "field_per_ampere"):
-        table.add_row("found", Text(*measured(found.value, found.standard_error, found.unit)))
-    console.print()
-    console.print(table)
-    told = "3  Correct a second recording of that sensor: how far the length of its field scatters"
-    console.print(Text(f"\n{told}", style="bold"))
-    console.print(f"by a calibration alone             {second.calibrated:.2f} µT")
-    console.print(f"by the model with what was found   {second.corrected:.2f} µT")
-    for file in second.files:
-        console.print(Text.assemble(f"{term('label.written'):<12}", (str(file), "cyan")), soft_wrap=True)

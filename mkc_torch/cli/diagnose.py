@@ -11,7 +11,6 @@ from typing import Annotated
 
 import typer
 
-from mkc_torch._parallel.processes import in_processes, keep_memory, one_thread
 from mkc_torch.cli.console import (
     FAILURES,
     Look,
@@ -26,9 +25,8 @@ from mkc_torch.cli.console import (
     progress,
     refuse_same_names,
 )
-from mkc_torch.cli.diagnosis_files import MAGNETOMETER, SIMULATIONS, Outcome, Request, diagnose_file, simulation_of
-from mkc_torch.diagnosis.arguments import BETWEEN
-from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
+from mkc_torch.cli.diagnosis_request import BETWEEN, LEVEL, MAGNETOMETER, SIMULATIONS, SURROGATES, Outcome, Request
+from mkc_torch.cli.loading import loading
 
 
 def diagnose(
@@ -92,9 +90,12 @@ def diagnose(
         force=force,
     )
     refuse_same_names(recordings)
+    with loading():
+        from mkc_torch._parallel.processes import in_processes, keep_memory, one_thread
+        from mkc_torch.cli.diagnosis_files import simulation_of
     total, failed, left = 0, 0, list(recordings)
     with interrupts_told(lambda: not_written(left, output)):
-        _refuse_unusable(request)
+        _refuse_unusable(request, simulation_of)
     one_thread()
     keep_memory()
     look = Look.of(out())
@@ -120,6 +121,8 @@ def diagnose(
 
 
 def _diagnosed(output: Path, request: Request, look: Look, step: Steps | None, path: Path) -> list[Outcome]:
+    from mkc_torch.cli.diagnosis_files import diagnose_file
+
     return diagnose_file(path, output / path.stem, request, look, step)
 
 
@@ -152,7 +155,7 @@ def _known(simulation: str | None, simulated: Path | None) -> str:
     return simulation or ""
 
 
-def _refuse_unusable(request: Request) -> None:
+def _refuse_unusable(request: Request, simulation_of: Callable[[Request], object]) -> None:
     """Said once, before anything is written, and not again for each recording."""
     try:
         simulation_of(request)

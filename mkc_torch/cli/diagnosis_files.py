@@ -6,16 +6,15 @@ import re
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkc_torch._parallel.early_import import load_early
 from mkc_torch._support.files import claim_folder, write_atomically
 from mkc_torch.cli.console import FAILURES, Look, folder_removed_on_failure, sentence_of, with_unit
+from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request
 from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.diagnosis import Diagnosis, diagnose
-from mkc_torch.diagnosis.diagnose import LEVEL, SURROGATES
 from mkc_torch.diagnosis.files.python_source import SourceError
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.load import load_simulation, raised_in
@@ -24,11 +23,7 @@ if TYPE_CHECKING:
     from mkc_torch.simulation import Simulation
 
 __all__ = [
-    "MAGNETOMETER",
-    "SIMULATIONS",
     "WRITTEN",
-    "Outcome",
-    "Request",
     "diagnose_file",
     "folder_names",
     "named_simulation",
@@ -37,37 +32,8 @@ __all__ = [
     "write_diagnosis",
 ]
 
-MAGNETOMETER = "magnetometer"
-SIMULATIONS = (MAGNETOMETER,)
-"""Simulations that are known by name."""
-
 _EXPERIMENT = "experiment"
 WRITTEN = ("diagnosis.json", "model.json", "corrected.py", "report.html")
-
-
-@dataclass(frozen=True)
-class Request:
-    """What is asked of each recording: to be compared with a simulation, or with what ``simulated`` holds of one."""
-
-    simulation: str = MAGNETOMETER
-    simulated: Path | None = None
-    columns: Mapping[str, str] = field(default_factory=dict)
-    unit: str = "µT"
-    noise: Mapping[str, float] = field(default_factory=dict)
-    between: Mapping[str, str] = field(default_factory=dict)
-    level: float = LEVEL
-    surrogates: int = SURROGATES
-    seed: int = 0
-    force: bool = False
-    report: bool = True
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """A recording, or one experiment of it: its summary, or the sentence that says why there is none."""
-
-    text: str
-    failed: bool
 
 
 def diagnose_file(

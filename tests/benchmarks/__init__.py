@@ -1,0 +1,1 @@
+"""What is measured and not tested: times differ from machine to machine."""

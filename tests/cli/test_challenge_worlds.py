@@ -9,9 +9,9 @@ pytest.importorskip("polars")
 pytest.importorskip("jsonschema")
 pytest.importorskip("jinja2")
 
-from mkc_torch.cli import challenge
-from mkc_torch.cli.challenge import diagnose_in_world
-from mkc_torch.cli.diagnosis_files import MAGNETOMETER
+from mkc_torch.cli import challenge_jobs
+from mkc_torch.cli.challenge_jobs import diagnose_in_world
+from mkc_torch.cli.diagnosis_request import MAGNETOMETER
 from tests.cli.test_diagnose import mkc, refused
 
 
@@ -23,7 +23,7 @@ def adequate(paths, folder):
 
 
 def test_worlds_are_drawn_scored_and_told_with_their_aims(tmp_path, monkeypatch):
-    monkeypatch.setattr(challenge, "diagnose_in_world", adequate)
+    monkeypatch.setattr(challenge_jobs, "diagnose_in_world", adequate)
     folder = tmp_path / "worlds"
     command = ("challenge", "--worlds", "--family", "dynamics", "--per-world", 3, "--hidden-per-world", 1, "--seed", 4)
     result = mkc(*command, "--only", "gusts", "--only", "useless", "--workers", 1, "--output", folder)
@@ -46,7 +46,7 @@ def test_worlds_are_drawn_scored_and_told_with_their_aims(tmp_path, monkeypatch)
 
 
 def test_a_third_as_many_have_something_hidden_by_default(tmp_path, monkeypatch):
-    monkeypatch.setattr(challenge, "diagnose_in_world", adequate)
+    monkeypatch.setattr(challenge_jobs, "diagnose_in_world", adequate)
     command = ("challenge", "--worlds", "--per-world", 3, "--only", "white", "--duration", 12, "--workers", 1)
     result = mkc(*command, "--output", tmp_path / "a")
     assert result.exit_code == 0, result.output
@@ -73,7 +73,9 @@ def test_what_does_not_belong_together_is_refused(tmp_path, arguments, words):
 
 def test_each_recording_is_compared_with_the_simulation_that_lies_ready_for_it(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(challenge, "_diagnose", lambda path, _, request: asked.append((path.stem, request.simulation)))
+    monkeypatch.setattr(
+        challenge_jobs, "_diagnose", lambda path, _, request: asked.append((path.stem, request.simulation))
+    )
     (tmp_path / "simulations").mkdir()
     for name in ("cart_pole_00003", "case_00004"):
         (tmp_path / "simulations" / f"{name}.py").touch()

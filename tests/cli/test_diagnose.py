@@ -421,7 +421,7 @@ def test_a_length_is_refused_where_each_system_has_its_own(tmp_path):
 
 
 def test_a_failed_diagnosis_is_not_scored_by_an_older_one(tmp_path):
-    from mkc_torch.cli.challenge import diagnose_unseen
+    from mkc_torch.cli.challenge_jobs import diagnose_unseen
 
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "diagnosis.json").write_text("{}")

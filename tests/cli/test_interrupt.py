@@ -80,7 +80,7 @@ def told(result, sentence):
 
 def test_calibrate_says_for_which_recordings_nothing_was_written(tmp_path, monkeypatch):
     paths = [table(tmp_path / f"{name}.csv", noisy_ellipsoid(200)) for name in "abc"]
-    interrupting(monkeypatch, "calibrate", "fit", after=1)
+    interrupting(monkeypatch, "calibration_files", "fit", after=1)
     result = mkc("calibrate", *paths, "--output", tmp_path / "out")
     told(result, f"nothing was written for {paths[1]}, {paths[2]}.")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["a"]
@@ -89,7 +89,7 @@ def test_calibrate_says_for_which_recordings_nothing_was_written(tmp_path, monke
 
 def test_diagnose_says_so_too(tmp_path, monkeypatch):
     path = table(tmp_path / "a.csv", noisy_ellipsoid(200))
-    interrupting(monkeypatch, "diagnose", "diagnose_file")
+    interrupting(monkeypatch, "diagnosis_files", "diagnose_file")
     told(
         mkc("diagnose", path, "--simulation", "magnetometer", "--output", tmp_path / "out"),
         f"nothing was written for {path}.",
@@ -99,12 +99,12 @@ def test_diagnose_says_so_too(tmp_path, monkeypatch):
 def test_apply_and_demo_say_so_too(tmp_path, monkeypatch):
     path = table(tmp_path / "a.csv", noisy_ellipsoid(200))
     assert mkc("calibrate", path, "--output", tmp_path).exit_code == 0
-    interrupting(monkeypatch, "apply", "correct")
+    interrupting(monkeypatch, "correction", "correct")
     output = tmp_path / "o.csv"
     told(
         mkc("apply", tmp_path / "a" / "calibration.json", path, "--output", output), f"nothing was written to {output}."
     )
-    interrupting(monkeypatch, "demo", "simulated_recording")
+    interrupting(monkeypatch, "demonstration", "simulated_recording")
     told(mkc("demo", "--output", tmp_path / "demo"), f"nothing was written to {tmp_path / 'demo'}.")
     assert not (tmp_path / "demo").exists()
 

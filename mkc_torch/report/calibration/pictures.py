@@ -121,7 +121,7 @@ def coverage_map(found: Coverage, directions: Tensor) -> str:
     """The sphere of directions in the sensor's axes, Mollweide: covered, not covered, samples, axes and gaps."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 4.6), layout="constrained")
-        ax = figure.add_subplot(projection="mollweide")
+        ax: Any = figure.add_subplot(projection="mollweide")
         lon, lat = np.meshgrid(np.radians(np.linspace(-180, 180, 121)), np.radians(np.linspace(-90, 90, 61)))
         covered = _covered(lon, lat, directions)
         ax.set_facecolor("#FFFFFF")
@@ -130,7 +130,10 @@ def coverage_map(found: Coverage, directions: Tensor) -> str:
         if not covered.all():
             ax.contourf(lon, lat, covered, levels=[-0.5, 0.5], colors="none", hatches=["///"])
         unit = torch.nn.functional.normalize(_thinned(directions), dim=-1).numpy()
-        ax.plot(*_lon_lat(unit), ".", ms=1.3, color=BLUE, alpha=0.6, rasterized=True)
+        # projected here, or the lines between them, which nobody draws, would be projected too, at 75 places each
+        place = ax.transProjection.transform(np.stack(_lon_lat(unit), -1))
+        on_page = ax.transAffine + ax.transAxes
+        ax.plot(*place.T, ".", ms=1.3, color=BLUE, alpha=0.6, rasterized=True, transform=on_page)
         for name, vector in (
             ("+x", (1, 0, 0)), ("+y", (0, 1, 0)), ("+z", (0, 0, 1)), ("−y", (0, -1, 0)), ("−z", (0, 0, -1)),
         ):  # fmt: skip
@@ -198,7 +201,7 @@ def _covered(lon: np.ndarray, lat: np.ndarray, directions: Tensor) -> np.ndarray
     grid = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], -1).reshape(-1, 3)
     unit = torch.nn.functional.normalize(_thinned(directions).float(), dim=-1)
     nearest = torch.full((len(grid),), -1.0)
-    for part in unit.split(2048):
+    for part in unit.split(256):  # what is compared stays in the cache
         nearest = torch.maximum(nearest, (torch.from_numpy(grid).float() @ part.mT).amax(-1))
     return (nearest.numpy() > np.cos(np.radians(NEAR_DEGREES))).astype(float).reshape(lon.shape)
 

@@ -11,7 +11,7 @@ pytest.importorskip("matplotlib")
 from mkc_torch.challenge.dynamics.subject import dynamics
 from mkc_torch.challenge.key import digest
 from mkc_torch.challenge.run import run_challenge
-from mkc_torch.cli.challenge import correct_dynamics, diagnose_dynamics
+from mkc_torch.cli.challenge_jobs import correct_dynamics, diagnose_dynamics
 from mkc_torch.recording.recording import Recording
 
 

@@ -1,0 +1,43 @@
+"""What a diagnosis can be asked for on the command line, and its outcome; nothing here needs torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+__all__ = ["BETWEEN", "LEVEL", "MAGNETOMETER", "SIMULATIONS", "SURROGATES", "Outcome", "Request"]
+
+MAGNETOMETER = "magnetometer"
+SIMULATIONS = (MAGNETOMETER,)
+"""Simulations that are known by name."""
+
+# those of mkc_torch.diagnosis, which cannot be imported without torch; a test holds them together
+BETWEEN = ("held", "linear", "smooth")
+LEVEL = 0.05
+SURROGATES = 99
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of each recording: to be compared with a simulation, or with what ``simulated`` holds of one."""
+
+    simulation: str = MAGNETOMETER
+    simulated: Path | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
+    unit: str = "µT"
+    noise: Mapping[str, float] = field(default_factory=dict)
+    between: Mapping[str, str] = field(default_factory=dict)
+    level: float = LEVEL
+    surrogates: int = SURROGATES
+    seed: int = 0
+    force: bool = False
+    report: bool = True
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A recording, or one experiment of it: its summary, or the sentence that says why there is none."""
+
+    text: str
+    failed: bool

@@ -1,0 +1,79 @@
+"""The command line answers what needs no computing without loading what computes."""
+
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("typer")
+pytest.importorskip("polars")
+
+from mkc_torch.cli import diagnosis_request
+from mkc_torch.diagnosis import arguments
+from mkc_torch.recording.demonstration import simulated_recording
+from mkc_torch.recording.recording import write_table
+
+REFUSING = """
+import sys
+
+class Refusing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in HEAVY:
+            raise AssertionError(f"{name} was loaded")
+
+HEAVY = {"torch", "numpy", "polars", "lightning", "matplotlib", "scipy", "sklearn", "jinja2", "pydantic"}
+sys.meta_path.insert(0, Refusing())
+import mkc_torch.cli as cli
+cli.find_spec = lambda name: name  # what is looked for is not loaded
+cli.main()
+"""
+
+
+def answered(*arguments):
+    return subprocess.run(
+        [sys.executable, "-c", REFUSING, *arguments], capture_output=True, text=True, check=False, timeout=60
+    )
+
+
+@pytest.mark.parametrize("command", [(), ("diagnose",), ("calibrate",), ("apply",), ("challenge",), ("demo",)])
+def test_help_comes_without_what_computes(command):
+    done = answered(*command, "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert " ".join(("Usage: mkc", *command)) in done.stdout
+
+
+def test_so_does_the_version():
+    done = answered("--version")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("mkc ")
+
+
+@pytest.mark.parametrize("mistake", [("nonsense",), ("calibrate", "--nonsense"), ("demo", "--outptu", "there")])
+def test_so_do_mistakes(mistake):
+    done = answered(*mistake)
+    assert done.returncode == 2
+    assert "Usage: mkc" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_work_does_need_them(tmp_path):
+    done = answered("demo", "--output", str(tmp_path / "demo"))
+    assert "was loaded" in done.stderr
+
+
+def test_a_calibration_loads_no_compiler(tmp_path):
+    path = tmp_path / "a.csv"
+    write_table(path, simulated_recording()[0].columns)
+    code = (
+        "import sys, torch; there = set(sys.modules); from mkc_torch.cli.app import app; app(standalone_mode=False); "
+        "print('loaded', sorted({'torch._dynamo', 'sympy'} & (set(sys.modules) - there)))"
+    )
+    arguments = ("calibrate", str(path), "--output", str(tmp_path / "out"))
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
+    assert done.stdout.endswith("loaded []\n"), done.stdout + done.stderr
+
+
+def test_what_the_command_line_knows_of_a_diagnosis_is_true():
+    module = sys.modules["mkc_torch.diagnosis.diagnose"]
+    assert (diagnosis_request.LEVEL, diagnosis_request.SURROGATES) == (module.LEVEL, module.SURROGATES)
+    assert diagnosis_request.BETWEEN == arguments.BETWEEN
