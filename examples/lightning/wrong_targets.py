@@ -88,9 +88,9 @@ def loaded(name: str) -> tuple[Tensor, Tensor]:
         frame = frame.sample(min(MOST, len(frame)), random_state=0)
         y = frame.pop(target).to_numpy()
         x = pd.get_dummies(frame, drop_first=True).to_numpy(dtype=float)
-    features = torch.as_tensor(np.asarray(x), dtype=torch.float32)
+    features = torch.as_tensor(np.array(x), dtype=torch.float32)
     features = (features - features.mean(0)) / features.std(0).clamp(min=1e-9)
-    return features.clamp(-5.0, 5.0), torch.as_tensor(np.asarray(y), dtype=torch.float32).unsqueeze(-1)
+    return features.clamp(-5.0, 5.0), torch.as_tensor(np.array(y), dtype=torch.float32).unsqueeze(-1)
 
 
 def spoilt(target: Tensor, kind: str, share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
