@@ -84,6 +84,7 @@ def test_a_bug_in_an_effect_is_no_search_that_fails(diagnosed):
         diagnosed(broken)
 
 
+@pytest.mark.slow
 def test_a_search_that_wanders_off_changes_nothing_of_what_was_found(diagnosed, recording):
     def wanders_off(base, first):
         base.model.residual(1.01 * base.parameters)
@@ -93,7 +94,11 @@ def test_a_search_that_wanders_off_changes_nothing_of_what_was_found(diagnosed, 
     diagnosis, searches = diagnosed(wanders_off)
     assert len(searches) == 2
     (finding,) = diagnosis.findings
-    assert finding.parameters == plain.parameters
+    # to rounding, which is not the same everywhere in memory; what wanders off does so by a hundredth
+    for found, expected in zip(finding.parameters, plain.parameters, strict=True):
+        assert found == replace(expected, value=found.value, standard_error=found.standard_error)
+        assert found.value == pytest.approx(expected.value, rel=1e-9)
+        assert found.standard_error == pytest.approx(expected.standard_error, rel=1e-9)
 
 
 def test_a_search_without_an_effect_of_a_possible_sign_finds_nothing(recording):
