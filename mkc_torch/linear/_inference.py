@@ -14,7 +14,7 @@ from mkc_torch._support.arrays import Data, as_tensor
 from mkc_torch._support.student_t import fisher_tail, student_quantile, student_tails
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._goodness import robust_r_squared
-from mkc_torch.linear._influence import Scores, degrees_of_freedom, robust_covariance
+from mkc_torch.linear._influence import ScaleInfluence, Scores, degrees_of_freedom, influence, robust_covariance
 from mkc_torch.linear.covariance import RobustCovarianceKind, checked_bandwidth, checked_robust_kind
 from mkc_torch.linear.summary import LIGHT, Summary, one_problem
 
@@ -242,10 +242,17 @@ class RobustInference(Inference):
         beta: Float[Tensor, "B n"],
         weight: Float[Tensor, "B N m"],
         equation: Scores,
-        influence_of: Callable[[Tensor | None], Tensor],
         ratio: float,
+        *,
+        of_scale: ScaleInfluence | None = None,
+        of_start: Callable[[Tensor | None], Tensor | None] | None = None,
         widening: Float[Tensor, " B"] | None = None,
     ) -> None:
+        def influence_of(share: Tensor | None) -> Tensor:
+            moved = influence(problem, equation, of_scale, share)
+            passed_on = None if of_start is None else of_start(share)
+            return moved if passed_on is None else moved + passed_on
+
         covariance = robust_covariance(problem, equation, influence_of, self.covariance, self.bandwidth)
         if widening is not None:
             covariance = covariance * problem.restore(widening.square())[..., None, None]

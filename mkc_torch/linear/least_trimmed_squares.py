@@ -15,7 +15,7 @@ from mkc_torch._support.arguments import checked_whole
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._inference import RobustInference
-from mkc_torch.linear._influence import Scores, coefficients_a_value, influence
+from mkc_torch.linear._influence import Scores, coefficients_a_value
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._scale_search import Search, minimise_scale, relative_precision, rounding_scale
 from mkc_torch.linear.covariance import RobustCovarianceKind
@@ -251,9 +251,8 @@ class LeastTrimmedSquares(RobustInference):
             beta,
             weight,
             equation,
-            lambda share: influence(problem, equation, None, share),
             gaussian_consistency(h / N) ** 2,
-            1.0 + (_SMALL_SAMPLE * (N - h) / N * coefficients_a_value(problem)).square(),
+            widening=1.0 + (_SMALL_SAMPLE * (N - h) / N * coefficients_a_value(problem)).square(),
         )
         self.exact_ = problem.num_channels == 1 and (h == N or _few_choices(problem, h))
         self.n_iter_ = n_iter

@@ -14,7 +14,7 @@ from mkc_torch._support.arguments import checked_number, checked_whole
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._inference import RobustInference
-from mkc_torch.linear._influence import influence, m_scale_influence, scores
+from mkc_torch.linear._influence import m_scale_influence, scores
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._psi import TUNING_95, Psi, PsiName, Tuning, checked_tuning
 from mkc_torch.linear._robust_start import checked_start, robust_start
@@ -248,14 +248,7 @@ class MEstimator(RobustInference):
             square = equation.z.square()
             slope = 2.0 * equation.z * inside
             of_scale = m_scale_influence(problem, square.clamp(max=clip * clip), slope, equation.z, found.scale)
-        self._infer(
-            problem,
-            found.beta,
-            found.weight,
-            equation,
-            lambda share: influence(problem, equation, of_scale, share),
-            psi.ratio(),
-        )
+        self._infer(problem, found.beta, found.weight, equation, psi.ratio(), of_scale=of_scale)
         self.n_iter_ = problem.restore(found.n_iter)
         self.converged_ = problem.restore(found.converged)
         return self

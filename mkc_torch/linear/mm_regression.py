@@ -9,7 +9,7 @@ from torch import Tensor
 from mkc_torch._support.arguments import checked_number, checked_whole
 from mkc_torch._support.arrays import Data
 from mkc_torch.linear._inference import RobustInference
-from mkc_torch.linear._influence import influence, scores
+from mkc_torch.linear._influence import scores
 from mkc_torch.linear._problem import linear_problem
 from mkc_torch.linear._psi import Psi, bisquare_for_efficiency
 from mkc_torch.linear.covariance import RobustCovarianceKind
@@ -103,14 +103,7 @@ class MMRegression(RobustInference):
         self.scale_ = problem.restore(found.scale)
         equation = scores(problem, found.beta, found.scale, psi)
         _, of_scale = m_scale_equation(problem, start.beta, start.scale, self.breakdown)
-        self._infer(
-            problem,
-            found.beta,
-            found.weight,
-            equation,
-            lambda share: influence(problem, equation, of_scale, share),
-            psi.ratio(),
-        )
+        self._infer(problem, found.beta, found.weight, equation, psi.ratio(), of_scale=of_scale)
         self.n_iter_ = problem.restore(found.n_iter)
         self.converged_ = problem.restore(found.converged)
         return self

@@ -130,13 +130,13 @@ class ReweightedLeastSquares(RobustInference):
         equation = Scores(z * weight, weight, z, scale)
         inside, edge = _gaussian_edge(self.threshold)
 
-        def influence_of(share: Tensor | None) -> Tensor:
-            moved = influence(problem, equation, None, share)
+        def of_start(share: Tensor | None) -> Tensor | None:
             start = self._start_influence(problem, share)
-            return moved if start is None else moved + edge / inside * start
+            return None if start is None else edge / inside * start
 
         wider = 1.0 + _SMALL_SAMPLE * coefficients_a_value(problem)
-        self._infer(problem, beta, weight, equation, influence_of, inside / (inside - edge), wider)
+        ratio = inside / (inside - edge)
+        self._infer(problem, beta, weight, equation, ratio, of_start=of_start, widening=wider)
 
     def _start_influence(self, problem: LinearProblem, share: Tensor | None) -> Tensor | None:
         """What each sample moves the start's coefficients by, in the basis, where that is known."""

@@ -17,7 +17,6 @@ from mkc_torch.linear._influence import (
     ScaleInfluence,
     Scores,
     coefficients_a_value,
-    influence,
     m_scale_influence,
     scores,
     weighed,
@@ -339,9 +338,9 @@ class SRegression(RobustInference):
             minimum.beta,
             minimum.weight,
             equation,
-            lambda share: influence(problem, equation, of_scale, share),
             Psi("tukey", (bisquare_of(self.breakdown),)).ratio(),
-            1.0 + _SMALL_SAMPLE * self.breakdown * coefficients_a_value(problem),
+            of_scale=of_scale,
+            widening=1.0 + _SMALL_SAMPLE * self.breakdown * coefficients_a_value(problem),
         )
         self.n_iter_ = minimum.n_iter
         self.converged_ = problem.restore(minimum.converged)
