@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mkc_torch.simulation.dynamics.kalman import Flow, Models, Parts, filtered, robust_likelihood
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer
+from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -234,18 +235,16 @@ def _models(flow: Flow, noises: Sequence[_Noise]) -> Models:
 
 def _likelihoods(flow: Flow, noises: Sequence[_Noise]) -> tuple[np.ndarray, np.ndarray]:
     """Of each, its scale profiled out, and that scale; at the scale it has, where some of the sensors' is declared."""
-    return _by_parts(_parts(flow), flow, noises)
+    parts = _parts(flow)
+    found = filtered(parts, _models(flow, noises))
+    return robust_likelihood(found, parts.mine, flow.reach, free=not any(noises[0].known))
 
 
 def _exactly(flow: Flow, noise: _Noise) -> tuple[float, float]:
     """The same of one, in one stretch: without a push there is nothing that corrects a filter which begins inside."""
-    values, scales = _by_parts(flow.whole, flow, [noise])
+    found = filtered_whole(flow, _models(flow, [noise]))
+    values, scales = robust_likelihood(found, flow.counts[:, None], flow.reach, free=not any(noise.known))
     return float(values[0]), float(scales[0])
-
-
-def _by_parts(parts: Parts, flow: Flow, noises: Sequence[_Noise]) -> tuple[np.ndarray, np.ndarray]:
-    found = filtered(parts, _models(flow, noises))
-    return robust_likelihood(found, parts.mine, flow.reach, free=not any(noises[0].known))
 
 
 @lru_cache(maxsize=2)
@@ -322,7 +321,7 @@ def observer_of(
     if not disturbances:
         return None
     models = models_of(flow, disturbances, sensor, names, channels)
-    kept = filtered(flow.whole, models, keep=True)
+    kept = filtered_whole(flow, models, keep=True)
     D, m = models.place.shape[1], flow.new.shape[1]
     own = np.zeros((m, D))
     for d in range(D):

@@ -17,7 +17,19 @@ import numpy as np
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Filtered", "Flow", "Models", "filtered", "robust_likelihood", "smoothed"]
+__all__ = [
+    "End",
+    "Filtered",
+    "Flow",
+    "Models",
+    "Parts",
+    "Start",
+    "filtered",
+    "robust_likelihood",
+    "run",
+    "smoothed",
+    "start_of",
+]
 
 _CLIP = 4.0
 _OUTLIERS = 0.05
@@ -147,8 +159,33 @@ class Models:
 
 
 @dataclass(frozen=True)
+class Start:
+    """What is known at one end of each stretch: states and lasting disturbances, and their covariance."""
+
+    state: Float[np.ndarray, "G B k"]
+    covariance: Float[np.ndarray, "G B k k"]
+
+
+@dataclass(frozen=True)
+class End(Start):
+    """What is known after the last sample of each stretch.
+
+    Attributes:
+        kept: what is left there of an error of the state before the first sample.
+    """
+
+    kept: Float[np.ndarray, "G B k k"]
+
+
+@dataclass(frozen=True)
 class Filtered:
-    """What a filter leaves: standardised innovations of each stretch, and covariances and states on its way if kept."""
+    """What a filter leaves: standardised innovations of each stretch, and covariances and states on its way if kept.
+
+    Attributes:
+        standard, log_spread: (L, G, B, m), of the innovations; the logarithm of what they were divided by.
+        prior, state: before each sample is taken up, covariances (L, G, B, k, k) and means (L, G, B, k), if kept.
+        posterior, after: the same after it.
+    """
 
     standard: Float[np.ndarray, "L G B m"]
     log_spread: Float[np.ndarray, "L G B m"]
@@ -158,49 +195,75 @@ class Filtered:
     posterior: Float[np.ndarray, "L G B k k"]
 
 
+def start_of(spread: Float[np.ndarray, "G B n"], models: Models) -> Start:
+    """States about where the trajectory has them, and disturbances as they are without any sample."""
+    G, B, n = spread.shape
+    D = models.place.shape[1]
+    P = np.zeros((G, B, n + D, n + D))
+    own, index = np.arange(n), n + np.arange(D)
+    P[..., own, own] = spread**2
+    P[..., index, index] = models.size**2
+    return Start(np.zeros((G, B, n + D)), P)
+
+
 def filtered(flow: Parts, models: Models, *, keep: bool = False) -> Filtered:
-    """Run the filters; ``keep`` for covariances and states too."""
+    """What the filters leave; ``keep`` for covariances and states too."""
+    return run(flow, models, keep=keep)[0]
+
+
+def run(flow: Parts, models: Models, *, keep: bool = False, start: Start | None = None) -> tuple[Filtered, End]:
+    """What the filters leave, and what is known after the last sample of each stretch.
+
+    Args:
+        flow: stretches.
+        models: of the noise.
+        keep: whether covariances and states on the way are kept.
+        start: what each stretch begins with; None where one that begins inside knows nothing of the samples before,
+            and nobody asks what is left of it.
+    """
     N, G, m = flow.new.shape
     n, p, B = flow.carried.shape[2], flow.pushed.shape[-1], len(models)
     D = models.place.shape[1]
     k = n + D
     at_rate = models.place < p
-    which = np.where(at_rate, models.place, 0)
+    # a disturbance pushes its rate alone
+    acts = np.where(at_rate[:, None], np.arange(p)[:, None] == models.place[:, None], 0.0)  # (B, p, D)
     C = np.zeros((G, B, m, k))
-    for d in range(D):
-        for j in range(m):
-            C[:, :, j, n + d] = models.place[:, d] == p + j
-    state = np.zeros((G, B, k))
-    P = np.zeros((G, B, k, k))
+    for j in range(m):
+        C[:, :, j, n:] = models.place == p + j
+    through = start is not None
+    if start is None:
+        start = start_of(np.where(flow.inside[:, None, None], flow.spread, np.zeros((B, 1))), models)
+    state, P = start.state, start.covariance
     index = n + np.arange(D)
-    P[..., index, index] = models.size**2
     variance = models.sensor**2
-    # where a stretch begins inside, its states are about where the trajectory has them
-    own = np.arange(n)
-    P[..., own, own] = np.where(flow.inside[:, None, None], flow.spread**2, 0.0)
-    standard, log_spread = np.zeros((N, G, B, m)), np.zeros((N, G, B, m))
+    standard, log_spread = np.empty((N, G, B, m)), np.empty((N, G, B, m))
     kept = (N, G, B, k, k) if keep else (0, G, B, k, k)
-    priors, posteriors = np.zeros(kept), np.zeros(kept)
-    states, afters = np.zeros(kept[:4]), np.zeros(kept[:4])
+    priors, posteriors = np.empty(kept), np.empty(kept)
+    states, afters = np.empty(kept[:4]), np.empty(kept[:4])
     A = np.zeros((G, B, k, k))
-    ratio = None if D == 0 else 1.0 / models.lasting
+    step = flow.step[:, :, None, None]
+    phi = np.where(step > 0, np.exp(-step / models.lasting), 0.0)
+    renewed = models.size**2 * (1.0 - phi**2)
+    whitened = bool(models.white.any())
+    left = np.broadcast_to(np.eye(k), P.shape)
     for row in range(N):
         if row:
             A[..., :n, :n] = flow.carried[row - 1][:, None]
-            pushed = flow.pushed[row - 1]
+            pushed = flow.pushed[row - 1][:, None]
             if D:
-                push = pushed.swapaxes(1, 2)[:, which]  # (G, B, D, n)
-                A[..., :n, n:] = np.where(at_rate[..., None], push, 0.0).swapaxes(2, 3)
-                step = flow.step[row - 1][:, None, None]
-                phi = np.where(step > 0, np.exp(-step * ratio), 0.0)
-                A[..., index, index] = phi
+                A[..., :n, n:] = pushed @ acts
+                A[..., index, index] = phi[row - 1]
             state = (A @ state[..., None])[..., 0]
             state[..., :n] -= flow.shift[row - 1][:, None]
             P = A @ P @ A.swapaxes(2, 3)
+            if through:
+                left = A @ left
             if D:
-                P[..., index, index] += models.size**2 * (1.0 - phi**2)
-            white = pushed[:, None] * models.white[:, None, :]
-            P[..., :n, :n] += white @ white.swapaxes(2, 3)
+                P[..., index, index] += renewed[row - 1]
+            if whitened:
+                white = pushed * models.white[:, None, :]
+                P[..., :n, :n] += white @ white.swapaxes(2, 3)
         C[..., :n] = flow.seen[row][:, None]
         if keep:
             priors[row], states[row] = P, state
@@ -210,14 +273,18 @@ def filtered(flow: Parts, models: Models, *, keep: bool = False) -> Filtered:
             S = (c * Pc).sum(-1) + variance[:, j]
             root = np.sqrt(np.maximum(S, 1e-300))
             z = (flow.new[row, :, j, None] - (c * state).sum(-1)) / root
-            standard[row, :, :, j], log_spread[row, :, :, j] = z, np.log(root)
+            standard[row, :, :, j], log_spread[row, :, :, j] = z, root
             used = flow.counts[row, :, j, None]
             pulled = used * _CLIP * np.tanh(z / _CLIP) / root
             state = state + Pc * pulled[..., None]
-            P = P - (used / S)[..., None, None] * Pc[..., :, None] * Pc[..., None, :]
+            gain = (used / S)[..., None] * Pc
+            P = P - gain[..., None] * Pc[..., None, :]
+            if through:
+                left = left - gain[..., None] * (c[..., None, :] @ left)
         if keep:
             afters[row], posteriors[row] = state, P
-    return Filtered(standard, log_spread, priors, states, afters, posteriors)
+    np.log(log_spread, out=log_spread)
+    return Filtered(standard, log_spread, priors, states, afters, posteriors), End(state, P, left)
 
 
 def robust_likelihood(

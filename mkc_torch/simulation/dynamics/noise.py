@@ -13,8 +13,9 @@ from torch import Tensor
 from mkc_torch.simulation.dynamics.disturbances import Disturbed, disturbed, models_of, observer_of, resized
 from mkc_torch.simulation.dynamics.first_fit import floor_of, without_noise
 from mkc_torch.simulation.dynamics.flow import flow_of
-from mkc_torch.simulation.dynamics.kalman import filtered, smoothed
+from mkc_torch.simulation.dynamics.kalman import smoothed
 from mkc_torch.simulation.dynamics.observer import Observable, Observer
+from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
 from mkc_torch.simulation.protocol import Changes, Nearby
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ def pushes_over_time(
     usual = float(np.median(flow.step[flow.step > 0]))
     lasting = tuple(one.lasting_at_least(0.1 * usual) for one in found.disturbances)
     models = models_of(flow, lasting, found.sensor, prepared.pushable, prepared.channels)
-    state, covariance = smoothed(flow, models, filtered(flow.whole, models, keep=True))
+    state, covariance = smoothed(flow, models, filtered_whole(flow, models, keep=True))
     n = flow.carried.shape[1]
     courses = []
     for number in range(len(lasting)):
