@@ -1,4 +1,4 @@
-"""Tangents of a function, by forward mode or by reverse mode."""
+"""Tangents of a function, by forward mode, by reverse mode, or by reverse mode of reverse mode."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import functools
 import warnings
 from collections.abc import Callable
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
-__all__ = ["Residual", "beside", "forward_tangents", "load_forward_mode", "reverse_tangents"]
+__all__ = ["Residual", "beside", "forward_tangents", "load_forward_mode", "reverse_tangents", "twice_reverse_tangents"]
 
 Residual = Callable[..., Tensor]
 
@@ -46,6 +47,55 @@ def forward_tangents(function: Residual) -> Residual:
         return torch.func.vmap(along)(basis)
 
     return tangents
+
+
+def twice_reverse_tangents(function: Residual) -> Residual:
+    """The tangents as slopes of what reverse mode makes of weights of the values, which is linear in these.
+
+    Forward mode does in Python what torch does here in C++, unless a constant has a tangent too (:func:`beside`). It is
+    used where reverse mode has no finite answer, as beside an infinite slope that ``torch.where`` leaves out, and where
+    there is no second derivative. Torch takes that for 0, so a function's first answer is compared along one direction.
+    """
+
+    def tangents(theta: Tensor, *data: Any) -> Tensor:
+        trusted = _trusted.get(function)
+        rows = None if trusted is False else _twice_reversed(function, theta, *data)
+        if rows is None or not bool(rows.isfinite().all()):
+            return forward_tangents(function)(theta, *data)
+        if trusted is None:
+            trusted = _trusted[function] = _agree(rows, function, theta, *data)
+        return rows if trusted else forward_tangents(function)(theta, *data)
+
+    return tangents
+
+
+_trusted: WeakKeyDictionary[Residual, bool] = WeakKeyDictionary()
+"""Whether a function's tangents by reverse mode of reverse mode were those of forward mode when they were compared."""
+
+
+def _agree(rows: Tensor, function: Residual, theta: Tensor, *data: Any) -> bool:
+    """Whether tangents are those of forward mode along one direction."""
+    load_forward_mode()
+    sizes = rows.flatten(1).abs().amax(1)
+    # each parameter by as much as the others, in the values
+    direction = torch.where((sizes > 0) & sizes.isfinite(), 1.0 / sizes, 1.0)
+    along = torch.func.jvp(lambda t: function(t, *data), (theta,), (direction,))[1]
+    off = (torch.tensordot(direction, rows, 1) - along).abs().amax()
+    return bool(off <= 1e3 * torch.finfo(theta.dtype).eps ** 0.5 * along.abs().amax())
+
+
+def _twice_reversed(function: Residual, theta: Tensor, *data: Any) -> Tensor | None:
+    """None where reverse mode cannot be had."""
+    with torch.enable_grad():
+        at = theta.detach().requires_grad_()
+        values = function(at, *data)
+        weights = torch.zeros_like(values, requires_grad=True)
+        basis = torch.eye(len(at), dtype=at.dtype, device=at.device)
+        try:
+            (weighed,) = torch.autograd.grad(values, at, weights, create_graph=True)
+            return torch.autograd.grad(weighed, weights, basis, is_grads_batched=True)[0].detach()
+        except RuntimeError:
+            return None
 
 
 def reverse_tangents(function: Residual) -> Residual:

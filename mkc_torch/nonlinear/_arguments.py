@@ -13,7 +13,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 from mkc_torch._support.arguments import as_numbers, refuse_not_real, refuse_other_type, told
 from mkc_torch._support.forward_mode import Residual
 from mkc_torch.nonlinear._descent import within
-from mkc_torch.nonlinear._problem import Constraint, Point, Problem
+from mkc_torch.nonlinear._problem import TANGENTS, Constraint, Point, Problem
 from mkc_torch.nonlinear.prior import GaussianPrior
 
 __all__ = ["per_channel", "prepared", "refuse_out_of_reach"]
@@ -74,8 +74,10 @@ def prepared(
             f"Expected argument `start` to be finite but got {int((~torch.isfinite(start)).sum())} values that are "
             "not; start elsewhere."
         )
-    if jacobian not in ("forward", "reverse"):
-        raise ValueError(f"Expected argument `jacobian` to be 'forward' or 'reverse' but got {jacobian!r}.")
+    if jacobian not in TANGENTS:
+        raise ValueError(
+            f"Expected argument `jacobian` to be 'forward', 'reverse' or 'reverse twice' but got {jacobian!r}."
+        )
     batch, p = start.shape[:-1], start.shape[-1]
     theta = start.detach().reshape(-1, p)
     box = _checked_box(lower, upper, theta)
@@ -94,7 +96,7 @@ def prepared(
         residual,
         flat,
         batch,
-        jacobian == "forward",
+        jacobian,
         prior_mean=mean,
         prior_precision=precision,
         box=box,

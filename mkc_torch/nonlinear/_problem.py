@@ -11,12 +11,19 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 from mkc_torch._support.arguments import refuse_other_type
-from mkc_torch._support.forward_mode import Residual, forward_tangents, reverse_tangents
+from mkc_torch._support.forward_mode import Residual, forward_tangents, reverse_tangents, twice_reverse_tangents
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Constraint", "Point", "Problem", "kernel_weights", "shaped_jacobian"]
+__all__ = ["TANGENTS", "Constraint", "Point", "Problem", "kernel_weights", "shaped_jacobian"]
+
+TANGENTS: dict[str, Callable[[Residual], Residual]] = {
+    "forward": forward_tangents,
+    "reverse": reverse_tangents,
+    "reverse twice": twice_reverse_tangents,
+}
+"""Ways to a Jacobian."""
 
 Constraint = Callable[[Tensor], Tensor]
 
@@ -28,7 +35,7 @@ class Problem:
     function: Residual
     data: Any
     batch: torch.Size
-    forward: bool
+    jacobian: str
     weight: Tensor | None = None
     used: Tensor | None = None  # None: all residuals are
     prior_mean: Tensor | None = None
@@ -55,9 +62,9 @@ class Problem:
 
     def tangents(self, theta: Float[Tensor, "B p"]) -> Float[Tensor, "B p N*m"]:
         """The transposed Jacobian: a row for each parameter, as forward mode makes them."""
-        rows = self._over_batch(
-            forward_tangents(self.function) if self.forward else reverse_tangents(self.function), theta
-        )
+        # a batch is differentiated in one, which reverse mode of reverse mode cannot be
+        way = "forward" if self.jacobian == "reverse twice" and len(theta) > 1 else self.jacobian
+        rows = self._over_batch(TANGENTS[way](self.function), theta)
         if self.used is not None:
             rows = torch.where(self.used.unsqueeze(1), rows, 0.0)
         return rows.flatten(2)

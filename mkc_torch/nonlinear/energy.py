@@ -70,7 +70,7 @@ def minimise(
     inequality: Constraint | None = None,
     max_iter: int = 50,
     tol: float = 1e-10,
-    jacobian: Literal["forward", "reverse"] = "forward",
+    jacobian: Literal["forward", "reverse", "reverse twice"] = "forward",
 ) -> Solution:
     """Minimise the MKC energy ``Σ w σ² (1 - exp(-e² / (2 d² σ²)))`` of a residual over its parameters.
 
@@ -99,7 +99,8 @@ def minimise(
         max_iter: trial steps at most; with constraints, for each of up to 30 sets of multipliers.
         tol: a problem has converged when a step promises and brings a decrease of less than this share of the
             objective.
-        jacobian: "forward" is quick for few parameters, "reverse" for few residuals.
+        jacobian: "forward" is quick for few parameters, "reverse" for few residuals; "reverse twice" for few parameters
+            and many small operations, half of forward mode's time where constants meet parameters at each of them.
 
     Raises:
         TypeError: ``start`` is no floating tensor, the residual has another dtype, or an argument is of another kind.

@@ -126,7 +126,7 @@ def fit(
     inequality: Constraint | None = None,
     max_iter: int = 200,
     tol: float = 1e-10,
-    jacobian: Literal["forward", "reverse"] = "forward",
+    jacobian: Literal["forward", "reverse", "reverse twice"] = "forward",
     covariance: CovarianceKind | None = "sandwich",
     bandwidth: float | None = None,
     starts: int = 1,

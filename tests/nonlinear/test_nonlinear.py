@@ -235,12 +235,56 @@ def test_a_weight_of_two_counts_a_sample_twice():
     torch.testing.assert_close(one.objective, other.objective)
 
 
-def test_reverse_mode_gives_what_forward_mode_gives():
+@pytest.mark.parametrize("jacobian", ["reverse", "reverse twice"])
+def test_reverse_mode_gives_what_forward_mode_gives(jacobian):
     residual = residual_to(noisy(0, 0.1)[:20].repeat(6))
-    one = minimise(residual, START, sigma=2.0, d=0.2)
-    other = minimise(residual, START, sigma=2.0, d=0.2, jacobian="reverse")
-    torch.testing.assert_close(one.theta, other.theta, rtol=1e-9, atol=0)
-    torch.testing.assert_close(one.jacobian, other.jacobian)
+    for start in (START, torch.stack([START, 1.1 * START])):
+        one = minimise(residual, start, sigma=2.0, d=0.2)
+        other = minimise(residual, start, sigma=2.0, d=0.2, jacobian=jacobian)
+        torch.testing.assert_close(one.theta, other.theta, rtol=1e-9, atol=0)
+        torch.testing.assert_close(one.jacobian, other.jacobian)
+
+
+class Once(torch.autograd.Function):
+    """The exponential, with a derivative in each mode and no second one."""
+
+    @staticmethod
+    def forward(x):
+        return torch.exp(x)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):  # noqa: ARG004
+        ctx.save_for_backward(output)
+        ctx.save_for_forward(output)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, gradient):
+        return gradient * ctx.saved_tensors[0]
+
+    @staticmethod
+    def jvp(ctx, tangent):
+        return tangent * ctx.saved_tensors[0]
+
+    generate_vmap_rule = True
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda theta: torch.where(T > 0, (T * theta[1]).abs().sqrt(), theta[1]) + theta[0] * T + theta[2],
+        lambda theta: Once.apply(-theta[1] * T) * theta[0] + theta[2],
+        lambda theta: theta[0] * T + theta[2] + 0.0 * theta[1],
+    ],
+    ids=["infinite slope left out", "no second derivative", "linear"],
+)
+def test_what_reverse_mode_cannot_differentiate_twice_forward_mode_differentiates(function):
+    from mkc_torch._support.forward_mode import forward_tangents, twice_reverse_tangents
+
+    found = twice_reverse_tangents(function)(TRUTH)
+    assert found.shape == (3, len(T))
+    assert bool(found.isfinite().all())
+    torch.testing.assert_close(found, forward_tangents(function)(TRUTH))
 
 
 def test_float32_stays_float32():
@@ -601,7 +645,7 @@ def test_more_parameters_than_residuals_are_refused():
         ({"prior": GaussianPrior(torch.zeros(2), torch.ones(2))}, "`prior` with a mean"),
         ({"prior": GaussianPrior(torch.zeros(3), -torch.ones(3))}, "positive semi-definite"),
         ({"equality": lambda t: t[0]}, "`equality` to return"),
-        ({"jacobian": "sideways"}, "'forward' or 'reverse'"),
+        ({"jacobian": "sideways"}, "'forward', 'reverse' or 'reverse twice'"),
         ({"max_iter": 0}, "`max_iter` to be a whole number of at least 1"),
         ({"tol": -1.0}, "`tol` to be >= 0 and finite"),
         ({"data": torch.ones(3, 4)}, None),
