@@ -326,23 +326,27 @@ class Recurrence:
     inverse: Tensor
 
     def solved(self, start: Float[Tensor, "G n"], defect: Float[Tensor, "G-1 n"]) -> Float[Tensor, "G n"]:
-        pushed = torch.einsum("kij,kj->ki", self.inverse, defect)
+        pushed = _applied(self.inverse, defect)
         return self._passed_on(start - torch.cat([torch.zeros_like(pushed[:1]), pushed]), 0)
 
     def _passed_on(self, values: Float[Tensor, "G n"], level: int) -> Float[Tensor, "G n"]:
         if level < len(self.carries):
             A = self.carries[level]
             first = values[::2]
-            second = values[1::2] + torch.einsum("kij,kj->ki", A[1::2], first[: len(values) // 2])
+            second = values[1::2] + _applied(A[1::2], first[: len(values) // 2])
             second = self._passed_on(second, level + 1)
-            later = first[1:] + torch.einsum("kij,kj->ki", A[2::2], second[: len(first) - 1])
+            later = first[1:] + _applied(A[2::2], second[: len(first) - 1])
             return _in_turn(torch.cat([first[:1], later]), second)
         shift = 1
         for product in self.products:
-            carried = torch.einsum("kij,kj->ki", product, values[:-shift])
+            carried = _applied(product, values[:-shift])
             values = torch.cat([values[:shift], values[shift:] + carried])
             shift *= 2
         return values
+
+
+def _applied(matrices: Float[Tensor, "G n n"], values: Float[Tensor, "G n"]) -> Float[Tensor, "G n"]:
+    return torch.matmul(matrices, values.unsqueeze(-1)).squeeze(-1)
 
 
 def _in_turn(first: Float[Tensor, "G n"], second: Float[Tensor, "H n"]) -> Float[Tensor, "G+H n"]:
