@@ -52,7 +52,7 @@ def calibrate(
         from mkc_torch.cli.calibration_summary import show
     keep_memory()
     console, failed, left = out(), 0, list(recordings)
-    with progress(len(recordings)) as step, interrupts_told(lambda: not_written(left, output)):
+    with progress(len(recordings), output) as step, interrupts_told(lambda: not_written(left, output)):
         for path in recordings:
             step(f"calibrating {path.name}")
             try:

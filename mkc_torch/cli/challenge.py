@@ -99,7 +99,7 @@ def challenge(
     keep_memory()
     allow_copies(0)  # the workers are as many processes as was asked for
     try:
-        with interrupts_told(lambda: f"what was done so far is in {output}."), progress(cases + empty) as step:
+        with interrupts_told(lambda: f"what was done so far is in {output}."), progress(cases + empty, output) as step:
             score = run.run_challenge(
                 diagnose, correct_one, subject=subject, cases=cases, empty=empty, seed=seed, output=output,
                 overwrite=force, workers=min(workers or cores(), cases + empty), progress=step.count,
@@ -154,7 +154,7 @@ def _in_worlds(
     keep_memory()
     allow_copies(0)  # the workers are as many processes as was asked for
     try:
-        with interrupts_told(lambda: f"what was done so far is in {output}."), progress(total) as step:
+        with interrupts_told(lambda: f"what was done so far is in {output}."), progress(total, output) as step:
             score = run.run_worlds(
                 diagnose_in_world, asked, only=only, per_world=per_world, hidden=hidden, seed=seed, output=output,
                 overwrite=force, workers=min(workers or cores(), total), progress=step.count,

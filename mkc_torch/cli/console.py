@@ -8,8 +8,10 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from threading import Event, RLock, Thread
+from time import monotonic
 from typing import TYPE_CHECKING
 
 import typer
@@ -167,14 +169,24 @@ def refuse_same_names(recordings: Sequence[Path]) -> None:
 
 
 class Steps:
-    """What is being done, how much of it is, and for how long; without a bar it does nothing."""
+    """What is being done, how much of it is, and for how long.
+
+    Attributes:
+        name: of what is being done.
+        done, total: how many things are done, and how many there are.
+    """
 
     def __init__(self, bar: Progress | None, total: int) -> None:
+        self.name, self.done, self.total = "", 0, total
         self._bar = bar
         self._task = None if bar is None else bar.add_task("", total=total)
 
     def __call__(self, name: str | None) -> None:
         """To be called with the name of each thing begun, and with None when one is done."""
+        if name is None:
+            self.done += 1
+        else:
+            self.name = name
         if self._bar is None or self._task is None:
             return
         if name is None:
@@ -184,6 +196,7 @@ class Steps:
 
     def count(self, name: str, done: int, total: int) -> None:
         """Name what is being done, and how much of it is."""
+        self.name, self.done, self.total = name, done, total
         if self._bar is not None and self._task is not None:
             self._bar.update(self._task, description=name, completed=done, total=total)
 
@@ -207,10 +220,36 @@ if hasattr(os, "register_at_fork"):
 
 _EVERY = 0.2  # s
 
+_NOTED_EVERY = 60.0
+"""Seconds after which a line on long work is added to a file."""
+
 
 @contextmanager
-def progress(total: int) -> Iterator[Steps]:
-    """What is being done and for how long, on a terminal, with a bar over several things; nothing in a pipe."""
+def progress(total: int, folder: Path | None = None) -> Iterator[Steps]:
+    """What is being done and for how long, on a terminal, with a bar over several things; nothing in a pipe.
+
+    Work of more than a minute adds a line a minute to ``progress.txt`` in the folder, if there is one to write into.
+    """
+    with _shown(total) as steps:
+        if folder is None:
+            yield steps
+            return
+        begin = monotonic()
+        with _repeated(lambda: _note(steps, folder, monotonic() - begin), _NOTED_EVERY):
+            yield steps
+
+
+def _note(steps: Steps, folder: Path, elapsed: float) -> None:
+    """Add a line on what is being done."""
+    count = f"{steps.done} of {steps.total} done, " if steps.total > 1 else ""
+    with suppress(OSError):  # no place for it is no reason to end the work
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / "progress.txt").open("a", encoding="utf-8") as file:
+            file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}  after {elapsed / 60:.0f} min: {count}{steps.name}\n")
+
+
+@contextmanager
+def _shown(total: int) -> Iterator[Steps]:
     console = err()
     if not console.is_terminal:
         yield Steps(None, total)
@@ -221,28 +260,27 @@ def progress(total: int) -> Iterator[Steps]:
         Progress(
             *parts, console=console, transient=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False
         ) as bar,
-        _refreshed(bar),
+        _repeated(lambda: bar.refresh() if bar.live.is_started else None, _EVERY),
     ):
         yield Steps(bar, total)
 
 
 @contextmanager
-def _refreshed(bar: Progress) -> Iterator[None]:
-    """Draws the bar anew from time to time; a thread of its own does, for the work gives it no moment."""
-    done = Event()
+def _repeated(work: Callable[[], None], every: float) -> Iterator[None]:
+    """Something that is done from time to time; a thread of its own does it, for the main work gives it no moment."""
+    over = Event()
 
-    def draw() -> None:
-        while not done.wait(_EVERY):
+    def repeat() -> None:
+        while not over.wait(every):
             with drawing:
-                if bar.live.is_started:
-                    bar.refresh()
+                work()
 
-    thread = Thread(target=draw, daemon=True)
+    thread = Thread(target=repeat, daemon=True)
     thread.start()
     try:
         yield
     finally:
-        done.set()
+        over.set()
         thread.join()
 
 

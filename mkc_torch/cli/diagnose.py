@@ -101,7 +101,7 @@ def diagnose(
     look = Look.of(out())
     with (
         interrupts_told(lambda: not_written(left, output)),
-        progress(len(recordings)) as step,
+        progress(len(recordings), output) as step,
         # a single one is worked on in this process, and says which experiment it is at
         in_processes(
             partial(_diagnosed, output, request, look, step if len(recordings) == 1 else None), recordings

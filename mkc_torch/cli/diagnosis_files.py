@@ -6,6 +6,7 @@ import re
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,7 +43,7 @@ def diagnose_file(
     """Diagnose a file into a folder.
 
     Each experiment of a table that holds several is diagnosed on its own, into a folder in it, but for a simulation
-    that takes several at once. One that fails does not keep the others from being done. ``step`` is told which it is.
+    that takes several at once. One that fails does not keep the others from being done. ``step`` is told what is done.
     """
     try:
         recording = Recording.read(path, columns=request.columns)
@@ -57,12 +58,17 @@ def diagnose_file(
     with folder_removed_on_failure(folder):
         parts, outcomes = list(_parts(recording, simulation, folder)), []
         for number, (label, part, place) in enumerate(parts, start=1):
-            if step is not None and len(parts) > 1:
-                step(f"diagnosing {path.name}, experiment {label} ({number} of {len(parts)})")
-            outcomes.append(_outcome(path, label, simulation, part, place, request, look))
+            which = f", experiment {label} ({number} of {len(parts)})" if len(parts) > 1 else ""
+            told = partial(_tell, step, f"diagnosing {path.name}{which}")
+            outcomes.append(_outcome(path, label, simulation, part, place, request, look, told))
         if all(outcome.failed for outcome in outcomes):
             _remove_if_empty(folder)
     return outcomes
+
+
+def _tell(step: Callable[[str], None] | None, subject: str, stage: str) -> None:
+    if step is not None:
+        step(f"{subject}: {stage}")
 
 
 def write_diagnosis(
@@ -120,7 +126,14 @@ def _parts(recording: Recording, simulation: Simulation, folder: Path) -> Iterat
 
 
 def _outcome(
-    path: Path, label: str, simulation: Simulation, recording: Recording, folder: Path, request: Request, look: Look
+    path: Path,
+    label: str,
+    simulation: Simulation,
+    recording: Recording,
+    folder: Path,
+    request: Request,
+    look: Look,
+    progress: Callable[[str], None],
 ) -> Outcome:
     try:
         # the whole folder was claimed before
@@ -134,7 +147,9 @@ def _outcome(
                 seed=request.seed,
                 noise=request.noise,
                 between=request.between,
+                progress=progress,
             )
+            progress("writing the report")
             files = write_diagnosis(diagnosis, folder, force=request.force, report=request.report)
     except Exception as error:
         own = raised_in(request.simulation, error) if ".py:" in request.simulation else None

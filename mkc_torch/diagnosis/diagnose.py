@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -61,6 +61,7 @@ def diagnose(
     settings: Settings = Settings(),  # noqa: B008
     noise: Mapping[str, float] | None = None,
     between: Mapping[str, str] | None = None,
+    progress: Callable[[str], object] = lambda _: None,
 ) -> Diagnosis:
     """What a simulation lacks, by one recording of what it simulates.
 
@@ -84,6 +85,7 @@ def diagnose(
             estimated otherwise.
         between: what an input does between two samples, "held" or "linear", where it is known; otherwise whichever is
             likelier. Of differential equations only.
+        progress: called with what is being done, as each stage begins.
 
     Returns:
         The diagnosis.
@@ -111,6 +113,7 @@ def diagnose(
         raise ValueError(
             f"{where}{len(recording)} samples are too few for a diagnosis; it needs {fewest} at least. Record longer."
         )
+    progress("reading the recording")
     prepared = simulation.prepare(recording)
     if len(prepared.time) < fewest:
         raise ValueError(
@@ -122,6 +125,7 @@ def diagnose(
     generator = torch.Generator().manual_seed(seed)
     if isinstance(prepared, PreparedDynamics):
         prepared = prepared.holding(fixed)
+    progress("fitting the simulation alone")
     world = simulation_in_the_world(prepared, declared, settings.noise)
     world = between_samples(world, declared, fixed, settings.noise)
     base = world.fit
@@ -136,6 +140,7 @@ def diagnose(
         # one effect may be what it lacks to follow; what it lacks beside that is told once it follows
         asked = replace(asked, max_findings=min(max_findings, 1))
     hopeless = lost_from_the_start(world, declared, settings.evidence)
+    progress(f"trying {len(terms)} effects")
     search = begun(base, () if hopeless else terms, asked, generator, world.free)
 
     def case(search: Search) -> Case:
@@ -156,11 +161,13 @@ def diagnose(
         so_far = case(search)
         # most often there is nothing more
         with meanwhile(parts_ahead(so_far), [*known, *search.parts]) as done:
+            progress(f"trying {len(search.left)} effects beside {len(search.found)} found")
             after = continued(search, asked, generator)
             if after.found == search.found:
                 return diagnosis(after, so_far, done())
         search = after
     so_far = case(search)
+    progress("checking what was found")
     return diagnosis(search, so_far, shared(parts_ahead(so_far), [*known, *search.parts]))
 
 

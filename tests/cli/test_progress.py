@@ -12,7 +12,8 @@ import torch
 pytest.importorskip("typer")
 pytest.importorskip("polars")
 
-from mkc_torch.cli.console import drawing
+from mkc_torch.cli import console
+from mkc_torch.cli.console import drawing, progress
 from tests.calibration.test_calibrate import noisy_ellipsoid
 from tests.cli.test_cli import table
 
@@ -93,3 +94,55 @@ def test_nothing_is_forked_while_something_is_drawn():
     assert done.is_set()
     assert os.waitpid(process, 0)[1] == 0
     thread.join()
+
+
+def test_long_work_adds_a_line_on_what_it_does_to_a_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(console, "_NOTED_EVERY", 0.02)
+    folder = tmp_path / "not yet there"
+    with progress(3, folder) as step:
+        step("diagnosing a.csv: trying 84 effects")
+        lines = wait_for(folder / "progress.txt", 2)
+        step(None)
+        step("diagnosing b.csv: fitting the simulation alone")
+        lines += wait_for(folder / "progress.txt", len(lines) + 3)
+    stamp = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d  after 0 min: "
+    assert re.fullmatch(stamp + r"0 of 3 done, diagnosing a\.csv: trying 84 effects", lines[0])
+    assert re.fullmatch(stamp + r"1 of 3 done, diagnosing b\.csv: fitting the simulation alone", lines[-1])
+    # another run is added to it
+    with progress(1, folder) as step:
+        step("calibrating c.csv")
+        assert wait_for(folder / "progress.txt", len(lines) + 1)[-1].endswith("min: calibrating c.csv")
+
+
+def wait_for(file, lines):
+    """The lines of a file once it has so many."""
+    for _ in range(500):
+        found = file.read_text().splitlines() if file.exists() else []
+        if len(found) >= lines:
+            return found
+        threading.Event().wait(0.02)
+    raise AssertionError(found)
+
+
+def test_short_work_and_a_folder_that_cannot_be_written_leave_no_file(tmp_path, monkeypatch):
+    with progress(1, tmp_path / "short") as step:
+        step("calibrating a.csv")
+    assert not (tmp_path / "short").exists()
+    monkeypatch.setattr(console, "_NOTED_EVERY", 0.02)
+    (tmp_path / "file").write_text("mine")
+    with progress(1, tmp_path / "file") as step:
+        step("calibrating a.csv")
+        threading.Event().wait(0.1)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_diagnosis_tells_its_stages():
+    from mkc_torch import diagnose
+    from mkc_torch.recording.demonstration import concealed_recording
+    from mkc_torch.simulation import Magnetometer
+
+    told = []
+    diagnose(Magnetometer(), concealed_recording(), surrogates=19, progress=told.append)
+    assert told[:2] == ["reading the recording", "fitting the simulation alone"]
+    assert re.fullmatch(r"trying \d+ effects", told[2])
+    assert re.fullmatch(r"trying \d+ effects beside 1 found", told[3])
