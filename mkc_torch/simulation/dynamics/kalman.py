@@ -82,16 +82,25 @@ class Flow:
         usual = [_REACH * float(np.median(one)) / 0.6745 if len(one) else 0.0 for one in used]
         return np.maximum(np.maximum(away.max(0), usual), 1e-300)
 
-    def in_parts(self, length: int, before: int) -> Parts:
-        """Stretches of so many samples, each with some before it in which a filter finds its way."""
+    def in_parts(self, length: int, before: int, most: int | None = None) -> Parts:
+        """Stretches of so many samples, each with some before it in which a filter finds its way.
+
+        Args:
+            length: samples of a stretch.
+            before: samples before it.
+            most: stretches; where there are more, so many of them, spread over the whole.
+        """
         N = len(self.new)
         count = max(N // max(length, 1), 1)
         edges = np.linspace(0, N, count + 1).astype(int)
         own = int(np.diff(edges).max())
-        last = edges[1:] - 1
+        first, last = edges[:-1], edges[1:] - 1
+        if most is not None and count > most:
+            taken = np.linspace(0, count - 1, most).astype(int)
+            first, last = first[taken], last[taken]
         index = np.maximum(last[None, :] - (own + before - 1) + np.arange(own + before)[:, None], 0)
         reached = last[None, :] - (own + before - 1) + np.arange(own + before)[:, None] >= 0
-        mine = (index >= edges[:-1][None, :]) & reached
+        mine = (index >= first[None, :]) & reached
         step = np.maximum(index[1:] - 1, 0)
         gone = reached[:-1]
         return Parts(
@@ -103,7 +112,7 @@ class Flow:
             np.where(gone, self.step[step], 0.0),
             np.where(reached[..., None], self.counts[index], 0.0),
             np.where(mine[..., None], self.counts[index], 0.0),
-            (edges[1:] - own - before) > 0,
+            (last + 1 - own - before) > 0,
             self.spread,
         )
 

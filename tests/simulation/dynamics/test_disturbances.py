@@ -71,6 +71,17 @@ class TestSought:
         if truth.lasting:
             assert LASTING / 3.0 < one.lasting < 3.0 * LASTING
 
+    def test_of_a_long_recording_stretches_tell_what_all_of_it_is_weighed_by(self):
+        along = world(WHITE, count=6000)
+        found = sought(along, most=1)
+        (one,), (error,), (gain,) = found.disturbances, found.errors, found.gains
+        # a grid is closed in on three times, whatever the samples
+        assert abs(np.log(one.size / PUSH)) < 0.2
+        # as exact as the stretches are, and as sure as all samples make it
+        short = sought(world(WHITE, count=3000), most=1)
+        assert 0.7 * short.errors[0] < error < short.errors[0]
+        assert gain > 1.5 * short.gains[0]
+
     def test_the_white_noise_beside_a_push_is_that_of_the_sensor(self):
         assert sought(world(WHITE, count=500)).sensor.item() == pytest.approx(NOISE, rel=0.15)
 

@@ -202,6 +202,15 @@ class TestParts:
         assert sorted(parts.new[mine]) == sorted(along.new[along.counts > 0])
         assert bool((parts.counts >= parts.mine).all())
 
+    def test_some_stretches_are_those_of_all_spread_over_them(self):
+        along = flow(1000, BOTH)
+        along.new[:] = np.arange(along.new.size).reshape(along.new.shape) + 1.0
+        every, some = along.in_parts(100, 20), along.in_parts(100, 20, 4)
+        for name in ("carried", "seen", "new", "shift", "step", "counts", "mine"):
+            np.testing.assert_array_equal(getattr(some, name), getattr(every, name)[:, [0, 3, 6, 9]])
+        np.testing.assert_array_equal(some.inside, every.inside[[0, 3, 6, 9]])
+        np.testing.assert_array_equal(along.in_parts(100, 20, 10).new, every.new)
+
     def test_one_stretch_is_the_flow(self):
         along = recording(flow(20, runs=2), MODELS["slow push"])
         for name in ("carried", "pushed", "seen", "new", "shift", "step", "counts"):
