@@ -49,7 +49,7 @@ class Derivatives(NamedTuple):
     log_d_log_d: Tensor
 
 
-def _energy_terms(q: Tensor, kappa: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def energy_terms(q: Tensor, kappa: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """exp(-x), E, -∂E/∂κ and ∂²E/∂κ² at q = z²/2, x = κ q."""
     x = kappa * q
     w = torch.exp(-x)
@@ -74,7 +74,7 @@ def _mean(values: Tensor, weight: Tensor | None) -> Tensor:
 
 def energy_derivatives(error: Tensor, weight: Tensor | None, kappa: Tensor, log_d: Tensor) -> Derivatives:
     q = 0.5 * (error * torch.exp(-log_d).unsqueeze(-2)).square()
-    w, e, first, second = _energy_terms(q, kappa.unsqueeze(-2))
+    w, e, first, second = energy_terms(q, kappa.unsqueeze(-2))
     qw = q * w
     q2w = q * qw
     mean_qw, mean_q2w = _mean(qw, weight), _mean(q2w, weight)
@@ -95,13 +95,13 @@ def normaliser_derivatives(kappa: Tensor, log_d: Tensor, log_bound: Tensor) -> D
     k = torch.where(tail > 0, kappa, 1.0)
     tail_1, tail_2 = tail / k.pow(2), tail * (1.0 - 2.0 * k) / k.pow(4)
     nodes, weights = head_rule(kappa, length)
-    _, e, first, second = _energy_terms(0.5 * nodes.square(), kappa.unsqueeze(-1))
+    _, e, first, second = energy_terms(0.5 * nodes.square(), kappa.unsqueeze(-1))
     p = torch.exp(-e)
 
     z = integrate(p, tail, length, weights)
     z_k = integrate(first * p, tail_1, length, weights) / z
     z_kk = integrate((first.square() - second) * p, tail_2, length, weights) / z
-    w_end, e_end, first_end, _ = _energy_terms(0.5 * length.square(), kappa)
+    w_end, e_end, first_end, _ = energy_terms(0.5 * length.square(), kappa)
     edge = 2.0 * torch.exp(-e_end) / z
     l_1 = length * edge
     l_2 = length * l_1 * (-length * w_end - edge) + l_1

@@ -1,0 +1,215 @@
+"""The search for the maximum of the MKC likelihood of a linear problem, in its basis: Algorithm 3 of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from mkc_torch.density.fit import (
+    DensityState,
+    conclusive,
+    domain_rule,
+    initial_state,
+    newton_step,
+    refuse_narrow_bound,
+)
+from mkc_torch.linear._mkc import channel_parameter, fixed_point_step
+from mkc_torch.linear._problem import LinearProblem
+from mkc_torch.linear._robust_start import RobustStart, Start, robust_start
+
+__all__ = ["Known", "Maximum", "maximise", "normalised_weight"]
+
+_FLOOR = 0.3
+"""Least d in robust scales: a scale is at most doubled by outliers, and a fit that interpolates ends far below."""
+
+
+@dataclass(frozen=True)
+class Maximum:
+    beta: Tensor
+    state: DensityState
+    value: Tensor
+    converged: Tensor
+    history: list[Tensor]
+
+
+def normalised_weight(problem: LinearProblem) -> Tensor | None:
+    w = problem.sample_weight
+    return None if w is None else w / w.sum(-2, keepdim=True)
+
+
+def _alternate(
+    problem: LinearProblem, beta: Tensor, state: DensityState, *, max_iter: int, tol: float, patience: int = 2
+) -> Maximum:
+    """E-steps and M-steps in turn; a problem leaves the batch after ``patience`` of them without progress."""
+    size = beta.shape[0]
+    index = torch.arange(size, device=beta.device)
+    out_beta, out_state = beta.clone(), state
+    value = state.value.sum(-1)
+    converged = torch.zeros(size, dtype=torch.bool, device=beta.device)
+    history = [value]
+    weight = normalised_weight(problem)
+    quiet = torch.zeros(size, dtype=torch.int64, device=beta.device)
+    for _ in range(max_iter):
+        residual = problem.residual(beta)
+        before = state
+        state = newton_step(residual, weight, before)
+        kappa, d = state.kappa, torch.exp(state.log_d)
+        for _ in range(2):
+            beta = fixed_point_step(problem, residual, kappa, d)
+            residual = problem.residual(beta)
+        now = state.value.sum(-1)
+        rounding = 8 * torch.finfo(beta.dtype).eps * now.abs()
+        improved = history[-1][index] - now > tol + rounding
+        quiet = torch.where(improved, 0, quiet + conclusive(before, state).all(-1).to(quiet.dtype))
+        current = history[-1].clone()
+        current[index] = now
+        history.append(current)
+        done = quiet >= patience
+        if bool(done.any()) or len(history) > max_iter:
+            out_beta[index] = beta
+            out_state = _write(out_state, index, state)
+            converged[index] = done & torch.isfinite(now)
+            keep = (~done).nonzero().squeeze(-1)
+            if keep.numel() == 0:
+                break
+            index, beta, quiet = index[keep], beta[keep], quiet[keep]
+            state, problem = state.select(keep), problem.select(keep)
+            weight = None if weight is None else weight[keep]
+    return Maximum(out_beta, out_state, history[-1], converged, history)
+
+
+def _write(whole: DensityState, index: Tensor, part: DensityState) -> DensityState:
+    fields = {}
+    for name in ("kappa", "log_d", "log_bound", "log_d_min", "damping", "value"):
+        fields[name] = getattr(whole, name).index_copy(0, index, getattr(part, name))
+    return DensityState(**fields, free_kappa=whole.free_kappa, free_d=whole.free_d)
+
+
+def _gaussian_candidate(problem: LinearProblem, maximum: Maximum, *, max_iter: int, tol: float) -> Maximum:
+    """Where a Gaussian density at weighted least squares is likelier than what was found, go on from there instead."""
+    state = maximum.state
+    beta = problem.weighted_fit(torch.ones_like(problem.Y))
+    weight = normalised_weight(problem)
+    for _ in range(2 if problem.num_channels > 1 else 0):
+        square = problem.residual(beta).square()
+        variance = square.mean(-2) if weight is None else (weight * square).sum(-2)
+        d = torch.maximum(variance.sqrt(), torch.exp(state.log_d_min))
+        beta = fixed_point_step(problem, problem.Y, torch.zeros_like(d), d)
+    residual = problem.residual(beta)
+    d_min = torch.exp(state.log_d_min)
+    gaussian = initial_state(residual, weight, d_min, torch.exp(state.log_bound), d_min, kappa=torch.zeros_like(d_min))
+    better = (gaussian.value.sum(-1) < maximum.value).nonzero().squeeze(-1)
+    if better.numel() == 0:
+        return maximum
+    begun = replace(gaussian.select(better), free_kappa=True)
+    again = _alternate(problem.select(better), beta[better], begun, max_iter=max_iter, tol=tol)
+    steps = max(len(maximum.history), len(again.history))
+    history = []
+    for i in range(steps):
+        now = maximum.history[min(i, len(maximum.history) - 1)].clone()
+        now[better] = again.history[min(i, len(again.history) - 1)]
+        history.append(now)
+    return Maximum(
+        beta=maximum.beta.index_copy(0, better, again.beta),
+        state=_write(state, better, again.state),
+        value=maximum.value.index_copy(0, better, again.value),
+        converged=maximum.converged.index_copy(0, better, again.converged),
+        history=history,
+    )
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a fit is given beside the data, as it was given."""
+
+    sigma: float | Tensor | None
+    d: float | Tensor | None
+    bound: float | Tensor | None
+    start: Start | Tensor
+
+    def initial_state(
+        self,
+        problem: LinearProblem,
+        beta: Tensor,
+        scale: Tensor,
+        bound: Tensor,
+        d_min: Tensor,
+        tails: Sequence[float | Tensor] = (0.1, 0.4, 1.5),
+    ) -> DensityState:
+        """The likeliest of a few densities to start from at coefficients ``beta``."""
+        d = None if self.d is None else channel_parameter("d", self.d, problem)
+        sigma = None if self.sigma is None else channel_parameter("sigma", self.sigma, problem, infinite=True)
+        if d is not None:
+            d_min = torch.minimum(d, d_min)
+        return initial_state(
+            problem.residual(beta),
+            normalised_weight(problem),
+            scale,
+            bound,
+            d_min,
+            kappa=None if sigma is None else sigma.pow(-2),
+            d=d,
+            tails=tails,
+        )
+
+
+HalfWidth = Callable[[Tensor, Tensor], Tensor]
+"""The half-width of the domain of each channel, from coefficients in the basis and the scale of a rough fit."""
+
+
+def maximise(
+    problem: LinearProblem,
+    known: Known,
+    *,
+    max_iter: int,
+    tol: float,
+    seed: int,
+    half_width: HalfWidth | None = None,
+) -> tuple[RobustStart, Maximum]:
+    """The robust start of a fit and where it ends.
+
+    Args:
+        problem: what is fitted.
+        known: parameters that are given.
+        max_iter, tol: of the alternation.
+        seed: of the start.
+        half_width: of the domain, where the residuals of this problem alone do not say it.
+    """
+    begin = robust_start(problem, known.start, seed=seed)
+    d_min = _FLOOR * begin.scale
+    if known.bound is None:
+        beta, state = _on_its_domain(problem, known, begin, d_min, max_iter, half_width)
+    else:
+        beta = begin.beta
+        bound = channel_parameter("bound", known.bound, problem)
+        refuse_narrow_bound(bound, begin.scale)
+        state = known.initial_state(problem, beta, begin.scale, bound, d_min)
+    maximum = _alternate(problem, beta, state, max_iter=max_iter, tol=tol)
+    if state.free_kappa and state.free_d:
+        maximum = _gaussian_candidate(problem, maximum, max_iter=max_iter, tol=tol)
+    return begin, maximum
+
+
+def _on_its_domain(
+    problem: LinearProblem,
+    known: Known,
+    begin: RobustStart,
+    d_min: Tensor,
+    max_iter: int,
+    half_width: HalfWidth | None,
+) -> tuple[Tensor, DensityState]:
+    """Coefficients and state to start from on the domain of the rule, which a rough fit gives.
+
+    A robust start's scale is up to twice that of the head when outliers are many and on one side, so the rough fit
+    is made on a tight domain, where it finds the head.
+    """
+    used = None if problem.sample_weight is None else problem.sample_weight > 0
+    tight = domain_rule(problem.residual(begin.beta), begin.scale, used, scales=5.0)
+    state = known.initial_state(problem, begin.beta, begin.scale, tight, d_min)
+    rough = _alternate(problem, begin.beta, state, max_iter=max_iter, tol=1e-4, patience=1)
+    kappa, d = rough.state.kappa, torch.exp(rough.state.log_d)
+    bound = domain_rule(problem.residual(rough.beta), d, used) if half_width is None else half_width(rough.beta, d)
+    return rough.beta, known.initial_state(problem, rough.beta, d, bound, d_min, tails=(kappa,))
