@@ -186,9 +186,27 @@ def initial_state(
 
 def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> DensityState:
     """One damped Newton step in (κ, log d) within κ in [0, 400] and d in [d_min, bound]; never uphill."""
-    fit = energy_derivatives(error, weight, state.kappa, state.log_d)
+    total = likelihood_derivatives(energy_derivatives(error, weight, state.kappa, state.log_d), state)
+    proposal = newton_proposal(total, state)
+    value = negative_log_likelihood(error, weight, proposal)
+    better = value <= total.value
+    return replace(
+        state,
+        kappa=torch.where(better, proposal.kappa, state.kappa),
+        log_d=torch.where(better, proposal.log_d, state.log_d),
+        damping=torch.where(better, 0.1 * state.damping, 10.0 * state.damping).clamp(1e-9, 1e6),
+        value=torch.where(better, value, total.value),
+    )
+
+
+def likelihood_derivatives(energy: Derivatives, state: DensityState) -> Derivatives:
+    """Those of the mean negative log-likelihood, from those of the mean energy."""
     norm = normaliser_derivatives(state.kappa, state.log_d, state.log_bound)
-    total = Derivatives(*(a + b for a, b in zip(fit, norm, strict=True)))
+    return Derivatives(*(a + b for a, b in zip(energy, norm, strict=True)))
+
+
+def newton_proposal(total: Derivatives, state: DensityState) -> DensityState:
+    """Where a damped Newton step from ``state`` leads, its value not yet known."""
     chain = state.kappa + _KAPPA_OFFSET
     g_s, g_l = total.kappa * chain, total.log_d
     h_ss = total.kappa_kappa * chain.square()
@@ -219,19 +237,10 @@ def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> De
     log_d = torch.minimum(
         torch.maximum(state.log_d + shorten * step_l.nan_to_num(0.0), state.log_d_min), state.log_bound
     )
-    proposal = replace(
+    return replace(
         state,
         kappa=kappa if state.free_kappa else state.kappa,
         log_d=log_d if state.free_d else state.log_d,
-    )
-    value = negative_log_likelihood(error, weight, proposal)
-    better = value <= total.value
-    return replace(
-        state,
-        kappa=torch.where(better, proposal.kappa, state.kappa),
-        log_d=torch.where(better, proposal.log_d, state.log_d),
-        damping=torch.where(better, 0.1 * state.damping, 10.0 * state.damping).clamp(1e-9, 1e6),
-        value=torch.where(better, value, total.value),
     )
 
 

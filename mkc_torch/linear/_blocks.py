@@ -15,7 +15,7 @@ from torch import Tensor
 from mkc_torch.density.fit import Derivatives, energy_terms
 
 if TYPE_CHECKING:
-    from jaxtyping import Float64
+    from jaxtyping import Float, Float64
 
 VALUES = 1 << 14
 """Values in a block: 1.2 MB of nine columns. Between 4096 and 32768 the time of a pass differs by less than noise."""
@@ -75,12 +75,23 @@ class Range(NamedTuple):
         return Range(torch.minimum(self.low, other.low), torch.maximum(self.high, other.high))
 
 
-def blocks(X: Tensor, Y: Tensor, weight: Tensor | None, values: int = VALUES) -> Iterator[Block]:
-    """Rows (N, m, n), targets (N, m) and weights (N, m) in blocks of so many values."""
+def blocks(
+    X: Float[Tensor, "N m n"],
+    Y: Float[Tensor, "N m"],
+    weight: Float[Tensor, "N m"] | None,
+    frame: Float64[Tensor, "n n"] | None = None,
+    values: int = VALUES,
+) -> Iterator[Block]:
+    """Rows times ``frame``, targets and weights in blocks of so many values."""
     step = max(1, values // Y.shape[-1])
     for first in range(0, Y.shape[0], step):
         part = slice(first, first + step)
-        yield Block(X[part].double(), Y[part].double(), None if weight is None else weight[part].double())
+        rows = X[part].double()
+        yield Block(
+            rows if frame is None else torch.matmul(rows, frame),
+            Y[part].double(),
+            None if weight is None else weight[part].double(),
+        )
 
 
 def residual(block: Block, coef: Float64[Tensor, " n"]) -> Float64[Tensor, "b m"]:
@@ -144,8 +155,6 @@ def matrices(block: Block, error: Tensor, q: Tensor, w: Tensor, density: Density
     bend = weighted * (1.0 - 2.0 * density.kappa * q) * precision
     score = weighted * error * precision
     flat = block.rows.flatten(0, 1)
-    if block.rows.shape[1] == 1:
-        scored = flat * score
-    else:
-        scored = torch.matmul(score.unsqueeze(1), block.rows).squeeze(1)
+    single = block.rows.shape[1] == 1
+    scored = flat * score if single else torch.matmul(score.unsqueeze(1), block.rows).squeeze(1)
     return Matrices(torch.matmul((flat * bend.reshape(-1, 1)).mT, flat), torch.matmul(scored.mT, scored))

@@ -14,9 +14,10 @@ from mkc_torch.density.fit import negative_log_likelihood
 from mkc_torch.linear._implicit.at_rest import Rest
 from mkc_torch.linear._implicit.layer import Given, fit_layer, wanted
 from mkc_torch.linear._inference import Inference
+from mkc_torch.linear._large import LargeMaximum, is_large, large_maximum
 from mkc_torch.linear._maximum import Known, Maximum, maximise, normalised_weight
 from mkc_torch.linear._mkc import coefficient_covariance, kernel_weight, values_left
-from mkc_torch.linear._problem import LinearProblem, linear_problem
+from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, laid_out, linear_problem
 from mkc_torch.linear._robust_start import RobustStart, Start, checked_start
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 
@@ -140,6 +141,13 @@ class MKCRegression(Inference):
             return self._fit_as_layer(X, Y, sample_weight)
         self.__dict__.pop("differentiable_", None)
         with torch.no_grad():
+            values = laid_out(X, Y, sample_weight)
+            if self.covariance == "sandwich" and is_large(values):
+                known = Known(self.sigma, self.d, self.bound, self.start)
+                found = large_maximum(values, known, max_iter=self.max_iter, seed=self.seed)
+                if found is not None:
+                    self._keep_large(values, found)
+                    return self
             problem = linear_problem(X, Y, sample_weight)
             self._keep(problem, *self._maximise(problem, Known(self.sigma, self.d, self.bound, self.start)))
         return self
@@ -186,6 +194,20 @@ class MKCRegression(Inference):
         self.exact_fit_, history = layer.extras
         self.history_ = history.movedim(-1, 0)
         return self
+
+    def _keep_large(self, values: CanonicalShapes, found: LargeMaximum) -> None:
+        def restored(value: Tensor) -> Tensor:
+            return value.to(values.Y.dtype).expand((*values.batch, *value.shape))
+
+        self._single_channel = values.single_channel
+        self.coef_, self.weights_ = restored(found.coef), restored(found.weights)
+        self.sigma_, self.d_, self.bound_ = restored(found.kappa.rsqrt()), restored(found.d), restored(found.bound)
+        self.log_likelihood_ = restored(found.log_likelihood)
+        self.covariance_, self.dof_ = restored(found.covariance), restored(found.dof)
+        self.history_ = torch.stack([restored(h) for h in found.history])
+        self.n_iter_ = len(found.history) - 1
+        flag = torch.ones(values.batch, dtype=torch.bool, device=values.Y.device)
+        self.converged_, self.exact_fit_ = flag, ~flag
 
     def _keep(self, problem: LinearProblem, begin: RobustStart, maximum: Maximum) -> None:
         kappa, d = maximum.state.kappa, torch.exp(maximum.state.log_d)
