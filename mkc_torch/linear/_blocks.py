@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,7 +19,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Float64
 
 VALUES = 1 << 14
-"""Values in a block: 1.2 MB of nine columns. Between 4096 and 32768 the time of a pass differs by less than noise."""
+"""Values in a block: 1.2 MB of nine columns. A pass of 8192 to 32768 takes as long, of 4096 half as much again."""
+
+_STRIP = 1 << 12
+"""Rows whose products are formed at once; of 16384 they take twice as long."""
 
 _PLAIN_KAPPA = 1e-2
 """From here on differences of sums over κ and κ² lose at most four digits, so that three sums give every derivative."""
@@ -42,27 +46,33 @@ class Density(NamedTuple):
 class Sums(NamedTuple):
     """What a step in the coefficients, κ and log d needs of the rows.
 
-    ``energy`` is that of the density's head and its derivatives, in the order of :class:`Derivatives`; ``score`` the
-    sums of ``w e x``, ``q w e x`` and ``e x`` with ``q = e² / (2 d²)`` and w the kernel's weight.
+    ``terms`` are what :func:`energy_of` makes the energy and its derivatives of; ``score`` is the sum of ``w e x``, w
+    being the kernel's weight.
     """
 
     weight: Float64[Tensor, " m"]
-    square: Float64[Tensor, " m"]
-    energy: Float64[Tensor, "6 m"]
-    score: Float64[Tensor, "3 m n"]
+    terms: Float64[Tensor, "k m"]
+    score: Float64[Tensor, "m n"]
 
     def plus(self, other: Sums) -> Sums:
         return Sums(*(a + b for a, b in zip(self, other, strict=True)))
 
 
-class Matrices(NamedTuple):
-    """Curvature of the summed energy by the coefficients, and the products of each sample's score with itself."""
+class Bends(NamedTuple):
+    """What changes little from step to step: curvature by the coefficients, and more that is wanted but once.
+
+    ``curvature`` is the Hessian of the summed energy, ``spread`` the products of each sample's score with itself,
+    ``tilt`` the sum of ``q w e x`` with ``q = e² / (2 d²)``, ``moment`` that of ``e x`` and ``square`` that of ``e²``.
+    """
 
     curvature: Float64[Tensor, "n n"]
     spread: Float64[Tensor, "n n"]
+    tilt: Float64[Tensor, "m n"]
+    moment: Float64[Tensor, "m n"]
+    square: Float64[Tensor, " m"]
 
-    def plus(self, other: Matrices) -> Matrices:
-        return Matrices(*(a + b for a, b in zip(self, other, strict=True)))
+    def plus(self, other: Bends) -> Bends:
+        return Bends(*(a + b for a, b in zip(self, other, strict=True)))
 
 
 class Range(NamedTuple):
@@ -95,6 +105,8 @@ def blocks(
 
 
 def residual(block: Block, coef: Float64[Tensor, " n"]) -> Float64[Tensor, "b m"]:
+    if block.rows.shape[1] == 1:
+        return torch.addmv(block.y[:, 0], block.rows[:, 0], coef, alpha=-1.0).unsqueeze(-1)
     return block.y - torch.matmul(block.rows, coef)
 
 
@@ -112,49 +124,77 @@ def kernel(error: Float64[Tensor, "b m"], density: Density) -> tuple[Float64[Ten
     return q, torch.exp(q * -density.kappa)
 
 
+def _moments(values: Float64[Tensor, "b m"], block: Block) -> Float64[Tensor, "m n"]:
+    """Sum over the rows of each channel's values times x."""
+    if block.rows.shape[1] == 1:
+        return torch.mv(block.rows[:, 0].mT, values[:, 0]).unsqueeze(0)
+    return torch.matmul(values.mT.unsqueeze(1), block.rows.transpose(0, 1)).squeeze(1)
+
+
 def sums(block: Block, error: Tensor, q: Tensor, w: Tensor, density: Density) -> Sums:
     """The sums of a block at its residual and :func:`kernel`."""
     weighted = w if block.weight is None else w * block.weight
-    plain = error if block.weight is None else error * block.weight
-    q_weighted = q * weighted
-    scored = torch.stack([weighted * error, q_weighted * error, plain]).permute(2, 0, 1)
     weight = error.new_full((error.shape[1],), float(error.shape[0])) if block.weight is None else block.weight.sum(0)
-    if bool((density.kappa >= _PLAIN_KAPPA).all()):
-        energy = _energy_of_sums(weight, weighted.sum(0), q_weighted.sum(0), (q * q_weighted).sum(0), density.kappa)
+    if _plain(density.kappa):
+        qw = q * weighted
+        terms = torch.stack([weighted.sum(0), qw.sum(0), qw.mul_(q).sum(0)])
     else:
-        energy = _energy(block, q, density.kappa)
-    return Sums(
-        weight, (plain * error).sum(0), energy, torch.matmul(scored, block.rows.transpose(0, 1)).transpose(0, 1)
-    )
+        w, value, first, second = energy_terms(q, density.kappa)
+        every = torch.stack([value, first, second, q * w, q * q * w])
+        terms = every.sum(1) if block.weight is None else (every * block.weight).sum(1)
+    return Sums(weight, terms, _moments(weighted * error, block))
 
 
-def _energy_of_sums(weight: Tensor, w: Tensor, qw: Tensor, q2w: Tensor, kappa: Tensor) -> Float64[Tensor, "6 m"]:
-    value = (weight - w) / kappa
-    first = (value - qw) / kappa
-    return _in_order(value, first, (2.0 * first - q2w) / kappa, qw, q2w, kappa)
+def _plain(kappa: Float64[Tensor, " m"]) -> bool:
+    return bool((kappa >= _PLAIN_KAPPA).all())
 
 
-def _energy(block: Block, q: Tensor, kappa: Tensor) -> Float64[Tensor, "6 m"]:
-    """As :func:`_energy_of_sums`, with every term exact down to κ = 0."""
-    w, value, first, second = energy_terms(q, kappa)
-    every = torch.stack([value, first, second, q * w, q * q * w])
-    total = every.sum(1) if block.weight is None else (every * block.weight).sum(1)
-    return _in_order(*total.unbind(), kappa)
+def energy_of(total: Sums, kappa: Float64[Tensor, " m"]) -> Derivatives:
+    """The summed energy and its derivatives by κ and log d."""
+    if _plain(kappa):
+        w, qw, q2w = total.terms
+        value = (total.weight - w) / kappa
+        first = (value - qw) / kappa
+        second = (2.0 * first - q2w) / kappa
+    else:
+        value, first, second, qw, q2w = total.terms
+    return Derivatives(value, -first, -2.0 * qw, second, 2.0 * q2w, 4.0 * (qw - kappa * q2w))
 
 
-def _in_order(
-    value: Tensor, first: Tensor, second: Tensor, qw: Tensor, q2w: Tensor, kappa: Tensor
-) -> Float64[Tensor, "6 m"]:
-    return torch.stack(Derivatives(value, -first, -2.0 * qw, second, 2.0 * q2w, 4.0 * (qw - kappa * q2w)))
+def _products(
+    rows: Float64[Tensor, "k n"], others: Float64[Tensor, "k n"], weight: Float64[Tensor, " k"]
+) -> Float64[Tensor, "n n"]:
+    """Sum of weight times a row times the other: by NumPy, half as long as by torch on processors that are not Intel's."""
+    total = np.zeros((rows.shape[1], others.shape[1]))
+    for first in range(0, rows.shape[0], _STRIP):
+        part = slice(first, first + _STRIP)
+        total += (rows[part] * weight[part].unsqueeze(-1)).numpy().T @ others[part].numpy()
+    return torch.from_numpy(total)
 
 
-def matrices(block: Block, error: Tensor, q: Tensor, w: Tensor, density: Density) -> Matrices:
-    """Curvature and spread of a block at its residual and :func:`kernel`."""
-    weighted = w if block.weight is None else w * block.weight
+def bends(block: Block, error: Tensor, q: Tensor, w: Tensor, density: Density) -> Bends:
+    """Those of a block at its residual and :func:`kernel`."""
+    weighted, plain = (w, error) if block.weight is None else (w * block.weight, error * block.weight)
     precision = density.d.pow(-2)
     bend = weighted * (1.0 - 2.0 * density.kappa * q) * precision
     score = weighted * error * precision
     flat = block.rows.flatten(0, 1)
-    single = block.rows.shape[1] == 1
-    scored = flat * score if single else torch.matmul(score.unsqueeze(1), block.rows).squeeze(1)
-    return Matrices(torch.matmul((flat * bend.reshape(-1, 1)).mT, flat), torch.matmul(scored.mT, scored))
+    if block.rows.shape[1] == 1:
+        spread = _products(flat, flat, score.square().flatten())
+    else:
+        scored = torch.matmul(score.unsqueeze(1), block.rows).squeeze(1)
+        spread = torch.matmul(scored.mT, scored)
+    return Bends(
+        curvature=_products(flat, flat, bend.flatten()),
+        spread=spread,
+        tilt=_moments(q * weighted * error, block),
+        moment=_moments(plain, block),
+        square=(plain * error).sum(0),
+    )
+
+
+def triangle(block: Block, above: Float64[Tensor, "k n"] | None) -> Float64[Tensor, "k n"]:
+    """The upper triangle R of X = QR, of the rows of a block in use and of those whose triangle is ``above``."""
+    rows = block.rows if block.weight is None else block.rows * (block.weight > 0).unsqueeze(-1)
+    flat = rows.flatten(0, 1)
+    return torch.linalg.qr(flat if above is None else torch.cat([above, flat]), mode="r").R

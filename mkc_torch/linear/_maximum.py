@@ -20,7 +20,7 @@ from mkc_torch.linear._mkc import channel_parameter, fixed_point_step
 from mkc_torch.linear._problem import LinearProblem
 from mkc_torch.linear._robust_start import RobustStart, Start, robust_start
 
-__all__ = ["Known", "Maximum", "maximise", "normalised_weight"]
+__all__ = ["HalfWidth", "Known", "Maximum", "maximise", "normalised_weight", "rough_fit"]
 
 _FLOOR = 0.3
 """Least d in robust scales: a scale is at most doubled by outliers, and a fit that interpolates ends far below."""
@@ -161,13 +161,7 @@ HalfWidth = Callable[[Tensor, Tensor], Tensor]
 
 
 def maximise(
-    problem: LinearProblem,
-    known: Known,
-    *,
-    max_iter: int,
-    tol: float,
-    seed: int,
-    half_width: HalfWidth | None = None,
+    problem: LinearProblem, known: Known, *, max_iter: int, tol: float, seed: int
 ) -> tuple[RobustStart, Maximum]:
     """The robust start of a fit and where it ends.
 
@@ -176,40 +170,46 @@ def maximise(
         known: parameters that are given.
         max_iter, tol: of the alternation.
         seed: of the start.
-        half_width: of the domain, where the residuals of this problem alone do not say it.
     """
     begin = robust_start(problem, known.start, seed=seed)
-    d_min = _FLOOR * begin.scale
-    if known.bound is None:
-        beta, state = _on_its_domain(problem, known, begin, d_min, max_iter, half_width)
-    else:
-        beta = begin.beta
-        bound = channel_parameter("bound", known.bound, problem)
-        refuse_narrow_bound(bound, begin.scale)
-        state = known.initial_state(problem, beta, begin.scale, bound, d_min)
+    beta, state = rough_fit(problem, known, begin, max_iter=max_iter)
     maximum = _alternate(problem, beta, state, max_iter=max_iter, tol=tol)
     if state.free_kappa and state.free_d:
         maximum = _gaussian_candidate(problem, maximum, max_iter=max_iter, tol=tol)
     return begin, maximum
 
 
-def _on_its_domain(
+def rough_fit(
     problem: LinearProblem,
     known: Known,
     begin: RobustStart,
-    d_min: Tensor,
+    *,
     max_iter: int,
-    half_width: HalfWidth | None,
+    tol: float = 1e-4,
+    half_width: HalfWidth | None = None,
 ) -> tuple[Tensor, DensityState]:
-    """Coefficients and state to start from on the domain of the rule, which a rough fit gives.
+    """Coefficients and state to start from: on the domain given, or on that of the rule, which a rough fit gives.
 
     A robust start's scale is up to twice that of the head when outliers are many and on one side, so the rough fit
     is made on a tight domain, where it finds the head.
+
+    Args:
+        problem: what is fitted.
+        known: parameters that are given.
+        begin: the robust start.
+        max_iter: alternations at most.
+        tol: what the last of them brings, in nats per sample.
+        half_width: of the domain, where the residuals of this problem alone do not say it.
     """
+    d_min = _FLOOR * begin.scale
+    if known.bound is not None:
+        bound = channel_parameter("bound", known.bound, problem)
+        refuse_narrow_bound(bound, begin.scale)
+        return begin.beta, known.initial_state(problem, begin.beta, begin.scale, bound, d_min)
     used = None if problem.sample_weight is None else problem.sample_weight > 0
     tight = domain_rule(problem.residual(begin.beta), begin.scale, used, scales=5.0)
     state = known.initial_state(problem, begin.beta, begin.scale, tight, d_min)
-    rough = _alternate(problem, begin.beta, state, max_iter=max_iter, tol=1e-4, patience=1)
+    rough = _alternate(problem, begin.beta, state, max_iter=max_iter, tol=tol, patience=1)
     kappa, d = rough.state.kappa, torch.exp(rough.state.log_d)
     bound = domain_rule(problem.residual(rough.beta), d, used) if half_width is None else half_width(rough.beta, d)
     return rough.beta, known.initial_state(problem, rough.beta, d, bound, d_min, tails=(kappa,))

@@ -1,65 +1,77 @@
-"""The pilot of a large fit: MKC-EM on rows drawn by chance, and whether they can stand for all."""
+"""Rows that stand for all of a large fit, drawn by chance, and whether they do."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from mkc_torch.linear._maximum import HalfWidth, Known, Maximum, maximise
-from mkc_torch.linear._mkc import kernel_weight
+from mkc_torch.linear._blocks import blocks, triangle
 from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, RankDeficientError, linear_problem
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float64, Int
+    from jaxtyping import Bool, Int
 
-ROWS = 8000
-"""Rows of a pilot: coefficients within a few hundredths of the noise, curvature within a tenth, in 30 ms."""
+_ROWS, _ROWS_A_COLUMN = 2000, 200
+"""Rows of a pilot, and no fewer for each column: coefficients within a twentieth of the noise."""
 
 _LEVERAGE = 0.05
-"""A row of more pins a direction that fewer than twenty others share; the pilot has to do without such rows."""
+"""A row of more pins a direction that fewer than twenty others share; a pilot has to do without such rows."""
 
-_TOLERANCE = 1e-6
-"""Of the pilot's alternation in nats per sample: it ends nearer to its maximum than that is to the one of all rows."""
-
-
-@dataclass(frozen=True)
-class Pilot:
-    """Where the pilot ended, in the basis of its problem, with sums per unit of weight of what a step goes by."""
-
-    problem: LinearProblem
-    maximum: Maximum
-    curvature: Float64[Tensor, "n n"]
-    majoriser: Float64[Tensor, "n n"]
-    grams: Float64[Tensor, "m n n"]
+_LEAST = 1e-6
+"""Of what the other rows may leave of a direction, in shares of what all have."""
 
 
-def drawn_rows(
-    count: int, total: int, used: Bool[Tensor, " N"] | None, seed: int, device: torch.device
-) -> Int[Tensor, " k"]:
+def drawn_rows(values: CanonicalShapes, count: int, seed: int) -> Int[Tensor, " k"]:
     """About ``count`` of the rows in use, each at most once and in their order."""
+    used = _used(values)
     generator = torch.Generator().manual_seed(seed)
     among = None if used is None else used.nonzero().squeeze(-1)
-    drawn = torch.randint(total if among is None else among.shape[0], (count,), generator=generator).unique().to(device)
+    total = values.Y.shape[-2] if among is None else among.shape[0]
+    drawn = torch.randint(total, (count,), generator=generator).unique()
     return drawn if among is None else among[drawn]
 
 
-def pilot_problem(values: CanonicalShapes, seed: int) -> LinearProblem | None:
-    """The problem of the pilot's rows in float64; None where they cannot stand for all."""
+def rows_at(values: CanonicalShapes, index: Int[Tensor, " k"]) -> CanonicalShapes:
+    """Those rows in float64, as a problem of their own."""
     weight = values.sample_weight
-    used = None if weight is None else (weight > 0).any(-1).flatten()
-    index = drawn_rows(ROWS, values.Y.shape[-2], used, seed, values.Y.device)
+    return CanonicalShapes(
+        values.X.index_select(-3, index).double(),
+        values.Y.index_select(-2, index).double(),
+        None if weight is None else weight.index_select(-2, index).double(),
+        values.batch,
+        values.single_channel,
+    )
+
+
+def pilot_problem(values: CanonicalShapes, seed: int) -> tuple[LinearProblem, bool] | None:
+    """A problem of few rows, and whether every row had the same chance to be in it; None where no rows will do.
+
+    Where rows drawn alike leave a direction to a few of them, as a column that is seldom other than 0, rows are added
+    by their leverage among all.
+    """
+    count = max(_ROWS, _ROWS_A_COLUMN * values.X.shape[-1])
+    index = drawn_rows(values, count, seed)
+    problem = _problem(values, index)
+    if problem is not None:
+        return problem, True
+    more = _rows_of_leverage(values, count, seed)
+    problem = None if more is None else _problem(values, torch.cat([index, more]).unique())
+    return None if problem is None else (problem, False)
+
+
+def _problem(values: CanonicalShapes, index: Int[Tensor, " k"]) -> LinearProblem | None:
+    some = rows_at(values, index)
     try:
-        problem = linear_problem(
-            values.X[..., index, :, :].double(),
-            values.Y[..., index, :].double(),
-            None if weight is None else weight[..., index, :].double(),
-        )
+        problem = linear_problem(some.X, some.Y, some.sample_weight)
     except (RankDeficientError, ValueError):
         return None
     return problem if _spans(problem) else None
+
+
+def _used(values: CanonicalShapes) -> Bool[Tensor, " N"] | None:
+    return None if values.sample_weight is None else (values.sample_weight > 0).any(-1).flatten()
 
 
 def _spans(problem: LinearProblem) -> bool:
@@ -67,26 +79,27 @@ def _spans(problem: LinearProblem) -> bool:
     basis = problem.basis[0]
     if problem.sample_weight is not None:
         basis = basis * (problem.sample_weight[0] > 0).unsqueeze(-1)
-    ordinary = basis.square().sum(-1) <= _LEVERAGE
-    kept = (basis * ordinary.unsqueeze(-1)).flatten(0, 1)
-    least = torch.linalg.eigvalsh(torch.matmul(kept.mT, kept))[0]
-    return bool(least > 1e-6)
+    kept = basis.flatten(0, 1)
+    kept = kept * (kept.square().sum(-1, keepdim=True) <= _LEVERAGE)
+    return bool(torch.linalg.eigvalsh(torch.matmul(kept.mT, kept))[0] > _LEAST)
 
 
-def pilot_fit(problem: LinearProblem, known: Known, *, max_iter: int, seed: int, half_width: HalfWidth) -> Pilot | None:
-    """MKC-EM on the pilot's rows and the domain of all; None without rest, or where it fits most of them exactly."""
-    begin, maximum = maximise(problem, known, max_iter=max_iter, tol=_TOLERANCE, seed=seed, half_width=half_width)
-    state = maximum.state
-    pinned = state.free_d & (state.log_d <= state.log_d_min)
-    if bool(begin.exact.any()) or not bool(maximum.converged.all()) or bool(pinned.any()):
+def _rows_of_leverage(values: CanonicalShapes, count: int, seed: int) -> Int[Tensor, " k"] | None:
+    """Rows drawn with a chance in proportion to their leverage; None where columns depend on one another."""
+    X, Y, weight = values.X, values.Y, values.sample_weight
+    X, Y = X.reshape(X.shape[-3:]), Y.reshape(Y.shape[-2:])
+    weight = None if weight is None else weight.reshape(weight.shape[-2:])
+    upper: Tensor | None = None
+    for block in blocks(X, Y, weight):
+        upper = triangle(block, upper)
+    assert upper is not None
+    inverse, info = torch.linalg.inv_ex(upper)
+    if int(info) or not bool(torch.isfinite(inverse).all()):
         return None
-    d, kappa = torch.exp(state.log_d), state.kappa
-    error = problem.residual(maximum.beta)
-    precision = d.pow(-2).unsqueeze(-2)
-    w = kernel_weight(error, kappa, d) * precision
-    total = problem.total_weight().sum()
-    bend = w * (1.0 - kappa.unsqueeze(-2) * error.square() * precision)
-    channels = torch.eye(problem.num_channels, dtype=w.dtype, device=w.device).unsqueeze(-2).expand(-1, *w.shape[1:])
-    curvature, majoriser = (problem.normal_equations(v)[0][0] / total for v in (bend, w))
-    grams = problem.normal_equations(channels.unsqueeze(0))[0][0] / total
-    return Pilot(problem, maximum, curvature, majoriser, grams)
+    found = []
+    for block in blocks(X, Y, weight):
+        of_values = torch.matmul(block.rows, inverse).square().sum(-1)
+        found.append((of_values if block.weight is None else of_values * (block.weight > 0)).sum(-1))
+    cumulated = torch.cat(found).cumsum(0)
+    drawn = torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=cumulated.dtype)
+    return torch.searchsorted(cumulated, drawn * cumulated[-1]).clamp(max=Y.shape[0] - 1)
