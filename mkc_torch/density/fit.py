@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 _KAPPA_OFFSET = 0.02
 """Steps in κ are measured in shares of κ and this: a thousandth matters near a Gaussian, and nowhere else."""
 
+WIDE = 10.0
+"""Least half-width of the domain in scales."""
+
 _LONGEST, _FURTHEST_DOWN = 2.0, math.exp(-2.0)
 """Of a step, in log d and in shares of κ; and the share of κ that a step leaves at least."""
 
@@ -282,7 +285,7 @@ def domain_rule(
     error: Float[Tensor, "*batch N m"],
     scale: Float[Tensor, "*batch m"],
     used: Tensor | None = None,
-    scales: float = 10.0,
+    scales: float = WIDE,
 ) -> Float[Tensor, "*batch m"]:
     """The half-width of the domain: half the range of the residuals of a robust fit, and no less than 10 scales.
 

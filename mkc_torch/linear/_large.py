@@ -14,20 +14,22 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.density.fit import DensityState
+from mkc_torch.density.fit import WIDE, DensityState
 from mkc_torch.density.normalizer import log_partition_value
 from mkc_torch.linear._blocks import Bends, Density
 from mkc_torch.linear._implicit.at_rest import Rest
-from mkc_torch.linear._maximum import Known, rough_fit
+from mkc_torch.linear._maximum import TIGHT, Known, least_d, rough_fit
 from mkc_torch.linear._passes import End, Rows, Slopes, density_of, descend
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem, rows_at
 from mkc_torch.linear._problem import MAX_IMPLIED_CHANNELS, CanonicalShapes, LinearProblem
 from mkc_torch.linear._robust_start import robust_start
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from jaxtyping import Float, Float64
 
-LARGE = 30_000
+LARGE = 20_000
 """Values from which a fit begins with a pilot."""
 
 _GROWTH = 16
@@ -42,11 +44,11 @@ _NEAR, _REST = 0.03, 1e-6
 _NEAR_ON_THE_WAY, _REST_ON_THE_WAY = 0.5, 0.5
 """The same of a fit of fewer rows, whose standard errors are four of those of the next."""
 
-_PASSES = 30
+_PASSES = 15
 """Passes after which a fit that did not come to rest is left to the alternation over all rows."""
 
 _ROUGH = 1e-3
-"""Nats per sample that the last alternation of the pilot's rough fit brings, what its 2000 rows tell from one another."""
+"""Nats per sample that the last alternation of the pilot's rough fit brings: what 2000 rows can tell."""
 
 _CONDITION = 1e3
 """Ratio of singular values of X, its columns scaled, up to which sums are formed from its columns as they are."""
@@ -96,44 +98,65 @@ def large_maximum(values: CanonicalShapes, known: Known, *, max_iter: int, seed:
     if drawn is None:
         return None
     problem, alike = drawn
-
-    def half_width(beta: Tensor, scale: Tensor) -> Tensor:
-        low, high = rows.range_at(torch.matmul(problem.to_coef[0], beta[0]))
-        return torch.maximum(0.5 * (high - low), 10.0 * scale)
-
     begin = robust_start(problem, known.start, seed=seed, pilot=True)
     if bool(begin.exact.any()):
         return None
-    beta, state = rough_fit(problem, known, begin, max_iter=max_iter, tol=_ROUGH, half_width=half_width)
+    rough = rough_fit(problem, known, begin, max_iter=max_iter, tol=_ROUGH)
     frame = _frame(problem)
-    into_frame = torch.linalg.inv(problem.to_coef[0])
+    out_of_basis = problem.to_coef[0] if frame is None else torch.eye(problem.num_coefficients, dtype=torch.float64)
     few = Rows(
         problem.basis[0],
         problem.Y[0],
         None if problem.sample_weight is None else problem.sample_weight[0],
-        into_frame if frame is None else None,
+        torch.linalg.inv(out_of_basis),
     )
-    rest = _at(beta if frame is not None else torch.matmul(beta, problem.to_coef[0].mT), state)
-    slopes = _slopes(few, rest)
-    total = values.Y.shape[-2]
-    # rows drawn by leverage say nothing of the curvature of all
-    count = problem.num_samples * _GROWTH if alike else total
-    while _AHEAD * count < total:
-        some = replace(_rows_of(rows_at(values, drawn_rows(values, count, seed + count))), frame=frame)
-        end = descend(some, rest, slopes, near=_NEAR_ON_THE_WAY, stop=_REST_ON_THE_WAY, passes=_PASSES)
-        if end is None:
-            return None
-        point, everything = end.place.point, end.sums.weight.sum()
-        rest = replace(rest, beta=point.beta, kappa=point.kappa, log_d=point.log_d)
-        slopes = replace(slopes, curvature=end.bends.curvature / everything, tilt=end.bends.tilt / everything)
-        count *= _GROWTH
-    weights = torch.empty_like(rows.Y)
     rows = replace(rows, frame=frame)
+    rest = _at(torch.matmul(rough.beta, out_of_basis.mT), rough.state)
+    slopes = _slopes(few, rest)
+    if known.bound is None:
+        tight = _half_width(rows, rest.beta, TIGHT * begin.scale)
+        rest = replace(rest, log_bound=torch.log(tight))
+    passes = min(max_iter, _PASSES)
+    # rows drawn by leverage say nothing of the curvature of all
+    for some in _on_the_way(values, problem.num_samples, frame, seed) if alike else ():
+        end = descend(some, rest, slopes, near=_NEAR_ON_THE_WAY, stop=_REST_ON_THE_WAY, passes=passes)
+        if end is None or end.bends is None:
+            return None
+        rest, everything = _moved(rest, end), end.sums.weight.sum()
+        slopes = replace(slopes, curvature=end.bends.curvature / everything, tilt=end.bends.tilt / everything)
+    if known.bound is None:
+        end = descend(rows, rest, slopes, near=0.0, stop=1.0, passes=passes) if alike else None
+        rest = rest if end is None else _moved(rest, end)
+        beta, d = torch.matmul(rest.beta, torch.linalg.inv(out_of_basis).mT), torch.exp(rest.log_d)
+        bound = _half_width(rows, rest.beta, WIDE * d)
+        state = known.initial_state(problem, beta, d, bound, least_d(begin), tails=(rest.kappa,))
+        rest = _at(rest.beta, state)
+    weights = torch.empty_like(rows.Y)
     near = _NEAR if alike else math.inf
-    end = descend(rows, rest, slopes, near=near, stop=_REST, passes=min(max_iter, _PASSES), weights=weights)
-    if end is None or _pinned(end, rest) or _gaussian_is_likelier(rows, rest, end, slopes.grams):
+    end = descend(rows, rest, slopes, near=near, stop=_REST, passes=passes, weights=weights)
+    if end is None or end.bends is None or _pinned(end, rest) or _gaussian_is_likelier(rows, rest, end, slopes.grams):
         return None
-    return _told(rows, rest, end, weights)
+    return _told(rows, rest, end, end.bends, weights)
+
+
+def _on_the_way(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int) -> Iterator[Rows]:
+    """More and more rows drawn by chance."""
+    count *= _GROWTH
+    while _AHEAD * count < values.Y.shape[-2]:
+        some = _rows_of(rows_at(values, drawn_rows(values, count, seed + count)))
+        yield replace(some, frame=frame)
+        count *= _GROWTH
+
+
+def _half_width(rows: Rows, beta: Float64[Tensor, "1 n"], least: Float64[Tensor, "1 m"]) -> Float64[Tensor, "1 m"]:
+    """That of :func:`domain_rule` for the residuals of all rows."""
+    low, high = rows.range_at(beta[0])
+    return torch.maximum(0.5 * (high - low), least)
+
+
+def _moved(rest: Rest, end: End) -> Rest:
+    point = end.place.point
+    return replace(rest, beta=point.beta, kappa=point.kappa, log_d=point.log_d)
 
 
 def _rows_of(values: CanonicalShapes) -> Rows:
@@ -222,6 +245,7 @@ def _gaussian_value(rest: Rest, end: End, grams: Float64[Tensor, "m n n"], slack
     assert rest.log_d_min is not None
     root = grams.diagonal(dim1=-2, dim2=-1).clamp(min=torch.finfo(grams.dtype).tiny).rsqrt()
     inverse = torch.linalg.pinv(root.unsqueeze(-1) * grams * root.unsqueeze(-2), hermitian=True)
+    assert end.bends is not None
     moment = (end.bends.moment * root).unsqueeze(-1)
     lowered = torch.matmul(moment.mT, torch.matmul(inverse, moment)).flatten()
     variance = ((end.bends.square - slack * lowered) / end.sums.weight).clamp(min=0.0)
@@ -230,12 +254,12 @@ def _gaussian_value(rest: Rest, end: End, grams: Float64[Tensor, "m n n"], slack
     return float((torch.log(d) + 0.5 * variance / d.square() + norm).sum())
 
 
-def _told(rows: Rows, rest: Rest, end: End, weights: Float[Tensor, "N m"]) -> LargeMaximum:
+def _told(rows: Rows, rest: Rest, end: End, found: Bends, weights: Float[Tensor, "N m"]) -> LargeMaximum:
     assert rest.log_bound is not None
     point = end.place.point
     used = rows.Y.numel() if rows.weight is None else int((rows.weight > 0).sum())
     left = used - point.beta.shape[-1]
-    coef, covariance = point.beta[0], _sandwich(end.bends, used, left)
+    coef, covariance = point.beta[0], _sandwich(found, used, left)
     if rows.frame is not None:
         coef, covariance = rows.frame @ coef, rows.frame @ covariance @ rows.frame.mT
     kappa, d = density_of(point)

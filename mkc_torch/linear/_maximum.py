@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -20,10 +20,14 @@ from mkc_torch.linear._mkc import channel_parameter, fixed_point_step
 from mkc_torch.linear._problem import LinearProblem
 from mkc_torch.linear._robust_start import RobustStart, Start, robust_start
 
-__all__ = ["HalfWidth", "Known", "Maximum", "maximise", "normalised_weight", "rough_fit"]
+__all__ = ["TIGHT", "Known", "Maximum", "given_bound", "least_d", "maximise", "normalised_weight", "rough_fit"]
 
 _FLOOR = 0.3
 """Least d in robust scales: a scale is at most doubled by outliers, and a fit that interpolates ends far below."""
+
+
+TIGHT = 5.0
+"""Least half-width, in robust scales, of the domain of a rough fit."""
 
 
 @dataclass(frozen=True)
@@ -156,10 +160,6 @@ class Known:
         )
 
 
-HalfWidth = Callable[[Tensor, Tensor], Tensor]
-"""The half-width of the domain of each channel, from coefficients in the basis and the scale of a rough fit."""
-
-
 def maximise(
     problem: LinearProblem, known: Known, *, max_iter: int, tol: float, seed: int
 ) -> tuple[RobustStart, Maximum]:
@@ -172,26 +172,39 @@ def maximise(
         seed: of the start.
     """
     begin = robust_start(problem, known.start, seed=seed)
-    beta, state = rough_fit(problem, known, begin, max_iter=max_iter)
+    d_min = least_d(begin)
+    if known.bound is None:
+        rough = rough_fit(problem, known, begin, max_iter=max_iter)
+        beta, kappa, d = rough.beta, rough.state.kappa, torch.exp(rough.state.log_d)
+        bound = domain_rule(problem.residual(beta), d, _used(problem))
+        state = known.initial_state(problem, beta, d, bound, d_min, tails=(kappa,))
+    else:
+        beta, bound = begin.beta, given_bound(problem, known, begin)
+        state = known.initial_state(problem, beta, begin.scale, bound, d_min)
     maximum = _alternate(problem, beta, state, max_iter=max_iter, tol=tol)
     if state.free_kappa and state.free_d:
         maximum = _gaussian_candidate(problem, maximum, max_iter=max_iter, tol=tol)
     return begin, maximum
 
 
-def rough_fit(
-    problem: LinearProblem,
-    known: Known,
-    begin: RobustStart,
-    *,
-    max_iter: int,
-    tol: float = 1e-4,
-    half_width: HalfWidth | None = None,
-) -> tuple[Tensor, DensityState]:
-    """Coefficients and state to start from: on the domain given, or on that of the rule, which a rough fit gives.
+def least_d(begin: RobustStart) -> Tensor:
+    """The floor under d."""
+    return _FLOOR * begin.scale
+
+
+def given_bound(problem: LinearProblem, known: Known, begin: RobustStart) -> Tensor:
+    """The domain that is given, of every channel; a clear error where the head does not fit in."""
+    assert known.bound is not None
+    bound = channel_parameter("bound", known.bound, problem)
+    refuse_narrow_bound(bound, begin.scale)
+    return bound
+
+
+def rough_fit(problem: LinearProblem, known: Known, begin: RobustStart, *, max_iter: int, tol: float = 1e-4) -> Maximum:
+    """A fit that says which domain the rule gives, and is near to the one there.
 
     A robust start's scale is up to twice that of the head when outliers are many and on one side, so the rough fit
-    is made on a tight domain, where it finds the head.
+    is made on a tight domain, where it finds the head, or on the one that is given.
 
     Args:
         problem: what is fitted.
@@ -199,17 +212,14 @@ def rough_fit(
         begin: the robust start.
         max_iter: alternations at most.
         tol: what the last of them brings, in nats per sample.
-        half_width: of the domain, where the residuals of this problem alone do not say it.
     """
-    d_min = _FLOOR * begin.scale
-    if known.bound is not None:
-        bound = channel_parameter("bound", known.bound, problem)
-        refuse_narrow_bound(bound, begin.scale)
-        return begin.beta, known.initial_state(problem, begin.beta, begin.scale, bound, d_min)
-    used = None if problem.sample_weight is None else problem.sample_weight > 0
-    tight = domain_rule(problem.residual(begin.beta), begin.scale, used, scales=5.0)
-    state = known.initial_state(problem, begin.beta, begin.scale, tight, d_min)
-    rough = _alternate(problem, begin.beta, state, max_iter=max_iter, tol=tol, patience=1)
-    kappa, d = rough.state.kappa, torch.exp(rough.state.log_d)
-    bound = domain_rule(problem.residual(rough.beta), d, used) if half_width is None else half_width(rough.beta, d)
-    return rough.beta, known.initial_state(problem, rough.beta, d, bound, d_min, tails=(kappa,))
+    if known.bound is None:
+        bound = domain_rule(problem.residual(begin.beta), begin.scale, _used(problem), scales=TIGHT)
+    else:
+        bound = given_bound(problem, known, begin)
+    state = known.initial_state(problem, begin.beta, begin.scale, bound, least_d(begin))
+    return _alternate(problem, begin.beta, state, max_iter=max_iter, tol=tol, patience=1)
+
+
+def _used(problem: LinearProblem) -> Tensor | None:
+    return None if problem.sample_weight is None else problem.sample_weight > 0

@@ -113,11 +113,11 @@ class Place(NamedTuple):
 
 
 class End(NamedTuple):
-    """Where a descent ended; ``bends`` are those of the last pass but one or two."""
+    """Where a descent ended; ``bends`` are those of the last pass but one or two, if any was to have them."""
 
     place: Place
     sums: Sums
-    bends: Bends
+    bends: Bends | None
     history: list[Float64[Tensor, ""]]
 
 
@@ -155,6 +155,12 @@ def _place(rest: Rest, point: Point, total: Sums, slopes: Slopes, unit: Tensor) 
     )
 
 
+def _represented(point: Point, slopes: Slopes, everything: Tensor) -> float:
+    """Length in standard errors of a change of every coefficient by four units in its last place."""
+    spread = (slopes.curvature.diagonal().clamp(min=0.0) * point.beta[0].square()).sum()
+    return 4.0 * torch.finfo(torch.float64).eps * math.sqrt(float(everything * spread))
+
+
 def _plain_move(rest: Rest, at: Place, slopes: Slopes, unit: Tensor) -> Float64[Tensor, "1 p"]:
     """An M-step with weights of 1, which is no longer than one with the kernel's, and a damped step in κ and log d."""
     precision = torch.exp(-2.0 * at.point.log_d[0])[:, None, None]
@@ -165,8 +171,9 @@ def _plain_move(rest: Rest, at: Place, slopes: Slopes, unit: Tensor) -> Float64[
     return torch.cat([by_beta, proposal.kappa - state.kappa, proposal.log_d - state.log_d]).unsqueeze(0)
 
 
-def _rounding(value: float) -> float:
-    return 64.0 * torch.finfo(torch.float64).eps * max(1.0, abs(value))
+def _slack(value: float, rounding: float, everything: Tensor) -> float:
+    """What rounding makes of the mean likelihood, of its sum and of residuals that are small beside the targets."""
+    return 64.0 * torch.finfo(torch.float64).eps * max(1.0, abs(value)) + rounding / float(everything)
 
 
 def descend(
@@ -185,7 +192,7 @@ def descend(
         rows: whose likelihood is maximised.
         rest: where to begin, with the domain and what is free.
         slopes: to step by at first, of other rows.
-        near: standard errors from the maximum, below which a pass adds up the curvature of these rows.
+        near: standard errors from the maximum, below which a pass adds up the curvature of these rows; at 0 none does.
         stop: length of the last step in standard errors; it is told, not made.
         passes: at most.
         weights: filled with the kernel's weights at the end.
@@ -196,10 +203,10 @@ def descend(
     best: Place | None = None
     found: Bends | None = None
     history: list[Tensor] = []
-    before, left, plain = math.inf, math.inf, False
+    before, left, plain = math.inf, math.inf if near < math.inf else 0.0, False
     move = torch.zeros_like(point.beta)
     for _ in range(passes):
-        close = found is not None or left <= near
+        close = found is not None or left < near
         total, more = rows.look(
             point.beta[0], density_of(point), bend=close and found is None, weights=weights if close else None
         )
@@ -208,7 +215,8 @@ def descend(
             found = more
             slopes = Slopes(more.curvature / everything, more.tilt / everything, slopes.grams)
         here = _place(rest, point, total, slopes, unit)
-        if best is not None and not here.value <= best.value + _rounding(best.value):
+        rounding = _represented(point, slopes, everything)
+        if best is not None and not here.value <= best.value + _slack(best.value, rounding, everything):
             # Newton's step failed: a plain one, and parts of it where that fails too
             move, plain = (0.25 * move if plain else _plain_move(rest, best, slopes, unit)), True
             point = moved(rest, best.point, move, unit, m)
@@ -222,7 +230,7 @@ def descend(
         else:
             move = -torch.matmul(inverse, here.gradient.unsqueeze(-1)).squeeze(-1)
             length = math.sqrt(max(0.0, -float((move * here.gradient).sum() * everything)))
-            if found is not None and length <= stop:
+            if (found is not None or near == 0.0) and length <= max(stop, rounding):
                 return End(here, total, found, history)
             left = length * (_FIRST_RATE if math.isinf(before) else min(1.0, length / before))
             before = length

@@ -110,7 +110,7 @@ class Search:
     ``starts`` elemental sets, least squares being one more, make ``screening_steps`` steps each on ``screened`` samples
     at most; one in ``raw`` of them does where ``ranking`` orders them before. The best ``candidates`` go on: of each of
     ``narrowing`` so many steps, after which so many candidates are left. All that may be approximate. The last go on
-    with the exact rule until a step lowers the logarithm of the scale by less than ``tolerance``, or ``max_iter`` steps.
+    with the exact rule until a step lowers the log of the scale by less than ``tolerance``, or ``max_iter`` steps.
     """
 
     screening: ScaleRule
