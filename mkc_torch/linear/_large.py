@@ -50,6 +50,12 @@ _PASSES = 15
 _ROUGH = 1e-3
 """Nats per sample that the last alternation of the pilot's rough fit brings: what 2000 rows can tell."""
 
+_TAILS = (0.1, 0.2, 0.4, 1.5)
+"""κ that it begins with: one more than otherwise, for a step of the alternation costs more than a look at it."""
+
+_FOR_SLOPES = 8
+"""Times the rows of the pilot from which the curvature to step by is: each step leaves a twentieth of the way."""
+
 _CONDITION = 1e3
 """Ratio of singular values of X, its columns scaled, up to which sums are formed from its columns as they are."""
 
@@ -101,23 +107,18 @@ def large_maximum(values: CanonicalShapes, known: Known, *, max_iter: int, seed:
     begin = robust_start(problem, known.start, seed=seed, pilot=True)
     if bool(begin.exact.any()):
         return None
-    rough = rough_fit(problem, known, begin, max_iter=max_iter, tol=_ROUGH)
+    rough = rough_fit(problem, known, begin, max_iter=max_iter, tol=_ROUGH, tails=_TAILS)
     frame = _frame(problem)
     out_of_basis = problem.to_coef[0] if frame is None else torch.eye(problem.num_coefficients, dtype=torch.float64)
-    few = Rows(
-        problem.basis[0],
-        problem.Y[0],
-        None if problem.sample_weight is None else problem.sample_weight[0],
-        torch.linalg.inv(out_of_basis),
-    )
     rows = replace(rows, frame=frame)
+    # rows drawn by leverage say nothing of the curvature of all, and seldom rows may be missing among others
+    few = _drawn(values, _FOR_SLOPES * problem.num_samples, frame, seed) if alike else rows
     rest = _at(torch.matmul(rough.beta, out_of_basis.mT), rough.state)
     slopes = _slopes(few, rest)
     if known.bound is None:
         tight = _half_width(rows, rest.beta, TIGHT * begin.scale)
         rest = replace(rest, log_bound=torch.log(tight))
     passes = min(max_iter, _PASSES)
-    # rows drawn by leverage say nothing of the curvature of all
     for some in _on_the_way(values, problem.num_samples, frame, seed) if alike else ():
         end = descend(some, rest, slopes, near=_NEAR_ON_THE_WAY, stop=_REST_ON_THE_WAY, passes=passes)
         if end is None or end.bends is None:
@@ -143,9 +144,12 @@ def _on_the_way(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n
     """More and more rows drawn by chance."""
     count *= _GROWTH
     while _AHEAD * count < values.Y.shape[-2]:
-        some = _rows_of(rows_at(values, drawn_rows(values, count, seed + count)))
-        yield replace(some, frame=frame)
+        yield _drawn(values, count, frame, seed)
         count *= _GROWTH
+
+
+def _drawn(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int) -> Rows:
+    return replace(_rows_of(rows_at(values, drawn_rows(values, count, seed + count))), frame=frame)
 
 
 def _half_width(rows: Rows, beta: Float64[Tensor, "1 n"], least: Float64[Tensor, "1 m"]) -> Float64[Tensor, "1 m"]:

@@ -26,6 +26,9 @@ _FLOOR = 0.3
 """Least d in robust scales: a scale is at most doubled by outliers, and a fit that interpolates ends far below."""
 
 
+TAILS = (0.1, 0.4, 1.5)
+"""κ of the densities that a fit begins with the likeliest of."""
+
 TIGHT = 5.0
 """Least half-width, in robust scales, of the domain of a rough fit."""
 
@@ -141,7 +144,7 @@ class Known:
         scale: Tensor,
         bound: Tensor,
         d_min: Tensor,
-        tails: Sequence[float | Tensor] = (0.1, 0.4, 1.5),
+        tails: Sequence[float | Tensor] = TAILS,
     ) -> DensityState:
         """The likeliest of a few densities to start from at coefficients ``beta``."""
         d = None if self.d is None else channel_parameter("d", self.d, problem)
@@ -200,7 +203,15 @@ def given_bound(problem: LinearProblem, known: Known, begin: RobustStart) -> Ten
     return bound
 
 
-def rough_fit(problem: LinearProblem, known: Known, begin: RobustStart, *, max_iter: int, tol: float = 1e-4) -> Maximum:
+def rough_fit(
+    problem: LinearProblem,
+    known: Known,
+    begin: RobustStart,
+    *,
+    max_iter: int,
+    tol: float = 1e-4,
+    tails: Sequence[float] = TAILS,
+) -> Maximum:
     """A fit that says which domain the rule gives, and is near to the one there.
 
     A robust start's scale is up to twice that of the head when outliers are many and on one side, so the rough fit
@@ -212,12 +223,13 @@ def rough_fit(problem: LinearProblem, known: Known, begin: RobustStart, *, max_i
         begin: the robust start.
         max_iter: alternations at most.
         tol: what the last of them brings, in nats per sample.
+        tails: κ to begin with.
     """
     if known.bound is None:
         bound = domain_rule(problem.residual(begin.beta), begin.scale, _used(problem), scales=TIGHT)
     else:
         bound = given_bound(problem, known, begin)
-    state = known.initial_state(problem, begin.beta, begin.scale, bound, least_d(begin))
+    state = known.initial_state(problem, begin.beta, begin.scale, bound, least_d(begin), tails=tails)
     return _alternate(problem, begin.beta, state, max_iter=max_iter, tol=tol, patience=1)
 
 
