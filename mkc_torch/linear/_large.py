@@ -16,13 +16,13 @@ from torch import Tensor
 
 from mkc_torch.density.fit import WIDE, DensityState
 from mkc_torch.density.normalizer import log_partition_value
-from mkc_torch.linear._blocks import Bends, Density
+from mkc_torch.linear._blocks import Bends, Density, Sums
 from mkc_torch.linear._implicit.at_rest import Rest
 from mkc_torch.linear._maximum import TIGHT, Known, least_d, rough_fit
 from mkc_torch.linear._passes import End, Rows, Slopes, density_of, descend
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem, rows_at
 from mkc_torch.linear._problem import MAX_IMPLIED_CHANNELS, CanonicalShapes, LinearProblem
-from mkc_torch.linear._robust_start import robust_start
+from mkc_torch.linear._robust_start import RobustStart, robust_start
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -99,8 +99,54 @@ def large_maximum(values: CanonicalShapes, known: Known, *, max_iter: int, seed:
     ends at its least, where a Gaussian is likelier than what was found, or where the passes do not come to rest: an
     alternation over all rows then tells what is wrong, or finds its way.
     """
-    rows = _rows_of(values)
-    drawn = pilot_problem(values, seed) if _sound(rows) else None
+    rows, passes = _rows_of(values), min(max_iter, _PASSES)
+    pilot = _pilot(values, known, max_iter, seed) if _sound(rows) else None
+    if pilot is None:
+        return None
+    rows, rest = replace(rows, frame=pilot.frame), pilot.rest
+    # rows drawn by leverage say nothing of the curvature of all, and seldom rows may be missing among others
+    count = pilot.problem.num_samples
+    slopes = _slopes(_drawn(values, _FOR_SLOPES * count, pilot.frame, seed) if pilot.alike else rows, rest)
+    if known.bound is None:
+        rest = replace(rest, log_bound=torch.log(_half_width(rows, rest.beta, TIGHT * pilot.begin.scale)))
+    for some in _on_the_way(values, count, pilot.frame, seed) if pilot.alike else ():
+        end = descend(some, rest, slopes, near=_NEAR_ON_THE_WAY, stop=_REST_ON_THE_WAY, passes=passes)
+        if end is None or end.bends is None:
+            return None
+        rest, everything = _moved(rest, end), end.sums.weight.sum()
+        slopes = replace(slopes, curvature=end.bends.curvature / everything, tilt=end.bends.tilt / everything)
+    first: Sums | None = None
+    if known.bound is None:
+        end = descend(rows, rest, slopes, near=0.0, stop=1.0, passes=passes) if pilot.alike else None
+        if end is not None:
+            rest, first = _moved(rest, end), end.sums
+        rest, first = _on_its_domain(rows, pilot, known, rest, first)
+    weights = torch.empty_like(rows.Y)
+    end = descend(
+        rows, rest, slopes, near=_NEAR, stop=_REST, passes=passes, weights=weights, first=first, alike=pilot.alike
+    )
+    if end is None or end.bends is None or _pinned(end, rest) or _gaussian_is_likelier(rows, rest, end, slopes.grams):
+        return None
+    return _told(rows, rest, end, end.bends, weights)
+
+
+@dataclass(frozen=True)
+class _Pilot:
+    """A rough fit of few rows, at ``rest`` in the frame of :class:`Rows`; ``alike`` where each was as likely as another."""
+
+    problem: LinearProblem
+    alike: bool
+    begin: RobustStart
+    frame: Float64[Tensor, "n n"] | None
+    rest: Rest
+
+    def in_basis(self, beta: Float64[Tensor, "1 n"]) -> Float64[Tensor, "1 n"]:
+        """Coefficients in the basis of the pilot's problem."""
+        return beta if self.frame is not None else torch.linalg.solve(self.problem.to_coef[0], beta.mT).mT
+
+
+def _pilot(values: CanonicalShapes, known: Known, max_iter: int, seed: int) -> _Pilot | None:
+    drawn = pilot_problem(values, seed)
     if drawn is None:
         return None
     problem, alike = drawn
@@ -109,35 +155,21 @@ def large_maximum(values: CanonicalShapes, known: Known, *, max_iter: int, seed:
         return None
     rough = rough_fit(problem, known, begin, max_iter=max_iter, tol=_ROUGH, tails=_TAILS)
     frame = _frame(problem)
-    out_of_basis = problem.to_coef[0] if frame is None else torch.eye(problem.num_coefficients, dtype=torch.float64)
-    rows = replace(rows, frame=frame)
-    # rows drawn by leverage say nothing of the curvature of all, and seldom rows may be missing among others
-    few = _drawn(values, _FOR_SLOPES * problem.num_samples, frame, seed) if alike else rows
-    rest = _at(torch.matmul(rough.beta, out_of_basis.mT), rough.state)
-    slopes = _slopes(few, rest)
-    if known.bound is None:
-        tight = _half_width(rows, rest.beta, TIGHT * begin.scale)
-        rest = replace(rest, log_bound=torch.log(tight))
-    passes = min(max_iter, _PASSES)
-    for some in _on_the_way(values, problem.num_samples, frame, seed) if alike else ():
-        end = descend(some, rest, slopes, near=_NEAR_ON_THE_WAY, stop=_REST_ON_THE_WAY, passes=passes)
-        if end is None or end.bends is None:
-            return None
-        rest, everything = _moved(rest, end), end.sums.weight.sum()
-        slopes = replace(slopes, curvature=end.bends.curvature / everything, tilt=end.bends.tilt / everything)
-    if known.bound is None:
-        end = descend(rows, rest, slopes, near=0.0, stop=1.0, passes=passes) if alike else None
-        rest = rest if end is None else _moved(rest, end)
-        beta, d = torch.matmul(rest.beta, torch.linalg.inv(out_of_basis).mT), torch.exp(rest.log_d)
-        bound = _half_width(rows, rest.beta, WIDE * d)
-        state = known.initial_state(problem, beta, d, bound, least_d(begin), tails=(rest.kappa,))
-        rest = _at(rest.beta, state)
-    weights = torch.empty_like(rows.Y)
-    near = _NEAR if alike else math.inf
-    end = descend(rows, rest, slopes, near=near, stop=_REST, passes=passes, weights=weights)
-    if end is None or end.bends is None or _pinned(end, rest) or _gaussian_is_likelier(rows, rest, end, slopes.grams):
-        return None
-    return _told(rows, rest, end, end.bends, weights)
+    beta = rough.beta if frame is not None else torch.matmul(rough.beta, problem.to_coef[0].mT)
+    return _Pilot(problem, alike, begin, frame, _at(beta, rough.state))
+
+
+def _on_its_domain(
+    rows: Rows, pilot: _Pilot, known: Known, rough: Rest, first: Sums | None
+) -> tuple[Rest, Sums | None]:
+    """Where to begin on the domain of the rule, with the sums there where they are those of the rough fit."""
+    d = torch.exp(rough.log_d)
+    bound = _half_width(rows, rough.beta, WIDE * d)
+    beta = pilot.in_basis(rough.beta)
+    state = known.initial_state(pilot.problem, beta, d, bound, least_d(pilot.begin), tails=(rough.kappa,))
+    if torch.allclose(state.kappa, rough.kappa) and torch.allclose(state.log_d, rough.log_d):
+        return replace(rough, log_bound=state.log_bound), first
+    return _at(rough.beta, state), None
 
 
 def _on_the_way(values: CanonicalShapes, count: int, frame: Float64[Tensor, "n n"] | None, seed: int) -> Iterator[Rows]:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from mkc_torch.density.energy import KAPPA_MAX
 from mkc_torch.density.fit import DensityState, Derivatives, likelihood_derivatives, newton_proposal
 from mkc_torch.linear._blocks import (
     Bends,
@@ -155,6 +156,29 @@ def _place(rest: Rest, point: Point, total: Sums, slopes: Slopes, unit: Tensor) 
     )
 
 
+def _newton_move(rest: Rest, at: Place) -> Float64[Tensor, "1 p"] | None:
+    """Newton's step; what would cross a limit ends there, and the others step accordingly. None at no convex place."""
+    assert rest.log_bound is not None
+    assert rest.log_d_min is not None
+    kappa, log_d = at.point.kappa, at.point.log_d
+    open_end = torch.full_like(at.point.beta, math.inf)
+    low = torch.cat([-open_end, -kappa, rest.log_d_min - log_d], -1)
+    high = torch.cat([open_end, KAPPA_MAX - kappa, rest.log_bound - log_d], -1)
+    keep = free_unknowns(rest, at.point, at.gradient)
+    fixed = torch.zeros_like(at.gradient)
+    while True:
+        inverse, strict = inverse_where(at.hessian, keep)
+        if not bool(strict):
+            return None
+        slope = at.gradient + torch.matmul(at.hessian, fixed.unsqueeze(-1)).squeeze(-1)
+        move = fixed - torch.matmul(inverse, slope.unsqueeze(-1)).squeeze(-1)
+        beyond = keep & ((move < low) | (move > high))
+        if not bool(beyond.any()):
+            return move
+        fixed = torch.where(beyond, torch.minimum(torch.maximum(move, low), high), fixed)
+        keep = keep & ~beyond
+
+
 def _represented(point: Point, slopes: Slopes, everything: Tensor) -> float:
     """Length in standard errors of a change of every coefficient by four units in its last place."""
     spread = (slopes.curvature.diagonal().clamp(min=0.0) * point.beta[0].square()).sum()
@@ -185,6 +209,8 @@ def descend(
     stop: float,
     passes: int,
     weights: Float[Tensor, "N m"] | None = None,
+    first: Sums | None = None,
+    alike: bool = True,
 ) -> End | None:
     """To where Newton's step with the curvature of these rows is short; None where that takes too many passes.
 
@@ -196,6 +222,8 @@ def descend(
         stop: length of the last step in standard errors; it is told, not made.
         passes: at most.
         weights: filled with the kernel's weights at the end.
+        first: the sums where it begins, if they are known.
+        alike: whether the slopes' rows are like these; otherwise the first pass, too, adds up their curvature.
     """
     point = Point(rest.beta, rest.kappa, rest.log_d)
     unit = torch.exp(rest.log_d.amin())
@@ -203,16 +231,18 @@ def descend(
     best: Place | None = None
     found: Bends | None = None
     history: list[Tensor] = []
-    before, left, plain = math.inf, math.inf if near < math.inf else 0.0, False
+    before, left, plain = math.inf, math.inf, False
     move = torch.zeros_like(point.beta)
     for _ in range(passes):
         close = found is not None or left < near
-        total, more = rows.look(
-            point.beta[0], density_of(point), bend=close and found is None, weights=weights if close else None
-        )
+        if first is None or close:
+            bend = not alike or (close and found is None)
+            total, more = rows.look(point.beta[0], density_of(point), bend=bend, weights=weights if close else None)
+        else:
+            total, more, first = first, None, None
         everything = total.weight.sum()
         if more is not None:
-            found = more
+            alike, found = True, more if close else None
             slopes = Slopes(more.curvature / everything, more.tilt / everything, slopes.grams)
         here = _place(rest, point, total, slopes, unit)
         rounding = _represented(point, slopes, everything)
@@ -223,12 +253,12 @@ def descend(
             continue
         best = here
         history.append(here.per_sample)
-        inverse, strict = inverse_where(here.hessian, free_unknowns(rest, point, here.gradient))
-        plain = not bool(strict)
-        if plain:
+        newton = _newton_move(rest, here)
+        plain = newton is None
+        if newton is None:
             move = _plain_move(rest, here, slopes, unit)
         else:
-            move = -torch.matmul(inverse, here.gradient.unsqueeze(-1)).squeeze(-1)
+            move = newton
             length = math.sqrt(max(0.0, -float((move * here.gradient).sum() * everything)))
             if (found is not None or near == 0.0) and length <= max(stop, rounding):
                 return End(here, total, found, history)
