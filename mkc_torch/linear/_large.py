@@ -19,7 +19,7 @@ from mkc_torch.density.normalizer import log_partition_value
 from mkc_torch.linear._blocks import Bends, Density, Sums
 from mkc_torch.linear._implicit.at_rest import Rest
 from mkc_torch.linear._maximum import TIGHT, Known, least_d, rough_fit
-from mkc_torch.linear._passes import End, Rows, Slopes, density_of, descend
+from mkc_torch.linear._passes import End, Rows, Slopes, descend
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem, rows_at
 from mkc_torch.linear._problem import MAX_IMPLIED_CHANNELS, CanonicalShapes, LinearProblem
 from mkc_torch.linear._robust_start import RobustStart, robust_start
@@ -77,14 +77,27 @@ def is_large(values: CanonicalShapes) -> bool:
     )
 
 
+def in_its_basis(problem: LinearProblem) -> CanonicalShapes:
+    """A problem whose X is the basis of another."""
+    basis, batch = problem.basis, problem.batch
+    if basis.shape[0] == 1:
+        basis = basis.expand(batch.numel(), *basis.shape[1:])
+    weight = problem.sample_weight
+    return CanonicalShapes(
+        basis.reshape(*batch, *basis.shape[1:]),
+        problem.Y.reshape(*batch, *problem.Y.shape[1:]),
+        None if weight is None else weight.reshape(*batch, *weight.shape[1:]),
+        batch,
+        problem.single_channel,
+    )
+
+
 @dataclass(frozen=True)
 class LargeMaximum:
-    """The maximum of the likelihood of all rows, in the user's columns; fields without batch dimensions."""
+    """The maximum of the likelihood of all rows, in the columns of X; ``rest`` is a batch of it, the others are not."""
 
     coef: Float64[Tensor, " n"]
-    kappa: Float64[Tensor, " m"]
-    d: Float64[Tensor, " m"]
-    bound: Float64[Tensor, " m"]
+    rest: Rest
     weights: Float[Tensor, "N m"]
     log_likelihood: Float64[Tensor, ""]
     covariance: Float64[Tensor, "n n"]
@@ -132,7 +145,7 @@ def large_maximum(values: CanonicalShapes, known: Known, *, max_iter: int, seed:
 
 @dataclass(frozen=True)
 class _Pilot:
-    """A rough fit of few rows, at ``rest`` in the frame of :class:`Rows`; ``alike`` where each was as likely as another."""
+    """A rough fit of few rows, at ``rest`` in the frame of :class:`Rows`; ``alike`` where any could be among them."""
 
     problem: LinearProblem
     alike: bool
@@ -291,19 +304,15 @@ def _gaussian_value(rest: Rest, end: End, grams: Float64[Tensor, "m n n"], slack
 
 
 def _told(rows: Rows, rest: Rest, end: End, found: Bends, weights: Float[Tensor, "N m"]) -> LargeMaximum:
-    assert rest.log_bound is not None
     point = end.place.point
     used = rows.Y.numel() if rows.weight is None else int((rows.weight > 0).sum())
     left = used - point.beta.shape[-1]
     coef, covariance = point.beta[0], _sandwich(found, used, left)
     if rows.frame is not None:
         coef, covariance = rows.frame @ coef, rows.frame @ covariance @ rows.frame.mT
-    kappa, d = density_of(point)
     return LargeMaximum(
         coef=coef,
-        kappa=kappa,
-        d=d,
-        bound=torch.exp(rest.log_bound[0]),
+        rest=replace(rest, beta=coef.unsqueeze(0), kappa=point.kappa, log_d=point.log_d),
         weights=weights,
         log_likelihood=-(end.sums.weight * end.place.by_channel.value).sum(),
         covariance=covariance,

@@ -137,6 +137,12 @@ class Known:
     bound: float | Tensor | None
     start: Start | Tensor
 
+    def in_basis_of(self, problem: LinearProblem) -> Known:
+        """The same for a problem whose X is the basis of this one."""
+        if not isinstance(self.start, Tensor):
+            return self
+        return replace(self, start=problem.restore(problem.in_basis(self.start.to(problem.Y))))
+
     def initial_state(
         self,
         problem: LinearProblem,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ from mkc_torch.density.fit import negative_log_likelihood
 from mkc_torch.linear._implicit.at_rest import Rest
 from mkc_torch.linear._implicit.layer import Given, fit_layer, wanted
 from mkc_torch.linear._inference import Inference
-from mkc_torch.linear._large import LargeMaximum, is_large, large_maximum
+from mkc_torch.linear._large import LargeMaximum, in_its_basis, is_large, large_maximum
 from mkc_torch.linear._maximum import Known, Maximum, maximise, normalised_weight
 from mkc_torch.linear._mkc import coefficient_covariance, kernel_weight, values_left
 from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, laid_out, linear_problem
@@ -141,24 +142,33 @@ class MKCRegression(Inference):
             return self._fit_as_layer(X, Y, sample_weight)
         self.__dict__.pop("differentiable_", None)
         with torch.no_grad():
-            values = laid_out(X, Y, sample_weight)
-            if self.covariance == "sandwich" and is_large(values):
-                known = Known(self.sigma, self.d, self.bound, self.start)
-                found = large_maximum(values, known, max_iter=self.max_iter, seed=self.seed)
-                if found is not None:
-                    self._keep_large(values, found)
-                    return self
+            values, known = laid_out(X, Y, sample_weight), Known(self.sigma, self.d, self.bound, self.start)
+            # scores of a time series are of use in their order alone
+            found = self._large_maximum(values, known) if self.covariance == "sandwich" else None
+            if found is not None:
+                self._keep_large(values, found)
+                return self
             problem = linear_problem(X, Y, sample_weight)
-            self._keep(problem, *self._maximise(problem, Known(self.sigma, self.d, self.bound, self.start)))
+            self._keep(problem, *self._maximise(problem, known))
         return self
+
+    def _large_maximum(self, values: CanonicalShapes, known: Known) -> LargeMaximum | None:
+        if not is_large(values):
+            return None
+        return large_maximum(values, known, max_iter=self.max_iter, seed=self.seed)
 
     def _maximise(self, problem: LinearProblem, known: Known) -> tuple[RobustStart, Maximum]:
         return maximise(problem, known, max_iter=self.max_iter, tol=self.tol, seed=self.seed)
 
     def _fit_as_layer(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None) -> MKCRegression:
         def solve(problem: LinearProblem, given: Given) -> Rest:
-            start = self.start if given.start is None else given.start
-            begin, maximum = self._maximise(problem, Known(given.sigma, given.d, given.bound, start))
+            known = Known(given.sigma, given.d, given.bound, self.start if given.start is None else given.start)
+            found = self._large_maximum(in_its_basis(problem), known.in_basis_of(problem))
+            if found is not None:
+                self.n_iter_ = len(found.history) - 1
+                flag = torch.ones_like(problem.Y[:, 0, 0], dtype=torch.bool)
+                return replace(found.rest, converged=flag, extras=(~flag, found.history.unsqueeze(0)))
+            begin, maximum = self._maximise(problem, known)
             self.n_iter_ = len(maximum.history) - 1
             state = maximum.state
             return Rest(
@@ -201,7 +211,10 @@ class MKCRegression(Inference):
 
         self._single_channel = values.single_channel
         self.coef_, self.weights_ = restored(found.coef), restored(found.weights)
-        self.sigma_, self.d_, self.bound_ = restored(found.kappa.rsqrt()), restored(found.d), restored(found.bound)
+        rest = found.rest
+        assert rest.log_bound is not None
+        self.sigma_, self.d_ = restored(rest.kappa[0].rsqrt()), restored(torch.exp(rest.log_d[0]))
+        self.bound_ = restored(torch.exp(rest.log_bound[0]))
         self.log_likelihood_ = restored(found.log_likelihood)
         self.covariance_, self.dof_ = restored(found.covariance), restored(found.dof)
         self.history_ = torch.stack([restored(h) for h in found.history])

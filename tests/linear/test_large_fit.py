@@ -261,11 +261,17 @@ def test_history_never_rises_and_ends_at_the_likelihood():
     torch.testing.assert_close(-N * fit.history_[-1], fit.log_likelihood_)
 
 
-def test_gradients_through_a_large_fit():
+def test_gradients_through_a_large_fit(piloted):
     X, y = sample()
-    plain = MKCRegression(bound=20.0).fit(X, y)
+    free = MKCRegression().fit(X, y)
     target = y.clone().requires_grad_()
-    fit = MKCRegression(bound=20.0).fit(X, target)
+    fit = MKCRegression(start="lts").fit(X, target)
+    assert piloted == [True, True]
+    assert bool(fit.differentiable_)
+    assert apart(free, fit) < 1e-6
+    torch.testing.assert_close(fit.bound_.detach(), free.bound_)
+    plain = MKCRegression(bound=20.0).fit(X, y)
+    fit = MKCRegression(bound=20.0, start=plain.coef_).fit(X, target)
     assert apart(plain, fit) < 1e-6
     fit.coef_.sum().backward()
     change = torch.zeros(N).double()
