@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from mkc_torch.density.em import gaussian_state, normalised, spread, written
 from mkc_torch.density.fit import (
     DensityState,
     conclusive,
@@ -20,11 +21,10 @@ from mkc_torch.linear._mkc import channel_parameter, fixed_point_step
 from mkc_torch.linear._problem import LinearProblem
 from mkc_torch.linear._robust_start import RobustStart, Start, robust_start
 
-__all__ = ["TIGHT", "Known", "Maximum", "given_bound", "least_d", "maximise", "normalised_weight", "rough_fit"]
+__all__ = ["TIGHT", "Known", "Maximum", "given_bound", "least_d", "maximise", "rough_fit"]
 
 _FLOOR = 0.3
 """Least d in robust scales: a scale is at most doubled by outliers, and a fit that interpolates ends far below."""
-
 
 TAILS = (0.1, 0.4, 1.5)
 """κ of the densities that a fit begins with the likeliest of."""
@@ -42,11 +42,6 @@ class Maximum:
     history: list[Tensor]
 
 
-def normalised_weight(problem: LinearProblem) -> Tensor | None:
-    w = problem.sample_weight
-    return None if w is None else w / w.sum(-2, keepdim=True)
-
-
 def _alternate(
     problem: LinearProblem, beta: Tensor, state: DensityState, *, max_iter: int, tol: float, patience: int = 2
 ) -> Maximum:
@@ -57,7 +52,7 @@ def _alternate(
     value = state.value.sum(-1)
     converged = torch.zeros(size, dtype=torch.bool, device=beta.device)
     history = [value]
-    weight = normalised_weight(problem)
+    weight = normalised(problem.sample_weight)
     quiet = torch.zeros(size, dtype=torch.int64, device=beta.device)
     for _ in range(max_iter):
         residual = problem.residual(beta)
@@ -77,7 +72,7 @@ def _alternate(
         done = quiet >= patience
         if bool(done.any()) or len(history) > max_iter:
             out_beta[index] = beta
-            out_state = _write(out_state, index, state)
+            out_state = written(out_state, index, state)
             converged[index] = done & torch.isfinite(now)
             keep = (~done).nonzero().squeeze(-1)
             if keep.numel() == 0:
@@ -88,26 +83,15 @@ def _alternate(
     return Maximum(out_beta, out_state, history[-1], converged, history)
 
 
-def _write(whole: DensityState, index: Tensor, part: DensityState) -> DensityState:
-    fields = {}
-    for name in ("kappa", "log_d", "log_bound", "log_d_min", "damping", "value"):
-        fields[name] = getattr(whole, name).index_copy(0, index, getattr(part, name))
-    return DensityState(**fields, free_kappa=whole.free_kappa, free_d=whole.free_d)
-
-
 def _gaussian_candidate(problem: LinearProblem, maximum: Maximum, *, max_iter: int, tol: float) -> Maximum:
     """Where a Gaussian density at weighted least squares is likelier than what was found, go on from there instead."""
     state = maximum.state
     beta = problem.weighted_fit(torch.ones_like(problem.Y))
-    weight = normalised_weight(problem)
+    weight = normalised(problem.sample_weight)
     for _ in range(2 if problem.num_channels > 1 else 0):
-        square = problem.residual(beta).square()
-        variance = square.mean(-2) if weight is None else (weight * square).sum(-2)
-        d = torch.maximum(variance.sqrt(), torch.exp(state.log_d_min))
+        d = spread(problem.residual(beta), weight, torch.exp(state.log_d_min))
         beta = fixed_point_step(problem, problem.Y, torch.zeros_like(d), d)
-    residual = problem.residual(beta)
-    d_min = torch.exp(state.log_d_min)
-    gaussian = initial_state(residual, weight, d_min, torch.exp(state.log_bound), d_min, kappa=torch.zeros_like(d_min))
+    gaussian = gaussian_state(problem.residual(beta), weight, state)
     better = (gaussian.value.sum(-1) < maximum.value).nonzero().squeeze(-1)
     if better.numel() == 0:
         return maximum
@@ -121,7 +105,7 @@ def _gaussian_candidate(problem: LinearProblem, maximum: Maximum, *, max_iter: i
         history.append(now)
     return Maximum(
         beta=maximum.beta.index_copy(0, better, again.beta),
-        state=_write(state, better, again.state),
+        state=written(state, better, again.state),
         value=maximum.value.index_copy(0, better, again.value),
         converged=maximum.converged.index_copy(0, better, again.converged),
         history=history,
@@ -159,7 +143,7 @@ class Known:
             d_min = torch.minimum(d, d_min)
         return initial_state(
             problem.residual(beta),
-            normalised_weight(problem),
+            normalised(problem.sample_weight),
             scale,
             bound,
             d_min,

@@ -91,7 +91,7 @@ def _trimmed_start(problem: LinearProblem, seed: int, pilot: bool) -> Float[Tens
         starts=elemental_count(problem.num_coefficients),
         ranking=QuantileScale(fraction) if pilot and steps else None,
         candidates=5 if pilot else 2,
-        screening_steps=min(steps, 1) if pilot else steps,
+        screening_steps=steps,
         max_iter=4,
         seed=seed,
         screened=max(_FEW, _FEW_A_COLUMN * problem.num_coefficients) if pilot else SCREENED,

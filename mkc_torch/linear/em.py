@@ -10,13 +10,14 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_out_of_range
 from mkc_torch._support.arrays import Data
+from mkc_torch.density.em import normalised
 from mkc_torch.density.energy import SIGMA_LEAST
 from mkc_torch.density.fit import negative_log_likelihood
 from mkc_torch.linear._implicit.at_rest import Rest
 from mkc_torch.linear._implicit.layer import Given, fit_layer, wanted
 from mkc_torch.linear._inference import Inference
 from mkc_torch.linear._large import LargeMaximum, in_its_basis, is_large, large_maximum
-from mkc_torch.linear._maximum import Known, Maximum, maximise, normalised_weight
+from mkc_torch.linear._maximum import Known, Maximum, maximise
 from mkc_torch.linear._mkc import coefficient_covariance, kernel_weight, values_left
 from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, laid_out, linear_problem
 from mkc_torch.linear._robust_start import RobustStart, Start, checked_start
@@ -226,7 +227,7 @@ class MKCRegression(Inference):
         kappa, d = maximum.state.kappa, torch.exp(maximum.state.log_d)
         residual = problem.residual(maximum.beta)
         self._set_common(problem, maximum.beta, kernel_weight(residual, kappa, d))
-        nll = negative_log_likelihood(residual, normalised_weight(problem), maximum.state)
+        nll = negative_log_likelihood(residual, normalised(problem.sample_weight), maximum.state)
         self.sigma_ = problem.restore(kappa.rsqrt())
         self.d_ = problem.restore(d)
         self.bound_ = problem.restore(torch.exp(maximum.state.log_bound))
