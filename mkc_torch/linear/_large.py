@@ -47,8 +47,8 @@ _NEAR_ON_THE_WAY, _REST_ON_THE_WAY = 0.5, 0.5
 _PASSES = 15
 """Passes after which a fit that did not come to rest is left to the alternation over all rows."""
 
-_ROUGH = 1e-3
-"""Nats per sample that the last alternation of the pilot's rough fit brings: what 2000 rows can tell."""
+_WIDEST = 2.0
+"""Robust scales of the start up to which a rough fit's d is the head's, and not that of a Gaussian over outliers."""
 
 _TAILS = (0.1, 0.2, 0.4, 1.5)
 """κ that it begins with: one more than otherwise, for a step of the alternation costs more than a look at it."""
@@ -108,9 +108,9 @@ class LargeMaximum:
 def large_maximum(values: CanonicalShapes, known: Known, *, max_iter: int, seed: int) -> LargeMaximum | None:
     """The maximum of the likelihood of one problem of many rows.
 
-    None where the values are not finite, where no pilot stands for all rows, where most values are fitted exactly or d
-    ends at its least, where a Gaussian is likelier than what was found, or where the passes do not come to rest: an
-    alternation over all rows then tells what is wrong, or finds its way.
+    None where the values are not finite, where no pilot stands for all rows or its rough fit finds no head, where most
+    values are fitted exactly or d ends at its least, where a Gaussian is likelier than what was found, or where the
+    passes do not come to rest: an alternation over all rows then tells what is wrong, or finds its way.
     """
     rows, passes = _rows_of(values), min(max_iter, _PASSES)
     pilot = _pilot(values, known, max_iter, seed) if _sound(rows) else None
@@ -166,7 +166,10 @@ def _pilot(values: CanonicalShapes, known: Known, max_iter: int, seed: int) -> _
     begin = robust_start(problem, known.start, seed=seed, pilot=True)
     if bool(begin.exact.any()):
         return None
-    rough = rough_fit(problem, known, begin, max_iter=max_iter, tol=_ROUGH, tails=_TAILS)
+    rough = rough_fit(problem, known, begin, max_iter=max_iter, tails=_TAILS)
+    learned = known.sigma is None and known.d is None
+    if learned and bool((torch.exp(rough.state.log_d) > _WIDEST * begin.scale).any()):
+        return None
     frame = _frame(problem)
     beta = rough.beta if frame is not None else torch.matmul(rough.beta, problem.to_coef[0].mT)
     return _Pilot(problem, alike, begin, frame, _at(beta, rough.state))

@@ -199,7 +199,6 @@ def rough_fit(
     begin: RobustStart,
     *,
     max_iter: int,
-    tol: float = 1e-4,
     tails: Sequence[float] = TAILS,
 ) -> Maximum:
     """A fit that says which domain the rule gives, and is near to the one there.
@@ -212,7 +211,6 @@ def rough_fit(
         known: parameters that are given.
         begin: the robust start.
         max_iter: alternations at most.
-        tol: what the last of them brings, in nats per sample.
         tails: κ to begin with.
     """
     if known.bound is None:
@@ -220,7 +218,7 @@ def rough_fit(
     else:
         bound = given_bound(problem, known, begin)
     state = known.initial_state(problem, begin.beta, begin.scale, bound, least_d(begin), tails=tails)
-    return _alternate(problem, begin.beta, state, max_iter=max_iter, tol=tol, patience=1)
+    return _alternate(problem, begin.beta, state, max_iter=max_iter, tol=1e-4, patience=1)
 
 
 def _used(problem: LinearProblem) -> Tensor | None:

@@ -76,8 +76,12 @@ def residual_scale(problem: LinearProblem, residual: Float[Tensor, "B N m"]) -> 
     return 1.4826 * (1.0 + 5.0 / left) * (N / left) * middle
 
 
-_FEW, _FEW_A_COLUMN = 300, 30
-"""Samples, and no fewer for each column, that the starts of a pilot are screened on, of which five go on."""
+_FEW, _FEW_A_SQUARE = 300, 6
+"""Samples that the starts of a pilot are screened on, and so many times the square of the columns.
+
+With 45 % of outliers to one side and 15 columns, where 1 of 8000 sets is clean, 24 starts of 24 were right on 1500
+samples and 19 on 450; with 9 columns 24 on 300.
+"""
 
 
 def _trimmed_start(problem: LinearProblem, seed: int, pilot: bool) -> Float[Tensor, "B n"]:
@@ -94,7 +98,7 @@ def _trimmed_start(problem: LinearProblem, seed: int, pilot: bool) -> Float[Tens
         screening_steps=steps,
         max_iter=4,
         seed=seed,
-        screened=max(_FEW, _FEW_A_COLUMN * problem.num_coefficients) if pilot else SCREENED,
+        screened=min(SCREENED, max(_FEW, _FEW_A_SQUARE * problem.num_coefficients**2)) if pilot else SCREENED,
     )
     return minimise_scale(problem, search).beta
 

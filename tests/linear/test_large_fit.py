@@ -156,6 +156,14 @@ def test_a_large_fit_is_the_fit_of_all_rows_from_the_start(case, monkeypatch):
     assert apart(fit, direct) < 0.05
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_nearly_half_the_rows_are_outliers(seed, piloted):
+    X, y = sample(seed, n=15, share=0.45)
+    fit = MKCRegression(seed=seed).fit(X, y)
+    assert len(piloted) == 1
+    assert float((fit.coef_ - 1.0).abs().max()) < 0.1
+
+
 @pytest.mark.parametrize(
     "given", [{"sigma": 2.0}, {"d": 1.1}, {"sigma": math.inf}, {"bound": 40.0}, {"sigma": 2.0, "d": 1.0}]
 )
