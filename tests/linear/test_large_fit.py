@@ -446,3 +446,16 @@ def test_a_time_series_is_fitted_directly(piloted):
     fit = MKCRegression(covariance="hac", bandwidth=3.0).fit(X, y)
     assert piloted == []
     assert apart(fit, converged(fit, X, y)) < 0.05
+
+
+def test_how_the_data_lie_in_memory_does_not_matter(piloted):
+    X, y = sample()
+    fit = MKCRegression().fit(X, y)
+    apart_in_memory = torch.stack([y, y], -1)[:, 0]
+    assert not apart_in_memory.is_contiguous()
+    for x in (X.mT.contiguous().mT, torch.cat([X, X], 1)[:, :5], X.flip(0).flip(0)):
+        assert apart(MKCRegression().fit(x, apart_in_memory), fit) < 1e-6
+    assert apart(MKCRegression().fit(X.numpy(), y.numpy()), fit) < 1e-6
+    with torch.inference_mode():
+        assert apart(MKCRegression().fit(X, y), fit) < 1e-6
+    assert piloted == [True] * 6
