@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 _KAPPA_OFFSET = 0.02
 """Steps in κ are measured in shares of κ and this: a thousandth matters near a Gaussian, and nowhere else."""
 
+WIDE = 10.0
+"""Least half-width of the domain in scales."""
+
 _LONGEST, _FURTHEST_DOWN = 2.0, math.exp(-2.0)
 """Of a step, in log d and in shares of κ; and the share of κ that a step leaves at least."""
 
@@ -49,7 +52,7 @@ class Derivatives(NamedTuple):
     log_d_log_d: Tensor
 
 
-def _energy_terms(q: Tensor, kappa: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def energy_terms(q: Tensor, kappa: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """exp(-x), E, -∂E/∂κ and ∂²E/∂κ² at q = z²/2, x = κ q."""
     x = kappa * q
     w = torch.exp(-x)
@@ -74,7 +77,7 @@ def _mean(values: Tensor, weight: Tensor | None) -> Tensor:
 
 def energy_derivatives(error: Tensor, weight: Tensor | None, kappa: Tensor, log_d: Tensor) -> Derivatives:
     q = 0.5 * (error * torch.exp(-log_d).unsqueeze(-2)).square()
-    w, e, first, second = _energy_terms(q, kappa.unsqueeze(-2))
+    w, e, first, second = energy_terms(q, kappa.unsqueeze(-2))
     qw = q * w
     q2w = q * qw
     mean_qw, mean_q2w = _mean(qw, weight), _mean(q2w, weight)
@@ -95,13 +98,13 @@ def normaliser_derivatives(kappa: Tensor, log_d: Tensor, log_bound: Tensor) -> D
     k = torch.where(tail > 0, kappa, 1.0)
     tail_1, tail_2 = tail / k.pow(2), tail * (1.0 - 2.0 * k) / k.pow(4)
     nodes, weights = head_rule(kappa, length)
-    _, e, first, second = _energy_terms(0.5 * nodes.square(), kappa.unsqueeze(-1))
+    _, e, first, second = energy_terms(0.5 * nodes.square(), kappa.unsqueeze(-1))
     p = torch.exp(-e)
 
     z = integrate(p, tail, length, weights)
     z_k = integrate(first * p, tail_1, length, weights) / z
     z_kk = integrate((first.square() - second) * p, tail_2, length, weights) / z
-    w_end, e_end, first_end, _ = _energy_terms(0.5 * length.square(), kappa)
+    w_end, e_end, first_end, _ = energy_terms(0.5 * length.square(), kappa)
     edge = 2.0 * torch.exp(-e_end) / z
     l_1 = length * edge
     l_2 = length * l_1 * (-length * w_end - edge) + l_1
@@ -186,9 +189,27 @@ def initial_state(
 
 def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> DensityState:
     """One damped Newton step in (κ, log d) within κ in [0, 400] and d in [d_min, bound]; never uphill."""
-    fit = energy_derivatives(error, weight, state.kappa, state.log_d)
+    total = likelihood_derivatives(energy_derivatives(error, weight, state.kappa, state.log_d), state)
+    proposal = newton_proposal(total, state)
+    value = negative_log_likelihood(error, weight, proposal)
+    better = value <= total.value
+    return replace(
+        state,
+        kappa=torch.where(better, proposal.kappa, state.kappa),
+        log_d=torch.where(better, proposal.log_d, state.log_d),
+        damping=torch.where(better, 0.1 * state.damping, 10.0 * state.damping).clamp(1e-9, 1e6),
+        value=torch.where(better, value, total.value),
+    )
+
+
+def likelihood_derivatives(energy: Derivatives, state: DensityState) -> Derivatives:
+    """Those of the mean negative log-likelihood, from those of the mean energy."""
     norm = normaliser_derivatives(state.kappa, state.log_d, state.log_bound)
-    total = Derivatives(*(a + b for a, b in zip(fit, norm, strict=True)))
+    return Derivatives(*(a + b for a, b in zip(energy, norm, strict=True)))
+
+
+def newton_proposal(total: Derivatives, state: DensityState) -> DensityState:
+    """Where a damped Newton step from ``state`` leads, its value not yet known."""
     chain = state.kappa + _KAPPA_OFFSET
     g_s, g_l = total.kappa * chain, total.log_d
     h_ss = total.kappa_kappa * chain.square()
@@ -219,19 +240,10 @@ def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> De
     log_d = torch.minimum(
         torch.maximum(state.log_d + shorten * step_l.nan_to_num(0.0), state.log_d_min), state.log_bound
     )
-    proposal = replace(
+    return replace(
         state,
         kappa=kappa if state.free_kappa else state.kappa,
         log_d=log_d if state.free_d else state.log_d,
-    )
-    value = negative_log_likelihood(error, weight, proposal)
-    better = value <= total.value
-    return replace(
-        state,
-        kappa=torch.where(better, proposal.kappa, state.kappa),
-        log_d=torch.where(better, proposal.log_d, state.log_d),
-        damping=torch.where(better, 0.1 * state.damping, 10.0 * state.damping).clamp(1e-9, 1e6),
-        value=torch.where(better, value, total.value),
     )
 
 
@@ -273,7 +285,7 @@ def domain_rule(
     error: Float[Tensor, "*batch N m"],
     scale: Float[Tensor, "*batch m"],
     used: Tensor | None = None,
-    scales: float = 10.0,
+    scales: float = WIDE,
 ) -> Float[Tensor, "*batch m"]:
     """The half-width of the domain: half the range of the residuals of a robust fit, and no less than 10 scales.
 

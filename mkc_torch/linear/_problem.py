@@ -21,6 +21,12 @@ MAX_IMPLIED_CHANNELS = 16
 _CHUNK = 1 << 22
 """Values held at once when outer products of rows are formed."""
 
+_BLOCK = 1 << 12
+"""Values of rows that are weighted and multiplied while they stay in a processor's cache."""
+
+_FEW = 10
+"""Sets of weights up to which this takes less than the products of rows that are not kept."""
+
 
 class RankDeficientError(ValueError):
     """The columns of X are linearly dependent, so that the coefficients are not determined."""
@@ -82,6 +88,9 @@ class LinearProblem:
         n = self.num_coefficients
         sums: Tensor | None = None
         step = max(1, _CHUNK // (n * n * self.num_channels * self.basis.shape[0]))
+        if step < self.num_samples and stack.shape[1] <= _FEW:
+            gram, moment = self._sums_of_blocks(stack)
+            return (gram, moment) if weight.dim() == 4 else (gram.squeeze(1), moment.squeeze(1))
         for first in range(0, self.num_samples, step):
             part = slice(first, first + step)
             w = stack[:, :, part].flatten(-2)
@@ -94,6 +103,21 @@ class LinearProblem:
         assert sums is not None
         gram, moment = sums[..., _symmetric(n, sums.device)[2]], sums[..., -n:]
         return (gram, moment) if weight.dim() == 4 else (gram.squeeze(1), moment.squeeze(1))
+
+    def _sums_of_blocks(self, stack: Tensor) -> tuple[Float[Tensor, "B S n n"], Float[Tensor, "B S n"]]:
+        """The same of a few weights of rows that are too many for their products to be kept."""
+        gram: Tensor | None = None
+        moment: Tensor | None = None
+        step = max(1, _BLOCK // self.num_channels)
+        for first in range(0, self.num_samples, step):
+            part = slice(first, first + step)
+            w, rows = stack[:, :, part].flatten(-2), self.basis[:, part].flatten(-3, -2).unsqueeze(1)
+            more = torch.matmul((rows * w.unsqueeze(-1)).mT, rows)
+            plus = torch.matmul((w * self.Y[:, part].flatten(-2).unsqueeze(1)).unsqueeze(-2), rows).squeeze(-2)
+            gram, moment = (more, plus) if gram is None or moment is None else (gram + more, moment + plus)
+        assert gram is not None
+        assert moment is not None
+        return gram, moment
 
     @property
     def _products(self) -> tuple[Tensor, bool]:

@@ -12,7 +12,7 @@ from torch import Tensor
 from mkc_torch._support.arguments import refuse_complex, seems_finite, told
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._problem import LinearProblem
-from mkc_torch.linear._scale_search import Search, minimise_scale
+from mkc_torch.linear._scale_search import SCREENED, Search, minimise_scale
 from mkc_torch.linear.least_trimmed_squares import QuantileScale, TrimmedScale, default_coverage
 from mkc_torch.linear.s_regression import minimise_m_scale
 
@@ -76,7 +76,15 @@ def residual_scale(problem: LinearProblem, residual: Float[Tensor, "B N m"]) -> 
     return 1.4826 * (1.0 + 5.0 / left) * (N / left) * middle
 
 
-def _trimmed_start(problem: LinearProblem, seed: int) -> Float[Tensor, "B n"]:
+_FEW, _FEW_A_SQUARE = 300, 6
+"""Samples that the starts of a pilot are screened on, and so many times the square of the columns.
+
+With 45 % of outliers to one side and 15 columns, where 1 of 8000 sets is clean, 24 starts of 24 were right on 1500
+samples and 19 on 450; with 9 columns 24 on 300.
+"""
+
+
+def _trimmed_start(problem: LinearProblem, seed: int, pilot: bool) -> Float[Tensor, "B n"]:
     """Least trimmed squares followed a few steps: near its minimum is enough for a start."""
     fraction = default_coverage(problem) / problem.num_samples
     # fits through up to three values are good enough to be ranked as they are
@@ -85,19 +93,24 @@ def _trimmed_start(problem: LinearProblem, seed: int) -> Float[Tensor, "B n"]:
         TrimmedScale(fraction) if steps else QuantileScale(fraction),
         TrimmedScale(fraction),
         starts=elemental_count(problem.num_coefficients),
-        candidates=2,
+        ranking=QuantileScale(fraction) if pilot and steps else None,
+        candidates=5 if pilot else 2,
         screening_steps=steps,
         max_iter=4,
         seed=seed,
+        screened=min(SCREENED, max(_FEW, _FEW_A_SQUARE * problem.num_coefficients**2)) if pilot else SCREENED,
     )
     return minimise_scale(problem, search).beta
 
 
-def robust_start(problem: LinearProblem, method: Start | Tensor = "lts", *, seed: int = 0) -> RobustStart:
+def robust_start(
+    problem: LinearProblem, method: Start | Tensor = "lts", *, seed: int = 0, pilot: bool = False
+) -> RobustStart:
     """Coefficients by the named method, or those given, with the scale of their residuals.
 
     An exact fit has scale 0; the scale returned is then the rounding error of Y, so that what follows needs no special
-    case: the values on the fit keep weight 1 and the others lose theirs.
+    case: the values on the fit keep weight 1 and the others lose theirs. The search for that of a ``pilot``, which more
+    samples follow, is shorter.
     """
     if isinstance(method, Tensor):
         n = problem.num_coefficients
@@ -107,7 +120,7 @@ def robust_start(problem: LinearProblem, method: Start | Tensor = "lts", *, seed
             )
         beta = problem.in_basis(method.to(problem.Y))
     elif method == "lts":
-        beta = _trimmed_start(problem, seed)
+        beta = _trimmed_start(problem, seed, pilot)
     elif method == "s":
         beta = minimise_m_scale(problem, starts=elemental_count(problem.num_coefficients), seed=seed).beta
     else:

@@ -40,7 +40,8 @@ _CHUNK = 1 << 16
 _BATCH = 1 << 18
 """Residuals of many problems worked on at once: so many that the calls themselves take little beside."""
 
-_SCREENING_SAMPLES = 1500
+SCREENED = 1500
+"""Samples that starts are screened on."""
 
 
 @dataclass(frozen=True)
@@ -106,10 +107,10 @@ def rounding_scale(problem: LinearProblem) -> Float[Tensor, "B m"]:
 class Search:
     """How the minimum is looked for.
 
-    ``starts`` elemental sets, least squares being one more, make ``screening_steps`` steps each; one in ``raw`` of them
-    does where ``ranking`` orders them before. The best ``candidates`` go on: of each of ``narrowing`` so many steps,
-    after which so many candidates are left. All that may be approximate. The last go on with the exact rule until a
-    step lowers the logarithm of the scale by less than ``tolerance``, or ``max_iter`` steps.
+    ``starts`` elemental sets, least squares being one more, make ``screening_steps`` steps each on ``screened`` samples
+    at most; one in ``raw`` of them does where ``ranking`` orders them before. The best ``candidates`` go on: of each of
+    ``narrowing`` so many steps, after which so many candidates are left. All that may be approximate. The last go on
+    with the exact rule until a step lowers the log of the scale by less than ``tolerance``, or ``max_iter`` steps.
     """
 
     screening: ScaleRule
@@ -123,6 +124,7 @@ class Search:
     tolerance: float = 0.0
     max_iter: int = 100
     seed: int = 0
+    screened: int = SCREENED
 
 
 def _step(problem: LinearProblem, beta: Tensor, rule: ScaleRule, near: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -190,13 +192,13 @@ def _in_parts(problem: LinearProblem, values: int, work: Callable[[LinearProblem
 
 
 def minimise_scale(problem: LinearProblem, search: Search) -> ScaleMinimum:
-    """A few steps from every start on at most 1500 samples, then the best candidates to rest on all of them."""
+    """A few steps from every start on some of the samples, then the best candidates to rest on all of them."""
     size = problem.num_samples * problem.num_channels
-    screened = min(size, _SCREENING_SAMPLES * problem.num_channels) * (search.starts + 1)
+    screened = min(size, search.screened * problem.num_channels) * (search.starts + 1)
     generator = torch.Generator().manual_seed(search.seed)
     some_samples: Tensor | None = None
-    if problem.num_samples > _SCREENING_SAMPLES:
-        keep = torch.randperm(problem.num_samples, generator=generator)[:_SCREENING_SAMPLES].sort().values
+    if problem.num_samples > search.screened:
+        keep = torch.randperm(problem.num_samples, generator=generator)[: search.screened].sort().values
         some_samples = keep.to(problem.Y.device)
     small = problem if some_samples is None else problem.select_samples(some_samples)
     drawn = _drawn(small, search.starts, generator)

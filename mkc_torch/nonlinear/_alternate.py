@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mkc_torch.density.fit import DensityState, conclusive, initial_state, newton_step
+from mkc_torch.density.em import gaussian_state, normalised, spread, written
+from mkc_torch.density.fit import DensityState, conclusive, newton_step
 from mkc_torch.nonlinear._constraints import constrained
 from mkc_torch.nonlinear._descent import damped_step
 from mkc_torch.nonlinear._problem import Point, Problem
@@ -32,7 +33,7 @@ def likelihood_of(problem: Problem, residual: Tensor) -> _Likelihood:
         count = residual.new_full((residual.shape[0], residual.shape[2]), residual.shape[1])
         return _Likelihood(None, count)
     total = problem.weight.sum(-2)
-    return _Likelihood(problem.weight / total.unsqueeze(-2), total)
+    return _Likelihood(normalised(problem.weight), total)
 
 
 @dataclass(frozen=True)
@@ -110,13 +111,8 @@ def gaussian_candidate(
         return replace(maximum, point=point)
     d_min = torch.exp(state.log_d_min)
 
-    def spread(residual: Tensor) -> Tensor:
-        square = residual.square()
-        mean = square.mean(-2) if likelihood.weight is None else (likelihood.weight * square).sum(-2)
-        return torch.maximum(mean.sqrt(), d_min)
-
     # the linear model of the residual shows whether the Gaussian stands a chance before any fit is made
-    d = spread(point.residual)
+    d = spread(point.residual, likelihood.weight, d_min)
     residual = point.residual
     for _ in range(1 if d.shape[-1] == 1 else 2):
         quadratic = quadratic_about(problem, point, torch.zeros_like(d), d, None)
@@ -131,11 +127,9 @@ def gaussian_candidate(
         )
         change = torch.matmul(step.unsqueeze(-2), point.tangents).squeeze(-2).unflatten(-1, residual.shape[1:])
         residual = point.residual + change
-        d = spread(residual)
+        d = spread(residual, likelihood.weight, d_min)
     share = likelihood.total / likelihood.total.mean(-1, keepdim=True)
-    gaussian = initial_state(
-        residual, likelihood.weight, d_min, torch.exp(state.log_bound), d_min, kappa=torch.zeros_like(d_min)
-    )
+    gaussian = gaussian_state(residual, likelihood.weight, state)
     better = tailed & ((share * gaussian.value).sum(-1) < maximum.value + tol)
     index = better.nonzero().squeeze(-1)
     if index.numel() == 0:
@@ -149,8 +143,6 @@ def gaussian_candidate(
     if won.numel() == 0:
         return replace(maximum, point=point, n_iter=maximum.n_iter + again.n_iter)
     index, winner = index[won], problem.select(index).refreshed(again.point).select(won)
-    fields = ("kappa", "log_d", "log_bound", "log_d_min", "damping", "value")
-    merged = {f: getattr(state, f).index_copy(0, index, getattr(again.state, f)[won]) for f in fields}
     penalty = maximum.penalty
     if penalty is not None and again.penalty is not None:
         penalty = Penalty(
@@ -159,7 +151,7 @@ def gaussian_candidate(
         )
     return Maximum(
         point=point.write(index, winner),
-        state=replace(state, **merged),
+        state=written(state, index, again.state.select(won)),
         value=maximum.value.index_copy(0, index, again.value[won]),
         converged=maximum.converged.index_copy(0, index, again.converged[won]),
         n_iter=maximum.n_iter + again.n_iter,

@@ -108,11 +108,16 @@ def test_stack_of_candidates_equals_one_at_a_time():
         torch.testing.assert_close(residuals[:, s], problem.residual(betas[:, s]))
 
 
-def test_normal_equations_in_chunks_equal_those_at_once(monkeypatch):
-    problem = linear_problem(sample(0, 3, 20, 2, 4), sample(1, 3, 20, 2))
-    weight = sample(2, 3, 20, 2).exp()
+@pytest.mark.parametrize("few", [0, 10])
+@pytest.mark.parametrize("x_batch", [(), (3,)])
+@pytest.mark.parametrize("stack", [(), (4,)])
+def test_normal_equations_in_chunks_equal_those_at_once(few, x_batch, stack, monkeypatch):
+    problem = linear_problem(sample(0, *x_batch, 20, 2, 4), sample(1, 3, 20, 2), sample(3, 3, 20).exp())
+    weight = sample(2, 3, *stack, 20, 2).exp()
     whole = problem.normal_equations(weight)
     monkeypatch.setattr("mkc_torch.linear._problem._CHUNK", 300)
+    monkeypatch.setattr("mkc_torch.linear._problem._BLOCK", 6)
+    monkeypatch.setattr("mkc_torch.linear._problem._FEW", few)
     for part, at_once in zip(problem.normal_equations(weight), whole, strict=True):
         torch.testing.assert_close(part, at_once)
 

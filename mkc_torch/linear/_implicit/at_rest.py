@@ -17,7 +17,7 @@ from mkc_torch.linear._problem import LinearProblem
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["Rest"]
+__all__ = ["Point", "Rest", "free_unknowns", "inverse_where", "moved"]
 
 _POLISHING_STEPS = 12
 
@@ -84,14 +84,14 @@ class FitData:
 
 
 @dataclass(frozen=True)
-class _Point:
+class Point:
     beta: Float[Tensor, "B n"]
     kappa: Float[Tensor, "B m"]
     log_d: Float[Tensor, "B m"]
 
 
 @dataclass(frozen=True)
-class _AtRest(_Point):
+class _AtRest(Point):
     unit: Float[Tensor, "B 1"]
     total: Float[Tensor, "B 1"]
     inverse: Float[Tensor, "B p p"]
@@ -112,14 +112,14 @@ def at_rest(problem: LinearProblem, rest: Rest) -> _AtRest:
         total=problem.total_weight().sum(-1, keepdim=True),
     )
     eps = torch.finfo(unit.dtype).eps
-    point = _Point(rest.beta, rest.kappa, rest.log_d)
+    point = Point(rest.beta, rest.kappa, rest.log_d)
     rounding = (10 * eps * problem.Y.abs().amax((-2, -1)) / unit.squeeze(-1)).square()
     before = rounding.new_full((size,), torch.inf)
     for step in range(_POLISHING_STEPS + 1):
         gradient = data.gradient(point.beta, point.kappa, point.log_d)
         hessian, head = _hessian(problem, data, point)
-        keep = _free(rest, point, gradient)
-        inverse, strict = _inverse_where(hessian, keep)
+        keep = free_unknowns(rest, point, gradient)
+        inverse, strict = inverse_where(hessian, keep)
         move = -torch.matmul(inverse, torch.where(keep, gradient, 0.0).unsqueeze(-1)).squeeze(-1)
         # what a step would still gain, in mean squares of the fitted values in d
         gain = -(move * gradient).sum(-1)
@@ -127,7 +127,7 @@ def at_rest(problem: LinearProblem, rest: Rest) -> _AtRest:
         done = ~strict | (near & ((gain <= (1e4 * eps) ** 2 * head) | (gain >= 0.25 * before)))
         if bool(done.all()) or step == _POLISHING_STEPS:
             break
-        point, before = _moved(rest, point, torch.where(done.unsqueeze(-1), 0.0, move), unit, m), gain
+        point, before = moved(rest, point, torch.where(done.unsqueeze(-1), 0.0, move), unit, m), gain
     cause = torch.where(strict | ~rest.converged, torch.where(near & rest.converged, 0, _NOT_AT_REST), _NO_MINIMUM)
     refused = (cause != 0).unsqueeze(-1)
     return _AtRest(
@@ -141,9 +141,7 @@ def at_rest(problem: LinearProblem, rest: Rest) -> _AtRest:
     )
 
 
-def _hessian(
-    problem: LinearProblem, data: FitData, point: _Point
-) -> tuple[Float[Tensor, "B p p"], Float[Tensor, " B"]]:
+def _hessian(problem: LinearProblem, data: FitData, point: Point) -> tuple[Float[Tensor, "B p p"], Float[Tensor, " B"]]:
     """Of the objective whose gradient :class:`FitData` gives, and the mean square of z under the kernel's weights."""
     kappa, log_d = point.kappa, point.log_d
     error = data.residual(point.beta)
@@ -178,7 +176,7 @@ def _hessian(
     return torch.cat(rows, -2), head
 
 
-def _free(rest: Rest, point: _Point, gradient: Float[Tensor, "B p"]) -> Bool[Tensor, "B p"]:
+def free_unknowns(rest: Rest, point: Point, gradient: Float[Tensor, "B p"]) -> Bool[Tensor, "B p"]:
     """The unknowns that follow the data: not those given, nor those that a bound holds back."""
     coefficients = torch.ones_like(point.beta, dtype=torch.bool)
     if rest.log_bound is None or rest.log_d_min is None:
@@ -190,7 +188,7 @@ def _free(rest: Rest, point: _Point, gradient: Float[Tensor, "B p"]) -> Bool[Ten
     return torch.cat([coefficients, ~held_kappa & rest.free_kappa, ~held_d & rest.free_d], -1)
 
 
-def _inverse_where(hessian: Tensor, keep: Tensor) -> tuple[Float[Tensor, "B p p"], Bool[Tensor, " B"]]:
+def inverse_where(hessian: Tensor, keep: Tensor) -> tuple[Float[Tensor, "B p p"], Bool[Tensor, " B"]]:
     """Inverse of the Hessian of the unknowns kept, 0 for the others, and whether it is safely positive definite."""
     both = keep.unsqueeze(-1) & keep.unsqueeze(-2)
     hessian = torch.where(both, hessian, torch.diag_embed((~keep).to(hessian.dtype)))
@@ -205,12 +203,12 @@ def _inverse_where(hessian: Tensor, keep: Tensor) -> tuple[Float[Tensor, "B p p"
     return torch.where(both & strict[:, None, None], inverse, 0.0), strict
 
 
-def _moved(rest: Rest, point: _Point, move: Float[Tensor, "B p"], unit: Tensor, m: int) -> _Point:
+def moved(rest: Rest, point: Point, move: Float[Tensor, "B p"], unit: Tensor, m: int) -> Point:
     n = point.beta.shape[-1]
     beta = point.beta + unit * move[:, :n]
     if rest.log_bound is None or rest.log_d_min is None:
-        return _Point(beta, point.kappa, point.log_d)
+        return Point(beta, point.kappa, point.log_d)
     kappa = (point.kappa + move[:, n : n + m]).clamp(0.0, KAPPA_MAX) if rest.free_kappa else point.kappa
     log_d = point.log_d + move[:, n + m :]
     bounded = torch.minimum(torch.maximum(log_d, rest.log_d_min), rest.log_bound)
-    return _Point(beta, kappa, bounded if rest.free_d else point.log_d)
+    return Point(beta, kappa, bounded if rest.free_d else point.log_d)

@@ -1,0 +1,44 @@
+"""What an alternation of E-steps on (σ, d) with steps of another kind needs, whatever the residual is a residual of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.density.fit import DensityState, initial_state
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["gaussian_state", "normalised", "spread", "written"]
+
+
+def normalised(weight: Float[Tensor, "*batch N m"] | None) -> Float[Tensor, "*batch N m"] | None:
+    """Weights that sum to 1 in each channel, as an E-step takes them."""
+    return None if weight is None else weight / weight.sum(-2, keepdim=True)
+
+
+def spread(
+    residual: Float[Tensor, "*batch N m"], weight: Float[Tensor, "*batch N m"] | None, least: Float[Tensor, "*batch m"]
+) -> Float[Tensor, "*batch m"]:
+    """Root mean square of each channel under normalised weights, the d of a Gaussian, and no less than ``least``."""
+    square = residual.square()
+    mean = square.mean(-2) if weight is None else (weight * square).sum(-2)
+    return torch.maximum(mean.sqrt(), least)
+
+
+def gaussian_state(
+    residual: Float[Tensor, "*batch N m"], weight: Float[Tensor, "*batch N m"] | None, state: DensityState
+) -> DensityState:
+    """The Gaussian of these residuals on the domain of ``state``, which it is compared with."""
+    least = torch.exp(state.log_d_min)
+    return initial_state(residual, weight, least, torch.exp(state.log_bound), least, kappa=torch.zeros_like(least))
+
+
+def written(whole: DensityState, index: Tensor, part: DensityState) -> DensityState:
+    """``whole`` with ``part`` in the place of its problems at ``index``."""
+    names = ("kappa", "log_d", "log_bound", "log_d_min", "damping", "value")
+    return replace(whole, **{name: getattr(whole, name).index_copy(0, index, getattr(part, name)) for name in names})

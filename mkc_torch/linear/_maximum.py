@@ -1,0 +1,225 @@
+"""The search for the maximum of the MKC likelihood of a linear problem, in its basis: Algorithm 3 of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from mkc_torch.density.em import gaussian_state, normalised, spread, written
+from mkc_torch.density.fit import (
+    DensityState,
+    conclusive,
+    domain_rule,
+    initial_state,
+    newton_step,
+    refuse_narrow_bound,
+)
+from mkc_torch.linear._mkc import channel_parameter, fixed_point_step
+from mkc_torch.linear._problem import LinearProblem
+from mkc_torch.linear._robust_start import RobustStart, Start, robust_start
+
+__all__ = ["TIGHT", "Known", "Maximum", "given_bound", "least_d", "maximise", "rough_fit"]
+
+_FLOOR = 0.3
+"""Least d in robust scales: a scale is at most doubled by outliers, and a fit that interpolates ends far below."""
+
+TAILS = (0.1, 0.4, 1.5)
+"""κ of the densities that a fit begins with the likeliest of."""
+
+TIGHT = 5.0
+"""Least half-width, in robust scales, of the domain of a rough fit."""
+
+
+@dataclass(frozen=True)
+class Maximum:
+    beta: Tensor
+    state: DensityState
+    value: Tensor
+    converged: Tensor
+    history: list[Tensor]
+
+
+def _alternate(
+    problem: LinearProblem, beta: Tensor, state: DensityState, *, max_iter: int, tol: float, patience: int = 2
+) -> Maximum:
+    """E-steps and M-steps in turn; a problem leaves the batch after ``patience`` of them without progress."""
+    size = beta.shape[0]
+    index = torch.arange(size, device=beta.device)
+    out_beta, out_state = beta.clone(), state
+    value = state.value.sum(-1)
+    converged = torch.zeros(size, dtype=torch.bool, device=beta.device)
+    history = [value]
+    weight = normalised(problem.sample_weight)
+    quiet = torch.zeros(size, dtype=torch.int64, device=beta.device)
+    for _ in range(max_iter):
+        residual = problem.residual(beta)
+        before = state
+        state = newton_step(residual, weight, before)
+        kappa, d = state.kappa, torch.exp(state.log_d)
+        for _ in range(2):
+            beta = fixed_point_step(problem, residual, kappa, d)
+            residual = problem.residual(beta)
+        now = state.value.sum(-1)
+        rounding = 8 * torch.finfo(beta.dtype).eps * now.abs()
+        improved = history[-1][index] - now > tol + rounding
+        quiet = torch.where(improved, 0, quiet + conclusive(before, state).all(-1).to(quiet.dtype))
+        current = history[-1].clone()
+        current[index] = now
+        history.append(current)
+        done = quiet >= patience
+        if bool(done.any()) or len(history) > max_iter:
+            out_beta[index] = beta
+            out_state = written(out_state, index, state)
+            converged[index] = done & torch.isfinite(now)
+            keep = (~done).nonzero().squeeze(-1)
+            if keep.numel() == 0:
+                break
+            index, beta, quiet = index[keep], beta[keep], quiet[keep]
+            state, problem = state.select(keep), problem.select(keep)
+            weight = None if weight is None else weight[keep]
+    return Maximum(out_beta, out_state, history[-1], converged, history)
+
+
+def _gaussian_candidate(problem: LinearProblem, maximum: Maximum, *, max_iter: int, tol: float) -> Maximum:
+    """Where a Gaussian density at weighted least squares is likelier than what was found, go on from there instead."""
+    state = maximum.state
+    beta = problem.weighted_fit(torch.ones_like(problem.Y))
+    weight = normalised(problem.sample_weight)
+    for _ in range(2 if problem.num_channels > 1 else 0):
+        d = spread(problem.residual(beta), weight, torch.exp(state.log_d_min))
+        beta = fixed_point_step(problem, problem.Y, torch.zeros_like(d), d)
+    gaussian = gaussian_state(problem.residual(beta), weight, state)
+    better = (gaussian.value.sum(-1) < maximum.value).nonzero().squeeze(-1)
+    if better.numel() == 0:
+        return maximum
+    begun = replace(gaussian.select(better), free_kappa=True)
+    again = _alternate(problem.select(better), beta[better], begun, max_iter=max_iter, tol=tol)
+    steps = max(len(maximum.history), len(again.history))
+    history = []
+    for i in range(steps):
+        now = maximum.history[min(i, len(maximum.history) - 1)].clone()
+        now[better] = again.history[min(i, len(again.history) - 1)]
+        history.append(now)
+    return Maximum(
+        beta=maximum.beta.index_copy(0, better, again.beta),
+        state=written(state, better, again.state),
+        value=maximum.value.index_copy(0, better, again.value),
+        converged=maximum.converged.index_copy(0, better, again.converged),
+        history=history,
+    )
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a fit is given beside the data, as it was given."""
+
+    sigma: float | Tensor | None
+    d: float | Tensor | None
+    bound: float | Tensor | None
+    start: Start | Tensor
+
+    def in_basis_of(self, problem: LinearProblem) -> Known:
+        """The same for a problem whose X is the basis of this one."""
+        if not isinstance(self.start, Tensor):
+            return self
+        return replace(self, start=problem.restore(problem.in_basis(self.start.to(problem.Y))))
+
+    def initial_state(
+        self,
+        problem: LinearProblem,
+        beta: Tensor,
+        scale: Tensor,
+        bound: Tensor,
+        d_min: Tensor,
+        tails: Sequence[float | Tensor] = TAILS,
+    ) -> DensityState:
+        """The likeliest of a few densities to start from at coefficients ``beta``."""
+        d = None if self.d is None else channel_parameter("d", self.d, problem)
+        sigma = None if self.sigma is None else channel_parameter("sigma", self.sigma, problem, infinite=True)
+        if d is not None:
+            d_min = torch.minimum(d, d_min)
+        return initial_state(
+            problem.residual(beta),
+            normalised(problem.sample_weight),
+            scale,
+            bound,
+            d_min,
+            kappa=None if sigma is None else sigma.pow(-2),
+            d=d,
+            tails=tails,
+        )
+
+
+def maximise(
+    problem: LinearProblem, known: Known, *, max_iter: int, tol: float, seed: int
+) -> tuple[RobustStart, Maximum]:
+    """The robust start of a fit and where it ends.
+
+    Args:
+        problem: what is fitted.
+        known: parameters that are given.
+        max_iter, tol: of the alternation.
+        seed: of the start.
+    """
+    begin = robust_start(problem, known.start, seed=seed)
+    d_min = least_d(begin)
+    if known.bound is None:
+        rough = rough_fit(problem, known, begin, max_iter=max_iter)
+        beta, kappa, d = rough.beta, rough.state.kappa, torch.exp(rough.state.log_d)
+        bound = domain_rule(problem.residual(beta), d, _used(problem))
+        state = known.initial_state(problem, beta, d, bound, d_min, tails=(kappa,))
+    else:
+        beta, bound = begin.beta, given_bound(problem, known, begin)
+        state = known.initial_state(problem, beta, begin.scale, bound, d_min)
+    maximum = _alternate(problem, beta, state, max_iter=max_iter, tol=tol)
+    if state.free_kappa and state.free_d:
+        maximum = _gaussian_candidate(problem, maximum, max_iter=max_iter, tol=tol)
+    return begin, maximum
+
+
+def least_d(begin: RobustStart) -> Tensor:
+    """The floor under d."""
+    return _FLOOR * begin.scale
+
+
+def given_bound(problem: LinearProblem, known: Known, begin: RobustStart) -> Tensor:
+    """The domain that is given, of every channel; a clear error where the head does not fit in."""
+    assert known.bound is not None
+    bound = channel_parameter("bound", known.bound, problem)
+    refuse_narrow_bound(bound, begin.scale)
+    return bound
+
+
+def rough_fit(
+    problem: LinearProblem,
+    known: Known,
+    begin: RobustStart,
+    *,
+    max_iter: int,
+    tails: Sequence[float] = TAILS,
+) -> Maximum:
+    """A fit that says which domain the rule gives, and is near to the one there.
+
+    A robust start's scale is up to twice that of the head when outliers are many and on one side, so the rough fit
+    is made on a tight domain, where it finds the head, or on the one that is given.
+
+    Args:
+        problem: what is fitted.
+        known: parameters that are given.
+        begin: the robust start.
+        max_iter: alternations at most.
+        tails: κ to begin with.
+    """
+    if known.bound is None:
+        bound = domain_rule(problem.residual(begin.beta), begin.scale, _used(problem), scales=TIGHT)
+    else:
+        bound = given_bound(problem, known, begin)
+    state = known.initial_state(problem, begin.beta, begin.scale, bound, least_d(begin), tails=tails)
+    return _alternate(problem, begin.beta, state, max_iter=max_iter, tol=1e-4, patience=1)
+
+
+def _used(problem: LinearProblem) -> Tensor | None:
+    return None if problem.sample_weight is None else problem.sample_weight > 0

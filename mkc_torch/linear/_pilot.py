@@ -1,0 +1,105 @@
+"""Rows that stand for all of a large fit, drawn by chance, and whether they do."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.linear._blocks import blocks, triangle
+from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, RankDeficientError, linear_problem
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Int
+
+_ROWS, _ROWS_A_COLUMN = 2000, 200
+"""Rows of a pilot, and no fewer for each column: coefficients within a twentieth of the noise."""
+
+_LEVERAGE = 0.05
+"""A row of more pins a direction that fewer than twenty others share; a pilot has to do without such rows."""
+
+_LEAST = 1e-6
+"""Of what the other rows may leave of a direction, in shares of what all have."""
+
+
+def drawn_rows(values: CanonicalShapes, count: int, seed: int) -> Int[Tensor, " k"]:
+    """About ``count`` of the rows in use, each at most once and in their order."""
+    used = _used(values)
+    generator = torch.Generator().manual_seed(seed)
+    among = None if used is None else used.nonzero().squeeze(-1)
+    total = values.Y.shape[-2] if among is None else among.shape[0]
+    drawn = torch.randint(total, (count,), generator=generator).unique()
+    return drawn if among is None else among[drawn]
+
+
+def rows_at(values: CanonicalShapes, index: Int[Tensor, " k"]) -> CanonicalShapes:
+    """Those rows in float64, as a problem of their own."""
+    weight = values.sample_weight
+    return CanonicalShapes(
+        values.X.index_select(-3, index).double(),
+        values.Y.index_select(-2, index).double(),
+        None if weight is None else weight.index_select(-2, index).double(),
+        values.batch,
+        values.single_channel,
+    )
+
+
+def pilot_problem(values: CanonicalShapes, seed: int) -> tuple[LinearProblem, bool] | None:
+    """A problem of few rows, and whether every row had the same chance to be in it; None where no rows will do.
+
+    Where rows drawn alike leave a direction to a few of them, as a column that is seldom other than 0, rows are added
+    by their leverage among all.
+    """
+    count = max(_ROWS, _ROWS_A_COLUMN * values.X.shape[-1])
+    index = drawn_rows(values, count, seed)
+    problem = _problem(values, index)
+    if problem is not None:
+        return problem, True
+    more = _rows_of_leverage(values, count, seed)
+    problem = None if more is None else _problem(values, torch.cat([index, more]).unique())
+    return None if problem is None else (problem, False)
+
+
+def _problem(values: CanonicalShapes, index: Int[Tensor, " k"]) -> LinearProblem | None:
+    some = rows_at(values, index)
+    try:
+        problem = linear_problem(some.X, some.Y, some.sample_weight)
+    except (RankDeficientError, ValueError):
+        return None
+    return problem if _spans(problem) else None
+
+
+def _used(values: CanonicalShapes) -> Bool[Tensor, " N"] | None:
+    return None if values.sample_weight is None else (values.sample_weight > 0).any(-1).flatten()
+
+
+def _spans(problem: LinearProblem) -> bool:
+    """Whether the rows determine every coefficient without the few of most leverage."""
+    basis = problem.basis[0]
+    if problem.sample_weight is not None:
+        basis = basis * (problem.sample_weight[0] > 0).unsqueeze(-1)
+    kept = basis.flatten(0, 1)
+    kept = kept * (kept.square().sum(-1, keepdim=True) <= _LEVERAGE)
+    return bool(torch.linalg.eigvalsh(torch.matmul(kept.mT, kept))[0] > _LEAST)
+
+
+def _rows_of_leverage(values: CanonicalShapes, count: int, seed: int) -> Int[Tensor, " k"] | None:
+    """Rows drawn with a chance in proportion to their leverage; None where columns depend on one another."""
+    X, Y, weight = values.X, values.Y, values.sample_weight
+    X, Y = X.reshape(X.shape[-3:]), Y.reshape(Y.shape[-2:])
+    weight = None if weight is None else weight.reshape(weight.shape[-2:])
+    upper: Tensor | None = None
+    for block in blocks(X, Y, weight):
+        upper = triangle(block, upper)
+    assert upper is not None
+    inverse, info = torch.linalg.inv_ex(upper)
+    if int(info) or not bool(torch.isfinite(inverse).all()):
+        return None
+    found = []
+    for block in blocks(X, Y, weight):
+        of_values = torch.matmul(block.rows, inverse).square().sum(-1)
+        found.append((of_values if block.weight is None else of_values * (block.weight > 0)).sum(-1))
+    cumulated = torch.cat(found).cumsum(0)
+    drawn = torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=cumulated.dtype)
+    return torch.searchsorted(cumulated, drawn * cumulated[-1]).clamp(max=Y.shape[0] - 1)

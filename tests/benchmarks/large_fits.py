@@ -1,0 +1,154 @@
+"""CPU time and memory of one large robust fit beside least squares, scikit-learn and statsmodels, in one run:
+
+    python -m tests.benchmarks.large_fits
+
+Data of 9 columns with 10 % outliers, in one thread; times are CPU milliseconds, the least of several. It prints how
+many times the data are read, how long that takes at the rate at which the machine reads and sums memory, and the peak
+of memory of a process that holds the data and fits them. What is not installed is left out.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mkc_torch.linear import MKCRegression, _passes
+from tests.benchmarks.small_fits import milliseconds
+
+COLUMNS = 9
+
+REPEATS = 7
+"""Timings of which the least is told."""
+
+
+def sample(N: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """X (N, 9) with an intercept, and y whose first tenth lies 20 higher."""
+    generator = torch.Generator().manual_seed(seed)
+    X = torch.randn(N, COLUMNS, generator=generator, dtype=torch.float64)
+    X[:, 0] = 1.0
+    y = X.sum(-1) + torch.randn(N, generator=generator, dtype=torch.float64)
+    y[: N // 10] += 20.0
+    return X, y
+
+
+def least(works: dict[str, Callable[[], object]]) -> dict[str, float]:
+    """The least CPU time of each, taken in turn so that what else the machine does meets them alike."""
+    times = {name: milliseconds(work, 1) for name, work in works.items()}
+    for _ in range(REPEATS):
+        for name, work in works.items():
+            times[name] = min(times[name], milliseconds(work, 1))
+    return times
+
+
+def peers(X: np.ndarray, y: np.ndarray) -> dict[str, Callable[[], object]]:
+    """What others fit, where it is installed; X holds its intercept."""
+    found: dict[str, Callable[[], object]] = {}
+    try:
+        from sklearn.linear_model import HuberRegressor
+
+        found["scikit-learn HuberRegressor"] = lambda: HuberRegressor(fit_intercept=False).fit(X, y)
+    except ImportError:
+        pass
+    try:
+        import statsmodels.api as sm
+
+        found["statsmodels RLM, Tukey"] = lambda: sm.RLM(y, X, M=sm.robust.norms.TukeyBiweight()).fit()
+    except ImportError:
+        pass
+    return found
+
+
+def bytes_read(X: Tensor, y: Tensor) -> int:
+    """Bytes of X and y that a fit takes up in blocks."""
+    read = 0
+    blocks = _passes.blocks
+
+    def counted(*given: Tensor | None) -> Iterator[object]:
+        nonlocal read
+        for block in blocks(*given):
+            read += block.y.numel() * (COLUMNS + 1) * y.element_size()
+            yield block
+
+    _passes.blocks = counted
+    try:
+        MKCRegression().fit(X, y)
+    finally:
+        _passes.blocks = blocks
+    # the look at every value beside
+    return read + X.nbytes + y.nbytes
+
+
+def apart(fit: MKCRegression, X: Tensor, y: Tensor) -> float:
+    """How far the coefficients are from fully converged ones at the same domain, in standard errors."""
+    rest = MKCRegression(bound=fit.bound_, start=fit.coef_).fit(X.clone().requires_grad_(), y)
+    return float(((fit.coef_ - rest.coef_.detach()) / fit.standard_error_).abs().max())
+
+
+def peak(N: int) -> float:
+    """Peak of memory of a process that fits data of N rows, its code not counted, over the data."""
+    with tempfile.TemporaryDirectory() as folder:
+        X, y = sample(N)
+        np.save(Path(folder) / "X.npy", X.numpy())
+        np.save(Path(folder) / "y.npy", y.numpy())
+        del X, y
+        done = subprocess.run(
+            [sys.executable, "-m", "tests.benchmarks.large_fits", folder], capture_output=True, text=True, check=True
+        )
+        return float(done.stdout)
+
+
+def print_own_peak(folder: str) -> None:
+    """Of this process, once it has loaded and fitted the data in ``folder``."""
+    MKCRegression().fit(*sample(25_000))
+    before = memory("VmRSS")
+    X, y = (torch.from_numpy(np.load(Path(folder) / f"{name}.npy")) for name in "Xy")
+    MKCRegression().fit(X, y)
+    print((memory("VmHWM") - before) / (X.nbytes + y.nbytes))
+
+
+def memory(name: str) -> int:
+    """Bytes of this process that Linux tells by this name; its own highest, as rusage's may be that of its parent."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:"))
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    if len(sys.argv) > 1:
+        print_own_peak(sys.argv[1])
+        return
+    X, y = sample(1_000_000)
+    print(f"one fit of {X.shape[0]} × {COLUMNS}, 10 % outliers{'ms':>12}{'ratio':>8}")
+    works = {
+        "torch.linalg.lstsq": lambda: torch.linalg.lstsq(X, y[:, None]),
+        "MKCRegression": lambda: MKCRegression().fit(X, y),
+        "read and sum X, y": lambda: X.sum() + y.sum(),
+    }
+    times = least(works)
+    for name, taken in times.items():
+        print(f"  {name:<36}{taken:>9.1f}{taken / times['torch.linalg.lstsq']:>8.2f}", flush=True)
+    passes = bytes_read(X, y) / (X.nbytes + y.nbytes)
+    limit = passes * times["read and sum X, y"]
+    rate = (X.nbytes + y.nbytes) / times["read and sum X, y"] / 1e6
+    print(f"  data read {passes:.1f} times; at {rate:.1f} GB/s that is {limit:.0f} ms", flush=True)
+    print(f"  peak of memory {peak(X.shape[0]):.2f} × the data", flush=True)
+    X, y = sample(200_000)
+    print(f"one fit of {X.shape[0]} × {COLUMNS}, 10 % outliers{'ms':>13}{'ratio':>8}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        times = least({"MKCRegression": lambda: MKCRegression().fit(X, y), **peers(X.numpy(), y.numpy())})
+    for name, taken in times.items():
+        print(f"  {name:<36}{taken:>9.1f}{taken / times['MKCRegression']:>8.2f}", flush=True)
+    print(f"  from fully converged: {apart(MKCRegression().fit(X, y), X, y):.0e} standard errors")
+
+
+if __name__ == "__main__":
+    main()

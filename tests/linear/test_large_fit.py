@@ -1,0 +1,461 @@
+"""MKC-EM on many rows: fully converged, the same function as on few, in few passes and without copies of the data."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from mkc_torch.density.fit import energy_derivatives
+from mkc_torch.linear import MKCRegression, RankDeficientError, _blocks, _large, _passes, em
+from mkc_torch.linear._blocks import Density, blocks, energy_of, kernel, residual, sums
+from mkc_torch.linear._mkc import coefficient_covariance
+from mkc_torch.linear._passes import Rows
+from mkc_torch.linear._pilot import drawn_rows, pilot_problem
+from mkc_torch.linear._problem import laid_out, linear_problem
+
+N = 24_000
+"""Rows of a fit that begins with a pilot."""
+
+
+def normal(seed: int, *shape: int) -> Tensor:
+    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def sample(seed: int = 0, rows: int = N, n: int = 5, share: float = 0.1) -> tuple[Tensor, Tensor]:
+    """y = X 1 + noise, the first rows with an outlier of 15: sorted, so that no part of the rows is like all."""
+    X = normal(seed, rows, n)
+    X[:, 0] = 1.0
+    y = X.sum(-1) + normal(seed + 1, rows)
+    y[: int(share * rows)] += 15.0
+    return X, y
+
+
+def clustered() -> tuple[Tensor, Tensor]:
+    """Two fifths of the rows in a far cluster of X, where y is wrong."""
+    X, y = sample(share=0.0)
+    bad = 2 * N // 5
+    X[:bad, 1:] = 8.0 + 0.1 * normal(4, bad, 4)
+    y[:bad] = X[:bad].sum(-1) - 40.0 + normal(5, bad)
+    return X, y
+
+
+def heavy_tailed() -> tuple[Tensor, Tensor]:
+    X, y = sample(share=0.0)
+    return X, y + 0.3 * normal(6, N) / normal(7, N).abs()
+
+
+def channels() -> tuple[Tensor, Tensor]:
+    """Two channels with columns of their own beside a common one, the first with outliers."""
+    X = torch.zeros(N, 2, 3, dtype=torch.float64)
+    X[..., 0] = 1.0
+    X[:, 0, 1], X[:, 1, 2] = normal(2, N), normal(3, N)
+    Y = X.sum(-1) + torch.tensor([0.5, 2.0]).double() * normal(4, N, 2)
+    Y[: N // 5, 0] += 10.0
+    return X, Y
+
+
+def seldom() -> tuple[Tensor, Tensor]:
+    """A column that is 1 in 30 rows and else 0."""
+    X, y = sample()
+    X = torch.cat([X, torch.zeros(N, 1).double()], 1)
+    X[:: N // 30, -1] = 1.0
+    return X, y + 1.5 * X[:, -1]
+
+
+def changed(
+    move_x: float = 0.0, move_y: float = 0.0, unit_x: float = 1.0, unit_y: float = 1.0
+) -> tuple[Tensor, Tensor]:
+    X, y = sample()
+    X[:, 1] = unit_x * X[:, 1] + move_x
+    return X, unit_y * y + move_y
+
+
+def rounded() -> tuple[Tensor, Tensor]:
+    X, y = sample()
+    return X, y.round()
+
+
+HARD = {
+    "sorted": sample,
+    "forty per cent on one side": lambda: sample(share=0.4),
+    "near outliers": lambda: (sample(share=0.0)[0], sample(share=0.0)[1] + 3.5 * (torch.arange(N) < N // 20)),
+    "Gaussian": lambda: sample(share=0.0),
+    "clustered at a leverage point": clustered,
+    "heavy tails": heavy_tailed,
+    "ties": rounded,
+    "two channels": channels,
+    "a column that is seldom other than 0": seldom,
+    "a column far from 0": lambda: changed(move_x=1e8),
+    "targets far from 0": lambda: changed(move_y=1e8),
+    "columns of different size": lambda: changed(unit_x=1e-8),
+    "targets of another unit": lambda: changed(unit_y=1e-6),
+}
+
+
+@pytest.fixture
+def piloted(monkeypatch) -> list[bool]:
+    """Of each fit that is large, whether it ended as one, and was not left to the alternation over all rows."""
+    ends: list[bool] = []
+    whole = _large.large_maximum
+
+    def told(*args, **kwargs):
+        found = whole(*args, **kwargs)
+        ends.append(found is not None)
+        return found
+
+    monkeypatch.setattr(em, "large_maximum", told)
+    return ends
+
+
+def directly(monkeypatch) -> None:
+    """No fit is large from here on."""
+    monkeypatch.setattr(_large, "LARGE", 1 << 60)
+
+
+def converged(fit: MKCRegression, X: Tensor, Y: Tensor, weight: Tensor | None = None, **given: float) -> MKCRegression:
+    """Fully converged on the same domain, by the Newton steps of a fit as a layer."""
+    rest = MKCRegression(bound=fit.bound_, start=fit.coef_, **given).fit(X.clone().requires_grad_(), Y, weight)
+    rest.coef_, rest.sigma_, rest.d_ = rest.coef_.detach(), rest.sigma_.detach(), rest.d_.detach()
+    rest.weights_, rest.log_likelihood_ = rest.weights_.detach(), rest.log_likelihood_.detach()
+    return rest
+
+
+def apart(fit: MKCRegression, other: MKCRegression) -> float:
+    """Between coefficients, in standard errors."""
+    return float(((fit.coef_ - other.coef_).abs() / other.standard_error_).detach().max())
+
+
+@pytest.mark.parametrize("case", HARD)
+def test_a_large_fit_is_fully_converged(case, piloted):
+    X, Y = HARD[case]()
+    fit = MKCRegression().fit(X, Y)
+    assert piloted == [True]
+    rest = converged(fit, X, Y)
+    # coefficients of 1e8 have a last place of their own
+    assert apart(fit, rest) < (1e-4 if "far" in case else 1e-6)
+    gaussian = torch.isinf(rest.sigma_)
+    assert torch.equal(torch.isinf(fit.sigma_), gaussian)
+    torch.testing.assert_close(fit.sigma_[~gaussian], rest.sigma_[~gaussian], rtol=1e-6, atol=0.0)
+    torch.testing.assert_close(fit.d_, rest.d_, rtol=1e-7, atol=0.0)
+    torch.testing.assert_close(fit.log_likelihood_, rest.log_likelihood_, rtol=1e-9, atol=1e-6)
+    torch.testing.assert_close(fit.weights_, rest.weights_, rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(fit.standard_error_, rest.standard_error_, rtol=1e-4, atol=0.0)
+    assert bool(fit.converged_)
+    assert not bool(fit.exact_fit_)
+
+
+@pytest.mark.parametrize("case", HARD)
+def test_a_large_fit_is_the_fit_of_all_rows_from_the_start(case, monkeypatch):
+    X, Y = HARD[case]()
+    fit = MKCRegression().fit(X, Y)
+    directly(monkeypatch)
+    direct = MKCRegression().fit(X, Y)
+    torch.testing.assert_close(fit.bound_, direct.bound_, rtol=0.02, atol=0.0)
+    assert apart(fit, direct) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nearly_half_the_rows_are_outliers(seed, piloted):
+    X, y = sample(seed, n=15, share=0.45)
+    fit = MKCRegression(seed=seed).fit(X, y)
+    assert len(piloted) == 1
+    assert float((fit.coef_ - 1.0).abs().max()) < 0.1
+
+
+@pytest.mark.parametrize(
+    "given", [{"sigma": 2.0}, {"d": 1.1}, {"sigma": math.inf}, {"bound": 40.0}, {"sigma": 2.0, "d": 1.0}]
+)
+def test_given_parameters_are_kept(given, piloted):
+    X, y = sample()
+    fit = MKCRegression(**given).fit(X, y)
+    assert piloted == [True]
+    for name, value in given.items():
+        assert float(getattr(fit, f"{name}_")) == pytest.approx(value)
+    given.pop("bound", None)
+    assert apart(fit, converged(fit, X, y, **given)) < 1e-6
+
+
+@pytest.mark.parametrize("start", ["s", "least_squares"])
+def test_any_start_ends_at_the_same_maximum(start, piloted):
+    X, y = sample(share=0.02)
+    fit = MKCRegression(start=start, bound=20.0).fit(X, y)
+    given = MKCRegression(start=torch.zeros(5).double(), bound=20.0).fit(X, y)
+    lts = MKCRegression(bound=20.0).fit(X, y)
+    assert apart(fit, lts) < 1e-6
+    assert apart(given, lts) < 1e-6
+    assert piloted[-1]
+
+
+def test_a_weight_of_0_is_removal_and_one_of_2_repetition(piloted):
+    X, y = sample()
+    weight = torch.arange(N).double() % 3
+    y[::3] = 1e6  # of no weight
+    fit = MKCRegression().fit(X, y, weight)
+    rows = torch.cat([torch.arange(N)[weight >= k] for k in (1, 2)])
+    repeated = converged(fit, X[rows], y[rows])
+    assert piloted[0]
+    assert apart(fit, repeated) < 1e-6
+    torch.testing.assert_close(fit.log_likelihood_, repeated.log_likelihood_, rtol=1e-9, atol=0.0)
+    assert float(fit.bound_) < 100.0
+    assert apart(fit, converged(fit, X, y, weight)) < 1e-6
+
+
+def test_the_seed_hardly_matters_and_not_at_all_on_a_given_domain():
+    X, y = sample()
+    fits = [MKCRegression(seed=seed).fit(X, y) for seed in range(4)]
+    assert max(apart(fit, fits[0]) for fit in fits) < 1e-3
+    fits = [MKCRegression(seed=seed, bound=20.0).fit(X, y) for seed in range(4)]
+    assert max(apart(fit, fits[0]) for fit in fits) < 1e-6
+
+
+def test_nothing_jumps_where_fits_become_large(monkeypatch, piloted):
+    X, y = sample(rows=6000)
+    monkeypatch.setattr(_large, "LARGE", 6000)
+    large = MKCRegression(bound=20.0).fit(X, y)
+    monkeypatch.setattr(_large, "LARGE", 6001)
+    small = MKCRegression(bound=20.0, tol=0.0).fit(X, y)
+    assert piloted == [True]
+    assert apart(large, small) < 1e-4
+    assert large.n_iter_ < small.n_iter_
+
+
+def test_more_levels_end_at_the_same_maximum(monkeypatch, piloted):
+    X, y = sample()
+    fit = MKCRegression().fit(X, y)
+    monkeypatch.setattr(_large, "_GROWTH", 2)
+    monkeypatch.setattr(_large, "_AHEAD", 2)
+    again = MKCRegression(bound=fit.bound_).fit(X, y)
+    assert piloted == [True, True]
+    assert apart(fit, again) < 1e-6
+
+
+def test_float32_data_have_float64_sums(monkeypatch):
+    X, y = (v.float() for v in changed(move_x=100.0))
+    fit = MKCRegression(bound=20.0).fit(X, y)
+    assert {fit.coef_.dtype, fit.weights_.dtype, fit.covariance_.dtype} == {torch.float32}
+    exact = MKCRegression(bound=20.0).fit(X.double(), y.double())
+    directly(monkeypatch)
+    direct = MKCRegression(bound=20.0).fit(X, y)
+    off, direct_off = (((f.coef_ - exact.coef_) / exact.standard_error_).abs().max() for f in (fit, direct))
+    assert off < 1e-4
+    assert off < 0.1 * direct_off
+    assert (fit.d_ - exact.d_).abs().max() < 1e-6
+
+
+def test_results_have_the_shapes_of_a_direct_fit(monkeypatch):
+    X, y = sample()
+    Xc, Yc = channels()
+    for x, t in ((X, y), (X[None], y[None]), (Xc, Yc), (Xc[None], Yc[None])):
+        fit = MKCRegression().fit(x, t)
+        with monkeypatch.context() as patch:
+            directly(patch)
+            direct = MKCRegression().fit(x, t)
+        assert set(vars(fit)) == set(vars(direct))
+        for name, value in vars(direct).items():
+            if isinstance(value, Tensor) and name != "history_":
+                mine = getattr(fit, name)
+                assert (mine.shape, mine.dtype) == (value.shape, value.dtype), name
+        assert fit.history_.shape == (fit.n_iter_ + 1, *direct.history_.shape[1:])
+        assert fit.predict(x).shape == t.shape
+        torch.testing.assert_close(fit.dof_, direct.dof_)
+
+
+def test_history_never_rises_and_ends_at_the_likelihood():
+    X, y = sample()
+    fit = MKCRegression().fit(X, y)
+    assert (fit.history_.diff() <= 1e-13).all()
+    torch.testing.assert_close(-N * fit.history_[-1], fit.log_likelihood_)
+
+
+def test_gradients_through_a_large_fit(piloted):
+    X, y = sample()
+    free = MKCRegression().fit(X, y)
+    target = y.clone().requires_grad_()
+    fit = MKCRegression(start="lts").fit(X, target)
+    assert piloted == [True, True]
+    assert bool(fit.differentiable_)
+    assert apart(free, fit) < 1e-6
+    torch.testing.assert_close(fit.bound_.detach(), free.bound_)
+    plain = MKCRegression(bound=20.0).fit(X, y)
+    fit = MKCRegression(bound=20.0, start=plain.coef_).fit(X, target)
+    assert apart(plain, fit) < 1e-6
+    fit.coef_.sum().backward()
+    change = torch.zeros(N).double()
+    change[N // 2 :: 7] = 1e-3
+    moved = MKCRegression(bound=20.0).fit(X, y + change).coef_.sum() - plain.coef_.sum()
+    assert target.grad is not None
+    assert float(moved) == pytest.approx(float((target.grad * change).sum()), rel=1e-3)
+
+
+class Largest(TorchDispatchMode):
+    """The most elements of a tensor that an operation makes, those that share the memory of ``given`` not counted."""
+
+    def __init__(self, *given: Tensor) -> None:
+        super().__init__()
+        self.known = {t.untyped_storage().data_ptr() for t in given}
+        self.most = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        result = func(*args, **(kwargs or {}))
+        for t in result if isinstance(result, (tuple, list)) else (result,):
+            if isinstance(t, Tensor) and t.untyped_storage().data_ptr() not in self.known:
+                self.most = max(self.most, t.untyped_storage().nbytes() // max(1, t.element_size()))
+        return result
+
+
+def test_the_data_are_read_a_few_times_and_never_copied(monkeypatch):
+    rows = 400_000
+    X, y = sample(rows=rows)
+    read = 0
+
+    def counted(*args):
+        nonlocal read
+        for block in blocks(*args):
+            read += block.y.shape[0]
+            yield block
+
+    monkeypatch.setattr(_passes, "blocks", counted)
+    with Largest(X, y) as largest:
+        MKCRegression().fit(X, y)
+    assert read < 12 * rows
+    # weights, and no more than that at once
+    assert largest.most == rows
+
+
+@pytest.mark.parametrize("kappa", [0.0, 1e-4, 9.9e-3, 1.01e-2, 0.5])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_sums_of_blocks_are_those_of_all_rows(kappa, weighted, monkeypatch):
+    X, Y = channels()
+    weight = torch.arange(2 * N).double().reshape(N, 2) % 3 if weighted else None
+    beta = torch.tensor([1.1, 0.9, 1.2]).double()
+    density = Density(torch.tensor([kappa, 0.3]).double(), torch.tensor([0.5, 2.0]).double())
+    total, bends = Rows(X, Y, weight).look(beta, density, bend=True)
+    assert bends is not None
+    problem = linear_problem(X, Y, weight)
+    in_basis = problem.in_basis(beta)
+    normalised = None if weight is None else weight / weight.sum(0)
+    log_d = torch.log(density.d)
+    wanted = energy_derivatives(problem.residual(in_basis)[0], normalised, density.kappa, log_d)
+    for mine, value in zip(energy_of(total, density.kappa), wanted, strict=True):
+        torch.testing.assert_close(mine / total.weight, value, rtol=1e-7, atol=1e-9)
+    covariance = coefficient_covariance(problem, in_basis, density.kappa[None], density.d[None], "sandwich", None)
+    used = 2 * N if weight is None else int((weight > 0).sum())
+    torch.testing.assert_close(_large._sandwich(bends, used, used - 3), covariance, rtol=1e-7, atol=0.0)
+    monkeypatch.setattr(_blocks, "_STRIP", 100)
+    monkeypatch.setattr(_passes, "blocks", lambda *args: blocks(*args, 1234))
+    again, bent = Rows(X, Y, weight).look(beta, density, bend=True)
+    for one, other in zip((*total, *bends), (*again, *(bent or ())), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-6)
+
+
+def test_a_frame_is_a_change_of_columns():
+    X, y = sample()
+    frame = torch.linalg.inv(normal(9, 5, 5))
+    density = Density(torch.tensor([0.2]).double(), torch.tensor([1.0]).double())
+    beta = torch.ones(5).double()
+    plain, bends = Rows(X[:, None], y[:, None], None).look(beta, density, bend=True)
+    framed, bent = Rows(X[:, None], y[:, None], None, frame).look(torch.linalg.solve(frame, beta), density, bend=True)
+    assert bends is not None
+    assert bent is not None
+    torch.testing.assert_close(framed.score, plain.score @ frame)
+    torch.testing.assert_close(bent.curvature, frame.mT @ bends.curvature @ frame)
+
+
+def test_score_is_the_slope_of_the_energy():
+    X, y = sample(rows=1000)
+    density = Density(torch.tensor([0.3]).double(), torch.tensor([1.2]).double())
+
+    def energy_at(beta: Tensor) -> Tensor:
+        block = next(iter(blocks(X[:, None], y[:, None], None)))
+        error = residual(block, beta)
+        found = sums(block, error, *kernel(error, density), density)
+        return torch.cat([energy_of(found, density.kappa).value, found.score.flatten()])
+
+    beta, step = torch.full((5,), 0.9).double(), 1e-5
+    for k in range(5):
+        move = step * torch.eye(5).double()[k]
+        slope = (energy_at(beta + move)[0] - energy_at(beta - move)[0]) / (2 * step)
+        assert float(slope) == pytest.approx(-float(energy_at(beta)[1 + k] / density.d.square()), rel=1e-6)
+
+
+def test_rows_are_drawn_of_those_in_use_and_seldom_ones_by_leverage():
+    X, y = seldom()
+    weight = (torch.arange(N) % 2).double()
+    index = drawn_rows(laid_out(X, y, weight), 2000, 0)
+    assert (weight[index] == 1).all()
+    assert (index.diff() > 0).all()
+    found = pilot_problem(laid_out(X, y), 0)
+    assert found is not None
+    problem, alike = found
+    assert not alike
+    assert int((problem.basis[0, :, 0] @ torch.linalg.inv(problem.to_coef[0]))[:, -1].round().sum()) >= 25
+    X, y = sample()
+    found = pilot_problem(laid_out(X, y), 0)
+    assert found is not None
+    assert found[1]
+
+
+def test_an_exact_fit_is_left_to_the_alternation(piloted):
+    X, y = sample()
+    y[N // 10 :] = X[N // 10 :].sum(-1)
+    fit = MKCRegression().fit(X, y)
+    assert piloted == [False]
+    assert bool(fit.exact_fit_)
+
+
+def test_a_likelier_gaussian_is_left_to_the_alternation(piloted, monkeypatch):
+    X, y = sample(share=0.0)
+    X[: N // 5, 1:] = 8.0 + 0.1 * normal(4, N // 5, 4)
+    y[: N // 5] = X[: N // 5].sum(-1) - 40.0
+    fit = MKCRegression().fit(X, y)
+    assert piloted == [False]
+    directly(monkeypatch)
+    assert torch.equal(MKCRegression().fit(X, y).coef_, fit.coef_)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_values_that_are_not_finite_are_refused_with_their_place(value):
+    X, y = sample()
+    X[20_001, 2] = value
+    with pytest.raises(ValueError, match=r"`X` to be finite but got .* at index \(20001, 2\)"):
+        MKCRegression().fit(X, y)
+
+
+def test_dependent_columns_are_refused():
+    X, y = sample()
+    with pytest.raises(RankDeficientError, match="linearly dependent"):
+        MKCRegression().fit(torch.cat([X, X[:, :1]], 1), y)
+    with pytest.raises(RankDeficientError, match="zero on every sample"):
+        MKCRegression().fit(torch.cat([X, 0 * X[:, :1]], 1), y)
+
+
+def test_negative_weights_and_a_narrow_bound_are_refused():
+    X, y = sample()
+    weight = torch.ones(N).double()
+    weight[5] = -1.0
+    with pytest.raises(ValueError, match="`sample_weight` to be >= 0"):
+        MKCRegression().fit(X, y, weight)
+    with pytest.raises(ValueError, match="`bound` to be at least two robust scales"):
+        MKCRegression(bound=0.1).fit(X, y)
+
+
+def test_a_time_series_is_fitted_directly(piloted):
+    X, y = sample()
+    fit = MKCRegression(covariance="hac", bandwidth=3.0).fit(X, y)
+    assert piloted == []
+    assert apart(fit, converged(fit, X, y)) < 0.05
+
+
+def test_how_the_data_lie_in_memory_does_not_matter(piloted):
+    X, y = sample()
+    fit = MKCRegression().fit(X, y)
+    apart_in_memory = torch.stack([y, y], -1)[:, 0]
+    assert not apart_in_memory.is_contiguous()
+    for x in (X.mT.contiguous().mT, torch.cat([X, X], 1)[:, :5], X.flip(0).flip(0)):
+        assert apart(MKCRegression().fit(x, apart_in_memory), fit) < 1e-6
+    assert apart(MKCRegression().fit(X.numpy(), y.numpy()), fit) < 1e-6
+    with torch.inference_mode():
+        assert apart(MKCRegression().fit(X, y), fit) < 1e-6
+    assert piloted == [True] * 6
