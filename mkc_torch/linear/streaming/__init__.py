@@ -1,6 +1,13 @@
 """Regression on more rows than memory holds, over blocks that come again in every pass, on one machine or many."""
 
-from mkc_torch.linear.streaming.regression import StreamedMKCRegression
+from mkc_torch.linear.streaming.regression import StreamChangedError, StreamedMKCRegression
 from mkc_torch.linear.streaming.sources import MemmapBatches, ParquetBatches, from_memmap, from_parquet
 
-__all__ = ["MemmapBatches", "ParquetBatches", "StreamedMKCRegression", "from_memmap", "from_parquet"]
+__all__ = [
+    "MemmapBatches",
+    "ParquetBatches",
+    "StreamChangedError",
+    "StreamedMKCRegression",
+    "from_memmap",
+    "from_parquet",
+]

@@ -149,7 +149,9 @@ class Progress:
             )
         coef = self.coef()
         expected = survey.total[:, n] - survey.total[:, :n] @ coef
-        size = survey.size[:, n] + survey.size[:, :n] @ coef.abs()
+        # of a column's absolute values, by Cauchy and Schwarz at most
+        size = (survey.weight.unsqueeze(-1) * survey.triangle.square().sum(-2)).sqrt()
+        size = size[:, n] + size[:, :n] @ coef.abs()
         wrong = ~((sums.residual - expected).abs() <= _SAME * size)
         if bool(wrong.any()):
             raise StreamChangedError(

@@ -49,7 +49,7 @@ class Reservoir:
         >>> sample = Reservoir(3, seed=0)
         >>> for start in (0, 5):
         ...     rows = np.arange(start, start + 5.0)
-        ...     sample.add(Block(rows[:, None, None], rows[:, None], None, 0, 0))
+        ...     sample.add(Block(rows[None, None], rows[None], None, 0, 0))
         >>> sample.drawn().numbers
         array([2, 3, 4])
     """
@@ -65,12 +65,13 @@ class Reservoir:
 
     def add(self, block: Block) -> None:
         """Look at the rows of a block."""
-        count = len(block.X)
-        keys = self._random.random(count)
+        count = block.Y.shape[-1]
+        keys = self._random.random((count,))
         chosen = np.flatnonzero(keys < self._limit)
         if len(chosen):
-            parts = [block.X[chosen].reshape(len(chosen), -1), block.Y[chosen]]
-            rows = np.concatenate(parts if block.weight is None else [*parts, block.weight[chosen]], axis=1)
+            parts: list[np.ndarray] = [block.X.reshape(-1, count), block.Y]
+            parts += [] if block.weight is None else [block.weight]
+            rows = np.concatenate([part[:, chosen] for part in parts]).T
             self._parts.append(Drawn(keys[chosen], self._number + chosen, rows))
             self._held += len(chosen)
         self._number += count

@@ -6,6 +6,7 @@ of the sums of 1, w, w r² and w r⁴. So a pass has a handful of operations on 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -50,7 +51,7 @@ class Slopes:
 
     Attributes:
         rows: their number, a scalar.
-        residual: of the residuals, by which the rows are known again, (m,).
+        residual: of the weighted residuals, by which the rows are known again, (m,).
         energy, first, second: of the energy and of what its first and second derivatives by κ are, (m,).
         qw, q2w: of w z²/2 and w z⁴/4, (m,).
         score: of w r x, (m, n).
@@ -101,84 +102,129 @@ def slopes_pass(batches: Iterable[Any], shape: Shape, point: Point, *, curvature
         point: where.
         curvature: work out also what the Hessian is made of, which takes two to three times as long.
     """
-    flat = torch.zeros(Slopes.length(shape), dtype=torch.float64)
-    into = Slopes.of(flat, shape)
+    adding = _Adding(shape, point, curvature=curvature)
     for block in _in_basis(batches, shape, point):
-        into.rows.add_(len(block.X))
-        for c in range(shape.m):
-            weight = None if block.weight is None else block.weight[:, c]
-            _add(into, c, block.X[:, c], block.Y[:, c], weight, point, curvature)
-    return flat
+        adding.add(block)
+    return torch.from_numpy(adding.flat)
 
 
-def _add(
-    into: Slopes,
-    c: int,
-    x: Float64[np.ndarray, "B n"],
-    y: Float64[np.ndarray, " B"],
-    weight: Float64[np.ndarray, " B"] | None,
-    point: Point,
-    curvature: bool,
-) -> None:
-    kappa, inverse = float(point.kappa[c]), float(point.d[c]) ** -2
-    r = y - x @ point.coef
-    r2 = r * r
-    into.residual[c] += float(r.sum())
-    w, energy, first, second = (_few_terms if kappa >= LEAST_KAPPA else _all_terms)(r2, weight, kappa, inverse)
-    s = w * r
-    qw, q2w = 0.5 * inverse * float(s @ r), 0.0
-    into.score[c] += torch.from_numpy(s @ x)
-    if curvature:
-        s3 = s * r2
-        q2w = 0.25 * inverse**2 * float(s3 @ r)
-        into.cubed[c] += torch.from_numpy(s3 @ x)
-        into.gram[c] += torch.from_numpy(_gram(x, w * (1.0 - kappa * inverse * r2)))
-    if first is None or second is None:
-        first = (energy - qw) / kappa
-        second = (2.0 * first - q2w) / kappa
-    for field, value in ((into.energy, energy), (into.first, first), (into.second, second), (into.qw, qw)):
-        field[c] += value
-    into.q2w[c] += q2w
+class _Adding:
+    """The sums of a pass while they grow, and memory for what is worked out of a block: new memory for each operation
+    would take as long as the operations."""
+
+    def __init__(self, shape: Shape, point: Point, *, curvature: bool, report: bool = False) -> None:
+        self.flat = np.zeros(Slopes.length(shape))
+        self.meat, self.light, self._report = np.zeros((shape.n, shape.n)), 0, report
+        into = Slopes.of(torch.from_numpy(self.flat), shape)
+        self._channels = self.flat[1 : 1 + 6 * shape.m].reshape(6, shape.m)
+        self._score, self._cubed, self._gram = (one.numpy() for one in (into.score, into.cubed, into.gram))
+        self._point, self._curvature = point, curvature
+        self._space = np.empty((5 + 2 * shape.n, 0))
+
+    def add(self, block: Block) -> None:
+        m, n, count = block.X.shape
+        if count > self._space.shape[1]:
+            self._space = np.empty((5 + 2 * n, count))
+        self.flat[0] += count
+        for c in range(m):
+            self._add_channel(c, block.X[c], block.Y[c], None if block.weight is None else block.weight[c])
+        if self._report:
+            score = self._space[-n:, :count]
+            self.meat += np.matmul(score, score.T)
+
+    def _add_channel(
+        self,
+        c: int,
+        x: Float64[np.ndarray, "n B"],
+        y: Float64[np.ndarray, " B"],
+        weight: Float64[np.ndarray, " B"] | None,
+    ) -> None:
+        kappa, inverse = float(self._point.kappa[c]), float(self._point.d[c]) ** -2
+        space = self._space[:, : len(y)]
+        r, r2, w, s, s3 = space[:5]
+        np.matmul(self._point.coef, x, out=r)
+        np.subtract(y, r, out=r)
+        np.multiply(r, r, out=r2)
+        if kappa >= LEAST_KAPPA:
+            energy = _few_terms(r2, weight, kappa, inverse, w)
+            first = second = math.nan
+        else:
+            energy, first, second = _all_terms(r2, weight, kappa, inverse, w)
+        np.multiply(w, r, out=s)
+        qw, q2w = 0.5 * inverse * float(np.dot(s, r)), 0.0
+        self._score[c] += np.matmul(x, s)
+        if self._curvature:
+            np.multiply(s, r2, out=s3)
+            q2w = 0.25 * inverse**2 * float(np.dot(s3, r))
+            self._cubed[c] += np.matmul(x, s3)
+            products = space[5 : 5 + len(x)]
+            if self._report:
+                self._add_score(c, np.multiply(x, s * inverse, out=products), r2)
+            # the curvature's weight takes the place of r²
+            r2 *= -kappa * inverse
+            r2 += 1.0
+            r2 *= w
+            self._gram[c] += np.matmul(np.multiply(x, r2, out=products), x.T)
+        if kappa >= LEAST_KAPPA:
+            first = (energy - qw) / kappa
+            second = (2.0 * first - q2w) / kappa
+        residual = float(r.sum()) if weight is None else float(np.dot(weight, r))
+        self._channels[:, c] += (residual, energy, first, second, qw, q2w)
+
+    def _add_score(self, c: int, score: Float64[np.ndarray, "n B"], r2: Float64[np.ndarray, " B"]) -> None:
+        """Each row's score, whose products with itself are summed when all its channels are in it."""
+        whole = self._space[-len(score) :, : score.shape[1]]
+        np.copyto(whole, score) if c == 0 else np.add(whole, score, out=whole)
+        exponent = 0.5 * float(self._point.kappa[c] / self._point.d[c] ** 2)
+        self.light += int(np.count_nonzero(r2 > -math.log(LIGHT) / exponent)) if exponent > 0.0 else 0
 
 
 def _few_terms(
-    r2: Float64[np.ndarray, " B"], weight: Float64[np.ndarray, " B"] | None, kappa: float, inverse: float
-) -> tuple[Float64[np.ndarray, " B"], float, None, None]:
-    """Weight times w, and the sum of the energy."""
-    w = np.multiply(r2, -0.5 * kappa * inverse)
+    r2: Float64[np.ndarray, " B"],
+    weight: Float64[np.ndarray, " B"] | None,
+    kappa: float,
+    inverse: float,
+    w: Float64[np.ndarray, " B"],
+) -> float:
+    """The sum of the energy; ``w`` gets the kernel's weight times the sample's."""
+    np.multiply(r2, -0.5 * kappa * inverse, out=w)
     np.exp(w, out=w)
     if weight is not None:
         w *= weight
     total = len(w) if weight is None else float(weight.sum())
-    return w, (total - float(w.sum())) / kappa, None, None
+    return (total - float(w.sum())) / kappa
 
 
 def _all_terms(
-    r2: Float64[np.ndarray, " B"], weight: Float64[np.ndarray, " B"] | None, kappa: float, inverse: float
-) -> tuple[Float64[np.ndarray, " B"], float, float, float]:
-    """Weight times w, and the sums of the energy and of its first and second derivative by κ."""
+    r2: Float64[np.ndarray, " B"],
+    weight: Float64[np.ndarray, " B"] | None,
+    kappa: float,
+    inverse: float,
+    w: Float64[np.ndarray, " B"],
+) -> tuple[float, float, float]:
+    """The sums of the energy and of its first and second derivative by κ; ``w`` gets the weights as above."""
     # capped where its cube overflows
-    q = torch.from_numpy(np.minimum(0.5 * inverse * r2, 1e100))
+    q = np.minimum(np.multiply(r2, 0.5 * inverse, out=w), 1e100, out=w)
+    own = np.ones_like(w) if weight is None else weight
     if kappa > 0.0:
-        w, *terms = _energy_terms(q, torch.tensor(kappa, dtype=torch.float64))
+        kernel, *terms = (
+            one.numpy() for one in _energy_terms(torch.from_numpy(q), torch.tensor(kappa, dtype=torch.float64))
+        )
+        energy, first, second = (float(np.dot(own, term)) for term in terms)
+        np.multiply(own, kernel, out=w)
     else:
-        w, *terms = torch.ones_like(q), q, 0.5 * q * q, q * q * q / 3.0
-    own = torch.ones_like(q) if weight is None else torch.from_numpy(weight).contiguous()
-    energy, first, second = (float(own @ term) for term in terms)
-    return (own * w).numpy(), energy, first, second
-
-
-def _gram(x: Float64[np.ndarray, "B n"], weight: Float64[np.ndarray, " B"]) -> Float64[np.ndarray, "n n"]:
-    # rows of the transpose are long, and numpy is slow where they are short
-    turned = np.ascontiguousarray(x.T)
-    turned *= weight
-    return turned @ x
+        own_q = own * q
+        energy, first = float(own_q.sum()), 0.5 * float(np.dot(own_q, q))
+        own_q *= q
+        second = float(np.dot(own_q, q)) / 3.0
+        w[:] = own
+    return energy, first, second
 
 
 def _in_basis(batches: Iterable[Any], shape: Shape, point: Point) -> Iterator[Block]:
     """The blocks of a pass, their columns turned where the point says so."""
     for _, block in blocks(batches, shape):
-        yield block if point.to_basis is None else replace(block, X=block.X @ point.to_basis)
+        yield block if point.to_basis is None else replace(block, X=np.matmul(point.to_basis.T, block.X))
 
 
 def range_pass(batches: Iterable[Any], shape: Shape, point: Point) -> Float64[Tensor, " k"]:
@@ -188,10 +234,10 @@ def range_pass(batches: Iterable[Any], shape: Shape, point: Point) -> Float64[Te
     """
     found = np.full((2, shape.m), -np.inf)
     for block in _in_basis(batches, shape, point):
-        residual = block.Y - block.X @ point.coef
-        used = True if block.weight is None else block.weight > 0
-        for sign, into in ((1.0, found[0]), (-1.0, found[1])):
-            np.maximum(into, (sign * residual).max(0, initial=-np.inf, where=used), out=into)
+        residual = block.Y - np.matmul(point.coef, block.X)
+        used: Any = True if block.weight is None else block.weight > 0
+        np.maximum(found[0], residual.max(1, initial=-np.inf, where=used), out=found[0])
+        np.maximum(found[1], -residual.min(1, initial=np.inf, where=used), out=found[1])
     return torch.from_numpy(found.reshape(-1))
 
 
@@ -221,19 +267,7 @@ class Report:
 
 def report_pass(batches: Iterable[Any], shape: Shape, point: Point) -> Float64[Tensor, " k"]:
     """The sums of :class:`Report` over this rank's rows, flat."""
-    flat = torch.zeros(Report.length(shape), dtype=torch.float64)
-    into = Report.of(flat, shape)
+    adding = _Adding(shape, point, curvature=True, report=True)
     for block in _in_basis(batches, shape, point):
-        into.slopes.rows.add_(len(block.X))
-        score = np.zeros((len(block.X), shape.n))
-        for c in range(shape.m):
-            weight = None if block.weight is None else block.weight[:, c]
-            x, y = block.X[:, c], block.Y[:, c]
-            _add(into.slopes, c, x, y, weight, point, curvature=True)
-            r = y - x @ point.coef
-            w = np.exp(-0.5 * point.kappa[c] * (r / point.d[c]) ** 2)
-            into.light.add_(int((w < LIGHT).sum()))
-            psi = w * r * float(point.d[c]) ** -2
-            score += x * (psi if weight is None else psi * weight)[:, None]
-        into.meat.add_(torch.from_numpy(score.T @ score))
-    return flat
+        adding.add(block)
+    return torch.from_numpy(np.concatenate([adding.flat, adding.meat.reshape(-1), [adding.light]]))

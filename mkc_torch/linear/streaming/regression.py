@@ -111,11 +111,10 @@ class StreamedMKCRegression(Inference):
         self._progress: Progress | None = None
         self._resume_from: Progress | None = None
 
-    @property
-    def weights_(self) -> Tensor:  # type: ignore[override]
-        raise AttributeError(
-            "A streamed fit keeps no `weights_`, as many as rows; weights(X, Y) gives those of a batch."
-        )
+    def __getattr__(self, name: str) -> Any:
+        if name == "weights_":
+            raise AttributeError("A streamed fit keeps no `weights_`, one a row; weights(X, Y) gives those of a batch.")
+        return super().__getattr__(name)
 
     def fit(  # type: ignore[override]
         self,
