@@ -140,7 +140,7 @@ class StreamedMKCRegression(Inference):
                 of something else.
             StreamChangedError: a pass gave other rows than the first.
             RankDeficientError: columns of X are linearly dependent.
-            mkc_torch._support.ranks.RanksError: another rank failed or is gone.
+            RanksError: another rank failed or is gone.
         """
         ranks = Ranks(group)
         counts = ranks.gathered(lambda: getattr(checked_source(batches), "rows", None))

@@ -138,9 +138,9 @@ class ParquetBatches:
         self._columns = list(dict.fromkeys([*named, weight] if weight is not None else named))
         self.column_names = tuple(self._inputs[0]) if isinstance(targets, str) else None
         groups = [(at, group, count) for at, path in enumerate(self._paths) for group, count in self._groups(path)]
-        self._mine = groups[slice(*_share(len(groups), shard))]
-        before = groups.index(self._mine[0]) if self._mine else len(groups)
-        self.first = sum(count for _, _, count in groups[:before])
+        start, end = _share(len(groups), shard)
+        self._mine = groups[start:end]
+        self.first = sum(count for _, _, count in groups[:start])
         self.rows = sum(count for _, _, count in self._mine)
 
     def _groups(self, path: str | os.PathLike[str]) -> list[tuple[int, int]]:
