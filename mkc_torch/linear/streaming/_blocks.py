@@ -14,7 +14,7 @@ from mkc_torch._support.arguments import told
 from mkc_torch._support.arrays import as_tensor, is_array
 
 if TYPE_CHECKING:
-    from jaxtyping import Float64
+    from jaxtyping import Float64, Shaped
 
 BLOCK_VALUES = 80_000
 """Numbers of a block at most: 640 kB in float64, which stay in a cache of 1 MB while some ten operations go over them.
@@ -25,7 +25,8 @@ _LEAST_ROWS = 64
 
 @dataclass(frozen=True)
 class Block:
-    """Rows of one batch in float64, and where they stand: the batch's number and the first row's in it.
+    """Rows of one batch in float64: where they stand, its number and the first row's in it, and whether they are
+    of float32.
 
     Each column is contiguous, with which products of columns and their sums take a third of the time.
     """
@@ -33,8 +34,9 @@ class Block:
     X: Float64[np.ndarray, "m n B"]
     Y: Float64[np.ndarray, "m B"]
     weight: Float64[np.ndarray, "m B"] | None
-    batch: int
-    first: int
+    batch: int = 0
+    first: int = 0
+    single: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,29 @@ def blocks(batches: Iterable[Any], shape: Shape | None = None) -> Iterator[tuple
         for first in range(0, len(X), rows):
             part = slice(first, first + rows)
             x, y = _filled(buffer, X[part], Y[part], shape)
-            yield shape, Block(x, y, _weights(weight, part, shape), number, first)
+            single = X.dtype == Y.dtype == np.float32
+            yield shape, Block(x, y, _weights(weight, part, shape), number, first, single)
+
+
+def pieces(
+    batches: Iterable[Any], shape: Shape, rows: int
+) -> Iterator[tuple[Shaped[np.ndarray, "B m n"], Shaped[np.ndarray, "B m"], Shaped[np.ndarray, "B m"] | None]]:
+    """One pass over the batches as they lie in memory, so many rows at a time.
+
+    Raises:
+        TypeError, ValueError: as :func:`blocks`.
+    """
+    for number, batch in enumerate(batches):
+        arrays = _arrays(batch, number)
+        _checked_shape(*arrays, number, shape)
+        x, y, weight = (None if a is None else a[:, None] if a.ndim == 1 else a for a in arrays)
+        assert x is not None
+        assert y is not None
+        x = x[:, None] if x.ndim == 2 else x
+        weight = None if weight is None else np.broadcast_to(weight, y.shape)
+        for first in range(0, len(x), rows):
+            part = slice(first, first + rows)
+            yield x[part], y[part], None if weight is None else weight[part]
 
 
 def _arrays(batch: Any, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:

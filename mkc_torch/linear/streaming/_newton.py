@@ -14,20 +14,24 @@ from torch import Tensor
 
 from mkc_torch.density.energy import KAPPA_MAX
 from mkc_torch.density.fit import normaliser_derivatives
+from mkc_torch.linear.streaming._rough import LEAST_KAPPA_OF_ROUGH
 from mkc_torch.linear.streaming._sums import Slopes
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float64
 
-__all__ = ["Climb", "Likelihood", "Place"]
+__all__ = ["NEAR", "Climb", "Likelihood", "Place"]
 
 _KAPPA_OFFSET, _LONGEST, _FURTHEST_DOWN = 0.02, 2.0, 0.1353352832366127
 """A step in κ is measured in shares of κ and the first; it and one in log d have the length of the second at most; the
 third is the share of κ that it leaves at least. They are those of the E-step in memory."""
 
-_REST = 1e-10
-"""Standard errors of one value, in d, that a solution may still be away from the maximum: what a further step would
-move it by. Four hundredths of what agreement to 1e-8 leaves room for."""
+NEAR = 1e-13
+"""Of the mean log-likelihood, what a step is still to gain where one with a Hessian of its own ends: 4e-7 d is then to
+go, of which such a step leaves the square."""
+
+_ROUGH = 1e-9
+"""Of the mean log-likelihood, what steps are to gain that a pass in float32 can tell: its gradient is good to 1e-6."""
 
 _FAST = 1e-2
 """A Hessian is kept while each step gains less than this share of what the one before it did."""
@@ -52,6 +56,7 @@ class Likelihood:
         free_kappa, free_d: whether these are learned.
         to_basis: takes sums over the rows to the basis, (n, n).
         largest: absolute value of Y.
+        single: passes in float32 are possible.
     """
 
     weight: Float64[Tensor, " m"]
@@ -61,6 +66,7 @@ class Likelihood:
     free_d: bool
     to_basis: Float64[Tensor, "n n"]
     largest: float
+    single: bool
 
     def channels(self, place: Place, sums: Slopes) -> Float64[Tensor, " m"]:
         """The mean of each channel."""
@@ -105,6 +111,11 @@ class Likelihood:
         held_d = ((place.log_d <= self.log_d_min) & (g_log_d >= 0)) | ((place.log_d >= self.log_bound) & (g_log_d <= 0))
         return torch.cat([torch.ones(n, dtype=torch.bool), ~held_kappa & self.free_kappa, ~held_d & self.free_d])
 
+    def allows_rough(self, place: Place) -> bool:
+        """Whether a pass in float32 is good to six digits there: not where residuals are digits of large numbers."""
+        far = self.largest > 1e3 * float(torch.exp(place.log_d.min()))
+        return self.single and not far and float(place.kappa.min()) >= LEAST_KAPPA_OF_ROUGH
+
     def moved(self, place: Place, step: Float64[Tensor, " p"]) -> Place:
         """The place a step away, the step in κ in shares of it, within the limits."""
         n, m = place.beta.shape[0], place.kappa.shape[0]
@@ -125,66 +136,77 @@ class Climb:
     Attributes:
         trial: where the next pass is made.
         curvature: whether it is to work out the Hessian.
-        place, value, gradient, hessian: the best place so far, and what is known of it; the Hessian may be that of a
-            place before it, which ``stale`` says.
+        rough: whether it is to be made in float32.
+        place, value, gradient, hessian: the best place so far, and what is known of it.
+        stale: the Hessian is that of another place, or of a sample.
+        loose: the value is one of float32.
         gain: what the last step was to gain, in the mean log-likelihood.
         damping: added to the scaled Hessian.
-        rested: the trial is the solution.
+        near: what is left to gain is for a step with a Hessian of its own.
         history: sum over channels of the mean negative log-likelihood, at every pass.
     """
 
     trial: Place
     curvature: bool = True
+    rough: bool = False
     place: Place | None = None
     value: float = float("inf")
     gradient: Float64[Tensor, " p"] | None = None
     hessian: Float64[Tensor, "p p"] | None = None
     stale: bool = False
+    loose: bool = False
     gain: float = 1.0
     damping: float = 0.0
-    rested: bool = False
+    near: bool = False
     history: tuple[float, ...] = ()
 
     def after(self, likelihood: Likelihood, sums: Slopes) -> Climb:
         """Where it stands after the pass at the trial."""
         value = likelihood.value(self.trial, sums)
         history = (*self.history, float(likelihood.channels(self.trial, sums).sum()))
-        # close to the maximum the value is rounding, and the gradient alone tells
-        rounding = max(1e-13 * (1.0 + abs(value)), 1e-3 * self.gain if self.gain < 1e-10 else 0.0)
-        if self.place is not None and not value <= self.value + rounding:
+        if self.place is not None and not value <= self.value + self._rounding(value):
             return self._back(likelihood, history)
-        gradient = likelihood.gradient(self.trial, sums)
         here = replace(
             self,
             place=self.trial,
             value=value,
-            gradient=gradient,
+            gradient=likelihood.gradient(self.trial, sums),
             hessian=likelihood.hessian(self.trial, sums) if self.curvature else self.hessian,
             stale=not self.curvature,
+            loose=self.rough,
             damping=0.1 * self.damping if self.damping > 1e-4 else 0.0,
             history=history,
         )
         step, gain = here._step(likelihood)
-        head = float(2.0 * sums.qw.sum() / likelihood.weight.sum())
-        unit = float(torch.exp(self.trial.log_d.min()))
-        eps = torch.finfo(torch.float64).eps
-        rounded = (10.0 * eps * likelihood.largest / unit) ** 2
         share = gain / self.gain if self.gain > 0 else 0.0
-        # the share shrinks further from step to step, so that the next gain is less
-        next_gain = gain * min(1.0, share)
-        rested = next_gain <= _REST**2 * head + rounded or (gain <= eps * head + rounded and share >= 0.25)
+        # steps shrink by the same share at least
+        left = gain * min(1.0, share)
+        head = float(2.0 * sums.qw.sum() / likelihood.weight.sum())
+        eps = torch.finfo(torch.float64).eps
+        rounded = (10.0 * eps * likelihood.largest / float(torch.exp(self.trial.log_d.min()))) ** 2
+        still = gain <= eps * head + rounded and share >= 0.25
+        trial = likelihood.moved(self.trial, step)
         return replace(
             here,
-            trial=likelihood.moved(self.trial, step),
+            trial=trial,
             gain=gain,
-            curvature=share > _FAST,
-            rested=rested and here.damping == 0.0,
+            curvature=share > _FAST and self.place is not None,
+            rough=left > _ROUGH and share <= _FAST and likelihood.allows_rough(trial),
+            near=not self.rough and here.damping == 0.0 and (left <= NEAR * head + rounded or still),
         )
+
+    def _rounding(self, value: float) -> float:
+        """By which two values differ where they are the same."""
+        if self.rough or self.loose:
+            return 1e-5 * (1.0 + abs(value))
+        # close to the maximum the value is rounding, and the gradient alone tells
+        return max(1e-13 * (1.0 + abs(value)), 1e-3 * self.gain if self.gain < 1e-10 else 0.0)
 
     def _back(self, likelihood: Likelihood, history: tuple[float, ...]) -> Climb:
         """The step was too long: a shorter one from the place before, whose own Hessian is worked out first."""
         assert self.place is not None
-        back = replace(self, history=history, damping=max(10.0 * self.damping, 1e-2), curvature=False)
+        back = replace(self, history=history, damping=max(10.0 * self.damping, 1e-2))
+        back = replace(back, curvature=False, rough=False)
         if self.stale:
             return replace(back, trial=self.place, curvature=True, gain=1.0)
         step, gain = back._step(likelihood)

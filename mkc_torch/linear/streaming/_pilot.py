@@ -12,6 +12,7 @@ from mkc_torch.linear._problem import RankDeficientError, linear_problem
 from mkc_torch.linear.em import MKCRegression, _alternate, _Known
 from mkc_torch.linear.streaming._blocks import Shape
 from mkc_torch.linear.streaming._reservoir import Drawn
+from mkc_torch.linear.streaming._sums import Point, slopes_pass
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
@@ -30,6 +31,8 @@ class Begun:
         free_kappa, free_d: whether 1/σ² and d are learned.
         exact: most values lie on the fit to rounding.
         rows: of the sample.
+        weight: sums of its weights, (m,).
+        sums: of :class:`Slopes` over it at its maximum, flat.
     """
 
     rough: Float64[Tensor, " n"]
@@ -42,10 +45,20 @@ class Begun:
     free_d: bool
     exact: bool
     rows: int
+    weight: Float64[Tensor, " m"]
+    sums: Float64[Tensor, " k"]
 
 
-def begun_from(drawn: Drawn, shape: Shape, estimator: MKCRegression) -> Begun:
+def begun_from(
+    drawn: Drawn, shape: Shape, estimator: MKCRegression, to_basis: Float64[Tensor, "n n"] | None = None
+) -> Begun:
     """The start, rough fit and maximum of :class:`MKCRegression` on a sample.
+
+    Args:
+        drawn: the sample.
+        shape: of the batches.
+        estimator: with the parameters of the fit.
+        to_basis: turns the columns for the sums, where it is to be.
 
     Raises:
         RankDeficientError: the sample's columns are linearly dependent.
@@ -63,17 +76,25 @@ def begun_from(drawn: Drawn, shape: Shape, estimator: MKCRegression) -> Begun:
         known = _Known(estimator.sigma, estimator.d, estimator.bound, estimator.start)
         begin, beta, state = estimator._begin(problem, known)
         found = _alternate(problem, beta, state, max_iter=estimator.max_iter, tol=estimator.tol)
+    coef, kappa, log_d = problem.coefficients(found.beta), found.state.kappa[0], found.state.log_d[0]
+    turned = coef if to_basis is None else torch.linalg.solve(to_basis, coef.unsqueeze(-1)).squeeze(-1)
+    point = Point(
+        turned.numpy(), kappa.numpy(), torch.exp(log_d).numpy(), None if to_basis is None else to_basis.numpy()
+    )
+    batch = (x, y) if weight is None else (x, y, weight)
     return Begun(
         rough=problem.coefficients(beta),
-        coef=problem.coefficients(found.beta),
-        kappa=found.state.kappa[0],
-        log_d=found.state.log_d[0],
+        coef=coef,
+        kappa=kappa,
+        log_d=log_d,
         log_bound=found.state.log_bound[0],
         log_d_min=found.state.log_d_min[0],
         free_kappa=found.state.free_kappa,
         free_d=found.state.free_d,
         exact=bool(begin.exact[0]),
         rows=len(x),
+        weight=problem.total_weight()[0],
+        sums=slopes_pass([batch], shape, point, curvature=True),
     )
 
 

@@ -16,7 +16,7 @@ from mkc_torch.density.fit import normaliser_derivatives
 from mkc_torch.linear._problem import solve_gram
 from mkc_torch.linear._scale_search import relative_precision
 from mkc_torch.linear.streaming._blocks import Shape
-from mkc_torch.linear.streaming._newton import Climb, Likelihood, Place
+from mkc_torch.linear.streaming._newton import NEAR, Climb, Likelihood, Place
 from mkc_torch.linear.streaming._pilot import Begun
 from mkc_torch.linear.streaming._sums import Point, Slopes
 from mkc_torch.linear.streaming._survey import Survey
@@ -26,18 +26,14 @@ if TYPE_CHECKING:
 
 __all__ = ["Phase", "Progress", "StreamChangedError"]
 
-Phase = Literal["range", "climb", "report"]
+Phase = Literal["range", "climb", "report", "done"]
 
 FORMAT = 1
 """Of a saved state; another one is refused."""
 
-NEARLY_DEPENDENT = 1e5
-"""Ratio of the singular values of the scaled columns above which they are turned in every block: sums of products of
-the columns as they are lose digits by its square, ten of sixteen here."""
-
-_SAME = 1e-9
-"""Share of a sum's absolute values by which it may differ from pass to pass: rounding in another order is a thousandth
-of it, and a millionth of the rows in other values is seen."""
+_SAME, _SAME_OF_ROUGH = 1e-9, 1e-5
+"""Share of a sum's absolute values by which it may differ from pass to pass, in float64 and float32: rounding in
+another order is a hundredth of it, and a millionth of the rows in other values is seen."""
 
 
 class StreamChangedError(ValueError):
@@ -52,7 +48,7 @@ class Progress:
         settings: what the fit was asked for, by name.
         survey: of all rows.
         begun: of the sample.
-        phase: what the next pass is for: the range of the residuals, the maximum, or the covariance at it.
+        phase: what the next pass is for: the range of the residuals, the maximum, or the covariance at it; or "done".
         passes: made so far.
         log_bound: of the domain, (m,).
         climb: to the maximum, once that has begun.
@@ -77,7 +73,9 @@ class Progress:
         return progress._climbing(begun.log_bound) if given else progress
 
     def likelihood(self) -> Likelihood:
-        turned = torch.eye(self.survey.shape.n, dtype=torch.float64) if self._is_turned() else self.survey.to_coef()
+        turned = (
+            torch.eye(self.survey.shape.n, dtype=torch.float64) if self.survey.is_turned() else self.survey.to_coef()
+        )
         return Likelihood(
             weight=self.survey.weight,
             log_bound=self.log_bound,
@@ -86,6 +84,7 @@ class Progress:
             free_d=self.begun.free_d,
             to_basis=turned,
             largest=float(self.survey.largest.max()),
+            single=self.survey.single and not self.survey.is_turned(),
         )
 
     def point(self) -> Point:
@@ -94,17 +93,13 @@ class Progress:
             beta, kappa, log_d = self._in_basis(self.begun.rough), self.begun.kappa, self.begun.log_d
         else:
             beta, kappa, log_d = self.climb.trial.beta, self.climb.trial.kappa, self.climb.trial.log_d
-        to_coef, turned = self.survey.to_coef(), self._is_turned()
+        to_coef, turned = self.survey.to_coef(), self.survey.is_turned()
         return Point(
             coef=(beta if turned else to_coef @ beta).numpy(),
             kappa=kappa.numpy(),
             d=torch.exp(log_d).numpy(),
             to_basis=to_coef.numpy() if turned else None,
         )
-
-    def coef(self) -> Float64[Tensor, " n"]:
-        assert self.climb is not None
-        return self.survey.to_coef() @ self.climb.trial.beta
 
     def after_range(self, extremes: Float64[Tensor, " k"]) -> Progress:
         """The domain is half the range of all rows' residuals, and no less than the sample's: its ten d are in that."""
@@ -119,23 +114,40 @@ class Progress:
             StreamChangedError: the pass had other rows.
         """
         assert self.climb is not None
-        self.refuse_other_rows(sums)
+        self.refuse_other_rows(sums, self.climb)
         likelihood = self.likelihood()
         climb = self.climb.after(likelihood, sums)
         now = replace(self, passes=self.passes + 1, climb=climb)
         # a fit through most values to rounding is at the limit of what can be said
-        rested = climb.rested or (self.begun.exact and len(climb.history) >= 8)
-        if not rested and now.passes < max_passes - 1:
+        # a fit through most values to rounding is at the limit of what can be said
+        near = climb.near or (self.begun.exact and len(climb.history) >= 8)
+        if not near and now.passes < max_passes - 1:
             return now
-        if rested and not self.gaussian and self.begun.free_kappa and self.begun.free_d:
+        if near and not self.gaussian and self.begun.free_kappa and self.begun.free_d:
             place, value = self._gaussian(likelihood)
             if value < climb.history[-1]:
                 return replace(now, climb=Climb(place, history=climb.history), gaussian=True)
-        if not rested and climb.place is not None:
-            now = replace(now, climb=replace(climb, trial=climb.place))
-        return replace(now, phase="report", gaussian=True, converged=rested)
+        if not near and climb.place is not None:
+            climb = replace(climb, trial=climb.place)
+        return replace(now, climb=replace(climb, curvature=True, rough=False), phase="report", gaussian=True)
 
-    def refuse_other_rows(self, sums: Slopes) -> None:
+    def after_report(self, sums: Slopes, max_passes: int) -> Progress:
+        """A last step, by the Hessian that the report has with it; on with the climb where that is too long a one.
+
+        Raises:
+            StreamChangedError: the pass had other rows.
+        """
+        assert self.climb is not None
+        self.refuse_other_rows(sums, self.climb)
+        climb = self.climb.after(self.likelihood(), sums)
+        head = float(2.0 * sums.qw.sum() / self.survey.weight.sum())
+        rested = self.begun.exact or climb.near or climb.gain <= 10.0 * NEAR * head
+        now = replace(self, passes=self.passes + 1, climb=climb)
+        if rested or now.passes >= max_passes:
+            return replace(now, phase="done", converged=rested)
+        return replace(now, phase="climb")
+
+    def refuse_other_rows(self, sums: Slopes, climb: Climb) -> None:
         """Refuse a pass whose rows are not those of the first, by their number and the sum of their residuals.
 
         Raises:
@@ -147,12 +159,13 @@ class Progress:
                 f"Expected `batches` to give the same rows in every pass but got {int(sums.rows)}, after {survey.rows} "
                 "in the first; shuffling is fine, dropping a last batch or drawing rows anew is not."
             )
-        coef = self.coef()
+        coef = self.survey.to_coef() @ climb.trial.beta
         expected = survey.total[:, n] - survey.total[:, :n] @ coef
         # of a column's absolute values, by Cauchy and Schwarz at most
         size = (survey.weight.unsqueeze(-1) * survey.triangle.square().sum(-2)).sqrt()
         size = size[:, n] + size[:, :n] @ coef.abs()
-        wrong = ~((sums.residual - expected).abs() <= _SAME * size)
+        same = _SAME_OF_ROUGH if climb.rough else _SAME
+        wrong = ~((sums.residual - expected).abs() <= same * size)
         if bool(wrong.any()):
             raise StreamChangedError(
                 "Expected `batches` to give the same values in every pass but got residuals that sum to "
@@ -167,7 +180,12 @@ class Progress:
         longer = torch.where(begun.kappa > 0, begun.kappa, 1.0).reciprocal() + log_bound - begun.log_bound
         kappa = torch.where(begun.kappa > 0, longer.reciprocal(), 0.0) if begun.free_kappa else begun.kappa
         place = Place(self._in_basis(begun.coef), kappa, begun.log_d)
-        return replace(self, phase="climb", log_bound=log_bound, climb=Climb(place))
+        now = replace(self, phase="climb", log_bound=log_bound)
+        likelihood = now.likelihood()
+        of_sample = replace(likelihood, weight=begun.weight)
+        hessian = of_sample.hessian(place, Slopes.of(begun.sums, self.survey.shape))
+        rough = likelihood.allows_rough(place) and begun.rows < self.survey.rows
+        return replace(now, climb=Climb(place, curvature=False, rough=rough, hessian=hessian, stale=True))
 
     def _gaussian(self, likelihood: Likelihood) -> tuple[Place, float]:
         """The Gaussian density at weighted least squares, as in memory, and its mean negative log-likelihood."""
@@ -192,12 +210,6 @@ class Progress:
 
     def _in_basis(self, coef: Float64[Tensor, " n"]) -> Float64[Tensor, " n"]:
         return torch.linalg.solve(self.survey.to_coef(), coef.unsqueeze(-1)).squeeze(-1)
-
-    def _is_turned(self) -> bool:
-        n = self.survey.shape.n
-        stacked = self.survey.triangle[:, :, :n].reshape(-1, n)
-        singular = torch.linalg.svdvals(stacked / torch.linalg.vector_norm(stacked, dim=0))
-        return bool(singular[0] > NEARLY_DEPENDENT * singular[n - 1])
 
     def state_dict(self) -> dict[str, Any]:
         """Numbers, texts and tensors, as ``torch.load(..., weights_only=True)`` reads them."""

@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Survey", "surveyed"]
 
+NEARLY_DEPENDENT = 1e5
+"""Ratio of the singular values of the scaled columns above which they are turned in every block: sums of products of
+the columns as they are lose digits by its square, ten of sixteen here."""
+
 LEAST_PIVOT = 1e-3
 """Of Cholesky's factor of the scaled products of a block's columns. Above it the products say as much as the rows, to
 ten digits; only blocks of nearly dependent columns, or of a target that they all but explain, need a QR decomposition,
@@ -44,6 +48,7 @@ class Survey:
         total: weighted sums of [x y], (m, n + 1), by which the rows are known again.
         weight: sums of the weights, (m,).
         largest: absolute values of Y, (m,).
+        single: all are of float32.
     """
 
     shape: Shape
@@ -53,6 +58,7 @@ class Survey:
     total: Float64[Tensor, "m k"]
     weight: Float64[Tensor, " m"]
     largest: Float64[Tensor, " m"]
+    single: bool
 
     @staticmethod
     def of_all(parts: list[Survey]) -> Survey:
@@ -81,6 +87,7 @@ class Survey:
             total=_summed([part.total for part in parts]),
             weight=_summed([part.weight for part in parts]),
             largest=torch.stack([part.largest for part in parts]).amax(0),
+            single=all(part.single for part in parts),
         )
         whole._check()
         return whole
@@ -109,6 +116,13 @@ class Survey:
         refuse_dependent(upper, scale, self.rows * self.shape.m)
         return torch.linalg.inv(upper) / scale.unsqueeze(-1)
 
+    def is_turned(self) -> bool:
+        """Whether the columns are so nearly dependent that they are turned in every block."""
+        n = self.shape.n
+        stacked = self.triangle[:, :, :n].reshape(-1, n)
+        singular = torch.linalg.svdvals(stacked / torch.linalg.vector_norm(stacked, dim=0))
+        return bool(singular[0] > NEARLY_DEPENDENT * singular[n - 1])
+
 
 def surveyed(batches: Iterable[Any], reservoir: Reservoir) -> Survey | None:
     """The survey of this rank's rows, None of no rows; the reservoir gets to see each of them.
@@ -131,6 +145,7 @@ class _Adding:
         m, k = shape.m, shape.n + 1
         self._shape = shape
         self._rows = self._used = 0
+        self._single = True
         self._total, self._weight, self._largest = np.zeros((m, k)), np.zeros(m), np.zeros(m)
         self._triangle, self._gram = torch.zeros(m, k, k, dtype=torch.float64), np.zeros((m, k, k))
         self._space = np.empty((2, m, k, 0))
@@ -148,6 +163,7 @@ class _Adding:
         if not np.isfinite(total).all() or own.min() < 0:
             refuse_bad_values(block)
         self._rows += count
+        self._single = self._single and block.single
         self._total += total
         self._largest = np.maximum(self._largest, np.maximum(block.Y.max(1), -block.Y.min(1)))
         self._used += int(np.count_nonzero(own > 0))
@@ -166,7 +182,7 @@ class _Adding:
         if self._gram.any():
             self._join(torch.linalg.cholesky(torch.from_numpy(self._gram), upper=True))
         total, weight, largest = map(torch.from_numpy, (self._total, self._weight, self._largest))
-        return Survey(self._shape, self._rows, self._used, self._triangle, total, weight, largest)
+        return Survey(self._shape, self._rows, self._used, self._triangle, total, weight, largest, self._single)
 
 
 def _is_good(gram: Float64[np.ndarray, "m k k"]) -> bool:

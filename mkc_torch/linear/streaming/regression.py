@@ -21,6 +21,7 @@ from mkc_torch.linear.streaming._blocks import checked_source
 from mkc_torch.linear.streaming._pilot import begun_from
 from mkc_torch.linear.streaming._progress import Progress, StreamChangedError
 from mkc_torch.linear.streaming._reservoir import Drawn, Reservoir, merged
+from mkc_torch.linear.streaming._rough import rough_pass
 from mkc_torch.linear.streaming._sums import Report, Slopes, range_pass, report_pass, slopes_pass
 from mkc_torch.linear.streaming._survey import Survey, surveyed
 
@@ -147,11 +148,11 @@ class StreamedMKCRegression(Inference):
         progress = ranks.from_first(lambda: self._resumed(checkpoint))
         if progress is None:
             progress = self._begun(ranks, batches, counts, checkpoint)
-        while progress.phase != "report":
-            progress = self._after_pass(ranks, batches, progress, checkpoint)
-        shape, point = progress.survey.shape, progress.point()
-        flat = ranks.sum_of(lambda: report_pass(batches, shape, point), Report.length(shape))
-        self._finish(progress, Report.of(flat, shape))
+        while progress.phase != "done":
+            before = progress
+            flat = ranks.sum_of(*_pass(batches, before), largest=before.phase == "range")
+            progress = self._kept(ranks, lambda: _after(before, flat, self.max_passes), checkpoint)  # noqa: B023
+        self._finish(before, progress, Report.of(flat, progress.survey.shape))
         self._name_columns(batches)
         return self
 
@@ -229,46 +230,41 @@ class StreamedMKCRegression(Inference):
         def begin() -> Progress:
             survey = Survey.of_all(surveys)
             sample = merged([part for part in drawn if part is not None], self.pilot)
-            begun = begun_from(sample, survey.shape, self._of_sample())
+            to_basis = survey.to_coef() if survey.is_turned() else None
+            begun = begun_from(sample, survey.shape, self._of_sample(), to_basis)
             return Progress.begin(self._settings(), survey, begun)
 
         return self._kept(ranks, begin, checkpoint)
-
-    def _after_pass(
-        self, ranks: Ranks, batches: Iterable[Any], progress: Progress, checkpoint: str | os.PathLike[str] | None
-    ) -> Progress:
-        shape, point = progress.survey.shape, progress.point()
-        if progress.climb is None:
-            extremes = ranks.sum_of(lambda: range_pass(batches, shape, point), 2 * shape.m, largest=True)
-            return self._kept(ranks, lambda: progress.after_range(extremes), checkpoint)
-        curvature = progress.climb.curvature
-        flat = ranks.sum_of(lambda: slopes_pass(batches, shape, point, curvature=curvature), Slopes.length(shape))
-        return self._kept(ranks, lambda: progress.after_slopes(Slopes.of(flat, shape), self.max_passes), checkpoint)
 
     def _kept(self, ranks: Ranks, work: Callable[[], Progress], checkpoint: str | os.PathLike[str] | None) -> Progress:
         """What rank 0 works out, once it is written where it is to be."""
 
         def written() -> Progress:
             progress = work()
-            if checkpoint is not None:
+            if checkpoint is not None and progress.phase != "done":
                 progress.save(checkpoint)
             return progress
 
-        self._progress = ranks.from_first(written)
-        return self._progress
+        progress = ranks.from_first(written)
+        # a state that goes on makes the last pass again, which tells whether the data are its own
+        self._progress = self._progress if progress.phase == "done" else progress
+        return progress
 
-    def _finish(self, progress: Progress, report: Report) -> None:
+    def _finish(self, before: Progress, progress: Progress, report: Report) -> None:
+        """Results from the last pass, made where the fit stood before it, and the step that followed."""
+        assert before.climb is not None
         assert progress.climb is not None
-        progress.refuse_other_rows(report.slopes)
-        likelihood, place, survey = progress.likelihood(), progress.climb.trial, progress.survey
+        likelihood, survey = progress.likelihood(), progress.survey
+        at = before.climb.trial
+        place = progress.climb.trial if progress.converged else at
         n = survey.shape.n
         left = survey.used - n
         self._single_channel = survey.shape.single_channel
-        self.coef_ = progress.coef()
+        self.coef_ = survey.to_coef() @ place.beta
         self.sigma_, self.d_, self.bound_ = place.kappa.rsqrt(), torch.exp(place.log_d), torch.exp(progress.log_bound)
-        self.log_likelihood_ = -(survey.weight * likelihood.channels(place, report.slopes)).sum()
+        self.log_likelihood_ = -(survey.weight * likelihood.channels(at, report.slopes)).sum()
         self.dof_ = torch.tensor(float(left), dtype=torch.float64)
-        curvature = torch.einsum("c,cij->ij", torch.exp(-2.0 * place.log_d), report.slopes.gram)
+        curvature = torch.einsum("c,cij->ij", torch.exp(-2.0 * at.log_d), report.slopes.gram)
         turn, to_coef = likelihood.to_basis, survey.to_coef()
         inverse = torch.linalg.pinv(turn.mT @ curvature @ turn, hermitian=True)
         middle = inverse @ (turn.mT @ report.meat @ turn) @ inverse
@@ -277,8 +273,8 @@ class StreamedMKCRegression(Inference):
         self.covariance_ = covariance if left > 0 else torch.full_like(covariance, torch.inf)
         self.history_ = torch.tensor(progress.climb.history, dtype=torch.float64)
         self.exact_fit_ = torch.tensor(progress.begun.exact)
-        self.converged_ = torch.tensor(progress.converged or progress.begun.exact)
-        self.n_iter_ = progress.passes + 1
+        self.converged_ = torch.tensor(progress.converged)
+        self.n_iter_ = progress.passes
         self.n_rows_, self.n_pilot_ = survey.rows, progress.begun.rows
         self._light_values = survey.rows * survey.shape.m, int(report.light)
 
@@ -291,6 +287,27 @@ class StreamedMKCRegression(Inference):
         names = getattr(batches, "column_names", None)
         if names is not None:
             self.feature_names_in_ = names
+
+
+def _pass(batches: Iterable[Any], progress: Progress) -> tuple[Callable[[], Float64[Tensor, " k"]], int]:
+    """What the next pass is, and how many sums it gives."""
+    shape, point, climb = progress.survey.shape, progress.point(), progress.climb
+    if climb is None:
+        return lambda: range_pass(batches, shape, point), 2 * shape.m
+    if progress.phase == "report":
+        return lambda: report_pass(batches, shape, point), Report.length(shape)
+    if climb.rough:
+        return lambda: rough_pass(batches, shape, point), Slopes.length(shape)
+    return lambda: slopes_pass(batches, shape, point, curvature=climb.curvature), Slopes.length(shape)
+
+
+def _after(progress: Progress, flat: Float64[Tensor, " k"], max_passes: int) -> Progress:
+    """Where the fit stands after a pass."""
+    if progress.phase == "range":
+        return progress.after_range(flat)
+    if progress.phase == "report":
+        return progress.after_report(Report.of(flat, progress.survey.shape).slopes, max_passes)
+    return progress.after_slopes(Slopes.of(flat, progress.survey.shape), max_passes)
 
 
 def _likely(drawn: Drawn | None, size: int, rows: int) -> Drawn | None:
