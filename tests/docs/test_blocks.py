@@ -5,6 +5,7 @@ import pytest
 pytest.importorskip("lightning")
 pytest.importorskip("typer")
 pytest.importorskip("polars")
+pytest.importorskip("pyarrow")
 
 from tests.docs.commands import EXAMPLES, SMALL, TESTED, commands, run
 from tests.docs.files import write_examples

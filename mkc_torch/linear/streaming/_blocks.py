@@ -31,12 +31,19 @@ class Block:
     Each column is contiguous, with which products of columns and their sums take a third of the time.
     """
 
-    X: Float64[np.ndarray, "m n B"]
-    Y: Float64[np.ndarray, "m B"]
+    joined: Float64[np.ndarray, "m n+1 B"]
     weight: Float64[np.ndarray, "m B"] | None
     batch: int = 0
     first: int = 0
     single: bool = False
+
+    @property
+    def X(self) -> Float64[np.ndarray, "m n B"]:  # noqa: N802
+        return self.joined[:, :-1]
+
+    @property
+    def Y(self) -> Float64[np.ndarray, "m B"]:  # noqa: N802
+        return self.joined[:, -1]
 
 
 @dataclass(frozen=True)
@@ -94,9 +101,9 @@ def blocks(batches: Iterable[Any], shape: Shape | None = None) -> Iterator[tuple
             buffer = np.empty(rows * shape.m * (shape.n + 1))
         for first in range(0, len(X), rows):
             part = slice(first, first + rows)
-            x, y = _filled(buffer, X[part], Y[part], shape)
+            joined = _filled(buffer, X[part], Y[part], shape)
             single = X.dtype == Y.dtype == np.float32
-            yield shape, Block(x, y, _weights(weight, part, shape), number, first, single)
+            yield shape, Block(joined, _weights(weight, part, shape), number, first, single)
 
 
 def pieces(
@@ -165,14 +172,13 @@ def _of(shape: Shape) -> str:
     return f"{channels}{shape.n} columns {'with' if shape.weighted else 'without'} weights"
 
 
-def _filled(buffer: np.ndarray, X: np.ndarray, Y: np.ndarray, shape: Shape) -> tuple[np.ndarray, np.ndarray]:
-    """X and Y in float64 in the buffer, each column in a row of it."""
+def _filled(buffer: np.ndarray, X: np.ndarray, Y: np.ndarray, shape: Shape) -> np.ndarray:
+    """X and Y in float64 in the buffer, each column in a row of it and Y of a channel behind its X."""
     count, m, n = len(X), shape.m, shape.n
-    x = buffer[: m * n * count].reshape(m, n, count)
-    y = buffer[m * n * count : m * (n + 1) * count].reshape(m, count)
-    np.copyto(x, np.moveaxis(X.reshape(count, m, n), 0, -1))
-    np.copyto(y, Y.reshape(count, m).T)
-    return x, y
+    joined = buffer[: m * (n + 1) * count].reshape(m, n + 1, count)
+    np.copyto(joined[:, :n], np.moveaxis(X.reshape(count, m, n), 0, -1))
+    np.copyto(joined[:, n], Y.reshape(count, m).T)
+    return joined
 
 
 def _weights(weight: np.ndarray | None, part: slice, shape: Shape) -> np.ndarray | None:

@@ -49,9 +49,9 @@ class Reservoir:
         >>> sample = Reservoir(3, seed=0)
         >>> for start in (0, 5):
         ...     rows = np.arange(start, start + 5.0)
-        ...     sample.add(Block(rows[None, None], rows[None], None, 0, 0))
+        ...     sample.add(Block(np.stack([rows, rows])[None], None))
         >>> sample.drawn().numbers
-        array([2, 3, 4])
+        array([1, 2, 3])
     """
 
     def __init__(self, size: int, seed: int, first: int | None = 0, rank: int = 0) -> None:

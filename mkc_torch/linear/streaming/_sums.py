@@ -224,7 +224,9 @@ def _all_terms(
 def _in_basis(batches: Iterable[Any], shape: Shape, point: Point) -> Iterator[Block]:
     """The blocks of a pass, their columns turned where the point says so."""
     for _, block in blocks(batches, shape):
-        yield block if point.to_basis is None else replace(block, X=np.matmul(point.to_basis.T, block.X))
+        if point.to_basis is not None:
+            block = replace(block, joined=np.concatenate([np.matmul(point.to_basis.T, block.X), block.Y[:, None]], 1))
+        yield block
 
 
 def range_pass(batches: Iterable[Any], shape: Shape, point: Point) -> Float64[Tensor, " k"]:

@@ -148,15 +148,14 @@ class _Adding:
         self._single = True
         self._total, self._weight, self._largest = np.zeros((m, k)), np.zeros(m), np.zeros(m)
         self._triangle, self._gram = torch.zeros(m, k, k, dtype=torch.float64), np.zeros((m, k, k))
-        self._space = np.empty((2, m, k, 0))
+        self._space = np.empty(0)
 
     def add(self, block: Block) -> None:
-        m, n, count = block.X.shape
-        if self._space.shape[3] < count:
-            self._space = np.empty((2, m, n + 1, count))
-        joined, weighted = self._space[:, :, :, :count]
-        joined[:, :n] = block.X
-        joined[:, n] = block.Y
+        joined = block.joined
+        m, _, count = joined.shape
+        if self._space.size < joined.size:
+            self._space = np.empty(joined.size)
+        weighted = self._space[: joined.size].reshape(joined.shape)
         own = np.ones((m, count)) if block.weight is None else block.weight
         total = np.matmul(joined, own[:, :, None])[:, :, 0]
         # a sum says in a fraction of the time that no element is NaN or infinite

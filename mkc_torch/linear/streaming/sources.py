@@ -90,14 +90,14 @@ def from_memmap(
     Example:
         >>> import tempfile
         >>> from pathlib import Path
-        >>> from mkc_torch.linear import StreamedMKCRegression
+        >>> from mkc_torch.linear.streaming import StreamedMKCRegression
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     table = np.random.default_rng(0).standard_normal((1000, 3), dtype=np.float32)
         ...     table[:, 2] = 0.1 * table[:, 2] + table[:, 0] - table[:, 1]
         ...     np.save(Path(folder) / "table.npy", table)
         ...     table = np.load(Path(folder) / "table.npy", mmap_mode="r")
         ...     StreamedMKCRegression().fit(from_memmap(table[:, :2], table[:, 2])).coef_.round(decimals=2)
-        tensor([ 1.0000, -1.0000], dtype=torch.float64)
+        tensor([ 1., -1.], dtype=torch.float64)
     """
     return MemmapBatches(X, Y, weight, rows=rows, shard=shard)
 
