@@ -21,6 +21,7 @@ from mkc_torch.linear.streaming._blocks import checked_source
 from mkc_torch.linear.streaming._pilot import begun_from
 from mkc_torch.linear.streaming._progress import Progress, StreamChangedError
 from mkc_torch.linear.streaming._reservoir import Drawn, Reservoir, merged
+from mkc_torch.linear.streaming._results import results
 from mkc_torch.linear.streaming._rough import rough_pass
 from mkc_torch.linear.streaming._sums import Report, Slopes, range_pass, report_pass, slopes_pass
 from mkc_torch.linear.streaming._survey import Survey, surveyed
@@ -70,6 +71,7 @@ class StreamedMKCRegression(Inference):
         converged_: whether the fit came to rest.
         n_iter_: passes made over the rows.
         n_rows_, n_pilot_: rows, and those of the sample.
+        n_light_: values of a weight below 0.1, which the fit all but leaves out.
 
     There is no ``weights_``, which would be as long as the rows: :meth:`weights` gives those of a batch.
 
@@ -152,7 +154,10 @@ class StreamedMKCRegression(Inference):
             before = progress
             flat = ranks.sum_of(*_pass(batches, before), largest=before.phase == "range")
             progress = self._kept(ranks, lambda: _after(before, flat, self.max_passes), checkpoint)  # noqa: B023
-        self._finish(before, progress, Report.of(flat, progress.survey.shape))
+        self._single_channel = progress.survey.shape.single_channel
+        found = ranks.from_first(lambda: results(before, progress, Report.of(flat, progress.survey.shape)))
+        for name, value in found.items():
+            setattr(self, name, value)
         self._name_columns(batches)
         return self
 
@@ -250,36 +255,8 @@ class StreamedMKCRegression(Inference):
         self._progress = self._progress if progress.phase == "done" else progress
         return progress
 
-    def _finish(self, before: Progress, progress: Progress, report: Report) -> None:
-        """Results from the last pass, made where the fit stood before it, and the step that followed."""
-        assert before.climb is not None
-        assert progress.climb is not None
-        likelihood, survey = progress.likelihood(), progress.survey
-        at = before.climb.trial
-        place = progress.climb.trial if progress.converged else at
-        n = survey.shape.n
-        left = survey.used - n
-        self._single_channel = survey.shape.single_channel
-        self.coef_ = survey.to_coef() @ place.beta
-        self.sigma_, self.d_, self.bound_ = place.kappa.rsqrt(), torch.exp(place.log_d), torch.exp(progress.log_bound)
-        self.log_likelihood_ = -(survey.weight * likelihood.channels(at, report.slopes)).sum()
-        self.dof_ = torch.tensor(float(left), dtype=torch.float64)
-        curvature = torch.einsum("c,cij->ij", torch.exp(-2.0 * at.log_d), report.slopes.gram)
-        turn, to_coef = likelihood.to_basis, survey.to_coef()
-        inverse = torch.linalg.pinv(turn.mT @ curvature @ turn, hermitian=True)
-        middle = inverse @ (turn.mT @ report.meat @ turn) @ inverse
-        covariance = (left + n) / max(left, 1) * to_coef @ middle @ to_coef.mT
-        # as many coefficients as values leave nothing to tell errors from
-        self.covariance_ = covariance if left > 0 else torch.full_like(covariance, torch.inf)
-        self.history_ = torch.tensor(progress.climb.history, dtype=torch.float64)
-        self.exact_fit_ = torch.tensor(progress.begun.exact)
-        self.converged_ = torch.tensor(progress.converged)
-        self.n_iter_ = progress.passes
-        self.n_rows_, self.n_pilot_ = survey.rows, progress.begun.rows
-        self._light_values = survey.rows * survey.shape.m, int(report.light)
-
     def _light(self, problem: tuple[int, ...]) -> tuple[int, int]:  # noqa: ARG002
-        return self._light_values
+        return self.n_rows_ * self.d_.shape[0], self.n_light_
 
     def _name_columns(self, batches: object) -> None:
         """The names that a table on disk has for the columns of X."""
