@@ -26,8 +26,8 @@ class Ranks:
     """The processes of a ``torch.distributed`` group, or this one alone.
 
     Every method that works does so on all ranks or raises on all: before a result is used the ranks tell one another
-    whether they have one. A process that is gone closes its connections, of which gloo and nccl tell the others; one
-    that hangs is waited for as long as the group's timeout says.
+    whether they have one. A process that is gone closes its connections, of which gloo tells the others at once; one
+    that hangs is waited for as long as the group's timeout says, and so is any with nccl.
 
     Args:
         group: of ``torch.distributed``; None takes the default group where it is initialised, else this process alone.
