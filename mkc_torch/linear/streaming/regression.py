@@ -43,8 +43,9 @@ class StreamedMKCRegression(Inference):
     while the first pass is made twice the sample.
 
     Where the sample holds all rows, the results are those of ``MKCRegression()`` in float64, domain included, to 1e-8
-    or as near as that comes to its maximum. Of more rows it is the maximum on a domain that the sample has a part in: ``MKCRegression(bound=fit.bound_)`` finds
-    the same to 1e-8, where it finds the same maximum, and ``bound`` given leaves nothing to the sample but the start.
+    or as near as that comes to its maximum. Of more rows it is the maximum on a domain that the sample has a part in:
+    ``MKCRegression(bound=fit.bound_)`` finds the same to 1e-8, where it finds the same maximum, and ``bound`` given
+    leaves nothing to the sample but the start.
 
     In a process group of ``torch.distributed``, as torchrun starts one, each rank is given its own part of the rows,
     which may be none, and the sums are those of all. Every rank ends with the same numbers to the bit. An error on one
