@@ -45,15 +45,12 @@ class Ranks:
         if self.rank < 0:
             raise ValueError("Expected argument `group` to be one that this process is a member of.")
 
-    def sum_of(
-        self, work: Callable[[], Float64[Tensor, " k"]], length: int, *, largest: bool = False
-    ) -> Float64[Tensor, " k"]:
-        """The sum over the ranks of what each works out, or the largest, element by element.
+    def sum_of(self, work: Callable[[], Float64[Tensor, " k"]], length: int) -> Float64[Tensor, " k"]:
+        """The sum over the ranks of what each works out, element by element.
 
         Args:
             work: gives float64 numbers.
             length: how many.
-            largest: take the largest instead of the sum.
 
         Raises:
             RanksError: another rank failed; on a rank that fails, its own error.
@@ -68,7 +65,7 @@ class Ranks:
             flat[-1], error = 1.0, caught
         with _connected():
             moved = flat.to(self._device())
-            dist.all_reduce(moved, dist.ReduceOp.MAX if largest else dist.ReduceOp.SUM, group=self.group)
+            dist.all_reduce(moved, group=self.group)
             flat = moved.cpu()
         if bool(flat[-1] > 0):
             self._raise(error)

@@ -5,7 +5,8 @@
 Writes rows of nine float32, eight columns and a target of which a fifth is wrong, to a file of 36 bytes a row, and
 removes it at the end. Prints nanoseconds a row of each pass and of reading and summing the same file, both warm and of
 one thread, the least of several in turn; seconds of a whole fit; the memory that it takes, anonymous (its own) and of
-the file's pages (the cache's, which gives them back); and the time of the passes and of the fit of two ranks.
+the file's pages (the cache's, which gives them back); and the time of passes and of a fit of one rank and of two, of
+the slower one, by the clock and of the CPU, which is the fairer where the processors have other work.
 """
 
 from __future__ import annotations
@@ -26,11 +27,12 @@ import numpy as np
 import torch
 from torch import distributed as dist
 
+from mkc_torch._support.ranks import Ranks
 from mkc_torch.linear.streaming import MemmapBatches, StreamedMKCRegression, from_memmap
 from mkc_torch.linear.streaming._blocks import Shape
 from mkc_torch.linear.streaming._reservoir import Reservoir
 from mkc_torch.linear.streaming._rough import rough_pass
-from mkc_torch.linear.streaming._sums import Point, range_pass, report_pass, slopes_pass
+from mkc_torch.linear.streaming._sums import Point, Slopes, range_pass, report_pass, slopes_pass
 from mkc_torch.linear.streaming._survey import surveyed
 
 COLUMNS = 8
@@ -124,21 +126,30 @@ def rank_main(rank: int, ranks: int, port: int, path: Path, repeats: int, told: 
     torch.set_num_threads(1)
     dist.init_process_group("gloo", f"tcp://127.0.0.1:{port}", rank=rank, world_size=ranks)
     batches, best = batches_of(path, (rank, ranks)), {}
-    work = {name: passes(batches)[name] for name in ("gradient in float32", "gradient")}
-    work["whole fit"] = lambda: StreamedMKCRegression().fit(batches)
+    shape, group = Shape(1, COLUMNS, True, False), Ranks()
+    length = Slopes.length(shape)
+    # of a pass for the gradient also what its sums cost
+    work: dict[str, Callable[[], object]] = {
+        "gradient in float32": lambda: group.sum_of(lambda: rough_pass(batches, shape, POINT), length),
+        "gradient": lambda: group.sum_of(lambda: slopes_pass(batches, shape, POINT, curvature=False), length),
+        "whole fit": lambda: StreamedMKCRegression().fit(batches),
+    }
     for _ in range(repeats):
         for name, one in work.items():
             dist.barrier()
-            # all begin together, and a pass has ended when the slowest has
-            taken = seconds(lambda one=one: (one(), dist.barrier()))
-            best[name] = min(best.get(name, math.inf), taken)
+            begin = time.process_time()
+            wall = seconds(one)
+            # of the slowest rank, as all wait for it
+            slowest = torch.tensor([wall, time.process_time() - begin])
+            dist.all_reduce(slowest, dist.ReduceOp.MAX)
+            best[name] = [min(pair) for pair in zip(best.get(name, [math.inf] * 2), slowest.tolist(), strict=True)]
     if rank == 0:
         told.put(best)
     dist.destroy_process_group()
 
 
-def of_ranks(ranks: int, path: Path, repeats: int) -> dict[str, float]:
-    """Seconds of two passes and of a fit with so many processes of one thread."""
+def of_ranks(ranks: int, path: Path, repeats: int) -> dict[str, list[float]]:
+    """Seconds of two passes and of a fit with so many processes of one thread, by the clock and of the CPU."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -149,7 +160,7 @@ def of_ranks(ranks: int, path: Path, repeats: int) -> dict[str, float]:
     ]
     for process in processes:
         process.start()
-    best: dict[str, float] = told.get()
+    best: dict[str, list[float]] = told.get()
     for process in processes:
         process.join()
     return best
@@ -178,9 +189,11 @@ def main() -> None:
         for name, time_taken in best.items():
             print(f"  {name:<30}{1e9 * time_taken / options.rows:>10.2f}{best['read and sum'] / time_taken:>29.0%}")
         one, two = (of_ranks(ranks, path, max(2, options.repeats // 2)) for ranks in (1, 2))
-        print(f"{'ranks of one thread':<32}{'one, s':>10}{'two, s':>10}{'ratio':>10}")
+        print(f"{'ranks of one thread':<32}{'one, s':>10}{'two, s':>10}{'ratio':>10}{'ratio of CPU time':>20}")
         for name in one:
-            print(f"  {name:<30}{one[name]:>10.2f}{two[name]:>10.2f}{one[name] / two[name]:>10.2f}")
+            (wall, cpu), (wall_of_two, cpu_of_two) = one[name], two[name]
+            ratios = f"{wall / wall_of_two:>10.2f}{cpu / cpu_of_two:>20.2f}"
+            print(f"  {name:<30}{wall:>10.2f}{wall_of_two:>10.2f}{ratios}")
 
 
 if __name__ == "__main__":

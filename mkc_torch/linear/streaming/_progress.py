@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 from dataclasses import asdict, dataclass, replace
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -18,7 +19,7 @@ from mkc_torch.linear._scale_search import relative_precision
 from mkc_torch.linear.streaming._blocks import Shape
 from mkc_torch.linear.streaming._newton import NEAR, Climb, Likelihood, Place
 from mkc_torch.linear.streaming._pilot import Begun
-from mkc_torch.linear.streaming._sums import Point, Slopes
+from mkc_torch.linear.streaming._sums import Extremes, Point, Slopes
 from mkc_torch.linear.streaming._survey import Survey
 
 if TYPE_CHECKING:
@@ -101,9 +102,18 @@ class Progress:
             to_basis=to_coef.numpy() if turned else None,
         )
 
-    def after_range(self, extremes: Float64[Tensor, " k"]) -> Progress:
-        """The domain is half the range of all rows' residuals, and no less than the sample's: its ten d are in that."""
-        half = 0.5 * extremes.view(2, -1).sum(0)
+    def after_range(self, parts: list[Extremes]) -> Progress:
+        """The domain is half the range of all rows' residuals, and no less than the sample's: its ten d are in that.
+
+        Args:
+            parts: of the ranks, in their order.
+
+        Raises:
+            StreamChangedError: the pass had other rows.
+        """
+        whole = reduce(Extremes.with_others, parts)
+        self.refuse_other_rows(whole.rows, torch.from_numpy(whole.residual), self.begun.rough, _SAME)
+        half = 0.5 * torch.from_numpy(whole.high - whole.low)
         bound = torch.maximum(torch.exp(self.begun.log_bound), half)
         return replace(self, passes=self.passes + 1)._climbing(torch.log(bound))
 
@@ -114,7 +124,7 @@ class Progress:
             StreamChangedError: the pass had other rows.
         """
         assert self.climb is not None
-        self.refuse_other_rows(sums, self.climb)
+        self._refuse_other_sums(sums, self.climb)
         likelihood = self.likelihood()
         climb = self.climb.after(likelihood, sums)
         now = replace(self, passes=self.passes + 1, climb=climb)
@@ -138,7 +148,7 @@ class Progress:
             StreamChangedError: the pass had other rows.
         """
         assert self.climb is not None
-        self.refuse_other_rows(sums, self.climb)
+        self._refuse_other_sums(sums, self.climb)
         climb = self.climb.after(self.likelihood(), sums)
         head = float(2.0 * sums.qw.sum() / self.survey.weight.sum())
         rested = self.begun.exact or climb.near or climb.gain <= 10.0 * NEAR * head
@@ -147,29 +157,39 @@ class Progress:
             return replace(now, phase="done", converged=rested)
         return replace(now, phase="climb")
 
-    def refuse_other_rows(self, sums: Slopes, climb: Climb) -> None:
-        """Refuse a pass whose rows are not those of the first, by their number and the sum of their residuals.
+    def _refuse_other_sums(self, sums: Slopes, climb: Climb) -> None:
+        coef = self.survey.to_coef() @ climb.trial.beta
+        self.refuse_other_rows(int(sums.rows), sums.residual, coef, _SAME_OF_ROUGH if climb.rough else _SAME)
+
+    def refuse_other_rows(
+        self, rows: int, residual: Float64[Tensor, " m"], coef: Float64[Tensor, " n"], same: float
+    ) -> None:
+        """Refuse a pass whose rows are not those of the first.
+
+        Args:
+            rows: of the pass.
+            residual: sums of its weighted residuals.
+            coef: coefficients that these are of.
+            same: share of the sums of absolute values by which those of the same rows may differ.
 
         Raises:
             StreamChangedError: they are others.
         """
         survey, n = self.survey, self.survey.shape.n
-        if int(sums.rows) != survey.rows:
+        if rows != survey.rows:
             raise StreamChangedError(
-                f"Expected `batches` to give the same rows in every pass but got {int(sums.rows)}, after {survey.rows} "
-                "in the first; shuffling is fine, dropping a last batch or drawing rows anew is not."
+                f"Expected `batches` to give the same rows in every pass but got {rows}, after {survey.rows} in the "
+                "first; shuffling is fine, dropping a last batch or drawing rows anew is not."
             )
-        coef = self.survey.to_coef() @ climb.trial.beta
         expected = survey.total[:, n] - survey.total[:, :n] @ coef
         # of a column's absolute values, by Cauchy and Schwarz at most
         size = (survey.weight.unsqueeze(-1) * survey.triangle.square().sum(-2)).sqrt()
         size = size[:, n] + size[:, :n] @ coef.abs()
-        same = _SAME_OF_ROUGH if climb.rough else _SAME
-        wrong = ~((sums.residual - expected).abs() <= same * size)
+        wrong = ~((residual - expected).abs() <= same * size)
         if bool(wrong.any()):
             raise StreamChangedError(
                 "Expected `batches` to give the same values in every pass but got residuals that sum to "
-                f"{float(sums.residual[wrong][0]):.6g} where those of the first pass sum to "
+                f"{float(residual[wrong][0]):.6g} where those of the first pass sum to "
                 f"{float(expected[wrong][0]):.6g}; leave out random transforms, and go on only with the data of the "
                 "state."
             )

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float64
     from torch import Tensor
 
-__all__ = ["LIGHT", "Point", "Report", "Slopes", "range_pass", "report_pass", "slopes_pass"]
+__all__ = ["LIGHT", "Extremes", "Point", "Report", "Slopes", "range_pass", "report_pass", "slopes_pass"]
 
 LEAST_KAPPA = 1e-3
 """1/σ² below which the derivatives by it are taken term by term: as differences of sums they would lose more than six
@@ -229,18 +229,41 @@ def _in_basis(batches: Iterable[Any], shape: Shape, point: Point) -> Iterator[Bl
         yield block
 
 
-def range_pass(batches: Iterable[Any], shape: Shape, point: Point) -> Float64[Tensor, " k"]:
-    """The largest residuals and the largest of their negatives over this rank's rows of positive weight, (2 m,).
+@dataclass(frozen=True)
+class Extremes:
+    """The residuals of rows that count, of one rank or of all.
 
-    ``kappa`` and ``d`` of the point are of no use here.
+    Attributes:
+        rows: their number.
+        residual: sum of the weighted residuals, (m,).
+        high, low: the largest and the smallest residual of positive weight, (m,).
     """
-    found = np.full((2, shape.m), -np.inf)
+
+    rows: int
+    residual: Float64[np.ndarray, " m"]
+    high: Float64[np.ndarray, " m"]
+    low: Float64[np.ndarray, " m"]
+
+    def with_others(self, other: Extremes) -> Extremes:
+        return Extremes(
+            self.rows + other.rows,
+            self.residual + other.residual,
+            np.maximum(self.high, other.high),
+            np.minimum(self.low, other.low),
+        )
+
+
+def range_pass(batches: Iterable[Any], shape: Shape, point: Point) -> Extremes:
+    """The extremes of this rank's residuals; ``kappa`` and ``d`` of the point are of no use here."""
+    nothing = np.full(shape.m, np.inf)
+    found = Extremes(0, np.zeros(shape.m), -nothing, nothing)
     for block in _in_basis(batches, shape, point):
         residual = block.Y - np.matmul(point.coef, block.X)
         used: Any = True if block.weight is None else block.weight > 0
-        np.maximum(found[0], residual.max(1, initial=-np.inf, where=used), out=found[0])
-        np.maximum(found[1], -residual.min(1, initial=np.inf, where=used), out=found[1])
-    return torch.from_numpy(found.reshape(-1))
+        weighted = residual if block.weight is None else residual * block.weight
+        high, low = residual.max(1, initial=-np.inf, where=used), residual.min(1, initial=np.inf, where=used)
+        found = found.with_others(Extremes(residual.shape[1], weighted.sum(1), high, low))
+    return found
 
 
 @dataclass(frozen=True)

@@ -152,9 +152,11 @@ class StreamedMKCRegression(Inference):
         progress = ranks.from_first(lambda: self._resumed(checkpoint))
         if progress is None:
             progress = self._begun(ranks, batches, counts, checkpoint)
+        if progress.phase == "range":
+            progress = self._ranged(ranks, batches, progress, checkpoint)
         while progress.phase != "done":
             before = progress
-            flat = ranks.sum_of(*_pass(batches, before), largest=before.phase == "range")
+            flat = ranks.sum_of(*_pass(batches, before))
             progress = self._kept(ranks, lambda: _after(before, flat, self.max_passes), checkpoint)  # noqa: B023
         self._single_channel = progress.survey.shape.single_channel
         found = ranks.from_first(lambda: results(before, progress, Report.of(flat, progress.survey.shape)))
@@ -243,6 +245,13 @@ class StreamedMKCRegression(Inference):
 
         return self._kept(ranks, begin, checkpoint)
 
+    def _ranged(
+        self, ranks: Ranks, batches: Iterable[Any], progress: Progress, checkpoint: str | os.PathLike[str] | None
+    ) -> Progress:
+        """After the pass for the domain."""
+        parts = ranks.gathered(lambda: range_pass(batches, progress.survey.shape, progress.point()))
+        return self._kept(ranks, lambda: progress.after_range(parts), checkpoint)
+
     def _kept(self, ranks: Ranks, work: Callable[[], Progress], checkpoint: str | os.PathLike[str] | None) -> Progress:
         """What rank 0 works out, once it is written where it is to be."""
 
@@ -270,9 +279,8 @@ class StreamedMKCRegression(Inference):
 
 def _pass(batches: Iterable[Any], progress: Progress) -> tuple[Callable[[], Float64[Tensor, " k"]], int]:
     """What the next pass is, and how many sums it gives."""
+    assert progress.climb is not None
     shape, point, climb = progress.survey.shape, progress.point(), progress.climb
-    if climb is None:
-        return lambda: range_pass(batches, shape, point), 2 * shape.m
     if progress.phase == "report":
         return lambda: report_pass(batches, shape, point), Report.length(shape)
     if climb.rough:
@@ -282,8 +290,6 @@ def _pass(batches: Iterable[Any], progress: Progress) -> tuple[Callable[[], Floa
 
 def _after(progress: Progress, flat: Float64[Tensor, " k"], max_passes: int) -> Progress:
     """Where the fit stands after a pass."""
-    if progress.phase == "range":
-        return progress.after_range(flat)
     if progress.phase == "report":
         return progress.after_report(Report.of(flat, progress.survey.shape).slopes, max_passes)
     return progress.after_slopes(Slopes.of(flat, progress.survey.shape), max_passes)
