@@ -139,7 +139,8 @@ def _arrays(batch: Any, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
 def _array(name: str, value: Any) -> np.ndarray:
     """Real numbers as they lie in memory where that is possible."""
     if isinstance(value, np.ndarray) and value.dtype in (np.float32, np.float64):
-        return value
+        # a memmap's own slices take ten times as long as a plain array's
+        return np.asarray(value)
     tensor = value if isinstance(value, Tensor) else as_tensor(name, value)
     if tensor.is_complex():
         raise TypeError(f"Expected argument `{name}` to be real but got {tensor.dtype}; pass its real part.")
@@ -176,7 +177,7 @@ def _filled(buffer: np.ndarray, X: np.ndarray, Y: np.ndarray, shape: Shape) -> n
     """X and Y in float64 in the buffer, each column in a row of it and Y of a channel behind its X."""
     count, m, n = len(X), shape.m, shape.n
     joined = buffer[: m * (n + 1) * count].reshape(m, n + 1, count)
-    np.copyto(joined[:, :n], np.moveaxis(X.reshape(count, m, n), 0, -1))
+    np.copyto(joined[:, :n], X.reshape(count, m, n).transpose(1, 2, 0))
     np.copyto(joined[:, n], Y.reshape(count, m).T)
     return joined
 

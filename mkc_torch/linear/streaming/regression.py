@@ -149,7 +149,8 @@ class StreamedMKCRegression(Inference):
         """
         ranks = Ranks(group)
         counts = ranks.gathered(lambda: getattr(checked_source(batches), "rows", None))
-        progress = ranks.from_first(lambda: self._resumed(checkpoint))
+        resume_from, self._resume_from = self._resume_from, None
+        progress = ranks.from_first(lambda: self._resumed(resume_from, checkpoint))
         if progress is None:
             progress = self._begun(ranks, batches, counts, checkpoint)
         if progress.phase == "range":
@@ -213,10 +214,10 @@ class StreamedMKCRegression(Inference):
         values = {name: getattr(self, name) for name in names}
         return {name: v.tolist() if isinstance(v, Tensor) else v for name, v in values.items()}
 
-    def _resumed(self, checkpoint: str | os.PathLike[str] | None) -> Progress | None:
-        progress, self._resume_from = self._resume_from, None
-        if checkpoint is not None:
-            progress = Progress.load(checkpoint) or progress
+    def _resumed(self, given: Progress | None, checkpoint: str | os.PathLike[str] | None) -> Progress | None:
+        """Where to go on from: a checkpoint that is there, or a state that was given."""
+        progress = None if checkpoint is None else Progress.load(checkpoint)
+        progress = given if progress is None else progress
         if progress is not None:
             progress.refuse_other_settings(self._settings())
         return progress

@@ -111,11 +111,11 @@ class ParquetBatches:
         column_names: of X.
 
     Example:
-        >>> import tempfile
-        >>> pyarrow = __import__("pytest").importorskip("pyarrow.parquet")
+        >>> import tempfile, pyarrow
+        >>> from pyarrow.parquet import write_table
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     table = __import__("pyarrow").table({"a": [1.0, 2.0, 3.0], "b": [2.0, 4.0, 6.0]})
-        ...     pyarrow.write_table(table, f"{folder}/table.parquet", row_group_size=2)
+        ...     table = pyarrow.table({"a": [1.0, 2.0, 3.0], "b": [2.0, 4.0, 6.0]})
+        ...     write_table(table, f"{folder}/table.parquet", row_group_size=2)
         ...     [len(X) for X, Y in ParquetBatches(f"{folder}/table.parquet", ["a"], "b")]
         [2, 1]
     """
@@ -203,6 +203,17 @@ def from_parquet(
         ImportError: pyarrow is not installed.
         FileNotFoundError, ValueError, TypeError: no such file, no Parquet file, no such columns, columns of something
             else than numbers, or no such shard.
+
+    Example:
+        >>> import tempfile, pyarrow
+        >>> from pyarrow.parquet import write_table
+        >>> from mkc_torch.linear.streaming import StreamedMKCRegression
+        >>> speed = np.arange(100.0)
+        >>> drag = 2.0 * speed + np.sin(speed)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_table(pyarrow.table({"speed": speed, "drag": drag}), f"{folder}/table.parquet")
+        ...     StreamedMKCRegression().fit(from_parquet(f"{folder}/table.parquet", ["speed"], "drag")).coef_
+        tensor([1.9998], dtype=torch.float64)
     """
     return ParquetBatches(path, inputs, targets, weight=weight, rows=rows, shard=shard)
 
