@@ -293,21 +293,19 @@ class MKCRegression(Inference):
         return self
 
     def _maximise(self, problem: LinearProblem, known: _Known) -> tuple[RobustStart, _Maximum]:
-        begin, beta, state = self._begin(problem, known)
+        begin = robust_start(problem, known.start, seed=self.seed)
+        d_min = _FLOOR * begin.scale
+        if known.bound is None:
+            beta, state = self._on_its_domain(problem, known, begin, d_min)
+        else:
+            beta = begin.beta
+            bound = channel_parameter("bound", known.bound, problem)
+            refuse_narrow_bound(bound, begin.scale)
+            state = known.initial_state(problem, beta, begin.scale, bound, d_min)
         maximum = _alternate(problem, beta, state, max_iter=self.max_iter, tol=self.tol)
         if state.free_kappa and state.free_d:
             maximum = _gaussian_candidate(problem, maximum, max_iter=self.max_iter, tol=self.tol)
         return begin, maximum
-
-    def _begin(self, problem: LinearProblem, known: _Known) -> tuple[RobustStart, Tensor, DensityState]:
-        """The robust start, and the coefficients and the state on the domain that the maximum is sought from."""
-        begin = robust_start(problem, known.start, seed=self.seed)
-        d_min = _FLOOR * begin.scale
-        if known.bound is None:
-            return begin, *self._on_its_domain(problem, known, begin, d_min)
-        bound = channel_parameter("bound", known.bound, problem)
-        refuse_narrow_bound(bound, begin.scale)
-        return begin, begin.beta, known.initial_state(problem, begin.beta, begin.scale, bound, d_min)
 
     def _on_its_domain(
         self, problem: LinearProblem, known: _Known, begin: RobustStart, d_min: Tensor

@@ -8,16 +8,23 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.linear._problem import RankDeficientError, linear_problem
-from mkc_torch.linear.em import MKCRegression, _alternate, _Known
+from mkc_torch.density.fit import normaliser_derivatives
+from mkc_torch.linear._problem import RankDeficientError
+from mkc_torch.linear.em import MKCRegression
 from mkc_torch.linear.streaming._blocks import Shape
 from mkc_torch.linear.streaming._reservoir import Drawn
-from mkc_torch.linear.streaming._sums import Point, slopes_pass
+from mkc_torch.linear.streaming._sums import Point, Slopes, slopes_pass
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
 __all__ = ["Begun", "begun_from"]
+
+_LEAST_D = 0.1
+"""d of all rows in d of the sample, at least: a scale that samples of a few hundred rows know to a tenth."""
+
+_HELD = 1e-3
+"""Slope of the mean log-likelihood by log d from which d has ended at its least; at rest it is below 1e-5."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +32,7 @@ class Begun:
     """What a sample says of where the maximum is sought.
 
     Attributes:
-        rough: coefficients of the rough fit, whose residuals the domain is taken from, (n,).
-        coef, kappa, log_d: the sample's maximum on the sample's domain, (n,), (m,), (m,).
+        coef, kappa, log_d: the sample's maximum, (n,), (m,), (m,).
         log_bound, log_d_min: of the sample's domain, and the least log d, (m,).
         free_kappa, free_d: whether 1/σ² and d are learned.
         exact: most values lie on the fit to rounding.
@@ -35,7 +41,6 @@ class Begun:
         sums: of :class:`Slopes` over it at its maximum, flat.
     """
 
-    rough: Float64[Tensor, " n"]
     coef: Float64[Tensor, " n"]
     kappa: Float64[Tensor, " m"]
     log_d: Float64[Tensor, " m"]
@@ -52,7 +57,7 @@ class Begun:
 def begun_from(
     drawn: Drawn, shape: Shape, estimator: MKCRegression, to_basis: Float64[Tensor, "n n"] | None = None
 ) -> Begun:
-    """The start, rough fit and maximum of :class:`MKCRegression` on a sample.
+    """The fit of :class:`MKCRegression` to a sample.
 
     Args:
         drawn: the sample.
@@ -65,37 +70,37 @@ def begun_from(
         ValueError: a parameter of the estimator does not suit the data.
     """
     x, y, weight = _columns(drawn, shape)
-    with torch.no_grad():
-        try:
-            problem = linear_problem(x, y, weight)
-        except RankDeficientError as error:
-            raise RankDeficientError(
-                f"In the sample of {len(x)} rows that the fit begins from: {error} Or raise `pilot`, where the rows "
-                "that tell these columns apart are few."
-            ) from None
-        known = _Known(estimator.sigma, estimator.d, estimator.bound, estimator.start)
-        begin, beta, state = estimator._begin(problem, known)
-        found = _alternate(problem, beta, state, max_iter=estimator.max_iter, tol=estimator.tol)
-    coef, kappa, log_d = problem.coefficients(found.beta), found.state.kappa[0], found.state.log_d[0]
+    try:
+        fit = estimator.fit(x, y, weight)
+    except RankDeficientError as error:
+        raise RankDeficientError(
+            f"In the sample of {len(x)} rows that the fit begins from: {error} Or raise `pilot`, where the rows that "
+            "tell these columns apart are few."
+        ) from None
+    coef, kappa, log_d, log_bound = fit.coef_, fit.sigma_.pow(-2), torch.log(fit.d_), torch.log(fit.bound_)
     turned = coef if to_basis is None else torch.linalg.solve(to_basis, coef.unsqueeze(-1)).squeeze(-1)
-    point = Point(
-        turned.numpy(), kappa.numpy(), torch.exp(log_d).numpy(), None if to_basis is None else to_basis.numpy()
-    )
-    batch = (x, y) if weight is None else (x, y, weight)
+    point = Point(turned.numpy(), kappa.numpy(), fit.d_.numpy(), None if to_basis is None else to_basis.numpy())
+    flat = slopes_pass([(x, y) if weight is None else (x, y, weight)], shape, point, curvature=True)
+    total = _total_weight(weight, len(x), shape.m)
+    exact = bool(fit.exact_fit_)
+    slope = normaliser_derivatives(kappa, log_d, log_bound).log_d - 2.0 * Slopes.of(flat, shape).qw / total
     return Begun(
-        rough=problem.coefficients(beta),
         coef=coef,
         kappa=kappa,
         log_d=log_d,
-        log_bound=found.state.log_bound[0],
-        log_d_min=found.state.log_d_min[0],
-        free_kappa=found.state.free_kappa,
-        free_d=found.state.free_d,
-        exact=bool(begin.exact[0]),
+        log_bound=log_bound,
+        log_d_min=torch.where(slope > _HELD, log_d, torch.log(_LEAST_D * fit.d_)) if not exact else log_d,
+        free_kappa=estimator.sigma is None,
+        free_d=estimator.d is None,
+        exact=exact,
         rows=len(x),
-        weight=problem.total_weight()[0],
-        sums=slopes_pass([batch], shape, point, curvature=True),
+        weight=total,
+        sums=flat,
     )
+
+
+def _total_weight(weight: Tensor | None, rows: int, m: int) -> Float64[Tensor, " m"]:
+    return torch.full((m,), float(rows), dtype=torch.float64) if weight is None else weight.reshape(rows, m).sum(0)
 
 
 def _columns(drawn: Drawn, shape: Shape) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -69,9 +69,10 @@ class Progress:
 
     @staticmethod
     def begin(settings: dict[str, Any], survey: Survey, begun: Begun) -> Progress:
-        given = settings["bound"] is not None
+        # a sample of all rows has had their range
+        known = settings["bound"] is not None or begun.rows == survey.rows
         progress = Progress(settings, survey, begun, "range", 1, begun.log_bound)
-        return progress._climbing(begun.log_bound) if given else progress
+        return progress._climbing(begun.log_bound) if known else progress
 
     def likelihood(self) -> Likelihood:
         turned = (
@@ -91,7 +92,7 @@ class Progress:
     def point(self) -> Point:
         """Where the next pass is made."""
         if self.climb is None:
-            beta, kappa, log_d = self._in_basis(self.begun.rough), self.begun.kappa, self.begun.log_d
+            beta, kappa, log_d = self._in_basis(self.begun.coef), self.begun.kappa, self.begun.log_d
         else:
             beta, kappa, log_d = self.climb.trial.beta, self.climb.trial.kappa, self.climb.trial.log_d
         to_coef, turned = self.survey.to_coef(), self.survey.is_turned()
@@ -112,7 +113,7 @@ class Progress:
             StreamChangedError: the pass had other rows.
         """
         whole = reduce(Extremes.with_others, parts)
-        self.refuse_other_rows(whole.rows, torch.from_numpy(whole.residual), self.begun.rough, _SAME)
+        self.refuse_other_rows(whole.rows, torch.from_numpy(whole.residual), self.begun.coef, _SAME)
         half = 0.5 * torch.from_numpy(whole.high - whole.low)
         bound = torch.maximum(torch.exp(self.begun.log_bound), half)
         return replace(self, passes=self.passes + 1)._climbing(torch.log(bound))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from mkc_torch.density.fit import _energy_terms
+from mkc_torch.density.fit import energy_derivatives
 from mkc_torch.linear.streaming._blocks import Block, Shape, blocks
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ class _Adding:
             energy = _few_terms(r2, weight, kappa, inverse, w)
             first = second = math.nan
         else:
-            energy, first, second = _all_terms(r2, weight, kappa, inverse, w)
+            energy, first, second = _all_terms(r, weight, kappa, inverse, w)
         np.multiply(w, r, out=s)
         qw, q2w = 0.5 * inverse * float(np.dot(s, r)), 0.0
         self._score[c] += np.matmul(x, s)
@@ -196,28 +196,28 @@ def _few_terms(
 
 
 def _all_terms(
-    r2: Float64[np.ndarray, " B"],
+    r: Float64[np.ndarray, " B"],
     weight: Float64[np.ndarray, " B"] | None,
     kappa: float,
     inverse: float,
     w: Float64[np.ndarray, " B"],
 ) -> tuple[float, float, float]:
     """The sums of the energy and of its first and second derivative by κ; ``w`` gets the weights as above."""
-    # capped where its cube overflows
-    q = np.minimum(np.multiply(r2, 0.5 * inverse, out=w), 1e100, out=w)
     own = np.ones_like(w) if weight is None else weight
     if kappa > 0.0:
-        kernel, *terms = (
-            one.numpy() for one in _energy_terms(torch.from_numpy(q), torch.tensor(kappa, dtype=torch.float64))
-        )
-        energy, first, second = (float(np.dot(own, term)) for term in terms)
-        np.multiply(own, kernel, out=w)
-    else:
-        own_q = own * q
-        energy, first = float(own_q.sum()), 0.5 * float(np.dot(own_q, q))
-        own_q *= q
-        second = float(np.dot(own_q, q)) / 3.0
-        w[:] = own
+        error, share = (torch.from_numpy(np.ascontiguousarray(one)).unsqueeze(-1) for one in (r, own))
+        at = (torch.tensor([one], dtype=torch.float64) for one in (kappa, -0.5 * math.log(inverse)))
+        found = energy_derivatives(error, share, *at)
+        np.exp(np.multiply(r * r, -0.5 * kappa * inverse, out=w), out=w)
+        w *= own
+        return float(found.value), -float(found.kappa), float(found.kappa_kappa)
+    # capped where its cube overflows
+    q = np.minimum(np.multiply(r * r, 0.5 * inverse, out=w), 1e100, out=w)
+    own_q = own * q
+    energy, first = float(own_q.sum()), 0.5 * float(np.dot(own_q, q))
+    own_q *= q
+    second = float(np.dot(own_q, q)) / 3.0
+    w[:] = own
     return energy, first, second
 
 

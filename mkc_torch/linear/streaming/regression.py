@@ -36,11 +36,11 @@ class StreamedMKCRegression(Inference):
     """:class:`mkc_torch.linear.MKCRegression` on more rows than memory holds: the same maximum, in passes over batches.
 
     The first pass checks and counts the rows and draws a uniform sample of them, which :class:`MKCRegression` fits in
-    memory. From its robust fit a second pass takes the domain by the rule of memory, half the range of all residuals
-    and no less than ten d. From its maximum Newton's method on the coefficients and each channel's σ and d goes up the
-    likelihood of all rows, three or four passes, and a last pass gives the covariance. The sums that decide are of
-    float64, of float32 data too. Memory does not grow with the rows: it holds one batch, a block of 80 000 numbers, and
-    while the first pass is made twice the sample.
+    memory. A second takes the domain by the rule of memory, half the range of all residuals of that fit and no less
+    than the sample's, unless it has all rows. From its maximum Newton's method on the coefficients and each channel's σ
+    and d goes up the likelihood of all rows, two to four passes, and a last pass gives the covariance. The sums that
+    decide are of float64, of float32 data too. Memory does not grow with the rows: it holds one batch, a block of
+    80 000 numbers, and while the first pass is made twice the sample.
 
     Where the sample holds all rows, the results are those of ``MKCRegression()`` in float64, domain included, to 1e-8
     or as near as that comes to its maximum. Of more rows it is the maximum on a domain that the sample has a part in:
@@ -59,7 +59,7 @@ class StreamedMKCRegression(Inference):
         start: of the sample's fit, "lts", "s", "least_squares", or a list or tensor of coefficients.
         pilot: rows of the sample at most. Its fit takes some 70 MB with 8 columns and 380 MB with 60; one of
             less than a few hundred rows may lead to another maximum where outliers are many.
-        max_passes: over the rows at most, 4 at least; a fit takes 6 or 7.
+        max_passes: over the rows at most, 4 at least; a fit takes 5 to 8.
         seed: of the sample and of its start.
 
     Attributes, after ``fit`` (m is 1 for one channel given as (N,)):
