@@ -16,19 +16,17 @@ import torch
 
 from mkc_torch.density.fit import energy_derivatives
 from mkc_torch.linear.streaming._blocks import Block, Shape, blocks
+from mkc_torch.linear.summary import LIGHT
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
     from torch import Tensor
 
-__all__ = ["LIGHT", "Extremes", "Point", "Report", "Slopes", "range_pass", "report_pass", "slopes_pass"]
+__all__ = ["Extremes", "Point", "Report", "Slopes", "range_pass", "report_pass", "slopes_pass"]
 
 LEAST_KAPPA = 1e-3
 """1/σ² below which the derivatives by it are taken term by term: as differences of sums they would lose more than six
 of sixteen digits."""
-
-LIGHT = 0.1
-"""A weight below it counts as that of a value that is all but left out, as in a summary."""
 
 
 @dataclass(frozen=True)

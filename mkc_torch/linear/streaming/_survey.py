@@ -167,7 +167,7 @@ class _Adding:
         self._largest = np.maximum(self._largest, np.maximum(block.Y.max(1), -block.Y.min(1)))
         self._used += int(np.count_nonzero(own > 0))
         self._weight += own.sum(1)
-        gram = np.matmul(np.multiply(joined, own[:, None], out=weighted), joined.mT)
+        gram = np.matmul(np.multiply(joined, own[:, None], out=weighted), joined.transpose(0, 2, 1))
         if _is_good(gram):
             self._gram += gram
         else:
