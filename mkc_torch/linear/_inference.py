@@ -166,18 +166,23 @@ class Inference(LinearEstimator):
         interval = self.confidence_interval(level)
         at = one_problem(problem, tuple(self.dof_.shape))
         names = self.__dict__.get("feature_names_in_") if names is None else names
-        weights, squared = self.weights_[at], getattr(self, "r_squared_", None)
+        squared = getattr(self, "r_squared_", None)
         return Summary.of(
             title=type(self).__name__,
             names=names,
             columns=(self.coef_[at], self.standard_error_[at], self.p_value_[at], interval[at]),
             level=level,
-            light=(weights.numel(), int((weights < LIGHT).sum())),
+            light=self._light(at),
             scale=self.scale_[at].tolist() if "scale_" in self.__dict__ else [],
             r_squared=[] if squared is None else squared[at].tolist(),
             dof=float(self.dof_[at]),
             kind=str(self.__dict__["covariance"]),
         )
+
+    def _light(self, problem: tuple[int, ...]) -> tuple[int, int]:
+        """How many values there are, and how many of them the fit all but leaves out."""
+        weights = self.weights_[problem]
+        return weights.numel(), int((weights < LIGHT).sum())
 
     def _quantile(self, level: float) -> Float[Tensor, " *batch"]:
         checked_number("level", level, 0.0, 1.0, "()", "0.95 is usual")

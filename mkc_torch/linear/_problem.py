@@ -247,14 +247,18 @@ class CanonicalShapes:
     single_channel: bool
 
 
-def _check_magnitude(Y: Tensor) -> None:
-    """Residuals are squared twice, in weights and in covariances, which must neither overflow nor vanish."""
-    largest = float(Y.detach().abs().max())
-    limit = float(torch.finfo(Y.dtype).max) ** 0.25
-    if largest > limit or 0.0 < largest < 1.0 / limit:
+def refuse_magnitude(largest: Tensor) -> None:
+    """Refuse Y of these largest absolute values, where residuals squared twice would overflow or vanish.
+
+    Raises:
+        ValueError: they would.
+    """
+    most = float(largest.detach().max())
+    limit = float(torch.finfo(largest.dtype).max) ** 0.25
+    if most > limit or 0.0 < most < 1.0 / limit:
         raise ValueError(
-            f"Expected argument `Y` of a magnitude between {1.0 / limit:.0e} and {limit:.0e} in {Y.dtype} "
-            f"but got {largest:.3g}; choose another unit."
+            f"Expected argument `Y` of a magnitude between {1.0 / limit:.0e} and {limit:.0e} in {largest.dtype} "
+            f"but got {most:.3g}; choose another unit."
         )
 
 
@@ -323,7 +327,7 @@ def canonical_shapes(
     values = laid_out(X, Y, sample_weight)
     _check_finite("X", X)
     _check_finite("Y", Y)
-    _check_magnitude(Y)
+    refuse_magnitude(Y.detach().abs().max())
     if sample_weight is not None:
         _check_weight(sample_weight, values)
     return values
@@ -406,17 +410,33 @@ def _check_weight(sample_weight: Tensor, values: CanonicalShapes) -> None:
 
 def _orthonormalise(X: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor]:
     """Basis and the matrix that takes its coefficients to those of the columns of X, on the samples in use."""
-    n = X.shape[-1]
     rows = X.flatten(-3, -2)
     if weight is not None and rows.shape[0] == weight.shape[:-2].numel():
         rows = rows * (weight > 0).reshape(rows.shape[0], -1, 1)
     scale = rows.abs().amax(-2)
+    _, upper = torch.linalg.qr(rows / torch.where(scale > 0, scale, 1.0).unsqueeze(-2))
+    refuse_dependent(upper, scale, rows.shape[-2])
+    to_coef = torch.linalg.inv(upper) / scale.unsqueeze(-1)
+    return torch.matmul(X.flatten(-3, -2), to_coef).unflatten(-2, X.shape[-3:-1]), to_coef
+
+
+def refuse_dependent(upper: Float[Tensor, "*batch k n"], scale: Float[Tensor, "*batch n"], num_rows: int) -> None:
+    """Refuse columns that are linearly dependent, by the R of a QR decomposition of them.
+
+    Args:
+        upper: R of the columns divided by ``scale``.
+        scale: of the columns; 0 of one that is 0 on every row.
+        num_rows: how many rows there are.
+
+    Raises:
+        RankDeficientError: they are, or one is 0.
+    """
     if (scale == 0).any():
         column = int((scale == 0).nonzero()[0, -1])
         raise RankDeficientError(f"Column {column} of `X` is zero on every sample in use; remove it.")
-    _, upper = torch.linalg.qr(rows / scale.unsqueeze(-2))
+    n = upper.shape[-1]
     _, singular, right = torch.linalg.svd(upper)
-    tolerance = max(rows.shape[-2], n) * torch.finfo(X.dtype).eps
+    tolerance = max(num_rows, n) * torch.finfo(upper.dtype).eps
     # more unknowns than rows leaves fewer singular values than columns
     ratio = singular[..., -1] / singular[..., 0] if singular.shape[-1] == n else singular.new_zeros(())
     if (ratio <= tolerance).any():
@@ -426,5 +446,3 @@ def _orthonormalise(X: Tensor, weight: Tensor | None) -> tuple[Tensor, Tensor]:
             f"Expected `X` of full column rank but columns {involved} are linearly dependent "
             f"(singular value ratio {float(ratio.min()):.1e}); remove one of them."
         )
-    to_coef = torch.linalg.inv(upper) / scale.unsqueeze(-1)
-    return torch.matmul(X.flatten(-3, -2), to_coef).unflatten(-2, X.shape[-3:-1]), to_coef

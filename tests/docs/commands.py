@@ -6,6 +6,7 @@ import re
 import runpy
 import shlex
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -110,6 +111,10 @@ def run(words: list[str], folder: Path) -> None:
             run_mkc(arguments)
         case ["python", script, *arguments] if script.startswith("examples/"):
             run_example(script, arguments, folder)
+        case ["torchrun", *arguments]:
+            words = [sys.executable, "-m", "torch.distributed.run", *arguments]
+            done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+            assert done.returncode == 0, f"torchrun {shlex.join(arguments)}:\n{done.stdout}\n{done.stderr}"
         case ["cp", source, target]:
             shutil.copy(folder / source, folder / target)
         case _:

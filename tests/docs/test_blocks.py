@@ -26,6 +26,10 @@ FOUND = {
 """What the diagnoses of a page find first in the tables that were made for it, by the name that the page gives them."""
 
 
+NEEDS = {"large_data": "pyarrow"}
+"""Packages that a page needs beside those of all."""
+
+
 @pytest.fixture(scope="module")
 def examples(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tables")
@@ -60,6 +64,8 @@ def run_shell(block, folder):
 
 @pytest.mark.parametrize("page", WITH_BLOCKS, ids=lambda page: page.stem)
 def test_every_block_of_a_page_runs(page, folder):
+    if page.stem in NEEDS:
+        pytest.importorskip(NEEDS[page.stem])
     names = {"__name__": page.stem}
     for block in blocks(page):
         print(f"{block}:")  # shown where it fails

@@ -19,6 +19,7 @@ MANUAL = {
     "diagnose.md",
     "estimators.md",
     "how_it_decides.md",
+    "large_data.md",
     "loss.md",
     "measured.md",
     "own_simulation.md",

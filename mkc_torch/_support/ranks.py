@@ -1,0 +1,144 @@
+"""Processes that work on parts of one problem: sums over all of them, and an error of one that is an error of all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import torch
+from torch import Tensor
+from torch import distributed as dist
+
+if TYPE_CHECKING:
+    from jaxtyping import Float64
+
+__all__ = ["Ranks", "RanksError"]
+
+T = TypeVar("T")
+
+
+class RanksError(RuntimeError):
+    """Another process of the group failed, or is gone."""
+
+
+class Ranks:
+    """The processes of a ``torch.distributed`` group, or this one alone.
+
+    Every method that works does so on all ranks or raises on all: before a result is used the ranks tell one another
+    whether they have one. A process that is gone closes its connections, of which gloo tells the others at once; one
+    that hangs is waited for as long as the group's timeout says, and so is any with nccl.
+
+    Args:
+        group: of ``torch.distributed``; None takes the default group where it is initialised, else this process alone.
+
+    Example:
+        >>> Ranks().sum_of(lambda: torch.ones(2).double(), 2)
+        tensor([1., 1.], dtype=torch.float64)
+    """
+
+    def __init__(self, group: Any = None) -> None:
+        self.group = group
+        self.alone = group is None and not (dist.is_available() and dist.is_initialized())
+        self.size = 1 if self.alone else dist.get_world_size(group)
+        self.rank = 0 if self.alone else dist.get_rank(group)
+        if self.rank < 0:
+            raise ValueError("Expected argument `group` to be one that this process is a member of.")
+
+    def sum_of(self, work: Callable[[], Float64[Tensor, " k"]], length: int) -> Float64[Tensor, " k"]:
+        """The sum over the ranks of what each works out, element by element.
+
+        Args:
+            work: gives float64 numbers.
+            length: how many.
+
+        Raises:
+            RanksError: another rank failed; on a rank that fails, its own error.
+        """
+        if self.alone:
+            return work()
+        # the last number says whether the rank failed, so that one message does
+        flat, error = torch.zeros(length + 1, dtype=torch.float64), None
+        try:
+            flat[:-1] = work()
+        except Exception as caught:
+            flat[-1], error = 1.0, caught
+        with _connected():
+            moved = flat.to(self._device())
+            dist.all_reduce(moved, group=self.group)
+            flat = moved.cpu()
+        if bool(flat[-1] > 0):
+            self._raise(error)
+        return flat[:-1]
+
+    def gathered(self, work: Callable[[], T]) -> list[T]:
+        """What every rank works out, in the order of ranks, on each of them.
+
+        Raises:
+            RanksError: another rank failed; on a rank that fails, its own error.
+        """
+        if self.alone:
+            return [work()]
+        mine, error = None, None
+        try:
+            mine = work()
+        except Exception as caught:
+            error = caught
+        found: list[Any] = [None] * self.size
+        with _connected():
+            dist.all_gather_object(found, (mine, _told(error)), group=self.group)
+        self._raise_first(error, [message for _, message in found])
+        return [value for value, _ in found]
+
+    def from_first(self, work: Callable[[], T]) -> T:
+        """What rank 0 works out, on each rank: bit for bit the same whatever their processors are.
+
+        Raises:
+            RanksError: rank 0 failed; there, its own error.
+        """
+        if self.alone:
+            return work()
+        result, error = None, None
+        if self.rank == 0:
+            try:
+                result = work()
+            except Exception as caught:
+                error = caught
+        box = [(result, _told(error))]
+        source = 0 if self.group is None else dist.get_global_rank(self.group, 0)
+        with _connected():
+            dist.broadcast_object_list(box, src=source, group=self.group)
+        self._raise_first(error, [box[0][1]])
+        return box[0][0]  # type: ignore[return-value]
+
+    def _device(self) -> torch.device:
+        backend = str(dist.get_backend(self.group))
+        return torch.device("cuda", torch.cuda.current_device()) if backend == "nccl" else torch.device("cpu")
+
+    def _raise(self, error: Exception | None) -> None:
+        messages: list[Any] = [None] * self.size
+        with _connected():
+            dist.all_gather_object(messages, _told(error), group=self.group)
+        self._raise_first(error, messages)
+
+    def _raise_first(self, error: Exception | None, messages: list[str | None]) -> None:
+        if error is not None:
+            raise error
+        for rank, message in enumerate(messages):
+            if message is not None:
+                raise RanksError(f"Rank {rank} failed, and so no rank goes on: {message}")
+
+
+def _told(error: Exception | None) -> str | None:
+    return None if error is None else f"{type(error).__name__}: {error}"
+
+
+@contextmanager
+def _connected() -> Iterator[None]:
+    try:
+        yield
+    except RuntimeError as error:
+        raise RanksError(
+            "Another process of the group is gone, or did not answer within the group's timeout; its own output says "
+            f"why. The message was: {str(error).splitlines()[0]}"
+        ) from error

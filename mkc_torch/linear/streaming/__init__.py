@@ -1,0 +1,15 @@
+"""Regression on more rows than memory holds, over blocks that come again in every pass, on one machine or many."""
+
+from mkc_torch._support.ranks import RanksError
+from mkc_torch.linear.streaming.regression import StreamChangedError, StreamedMKCRegression
+from mkc_torch.linear.streaming.sources import MemmapBatches, ParquetBatches, from_memmap, from_parquet
+
+__all__ = [
+    "MemmapBatches",
+    "ParquetBatches",
+    "RanksError",
+    "StreamChangedError",
+    "StreamedMKCRegression",
+    "from_memmap",
+    "from_parquet",
+]

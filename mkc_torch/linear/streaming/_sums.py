@@ -1,0 +1,296 @@
+"""Sums over rows that the likelihood, its gradient and its Hessian are made of: what one pass works out.
+
+With ``w = exp(-κ z² / 2)`` the energy is ``(1 - w) / κ``, and each of its derivatives by κ and log d is a combination
+of the sums of 1, w, w r² and w r⁴. So a pass has a handful of operations on each residual r and one on each row.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from mkc_torch.density.fit import energy_derivatives
+from mkc_torch.linear.streaming._blocks import Block, Shape, blocks
+from mkc_torch.linear.summary import LIGHT
+
+if TYPE_CHECKING:
+    from jaxtyping import Float64
+    from torch import Tensor
+
+__all__ = ["Extremes", "Point", "Report", "Slopes", "range_pass", "report_pass", "slopes_pass"]
+
+LEAST_KAPPA = 1e-3
+"""1/σ² below which the derivatives by it are taken term by term: as differences of sums they would lose more than six
+of sixteen digits."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """Where a pass is made: coefficients, κ = 1/σ² and d of each channel.
+
+    ``to_basis`` turns the columns, block by block, where they are so nearly dependent that sums of their products
+    would be of no use; the coefficients then are those of the columns it makes.
+    """
+
+    coef: Float64[np.ndarray, " n"]
+    kappa: Float64[np.ndarray, " m"]
+    d: Float64[np.ndarray, " m"]
+    to_basis: Float64[np.ndarray, "n n"] | None = None
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """Sums over rows at a point, of each channel, as views of one flat tensor.
+
+    Attributes:
+        rows: their number, a scalar.
+        residual: of the weighted residuals, by which the rows are known again, (m,).
+        energy, first, second: of the energy and of what its first and second derivatives by κ are, (m,).
+        qw, q2w: of w z²/2 and w z⁴/4, (m,).
+        score: of w r x, (m, n).
+        cubed: of w r³ x, (m, n); 0 unless the curvature is worked out.
+        gram: of w (1 - κ z²) x xᵀ, (m, n, n); 0 unless the curvature is worked out.
+    """
+
+    rows: Tensor
+    residual: Tensor
+    energy: Tensor
+    first: Tensor
+    second: Tensor
+    qw: Tensor
+    q2w: Tensor
+    score: Tensor
+    cubed: Tensor
+    gram: Tensor
+
+    @staticmethod
+    def length(shape: Shape) -> int:
+        return 1 + shape.m * (6 + 2 * shape.n + shape.n**2)
+
+    @staticmethod
+    def of(flat: Float64[Tensor, " k"], shape: Shape) -> Slopes:
+        m, n = shape.m, shape.n
+        rows, channels, score, cubed, gram = flat.split([1, 6 * m, m * n, m * n, m * n * n])
+        residual, energy, first, second, qw, q2w = channels.view(6, m).unbind()
+        return Slopes(
+            rows=rows[0],
+            residual=residual,
+            energy=energy,
+            first=first,
+            second=second,
+            qw=qw,
+            q2w=q2w,
+            score=score.view(m, n),
+            cubed=cubed.view(m, n),
+            gram=gram.view(m, n, n),
+        )
+
+
+def slopes_pass(batches: Iterable[Any], shape: Shape, point: Point, *, curvature: bool) -> Float64[Tensor, " k"]:
+    """The sums of :class:`Slopes` over this rank's rows, flat.
+
+    Args:
+        batches: of this rank.
+        shape: of every batch.
+        point: where.
+        curvature: work out also what the Hessian is made of, which takes two to three times as long.
+    """
+    adding = _Adding(shape, point, curvature=curvature)
+    for block in _in_basis(batches, shape, point):
+        adding.add(block)
+    return torch.from_numpy(adding.flat)
+
+
+class _Adding:
+    """The sums of a pass while they grow, and memory for what is worked out of a block: new memory for each operation
+    would take as long as the operations."""
+
+    def __init__(self, shape: Shape, point: Point, *, curvature: bool, report: bool = False) -> None:
+        self.flat = np.zeros(Slopes.length(shape))
+        self.meat, self.light, self._report = np.zeros((shape.n, shape.n)), 0, report
+        into = Slopes.of(torch.from_numpy(self.flat), shape)
+        self._channels = self.flat[1 : 1 + 6 * shape.m].reshape(6, shape.m)
+        self._score, self._cubed, self._gram = (one.numpy() for one in (into.score, into.cubed, into.gram))
+        self._point, self._curvature = point, curvature
+        self._space = np.empty((5 + 2 * shape.n, 0))
+
+    def add(self, block: Block) -> None:
+        m, n, count = block.X.shape
+        if count > self._space.shape[1]:
+            self._space = np.empty((5 + 2 * n, count))
+        self.flat[0] += count
+        for c in range(m):
+            self._add_channel(c, block.X[c], block.Y[c], None if block.weight is None else block.weight[c])
+        if self._report:
+            score = self._space[-n:, :count]
+            self.meat += np.matmul(score, score.T)
+
+    def _add_channel(
+        self,
+        c: int,
+        x: Float64[np.ndarray, "n B"],
+        y: Float64[np.ndarray, " B"],
+        weight: Float64[np.ndarray, " B"] | None,
+    ) -> None:
+        kappa, inverse = float(self._point.kappa[c]), float(self._point.d[c]) ** -2
+        space = self._space[:, : len(y)]
+        r, r2, w, s, s3 = space[:5]
+        np.matmul(self._point.coef, x, out=r)
+        np.subtract(y, r, out=r)
+        np.multiply(r, r, out=r2)
+        if kappa >= LEAST_KAPPA:
+            energy = _few_terms(r2, weight, kappa, inverse, w)
+            first = second = math.nan
+        else:
+            energy, first, second = _all_terms(r, weight, kappa, inverse, w)
+        np.multiply(w, r, out=s)
+        qw, q2w = 0.5 * inverse * float(np.dot(s, r)), 0.0
+        self._score[c] += np.matmul(x, s)
+        if self._curvature:
+            np.multiply(s, r2, out=s3)
+            q2w = 0.25 * inverse**2 * float(np.dot(s3, r))
+            self._cubed[c] += np.matmul(x, s3)
+            products = space[5 : 5 + len(x)]
+            if self._report:
+                self._add_score(c, np.multiply(x, s * inverse, out=products), r2)
+            # the curvature's weight takes the place of r²
+            r2 *= -kappa * inverse
+            r2 += 1.0
+            r2 *= w
+            self._gram[c] += np.matmul(np.multiply(x, r2, out=products), x.T)
+        if kappa >= LEAST_KAPPA:
+            first = (energy - qw) / kappa
+            second = (2.0 * first - q2w) / kappa
+        residual = float(r.sum()) if weight is None else float(np.dot(weight, r))
+        self._channels[:, c] += (residual, energy, first, second, qw, q2w)
+
+    def _add_score(self, c: int, score: Float64[np.ndarray, "n B"], r2: Float64[np.ndarray, " B"]) -> None:
+        """Each row's score, whose products with itself are summed when all its channels are in it."""
+        whole = self._space[-len(score) :, : score.shape[1]]
+        np.copyto(whole, score) if c == 0 else np.add(whole, score, out=whole)
+        exponent = 0.5 * float(self._point.kappa[c] / self._point.d[c] ** 2)
+        self.light += int(np.count_nonzero(r2 > -math.log(LIGHT) / exponent)) if exponent > 0.0 else 0
+
+
+def _few_terms(
+    r2: Float64[np.ndarray, " B"],
+    weight: Float64[np.ndarray, " B"] | None,
+    kappa: float,
+    inverse: float,
+    w: Float64[np.ndarray, " B"],
+) -> float:
+    """The sum of the energy; ``w`` gets the kernel's weight times the sample's."""
+    np.multiply(r2, -0.5 * kappa * inverse, out=w)
+    np.exp(w, out=w)
+    if weight is not None:
+        w *= weight
+    total = len(w) if weight is None else float(weight.sum())
+    return (total - float(w.sum())) / kappa
+
+
+def _all_terms(
+    r: Float64[np.ndarray, " B"],
+    weight: Float64[np.ndarray, " B"] | None,
+    kappa: float,
+    inverse: float,
+    w: Float64[np.ndarray, " B"],
+) -> tuple[float, float, float]:
+    """The sums of the energy and of its first and second derivative by κ; ``w`` gets the weights as above."""
+    own = np.ones_like(w) if weight is None else weight
+    if kappa > 0.0:
+        error, share = (torch.from_numpy(np.ascontiguousarray(one)).unsqueeze(-1) for one in (r, own))
+        at = (torch.tensor([one], dtype=torch.float64) for one in (kappa, -0.5 * math.log(inverse)))
+        found = energy_derivatives(error, share, *at)
+        np.exp(np.multiply(r * r, -0.5 * kappa * inverse, out=w), out=w)
+        w *= own
+        return float(found.value), -float(found.kappa), float(found.kappa_kappa)
+    # capped where its cube overflows
+    q = np.minimum(np.multiply(r * r, 0.5 * inverse, out=w), 1e100, out=w)
+    own_q = own * q
+    energy, first = float(own_q.sum()), 0.5 * float(np.dot(own_q, q))
+    own_q *= q
+    second = float(np.dot(own_q, q)) / 3.0
+    w[:] = own
+    return energy, first, second
+
+
+def _in_basis(batches: Iterable[Any], shape: Shape, point: Point) -> Iterator[Block]:
+    """The blocks of a pass, their columns turned where the point says so."""
+    for _, block in blocks(batches, shape):
+        if point.to_basis is not None:
+            block = replace(block, joined=np.concatenate([np.matmul(point.to_basis.T, block.X), block.Y[:, None]], 1))
+        yield block
+
+
+@dataclass(frozen=True)
+class Extremes:
+    """The residuals of rows that count, of one rank or of all.
+
+    Attributes:
+        rows: their number.
+        residual: sum of the weighted residuals, (m,).
+        high, low: the largest and the smallest residual of positive weight, (m,).
+    """
+
+    rows: int
+    residual: Float64[np.ndarray, " m"]
+    high: Float64[np.ndarray, " m"]
+    low: Float64[np.ndarray, " m"]
+
+    def with_others(self, other: Extremes) -> Extremes:
+        return Extremes(
+            self.rows + other.rows,
+            self.residual + other.residual,
+            np.maximum(self.high, other.high),
+            np.minimum(self.low, other.low),
+        )
+
+
+def range_pass(batches: Iterable[Any], shape: Shape, point: Point) -> Extremes:
+    """The extremes of this rank's residuals; ``kappa`` and ``d`` of the point are of no use here."""
+    nothing = np.full(shape.m, np.inf)
+    found = Extremes(0, np.zeros(shape.m), -nothing, nothing)
+    for block in _in_basis(batches, shape, point):
+        residual = block.Y - np.matmul(point.coef, block.X)
+        used: Any = True if block.weight is None else block.weight > 0
+        weighted = residual if block.weight is None else residual * block.weight
+        high, low = residual.max(1, initial=-np.inf, where=used), residual.min(1, initial=np.inf, where=used)
+        found = found.with_others(Extremes(residual.shape[1], weighted.sum(1), high, low))
+    return found
+
+
+@dataclass(frozen=True)
+class Report:
+    """Sums of the last pass, made at the solution.
+
+    Attributes:
+        slopes: as in every pass, with the curvature.
+        meat: of the products of each row's score with itself, summed over its channels, (n, n).
+        light: values of a weight below 0.1, a scalar.
+    """
+
+    slopes: Slopes
+    meat: Tensor
+    light: Tensor
+
+    @staticmethod
+    def length(shape: Shape) -> int:
+        return Slopes.length(shape) + shape.n**2 + 1
+
+    @staticmethod
+    def of(flat: Float64[Tensor, " k"], shape: Shape) -> Report:
+        slopes, meat, light = flat.split([Slopes.length(shape), shape.n**2, 1])
+        return Report(Slopes.of(slopes, shape), meat.view(shape.n, shape.n), light[0])
+
+
+def report_pass(batches: Iterable[Any], shape: Shape, point: Point) -> Float64[Tensor, " k"]:
+    """The sums of :class:`Report` over this rank's rows, flat."""
+    adding = _Adding(shape, point, curvature=True, report=True)
+    for block in _in_basis(batches, shape, point):
+        adding.add(block)
+    return torch.from_numpy(np.concatenate([adding.flat, adding.meat.reshape(-1), [adding.light]]))

@@ -1,0 +1,446 @@
+"""Streamed MKC-EM: the numbers of memory, whatever the batches; restarts; what is refused."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, TensorDataset
+
+from mkc_torch.linear import MKCRegression, NotFittedError, RankDeficientError
+from mkc_torch.linear.streaming import StreamChangedError, StreamedMKCRegression, _blocks, from_memmap, regression
+from mkc_torch.linear.streaming._blocks import Block, Shape
+from mkc_torch.linear.streaming._reservoir import Reservoir, merged
+from mkc_torch.linear.streaming._rough import rough_pass
+from mkc_torch.linear.streaming._sums import Point, Slopes, slopes_pass
+
+
+def problem(
+    seed: int,
+    N: int = 400,
+    n: int = 3,
+    m: int = 1,
+    *,
+    outliers: float = 0.2,
+    leverage: bool = False,
+    offset: float = 0.0,
+    sort: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """X with an intercept and Y = X 1 + 0.5 noise, a share of which lies up to 20 higher."""
+    g = torch.Generator().manual_seed(seed)
+    X = torch.randn(N, m, n, generator=g, dtype=torch.float64)
+    X[..., 0] = 1.0
+    X[..., 1:] += offset
+    Y = X.sum(-1) + 0.5 * torch.randn(N, m, generator=g, dtype=torch.float64)
+    bad = int(outliers * N)
+    Y[:bad] += 20.0 * torch.rand(bad, m, generator=g, dtype=torch.float64)
+    if leverage:
+        X[:bad, :, 1:] += 10.0
+    if not sort:
+        order = torch.randperm(N, generator=g)
+        X, Y = X[order], Y[order]
+    return (X, Y) if m > 1 else (X[:, 0], Y[:, 0])
+
+
+def cut(*tensors: Tensor, rows: int = 97) -> list[tuple[Tensor, ...]]:
+    return list(zip(*(t.split(rows) for t in tensors), strict=True))
+
+
+def in_memory(X: Tensor, Y: Tensor, weight: Tensor | None = None, **arguments) -> MKCRegression:
+    """The fit of memory, polished to where the gradient is rounding, as it is where a derivative is asked for."""
+    fit = MKCRegression(**arguments).fit(X.clone().requires_grad_(), Y, weight)
+    for name in ("coef_", "sigma_", "d_", "bound_", "log_likelihood_", "covariance_"):
+        setattr(fit, name, getattr(fit, name).detach())
+    return fit
+
+
+def assert_same(fit: StreamedMKCRegression, memory: MKCRegression, tol: float = 1e-8) -> None:
+    assert fit.converged_
+    assert fit.coef_.dtype == torch.float64
+    # the standard error that one row has: d, but for what columns have in common
+    unit = memory.standard_error_ * memory.dof_.sqrt()
+    torch.testing.assert_close(fit.coef_ / unit, memory.coef_ / unit, rtol=0, atol=tol)
+    torch.testing.assert_close(fit.d_, memory.d_, rtol=tol, atol=0)
+    torch.testing.assert_close(fit.sigma_.pow(-2), memory.sigma_.pow(-2), rtol=0, atol=tol)
+    torch.testing.assert_close(fit.bound_, memory.bound_, rtol=tol, atol=0)
+    torch.testing.assert_close(fit.log_likelihood_, memory.log_likelihood_, rtol=tol, atol=0)
+    size = memory.covariance_.abs().max()
+    torch.testing.assert_close(fit.covariance_ / size, memory.covariance_ / size, rtol=0, atol=1e-6)
+    assert fit.dof_ == memory.dof_
+
+
+KINDS = {
+    "clean": {"outliers": 0.0},
+    "few outliers": {"outliers": 0.05, "n": 5},
+    "many outliers": {"outliers": 0.4},
+    "leverage": {"outliers": 0.1, "leverage": True},
+    "sorted": {"sort": True},
+    "two channels": {"m": 2},
+    "three channels": {"m": 3, "n": 4, "outliers": 0.3},
+    "offset": {"offset": 1e3},
+    "nearly dependent": {"offset": 1e6},
+}
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_numbers_of_memory(kind, seed):
+    X, Y = problem(seed, **KINDS[kind])
+    fit = StreamedMKCRegression().fit(cut(X, Y))
+    assert_same(fit, in_memory(X, Y))
+    assert fit.n_rows_ == fit.n_pilot_ == len(X)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("m", [1, 2])
+def test_the_numbers_of_memory_with_weights(m, seed):
+    X, Y = problem(seed, m=m)
+    weight = torch.rand(Y.shape if seed else Y.shape[:1], generator=torch.Generator().manual_seed(seed)).double()
+    weight[::7] = 0.0
+    memory = in_memory(X, Y, weight)
+    assert_same(StreamedMKCRegression().fit(cut(X, Y, weight)), memory)
+
+
+def test_a_weight_of_two_is_two_rows():
+    X, Y = problem(0)
+    weight = 1.0 + torch.arange(len(X)).double() % 2
+    index = torch.arange(len(X)).repeat_interleave(weight.long())
+    bound = 30.0
+    one = StreamedMKCRegression(bound=bound).fit(cut(X, Y, weight))
+    other = StreamedMKCRegression(bound=bound).fit(cut(X[index], Y[index]))
+    torch.testing.assert_close(one.coef_, other.coef_, rtol=1e-9, atol=0)
+    torch.testing.assert_close(one.log_likelihood_, other.log_likelihood_, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", ["clean", "many outliers", "leverage", "sorted", "two channels"])
+def test_the_numbers_of_memory_on_its_domain_where_the_sample_is_a_part(kind, seed):
+    X, Y = problem(seed, N=6000, **KINDS[kind])
+    fit = StreamedMKCRegression(pilot=500).fit(cut(X, Y, rows=1000))
+    assert fit.n_pilot_ == 500
+    assert_same(fit, in_memory(X, Y, bound=fit.bound_))
+    # and the domain is that of memory, but for what a sample knows less of the rough fit
+    torch.testing.assert_close(fit.bound_, MKCRegression().fit(X, Y).bound_, rtol=0.1, atol=0)
+
+
+def test_the_domain_covers_the_residuals_of_all_rows():
+    X, Y = problem(0, N=5000)
+    Y[2345] += 1000.0
+    fit = StreamedMKCRegression(pilot=200).fit(cut(X, Y, rows=1000))
+    residual = Y - X @ fit.coef_
+    assert 2.0 * float(fit.bound_) >= float(residual.max() - residual.min()) * 0.999
+
+
+@pytest.mark.parametrize(
+    "given", [{"sigma": 2.0}, {"sigma": math.inf}, {"d": 0.4}, {"bound": 25.0}, {"start": "s"}, {"start": [1.0] * 3}]
+)
+def test_what_is_given_is_given_to_both(given):
+    X, Y = problem(3)
+    tensors = {k: torch.tensor(v).double() if isinstance(v, list) else v for k, v in given.items()}
+    assert_same(StreamedMKCRegression(**given).fit(cut(X, Y)), in_memory(X, Y, **tensors))
+
+
+def test_float32_rows_are_summed_in_float64():
+    X, Y = (t.float() for t in problem(1, N=3000))
+    fit = StreamedMKCRegression().fit(cut(X, Y, rows=500))
+    assert_same(fit, in_memory(X.double(), Y.double()))
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_a_pass_in_float32_is_good_to_six_digits(weighted):
+    X, Y = problem(0, N=2000, m=2)
+    arrays = [t.float() for t in (X, Y, *([torch.rand(2000).double()] if weighted else []))]
+    shape = Shape(2, 3, False, weighted)
+    point = Point(np.array([1.1, 0.9, 1.0]), np.array([0.2, 0.3]), np.array([0.6, 0.5]))
+    rough = Slopes.of(rough_pass(cut(*arrays, rows=300), shape, point), shape)
+    exact = Slopes.of(slopes_pass(cut(*arrays), shape, point, curvature=False), shape)
+    assert rough.rows == exact.rows
+    for name in ("residual", "energy", "first", "qw", "score"):
+        one, other = getattr(rough, name), getattr(exact, name)
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5 * float(other.abs().max()), msg=name)
+
+
+def test_the_first_steps_of_float32_data_are_made_in_float32(monkeypatch):
+    X, Y = (t.float() for t in problem(1, N=6000))
+    calls = []
+    monkeypatch.setattr(regression, "rough_pass", lambda *given: calls.append(given) or rough_pass(*given))
+    fit = StreamedMKCRegression(pilot=1000).fit(cut(X, Y, rows=1000))
+    assert calls
+    assert_same(fit, in_memory(X.double(), Y.double(), bound=fit.bound_))
+    calls.clear()
+    StreamedMKCRegression(pilot=1000).fit(cut(X, 1e4 + Y, rows=1000))  # residuals are the last digits
+    StreamedMKCRegression(pilot=1000).fit(cut(X.double(), Y.double(), rows=1000))
+    assert not calls
+
+
+def test_an_exact_fit_of_most_rows():
+    X, Y = problem(0, outliers=0.0)
+    Y = X @ torch.tensor([1.0, 2.0, 3.0]).double()
+    Y[::4] += 5.0
+    fit = StreamedMKCRegression().fit(cut(X, Y))
+    assert fit.exact_fit_
+    torch.testing.assert_close(fit.coef_, torch.tensor([1.0, 2.0, 3.0]).double(), rtol=1e-10, atol=0)
+
+
+# --- batches
+
+
+def test_neither_the_size_of_batches_nor_of_blocks_matters(monkeypatch):
+    X, Y = problem(2, N=3000)
+    one = StreamedMKCRegression(pilot=300).fit(cut(X, Y, rows=3000))
+    monkeypatch.setattr(_blocks, "BLOCK_VALUES", 400)
+    for rows in (7, 1000):
+        other = StreamedMKCRegression(pilot=300).fit(cut(X, Y, rows=rows))
+        torch.testing.assert_close(one.coef_, other.coef_, rtol=1e-10, atol=0)
+        torch.testing.assert_close(one.covariance_, other.covariance_, rtol=1e-8, atol=1e-15)
+        assert torch.allclose(one.bound_, other.bound_, rtol=1e-12)
+
+
+def test_a_loader_that_shuffles():
+    X, Y = problem(4, N=2000)
+    loader = DataLoader(TensorDataset(X, Y), batch_size=300, shuffle=True, generator=torch.Generator().manual_seed(0))
+    fit = StreamedMKCRegression(pilot=300, bound=20.0).fit(loader)
+    assert_same(fit, in_memory(X, Y, bound=20.0))
+
+
+def test_every_row_of_a_reservoir_is_as_likely():
+    rows = np.arange(40.0)
+    counts = np.zeros(40)
+    for seed in range(500):
+        sample = Reservoir(10, seed)
+        for part in np.split(rows, [3, 25]):
+            sample.add(Block(np.stack([part, part])[None], None))
+        drawn = sample.drawn()
+        assert (np.diff(drawn.numbers) > 0).all()
+        assert (drawn.rows[:, 0] == drawn.numbers).all()
+        counts[drawn.numbers] += 1
+    # 125 of 500 draws each, with a standard deviation of 9.7
+    assert abs(counts - 125).max() < 4.5 * 9.7
+
+
+def test_samples_of_parts_are_the_sample_of_all():
+    rows = np.arange(100.0)
+    whole = Reservoir(20, seed=1)
+    whole.add(Block(np.stack([rows, rows])[None], None))
+    parts = []
+    for first in (0, 30):
+        part = rows[first : 30 if first == 0 else None]
+        sample = Reservoir(20, seed=1, first=first)
+        sample.add(Block(np.stack([part, part])[None], None))
+        parts.append(sample.drawn())
+    assert (merged(parts, 20).numbers == whole.drawn().numbers).all()
+
+
+# --- what follows
+
+
+def test_predictions_weights_intervals_and_summary():
+    X, Y = problem(0)
+    fit, memory = StreamedMKCRegression().fit(cut(X, Y)), in_memory(X, Y)
+    torch.testing.assert_close(fit.predict(X), X @ fit.coef_)
+    torch.testing.assert_close(fit.weights(X, Y), memory.weights_.detach(), rtol=0, atol=1e-8)
+    torch.testing.assert_close(fit.confidence_interval(), memory.confidence_interval().detach(), rtol=1e-6, atol=1e-9)
+    mine, other = fit.summary(), memory.summary()
+    assert (mine.num_values, mine.num_light, mine.kind) == (other.num_values, other.num_light, "sandwich")
+    assert (fit.history_.diff() <= 1e-12).all()
+    with pytest.raises(AttributeError, match=r"weights\(X, Y\)"):
+        fit.weights_  # noqa: B018
+    with pytest.raises(ValueError, match="Expected argument `Y` of shape"):
+        fit.weights(X, Y[:-1])
+
+
+def test_parameters_are_shown_and_set():
+    fit = StreamedMKCRegression(pilot=100)
+    assert "pilot=100" in repr(fit)
+    assert fit.set_params(pilot=200).get_params()["pilot"] == 200
+    with pytest.raises(NotFittedError, match=r"fit\(batches\)"):
+        fit.coef_  # noqa: B018
+
+
+# --- restarts
+
+
+class Interrupted(list):
+    """Batches that stop in the middle of a pass."""
+
+    def __init__(self, batches, passes):
+        super().__init__(batches)
+        self.left = passes
+
+    def __iter__(self):
+        self.left -= 1
+        for number, batch in enumerate(super().__iter__()):
+            if self.left < 0 and number == 2:
+                raise KeyboardInterrupt
+            yield batch
+
+
+@pytest.mark.parametrize("passes", range(1, 6))
+def test_an_interrupted_fit_goes_on(passes, tmp_path):
+    X, Y = problem(5, N=2000)
+    batches, path = cut(X, Y), tmp_path / "fit.pt"
+    whole = StreamedMKCRegression(pilot=200).fit(batches)
+    assert whole.n_iter_ > 6
+    broken = StreamedMKCRegression(pilot=200)
+    with pytest.raises(KeyboardInterrupt):
+        broken.fit(Interrupted(batches, passes), checkpoint=path)
+    counted = Interrupted(batches, 1000)
+    again = StreamedMKCRegression(pilot=200).fit(counted, checkpoint=path)
+    assert 1000 - counted.left == whole.n_iter_ - passes
+    taken_over = StreamedMKCRegression(pilot=200)
+    taken_over.load_state_dict(broken.state_dict())
+    taken_over.fit(batches)
+    for other in (again, taken_over):
+        for name in ("coef_", "sigma_", "d_", "bound_", "covariance_", "history_"):
+            assert torch.equal(getattr(other, name), getattr(whole, name)), name
+        assert other.n_iter_ == whole.n_iter_
+    assert path.stat().st_size < 20_000
+
+
+def test_a_state_goes_on_with_its_own_data_and_parameters_alone(tmp_path):
+    X, Y = problem(5, N=2000)
+    path = tmp_path / "fit.pt"
+    StreamedMKCRegression(pilot=200).fit(cut(X, Y), checkpoint=path)
+    with pytest.raises(StreamChangedError, match="1999, after 2000"):
+        StreamedMKCRegression(pilot=200).fit(cut(X[1:], Y[1:]), checkpoint=path)
+    other = Y.clone()
+    other[7] += 1.0
+    with pytest.raises(StreamChangedError, match="the same values in every pass"):
+        StreamedMKCRegression(pilot=200).fit(cut(X, other), checkpoint=path)
+    with pytest.raises(ValueError, match="every batch like the first, 3 columns without weights"):
+        StreamedMKCRegression(pilot=200).fit(cut(X[:, :2], Y), checkpoint=path)
+    with pytest.raises(ValueError, match="Expected argument `pilot` of the fit that the state is of, 200, but got 300"):
+        StreamedMKCRegression(pilot=300).fit(cut(X, Y), checkpoint=path)
+    path.write_bytes(b"something else")
+    with pytest.raises(ValueError, match="Expected argument `checkpoint` to be a file of a streamed fit"):
+        StreamedMKCRegression(pilot=200).fit(cut(X, Y), checkpoint=path)
+    with pytest.raises(ValueError, match="Expected the state of a streamed fit"):
+        StreamedMKCRegression().load_state_dict({"format": 0})
+    with pytest.raises(NotFittedError):
+        StreamedMKCRegression().state_dict()
+
+
+def test_a_fit_after_another_begins_anew():
+    X, Y = problem(5)
+    fit = StreamedMKCRegression().fit(cut(X, Y))
+    X, Y = problem(6, m=2)
+    assert_same(fit.fit(cut(X, Y)), in_memory(X, Y))
+
+
+# --- refusals
+
+
+class Changing:
+    """Batches that are others in each pass."""
+
+    def __init__(self, *passes):
+        self.passes = itertools.cycle(passes)
+
+    def __iter__(self):
+        return iter(next(self.passes))
+
+
+def test_a_stream_that_changes_between_passes():
+    X, Y = problem(0)
+    with pytest.raises(StreamChangedError, match="387, after 400 in the first"):
+        StreamedMKCRegression(bound=30.0).fit(Changing(cut(X, Y), cut(X[:387], Y[:387])))
+    for bound in (None, 30.0):
+        with pytest.raises(StreamChangedError, match="leave out random transforms"):
+            StreamedMKCRegression(bound=bound).fit(Changing(cut(X, Y), cut(X, Y + 0.01)))
+
+
+def test_what_can_be_gone_through_once_is_refused():
+    X, Y = problem(0)
+    with pytest.raises(TypeError, match="used up by one; pass a DataLoader, a list"):
+        StreamedMKCRegression().fit(batch for batch in cut(X, Y))
+    with pytest.raises(TypeError, match="from_memmap"):
+        StreamedMKCRegression().fit(X)
+    with pytest.raises(TypeError, match="an iterable of"):
+        StreamedMKCRegression().fit(3)
+
+
+def test_bad_values_are_named_by_batch_and_row():
+    X, Y = problem(0)
+    for name, where in (("X", X[:, 1]), ("Y", Y)):
+        value, where[210] = where[210].clone(), math.nan
+        with pytest.raises(ValueError, match=f"`{name}` to be finite but got nan in row 16 of batch 2"):
+            StreamedMKCRegression().fit(cut(X, Y))
+        where[210] = value
+    weight = torch.ones(len(X)).double()
+    weight[300] = -1.0
+    with pytest.raises(ValueError, match=r"`weight` to be finite and >= 0 but got -1.0 in row 9 of batch 3"):
+        StreamedMKCRegression().fit(cut(X, Y, weight))
+
+
+def test_batches_that_do_not_fit():
+    X, Y = problem(0)
+    pairs = cut(X, Y)
+    fit = StreamedMKCRegression()
+    with pytest.raises(ValueError, match="3 columns without weights, but got 2 columns without weights in batch 5"):
+        fit.fit([*pairs, (X[:, :2], Y)])
+    with pytest.raises(ValueError, match="3 columns with weights in batch 5"):
+        fit.fit([*pairs, (X, Y, Y.abs())])
+    with pytest.raises(ValueError, match=r"\(400, 3\) and \(399,\) in batch 0"):
+        fit.fit([(X, Y[1:])])
+    with pytest.raises(ValueError, match=r"one channel is Y.squeeze\(-1\)"):
+        fit.fit([(X, Y[:, None])])
+    with pytest.raises(ValueError, match="Expected weights of shape"):
+        fit.fit([(X, Y, Y[1:])])
+    with pytest.raises(TypeError, match="Expected every batch to be"):
+        fit.fit([X, Y])
+    with pytest.raises(TypeError, match="dict of 2 as batch 0"):
+        fit.fit([{"X": X, "Y": Y}])
+    with pytest.raises(TypeError, match="to be real"):
+        fit.fit([(X.to(torch.complex128), Y)])
+    for nothing in ([], [(X[:0], Y[:0])]):
+        with pytest.raises(ValueError, match="to have rows but got none"):
+            fit.fit(nothing)
+    with pytest.raises(ValueError, match="Expected at least 3 values for 3 coefficients"):
+        fit.fit([(X[:2], Y[:2])])
+    with pytest.raises(ValueError, match="weights to be positive somewhere"):
+        fit.fit([(X, Y, torch.zeros_like(Y))])
+    with pytest.raises(ValueError, match="of a magnitude between"):
+        fit.fit([(X, 1e90 * Y)])
+
+
+def test_dependent_columns():
+    X, Y = problem(0, N=3000)
+    with pytest.raises(RankDeficientError, match=r"columns \[1, 3\] are linearly dependent"):
+        StreamedMKCRegression().fit(cut(torch.cat([X, 2.0 * X[:, 1:2]], 1), Y))
+    with pytest.raises(RankDeficientError, match="Column 2 of `X` is zero"):
+        StreamedMKCRegression().fit(cut(X * torch.tensor([1.0, 1.0, 0.0]), Y))
+    rare = torch.zeros(len(X), 1).double()
+    rare[1234] = 1.0
+    with pytest.raises(RankDeficientError, match="raise `pilot`"):
+        StreamedMKCRegression(pilot=100).fit(cut(torch.cat([X, rare], 1), Y))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"pilot": 1}, "`pilot` to be a whole number of at least 2"),
+        ({"max_passes": 3}, "`max_passes` to be a whole number of at least 4"),
+        ({"sigma": 0.01}, "`sigma`"),
+        ({"d": -1.0}, "`d`"),
+        ({"start": "best"}, "`start`"),
+    ],
+)
+def test_arguments_out_of_range(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        StreamedMKCRegression(**arguments)
+
+
+def test_a_fit_that_is_not_given_enough_passes_says_so():
+    X, Y = problem(5, N=2000)
+    fit = StreamedMKCRegression(pilot=50, max_passes=4).fit(cut(X, Y))
+    assert not fit.converged_
+    assert fit.n_iter_ == 4
+    assert torch.isfinite(fit.coef_).all()
+
+
+def test_an_array_in_memory_is_cut_into_batches():
+    X, Y = problem(1)
+    fit = StreamedMKCRegression().fit(from_memmap(X.numpy(), Y.numpy(), rows=33))
+    assert_same(fit, in_memory(X, Y))
