@@ -129,7 +129,10 @@ class SearchSettings(_Stage):
         smaller: scale with the effect over that without, which has to be above this, for the fit without it to hide
             nothing: then the effect is judged by tangents there.
         doubted: nats beyond all draws of noise up to which draws of other plausible noise are asked too.
-        own_noise: leading candidates that are fitted and compared under the pushes that each of them leaves.
+        own_noise: leading candidates that are fitted and compared under the pushes that each of them leaves,
+        behind: but for those whose first fit is so many nats behind the best one
+        behind_share: and this share of what that one gains. Set on a simulated cart and a servo, where they were 90 to
+            430 nats behind in the end.
         stretches: a stretch of the recording is as long as one of so many.
         in_one_stretch: share of an effect's evidence above which it lies in one stretch. If there are bursts of
             outliers elsewhere, the stretch may be another, and the effect is judged without it.
@@ -149,6 +152,8 @@ class SearchSettings(_Stage):
     smaller: float = 0.8
     doubted: float = 25.0
     own_noise: int = 5
+    behind: float = 50.0
+    behind_share: float = 0.5
     stretches: int = 25
     in_one_stretch: float = 0.5
 

@@ -77,8 +77,14 @@ def located_among_pushes(
     fits: Sequence[FittedModel] = ()
     if found.p_value <= level:
         chosen = _chosen(found, ranking, terms, settings.search.own_noise)
-        works = [partial(_own, base, free, terms[number], found, number, declared, settings) for number in chosen]
-        fits = at_once(works, base.model.prepared, [terms[number] for number in chosen])
+        common = base.model.prepared, [terms[number] for number in chosen]
+        first = at_once([partial(_fit_of, base, terms[number], found, number) for number in chosen], *common)
+        chosen, first = _within_reach(chosen, first, [prefer.score_with_shape(fit, base) for fit in first], settings)
+        works = [
+            partial(_own, base, free, terms[number], fit, found.gamma[number], declared, settings)
+            for number, fit in zip(chosen, first, strict=True)
+        ]
+        fits = at_once(works, *common)
         best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer)
         best = between_beside_effects(best, declared, fixed, settings.noise)
     needless = bool(fits) and _needless(base, best, declared, settings)
@@ -147,26 +153,35 @@ def _inside(base: FittedModel, parameters: Tensor) -> Tensor:
     return torch.where(far & (torch.arange(len(parameters)) < own), base.parameters, parameters)
 
 
+def _within_reach(
+    chosen: Sequence[int], fits: Sequence[FittedModel], scores: Sequence[float], settings: Settings
+) -> tuple[list[int], list[FittedModel]]:
+    """Candidates, with their first fits, that are not so far behind the best that they could not come near it."""
+    least = max(scores) - settings.search.behind - settings.search.behind_share * max(max(scores), 0.0)
+    kept = [place for place, score in enumerate(scores) if score >= least]
+    return [chosen[place] for place in kept], [fits[place] for place in kept]
+
+
 def _own(
     base: FittedModel,
     free: FittedModel | None,
     term: Term,
-    found: Profiled,
-    number: int,
+    fit: FittedModel,
+    gamma: Tensor,
     declared: Mapping[str, float],
     settings: Settings,
 ) -> FittedModel:
     """The joint fit of a candidate, under the noise that it leaves.
 
-    Begun under the pushes, and from the free run: what a push has taken over is not always given back.
+    Begun with its first fit under the pushes, and from the free run with the amplitudes of the search: what a push has
+    taken over is not always given back.
     """
     prepared = base.model.prepared
     assert isinstance(prepared, PreparedDynamics)
-    fit = _fit_of(base, term, found, number)
     under = shape_fitted(beside_effects(fit, noise_of(prepared, declared), declared, settings.noise))
     if free is None or not pushed(under):
         return under
-    start = torch.cat([free.parameters, found.gamma[number]])
+    start = torch.cat([free.parameters, gamma])
     tried = [fitted_beside(free, free.model.with_term(term), one) for one in (start, _with_none(free, term))]
     running = shape_fitted(max(tried, key=lambda one: one.log_likelihood))
     left = noise_around(running, declared, settings.noise)

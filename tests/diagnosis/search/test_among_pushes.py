@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from mkc_torch.diagnosis.search.among_pushes import located_among_pushes
+from mkc_torch.diagnosis.search.among_pushes import _within_reach, located_among_pushes
 from mkc_torch.diagnosis.settings import SearchSettings, Settings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.nonlinear import NoFitError
@@ -59,3 +59,23 @@ def test_a_lost_trajectory_is_told(monkeypatch):
     monkeypatch.setattr("mkc_torch.diagnosis.search.among_pushes.profiled", lambda *_: None)
     with pytest.raises(NoFitError, match="trajectory is lost"):
         located(at_the_truth("white", 1))
+
+
+def test_what_is_far_behind_at_first_is_not_fitted_any_further():
+    fits, behind = ("best", "near", "far"), Settings(search=dataclasses.replace(SearchSettings(), behind=50.0))
+    scores = [400.0, 151.0, 149.0]
+    assert _within_reach([7, 3, 5], fits, scores, behind) == ([7, 3], ["best", "near"])
+    # one that gains nothing is no measure of what others have to gain
+    assert _within_reach([7, 3, 5], fits, [-10.0, -59.0, -61.0], behind) == ([7, 3], ["best", "near"])
+
+
+def test_the_one_that_is_left_out_is_still_in_the_ranking():
+    base = swung_in_the_world("slow", drag=0.4).fit
+    strict = dataclasses.replace(FEW, search=dataclasses.replace(FEW.search, behind=0.0, behind_share=0.0))
+    found = located_among_pushes(
+        base, candidates(base, DYNAMICS), level=0.05, surrogates=39, generator=torch.Generator().manual_seed(0),
+        declared={}, fixed={}, settings=strict,
+    )  # fmt: skip
+    assert len(found.compared) == 1
+    assert len({one.number for one in found.ranking}) > 4
+    assert found.ranking[0].gap == 0.0 <= min(one.gap for one in found.ranking[1:])
