@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import runpy
 import shlex
@@ -111,6 +112,10 @@ def run(words: list[str], folder: Path) -> None:
             run_mkc(arguments)
         case ["python", script, *arguments] if script.startswith("examples/"):
             run_example(script, arguments, folder)
+        case ["python", "-m", module, *_] if module.startswith("tests.benchmarks"):
+            # minutes each: here only whether it is there
+            name = f"{module}.__main__" if module == "tests.benchmarks" else module
+            assert callable(importlib.import_module(name).main)
         case ["torchrun", *arguments]:
             words = [sys.executable, "-m", "torch.distributed.run", *arguments]
             done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=120, check=False)

@@ -1,0 +1,56 @@
+"""What the benchmarks measure with: their recordings, and curves that end in time."""
+
+import itertools
+
+import pytest
+import torch
+
+pytest.importorskip("polars")
+pytest.importorskip("matplotlib")
+
+from mkc_torch import Recording
+from tests.benchmarks import diagnosis, sizes
+
+
+def test_quaternions_turn_as_their_matrices_do():
+    to_world = torch.linalg.qr(torch.randn(50, 3, 3, dtype=torch.float64, generator=torch.manual_seed(0)))[0]
+    to_world = to_world * torch.linalg.det(to_world).sign()[:, None, None]
+    w, x, y, z = diagnosis.quaternions(to_world).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    torch.testing.assert_close(torch.stack([torch.stack(row, -1) for row in rows], -2), to_world)
+
+
+def test_a_sensor_is_recorded_at_the_rate_that_is_asked_for(tmp_path):
+    recording = Recording.read(diagnosis.sensor(tmp_path / "a.csv", 10.0, 60.0, 1, attitude=True))
+    assert len(recording) == 600
+    assert float(recording["time"][-1]) == pytest.approx(59.9)
+    field = recording.stack("mag_x", "mag_y", "mag_z")
+    assert bool(((field - field.mean(0)).norm(dim=1) > 20.0).all())
+
+
+def test_rows_of_recordings_that_are_absent_are_left_out(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(diagnosis, "CASES", tmp_path)
+    assert list(diagnosis.rows(tmp_path, "case tanks")) == []
+    assert f"left out: {tmp_path / 'tanks' / 'fit.csv'} is absent" in capsys.readouterr().out
+    (row,) = diagnosis.rows(tmp_path, "three states, 1,000")
+    assert len(Recording.read(row.files[0])) == 1000
+
+
+def test_a_curve_ends_before_the_point_that_would_take_too_long(monkeypatch):
+    clock = itertools.accumulate([0.0, 1.0, 0.0, 4.0, 0.0, 16.0, 0.0, 64.0])
+    monkeypatch.setattr(sizes.time, "process_time", lambda: next(clock))
+    curve = sizes.Curve("squares", "size").measure([1, 2, 4, 8, 16], lambda _: lambda: None, 20.0)
+    assert curve.sizes == [1.0, 2.0, 4.0]
+    assert curve.seconds == [1.0, 4.0, 16.0]
+
+
+def test_the_picture_has_a_panel_for_each_size(tmp_path):
+    curves = [sizes.Curve(f"curve {k}", f"panel {k}", [1.0, 2.0], [0.5, 1.0]) for k in range(5)]
+    sizes.picture(
+        [*curves, sizes.Curve("by the clock", "ranks of one thread", [1.0, 2.0], [2.0, 1.0])], tmp_path / "a.png"
+    )
+    assert (tmp_path / "a.png").stat().st_size > 10_000
