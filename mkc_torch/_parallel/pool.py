@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -61,8 +61,8 @@ def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) -> li
     """
     if len(works) < 2:
         return [work() for work in works]
-    with _begun(works, min(_copies, len(works) - 1), Parcels(known)) as crew:
-        return _results(works, *crew)
+    with _begun(works, min(_copies, len(works) - 1), known) as results:
+        return results()
 
 
 @contextmanager
@@ -72,13 +72,9 @@ def meanwhile(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) ->
     Gives a function for all results, which takes part in what nobody has begun, and waits for the rest; where there is
     no core to spare it does all of it. What is shared goes before: the copies take what is left of the cores.
     """
-    busy = sum(not future.done() for future in _ahead)
-    with _begun(works, min(_copies - busy, len(works)), Parcels(known), _BEHIND) as crew:
-        _ahead.extend(crew.copies)
-        try:
-            yield lambda: _results(works, *crew)
-        finally:
-            _ahead[:] = [one for one in _ahead if one not in crew.copies]
+    busy = sum(not copy.done() for copy in _ahead)
+    with _begun(works, min(_copies - busy, len(works)), known, ahead=True) as results:
+        yield results
 
 
 class Parcels:
@@ -126,50 +122,53 @@ class _Unpacker(pickle.Unpickler):
         return self._known[pid]
 
 
-class _Crew(NamedTuple):
-    """Copies that take part, and where the numbers of works are taken from: whoever reads one has it."""
-
-    parcels: Parcels
-    todo: int
-    copies: list[Future[dict[int, bytes]]]
-
-
 @contextmanager
-def _begun(works: Sequence[object], copies: int, parcels: Parcels, niceness: int = 0) -> Iterator[_Crew]:
-    """Works that copies have begun with; none of them is left in the end."""
+def _begun(
+    works: Sequence[Callable[[], T]], copies: int, known: Iterable[object], *, ahead: bool = False
+) -> Iterator[Callable[[], list[T]]]:
+    """Works that copies have begun with, as a function for all results; no copy is left in the end."""
+    parcels = Parcels(known)
+    if copies < 1:
+        yield lambda: [_done(work, parcels) for work in works]
+        return
+    # whoever reads a number has that work
     todo, entry = os.pipe()
     # the last ones first: works are listed by how likely they are, and the fit of what does not fit takes longest
     os.write(entry, b"".join(number.to_bytes(_BYTES, "big") for number in reversed(range(len(works)))))
     os.close(entry)
+    before = set(multiprocessing.active_children())
+    task = works, todo, parcels, _BEHIND if ahead else 0
+    pool = ProcessPoolExecutor(copies, multiprocessing.get_context("fork"), _begin, task)
+    begun: list[Future[dict[int, bytes]]] = []
     try:
-        if copies < 1:
-            yield _Crew(parcels, todo, [])
-            return
-        before = set(multiprocessing.active_children())
-        pool = ProcessPoolExecutor(
-            copies, multiprocessing.get_context("fork"), _begin, (works, todo, parcels, niceness)
-        )
-        try:
-            yield _Crew(parcels, todo, _forked(pool, copies))
-        finally:
+        begun += _forked(pool, copies)
+        _ahead.extend(begun if ahead else ())
+        yield lambda: _results(works, parcels, todo, begun)
+    finally:
+        with _uninterrupted():
+            _ahead[:] = [copy for copy in _ahead if copy not in begun]
             for child in set(multiprocessing.active_children()) - before:
                 child.kill()
             pool.shutdown()
-    finally:
-        os.close(todo)
+            os.close(todo)
 
 
 def _forked(pool: ProcessPoolExecutor, copies: int) -> list[Future[dict[int, bytes]]]:
-    """What copies will have done; none where there is no memory for another process."""
-    # copies never hear of an interrupt: this process does, and ends them
+    """What copies will have done; nothing where there is no memory for another process."""
+    # copies stay deaf to an interrupt: this process hears of it, and ends them
+    with suppress(OSError), _uninterrupted(), warnings.catch_warnings():
+        # a fork beside threads is deprecated; those of pools and progress bars hold nothing that a copy uses
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return [pool.submit(_take_part) for _ in range(copies)]
+    return []
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """An interrupt comes afterwards."""
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        with warnings.catch_warnings():
-            # a fork beside threads is deprecated; those of pools and progress bars hold nothing that a copy uses
-            warnings.simplefilter("ignore", DeprecationWarning)
-            return [pool.submit(_take_part) for _ in range(copies)]
-    except OSError:
-        return []
+        yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
