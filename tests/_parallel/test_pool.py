@@ -258,13 +258,14 @@ CODE = """
     one_thread()
 
     def alike(one, other):
-        # numbers to rounding, which depends on where an array lies in memory; all else exactly
+        # one process alone repeats a diagnosis to rounding only, and a free run multiplies that by a million;
+        # what a copy did of something else is further away. All that is no number is the same.
         if isinstance(one, dict):
             return one.keys() == other.keys() and all(alike(one[key], other[key]) for key in one)
         if isinstance(one, list):
             return len(one) == len(other) and all(map(alike, one, other))
         if isinstance(one, float):
-            return math.isclose(one, other, rel_tol=1e-9, abs_tol=1e-12)
+            return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-9)
         return one == other
 
     class Cart(Dynamics):
