@@ -48,7 +48,7 @@ def main() -> None:
 
 def _begin(usual: Callable[[int, FrameType | None], object] | int | None) -> None:
     """Make the process the command's own, now that it has loaded what it needs."""
-    from mkc_torch._parallel.fork import allow_copies
+    from mkc_torch._parallel.pool import allow_copies
     from mkc_torch._parallel.processes import keep_modules
 
     keep_modules()

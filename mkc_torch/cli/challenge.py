@@ -81,7 +81,7 @@ def challenge(
     if family is Family.dynamics and duration is not None:
         raise typer.BadParameter("--duration is of the magnetometer's recordings; each system has a length of its own.")
     with loading():
-        from mkc_torch._parallel.fork import allow_copies
+        from mkc_torch._parallel.pool import allow_copies
         from mkc_torch._parallel.processes import cores, keep_memory, one_thread
         from mkc_torch.challenge import run
         from mkc_torch.cli.challenge_jobs import JOBS
@@ -136,7 +136,7 @@ def _in_worlds(
     workers: int | None,
     force: bool,
 ) -> None:
-    from mkc_torch._parallel.fork import allow_copies
+    from mkc_torch._parallel.pool import allow_copies
     from mkc_torch._parallel.processes import cores, keep_memory, one_thread
     from mkc_torch.challenge.worlds import run
     from mkc_torch.cli.challenge_jobs import diagnose_in_world

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mkc_torch._parallel.early_import import load_early
 from mkc_torch._support.files import claim_folder, write_atomically
 from mkc_torch.cli.console import FAILURES, Look, folder_removed_on_failure, sentence_of, with_unit
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request
@@ -53,8 +52,6 @@ def diagnose_file(
         claim_folder(folder, overwrite=request.force, files=WRITTEN)
     except Exception as error:
         return [_failed(path, "", error)]
-    if request.report:
-        load_early("matplotlib.figure")
     with folder_removed_on_failure(folder):
         parts, outcomes = list(_parts(recording, simulation, folder)), []
         for number, (label, part, place) in enumerate(parts, start=1):

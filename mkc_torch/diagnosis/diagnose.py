@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from mkc_torch._parallel.fork import meanwhile, shared
+from mkc_torch._parallel.pool import meanwhile, shared
 from mkc_torch.diagnosis.arguments import (
     check_numbers,
     checked_between,

@@ -9,7 +9,7 @@ from functools import partial
 
 import torch
 
-from mkc_torch._parallel.fork import meanwhile
+from mkc_torch._parallel.pool import meanwhile
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
 from mkc_torch.diagnosis.evidence.simpler_form import simplified
 from mkc_torch.diagnosis.evidence.unrecorded_cause import course_without, located_cause

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._parallel.fork import shared
+from mkc_torch._parallel.pool import shared
 from mkc_torch.diagnosis.linearised.linear_search import Gains, LinearSearch
 from mkc_torch.diagnosis.linearised.tangents import AT_ONCE, Slow, Tangents, in_blocks
 from mkc_torch.diagnosis.model.joint import JointModel

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-from mkc_torch._parallel.fork import shared
+from mkc_torch._parallel.pool import shared
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.simulation.protocol import PreparedSimulation
 

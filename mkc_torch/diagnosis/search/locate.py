@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from mkc_torch._parallel.fork import meanwhile
+from mkc_torch._parallel.pool import meanwhile
 from mkc_torch.diagnosis.linearised.beside_wander import beside_wander
 from mkc_torch.diagnosis.linearised.linearise import Linearised
 from mkc_torch.diagnosis.linearised.tangents import Tangents, candidate_tangents, tangents_of

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from markupsafe import Markup
 
-from mkc_torch._parallel.fork import shared
+from mkc_torch._parallel.pool import shared
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability
 from mkc_torch.report.diagnosis import (
     evidence,

@@ -1,10 +1,8 @@
 """Fits that copies of the process make come back whole."""
 
-import io
-
 import torch
 
-from mkc_torch._parallel.fork import _Receiver, _Sender
+from mkc_torch._parallel.pool import Parcels
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.fit import fitted
@@ -39,9 +37,8 @@ class Decay(Dynamics):
 
 
 def sent(fits, known):
-    known = {id(one): one for one in known}
-    _Sender(there := io.BytesIO(), known).dump(fits)
-    return _Receiver(io.BytesIO(there.getvalue()), known).load()
+    parcels = Parcels(known)
+    return parcels.unpacked(parcels.packed(fits))
 
 
 def test_a_fit_comes_back_with_its_own_effect_and_driver():
