@@ -258,7 +258,7 @@ CODE = """
     one_thread()
 
     def alike(one, other):
-        # one process alone repeats a diagnosis to rounding only, and a free run multiplies that by a million;
+        # one process alone repeats a diagnosis to rounding only, which fits and free runs multiply;
         # what a copy did of something else is further away. All that is no number is the same.
         if isinstance(one, dict):
             return one.keys() == other.keys() and all(alike(one[key], other[key]) for key in one)
@@ -276,7 +276,7 @@ CODE = """
         def derivative(self, time, x, u, p):
             return {"place": x.speed, "speed": u.force - p.damping * x.speed}
 
-    time = torch.arange(0.0, 8.0, 0.02, dtype=torch.float64)
+    time = torch.arange(0.0, 4.0, 0.02, dtype=torch.float64)
     force = torch.sin(1.3 * time) + torch.sin(0.31 * time)
     place, speed, places = 0.0, 0.0, []
     for f in force.tolist():
