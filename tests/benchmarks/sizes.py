@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from mkc_torch.linear.streaming import StreamedMKCRegression
 
 from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.model.drivers import find_drivers
@@ -25,6 +24,7 @@ from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.linear import MKCRegression
+from mkc_torch.linear.streaming import StreamedMKCRegression
 from mkc_torch.simulation import Magnetometer, Simulation
 from mkc_torch.simulation.load import load_simulation
 from tests.benchmarks import diagnosis, streaming
