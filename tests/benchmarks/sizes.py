@@ -62,7 +62,7 @@ class Curve:
             work()
             self.sizes.append(float(size))
             self.seconds.append(time.process_time() - begin)
-            print(f"{self.panel:<28}{self.name:<36}{size:>12,}{self.seconds[-1]:>12.3f} s", flush=True)
+            print(f"{self.panel:<32}{self.name:<34}{size:>12,}{self.seconds[-1]:>12.3f} s", flush=True)
         return self
 
     def _expected(self, size: int) -> float:
@@ -136,7 +136,7 @@ def of_ranks(limits: Limits, folder: Path) -> list[Curve]:
         wall, _ = streaming.of_ranks(ranks, path, 2)["whole fit"]
         curve.sizes.append(float(ranks))
         curve.seconds.append(wall)
-        print(f"{curve.panel:<28}{curve.name:<36}{ranks:>12,}{wall:>12.3f} s", flush=True)
+        print(f"{curve.panel:<32}{curve.name:<34}{ranks:>12,}{wall:>12.3f} s", flush=True)
     return [curve]
 
 
@@ -177,13 +177,14 @@ def of_samples(limits: Limits, folder: Path) -> list[Curve]:
 
     panel = "samples of a diagnosis"
     return [
-        Curve("magnetometer, 50 Hz", panel).measure(powers(1e3, 1e5), sensor, limits.seconds),
+        Curve("magnetometer, 50 Hz", panel).measure(powers(3162, 1e5), sensor, limits.seconds),
         Curve("three states, 50 Hz", panel).measure(powers(1e3, 1e5), cart, limits.seconds),
     ]
 
 
 def picture(curves: list[Curve], path: Path) -> None:
     from matplotlib.figure import Figure
+    from matplotlib.ticker import NullFormatter
 
     panels = list(dict.fromkeys(curve.panel for curve in curves))
     figure = Figure(figsize=(12, 7.5), layout="constrained")
@@ -192,8 +193,12 @@ def picture(curves: list[Curve], path: Path) -> None:
         mine = [curve for curve in curves if curve.panel == panel]
         for curve in mine:
             ax.loglog(curve.sizes, curve.seconds, "o-", markersize=4, label=curve.name)
+        ends = [math.log10(size) for curve in mine for size in curve.sizes]
+        ax.set_xlim(10 ** math.floor(min(ends)) / 1.2, 10 ** math.ceil(max(ends)) * 1.2)
+        ax.xaxis.set_minor_formatter(NullFormatter())
         if panel.startswith("ranks"):
             ax.set_xscale("linear")
+            ax.set_xlim(0.9, 2.1)
             ax.set_yscale("linear")
             ax.set_xticks([1, 2])
             ax.set_ylim(bottom=0.0)
