@@ -61,7 +61,7 @@ class Ranks:
         flat, error = torch.zeros(length + 1, dtype=torch.float64), None
         try:
             flat[:-1] = work()
-        except Exception as caught:
+        except Exception as caught:  # whatever a user's batches raise, the others wait for this rank; raised below
             flat[-1], error = 1.0, caught
         with _connected():
             moved = flat.to(self._device())
@@ -82,7 +82,7 @@ class Ranks:
         mine, error = None, None
         try:
             mine = work()
-        except Exception as caught:
+        except Exception as caught:  # raised below, once the others know
             error = caught
         found: list[Any] = [None] * self.size
         with _connected():
@@ -102,7 +102,7 @@ class Ranks:
         if self.rank == 0:
             try:
                 result = work()
-            except Exception as caught:
+            except Exception as caught:  # raised below, once the others know
                 error = caught
         box = [(result, _told(error))]
         source = 0 if self.group is None else dist.get_global_rank(self.group, 0)

@@ -273,7 +273,9 @@ class Progress:
             return None
         try:
             state = torch.load(path, weights_only=True)
-        except Exception as error:
+        except OSError:  # a file that may not be read is not a damaged one
+            raise
+        except Exception as error:  # torch has no one error for what it did not write
             raise ValueError(
                 f"Expected argument `checkpoint` to be a file of a streamed fit but {path} is none, or a damaged one; "
                 "choose another name."
