@@ -7,41 +7,72 @@ from pathlib import Path
 
 import numpy as np
 
-from mkc_torch.recording.formats.base import FileFormat, MissingColumnError, RecordingError, Table
+from mkc_torch.recording.formats.base import FileFormat, MissingColumnError, RecordingError, Table, Topic, listed
 from mkc_torch.recording.formats.csv import CSV
 from mkc_torch.recording.formats.parquet import PARQUET
 
-__all__ = ["FORMATS", "MissingColumnError", "RecordingError", "check_ending", "encoded", "read_table"]
+__all__ = [
+    "FORMATS",
+    "MissingColumnError",
+    "RecordingError",
+    "Topic",
+    "check_ending",
+    "encoded",
+    "read_table",
+    "read_topics",
+]
 
 FORMATS: tuple[FileFormat, ...] = (CSV, PARQUET)
 """All formats; the ending of a file says which it is of."""
 
+_WRITTEN = "a .csv or a .parquet"
 
-def read_table(path: Path) -> Table:
-    """The table in a file; at least one of its columns has a name.
+
+def read_topics(path: Path) -> list[Topic]:
+    """The tables in a file, at least one; each has a column with a name.
 
     Raises:
         RecordingError: no file of a known kind, or a damaged or empty one.
         FileNotFoundError: no such file.
     """
     _check_file(path)
-    table = _format_of(path).read(path)
-    if not any(table.names):
+    topics = [topic for topic in _format_of(path).topics(path) if any(topic.table.names)]
+    if not topics:
         raise RecordingError(f"{path}: no column has a name; the first line must hold the column names.")
-    return table
+    return topics
+
+
+def read_table(path: Path) -> Table:
+    """The table in a file that holds one alone.
+
+    Raises:
+        RecordingError: no file of a known kind, a damaged or empty one, or one of several tables.
+        FileNotFoundError: no such file.
+    """
+    topics = read_topics(path)
+    if len(topics) > 1:
+        raise RecordingError(f"{path}: the file holds {len(topics)} tables, {listed(topic.name for topic in topics)}.")
+    return topics[0].table
 
 
 def encoded(path: Path, columns: Mapping[str, np.ndarray]) -> str | bytes:
     """The content of a table file of the kind that the ending of ``path`` says."""
-    return _format_of(path).encoded(path, columns)
+    encoder = _format_of(path).encoded
+    if encoder is None:
+        raise RecordingError(f"{path}: files ending in {path.suffix} are read and not written; write {_WRITTEN}.")
+    return encoder(path, columns)
 
 
 def check_ending(path: Path) -> None:
-    """Refuse a file whose ending says no known kind of table."""
-    _format_of(path)
+    """Refuse a file whose ending says no kind of table that is written."""
+    if _format_of(path).encoded is None:
+        raise RecordingError(f"{path}: files ending in {path.suffix} are read and not written; write {_WRITTEN}.")
 
 
 def _format_of(path: Path) -> FileFormat:
+    for file_format in FORMATS:
+        if file_format.marker and path.is_dir() and (path / file_format.marker).is_file():
+            return file_format
     by_ending = {ending: file_format for file_format in FORMATS for ending in file_format.endings}
     if path.suffix.lower() not in by_ending:
         kind = f"files ending in {path.suffix}" if path.suffix else "files without an ending"
@@ -50,7 +81,8 @@ def _format_of(path: Path) -> FileFormat:
 
 
 def _check_file(path: Path) -> None:
-    if path.is_dir():
+    markers = [file_format.marker for file_format in FORMATS if file_format.marker]
+    if path.is_dir() and not any((path / marker).is_file() for marker in markers):
         raise RecordingError(f"{path}: this is a folder; name the file in it.")
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file.")

@@ -4,11 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["FileFormat", "MissingColumnError", "RecordingError", "Table", "counted", "is_number", "listed", "polars"]
+__all__ = [
+    "FileFormat",
+    "MissingColumnError",
+    "RecordingError",
+    "Table",
+    "Topic",
+    "counted",
+    "is_number",
+    "listed",
+    "polars",
+]
 
 MISSING_WORDS = ["na", "n/a", "null"]
 MISSING = ["", "nan", "-nan", *MISSING_WORDS]
@@ -32,18 +43,36 @@ class Table(NamedTuple):
     line: str = "line"
 
 
+class Topic(NamedTuple):
+    """One of the tables of a file: a topic of a log, a group of measurements, or the whole of a CSV.
+
+    Attributes:
+        name: as the file has it, such as ``sensor_mag_0`` or ``/imu/mag``; empty where a file holds one table alone.
+        table: its columns, among them the one that holds its own time.
+        units: of columns, as the format writes them, where it does: ``{"timestamp": "us", "x": "gauss"}``.
+        warnings: sentences about what was found or dropped while it was read.
+    """
+
+    name: str
+    table: Table
+    units: Mapping[str, str] = MappingProxyType({})
+    warnings: tuple[str, ...] = ()
+
+
 class FileFormat(NamedTuple):
-    """A kind of file that holds a table; a new one is a file of this folder and an entry in ``FORMATS``.
+    """A kind of file that holds tables; a new one is a file of this folder and an entry in ``FORMATS``.
 
     Attributes:
         endings: of its files, in lower case.
-        read: the table in a file; raises :class:`RecordingError` where it is damaged or empty.
-        encoded: the content of a file with these columns.
+        topics: the tables in a file, at least one; raises :class:`RecordingError` where it is damaged or empty.
+        encoded: the content of a file with these columns; None of a format that is only read.
+        marker: a file that lies in a folder of this kind, where the recording is a folder.
     """
 
     endings: tuple[str, ...]
-    read: Callable[[Path], Table]
-    encoded: Callable[[Path, Mapping[str, np.ndarray]], str | bytes]
+    topics: Callable[[Path], list[Topic]]
+    encoded: Callable[[Path, Mapping[str, np.ndarray]], str | bytes] | None = None
+    marker: str = ""
 
 
 def polars() -> Any:

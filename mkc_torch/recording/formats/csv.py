@@ -12,7 +12,16 @@ from typing import Literal
 
 import numpy as np
 
-from mkc_torch.recording.formats.base import FileFormat, RecordingError, Table, counted, is_number, listed, polars
+from mkc_torch.recording.formats.base import (
+    FileFormat,
+    RecordingError,
+    Table,
+    Topic,
+    counted,
+    is_number,
+    listed,
+    polars,
+)
 
 __all__ = ["CSV"]
 
@@ -78,4 +87,4 @@ def _cells(line: str, separator: str) -> list[str]:
     return next(csv.reader([line], delimiter=separator))
 
 
-CSV = FileFormat((".csv", ".tsv", ".txt"), read, encoded)
+CSV = FileFormat((".csv", ".tsv", ".txt"), lambda path: [Topic("", read(path))], encoded)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mkc_torch.recording.formats.base import FileFormat, RecordingError, Table, polars
+from mkc_torch.recording.formats.base import FileFormat, RecordingError, Table, Topic, polars
 
 __all__ = ["PARQUET"]
 
@@ -34,4 +34,4 @@ def encoded(_path: Path, columns: Mapping[str, np.ndarray]) -> bytes:
     return buffer.getvalue()
 
 
-PARQUET = FileFormat((".parquet",), read, encoded)
+PARQUET = FileFormat((".parquet",), lambda path: [Topic("", read(path))], encoded)
