@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import refuse_no_tensor, refuse_out_of_range
+from mkc_torch._support.arguments import refuse_no_tensor, refuse_other_shapes, refuse_out_of_range
 from mkc_torch.density.energy import KAPPA_MAX, SIGMA_LEAST, as_computed, energy, inverse_square, kernel_weight
-from mkc_torch.density.normalizer import log_partition
+from mkc_torch.density.normalizer import log_partition, refuse_bad_ratio
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -54,7 +54,9 @@ def _checked(least_sigma: float = _SIGMA_TINY, **given: object) -> tuple[Tensor,
             refuse_out_of_range(name, value, advice="it is in the unit of the errors")
         elif not isinstance(value, (int, float)):
             refuse_no_tensor(name, value, "a real tensor")
-    return as_computed(*given.values())
+    values = as_computed(*given.values())
+    refuse_other_shapes(**dict(zip(given, values, strict=True)))
+    return values
 
 
 def mkc_energy(
@@ -73,7 +75,8 @@ def mkc_energy(
 
     Raises:
         TypeError: complex values, or an argument that is no number and no tensor.
-        ValueError: ``sigma`` or ``d`` out of range, where it can be seen; the module says where.
+        ValueError: ``sigma`` or ``d`` out of range, where it can be seen; the module says where. Shapes that do not
+            broadcast.
 
     Example:
         >>> mkc_energy(torch.tensor([0.0, 1.0, 100.0]), sigma=2.0, d=1.0)
@@ -130,6 +133,7 @@ def log_normalizer(
         tensor(0.9189)
     """
     sigma, d, bound = _checked(SIGMA_LEAST, sigma=sigma, d=d, bound=bound)
+    refuse_bad_ratio(bound / d)
     return torch.log(d) + log_partition(inverse_square(sigma), bound / d)
 
 
@@ -163,4 +167,5 @@ def mkc_nll(
     """
     error, sigma, d, bound = _checked(SIGMA_LEAST, error=error, sigma=sigma, d=d, bound=bound)
     kappa = inverse_square(sigma)
+    refuse_bad_ratio(bound / d)
     return energy(error / d, kappa) + (torch.log(d) + log_partition(kappa, bound / d))

@@ -30,6 +30,7 @@ __all__ = [
     "refuse_no_tensor",
     "refuse_not_finite",
     "refuse_not_real",
+    "refuse_other_shapes",
     "refuse_other_type",
     "refuse_out_of_range",
     "refuse_text",
@@ -149,7 +150,7 @@ def refuse_out_of_range(
         ValueError: it is out of range, or NaN.
     """
     if isinstance(value, (int, float)):
-        least, most = value, value
+        least = most = _float(name, value)
     else:
         value = as_numbers(name, value)
         seen = _extremes(value)
@@ -289,6 +290,30 @@ def refuse_bad_batch(
         return
     refuse_not_finite("target", target, "Leave them out: loss(input, target, weight=torch.isfinite(target))", counts)
     refuse_not_finite("input", input, DIVERGED, counts)
+
+
+def _float(name: str, value: float) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        raise ValueError(
+            f"Expected argument `{name}` to be a number that a float holds but got {told(value)}."
+        ) from None
+
+
+def refuse_other_shapes(**given: Tensor) -> None:
+    """Refuse tensors that do not broadcast, by their names; not in compiled code, which says so itself.
+
+    Raises:
+        ValueError: they do not.
+    """
+    if torch.compiler.is_compiling():
+        return
+    try:
+        torch.broadcast_shapes(*(value.shape for value in given.values()))
+    except RuntimeError:
+        shapes = ", ".join(f"`{name}` {tuple(value.shape)}" for name, value in given.items())
+        raise ValueError(f"Expected arguments of shapes that broadcast but got {shapes}.") from None
 
 
 def _extremes(value: Tensor) -> tuple[float, float] | None:

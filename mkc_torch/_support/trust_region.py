@@ -107,6 +107,9 @@ def minimise(
         max_iter: steps tried at most.
         retract: takes points to equivalent ones, where a function is constant along some curves.
 
+    Raises:
+        ValueError: a function, its gradient or its Hessian is not finite at a start.
+
     Example:
         >>> def wells(x, index):  # x⁴ - 2 x², with minima at -1 and 1
         ...     return Quadratic((x**4 - 2 * x**2)[:, 0], 4 * x**3 - 4 * x, (12 * x**2 - 4).unsqueeze(-1))
@@ -119,6 +122,7 @@ def minimise(
     retract = retract if retract is not None else _same
     active = torch.arange(start.shape[0], device=start.device)
     point, at = start, function(start, active)
+    _refuse_not_finite(at, torch.linalg.vector_norm(point, dim=-1) + radius)
     found, value = start.clone(), at.value.clone()
     n_iter, converged = torch.zeros_like(active), torch.zeros_like(active, dtype=torch.bool)
     for iteration in range(1, max_iter + 1):
@@ -158,6 +162,16 @@ def minimise(
         radius = torch.where(accept & (ratio > 0.25), kept, 0.25 * newton.length)
     found[active], value[active], n_iter[active] = point, at.value, max_iter
     return Minima(found, value, n_iter, converged)
+
+
+def _refuse_not_finite(at: Quadratic, reach: Float[Tensor, " K"]) -> None:
+    for name, value in (("size", reach), ("value", at.value), ("gradient", at.gradient), ("curvature", at.hessian)):
+        wrong = ~torch.isfinite(value).reshape(len(value), -1).all(-1)
+        if bool(wrong.any()):
+            raise ValueError(
+                f"The {name} of what is minimised is not finite at start {int(wrong.nonzero()[0])}: squares overflow "
+                "or vanish. Divide the data by units near their scale, or begin elsewhere."
+            )
 
 
 def _same(point: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from mkc_torch._support.arguments import checked_number
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.calibration.coverage import Coverage
 from mkc_torch.calibration.ellipsoid import ellipsoid_from_coefficients
@@ -94,7 +95,7 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
         MissingColumnError: a column of the magnetometer is not there.
         RecordingError: fewer than nine usable samples.
         NotIdentifiableError: the samples do not determine an ellipsoid.
-        ValueError: a field strength that is not positive.
+        TypeError, ValueError: a field strength that is no number, or not positive.
 
     Example:
         >>> from mkc_torch.calibration.coverage import fibonacci_sphere
@@ -105,8 +106,8 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
         >>> [round(v, 3) for v in result.center], result.rejected
         ([1.0, 2.0, 3.0], 20)
     """
-    if field_strength is not None and not (math.isfinite(field_strength) and field_strength > 0):
-        raise ValueError(f"Expected argument `field_strength` to be positive but got {field_strength}.")
+    if field_strength is not None:
+        field_strength = checked_number("field_strength", field_strength, advice="it is a length in µT")
     usable = prepared(recording)
     points = usable.magnetometer()
     fit = recorded_ellipsoid(usable, seed)

@@ -9,9 +9,16 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, constraints
 
-from mkc_torch._support.arguments import as_numbers, first_of, refuse_no_tensor, told
+from mkc_torch._support.arguments import (
+    as_numbers,
+    first_of,
+    refuse_complex,
+    refuse_no_tensor,
+    refuse_other_shapes,
+    told,
+)
 from mkc_torch.density.energy import as_computed, energy, inverse_square
-from mkc_torch.density.normalizer import head_rule, log_partition, partition, tail_density
+from mkc_torch.density.normalizer import head_rule, log_partition, partition, refuse_bad_ratio, tail_density
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -49,7 +56,7 @@ class MKCDistribution(Distribution):
 
     Raises:
         TypeError: a parameter that is no number and no tensor, or a value that is no tensor.
-        ValueError: a parameter out of range, or a value outside the domain.
+        ValueError: a parameter out of range, a value outside the domain, or shapes that do not broadcast.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (17), Theorem 2, Corollary 1.
@@ -65,7 +72,7 @@ class MKCDistribution(Distribution):
 
     arg_constraints = {  # noqa: RUF012
         "sigma": constraints.greater_than_eq(SIGMA_MIN),
-        "d": constraints.positive,
+        "d": _Finite(),
         "bound": _Finite(),
         "loc": constraints.real,
     }
@@ -81,9 +88,13 @@ class MKCDistribution(Distribution):
     ) -> None:
         for name, value in (("sigma", sigma), ("d", d), ("bound", bound), ("loc", loc)):
             as_numbers(name, value)
-        self.sigma, self.d, self.bound, self.loc = torch.broadcast_tensors(*as_computed(sigma, d, bound, loc))
+        values = as_computed(sigma, d, bound, loc)
+        refuse_other_shapes(**dict(zip(("sigma", "d", "bound", "loc"), values, strict=True)))
+        self.sigma, self.d, self.bound, self.loc = torch.broadcast_tensors(*values)
         validated = not torch.compiler.is_compiling() if validate_args is None else validate_args
         super().__init__(self.sigma.shape, validate_args=validated)
+        if validated:
+            refuse_bad_ratio(self._length)
 
     def expand(self, batch_shape: _Shape, _instance: MKCDistribution | None = None) -> MKCDistribution:
         """The same distribution with its batch dimensions broadcast to ``batch_shape``."""
@@ -115,19 +126,23 @@ class MKCDistribution(Distribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density; ``-inf`` outside the domain, where validation is off."""
-        if self._validate_args:
-            refuse_no_tensor("value", value, "a tensor")
-            self._validate_sample(value)
+        value = self._checked_value(value)
         error = value - self.loc
         inside = (value >= self.loc - self.bound) & (value <= self.loc + self.bound)
         log_density = -energy(torch.where(inside, error, 0.0) / self.d, self._kappa) - self.log_normalizer()
         return torch.where(inside, log_density, -torch.inf)
 
-    def cdf(self, value: Tensor) -> Tensor:
-        """Probability of a value at most ``value``."""
+    def _checked_value(self, value: Tensor) -> Tensor:
         if self._validate_args:
             refuse_no_tensor("value", value, "a tensor")
+            refuse_complex("value", value)
+            value = value.to(self.d) if value.dtype == torch.bool else value
             self._validate_sample(value)
+        return value
+
+    def cdf(self, value: Tensor) -> Tensor:
+        """Probability of a value at most ``value``."""
+        value = self._checked_value(value)
         error = torch.minimum(torch.maximum(value - self.loc, -self.bound), self.bound)
         return _cumulative(error / self.d, self._kappa, self._length)
 

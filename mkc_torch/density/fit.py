@@ -305,14 +305,20 @@ def domain_rule(
     return torch.maximum(0.5 * (high.amax(-2) - low.amin(-2)), scales * scale)
 
 
-def refuse_narrow_bound(bound: Tensor, scale: Tensor) -> None:
-    """Refuse a domain that the head of the density does not fit in."""
+def refuse_bad_bound(bound: Tensor, scale: Tensor) -> None:
+    """Refuse a domain that the head of the density does not fit in, and one whose square overflows."""
+    most = torch.finfo(scale.dtype).max ** 0.4
+    if not bool((bound <= most).all()):
+        raise ValueError(
+            f"Expected argument `bound` within {most:.1g}, beyond which squares overflow, but got "
+            f"{float(bound.max()):.4g}; it is the half-width of the domain that errors can lie in."
+        )
     narrow = bound < 2.0 * scale
     if bool(narrow.any()):
-        first = narrow.nonzero()[0]
+        first = tuple(narrow.nonzero()[0])
         raise ValueError(
             f"Expected argument `bound` to be at least two robust scales of the residuals, "
-            f"{2.0 * scale[tuple(first)].item():.4g}, but got {bound[tuple(first)].item():.4g}; it is the half-width "
+            f"{2.0 * scale[first].item():.4g}, but got {bound[first].item():.4g}; it is the half-width "
             "of the domain that errors can lie in, in the unit of the data."
         )
 
@@ -404,7 +410,7 @@ def fit_density(
     floor = parameter("d_min", d_min)
     half_width = parameter("bound", bound)
     if half_width is not None:
-        refuse_narrow_bound(half_width, scale)
+        refuse_bad_bound(half_width, scale)
     else:
         half_width = domain_rule(error, scale, None if weight is None else weight > 0)
     if floor is not None and bool((floor >= half_width).any()):

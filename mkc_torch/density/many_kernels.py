@@ -18,6 +18,7 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import as_numbers, refuse_not_real
 from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.density.fit import refuse_bad_bound
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -109,7 +110,13 @@ def fit_kernels(error: Float[Tensor, "N m"], *, bound: float | Float[Tensor, " m
         )
     largest = error.abs().amax(0)
     half_width = torch.maximum(largest, 4.0 * scale) if bound is None else as_numbers("bound", bound).double()
+    if half_width.shape not in ((), (1,), scale.shape):
+        raise ValueError(
+            f"Expected argument `bound` to be a number or of shape {tuple(scale.shape)} but got "
+            f"{tuple(half_width.shape)}."
+        )
     half_width = half_width.to(error.device).expand_as(scale)
+    refuse_bad_bound(half_width, scale)
     if not bool((half_width >= 4.0 * scale).all()):
         raise ValueError(
             f"Expected argument `bound` to be at least four robust scales of the residuals, {(4.0 * scale).tolist()}, "

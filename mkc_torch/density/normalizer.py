@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import refuse_no_tensor
+from mkc_torch._support.arguments import refuse_no_tensor, refuse_out_of_range
 from mkc_torch.density._normalizer_of_few import few, log_partition_and_slopes
 from mkc_torch.density.energy import energy, energy_dkappa, energy_value
 
@@ -181,3 +181,16 @@ class _LogPartition(torch.autograd.Function):
         if length_t is not None:
             change = change + by_length * length_t
         return change, None, None
+
+
+def refuse_bad_ratio(length: Float[Tensor, "*batch"]) -> None:
+    """Refuse a domain of so many or so few scales that squares of their number overflow or vanish.
+
+    Args:
+        length: ``bound / d``.
+
+    Raises:
+        ValueError: one is, where it can be seen.
+    """
+    most = torch.finfo(length.dtype).max ** 0.4
+    refuse_out_of_range("bound / d", length.detach(), 1.0 / most, most, "[]", "are they in one unit?")

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.arguments import as_numbers, checked_whole
 from mkc_torch.density.energy import as_computed, inverse_square, kernel_weight
 
 if TYPE_CHECKING:
@@ -49,9 +50,17 @@ def _positive(name: str, value: Tensor, *, zero: bool = False, infinite: bool = 
     _refuse(name, wanted, value.tolist(), right, "check its sign and its unit")
 
 
+def _numbers(**given: Tensor | float) -> tuple[Tensor, ...]:
+    """Tensors of one dtype from numbers and tensors; what is neither is refused by its name."""
+    for name, value in given.items():
+        as_numbers(name, value, torch.float64)
+    return as_computed(*given.values())
+
+
 def _shares(num_samples: Tensor | int, num_inliers: Tensor | int, *, outliers: bool = False) -> tuple[Tensor, Tensor]:
     """q = (N - M) / M and 1 - q, each to rounding, in float64."""
-    N, M = (torch.as_tensor(v, dtype=torch.float64) for v in (num_samples, num_inliers))
+    N = as_numbers("num_samples", num_samples, torch.float64).double()
+    M = as_numbers("num_inliers", num_inliers, torch.float64).double()
     most = M < N if outliers else M <= N
     wanted = f"more than half of the samples and {'fewer than' if outliers else 'at most'} all of them"
     advice = "the bound of Theorem 3 needs Assumption 1"
@@ -94,7 +103,7 @@ def phi(p: Float[Tensor, "*batch"] | float, q: Float[Tensor, "*batch"] | float) 
         >>> phi(torch.tensor([0.3, 0.5, 0.9]), 0.25)
         tensor([2.4114, 1.0000, 0.3386])
     """
-    p, q = as_computed(p, q)
+    p, q = _numbers(p=p, q=q)
     _refuse("q", "in [0, 1)", q.tolist(), (q >= 0) & (q < 1), "it is outliers over inliers, (N - M) / M")
     _refuse("p", "in (q, 1]", p.tolist(), (p > q) & (p <= 1), "raise the bandwidth above `least_bandwidth`")
     gap = p - q
@@ -123,7 +132,7 @@ def least_bandwidth(
         >>> least_bandwidth(2.0, 100, torch.tensor([60, 80, 99]))
         tensor([2.2209, 1.2011, 0.6597])
     """
-    (epsilon,) = as_computed(epsilon)
+    (epsilon,) = _numbers(epsilon=epsilon)
     _positive("epsilon", epsilon, zero=True)
     q, _ = _shares(num_samples, num_inliers)
     return (epsilon * torch.rsqrt(-2.0 * torch.log(q))).to(epsilon.dtype)
@@ -137,7 +146,7 @@ def _checked(
     num_samples: Tensor | int,
     num_inliers: Tensor | int,
 ) -> tuple[Tensor, ...]:
-    sigma, d, epsilon, zeta = as_computed(sigma, d, epsilon, zeta)
+    sigma, d, epsilon, zeta = _numbers(sigma=sigma, d=d, epsilon=epsilon, zeta=zeta)
     _positive("sigma", sigma, infinite=True)
     _positive("d", d)
     _positive("epsilon", epsilon, zero=True)
@@ -258,7 +267,7 @@ def optimal_bandwidth(
         >>> optimal_bandwidth(2.0, 100, torch.tensor([60, 80, 99]))
         tensor([2.6614, 1.6986, 1.4240])
     """
-    (epsilon,) = as_computed(epsilon)
+    (epsilon,) = _numbers(epsilon=epsilon)
     _positive("epsilon", epsilon)
     _, r = _shares(num_samples, num_inliers, outliers=True)
     lost = r - _optimal_gap(r)
@@ -287,7 +296,7 @@ def least_error_bound(
         >>> least_error_bound(0.5, 2.0, 1.0, 100, torch.tensor([60, 80, 99]))
         tensor([3.9384, 2.4142, 2.0138])
     """
-    d, epsilon, zeta = as_computed(d, epsilon, zeta)
+    d, epsilon, zeta = _numbers(d=d, epsilon=epsilon, zeta=zeta)
     _positive("d", d)
     _positive("epsilon", epsilon)
     _positive("zeta", zeta)
@@ -298,7 +307,7 @@ def least_error_bound(
 
 def _relative_width(sigma: Tensor | float, d: Tensor | float, noise: Tensor | float) -> Tensor:
     """h = σ d in units of the noise's standard deviation."""
-    sigma, d, noise = as_computed(sigma, d, noise)
+    sigma, d, noise = _numbers(sigma=sigma, d=d, noise=noise)
     _positive("sigma", sigma, infinite=True)
     _positive("d", d)
     _positive("noise", noise)
@@ -355,7 +364,7 @@ def bandwidth_for_efficiency(efficiency: Float[Tensor, "*batch"] | float) -> Flo
         >>> bandwidth_for_efficiency(torch.tensor([0.64, 0.95, 0.99, 1.0]))
         tensor([0.9855, 2.1105, 3.3522,    inf])
     """
-    (efficiency,) = as_computed(efficiency)
+    (efficiency,) = _numbers(efficiency=efficiency)
     inside = (efficiency > 0) & (efficiency <= 1)
     _refuse("efficiency", "in (0, 1]", efficiency.tolist(), inside, "0.95 is usual")
     # share = 1 - sqrt(1 - e^(2/3)) and h² = share / (1 - share)
@@ -425,18 +434,15 @@ def breakdown_point(
         >>> breakdown_point(torch.linspace(-2, 2, 21), torch.tensor([0.5, 2.0, math.inf]), 1.0, num_coefficients=2)
         tensor([0.2222, 0.4474, 0.0000])
     """
-    error, sigma, d = as_computed(error, sigma, d)
+    error, sigma, d = _numbers(error=error, sigma=sigma, d=d)
     if error.dim() < 1 or error.shape[-1] == 0:
         raise ValueError(f"Expected argument `error` of shape (*, N >= 1) but got {tuple(error.shape)}.")
     finite = torch.isfinite(error)
     _refuse("error", "finite", f"{int((~finite).sum())} values that are not", finite, "leave those samples out")
     _positive("sigma", sigma, infinite=True)
     _positive("d", d)
-    if isinstance(num_coefficients, bool) or not isinstance(num_coefficients, int) or num_coefficients < 1:
-        raise ValueError(
-            f"Expected argument `num_coefficients` to be a whole number of at least 1 but got {num_coefficients!r}; "
-            "count the columns of X."
-        )
+    num_coefficients = checked_whole("num_coefficients", num_coefficients, 1, "count the columns of X")
+    num_coefficients = min(num_coefficients, error.shape[-1] + 1)  # more determine no fewer than none
     total = kernel_weight(error / d.unsqueeze(-1), inverse_square(sigma.unsqueeze(-1))).sum(-1)
     fewest = torch.ceil(total - (num_coefficients - 1)).clamp(min=0.0)
     return torch.where(torch.isfinite(sigma), fewest / (error.shape[-1] + fewest), 0.0)

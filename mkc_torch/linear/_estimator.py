@@ -118,6 +118,11 @@ class LinearEstimator(Fitted):
     def _set_common(self, problem: LinearProblem, beta: Tensor, weights: Tensor) -> None:
         self._single_channel = problem.single_channel
         self.coef_ = problem.coefficients(beta)
+        if not bool(torch.isfinite(self.coef_.detach()).all()):
+            raise ValueError(
+                "The fit has no finite coefficients: squares of `X` or `Y` overflow or vanish. Divide each column by a "
+                "unit near its scale, and look for values that cannot be right."
+            )
         self.weights_ = problem.restore(weights)
 
     def _set_layer(self, layer: Layer) -> None:

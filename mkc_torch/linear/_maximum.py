@@ -15,7 +15,7 @@ from mkc_torch.density.fit import (
     domain_rule,
     initial_state,
     newton_step,
-    refuse_narrow_bound,
+    refuse_bad_bound,
 )
 from mkc_torch.linear._mkc import channel_parameter, fixed_point_step
 from mkc_torch.linear._problem import LinearProblem
@@ -189,7 +189,7 @@ def given_bound(problem: LinearProblem, known: Known, begin: RobustStart) -> Ten
     """The domain that is given, of every channel; a clear error where the head does not fit in."""
     assert known.bound is not None
     bound = channel_parameter("bound", known.bound, problem)
-    refuse_narrow_bound(bound, begin.scale)
+    refuse_bad_bound(bound, begin.scale)
     return bound
 
 

@@ -27,6 +27,12 @@ def channel_parameter(name: str, value: float | Tensor, problem: LinearProblem, 
     if not bool(((t > 0) & (torch.isfinite(t) | infinite)).all()):
         kind = "positive" if infinite else "positive and finite"
         raise ValueError(f"Expected argument `{name}` to be {kind} but got {value}.")
+    most = torch.finfo(t.dtype).max ** 0.4
+    if not bool(((t >= 1.0 / most) & ((t <= most) | torch.isinf(t))).all()):
+        raise ValueError(
+            f"Expected argument `{name}` between {1.0 / most:.0e} and {most:.0e}, beyond which squares vanish or "
+            f"overflow, but got {value}; choose another unit."
+        )
     try:
         return t.expand(*problem.batch, m).reshape(-1, m)
     except RuntimeError:

@@ -153,7 +153,7 @@ def checked_tuning(name: str, tuning: float | Tuning | None) -> tuple[PsiName, T
         return known, default
     try:
         given = tuple(float(t) for t in tuning) if isinstance(tuning, (tuple, list)) else (float(tuning),)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         given = ()
     rising = all(0 < low <= high for low, high in itertools.pairwise(given))
     if len(given) != len(default) or not all(0 < t < math.inf for t in given) or not rising:

@@ -172,7 +172,7 @@ what large samples let expect.
 
 def _gaussian_edge(threshold: float) -> tuple[float, float]:
     """The share of a Gaussian within ±threshold, and 2 c φ(c): what its mean within moves by, a unit of the edges'."""
-    density = math.exp(-0.5 * threshold**2) / math.sqrt(2.0 * math.pi)
+    density = math.exp(-0.5 * threshold * threshold) / math.sqrt(2.0 * math.pi)
     return math.erf(threshold / math.sqrt(2.0)), 2.0 * threshold * density
 
 

@@ -91,6 +91,8 @@ class FollowsResiduals(nn.Module):
         # compiled code is one for all batches
         search = compiled or self._passes % SEARCH_EVERY == 0
         state = self.following.after(input, target, weight, axis, error=error, search=search)
+        if not compiled:
+            _refuse_huge(state.far)
         if learning:
             if not compiled:
                 self._passes += 1
@@ -130,3 +132,12 @@ class FollowsResiduals(nn.Module):
         if self.reduction == "none":
             return steered_each(input if target is None else input - target, axis, state, late)
         return steered(input, target, weight, axis, state, late, turned=self._turned).sum()
+
+
+def _refuse_huge(far: Float[Tensor, " m"]) -> None:
+    """Refuse errors that what is remembered of them cannot hold, where looking waits for no accelerator."""
+    if far.device.type == "cpu" and not bool(torch.isfinite(far).all()):
+        raise ValueError(
+            f"Expected arguments `input` and `target` to differ by less than {torch.finfo(far.dtype).max:.0e}, which "
+            f"{far.dtype} ends at; choose a unit near the scale of the targets, or look at them."
+        )

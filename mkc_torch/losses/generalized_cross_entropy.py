@@ -219,8 +219,10 @@ def graduated_sigma(progress: float, *, start: float = 1.2, end: float = 0.8, un
     """
     checked_number("progress", progress, 0.0, 1.0, "[]", "pass epoch / epochs")
     checked_number("until", until, 0.0, 1.0, "(]", "0.5 is half of the training")
-    for name, sigma in (("start", start), ("end", end)):
+    start, end = (
         checked_number(name, sigma, SIGMA_LEAST, math.inf, "[]", "1.2 to 0.8 is usual")
+        for name, sigma in (("start", start), ("end", end))
+    )
     done = min(1.0, progress / until)
     kappa = (1.0 - done) * start**-2 + done * end**-2
     return kappa**-0.5 if kappa > 0.0 else math.inf

@@ -1,0 +1,115 @@
+"""Every public entry with each of its arguments spoilt in each way: a clear refusal, or an answer without NaN."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import warnings
+from collections.abc import Iterator
+from dataclasses import is_dataclass
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from mkc_torch.nonlinear import NoFitError
+from tests.public_entries import Entry, entries, spoilt
+
+ENTRIES = {entry.names[0]: entry for entry in entries()}
+ROOMS = ("covariance", "density", "functional", "linear", "losses", "metrics", "nonlinear")
+"""Those whose public names are all entries with tensors; the others have files, recordings or effects of their own."""
+
+ELSEWHERE = {
+    "functional.KAPPA_MAX": "a number",
+    "functional.energy": "a part of mkc_energy that looks at nothing, as its module says",
+    "functional.inverse_square": "likewise",
+    "functional.log_partition": "likewise, of log_normalizer",
+    "linear.NotFittedError": "an error",
+    "linear.RankDeficientError": "an error",
+    "nonlinear.NoFitError": "an error",
+    "nonlinear.NonlinearFit": "what fit gives",
+    "nonlinear.Solution": "what minimise gives",
+    "nonlinear.beside": "puts two tensors beside one another, in tests/nonlinear",
+    "nonlinear.load_forward_mode": "takes nothing",
+    "covariance.ExactFitError": "an error",
+    "covariance.SampleKind": "an enumeration",
+}
+"""Public names that are no entry, and why."""
+
+SLOW = ("calibration.", "density.fit_kernels", "losses.least_entropy_like", "nonlinear.")
+"""Those of which a sample is drawn; all of theirs take most of a minute."""
+
+CASES = [
+    (name, argument)
+    for name, entry in ENTRIES.items()
+    for argument in entry.arguments
+    if argument not in entry.fixed + entry.passes
+]
+
+
+def tensors(value: Any) -> Iterator[Tensor]:
+    if isinstance(value, Tensor):
+        yield value
+    elif isinstance(value, (list, tuple)):
+        for one in value:
+            yield from tensors(one)
+    elif is_dataclass(value):
+        for one in vars(value).values():
+            yield from tensors(one)
+
+
+def outcome(entry: Entry, argument: str, value: Any) -> str:
+    """What is wrong with a call that has one argument replaced: an error that says too little, or a NaN; else empty."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # our own, of a tail beyond the bound and the like
+            answer = entry.call(**{**entry.arguments, argument: value})
+    except (ValueError, TypeError, NoFitError) as error:
+        return "" if len(str(error)) >= 30 else f"{error!r} says too little"
+    except Exception as error:
+        return f"{error!r} is none of ours"
+    return "NaN" if any(tensor.isnan().any() for tensor in tensors(answer)) else ""
+
+
+def wrong(name: str, argument: str) -> dict[str, str]:
+    entry = ENTRIES[name]
+    outcomes = {way: outcome(entry, argument, value) for way, value in spoilt(entry.arguments[argument])}
+    return {way: told for way, told in outcomes.items() if told}
+
+
+@pytest.mark.parametrize(("name", "argument"), [case for case in CASES if not case[0].startswith(SLOW)])
+def test_a_spoilt_argument_is_refused_or_answered_with_numbers(name, argument):
+    assert wrong(name, argument) == {}
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.data())
+def test_so_of_those_that_take_long(data):
+    name, argument = data.draw(st.sampled_from([case for case in CASES if case[0].startswith(SLOW)]))
+    entry = ENTRIES[name]
+    assert outcome(entry, argument, data.draw(st.sampled_from(list(spoilt(entry.arguments[argument]))))[1]) == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "argument"), [case for case in CASES if case[0].startswith(SLOW)])
+def test_so_of_all_of_them(name, argument):
+    assert wrong(name, argument) == {}
+
+
+@pytest.mark.parametrize("name", [name for name in ENTRIES if name != "diagnosis.diagnose"])
+def test_arguments_that_fit_are_answered(name):
+    assert not any(tensor.isnan().any() for tensor in tensors(ENTRIES[name].call(**ENTRIES[name].arguments)))
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_each_public_name_is_an_entry(room):
+    names = {f"{room}.{name}" for name in importlib.import_module(f"mkc_torch.{room}").__all__}
+    asked = {name.split(" ")[0] for entry in ENTRIES.values() for name in entry.names}
+    modules = {
+        name
+        for name in names
+        if inspect.ismodule(getattr(importlib.import_module(f"mkc_torch.{room}"), name.split(".")[1]))
+    }
+    assert names - asked - set(ELSEWHERE) - modules == set()
