@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["claim_folder", "write_atomically"]
+try:
+    import fcntl
+except ImportError:  # not POSIX
+    fcntl = None  # type: ignore[assignment]
+
+__all__ = ["claim_folder", "folder_held", "write_atomically"]
 
 
 def write_atomically(path: str | os.PathLike[str], data: str | bytes, *, overwrite: bool = False) -> None:
@@ -44,9 +51,63 @@ def write_atomically(path: str | os.PathLike[str], data: str | bytes, *, overwri
             file.write(data.encode() if isinstance(data, str) else data)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, path)  # noqa: PTH105 - one name for the step that tests make fail
+        _take_name(temporary, path, overwrite)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _take_name(temporary: Path, path: Path, overwrite: bool) -> None:
+    """Give a file its name; a file that another process gave that name meanwhile is not replaced unasked."""
+    if not overwrite:
+        try:
+            os.link(temporary, path)  # fails where the name is taken
+        except FileExistsError:
+            raise FileExistsError(f"{path} exists; use `--force` (in Python `overwrite=True`) to replace it.") from None
+        except OSError:  # a file system without hard links
+            pass
+        else:
+            return
+    os.replace(temporary, path)  # noqa: PTH105 - one name for the step that tests make fail
+
+
+_LEFT = re.compile(r"\.[0-9a-f]{16}\.tmp")
+"""What a process that was killed while it wrote leaves behind."""
+
+
+@contextmanager
+def folder_held(path: str | os.PathLike[str]) -> Iterator[None]:
+    """No other process holds the folder meanwhile; whichever way this one ends, it is free again.
+
+    What a process that was killed left half-written is removed. Where the system has no locks, nothing is held.
+
+    Raises:
+        FileExistsError: another process holds it.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder, folder_held(folder):
+        ...     write_atomically(Path(folder) / "a.txt", "text")
+    """
+    path = Path(path)
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise FileExistsError(
+                f"{path} is being written by another mkc; wait for it, or choose another output folder."
+            ) from None
+        except OSError:  # a file system without locks
+            pass
+        for left in path.iterdir():
+            if _LEFT.fullmatch(left.name):
+                left.unlink(missing_ok=True)
+        yield
+    finally:
+        os.close(handle)
 
 
 _MARKS = {".html": b"Made by mkc_torch", ".json": b'"schema": "mkc-', ".py": b"`mkc diagnose`"}
@@ -77,7 +138,7 @@ def claim_folder(path: str | os.PathLike[str], *, overwrite: bool = False, files
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise FileExistsError(f"{path} is a file, not a folder; choose another output folder.")
-    if path.is_dir() and not overwrite and any(path.iterdir()):
+    if path.is_dir() and not overwrite and _something_in(path):
         raise FileExistsError(
             f"{path} exists and is not empty; use `--force` (in Python `overwrite=True`) to write into it, "
             "or choose another output folder."
@@ -89,6 +150,10 @@ def claim_folder(path: str | os.PathLike[str], *, overwrite: bool = False, files
         )
     path.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def _something_in(folder: Path) -> bool:
+    return any(not _LEFT.fullmatch(path.name) for path in folder.iterdir())
 
 
 def _foreign(folder: Path, names: Sequence[str]) -> list[str]:

@@ -9,7 +9,7 @@ from mkc_torch._support.files import claim_folder, write_atomically
 from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.calibrate import calibrate as fit
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
-from mkc_torch.cli.console import folder_removed_on_failure, with_unit
+from mkc_torch.cli.console import folder_written, with_unit
 from mkc_torch.recording.recording import Recording
 
 __all__ = ["calibrate_file"]
@@ -24,7 +24,7 @@ def calibrate_file(
 
     report, result = folder / "report.html", folder / "calibration.json"
     claim_folder(folder, overwrite=force, files=(report.name, result.name))
-    with folder_removed_on_failure(folder):
+    with folder_written(folder):
         try:
             calibration = fit(recording, field_strength=field_strength)
         except NotIdentifiableError as error:

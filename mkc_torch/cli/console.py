@@ -18,6 +18,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from mkc_torch._support.files import folder_held
 from mkc_torch.report.words.terms import term
 
 if TYPE_CHECKING:
@@ -311,11 +312,16 @@ def not_written(recordings: Iterable[Path], output: Path) -> str:
 
 
 @contextmanager
-def folder_removed_on_failure(folder: Path) -> Iterator[None]:
-    """Leaves no empty folder behind when what was to be written into it failed."""
-    try:
-        yield
-    except BaseException:
-        with suppress(OSError):
-            folder.rmdir()
-        raise
+def folder_written(folder: Path) -> Iterator[None]:
+    """No other process writes into a folder meanwhile; an empty one is removed when what was to be written failed.
+
+    Raises:
+        FileExistsError: another process writes into it.
+    """
+    with folder_held(folder):
+        try:
+            yield
+        except BaseException:
+            with suppress(OSError):
+                folder.rmdir()
+            raise

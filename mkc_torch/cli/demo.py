@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from mkc_torch._support.files import claim_folder
-from mkc_torch.cli.console import FAILURES, complain, folder_removed_on_failure, interrupts_told, out, progress
+from mkc_torch.cli.console import FAILURES, complain, folder_written, interrupts_told, out, progress
 from mkc_torch.cli.loading import loading
 
 
@@ -38,8 +38,8 @@ def demo(
         place = claim_folder(output / CONCEALED, overwrite=force, files=WRITTEN)
         with (
             interrupts_told(lambda: _written(output)),
-            folder_removed_on_failure(output),
-            folder_removed_on_failure(place),
+            folder_written(output),
+            folder_written(place),
             progress(1) as step,
         ):
             step("calibrating a simulated sensor")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkc_torch._support.files import claim_folder, write_atomically
-from mkc_torch.cli.console import FAILURES, Look, folder_removed_on_failure, sentence_of, with_unit
+from mkc_torch.cli.console import FAILURES, Look, folder_written, sentence_of, with_unit
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request
 from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.diagnosis import Diagnosis, diagnose
@@ -52,7 +52,7 @@ def diagnose_file(
         claim_folder(folder, overwrite=request.force, files=WRITTEN)
     except Exception as error:
         return [_failed(path, "", error)]
-    with folder_removed_on_failure(folder):
+    with folder_written(folder):
         parts, outcomes = list(_parts(recording, simulation, folder)), []
         for number, (label, part, place) in enumerate(parts, start=1):
             which = f", experiment {label} ({number} of {len(parts)})" if len(parts) > 1 else ""
@@ -135,7 +135,7 @@ def _outcome(
     try:
         # the whole folder was claimed before
         claim_folder(folder, overwrite=request.force or not label, files=WRITTEN)
-        with folder_removed_on_failure(folder):
+        with folder_written(folder) if label else nullcontext():
             diagnosis = diagnose(
                 simulation,
                 recording,

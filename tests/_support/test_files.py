@@ -1,11 +1,12 @@
 import os
 import stat
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from mkc_torch._support.files import claim_folder, write_atomically
+from mkc_torch._support.files import claim_folder, folder_held, write_atomically
 
 
 def contents(folder):
@@ -55,13 +56,62 @@ def test_a_write_that_fails_half_way_leaves_the_folder_as_it_was(tmp_path, monke
     assert contents(tmp_path) == before
 
 
-def test_data_reach_the_disk_before_the_name(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("overwrite", "named"), [(False, "link"), (True, "replace")])
+def test_data_reach_the_disk_before_the_name(tmp_path, monkeypatch, overwrite, named):
     steps = []
-    fsync, replace = os.fsync, os.replace
-    monkeypatch.setattr(os, "fsync", lambda *a: (steps.append("fsync"), fsync(*a)))
-    monkeypatch.setattr(os, "replace", lambda *a: (steps.append("replace"), replace(*a)))
+    for step in ("fsync", "link", "replace"):
+        own = getattr(os, step)
+        monkeypatch.setattr(os, step, lambda *a, step=step, own=own: (steps.append(step), own(*a)))
+    write_atomically(tmp_path / "a", "x", overwrite=overwrite)
+    assert steps == ["fsync", named]
+    assert contents(tmp_path) == {"a": b"x"}
+
+
+def test_a_name_that_another_process_takes_meanwhile_is_not_replaced(tmp_path, monkeypatch):
+    fsync = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda handle: (fsync(handle), (tmp_path / "a").write_text("theirs")))
+    with pytest.raises(FileExistsError, match=r"a exists; use `--force`"):
+        write_atomically(tmp_path / "a", "ours")
+    assert contents(tmp_path) == {"a": b"theirs"}
+
+
+def test_a_file_system_without_hard_links_is_written_to(tmp_path, monkeypatch):
+    def refused(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refused)
     write_atomically(tmp_path / "a", "x")
-    assert steps == ["fsync", "replace"]
+    assert contents(tmp_path) == {"a": b"x"}
+
+
+HOLDS = """
+import sys
+from mkc_torch._support.files import folder_held
+with folder_held(sys.argv[1]):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of this kind")
+def test_a_folder_is_held_by_one_process_and_free_when_that_is_killed(tmp_path):
+    left = tmp_path / f".{'0' * 16}.tmp"
+    left.write_text("half")
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDS, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout.readline() == "held\n"
+        assert not left.exists()
+        with pytest.raises(FileExistsError, match="is being written by another mkc; wait"), folder_held(tmp_path):
+            pass
+        other.kill()
+    with folder_held(tmp_path):
+        write_atomically(tmp_path / "a", "x")
+
+
+def test_what_a_killed_process_left_half_written_is_in_nobodys_way(tmp_path):
+    (tmp_path / f".{'a' * 16}.tmp").write_text("half")
+    assert claim_folder(tmp_path) == tmp_path
 
 
 def test_text_that_has_no_utf8_leaves_nothing(tmp_path):

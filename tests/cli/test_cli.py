@@ -218,7 +218,7 @@ def test_a_write_that_fails_leaves_no_half_file(good, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device", "calibration.json")
 
-    monkeypatch.setattr(_files.os, "replace", full)
+    monkeypatch.setattr(_files.os, "fsync", full)
     refused(mkc("calibrate", good, "--output", tmp_path / "out"), "no space left")
     assert not (tmp_path / "out" / "good").exists()
 
