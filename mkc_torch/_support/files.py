@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 import re
 import secrets
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-try:
+if sys.platform != "win32":
     import fcntl
-except ImportError:  # not POSIX
-    fcntl = None  # type: ignore[assignment]
 
 __all__ = ["claim_folder", "folder_held", "write_atomically"]
 
@@ -89,7 +88,7 @@ def folder_held(path: str | os.PathLike[str]) -> Iterator[None]:
         ...     write_atomically(Path(folder) / "a.txt", "text")
     """
     path = Path(path)
-    if fcntl is None:
+    if sys.platform == "win32":  # which has no such locks
         yield
         return
     handle = os.open(path, os.O_RDONLY)

@@ -334,7 +334,7 @@ def test_a_write_that_fails_leaves_no_half_file(stepped, tmp_path, monkeypatch):
 
     diagnosis = make_diagnosis(1, model=None)
     monkeypatch.setattr(diagnosis_files, "diagnose", lambda *_, **__: diagnosis)
-    monkeypatch.setattr(_files.os, "replace", full)
+    monkeypatch.setattr(_files.os, "fsync", full)
     refused(diagnosed(stepped[0], "--output", tmp_path / "out"), "no space left")
     assert not (tmp_path / "out" / "stepped").exists()
 

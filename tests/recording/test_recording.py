@@ -615,7 +615,7 @@ def test_a_table_that_fails_half_way_leaves_nothing(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("disk full")
 
-    monkeypatch.setattr(os, "replace", fail)
+    monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises(OSError, match="disk full"):
         write_table(tmp_path / "a.csv", {"a": column(1)})
     assert list(tmp_path.iterdir()) == []
