@@ -23,6 +23,7 @@ MANUAL = {
     "loss.md",
     "measured.md",
     "own_simulation.md",
+    "promises.md",
     "wrong_targets.md",
 }
 COMMON = {"--version", "--help"}
