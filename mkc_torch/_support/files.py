@@ -49,7 +49,9 @@ def write_atomically(path: str | os.PathLike[str], data: str | bytes, *, overwri
         temporary.unlink(missing_ok=True)
 
 
-_MARKS = {".html": b"Made by mkc_torch", ".json": b'"schema": "mkc-', ".py": b"`mkc diagnose`"}
+_MADE = b"Made by mkc_torch"
+_MARKS = {".html": _MADE, ".json": b'"schema": "mkc-', ".py": b"`mkc diagnose`"}
+_MARKS |= dict.fromkeys((".params", ".param", ".h", ".yaml"), _MADE)
 """By which files of a kind are known as written here."""
 
 
