@@ -45,6 +45,9 @@ def write_atomically(path: str | os.PathLike[str], data: str | bytes, *, overwri
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)  # noqa: PTH105 - one name for the step that tests make fail
+    except OSError as error:
+        # a write to a full disk does not name the file, and the temporary's name tells a user nothing
+        raise type(error)(error.errno, error.strerror, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 

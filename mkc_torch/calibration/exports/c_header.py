@@ -6,13 +6,16 @@ import re
 from collections.abc import Sequence
 
 from mkc_torch.calibration.exports.base import MADE_BY, Destination, Export, Exported, SensorCorrection
-from mkc_torch.calibration.exports.numbers import one_line, single
+from mkc_torch.calibration.exports.numbers import SMALLEST, not_held, one_line, single
 
 __all__ = ["C_HEADER"]
 
 
 def text(correction: SensorCorrection, _to: Destination) -> Exported:
     """The header of a correction, in its own units: C99 and C++.
+
+    Raises:
+        ExportError: numbers that 32 bits do not hold.
 
     Example:
         >>> eye = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -21,6 +24,9 @@ def text(correction: SensorCorrection, _to: Destination) -> Exported:
         ('#ifndef MAG_CALIBRATION_MAST_2_H', True)
     """
     c = correction
+    largest = max(map(abs, c.offset))
+    if 0.0 < largest < SMALLEST:
+        raise not_held(largest)
     guard = f"MAG_CALIBRATION_{re.sub('[^A-Z0-9]+', '_', c.name.upper()).strip('_') or 'SENSOR'}_H"
     unit, field_unit = one_line(c.unit) or "recorded units", one_line(c.field_unit) or "recorded units"
     rows = ",\n".join(f"    {_listed(row)}" for row in c.matrix)

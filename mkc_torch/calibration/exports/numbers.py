@@ -8,29 +8,37 @@ import numpy as np
 
 from mkc_torch.calibration.exports.base import ExportError
 
-__all__ = ["one_line", "single", "symmetric"]
+__all__ = ["SMALLEST", "not_held", "one_line", "single", "symmetric"]
+
+SMALLEST = float(np.finfo(np.float32).tiny)
+"""Of the numbers of 32 bits that have all their digits."""
 
 _SYMMETRIC = 1e-9
 _TOLD = 0.01  # degrees
 
 
 def single(value: float) -> str:
-    """A number with the digits that tell it from all others of 32 bits, and no power of ten.
+    """A number with the digits that tell it from all others of 32 bits, and no power of ten; nothing if too small.
 
     Raises:
-        ExportError: 32 bits hold no number of its size.
+        ExportError: 32 bits hold no number so large.
 
     Example:
         >>> single(0.1), single(-2.0), single(1.25e-7)
         ('0.1', '-2.0', '0.000000125')
     """
     size = abs(value)
-    if size > float(np.finfo(np.float32).max) or 0.0 < size < float(np.finfo(np.float32).tiny):
-        raise ExportError(
-            f"the calibration has a number of the size {size:.1e}, which 32 bits do not hold; calibrate again with the "
-            "columns in µT, gauss or mG."
-        )
-    return np.format_float_positional(np.float32(value), unique=True, trim="0")
+    if size > float(np.finfo(np.float32).max):
+        raise not_held(size)
+    return np.format_float_positional(np.float32(value if size >= SMALLEST else 0.0), unique=True, trim="0")
+
+
+def not_held(size: float) -> ExportError:
+    """The error for a number that 32 bits do not hold."""
+    return ExportError(
+        f"the calibration has a number of the size {size:.1e}, which 32 bits do not hold; calibrate again with the "
+        "columns in µT, gauss or mG."
+    )
 
 
 def one_line(text: str) -> str:

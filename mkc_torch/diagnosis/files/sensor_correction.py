@@ -97,7 +97,11 @@ def _why(term: Term, current_taken: bool) -> str:
     )
     why = "an export holds an offset, a matrix and the field of a current"
     if term.effect.id == "current_field":
-        why = "an export holds the field of one current" if current_taken else "its column is in no unit of a current"
+        why = (
+            "an export holds the field of one current"
+            if current_taken
+            else "its column is in no known unit of a current, such as A"
+        )
     return f"{why}. The offset is that at {means}."
 
 

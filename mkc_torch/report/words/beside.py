@@ -12,6 +12,7 @@ from mkc_torch.report.words.terms import term
 __all__ = ["difference_rows", "difference_sentences"]
 
 _NAMED = 3
+_ROUNDING = 9
 
 
 def difference_rows(found: Differences) -> list[tuple[str, str, str, str, str]]:
@@ -38,8 +39,9 @@ def difference_sentences(found: Differences) -> list[str]:
         term(
             "beside.field",
             samples=f"{found.samples:,}",
-            angle_max=size(found.angle_max),
-            angle_rms=size(found.angle_rms),
+            # below is rounding, not a difference
+            angle_max=size(round(found.angle_max, _ROUNDING)),
+            angle_rms=size(round(found.angle_rms, _ROUNDING)),
             length_max=f"{size(found.length_max)} {found.unit}".rstrip(),
             length_rms=f"{size(found.length_rms)} {found.unit}".rstrip(),
         ),
