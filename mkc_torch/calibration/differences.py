@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["LEVEL", "Difference", "Differences", "differences"]
 
 LEVEL = 0.01
-"""Probability at most with which two calibrations of an unchanged sensor are said to differ: shared out among the nine
+"""Probability at most with which two calibrations of an unchanged sensor are said to differ: shared out among the ten
 numbers (Bonferroni), which holds however they are correlated."""
 
 _AXES = "xyz"
@@ -25,7 +25,7 @@ _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 class Difference(NamedTuple):
-    """One of the nine numbers in both calibrations.
+    """One of the ten numbers in both calibrations.
 
     Attributes:
         name: such as "offset x".
@@ -53,7 +53,8 @@ class Differences(NamedTuple):
 
     Attributes:
         name: of the other one.
-        numbers: the offset and the six entries of the matrix.
+        numbers: the offset, the six entries of the matrix, and the radius: a field or a gain of all axes that changed
+            shows there alone, where each calibration has its own field's length.
         limit: of what is still within errors, in combined standard errors.
         samples: measurements that the corrected fields are compared at.
         angle_max, angle_rms: between the two corrected fields, in degrees.
@@ -134,6 +135,15 @@ def differences(new: Calibration, old: Calibration, points: Float[Tensor, "N 3"]
         )
         for i, j in _ENTRIES
     ]
+    numbers.append(
+        Difference(
+            "radius",
+            new.unit,
+            new.radius,
+            old.radius * measured,
+            math.hypot(_of_radius(new), measured * _of_radius(old)),
+        )
+    )
     ours, theirs = new.corrected(points), (points - center) @ matrix.mT
     angle = torch.rad2deg(_angle(ours, theirs))
     length = torch.linalg.vector_norm(ours, dim=-1) - torch.linalg.vector_norm(theirs, dim=-1)
@@ -149,6 +159,12 @@ def differences(new: Calibration, old: Calibration, points: Float[Tensor, "N 3"]
         length_rms=float(length.square().mean().sqrt()),
         unit=new.field_unit,
     )
+
+
+def _of_radius(calibration: Calibration) -> float:
+    """Standard error at most of the geometric mean of the semi-axes, however their errors are correlated."""
+    pairs = zip(calibration.semi_axes, calibration.semi_axes_se, strict=True)
+    return calibration.radius * sum(error / axis for axis, error in pairs) / 3.0
 
 
 def _angle(a: Float[Tensor, "N 3"], b: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:

@@ -23,7 +23,7 @@ def pair(points):
 
 def test_the_same_sensor_is_the_same_within_errors(pair, points):
     found = differences(*pair, points)
-    assert len(found.numbers) == 9
+    assert len(found.numbers) == 10
     assert found.beyond == ()
     assert difference_sentences(found)[0].startswith("The same within errors")
     assert found.name == "old"
@@ -39,12 +39,12 @@ def test_a_calibration_beside_itself_differs_in_nothing(pair, points):
 def test_errors_combine_and_the_limit_is_bonferronis(pair, points):
     new, old = pair
     found = differences(new, old, points)
-    offset_x, matrix_yz = found.numbers[0], found.numbers[-1]
+    offset_x, matrix_yz = found.numbers[0], found.numbers[-2]
     assert offset_x.error == pytest.approx(math.sqrt(new.center_se[0] ** 2 + old.center_se[0] ** 2))
     assert offset_x.in_errors == pytest.approx((new.center[0] - old.center[0]) / offset_x.error)
     assert (matrix_yz.name, matrix_yz.new, matrix_yz.old) == ("matrix yz", new.matrix[1][2], old.matrix[1][2])
     tail = torch.special.erfc(torch.tensor(found.limit / math.sqrt(2.0), dtype=torch.float64))
-    assert float(tail) * 9 == pytest.approx(LEVEL)
+    assert float(tail) * 10 == pytest.approx(LEVEL)
 
 
 def test_a_moved_offset_is_named_and_its_field_measured(pair, points):
@@ -75,6 +75,9 @@ def test_an_older_one_in_other_units_is_converted(pair, points):
         field_unit="gauss",
         center=tuple(0.01 * v for v in old.center),
         center_se=tuple(0.01 * v for v in old.center_se),
+        semi_axes=tuple(0.01 * v for v in old.semi_axes),
+        semi_axes_se=tuple(0.01 * v for v in old.semi_axes_se),
+        radius=0.01 * old.radius,
     )
     expected, found = differences(new, old, points), differences(new, in_gauss, points)
     for one, other in zip(found.numbers, expected.numbers, strict=True):
@@ -92,7 +95,8 @@ def test_units_without_a_size_are_refused_with_what_to_do(pair, points):
 
 def test_unknown_errors_are_shown_as_unknown(pair, points):
     new, old = pair
-    unknown = dataclasses.replace(old, center_se=(math.nan,) * 3, matrix_se=((math.nan,) * 3,) * 3)
+    nothing = (math.nan,) * 3
+    unknown = dataclasses.replace(old, center_se=nothing, semi_axes_se=nothing, matrix_se=(nothing,) * 3)
     found = differences(new, unknown, points)
     assert found.beyond == ()
     assert difference_sentences(found)[0] == ("Whether they differ cannot be said: one of them has no standard errors.")
@@ -108,3 +112,11 @@ def test_many_differences_are_counted(pair, points):
     sentence = difference_sentences(differences(new, other, points))[0]
     assert sentence.startswith("It differs: matrix")
     assert sentence.count("matrix") == 3
+
+
+def test_a_gain_of_all_axes_shows_in_the_radius_alone(points):
+    """Both correct to the length that they measured, so that their matrices are the same."""
+    new, old = calibrate(recorded(1.02 * points)), calibrate(recorded(points))
+    radius = [one for one in differences(new, old, points).beyond if one.name == "radius"]
+    assert radius[0].new == pytest.approx(1.02 * old.radius, rel=1e-3)
+    assert not [one for one in differences(new, old, points).beyond if one.name.startswith("matrix")]

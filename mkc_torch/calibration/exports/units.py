@@ -9,7 +9,7 @@ import numpy as np
 from mkc_torch._support.unit_text import ratio
 from mkc_torch.calibration.exports.base import ExportError, SensorCorrection
 
-__all__ = ["Converted", "converted"]
+__all__ = ["Converted", "converted", "is_known"]
 
 _SPELT = {
     "gauss": ("gs", "ga", "gauß"),
@@ -77,6 +77,16 @@ def converted(correction: SensorCorrection, unit: str, kind: str) -> Converted:
         mean=0.0 if current is None else current.mean,
         strength=None if correction.field_strength is None else correction.field_strength * of_field,
     )
+
+
+def is_known(unit: str) -> bool:
+    """Whether a text names a unit of the magnetic field.
+
+    Example:
+        >>> is_known("mG"), is_known("counts")
+        (True, False)
+    """
+    return _ratio(unit, "T") is not None
 
 
 def _ratio(unit: str, other: str) -> float | None:

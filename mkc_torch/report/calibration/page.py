@@ -9,6 +9,7 @@ from markupsafe import Markup
 
 from mkc_torch.calibration.calibrate import ENOUGH_INFORMATION, MAX_REJECTED, Calibration, Vector, prepared
 from mkc_torch.calibration.differences import Differences
+from mkc_torch.calibration.exports.units import is_known
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.recording.recording import Recording
 from mkc_torch.report.calibration import pictures
@@ -66,6 +67,7 @@ def calibration_report(
         rejects_many=calibration.rejected_share > MAX_REJECTED,
         note=note,
         comparison=comparison,
+        in_known_unit=is_known(calibration.unit),
         against=against,
         difference_rows=[] if against is None else difference_rows(against),
         difference_sentences=[] if against is None else difference_sentences(against),

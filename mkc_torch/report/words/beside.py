@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from mkc_torch.calibration.differences import LEVEL, Difference, Differences
-from mkc_torch.report.words.numbers import decimals, in_power, number, power, size, with_errors
+from mkc_torch.report.words.numbers import decimals, in_power, number, power, share, size, with_errors
 from mkc_torch.report.words.terms import term
 
 __all__ = ["difference_rows", "difference_sentences"]
@@ -31,8 +31,8 @@ def difference_sentences(found: Differences) -> list[str]:
 
     Example:
         >>> one = Difference("offset x", "µT", 12.5, 12.0, 0.25)
-        >>> difference_sentences(Differences("old", (one,), 3.26, 100, 0.5, 0.2, 0.3, 0.1, "µT"))[0]
-        'The same within errors: offset x differs most, by +2.0 combined standard errors of 3.26 that are needed.'
+        >>> difference_sentences(Differences("old", (one,), 3.26, 100, 0.5, 0.2, 0.3, 0.1, "µT"))[0].partition(",")
+        ('The same within errors: offset x differs most', ',', ' by +2.0 combined standard errors, ...')
     """
     return [
         _verdict(found),
@@ -57,7 +57,7 @@ def _verdict(found: Differences) -> str:
     named = [term("beside.one", what=one.name, errors=_signed(one.in_errors)) for one in found.beyond[:_NAMED]]
     if len(found.beyond) > _NAMED:
         named.append(term("beside.more", count=len(found.beyond) - _NAMED))
-    return term("beside.differs", what=", ".join(named), limit=f"{found.limit:.2f}", level=f"{LEVEL:g}")
+    return term("beside.differs", what=", ".join(named), limit=f"{found.limit:.2f}", level=share(LEVEL))
 
 
 def _groups(numbers: Sequence[Difference]) -> list[list[Difference]]:

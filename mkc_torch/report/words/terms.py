@@ -216,10 +216,10 @@ TERMS: dict[str, str] = {
     "calibration.coverage": "{share} of all directions have a sample within 15°",
     "calibration.change": "{robust} [unit.robust], {before} → {after} [unit.rms]",
     # a calibration beside an older one
-    "beside.same": "The same within errors: {what} differs most, by {errors} combined [unit.standard_error]s of {limit}"
-    " that are needed.",
-    "beside.differs": "It differs: {what}. More than {limit} combined [unit.standard_error]s are chance in {level} of"
-    " all cases at most.",
+    "beside.same": "The same within errors: {what} differs most, by {errors} combined [unit.standard_error]s, and a"
+    " difference begins at {limit}.",
+    "beside.differs": "It differs: {what}. Of an unchanged sensor, one number or more goes beyond {limit} in {level} of"
+    " cases at most.",
     "beside.one": "{what} by {errors} combined [unit.standard_error]s",
     "beside.more": "and {count} more",
     "beside.unknown": "Whether they differ cannot be said: one of them has no [unit.standard_error]s.",
