@@ -24,9 +24,10 @@ def text(correction: SensorCorrection, _to: Destination) -> Exported:
         ('#ifndef MAG_CALIBRATION_MAST_2_H', True)
     """
     c = correction
-    largest = max(map(abs, c.offset))
-    if 0.0 < largest < SMALLEST:
-        raise not_held(largest)
+    if c.field_strength is not None:
+        reading = c.field_strength / max(SMALLEST, *(abs(value) for row in c.matrix for value in row))
+        if reading < SMALLEST:
+            raise not_held(reading)
     guard = f"MAG_CALIBRATION_{re.sub('[^A-Z0-9]+', '_', c.name.upper()).strip('_') or 'SENSOR'}_H"
     unit, field_unit = one_line(c.unit) or "recorded units", one_line(c.field_unit) or "recorded units"
     rows = ",\n".join(f"    {_listed(row)}" for row in c.matrix)

@@ -3,6 +3,7 @@
 import csv
 import io
 import itertools
+import re
 
 import numpy as np
 
@@ -93,3 +94,15 @@ def plain_json(numbers, readings, current=0.0):
     away = np.broadcast_to(np.asarray(current) - numbers["mean_current"], len(readings))[:, None] * k
     field = (readings / TESLA[numbers["unit"]] - offset - away) @ matrix.T
     return field * TESLA[numbers["field_unit"]]
+
+
+def c_header(text, readings, unit, field_unit):
+    """What mag_correct computes in single precision; readings in tesla to the field in tesla."""
+
+    def array(name):
+        body = re.search(rf"{name}(?:\[3\])+ = (.*?);", text, re.DOTALL)[1]
+        return np.array([np.float32(v) for v in re.findall(r"(-?\d+\.\d+)f", body)])
+
+    offset, matrix = array("mag_offset"), array("mag_matrix").reshape(3, 3)
+    away = (readings / TESLA[unit]).astype(np.float32) - offset
+    return (away @ matrix.T).astype(np.float64) * TESLA[field_unit]

@@ -88,6 +88,9 @@ def test_each_documented_formula_gives_what_apply_writes(fitted, data):
     assert not any("MOT" in name for name in ardupilot)
     numbers = json.loads(exported("json", correction).text)
     assert np.abs(formulas.plain_json(numbers, in_tesla) - expected).max() < 1e-3 * CLOSE
+    header = exported("c-header", correction).text
+    field = formulas.c_header(header, in_tesla, calibration.unit, calibration.field_unit)
+    assert np.abs(field - expected).max() < CLOSE
 
 
 @given(data=st.data())
@@ -268,6 +271,6 @@ def test_numbers_of_32_bits_round_trip(value):
 
 
 def test_numbers_that_32_bits_do_not_hold_are_refused():
-    for kind, value in (("c-header", 1e60), ("px4", 1e60), ("c-header", 1e-60)):
+    for kind, offset, strength in (("c-header", 1e60, 48.0), ("px4", 1e60, 48.0), ("c-header", 1e-60, 1e-59)):
         with pytest.raises(ExportError, match="32 bits"):
-            exported(kind, SensorCorrection("a", "µT", (value, 0.0, 0.0), EYE, "µT"))
+            exported(kind, SensorCorrection("a", "µT", (offset, 0.0, 0.0), EYE, "µT", strength))
