@@ -329,7 +329,7 @@ def _extremes(value: Tensor) -> tuple[float, float] | None:
 
 def first_of(value: Tensor, wrong: Tensor) -> str:
     """The first element that is wrong, as an error tells it."""
-    index = tuple(wrong.nonzero()[0].tolist())
+    index = tuple(int(at) for at in wrong.nonzero()[0])  # not tolist, which torch 2.6 lacks under its transforms
     return f"{value[index].item():.6g}" + (f" at index {index}" if index else "")
 
 

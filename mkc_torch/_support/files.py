@@ -51,6 +51,11 @@ def write_atomically(path: str | os.PathLike[str], data: str | bytes, *, overwri
             file.flush()
             os.fsync(file.fileno())
         _take_name(temporary, path, overwrite)
+    except OSError as error:
+        if error.errno is None:  # our own sentence
+            raise
+        # a write to a full disk does not name the file, and the temporary's name tells a user nothing
+        raise type(error)(error.errno, error.strerror, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -109,7 +114,9 @@ def folder_held(path: str | os.PathLike[str]) -> Iterator[None]:
         os.close(handle)
 
 
-_MARKS = {".html": b"Made by mkc_torch", ".json": b'"schema": "mkc-', ".py": b"`mkc diagnose`"}
+_MADE = b"Made by mkc_torch"
+_MARKS = {".html": _MADE, ".json": b'"schema": "mkc-', ".py": b"`mkc diagnose`"}
+_MARKS |= dict.fromkeys((".params", ".param", ".h", ".yaml"), _MADE)
 """By which files of a kind are known as written here."""
 
 

@@ -79,7 +79,9 @@ def prepared(recording: Recording) -> Recording:
     return usable
 
 
-def calibrate(recording: Recording, *, field_strength: float | None = None, seed: int = 0) -> Calibration:
+def calibrate(
+    recording: Recording, *, field_strength: float | None = None, name: str | None = None, seed: int = 0
+) -> Calibration:
     """Calibrate the magnetometer of a recording by MKC-EM on the linear ellipsoid fit.
 
     Samples that are not finite, or that no field explains, are left out and the rest is sorted by time, which the
@@ -89,6 +91,7 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
     Args:
         recording: with columns ``mag_x``, ``mag_y``, ``mag_z``, in any one unit, and ``time`` in s where it has one.
         field_strength: length of the corrected field in µT; default the radius of the ellipsoid, in its own unit.
+        name: what the sensor is called; default the recording's name.
         seed: of the robust start.
 
     Raises:
@@ -152,6 +155,7 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
             *(sentence for sentence in (size, time_warning(usable)) if sentence),
             *_warnings(fit, found, float(rejected.double().mean())),
         ),
+        name=usable.name if name is None else name,
     )
 
 

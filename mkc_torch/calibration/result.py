@@ -62,6 +62,7 @@ class Calibration:
         disturbed: where rejected samples stand close together in time.
         coverage: of directions, by the samples in use.
         warnings: sentences about the recording and the fit.
+        name: what the sensor is called: the recording's name, unless another was given.
     """
 
     recording: str
@@ -86,6 +87,7 @@ class Calibration:
     disturbed: tuple[Interval, ...]
     coverage: Coverage
     warnings: tuple[str, ...]
+    name: str = ""
 
     @property
     def rejected_share(self) -> float:
@@ -158,6 +160,7 @@ def calibration_to_json(calibration: Calibration) -> str:
     content = {
         "schema": SCHEMA,
         "recording": c.recording,
+        "name": c.name,
         "samples": c.samples,
         "unit": c.unit,
         "center": {"value": c.center, "standard_error": finite_or_none(c.center_se)},
@@ -234,4 +237,5 @@ def calibration_from_json(text: str) -> Calibration:
             information=c.number("coverage", "information"),
         ),
         warnings=tuple(c.text("warnings", i) for i in c.each("warnings")),
+        name=c.text("name") if "name" in content else c.text("recording"),
     )

@@ -19,6 +19,7 @@ from mkc_torch.cli.console import (
     progress,
     refuse_same_names,
 )
+from mkc_torch.cli.export_options import DEVICE_ID, INSTANCE, checked_exports
 from mkc_torch.cli.loading import loading
 
 
@@ -34,6 +35,22 @@ def calibrate(
         typer.Option(metavar="µT", help="Length of the corrected field in µT; default: as measured."),
     ] = None,
     unit: Annotated[str, typer.Option(help="Unit of the magnetometer's columns, such as counts.")] = "µT",
+    name: Annotated[
+        str | None, typer.Option(help="What the sensor is called in all results; default: the recording's name.")
+    ] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(metavar="OLD.json", help="An older calibration.json to set the new one beside."),
+    ] = None,
+    export: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND",
+            help="Also write it as px4, ardupilot, c-header, ros-yaml or json; may be given several times.",
+        ),
+    ] = None,
+    instance: INSTANCE = None,
+    device_id: DEVICE_ID = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
     """Find a magnetometer's offset, gains and cross-axis coupling in recordings of it being turned.
@@ -45,29 +62,50 @@ def calibrate(
         raise typer.BadParameter(f"--field-strength must be a positive number of µT but is {field_strength:g}.")
     if not unit.strip():
         raise typer.BadParameter("--unit is empty; name the unit, such as counts.")
+    if name is not None and (not name.strip() or len(recordings) > 1):
+        raise typer.BadParameter("--name is the name of one sensor: give it with one REC, and not empty.")
+    exports = checked_exports("--export", export or [], instance, device_id)
     refuse_same_names(recordings)
     with loading():
         from mkc_torch._parallel.processes import keep_memory
-        from mkc_torch.cli.calibration_files import calibrate_file
+        from mkc_torch.calibration.exports import Destination
+        from mkc_torch.cli.calibration_files import Asked, calibrate_file, read_calibration
         from mkc_torch.cli.calibration_summary import show
     keep_memory()
+    try:
+        old = None if against is None else read_calibration(against)
+    except FAILURES as error:
+        complain(str(against), error)
+        raise typer.Exit(1) from None
+    asked = Asked(
+        names,
+        unit,
+        field_strength,
+        None if name is None else name.strip(),
+        old,
+        against,
+        exports,
+        Destination(instance, device_id),
+    )
     console, failed, left = out(), 0, list(recordings)
     with progress(len(recordings), output) as step, interrupts_told(lambda: not_written(left, output)):
         for path in recordings:
             step(f"calibrating {path.name}")
             try:
-                calibration, files = calibrate_file(
-                    path, output / path.stem, columns=names, unit=unit, field_strength=field_strength, force=force
-                )
+                found = calibrate_file(path, output / path.stem, asked, force=force)
             except FAILURES as error:
                 failed += 1
                 with step.aside():
                     complain(path, error)
             else:
                 with step.aside():
-                    show(console, calibration, files)
+                    show(console, found.calibration, found.files, found.differences, found.notes)
+                    for refused in found.refused:
+                        complain(path, refused)
+                failed += bool(found.refused)
             left.remove(path)
             step(None)
     if len(recordings) > 1 and failed:
-        err().print(f"mkc: {failed} of {len(recordings)} recordings were not calibrated.", soft_wrap=True)
+        what = "not done in full" if asked.exports or asked.old else "not calibrated"
+        err().print(f"mkc: {failed} of {len(recordings)} recordings were {what}.", soft_wrap=True)
     raise typer.Exit(1 if failed else 0)

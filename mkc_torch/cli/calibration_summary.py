@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -9,14 +10,22 @@ from rich.table import Table
 from rich.text import Text
 
 from mkc_torch.calibration.calibrate import Calibration
+from mkc_torch.calibration.differences import Differences
 from mkc_torch.report.words import numbers as w
+from mkc_torch.report.words.beside import difference_rows, difference_sentences
 from mkc_torch.report.words.terms import term
 
 
-def show(console: Console, c: Calibration, files: list[Path]) -> None:
-    """Print the summary of a calibration and the files that hold it."""
+def show(
+    console: Console,
+    c: Calibration,
+    files: Sequence[Path],
+    beside: Differences | None = None,
+    notes: Sequence[str] = (),
+) -> None:
+    """Print the summary of a calibration, what it differs in from another, and the files that hold it."""
     console.print()
-    console.print(Text(c.recording or term("label.recording"), style="bold"))
+    console.print(Text(c.name or c.recording or term("label.recording"), style="bold"))
     table = Table.grid(padding=(0, 3, 0, 0))
     table.add_column(no_wrap=True)
     for _ in range(3):
@@ -42,9 +51,26 @@ def show(console: Console, c: Calibration, files: list[Path]) -> None:
         (term("label.coverage"), term("calibration.coverage", share=w.share(c.coverage.fraction))),
     ):
         facts.add_row(name, Text(value))
-    for warning in c.warnings:
+    for warning in (*c.warnings, *notes):
         facts.add_row(Text(term("label.warning"), style="bold yellow"), Text(warning))
     console.print(facts)
+    if beside is not None:
+        _show_differences(console, beside)
     for file in files:
         # outside the table, where a long path would be broken and could not be copied
         console.print(Text.assemble(f"{term('label.written'):<11}", (str(file), "cyan")), soft_wrap=True)
+
+
+def _show_differences(console: Console, found: Differences) -> None:
+    """Print what differs from an older calibration."""
+    console.print(Text(term("section.against", name=found.name), style="bold"))
+    table = Table(box=None, pad_edge=False, padding=(0, 3, 0, 0), header_style="")
+    table.add_column("", no_wrap=True)
+    heads = (term("table.this_one"), found.name, term("table.difference"), term("table.in_errors"))
+    for head in heads:
+        table.add_column(Text(head), justify="right")
+    for row in difference_rows(found):
+        table.add_row(*map(Text, row))
+    console.print(table)
+    for sentence in difference_sentences(found):
+        console.print(Text(sentence))

@@ -53,6 +53,8 @@ def demo(
             with step.aside():
                 show_diagnosis(console, diagnosis, found, second)
     except FAILURES as error:
+        if isinstance(error, OSError) and error.errno is not None and error.filename is None:
+            raise  # of the terminal's, not of a file's
         complain(output, error)
         raise typer.Exit(1) from None
     console.print(f"\nNext: open {files[-1]} and {output / CONCEALED / 'report.html'}, or", soft_wrap=True)

@@ -318,8 +318,7 @@ def refuse_bad_bound(bound: Tensor, scale: Tensor) -> None:
         first = tuple(narrow.nonzero()[0])
         raise ValueError(
             f"Expected argument `bound` to be at least two robust scales of the residuals, "
-            f"{2.0 * scale[first].item():.4g}, but got {bound[first].item():.4g}; it is the half-width "
-            "of the domain that errors can lie in, in the unit of the data."
+            f"{2.0 * scale[first].item():.4g}, but got {bound[first].item():.4g}; it is the domain's half-width."
         )
 
 

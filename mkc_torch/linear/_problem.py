@@ -247,10 +247,8 @@ class CanonicalShapes:
     single_channel: bool
 
 
-def refuse_magnitude(largest: Tensor, name: str = "Y") -> None:
+def refuse_magnitude(largest: Tensor) -> None:
     """Refuse Y of these largest absolute values, where residuals squared twice would overflow or vanish.
-
-    So of what is in the unit of Y, by its ``name``.
 
     Raises:
         ValueError: they would.
@@ -259,7 +257,7 @@ def refuse_magnitude(largest: Tensor, name: str = "Y") -> None:
     limit = float(torch.finfo(largest.dtype).max) ** 0.25
     if most > limit or 0.0 < most < 1.0 / limit:
         raise ValueError(
-            f"Expected argument `{name}` of a magnitude between {1.0 / limit:.0e} and {limit:.0e} in {largest.dtype} "
+            f"Expected argument `Y` of a magnitude between {1.0 / limit:.0e} and {limit:.0e} in {largest.dtype} "
             f"but got {most:.3g}; choose another unit."
         )
 
@@ -404,12 +402,8 @@ def _check_weight(sample_weight: Tensor, values: CanonicalShapes) -> None:
     _check_finite("sample_weight", weight)
     if (weight < 0).any():
         raise ValueError(f"Expected argument `sample_weight` to be >= 0 but got {weight.min().item()}.")
-    most = float(torch.finfo(weight.dtype).max) ** 0.5
-    if (weight > most).any():
-        raise ValueError(
-            f"Expected argument `sample_weight` of at most {most:.0e}, beyond which squares overflow, but got "
-            f"{float(weight.max()):.3g}; divide the weights by their mean."
-        )
+    if (weight > torch.finfo(weight.dtype).max ** 0.5).any():
+        raise ValueError(f"Expected argument `sample_weight` to have finite squares but got {weight.max():.3g}.")
     if (weight.sum(-2) <= 0).any():
         raise ValueError(
             "Expected argument `sample_weight` to be positive somewhere in every channel but got all zeros."

@@ -10,6 +10,7 @@ import numpy as np
 
 from mkc_torch._support.files import write_atomically
 from mkc_torch.recording.formats import check_ending, encoded, read_table
+from mkc_torch.recording.formats.base import polars
 from mkc_torch.recording.formats.cells import as_numbers
 from mkc_torch.recording.formats.csv import CSV
 
@@ -18,13 +19,17 @@ if TYPE_CHECKING:
 
 __all__ = ["write_beside"]
 
+_LEADING_ZERO = r"^\s*[+-]?0\d"
+"""Of digits that are a name rather than a number, such as 007."""
+
 
 def write_beside(
     source: Path, path: Path, columns: Mapping[str, Tensor], *, overwrite: bool = False
 ) -> tuple[str, ...]:
     """Write the columns of a file, in its order, with others: in the place of one of that name, or after all.
 
-    What is text in the file is written as it is, to the last digit; into a Parquet file numbers go as numbers.
+    What is text in the file is written as it is, to the last digit. Into a Parquet file numbers go as numbers, and
+    what comes from one keeps its type; into text, times go as ISO 8601. Columns without a name keep having none.
 
     Args:
         source: the file that was read.
@@ -41,24 +46,41 @@ def write_beside(
     """
     check_ending(path)
     table = read_table(source)
-    as_text = path.suffix.lower() in CSV.endings
-    told = {name: _cells(series, as_text) for name, series in zip(table.names, table.series, strict=True) if name}
+    of_text, as_text = (file.suffix.lower() in CSV.endings for file in (source, path))
+    told: dict[str, Any] = {}
+    for name, series in zip(table.names, table.series, strict=True):
+        while not name and name in told:
+            name += " "  # blanks tell several without a name apart, and are none when it is read
+        told[name] = _texts(series) if as_text else _typed(series) if of_text else series
     told |= {name: values.numpy() for name, values in columns.items()}
     write_atomically(path, encoded(path, told), overwrite=overwrite)
     return tuple(told)
 
 
-def _cells(series: Any, as_text: bool) -> np.ndarray:
-    """Values for an encoder: numbers, or the text of each."""
-    if series.dtype.is_numeric():
-        return series.to_numpy()
+def _typed(series: Any) -> Any:
+    """A column of text for a file that has types: as it is, but for one that holds numbers alone."""
+    package = polars()
     numbers, bad = as_numbers(series)
-    if not as_text and not bad.any():
-        return numbers.fill_null(float("nan")).to_numpy()
-    if not as_text and not _is_text(series):
-        return series.to_numpy()
-    return np.array(["" if value is None else str(value) for value in series.to_list()], dtype=object)
+    if bad.any() or series.str.contains(_LEADING_ZERO).any() or numbers.is_null().all():
+        return series
+    whole = series.str.strip_chars().cast(package.Int64, strict=False)
+    # beyond 2^53 a float has not all digits of a whole number, such as a time stamp in ns
+    return whole if whole.null_count() == numbers.null_count() else numbers
 
 
-def _is_text(series: Any) -> bool:
-    return all(value is None or isinstance(value, str) for value in series.head(100).to_list())
+def _texts(series: Any) -> np.ndarray:
+    """The text of each cell, empty where there is none."""
+    package = polars()
+    if series.dtype == package.Float64:
+        cells = [None if value is None else repr(value) for value in series.to_list()]
+    elif series.dtype.is_temporal():
+        cells = series.dt.to_string("iso").to_list()
+    elif series.dtype.is_nested() or series.dtype in (package.Binary, package.Object):
+        cells = [None if value is None else str(_plain(value)) for value in series.to_list()]
+    else:
+        cells = series.cast(package.String).to_list()
+    return np.array(["" if cell is None else cell for cell in cells], dtype=object)
+
+
+def _plain(value: Any) -> Any:
+    return value.to_list() if hasattr(value, "to_list") else value

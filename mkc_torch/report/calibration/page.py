@@ -8,10 +8,13 @@ from dataclasses import dataclass
 from markupsafe import Markup
 
 from mkc_torch.calibration.calibrate import ENOUGH_INFORMATION, MAX_REJECTED, Calibration, Vector, prepared
+from mkc_torch.calibration.differences import Differences
+from mkc_torch.calibration.exports.units import is_known
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.recording.recording import Recording
 from mkc_torch.report.calibration import pictures
 from mkc_torch.report.rendering import render
+from mkc_torch.report.words.beside import difference_rows, difference_sentences
 
 __all__ = ["Comparison", "calibration_report", "refusal_report"]
 
@@ -26,7 +29,12 @@ class Comparison:
 
 
 def calibration_report(
-    calibration: Calibration, recording: Recording, *, note: str = "", comparison: Sequence[Comparison] = ()
+    calibration: Calibration,
+    recording: Recording,
+    *,
+    note: str = "",
+    comparison: Sequence[Comparison] = (),
+    against: Differences | None = None,
 ) -> str:
     """The page for a calibration and the recording it was made from.
 
@@ -35,6 +43,7 @@ def calibration_report(
         recording: the one it came from.
         note: a sentence at the top of the page, such as that the data are simulated.
         comparison: other results, or the truth, to set beside this one.
+        against: what differs from an older calibration.
 
     Returns:
         HTML with its pictures in it.
@@ -58,6 +67,10 @@ def calibration_report(
         rejects_many=calibration.rejected_share > MAX_REJECTED,
         note=note,
         comparison=comparison,
+        in_known_unit=is_known(calibration.unit),
+        against=against,
+        difference_rows=[] if against is None else difference_rows(against),
+        difference_sentences=[] if against is None else difference_sentences(against),
         figures={
             "sphere": Markup(pictures.sphere(calibration, points)),
             "residual": Markup(pictures.residual(calibration, points, usable.time)),

@@ -215,6 +215,16 @@ TERMS: dict[str, str] = {
     "calibration.scattered": "{rejected}, scattered over the recording.",
     "calibration.coverage": "{share} of all directions have a sample within 15°",
     "calibration.change": "{robust} [unit.robust], {before} → {after} [unit.rms]",
+    # a calibration beside an older one
+    "beside.same": "The same within errors: {what} differs most, by {errors} combined [unit.standard_error]s, and a"
+    " difference begins at {limit}.",
+    "beside.differs": "It differs: {what}. Of an unchanged sensor, one number or more goes beyond {limit} in {level} of"
+    " cases at most.",
+    "beside.one": "{what} by {errors} combined [unit.standard_error]s",
+    "beside.more": "and {count} more",
+    "beside.unknown": "Whether they differ cannot be said: one of them has no [unit.standard_error]s.",
+    "beside.field": "Over the directions of the {samples} samples in use, the corrected fields differ by {angle_max}°"
+    " and {length_max} at most, {angle_rms}° and {length_rms} [unit.rms].",
     # names of lines, on the terminal and on a page
     "label.recording": "recording",
     "label.a_recording": "a recording",
@@ -291,6 +301,9 @@ TERMS: dict[str, str] = {
     "table.robust": "[unit.robust] (1.4826 × median absolute), {unit}",
     "table.rms": "[unit.root_mean_square], rejected samples included, {unit}",
     "table.share_of_radius": "[unit.robust], share of the radius",
+    "table.this_one": "this one",
+    "table.difference": "difference ± SE",
+    "table.in_errors": "in [unit.standard_error]s",
     "table.offset_of": "offset {axis}",
     "table.semi_axis": "semi-axis {number}",
     "table.offset_line": "offset x, y, z ± SE, {unit}",
@@ -317,6 +330,7 @@ TERMS: dict[str, str] = {
     "section.separability": "What this recording can tell apart",
     "section.result": "The result",
     "section.truth": "Beside the truth",
+    "section.against": "Beside the calibration {name}",
     "section.next": "What to do next",
     "section.to_record": "What to record",
     "section.before_and_after": "Before and after",

@@ -1,0 +1,30 @@
+"""Calibrations in the form that others take, a kind a file; a new one is an :class:`Export` in ``EXPORTS``."""
+
+from __future__ import annotations
+
+from mkc_torch.calibration.exports.ardupilot import ARDUPILOT
+from mkc_torch.calibration.exports.base import (
+    CurrentField,
+    Destination,
+    Export,
+    Exported,
+    ExportError,
+    SensorCorrection,
+)
+from mkc_torch.calibration.exports.c_header import C_HEADER
+from mkc_torch.calibration.exports.json import JSON
+from mkc_torch.calibration.exports.px4 import PX4
+from mkc_torch.calibration.exports.ros_yaml import ROS_YAML
+
+__all__ = [
+    "EXPORTS",
+    "CurrentField",
+    "Destination",
+    "Export",
+    "ExportError",
+    "Exported",
+    "SensorCorrection",
+]
+
+EXPORTS: dict[str, Export] = {export.name: export for export in (PX4, ARDUPILOT, C_HEADER, ROS_YAML, JSON)}
+"""All kinds, by the name that the command line has for them."""

@@ -1,0 +1,95 @@
+"""Corrections in the unit that a kind of file is in."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mkc_torch._support.unit_text import ratio
+from mkc_torch.calibration.exports.base import ExportError, SensorCorrection
+
+__all__ = ["Converted", "converted", "is_known"]
+
+_SPELT = {
+    "gauss": ("gs", "ga", "gauß"),
+    "mG": ("mgauss", "milligauss", "mga"),
+    "T": ("tesla",),
+    "µT": ("microtesla",),
+    "nT": ("nanotesla",),
+    "mT": ("millitesla",),
+}
+_NAMES = {spelling: unit for unit, spellings in _SPELT.items() for spelling in spellings} | {"gauss": "gauss"}
+
+
+class Converted(NamedTuple):
+    """A correction whose measurement and field are in one unit.
+
+    Attributes:
+        offset: (3,), at the mean current.
+        matrix: (3, 3), no unit.
+        per_ampere: (3,), in the sensor's axes, in the unit per A; zero where there is no current.
+        mean: of the current in A.
+        strength: of the field; None where it is not known.
+    """
+
+    offset: np.ndarray
+    matrix: np.ndarray
+    per_ampere: np.ndarray
+    mean: float
+    strength: float | None
+
+    @property
+    def offset_without_current(self) -> np.ndarray:
+        """(3,): the offset where no current flows."""
+        return self.offset - self.per_ampere * self.mean
+
+
+def converted(correction: SensorCorrection, unit: str, kind: str) -> Converted:
+    """The correction with measurement and field in a unit of the magnetic field.
+
+    Args:
+        correction: in any unit.
+        unit: such as gauss.
+        kind: of file, for the message.
+
+    Raises:
+        ExportError: the correction is in a unit whose size is not known, such as counts.
+
+    Example:
+        >>> eye = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+        >>> converted(SensorCorrection("a", "uT", (10.0, 0.0, -20.0), eye, "uT"), "gauss", "px4").offset
+        array([ 0.1,  0. , -0.2])
+    """
+    of_measured, of_field = (_ratio(name, unit) for name in (correction.unit, correction.field_unit))
+    if of_measured is None or of_field is None:
+        found = correction.unit if of_measured is None else correction.field_unit
+        raise ExportError(
+            f"the calibration is in {found or 'no known unit'}, and {kind} needs {unit}, so nothing was exported to "
+            "it. If the columns are in a unit of the magnetic field, calibrate again and name it, such as `--unit "
+            "mag=gauss`; raw counts have to be scaled by the sensor's data sheet first."
+        )
+    current = correction.current
+    return Converted(
+        offset=np.array(correction.offset) * of_measured,
+        matrix=np.array(correction.matrix) * (of_field / of_measured),
+        per_ampere=np.zeros(3) if current is None else np.array(current.per_ampere) * of_measured,
+        mean=0.0 if current is None else current.mean,
+        strength=None if correction.field_strength is None else correction.field_strength * of_field,
+    )
+
+
+def is_known(unit: str) -> bool:
+    """Whether a text names a unit of the magnetic field.
+
+    Example:
+        >>> is_known("mG"), is_known("counts")
+        (True, False)
+    """
+    return _ratio(unit, "T") is not None
+
+
+def _ratio(unit: str, other: str) -> float | None:
+    """How many of the other one a unit of the magnetic field is; None where that is not known."""
+    plain = unit.strip().replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
+    return ratio(_NAMES.get(plain.lower(), plain), other)

@@ -1,0 +1,57 @@
+"""``mkc export``: a calibration or a model made before, in the form that an autopilot or a program takes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mkc_torch.cli.console import FAILURES, complain, out
+from mkc_torch.cli.export_options import DEVICE_ID, INSTANCE, checked_exports
+from mkc_torch.cli.loading import loading
+
+
+def export(
+    model: Annotated[
+        Path,
+        typer.Argument(metavar="MODEL.json", help="calibration.json of `mkc calibrate`, model.json of `mkc diagnose`."),
+    ],
+    to: Annotated[str, typer.Option(metavar="KIND", help="px4, ardupilot, c-header, ros-yaml or json.")],
+    output: Annotated[Path, typer.Option(help="File to write.")],
+    name: Annotated[
+        str | None,
+        typer.Option(help="What the sensor is called; default: as in the calibration; of a model its folder's."),
+    ] = None,
+    instance: INSTANCE = None,
+    device_id: DEVICE_ID = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+) -> None:
+    """Write a calibration as parameters of PX4 or ArduPilot, a C header, a parameter file of ROS, or plain JSON.
+
+    Of a model, offset, matrix and the field of a current are exported; what else it found is told as left out.
+    """
+    if name is not None and not name.strip():
+        raise typer.BadParameter("--name is empty; name the sensor, such as mast.")
+    checked_exports("--to", [to], instance, device_id)
+    with loading():
+        from mkc_torch._support.files import write_atomically
+        from mkc_torch.calibration.exports import EXPORTS, Destination
+        from mkc_torch.cli.correction import read_correction
+        from mkc_torch.cli.exported import correction_of
+    subject = model
+    try:
+        correction = correction_of(read_correction(model), model, name)
+        kind = EXPORTS[to]
+        exported = kind.text(correction, Destination(instance, device_id))
+        subject = output
+        if output.exists() and output.samefile(model):
+            raise ValueError("this is what is exported, which is read and never overwritten; choose another --output.")
+        write_atomically(output, exported.text, overwrite=force)
+    except FAILURES as error:
+        complain(subject, error)
+        raise typer.Exit(1) from None
+    console = out()
+    for warning in exported.warnings:
+        console.print(f"warning: {warning}", soft_wrap=True)
+    console.print(f"{correction.name} for {to}, to load {kind.load}: {output}", soft_wrap=True)

@@ -1,0 +1,122 @@
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch.calibration.calibrate import calibrate
+from mkc_torch.calibration.differences import LEVEL, differences
+from mkc_torch.report.words.beside import difference_rows, difference_sentences
+from tests.calibration.test_calibrate import noisy_ellipsoid, recorded
+
+
+@pytest.fixture(scope="module")
+def points():
+    return noisy_ellipsoid(300, seed=1)
+
+
+@pytest.fixture(scope="module")
+def pair(points):
+    return calibrate(recorded(points), name="new"), calibrate(recorded(noisy_ellipsoid(300, seed=2)), name="old")
+
+
+def test_the_same_sensor_is_the_same_within_errors(pair, points):
+    found = differences(*pair, points)
+    assert len(found.numbers) == 10
+    assert found.beyond == ()
+    assert difference_sentences(found)[0].startswith("The same within errors")
+    assert found.name == "old"
+
+
+def test_a_calibration_beside_itself_differs_in_nothing(pair, points):
+    found = differences(pair[0], pair[0], points)
+    assert {one.in_errors for one in found.numbers} == {0.0}
+    assert (found.angle_max, found.length_max) == pytest.approx((0.0, 0.0), abs=1e-12)
+    assert "0° and 0 µT at most" in difference_sentences(found)[1]
+
+
+def test_errors_combine_and_the_limit_is_bonferronis(pair, points):
+    new, old = pair
+    found = differences(new, old, points)
+    offset_x, matrix_yz = found.numbers[0], found.numbers[-2]
+    assert offset_x.error == pytest.approx(math.sqrt(new.center_se[0] ** 2 + old.center_se[0] ** 2))
+    assert offset_x.in_errors == pytest.approx((new.center[0] - old.center[0]) / offset_x.error)
+    assert (matrix_yz.name, matrix_yz.new, matrix_yz.old) == ("matrix yz", new.matrix[1][2], old.matrix[1][2])
+    tail = torch.special.erfc(torch.tensor(found.limit / math.sqrt(2.0), dtype=torch.float64))
+    assert float(tail) * 10 == pytest.approx(LEVEL)
+
+
+def test_a_moved_offset_is_named_and_its_field_measured(pair, points):
+    """0.8 µT across the field turns it by 0.8/48 rad at most, and 0.8 µT along makes it so much longer."""
+    new, _ = pair
+    old = dataclasses.replace(new, center=(new.center[0] + 0.8, *new.center[1:]), name="before")
+    found = differences(new, old, points)
+    assert [one.name for one in found.beyond] == ["offset x"]
+    assert found.beyond[0].in_errors == pytest.approx(-0.8 / (math.sqrt(2) * new.center_se[0]))
+    ours, theirs = new.corrected(points).numpy(), old.corrected(points).numpy()
+    lengths = np.linalg.norm(ours, axis=1) - np.linalg.norm(theirs, axis=1)
+    cosines = (ours * theirs).sum(1) / np.linalg.norm(ours, axis=1) / np.linalg.norm(theirs, axis=1)
+    angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+    assert found.length_max == pytest.approx(np.abs(lengths).max())
+    assert found.length_rms == pytest.approx(np.sqrt((lengths**2).mean()))
+    assert found.angle_max == pytest.approx(angles.max(), rel=1e-6)
+    assert found.angle_rms == pytest.approx(np.sqrt((angles**2).mean()), rel=1e-6)
+    sentences = difference_sentences(found)
+    assert sentences[0].startswith("It differs: offset x by −")
+    assert f"{len(points)} samples" in sentences[1]
+
+
+def test_an_older_one_in_other_units_is_converted(pair, points):
+    new, old = pair
+    in_gauss = dataclasses.replace(
+        old,
+        unit="gauss",
+        field_unit="gauss",
+        center=tuple(0.01 * v for v in old.center),
+        center_se=tuple(0.01 * v for v in old.center_se),
+        semi_axes=tuple(0.01 * v for v in old.semi_axes),
+        semi_axes_se=tuple(0.01 * v for v in old.semi_axes_se),
+        radius=0.01 * old.radius,
+    )
+    expected, found = differences(new, old, points), differences(new, in_gauss, points)
+    for one, other in zip(found.numbers, expected.numbers, strict=True):
+        assert one[2:] == pytest.approx(other[2:])
+    assert found.angle_rms == pytest.approx(expected.angle_rms)
+
+
+def test_units_without_a_size_are_refused_with_what_to_do(pair, points):
+    new, old = pair
+    with pytest.raises(ValueError, match=r"counts .* with the same `--unit`"):
+        differences(new, dataclasses.replace(old, unit="counts"), points)
+    with pytest.raises(ValueError, match="--field-strength"):
+        differences(new, dataclasses.replace(old, field_unit="counts"), points)
+
+
+def test_unknown_errors_are_shown_as_unknown(pair, points):
+    new, old = pair
+    nothing = (math.nan,) * 3
+    unknown = dataclasses.replace(old, center_se=nothing, semi_axes_se=nothing, matrix_se=(nothing,) * 3)
+    found = differences(new, unknown, points)
+    assert found.beyond == ()
+    assert difference_sentences(found)[0] == ("Whether they differ cannot be said: one of them has no standard errors.")
+    assert {row[-1] for row in difference_rows(found)} == {"?"}
+    assert "nan" not in " ".join(" ".join(row) for row in difference_rows(found))
+    half = dataclasses.replace(old, center=(99.0, *old.center[1:]), matrix_se=((math.nan,) * 3,) * 3)
+    assert [one.name for one in differences(new, half, points).beyond] == ["offset x"]
+
+
+def test_many_differences_are_counted(pair, points):
+    new, _ = pair
+    other = dataclasses.replace(new, matrix=tuple(tuple(1.1 * v for v in row) for row in new.matrix))
+    sentence = difference_sentences(differences(new, other, points))[0]
+    assert sentence.startswith("It differs: matrix")
+    assert sentence.count("matrix") == 3
+
+
+def test_a_gain_of_all_axes_shows_in_the_radius_alone(points):
+    """Both correct to the length that they measured, so that their matrices are the same."""
+    new, old = calibrate(recorded(1.02 * points)), calibrate(recorded(points))
+    radius = [one for one in differences(new, old, points).beyond if one.name == "radius"]
+    assert radius[0].new == pytest.approx(1.02 * old.radius, rel=1e-3)
+    assert not [one for one in differences(new, old, points).beyond if one.name.startswith("matrix")]
