@@ -2,7 +2,8 @@
 
 Own code, not pymavlink's: that reads message by message, drops in silence all that follows a message of a kind it does
 not know, writes a line to the terminal for each byte that it passes over, and brings 90 MB of code for telemetry. It
-is the oracle of the tests."""
+is the oracle of the tests.
+"""
 
 from __future__ import annotations
 

@@ -3,7 +3,8 @@
 Each group is a topic. Arrays (N, 3) become the columns ``name_x``, ``name_y``, ``name_z``; of another width
 ``name[0]``, ``name[1]``, …; (3, N) is turned round. Arrays of a group that differ in length are topics of their own,
 each with the time that has its length. A group within a group that has the same length and no time of its own joins
-the one above it, with a dot in the names of its columns. Single numbers are no recordings."""
+the one above it, with a dot in the names of its columns. A column of time comes first. Single numbers are no recordings.
+"""
 
 from __future__ import annotations
 
@@ -94,6 +95,7 @@ def _own_topics(group: Group) -> list[Topic]:
             if name in group.units:
                 units |= dict.fromkeys(parts, group.units[name])
         name = group.name if not topics else f"{group.name}[{length} rows]"
+        columns = dict(sorted(columns.items(), key=lambda item: not _TIME.search(item[0])))
         if columns and (topic := topic_of(name, columns, units)):
             topics.append(topic)
     told = list(group.told)

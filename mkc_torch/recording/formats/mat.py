@@ -76,16 +76,21 @@ def _of_scipy(path: Path) -> Group:
         ) from error
     with path.open("rb") as file:
         head = file.read(128)
-    # version 4 has no magic number: its first bytes are a small number, which tells the type of the first variable
-    if head[124:128] not in (b"\x00\x01IM", b"\x01\x00MI") and (len(head) < 20 or head[:4].isalnum()):
+    if head[124:128] not in (b"\x00\x01IM", b"\x01\x00MI") and not _is_version_4(head):
         raise foreign(path, "MATLAB file")
     with guarded(path, "MATLAB file"):
         try:
             matfile_version(str(path))
-        except ValueError as error:
+        except Exception as error:  # ValueError, MatReadError, …
             raise foreign(path, "MATLAB file") from error
         found = loadmat(str(path), chars_as_strings=True, struct_as_record=True)
         return _group("", {name: value for name, value in found.items() if not name.startswith("__")}, 0)
+
+
+def _is_version_4(head: bytes) -> bool:
+    """Version 4 has no magic number; it begins with a variable's header, whose first number is MOPT, below 5000."""
+    numbers = {int.from_bytes(head[:4], order) for order in ("little", "big")}
+    return len(head) > 20 and any(number < 5000 and number % 10 < 3 for number in numbers)
 
 
 def _group(name: str, variables: dict[str, Any], depth: int) -> Group:

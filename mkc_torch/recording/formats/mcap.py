@@ -5,6 +5,7 @@ Source: mcap.dev/spec, and its registry of well-known encodings.
 
 from __future__ import annotations
 
+import contextlib
 import io
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -90,13 +91,14 @@ def _records(file: io.BufferedReader, size: int) -> Iterator[tuple[Any, int]]:
         for record in reader.records:
             place = size if type(record).__name__ == "Footer" else file.tell()
             yield record, place
+        return
     except Exception:  # of a file that is cut off, whatever its half record leads to; what came before stays
         file.seek(place)
-        head = file.read(9)
-        if head[:1] != bytes([Opcode.CHUNK]) or place == size:
-            return
-        half = Chunk.read(ReadDataStream(file))
-    yield half, size
+    head = file.read(9)
+    if head[:1] == bytes([Opcode.CHUNK]):
+        with contextlib.suppress(Exception):
+            half = Chunk.read(ReadDataStream(file))
+            yield half, size
 
 
 def _chunk(chunk: Any, state: _State) -> bool:

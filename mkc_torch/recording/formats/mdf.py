@@ -8,13 +8,19 @@ Source: ASAM MDF 4.2.
 
 from __future__ import annotations
 
+import contextlib
+import io
+import logging
+import sys
+import traceback
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from mkc_torch.recording.formats.base import FileFormat, Topic
+from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic
 from mkc_torch.recording.formats.begins import begins_with, check_begins
 from mkc_torch.recording.formats.damage import guarded, no_rows, with_warnings
 from mkc_torch.recording.formats.topics import spread, topic_of
@@ -49,7 +55,7 @@ def read(path: Path) -> list[Topic]:
         raise ImportError('MDF files are read with asammdf; install it with `pip install "mkc-torch[mdf]"`.') from error
     topics: list[Topic] = []
     told: list[str] = []
-    with guarded(path, _WHAT), asammdf.MDF(str(path)) as file:
+    with guarded(path, _WHAT), _quiet(), _stream(path) as stream, _opened(path, asammdf, stream) as file:
         names = _names(file)
         for place in file.virtual_groups:
             topic, said = _topic_or_why(file, place, names[place])
@@ -60,6 +66,43 @@ def read(path: Path) -> list[Topic]:
     if not topics:
         raise no_rows(path, _WHAT, told)
     return with_warnings(topics, told)
+
+
+def _stream(path: Path) -> BinaryIO:
+    """The file, opened here: of a path asammdf leaves it open where it fails, and copies one that was not closed.
+
+    It writes what is missing into a file that was not closed, so that it gets the content of one in memory.
+    """
+    return io.BytesIO(path.read_bytes()) if begins_with(path, _BEGINS[1]) else path.open("rb")
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps asammdf from logging errors to the terminal, which are told here otherwise."""
+    logger = logging.getLogger("asammdf")
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before
+
+
+def _opened(path: Path, package: Any, stream: BinaryIO) -> Any:
+    """The file as asammdf has it.
+
+    Where it is damaged, an object is left half made, whose removal fails, which Python would print; so it is removed here.
+    """
+    before, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        return package.MDF(stream)
+    except Exception as error:  # the library raises what comes
+        said = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
+        traceback.clear_frames(error.__traceback__)
+    finally:
+        sys.unraisablehook = before
+    raise RecordingError(
+        f"{path}: the {_WHAT} cannot be read: it is damaged ({said}); copy it anew from where it was recorded."
+    )
 
 
 def _names(file: Any) -> dict[int, str]:
@@ -145,10 +188,8 @@ def _master(file: Any, place: int) -> tuple[str, str]:
         index = file.masters_db.get(group)
         if index is not None:
             channel = file.groups[group].channels[index]
-            unit = str(channel.unit or "") or _SYNC_UNITS.get(
-                int(channel.sync_type if hasattr(channel, "sync_type") else 1), ""
-            )
-            return channel.name, unit
+            kind: Any = getattr(channel, "sync_type", None)  # versions 2 and 3 count time alone
+            return str(channel.name), str(channel.unit or "") or _SYNC_UNITS.get(kind or 1, "")
     return "", ""
 
 
@@ -156,13 +197,11 @@ def _has_formula(conversion: Any, depth: int) -> bool:
     """Whether a conversion, or one that it refers to, is a text that would be executed."""
     if conversion is None:
         return False
-    if depth > 8 or getattr(conversion, "formula", ""):
+    formula: Any = getattr(conversion, "formula", "")
+    if depth > 8 or formula:
         return True
-    return any(
-        _has_formula(one, depth + 1)
-        for one in (getattr(conversion, "referenced_blocks", None) or {}).values()
-        if not isinstance(one, str | bytes)
-    )
+    inner: Any = getattr(conversion, "referenced_blocks", None)
+    return any(_has_formula(one, depth + 1) for one in (inner or {}).values() if not isinstance(one, str | bytes))
 
 
 MDF = FileFormat((".mf4", ".mdf"), read)

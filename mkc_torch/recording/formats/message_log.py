@@ -19,7 +19,8 @@ class MessageLog:
     """Gathers messages; a topic that several wrote to is one table, in the order of ``log_time``.
 
     Times are in ns. ``header.stamp`` is the sensor's own, where it has one; ``log_time`` when the logger wrote the
-    message down; ``publish_time`` when it was sent, where that differs."""
+    message down; ``publish_time`` when it was sent, where that differs.
+    """
 
     def __init__(self) -> None:
         self._readers: dict[object, tuple[str, Callable[[bytes], Mapping[str, Cell]], MessageRows]] = {}

@@ -1,7 +1,8 @@
 """Units of PX4's topics, where its message definitions state them.
 
 Source: PX4-Autopilot, msg/*.msg (main, and unchanged since 1.8 for those here); suffixes are its naming rule for
-fields."""
+fields.
+"""
 
 from __future__ import annotations
 

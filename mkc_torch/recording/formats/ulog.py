@@ -41,8 +41,8 @@ def read(path: Path) -> list[Topic]:
         raise ImportError(
             'ULog files are read with pyulog; install it with `pip install "mkc-torch[ulog]"`.'
         ) from error
-    with guarded(path, "PX4 ULog"):
-        log = pyulog.ULog(str(path))
+    with guarded(path, "PX4 ULog"), path.open("rb") as file:
+        log = pyulog.ULog(file)
         warnings = _losses(path, log)
         topics = [topic for data in log.data_list if (topic := _topic(data)) is not None]
     if not topics:

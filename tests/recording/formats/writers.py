@@ -90,7 +90,9 @@ def dataflash(path: Path, given: Samples, instances: int = 1, units: bool = True
 def dataflash_text(path: Path, given: Samples) -> None:
     """As ArduPilot's ground stations write it out, a line a message."""
     out = ["FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns"]
-    out += [f"FMT, {kind}, 23, {name}, {letters}, {names}" for name, (kind, letters, names) in DATAFLASH_LETTERS.items()]
+    out += [
+        f"FMT, {kind}, 23, {name}, {letters}, {names}" for name, (kind, letters, names) in DATAFLASH_LETTERS.items()
+    ]
     out += [f"UNIT, 1, {ord(letter)}, {label}" for letter, label in (("s", "s"), ("G", "Gauss"), ("#", "instance"))]
     out += [f"MULT, 1, {ord(letter)}, {factor!r}" for letter, factor in (("F", 1e-6), ("C", 1e-3), ("-", 0.0))]
     out.append("FMTU, 1, 130, s#GGG, F-CCC")
@@ -255,7 +257,11 @@ def mat73(path: Path, given: Samples) -> None:
     with h5py.File(path, "w", userblock_size=512) as file:
         group = file.create_group("log")
         group.attrs["MATLAB_class"] = np.bytes_("struct")
-        for name, values in (("t", given.time[None].astype(np.float64)), ("mag", given.mag.T), ("rate", np.array([[1e2]]))):
+        for name, values in (
+            ("t", given.time[None].astype(np.float64)),
+            ("mag", given.mag.T),
+            ("rate", np.array([[1e2]])),
+        ):
             group[name] = values
             group[name].attrs["MATLAB_class"] = np.bytes_("double")
     text = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
@@ -280,7 +286,9 @@ def mdf(path: Path, given: Samples, version: str = "4.10") -> None:
     # seconds are what MDF counts time in
     time = given.time / 1e6
     with MDF(version=version) as file:
-        signals = [Signal(given.mag[:, place], time, name=f"mag_{axis}", unit="Gauss") for place, axis in enumerate("xyz")]
+        signals = [
+            Signal(given.mag[:, place], time, name=f"mag_{axis}", unit="Gauss") for place, axis in enumerate("xyz")
+        ]
         file.append(signals, acq_name="magnetometer", comment="magnetometer")
         file.save(path, overwrite=True)
 
