@@ -7,8 +7,6 @@ import io
 from collections.abc import Callable
 from typing import Any
 
-from mkc_torch.recording.formats.base import RecordingError
-
 __all__ = ["inflated"]
 
 _PIECE = 2**20
@@ -24,15 +22,15 @@ def inflated(kind: str, data: bytes, size: int) -> bytes:
         size: of the content in bytes, as the file says; no more is unpacked.
 
     Raises:
-        RecordingError: a kind that is not known, or a block said to be larger than 1 GiB.
+        ValueError: a kind that is not known.
         ImportError: the library for it is not installed.
     """
     if kind in ("", "none"):
         return data
-    if size > _LARGEST_BLOCK:
-        raise RecordingError(f"a block of the file is said to hold {size:,} bytes, which is damage.")
     if kind not in _OPENED:
-        raise RecordingError(f"the file is compressed by {kind}, which is not read; write it anew without compression.")
+        raise ValueError(f"it is compressed by {kind[:20]!r}, which is not read: write it anew without compression")
+    if size > _LARGEST_BLOCK:
+        return b""
     parts: list[bytes] = []
     left = size
     try:

@@ -3,11 +3,12 @@
 Each group is a topic. Arrays (N, 3) become the columns ``name_x``, ``name_y``, ``name_z``; of another width
 ``name[0]``, ``name[1]``, …; (3, N) is turned round. Arrays of a group that differ in length are topics of their own,
 each with the time that has its length. A group within a group that has the same length and no time of its own joins
-the one above it, with a dot in the names of its columns. A column of time comes first. Single numbers are no recordings.
+the one above it, with a dot in the names of its columns. Time comes first. Single numbers are no recordings.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from typing import NamedTuple
@@ -87,7 +88,7 @@ def _own_topics(group: Group) -> list[Topic]:
             if lengths[name] != length:
                 continue
             rows = _upright(values, length)
-            if rows[0].size > MOST_ELEMENTS:
+            if math.prod(rows.shape[1:]) > MOST_ELEMENTS:
                 wide.append(name)
                 continue
             parts = spread(name, rows)

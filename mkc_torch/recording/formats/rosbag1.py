@@ -64,7 +64,7 @@ def read(path: Path) -> list[Topic]:
         for record in _records(content, read_to):
             kind = record.header.get(b"op")
             if kind == _CHUNK:
-                broken += not _chunk(path, record, log)
+                broken += not _chunk(record, log)
                 read_to = record.end
             elif record.whole:
                 _take(record, log)
@@ -114,16 +114,13 @@ def _header(data: bytes) -> dict[bytes, bytes] | None:
     return fields if b"op" in fields and place == len(data) else None
 
 
-def _chunk(path: Path, chunk: _Record, log: MessageLog) -> bool:
+def _chunk(chunk: _Record, log: MessageLog) -> bool:
     """Take the records of a chunk; whether all of them could be read."""
     size = chunk.header.get(b"size", b"")
     if len(size) != 4:
         return False
     (length,) = _LENGTH.unpack(size)
-    try:
-        data = inflated(chunk.header.get(b"compression", b"").decode("ascii", "replace"), chunk.data, length)
-    except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from error
+    data = inflated(chunk.header.get(b"compression", b"").decode("ascii", "replace"), chunk.data, length)
     end = 0
     for record in _records(data, 0):
         if record.whole:

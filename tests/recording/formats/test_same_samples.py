@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-pl = pytest.importorskip("polars")
+pytest.importorskip("polars")
 
 from mkc_torch import Recording
 from mkc_torch.calibration.calibrate import calibrate

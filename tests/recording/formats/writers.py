@@ -41,11 +41,11 @@ def ulog(path: Path, given: Samples, instances: int = 1) -> None:
     """By docs.px4.io, "ULog File Format": header, flags, formats, subscriptions, data."""
     out = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", int(given.time[0]))]
     out.append(_ulog_message("B", bytes(40)))
-    layout = "sensor_mag:uint64_t timestamp;uint64_t timestamp_sample;float x;float y;float z;char[4] tag;uint8_t[4] _padding0;"
+    layout = "sensor_mag:uint64_t timestamp;uint64_t timestamp_sample;float x;float y;float z;char[4] tag;"
+    layout += "uint8_t[4] _padding0;"
     out.append(_ulog_message("F", layout.encode()))
     out.append(_ulog_message("I", bytes([len(b"char[3] sys_name")]) + b"char[3] sys_name" + b"PX4"))
-    for one in range(instances):
-        out.append(_ulog_message("A", struct.pack("<BH", one, one) + b"sensor_mag"))
+    out += [_ulog_message("A", struct.pack("<BH", one, one) + b"sensor_mag") for one in range(instances)]
     for time, mag in zip(given.time.tolist(), given.mag.tolist(), strict=True):
         for one in range(instances):
             row = struct.pack("<HQQ3f4s", one, time, time - 100, *(value + one for value in mag), b"abc\0")
