@@ -95,4 +95,6 @@ def _check_file(path: Path) -> None:
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file.")
     if path.is_file() and path.stat().st_size == 0:
-        raise RecordingError(f"{path}: the file is empty; it must hold a header line and rows of numbers.")
+        text = path.suffix.lower() in CSV.endings
+        advice = "it must hold a header line and rows of numbers" if text else "record it anew, or copy it whole"
+        raise RecordingError(f"{path}: the file is empty; {advice}.")

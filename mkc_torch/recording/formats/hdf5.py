@@ -17,6 +17,8 @@ __all__ = ["HDF5", "h5py", "hdf5_group"]
 _UNITS = ("units", "unit", "UNITS", "Units", "Unit")
 _DEEPEST = 32
 _MOST_OBJECTS = 4096
+_MOST_EXPANSION = 1100
+"""Bytes that deflate can make of one (zlib's technical notes); what is said to hold more was never written."""
 
 
 def h5py(extra: str) -> Any:
@@ -80,8 +82,14 @@ def hdf5_group(package: Any, group: Any, name: str, *, upright: bool, count: lis
 
 def _add(package: Any, group: Group, key: str, path: str, dataset: Any, upright: bool) -> None:
     """A dataset's values; one with named fields is a group of its own."""
+    size = dataset.file.id.get_filesize()
     if dataset.shape is None or (dataset.dtype.hasobject and not package.check_string_dtype(dataset.dtype)):
         group.told.append(f"`{path}` holds references and is left out.")
+        return
+    if dataset.nbytes > _MOST_EXPANSION * size + 10**6:
+        group.told.append(
+            f"`{path}` is said to hold {dataset.nbytes:,} bytes, more than the file can, and is left out."
+        )
         return
     unit = next((_text(dataset.attrs[name]) for name in _UNITS if name in dataset.attrs), "")
     if package.check_string_dtype(dataset.dtype):

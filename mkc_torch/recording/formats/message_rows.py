@@ -89,13 +89,21 @@ class MessageRows:
         if len(column) > self._rows:  # a name that stands twice in one message
             return
         if column.typecode == "q" and (not isinstance(value, int) or value not in _WHOLE or len(column) < self._rows):
-            column = self._columns[key] = array("d", map(float, column))
+            column = self._columns[key] = array("d", map(_real, column))
         if len(column) < self._rows:
             column.extend(array("d", [np.nan]) * (self._rows - len(column)))  # type: ignore[arg-type]
-        column.append(float(value) if column.typecode == "d" else value)  # type: ignore[arg-type]
+        column.append(_real(value) if column.typecode == "d" else value)  # type: ignore[arg-type]
 
     def _whole(self, values: array[int] | array[float]) -> np.ndarray:
         found = np.frombuffer(values, np.int64 if values.typecode == "q" else np.float64)
         if len(found) == self._rows:
             return found
         return np.concatenate([found.astype(np.float64), np.full(self._rows - len(found), np.nan)])
+
+
+def _real(value: float) -> float:
+    """As float64; infinite where a whole number, as JSON can hold, is larger than any."""
+    try:
+        return float(value)
+    except OverflowError:
+        return float("inf") if value > 0 else float("-inf")

@@ -6,6 +6,7 @@ Source: docs.px4.io, "ULog File Format".
 from __future__ import annotations
 
 import mmap
+import re
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,9 @@ __all__ = ["ULOG"]
 
 _MAGIC = b"ULog\x01\x12\x35"
 _HEADER = 16
+_MOST_FIELDS = 65536
+_DEEPEST = 8
+_FIELD = re.compile(r"(?P<kind>\w+)(\[(?P<count>\d{1,9})\])? ")
 _KINDS = frozenset(b"BFIMPQAARDLCSO")
 """Kinds of messages of the specification; all others are damage, or a version to come."""
 
@@ -42,8 +46,9 @@ def read(path: Path) -> list[Topic]:
             'ULog files are read with pyulog; install it with `pip install "mkc-torch[ulog]"`.'
         ) from error
     with guarded(path, "PX4 ULog"), path.open("rb") as file:
+        walk = _walk(path)
         log = pyulog.ULog(file)
-        warnings = _losses(path, log)
+        warnings = _losses(log, walk)
         topics = [topic for data in log.data_list if (topic := _topic(data)) is not None]
     if not topics:
         raise no_rows(path, "PX4 ULog", warnings)
@@ -72,13 +77,13 @@ def _named_once(topics: list[Topic]) -> list[Topic]:
     return named
 
 
-def _losses(path: Path, log: Any) -> list[str]:
+def _losses(log: Any, walk: tuple[int, int, int]) -> list[str]:
     """What the logger did not write, and what of the file cannot be read."""
     warnings = []
     if log.dropouts:
         seconds = sum(dropout.duration for dropout in log.dropouts) / 1000.0
         warnings.append(f"The logger lost {seconds:.3g} s of data in {counted(len(log.dropouts), 'dropout')}.")
-    whole, rows, size = _walk(path)
+    whole, rows, size = walk
     if whole < size:
         warnings.append(lost_warning(size - whole, size, "its end"))
     read_rows = sum(len(next(iter(data.data.values()))) for data in log.data_list if data.data)
@@ -98,6 +103,7 @@ def _walk(path: Path) -> tuple[int, int, int]:
     if size < _HEADER:
         raise RecordingError(f"{path}: the PX4 ULog ends within its header; record it anew, or copy it whole.")
     place, rows = _HEADER, 0
+    formats: dict[str, list[tuple[str, int]]] = {}
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         while place + 3 <= size:
             length = content[place] + 256 * content[place + 1]
@@ -105,8 +111,38 @@ def _walk(path: Path) -> tuple[int, int, int]:
             if place + 3 + length > size or kind not in _KINDS:
                 break
             rows += kind == ord("D")
+            if kind == ord("F"):
+                _define(content[place + 3 : place + 3 + length], formats)
             place += 3 + length
+    known: dict[str, int] = {}
+    if any(_width(name, formats, known, 0) > _MOST_FIELDS for name in formats):
+        raise RecordingError(f"{path}: the PX4 ULog is damaged: a message of it has more than {_MOST_FIELDS:,} fields.")
     return place, rows, size
+
+
+def _define(text: bytes, formats: dict[str, list[tuple[str, int]]]) -> None:
+    """Note the kinds of fields of a message, ``name:type[count] field;…``, and how many there are of each."""
+    name, _, fields = text.decode("utf-8", "replace").partition(":")
+    formats[name] = [
+        (found["kind"], int(found["count"] or 1)) for field in fields.split(";") if (found := _FIELD.match(field))
+    ]
+
+
+def _width(name: str, formats: dict[str, list[tuple[str, int]]], known: dict[str, int], depth: int) -> int:
+    """How many numbers a message has; pyulog makes an object of each, though formats can nest in one another."""
+    if name not in formats:
+        return 1
+    if depth > _DEEPEST:
+        return _MOST_FIELDS + 1
+    if name in known:
+        return known[name]
+    total = 0
+    for kind, count in formats[name]:
+        total += count * _width(kind, formats, known, depth + 1) if count else 0
+        if total > _MOST_FIELDS:
+            break
+    known[name] = total
+    return total
 
 
 ULOG = FileFormat((".ulg", ".ulog"), read)

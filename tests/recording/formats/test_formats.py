@@ -55,6 +55,27 @@ def test_dropouts_of_a_ulog_are_told(tmp_path):
     assert topic.warnings[0] == "The logger lost 0.12 s of data in 1 dropout."
 
 
+def test_formats_of_a_ulog_that_nest_without_measure_are_refused(tmp_path):
+    bodies = [f"a{place}:a{place + 1}[60000] x;" for place in range(3)] + ["a3:float y;", "loop:loop x;"]
+    for some in (bodies[:4], bodies[4:]):
+        messages = [struct.pack("<HB", len(body), ord("F")) + body.encode() for body in some]
+        name = some[0].partition(":")[0].encode()
+        messages.append(struct.pack("<HB", 3 + len(name), ord("A")) + struct.pack("<BH", 0, 0) + name)
+        (tmp_path / "log.ulg").write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8) + b"".join(messages))
+        with pytest.raises(RecordingError, match="more than 65,536 fields"):
+            read_topics(tmp_path / "log.ulg")
+
+
+def test_a_dataset_that_is_said_to_be_larger_than_its_file_can_hold_is_not_made_room_for(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file.create_dataset("huge", (10**12,), "f8", chunks=(1000,))
+        file["mag"] = np.zeros((5, 3))
+    (topic,) = read_topics(tmp_path / "log.h5")
+    assert topic.table.names == ["mag_x", "mag_y", "mag_z"]
+    assert "`huge` is said to hold 8,000,000,000,000 bytes" in topic.warnings[0]
+
+
 def test_a_dataflash_log_without_units_has_those_that_never_changed(tmp_path):
     writers.dataflash(tmp_path / "log.bin", GIVEN, units=False)
     topic = chosen(tmp_path / "log.bin", "MAG[0]")
