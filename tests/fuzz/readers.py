@@ -20,8 +20,8 @@ from typing import Any
 from tests.recording.formats import writers
 from tests.recording.formats.writers import Samples, samples
 
-LONGEST = 8192
-"""Bytes; of longer inputs libFuzzer tries fewer."""
+LONGEST = 65536
+"""Bytes; the smallest database is half of it."""
 
 PATIENCE = 60
 """Seconds for one input."""

@@ -3,13 +3,14 @@
 import contextlib
 import csv
 import io
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("polars")
 
-from mkc_torch.recording.formats import read_topics
+from mkc_torch.recording.formats import RecordingError, read_topics
 from tests.recording.formats.test_same_samples import numbers
 from tests.recording.formats.writers import dataflash, dataflash_text, samples
 from tests.shared_data import shared_data
@@ -95,3 +96,40 @@ def test_a_log_of_several_instances_is_what_pymavlink_reads(write, ending, tmp_p
             assert numbers(topics[name], column).astype(float).tolist() == theirs
     assert numbers(topics["BARO"], "Temp").tolist() == [25.31] * 40
     assert topics["MAG[0]"].units == {"TimeUS": "µs", "MagX": "mGauss", "MagY": "mGauss", "MagZ": "mGauss"}
+
+
+def files_beside(package, *folder):
+    """The files that a package's own tests read, written by programs of all ages on machines of all kinds."""
+    place = Path(pytest.importorskip(package).__file__).parent.joinpath(*folder)
+    found = sorted(path for path in place.glob("*") if path.suffix in (".mat", ".h5"))
+    if not found:
+        pytest.skip(f"no files in {place}")
+    return found
+
+
+def test_files_of_matlab_from_version_4_on_are_read_or_refused():
+    files = files_beside("scipy", "io", "matlab", "tests", "data")
+    outcomes = {}
+    for path in files:
+        try:
+            outcomes[path.name] = read_topics(path)
+        except RecordingError as error:
+            assert str(path) in str(error)
+            outcomes[path.name] = []
+    assert len(files) >= 100
+    for version in ("4.2c_SOL2", "6.1_SOL2", "6.5.1_GLNX86", "7.1_GLNX86", "7.4_GLNX86"):
+        (topic,) = outcomes[f"testdouble_{version}.mat"]
+        assert np.allclose(numbers(topic, "testdouble"), np.linspace(0, 2 * np.pi, 9), rtol=0, atol=1e-15)
+    (whole,) = outcomes["testhdf5_7.4_GLNX86.mat"]  # version 7.3, by MATLAB itself
+    assert np.allclose(numbers(whole, "testdouble"), np.linspace(0, 2 * np.pi, 9), rtol=0, atol=1e-15)
+    assert sum(map(bool, outcomes.values())) >= 25
+
+
+def test_files_of_hdf5_by_others_give_rows_or_a_sentence():
+    read = 0
+    for path in files_beside("h5py", "tests", "data_files"):
+        try:
+            read += bool(read_topics(path))
+        except RecordingError as error:
+            assert str(path) in str(error)
+    assert read >= 1
