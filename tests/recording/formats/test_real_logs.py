@@ -10,7 +10,8 @@ import pytest
 
 pytest.importorskip("polars")
 
-from mkc_torch.recording.formats import RecordingError, read_topics
+from mkc_torch.recording.formats import read_topics
+from tests.recording.formats.test_damage import rows_or_sentence
 from tests.recording.formats.test_same_samples import numbers
 from tests.recording.formats.writers import dataflash, dataflash_text, samples
 from tests.shared_data import shared_data
@@ -109,13 +110,7 @@ def files_beside(package, *folder):
 
 def test_files_of_matlab_from_version_4_on_are_read_or_refused():
     files = files_beside("scipy", "io", "matlab", "tests", "data")
-    outcomes = {}
-    for path in files:
-        try:
-            outcomes[path.name] = read_topics(path)
-        except RecordingError as error:
-            assert str(path) in str(error)
-            outcomes[path.name] = []
+    outcomes = {path.name: rows_or_sentence(path)[0] for path in files}
     assert len(files) >= 100
     for version in ("4.2c_SOL2", "6.1_SOL2", "6.5.1_GLNX86", "7.1_GLNX86", "7.4_GLNX86"):
         (topic,) = outcomes[f"testdouble_{version}.mat"]
@@ -126,10 +121,5 @@ def test_files_of_matlab_from_version_4_on_are_read_or_refused():
 
 
 def test_files_of_hdf5_by_others_give_rows_or_a_sentence():
-    read = 0
-    for path in files_beside("h5py", "tests", "data_files"):
-        try:
-            read += bool(read_topics(path))
-        except RecordingError as error:
-            assert str(path) in str(error)
-    assert read >= 1
+    read = [rows_or_sentence(path)[0] for path in files_beside("h5py", "tests", "data_files")]
+    assert any(read)
