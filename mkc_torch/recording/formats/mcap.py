@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -63,11 +64,14 @@ def gather_mcap(path: Path, log: MessageLog) -> list[str]:
     size = path.stat().st_size
     state = _State({}, {}, log, path)
     with guarded(path, "MCAP file"), path.open("rb") as file:
-        read_to, broken = 0, 0
+        read_to, broken, wrong = 0, 0, 0
         for record, place in _records(file, size):
             read_to = place
             if type(record).__name__ == "Chunk":
-                broken += not _chunk(record, state)
+                data = inflated(record.compression, record.data, record.uncompressed_size)
+                broken += not _chunk(data, record.uncompressed_size, state)
+                if record.uncompressed_crc and len(data) == record.uncompressed_size:
+                    wrong += zlib.crc32(data) != record.uncompressed_crc
             else:
                 _take(record, state)
     warnings = []
@@ -75,6 +79,10 @@ def gather_mcap(path: Path, log: MessageLog) -> list[str]:
         warnings.append(lost_warning(size - read_to, size, f"its end, from byte {read_to:,} on", "cannot be read"))
     if broken:
         warnings.append(f"The file is damaged or cut off: {broken} of its chunks could be read only in part.")
+    if wrong:
+        warnings.append(
+            f"The file is damaged: the checksum of {wrong} of its chunks is wrong, and so may be numbers there."
+        )
     return warnings
 
 
@@ -101,11 +109,10 @@ def _records(file: io.BufferedReader, size: int) -> Iterator[tuple[Any, int]]:
             yield half, size
 
 
-def _chunk(chunk: Any, state: _State) -> bool:
-    """Take the records of a chunk; whether all of them could be read."""
+def _chunk(data: bytes, size: int, state: _State) -> bool:
+    """Take the records of a chunk, which should have this size; whether all of them could be read."""
     from mcap.stream_reader import StreamReader
 
-    data = inflated(chunk.compression, chunk.data, chunk.uncompressed_size)
     stream = io.BytesIO(data)
     end = 0
     try:
@@ -113,8 +120,8 @@ def _chunk(chunk: Any, state: _State) -> bool:
             _take(record, state)
             end = stream.tell()
     except Exception:  # at the end of the chunk, too: this reader has no other way to say so
-        return end == len(data) == chunk.uncompressed_size
-    return end == len(data) == chunk.uncompressed_size
+        return end == len(data) == size
+    return end == len(data) == size
 
 
 def _take(record: Any, state: _State) -> None:

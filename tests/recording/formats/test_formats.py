@@ -125,6 +125,15 @@ def test_the_whole_messages_of_the_last_broken_chunk_of_an_mcap_file_are_kept(co
     assert "cut off" in topic.warnings[0]
 
 
+def test_a_wrong_checksum_of_an_mcap_file_is_told(tmp_path):
+    writers.mcap_of(tmp_path / "log.mcap", GIVEN, "json", "NONE")
+    whole = (tmp_path / "log.mcap").read_bytes()
+    assert whole.count(b'"x": 0.') > 5
+    (tmp_path / "log.mcap").write_bytes(whole.replace(b'"x": 0.', b'"x": 7.', 1))
+    (topic,) = read_topics(tmp_path / "log.mcap")
+    assert "the checksum of 1 of its chunks is wrong" in topic.warnings[0]
+
+
 @pytest.mark.parametrize("compression", ["", "bz2", "lz4"])
 def test_a_ros1_bag_that_was_not_closed_is_read(compression, tmp_path):
     # bz2 gives nothing of a chunk that is not whole, so that there must be another
