@@ -132,7 +132,7 @@ def fuzz(ending: str, folder: Path, seconds: float) -> None:
             pass
         except BaseException as error:  # a crash: kept, and the search goes on
             counts["crashed"] += 1
-            place = "".join(traceback.format_exception(error)[-2:])
+            place = f"{type(error).__name__} {traceback.format_tb(error.__traceback__)[-1]}"
             if place not in known:
                 known.add(place)
                 (folder / f"crash_{len(known)}{ending}").write_bytes(data)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from mkc_torch.recording.formats.base import RecordingError, Topic, counted
 
-__all__ = ["guarded", "lost_warning", "no_rows", "with_warnings"]
+__all__ = ["guarded", "lost_warning", "no_rows", "quiet_terminal", "with_warnings"]
 
 
 @contextlib.contextmanager
@@ -34,6 +35,23 @@ def guarded(path: Path, what: str) -> Iterator[None]:
             f"{path}: the {what} cannot be read: it is damaged, or of a variant that is not known{said}; "
             "copy it anew from where it was recorded, or export it as CSV."
         ) from error
+
+
+@contextlib.contextmanager
+def quiet_terminal() -> Iterator[None]:
+    """Keep compiled code, which writes past Python, from telling the terminal of damage that is told here otherwise."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is no terminal
+        yield
+        return
+    try:
+        with open(os.devnull, "wb") as nowhere:  # noqa: PTH123 - a device, not a path
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def lost_warning(lost: int, of: int, where: str, why: str = "hold no whole message") -> str:

@@ -115,6 +115,20 @@ def test_a_file_with_wrong_bytes_gives_rows_or_a_sentence(kind, tmp, places):
     rows_or_sentence(path)
 
 
+def test_a_parquet_file_over_which_polars_breaks_off_is_damaged(tmp_path, capfd):
+    pl = pytest.importorskip("polars")
+    path = tmp_path / "table.parquet"
+    pl.DataFrame({"time": [0.0, 1.0], "mag_x": [1.0, 2.0]}).write_parquet(path)
+    whole = path.read_bytes()
+    broken = 0
+    for cut in range(4, len(whole) - 12, 40):
+        # the end, which says where all is, with some of it gone before
+        path.write_bytes(whole[:4] + whole[cut:])
+        broken += not rows_or_sentence(path)[0]
+    assert broken >= 5
+    assert capfd.readouterr().err == ""
+
+
 MAGIC = {
     ".ulg": b"ULog\x01\x12\x35\x01",
     ".bin": b"\xa3\x95\x80",
