@@ -9,7 +9,15 @@ import numpy as np
 
 from mkc_torch.recording.formats.base import FileFormat, MissingColumnError, RecordingError, Table, Topic, listed
 from mkc_torch.recording.formats.csv import CSV
+from mkc_torch.recording.formats.dataflash import DATAFLASH
+from mkc_torch.recording.formats.hdf5 import HDF5
+from mkc_torch.recording.formats.mat import MAT
+from mkc_torch.recording.formats.mcap import MCAP
+from mkc_torch.recording.formats.mdf import MDF
 from mkc_torch.recording.formats.parquet import PARQUET
+from mkc_torch.recording.formats.rosbag1 import ROSBAG1
+from mkc_torch.recording.formats.rosbag2 import ROSBAG2
+from mkc_torch.recording.formats.ulog import ULOG
 
 __all__ = [
     "FORMATS",
@@ -22,7 +30,7 @@ __all__ = [
     "read_topics",
 ]
 
-FORMATS: tuple[FileFormat, ...] = (CSV, PARQUET)
+FORMATS: tuple[FileFormat, ...] = (CSV, PARQUET, ULOG, DATAFLASH, MCAP, ROSBAG1, ROSBAG2, MAT, HDF5, MDF)
 """All formats; the ending of a file says which it is of."""
 
 _WRITTEN = "a .csv or a .parquet"
@@ -87,4 +95,6 @@ def _check_file(path: Path) -> None:
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file.")
     if path.is_file() and path.stat().st_size == 0:
-        raise RecordingError(f"{path}: the file is empty; it must hold a header line and rows of numbers.")
+        text = path.suffix.lower() in CSV.endings
+        advice = "it must hold a header line and rows of numbers" if text else "record it anew, or copy it whole"
+        raise RecordingError(f"{path}: the file is empty; {advice}.")

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from mkc_torch.recording.formats.base import FileFormat, RecordingError, Table, Topic, polars
+from mkc_torch.recording.formats.begins import begins_with, foreign
+from mkc_torch.recording.formats.damage import quiet_terminal
 
 __all__ = ["PARQUET"]
 
@@ -16,12 +18,17 @@ __all__ = ["PARQUET"]
 def read(path: Path) -> Table:
     """The table in a Parquet file."""
     package = polars()
+    if not begins_with(path, b"PAR1"):
+        raise foreign(path, "Parquet file")
     try:
-        frame = package.read_parquet(io.BytesIO(path.read_bytes()))  # a path would be a pattern
+        with quiet_terminal():
+            frame = package.read_parquet(io.BytesIO(path.read_bytes()))  # a path would be a pattern
     except package.exceptions.PolarsError as error:
         raise RecordingError(
             f"{path}: this is no Parquet file, or a damaged one: {str(error).splitlines()[0]}"
         ) from error
+    except package.exceptions.PanicException as error:  # polars breaks off over some damaged files
+        raise RecordingError(f"{path}: the Parquet file is damaged; copy it anew from where it was written.") from error
     if not len(frame):
         raise RecordingError(f"{path}: the table has no rows.")
     return Table([name.strip() for name in frame.columns], frame.get_columns(), range(1, len(frame) + 1), "row")

@@ -1,0 +1,57 @@
+"""ArduPilot's DataFlash logs, binary (``.bin``) and text (``.log``)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic
+from mkc_torch.recording.formats.begins import begins_with, foreign
+from mkc_torch.recording.formats.damage import guarded, no_rows, with_warnings
+from mkc_torch.recording.formats.dataflash_binary import read_binary
+from mkc_torch.recording.formats.dataflash_text import read_text
+
+__all__ = ["DATAFLASH"]
+
+_WHAT = "ArduPilot DataFlash log"
+_HEAD = 4096
+
+
+def read(path: Path) -> list[Topic]:
+    """The topics of a log, ``MAG`` or ``MAG[0]``, ``MAG[1]``, with ArduPilot's names of messages and columns.
+
+    ``TimeUS`` is in µs, ``TimeMS`` of logs from before 2015 in ms. Units are what the log states (UNIT, MULT, FMTU);
+    where it states none, those that ArduPilot never changed: ``MAG`` in mGauss, ``IMU`` in rad/s and m/s².
+
+    Raises:
+        RecordingError: no DataFlash log, or one without a whole message.
+    """
+    if begins_with(path, b"\xa3\x95"):
+        reader = read_binary
+    elif _is_text(path):
+        reader = read_text
+    else:
+        raise _no_log(path)
+    with guarded(path, _WHAT):
+        topics, warnings = reader(path)
+    if not topics:
+        raise no_rows(path, _WHAT, warnings)
+    return with_warnings(topics, warnings)
+
+
+def _is_text(path: Path) -> bool:
+    """Whether a line near the beginning defines a message; a header of the ground station may stand above it."""
+    with path.open("rb") as file:
+        head = file.read(_HEAD)
+    return b"\0" not in head and any(line.lstrip().startswith(b"FMT,") for line in head.splitlines())
+
+
+def _no_log(path: Path) -> RecordingError:
+    if path.suffix.lower() == ".log":
+        return RecordingError(
+            f"{path}: this is no {_WHAT}: no line near its beginning defines a message (FMT, …); "
+            "if it is a table, rename it to end in .csv."
+        )
+    return foreign(path, _WHAT)
+
+
+DATAFLASH = FileFormat((".bin", ".log"), read)

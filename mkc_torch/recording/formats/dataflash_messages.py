@@ -1,0 +1,162 @@
+"""Messages of ArduPilot's DataFlash logs: what their format letters mean, their units, and their topics.
+
+Source: ArduPilot, libraries/AP_Logger/LogStructure.h (letters of formats, UNIT, MULT, FMTU) and README.md; so are the
+units of logs from before 2018, which do not state them.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+__all__ = ["MESSAGE_FORMAT", "MessageFormat", "instance_column", "message_format", "units_of"]
+
+
+class MessageFormat(NamedTuple):
+    """How the rows of one kind of message are laid out.
+
+    Attributes:
+        name: of the message, such as ``MAG``.
+        letters: one for each column.
+        columns: their names.
+        length: of a message, in bytes, its three of header counted.
+    """
+
+    name: str
+    letters: str
+    columns: tuple[str, ...]
+    length: int
+
+    @property
+    def dtype(self) -> np.dtype[np.void]:
+        """The layout of a message's body; of no fields where letters, columns and length contradict one another."""
+        fields = [(column, _LAYOUT[letter]) for letter, column in zip(self.letters, self.columns, strict=False)]
+        layout = np.dtype(fields)
+        fits = len(self.letters) == len(self.columns) and layout.itemsize == self.length - 3
+        return layout if fits else np.dtype([])
+
+    def numbers(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        """The columns of rows of this layout, in the units of the log, and arrays ``name[i]`` apart."""
+        columns: dict[str, np.ndarray] = {}
+        for letter, name in zip(self.letters, self.columns, strict=True):
+            values = rows[name]
+            if letter in DIVIDED:
+                values = values / DIVIDED[letter]
+            if values.ndim == 2:
+                columns |= {f"{name}[{place}]": values[:, place] for place in range(values.shape[1])}
+            else:
+                columns[name] = values
+        return columns
+
+
+_LAYOUT: dict[str, object] = {
+    "a": ("<i2", (32,)),
+    "b": "i1",
+    "B": "u1",
+    "g": "<f2",
+    "h": "<i2",
+    "H": "<u2",
+    "i": "<i4",
+    "I": "<u4",
+    "f": "<f4",
+    "d": "<f8",
+    "n": "S4",
+    "N": "S16",
+    "Z": "S64",
+    "c": "<i2",
+    "C": "<u2",
+    "e": "<i4",
+    "E": "<u4",
+    "L": "<i4",
+    "M": "u1",
+    "q": "<i8",
+    "Q": "<u8",
+}
+TEXT = frozenset("nNZ")
+WHOLE = frozenset("bBhHiIMqQ")
+DIVIDED: Mapping[str, float] = {"c": 1e2, "C": 1e2, "e": 1e2, "E": 1e2, "L": 1e7}
+"""Letters of whole numbers that stand for a fraction of the unit; division gives the nearest number, 1e-7 does not."""
+
+MESSAGE_FORMAT = MessageFormat("FMT", "BBnNZ", ("Type", "Length", "Name", "Format", "Columns"), 89)
+"""The format of the messages that tell the formats."""
+
+_PREFIXES = {1.0: "", 1e-1: "d", 1e-2: "c", 1e-3: "m", 1e-6: "µ", 1e-9: "n", 1e3: "k"}
+
+_LEGACY = {
+    "MAG": dict.fromkeys(("MagX", "MagY", "MagZ", "OfsX", "OfsY", "OfsZ", "MOX", "MOY", "MOZ"), "mGauss")
+    | {f"MOfs{axis}": "mGauss" for axis in "XYZ"},
+    "IMU": {f"Gyr{axis}": "rad/s" for axis in "XYZ"} | {f"Acc{axis}": "m/s/s" for axis in "XYZ"},
+    "ATT": dict.fromkeys(("DesRoll", "Roll", "DesPitch", "Pitch", "DesYaw", "Yaw"), "deg"),
+    "BAT": {"Volt": "V", "Curr": "A"},
+    "BARO": {"Alt": "m", "Press": "Pa", "Temp": "degC"},
+}
+"""Units that were the same in all versions of ArduPilot, for logs that do not state theirs."""
+
+
+def message_format(kind: int, length: int, name: str, letters: str, columns: str) -> MessageFormat | None:
+    """A format from the fields of an FMT message; None where it makes no sense."""
+    names = tuple(column.strip() for column in columns.split(",")) if columns else ()
+    if not 0 <= kind <= 255 or not 3 <= length <= 255 or not name.isprintable() or not name:
+        return None
+    if set(letters) - set(_LAYOUT) or len(set(names)) < len(names) or not all(names):
+        return MessageFormat(name, "", (), length)
+    return MessageFormat(name, letters, names, length)
+
+
+def units_of(
+    message: MessageFormat,
+    unit_ids: str,
+    multiplier_ids: str,
+    units: Mapping[str, str],
+    multipliers: Mapping[str, float],
+) -> dict[str, str]:
+    """The units of a message's columns: what the log states, or what was always so.
+
+    Args:
+        unit_ids, multiplier_ids: of the message's FMTU, a letter for each column; empty without one.
+        units, multipliers: of the log's UNIT and MULT messages, by letter.
+
+    Example:
+        >>> mag = MessageFormat("MAG", "Qh", ("TimeUS", "MagX"), 13)
+        >>> units_of(mag, "sG", "FC", {"s": "s", "G": "Gauss"}, {"F": 1e-6, "C": 1e-3})
+        {'TimeUS': 'µs', 'MagX': 'mGauss'}
+        >>> units_of(mag, "", "", {}, {})
+        {'TimeUS': 'us', 'MagX': 'mGauss'}
+    """
+    found = {}
+    legacy = _LEGACY.get(message.name.rstrip("0123456789"), {}) if not unit_ids else {}
+    for place, (letter, column) in enumerate(zip(message.letters, message.columns, strict=True)):
+        unit = units.get(unit_ids[place : place + 1], "")
+        if unit and letter not in DIVIDED:
+            multiplier = float(f"{multipliers.get(multiplier_ids[place : place + 1], 1.0):.7g}")
+            # zero stands for "none" and −1 for "unknown"
+            unit = f"{_PREFIXES[multiplier]}{unit}" if multiplier in _PREFIXES else "" if multiplier > 0 else unit
+        if not unit:
+            unit = {"TimeUS": "us", "TimeMS": "ms"}.get(column, legacy.get(column, ""))
+        if unit and unit not in ("instance", "UNKNOWN"):
+            found[column] = unit
+    return found
+
+
+def instance_column(message: MessageFormat, unit_ids: str) -> str | None:
+    """The column that numbers the sensor, ``#`` in FMTU; ``I`` in the logs of the years before it was said there."""
+    place = unit_ids.find("#")
+    if 0 <= place < len(message.columns):
+        return message.columns[place]
+    if not unit_ids and "I" in message.columns and message.letters[message.columns.index("I")] == "B":
+        return "I"
+    return None
+
+
+def c_text(field: bytes | str) -> str:
+    """Text up to its first zero."""
+    return (field if isinstance(field, str) else field.decode("utf-8", "replace")).partition("\0")[0]
+
+
+def definition(body: bytes) -> MessageFormat | None:
+    """The format that the body of a binary FMT message tells."""
+    kind, length, name, letters, columns = struct.unpack("<BB4s16s64s", body)
+    return message_format(kind, length, c_text(name), c_text(letters), c_text(columns))

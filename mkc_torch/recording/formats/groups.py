@@ -1,0 +1,143 @@
+"""From a tree of named arrays, a MATLAB file's structs or an HDF5 file's groups, to topics.
+
+Each group is a topic. Arrays (N, 3) become the columns ``name_x``, ``name_y``, ``name_z``; of another width
+``name[0]``, ``name[1]``, …; (3, N) is turned round. Arrays of a group that differ in length are topics of their own,
+each with the time that has its length. A group within a group that has the same length and no time of its own joins
+the one above it, with a dot in the names of its columns. Time comes first. Single numbers are no recordings.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from typing import NamedTuple
+
+import numpy as np
+
+from mkc_torch.recording.formats.base import Topic, listed
+from mkc_torch.recording.formats.topics import MOST_ELEMENTS, spread, topic_of
+
+__all__ = ["Group", "group_topics"]
+
+_TIME = re.compile(r"(?i)(^|[._])(t|tout|time|times|timestamp|timestamps|time_?stamp|stamp)([._].*)?$|^time")
+
+
+class Group(NamedTuple):
+    """A node of the tree.
+
+    Attributes:
+        name: its whole path, as the format writes it; empty at the root.
+        arrays: by name; of any shape and type.
+        units: of the arrays, where the format states them.
+        groups: by name.
+        told: what was left out while it was read.
+    """
+
+    name: str
+    arrays: dict[str, np.ndarray]
+    units: dict[str, str]
+    groups: dict[str, Group]
+    told: list[str]
+
+
+def group_topics(root: Group) -> list[Topic]:
+    """The topics of a tree, its root first.
+
+    Example:
+        >>> mag = Group("mag", {"t": np.arange(4.0), "field": np.zeros((4, 3))}, {"t": "s"}, {}, [])
+        >>> [(topic.name, topic.table.names) for topic in group_topics(Group("", {}, {}, {"mag": mag}, []))]
+        [('mag', ['t', 'field_x', 'field_y', 'field_z'])]
+    """
+    joined = _joined(root)
+    topics = _own_topics(joined)
+    for group in joined.groups.values():
+        topics += group_topics(group)
+    return topics
+
+
+def _joined(group: Group) -> Group:
+    """With the columns of groups in it that share its length, and have no time of their own."""
+    arrays, units, told, apart = dict(group.arrays), dict(group.units), list(group.told), {}
+    lengths = {_rows(values) for name, values in arrays.items() if _TIME.search(name)}
+    for name, inner in group.groups.items():
+        inner = _joined(inner)
+        own = [_length(values, lengths) for values in inner.arrays.values()]
+        timed = any(_TIME.search(key) and _rows(values) > 1 for key, values in inner.arrays.items())
+        if own and not timed and not inner.groups and set(own) & (lengths - {1}):
+            arrays |= {f"{name}.{key}": values for key, values in inner.arrays.items()}
+            units |= {f"{name}.{key}": unit for key, unit in inner.units.items()}
+            told += inner.told
+        else:
+            apart[name] = inner
+    return Group(group.name, arrays, units, apart, told)
+
+
+def _own_topics(group: Group) -> list[Topic]:
+    """One topic for each length of the group's arrays, that of most columns first."""
+    times = {_rows(values) for name, values in group.arrays.items() if _TIME.search(name)}
+    lengths = {name: _length(values, times | _vectors(group)) for name, values in group.arrays.items()}
+    single = [name for name, length in lengths.items() if length < 2]
+    sizes = Counter(length for length in lengths.values() if length >= 2)
+    topics: list[Topic] = []
+    wide = []
+    for length, _ in sizes.most_common():
+        columns: dict[str, np.ndarray] = {}
+        units: dict[str, str] = {}
+        for name, values in group.arrays.items():
+            if lengths[name] != length:
+                continue
+            rows = _upright(values, length)
+            if math.prod(rows.shape[1:]) > MOST_ELEMENTS:
+                wide.append(name)
+                continue
+            parts = spread(name, rows)
+            columns |= parts
+            if name in group.units:
+                units |= dict.fromkeys(parts, group.units[name])
+        name = group.name if not topics else f"{group.name}[{length} rows]"
+        columns = dict(sorted(columns.items(), key=lambda item: not _TIME.search(item[0])))
+        if columns and (topic := topic_of(name, columns, units)):
+            topics.append(topic)
+    told = list(group.told)
+    if single:
+        told.append(f"{listed(single[:8])}{' and others' if len(single) > 8 else ''}: single values, left out.")
+    if wide:
+        told.append(f"{listed(wide[:8])}: more than {MOST_ELEMENTS} numbers a row, left out.")
+    if len(topics) > 1:
+        told.append(f"Columns of different lengths are {len(topics)} tables.")
+    if told and topics:
+        topics[0] = topics[0]._replace(warnings=(*told, *topics[0].warnings))
+    return topics
+
+
+def _vectors(group: Group) -> set[int]:
+    """The lengths of the group's vectors; they say which way round its matrices are."""
+    return {_rows(values) for values in group.arrays.values() if _is_vector(values)} - {0, 1, 3}
+
+
+def _is_vector(values: np.ndarray) -> bool:
+    return values.size > 1 and values.ndim >= 1 and max(values.shape) == values.size
+
+
+def _rows(values: np.ndarray) -> int:
+    return int(values.size) if _is_vector(values) else (int(values.shape[0]) if values.ndim and values.size else 0)
+
+
+def _length(values: np.ndarray, known: set[int]) -> int:
+    """How many rows an array has, which lie along the axis whose length is known, or else its longest of two."""
+    if values.ndim == 0 or values.size == 0:
+        return min(values.size, 1)
+    if _is_vector(values) or values.size == 1:
+        return int(values.size)
+    for length in (values.shape[0], values.shape[-1]):
+        if length in known:
+            return int(length)
+    return int(max(values.shape)) if values.ndim == 2 else int(values.shape[0])
+
+
+def _upright(values: np.ndarray, length: int) -> np.ndarray:
+    """With its rows along the first axis."""
+    if _is_vector(values):
+        return values.reshape(-1)
+    return values if values.shape[0] == length else np.moveaxis(values, -1, 0)

@@ -1,0 +1,174 @@
+"""ASAM MDF (``.mf4``, ``.mdf``), versions 2 to 4, by asammdf, which runs in a process of its own.
+
+asammdf is large: it brings pandas and canmatrix, and takes two seconds to import. There is nothing as complete beside
+it: mdfreader is no longer kept.
+
+Source: ASAM MDF 4.2.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import importlib.util
+import json
+import math
+import os
+import struct
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic
+from mkc_torch.recording.formats.begins import begins_with, check_begins
+from mkc_torch.recording.formats.damage import no_rows, with_warnings
+from mkc_torch.recording.formats.topics import MOST_ELEMENTS, spread, topic_of
+
+__all__ = ["MDF"]
+
+_WHAT = "ASAM MDF file"
+_BEGINS = b"MDF     ", b"UnFinMF "
+_SCRIPT = Path(__file__).with_name("mdf_process.py")
+_PATIENCE = 60.0, 2.0
+"""Seconds, and seconds for each MB of the file: a damaged file can lead asammdf round in a circle."""
+
+
+def read(path: Path) -> list[Topic]:
+    """The topics of a file: each group of channels is one, named by its acquisition or source, or else ``group_0``.
+
+    Values are physical, converted as the file says, and numbers where it has words for them. Units are the channels';
+    the master channel, mostly ``time`` in s, comes first. A value that the file marks as invalid is NaN. Memory is that
+    of all channels, twice for a moment.
+
+    A channel whose conversion is a formula in words is left out: it would be executed.
+
+    Raises:
+        RecordingError: no MDF file, a damaged one, or one without rows.
+        ImportError: asammdf is not installed.
+    """
+    check_begins(path, _WHAT, *_BEGINS)
+    if importlib.util.find_spec("asammdf") is None:
+        raise ImportError('MDF files are read with asammdf; install it with `pip install "mkc-torch[mdf]"`.')
+    found, told = _READER.groups(path)
+    if begins_with(path, _BEGINS[1]):
+        told.append("The file was not closed by its recorder; its last rows may be missing.")
+    topics = [topic for group in found if (topic := _topic(group)) is not None]
+    if not topics:
+        raise no_rows(path, _WHAT, told)
+    return with_warnings(topics, told)
+
+
+def _topic(group: dict[str, Any]) -> Topic | None:
+    columns: dict[str, np.ndarray] = {}
+    units: dict[str, str] = {}
+    told = list(group["told"])
+    for name, values in group["columns"].items():
+        if math.prod(values.shape[1:]) > MOST_ELEMENTS:
+            told.append(f"`{name}`: more than {MOST_ELEMENTS} numbers a row, left out.")
+            continue
+        parts = spread(name, values)
+        columns |= parts
+        units |= dict.fromkeys(parts, group["units"].get(name, ""))
+    rows = {len(values) for values in columns.values()}
+    return topic_of(group["name"], columns, units, told) if len(rows) == 1 and rows != {0} else None
+
+
+class _Reader:
+    """The process, started with the first file and again after one that ended it; it ends with this one."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._owner = os.getpid()
+        self._lock = threading.Lock()
+
+    def groups(self, path: Path) -> tuple[list[dict[str, Any]], list[str]]:
+        """The groups of a file, and what is to be told of it.
+
+        Raises:
+            RecordingError: a damaged file.
+        """
+        with self._lock:
+            process = self._process
+            if process is None or self._owner != os.getpid() or process.poll() is not None:
+                process = self._started()
+            patience = _PATIENCE[0] + _PATIENCE[1] * path.stat().st_size / 1e6
+            timer = threading.Timer(patience, process.kill)
+            timer.start()
+            try:
+                assert process.stdin is not None
+                assert process.stdout is not None
+                process.stdin.write(json.dumps(str(path.resolve())).encode() + b"\n")
+                process.stdin.flush()
+                header, found = _received(process.stdout)
+            except (EOFError, OSError) as error:
+                self.end()
+                raise _damaged(path, "the library that reads it broke down over it") from error
+            finally:
+                timer.cancel()
+        if "error" in header:
+            raise _damaged(path, header["error"])
+        return found, header["told"]
+
+    def _started(self) -> subprocess.Popen[bytes]:
+        self.end()
+        # by sys.path as it is here, and not by the script's folder, whose csv.py is not Python's
+        start = "import json, runpy, sys; sys.path[:] = json.loads(sys.argv[1]); "
+        start += "runpy.run_path(sys.argv[2], run_name='__main__')"
+        self._owner = os.getpid()
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", start, json.dumps(sys.path), str(_SCRIPT)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
+        return self._process
+
+    def end(self) -> None:
+        """Let the process end, if it is ours: after a fork it is that of the process above."""
+        if self._process is None or self._owner != os.getpid():
+            return
+        self._process.kill()
+        for pipe in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(OSError):
+                if pipe is not None:
+                    pipe.close()
+        self._process.wait()
+        self._process = None
+
+
+def _received(pipe: IO[bytes]) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The header and the groups of an answer."""
+    (length,) = struct.unpack("<Q", _exactly(pipe, 8))
+    header = json.loads(_exactly(pipe, length))
+    groups = header.get("groups", [])
+    for group in groups:
+        columns = {}
+        for name, kind, shape in group["columns"]:
+            layout = np.dtype(kind)
+            block = _exactly(pipe, layout.itemsize * math.prod(shape))
+            columns[name] = np.frombuffer(block, layout).reshape(shape)
+        group["columns"] = columns
+    return header, groups
+
+
+def _exactly(pipe: IO[bytes], count: int) -> bytes:
+    data = pipe.read(count) if count else b""
+    if len(data) < count:
+        raise EOFError("The process has ended.")
+    return data
+
+
+def _damaged(path: Path, said: str) -> RecordingError:
+    return RecordingError(
+        f"{path}: the {_WHAT} cannot be read: it is damaged ({said}); copy it anew from where it was recorded."
+    )
+
+
+_READER = _Reader()
+atexit.register(_READER.end)
+
+MDF = FileFormat((".mf4", ".mdf"), read)

@@ -1,0 +1,90 @@
+"""Logs of messages, ROS's bags and MCAP: from messages of many topics to tables."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+
+from mkc_torch.recording.formats.base import Topic, counted
+from mkc_torch.recording.formats.message_rows import LARGEST_MESSAGE, Cell, MessageRows
+
+__all__ = ["MessageLog"]
+
+LOG_TIME = "log_time"
+_PUBLISH_TIME = "publish_time"
+_STAMP = "header.stamp"
+
+
+class MessageLog:
+    """Gathers messages; a topic that several wrote to is one table, in the order of ``log_time``.
+
+    Times are in ns. ``header.stamp`` is the sensor's own, where it has one; ``log_time`` when the logger wrote the
+    message down; ``publish_time`` when it was sent, where that differs.
+    """
+
+    def __init__(self) -> None:
+        self._readers: dict[object, tuple[str, Callable[[bytes], Mapping[str, Cell]], MessageRows]] = {}
+        self._rows: dict[tuple[str, str], MessageRows] = {}
+        self._left_out: dict[str, str] = {}
+        self._failed: Counter[str] = Counter()
+        self._large: Counter[str] = Counter()
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._readers
+
+    def open(
+        self,
+        key: object,
+        topic: str,
+        kind: str,
+        read: Callable[[bytes], Mapping[str, Cell]],
+        units: Mapping[str, str],
+    ) -> None:
+        """Messages under ``key`` are of this topic and type, and read like this."""
+        known = {**units, LOG_TIME: "ns", _PUBLISH_TIME: "ns"}
+        rows = self._rows.setdefault((topic, kind), MessageRows(topic, known))
+        self._readers[key] = topic, read, rows
+
+    def leave_out(self, topic: str, why: str) -> None:
+        """A topic cannot be read: the end of a sentence that says why."""
+        self._left_out[topic] = why
+
+    def add(self, key: object, data: bytes, log_time: int, publish_time: int | None = None) -> None:
+        """One message more; of topics that were not opened none is kept."""
+        if key not in self._readers:
+            return
+        topic, read, rows = self._readers[key]
+        if len(data) > LARGEST_MESSAGE:
+            self._large[topic] += 1
+            return
+        try:
+            values = dict(read(data))
+        except Exception:  # decoders raise what comes over bytes that are none of their messages
+            self._failed[topic] += 1
+            return
+        times = {LOG_TIME: log_time}
+        if publish_time is not None and publish_time != log_time:
+            times[_PUBLISH_TIME] = publish_time
+        rows.add({**values, **times})
+
+    def topics(self) -> tuple[list[Topic], list[str]]:
+        """All tables, and what is to be said of the file."""
+        topics = []
+        names = Counter(name for name, _ in self._rows)
+        for (name, kind), rows in self._rows.items():
+            told = []
+            if failed := self._failed[name]:
+                told.append(f"{counted(failed, 'message')} could not be read and {_are(failed)} left out.")
+            if large := self._large[name]:
+                told.append(f"{counted(large, 'message')} of more than 64 KiB {_are(large)} left out.")
+            topic = rows.topic((_STAMP, LOG_TIME, _PUBLISH_TIME), LOG_TIME, told)
+            if topic is not None and set(topic.table.names) - {LOG_TIME, _PUBLISH_TIME}:
+                topics.append(topic if names[name] == 1 else topic._replace(name=f"{name} ({kind})"))
+            elif told:
+                self._left_out[name] = told[0][0].lower() + told[0][1:-1]
+        warnings = [f"Topic {name} is left out: {why}." for name, why in self._left_out.items()]
+        return topics, warnings
+
+
+def _are(count: int) -> str:
+    return "is" if count == 1 else "are"

@@ -1,0 +1,148 @@
+"""PX4 ULog (``.ulg``), by pyulog.
+
+Source: docs.px4.io, "ULog File Format".
+"""
+
+from __future__ import annotations
+
+import mmap
+import re
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic, counted
+from mkc_torch.recording.formats.begins import check_begins
+from mkc_torch.recording.formats.damage import guarded, lost_warning, no_rows, with_warnings
+from mkc_torch.recording.formats.px4_units import px4_units
+from mkc_torch.recording.formats.topics import topic_of
+
+__all__ = ["ULOG"]
+
+_MAGIC = b"ULog\x01\x12\x35"
+_HEADER = 16
+_MOST_FIELDS = 65536
+_DEEPEST = 8
+_FIELD = re.compile(r"(?P<kind>\w+)(\[(?P<count>\d{1,9})\])? ")
+_KINDS = frozenset(b"BFIMPQAARDLCSO")
+"""Kinds of messages of the specification; all others are damage, or a version to come."""
+
+
+def read(path: Path) -> list[Topic]:
+    """The topics of a log, named ``sensor_mag_0`` by instance, with the fields' names in PX4.
+
+    Fields of nested messages have dots in their names and arrays ``[i]``; ``timestamp`` is in µs. Memory is twice the
+    file's size.
+
+    Raises:
+        RecordingError: no ULog, or one without a whole row.
+        ImportError: pyulog is not installed.
+    """
+    check_begins(path, "PX4 ULog", _MAGIC)
+    try:
+        import pyulog
+    except ImportError as error:
+        raise ImportError(
+            'ULog files are read with pyulog; install it with `pip install "mkc-torch[ulog]"`.'
+        ) from error
+    with guarded(path, "PX4 ULog"), path.open("rb") as file:
+        walk = _walk(path)
+        log = pyulog.ULog(file)
+        warnings = _losses(log, walk)
+        topics = [topic for data in log.data_list if (topic := _topic(data)) is not None]
+    if not topics:
+        raise no_rows(path, "PX4 ULog", warnings)
+    return with_warnings(_named_once(topics), warnings)
+
+
+def _topic(data: Any) -> Topic | None:
+    kinds = {field.field_name: field.type_str for field in data.field_data}
+    columns = {name: values for name, values in data.data.items() if not name.split(".")[-1].startswith("_padding")}
+    text = sorted({name.partition("[")[0] for name in columns if kinds.get(name) == "char"})
+    columns = {name: values for name, values in columns.items() if kinds.get(name) != "char"}
+    first = [name for name in ("timestamp",) if name in columns]
+    columns = {name: columns[name] for name in [*first, *columns]}
+    told = [f"Column `{name}` holds text and is left out." for name in text]
+    return topic_of(f"{data.name}_{data.multi_id}", columns, px4_units(data.name, columns), told)
+
+
+def _named_once(topics: list[Topic]) -> list[Topic]:
+    """A topic that was logged anew after it had ended keeps its rows, under a name of its own."""
+    seen: Counter[str] = Counter()
+    named = []
+    for topic in topics:
+        seen[topic.name] += 1
+        count = seen[topic.name]
+        named.append(topic if count == 1 else topic._replace(name=f"{topic.name} ({count})"))
+    return named
+
+
+def _losses(log: Any, walk: tuple[int, int, int]) -> list[str]:
+    """What the logger did not write, and what of the file cannot be read."""
+    warnings = []
+    if log.dropouts:
+        seconds = sum(dropout.duration for dropout in log.dropouts) / 1000.0
+        warnings.append(f"The logger lost {seconds:.3g} s of data in {counted(len(log.dropouts), 'dropout')}.")
+    whole, rows, size = walk
+    if whole < size:
+        warnings.append(lost_warning(size - whole, size, "its end"))
+    read_rows = sum(len(next(iter(data.data.values()))) for data in log.data_list if data.data)
+    if read_rows < rows:
+        warnings.append(f"The file is damaged: {rows - read_rows:,} of its {rows:,} rows cannot be read.")
+    elif log.file_corruption and whole == size:
+        warnings.append("The file is damaged in places; what could not be read there is left out.")
+    return warnings
+
+
+def _walk(path: Path) -> tuple[int, int, int]:
+    """Where the whole messages end, how many of them are rows, and the file's size.
+
+    pyulog stops in silence where the file ends; this walks from header to header, without looking at what they hold.
+    """
+    size = path.stat().st_size
+    if size < _HEADER:
+        raise RecordingError(f"{path}: the PX4 ULog ends within its header; record it anew, or copy it whole.")
+    place, rows = _HEADER, 0
+    formats: dict[str, list[tuple[str, int]]] = {}
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        while place + 3 <= size:
+            length = content[place] + 256 * content[place + 1]
+            kind = content[place + 2]
+            if place + 3 + length > size or kind not in _KINDS:
+                break
+            rows += kind == ord("D")
+            if kind == ord("F"):
+                _define(content[place + 3 : place + 3 + length], formats)
+            place += 3 + length
+    known: dict[str, int] = {}
+    if any(_width(name, formats, known, 0) > _MOST_FIELDS for name in formats):
+        raise RecordingError(f"{path}: the PX4 ULog is damaged: a message of it has more than {_MOST_FIELDS:,} fields.")
+    return place, rows, size
+
+
+def _define(text: bytes, formats: dict[str, list[tuple[str, int]]]) -> None:
+    """Note the kinds of fields of a message, ``name:type[count] field;…``, and how many there are of each."""
+    name, _, fields = text.decode("utf-8", "replace").partition(":")
+    formats[name] = [
+        (found["kind"], int(found["count"] or 1)) for field in fields.split(";") if (found := _FIELD.match(field))
+    ]
+
+
+def _width(name: str, formats: dict[str, list[tuple[str, int]]], known: dict[str, int], depth: int) -> int:
+    """How many numbers a message has; pyulog makes an object of each, though formats can nest in one another."""
+    if name not in formats:
+        return 1
+    if depth > _DEEPEST:
+        return _MOST_FIELDS + 1
+    if name in known:
+        return known[name]
+    total = 0
+    for kind, count in formats[name]:
+        total += count * _width(kind, formats, known, depth + 1) if count else 0
+        if total > _MOST_FIELDS:
+            break
+    known[name] = total
+    return total
+
+
+ULOG = FileFormat((".ulg", ".ulog"), read)

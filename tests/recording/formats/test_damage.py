@@ -1,0 +1,202 @@
+"""Files that are cut off, damaged, empty or foreign: whole rows, or a sentence that says what to do."""
+
+import functools
+import io
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+pytest.importorskip("polars")
+
+from mkc_torch.recording.formats import RecordingError, read_topics
+from tests.recording.formats import writers
+from tests.recording.formats.test_same_samples import KINDS, numbers
+from tests.recording.formats.writers import samples
+
+GIVEN = samples(60)
+FILES = {kind: row for kind, row in KINDS.items() if row[0]}
+SEQUENTIAL = ("ULog", "DataFlash", "DataFlash text", "MCAP", "ROS 1")
+"""Formats whose messages can be read up to where the file ends."""
+
+
+@functools.cache
+def content(kind, tmp):
+    ending, write, *_ = FILES[kind]
+    path = tmp / f"whole_{kind.replace(' ', '_')}{ending}"
+    write(path, GIVEN)
+    return path.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def tmp(tmp_path_factory):
+    return tmp_path_factory.mktemp("damage")
+
+
+def rows_or_sentence(path):
+    """The topics, or the sentence of the one error that is allowed; a warning of a library is an error, too."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            topics = read_topics(path)
+        except RecordingError as error:
+            topics, said = [], str(error)
+    if not topics:
+        assert str(path) in said
+        assert "\n" not in said
+        return [], said
+    for topic in topics:
+        lengths = {len(series) for series in topic.table.series}
+        assert len(lengths) == 1
+        assert lengths.pop() > 0
+    return topics, " ".join(sentence for topic in topics for sentence in topic.warnings)
+
+
+many = settings(max_examples=50, deadline=None)
+few = settings(max_examples=25, deadline=None)
+
+
+@pytest.mark.parametrize("kind", FILES)
+@many
+@given(share=st.floats(0.0, 1.0))
+def test_a_file_cut_off_anywhere_gives_its_whole_rows_or_says_why_not(kind, tmp, share):
+    whole = content(kind, tmp)
+    cut = whole[: int(share * (len(whole) - 1))]
+    path = tmp / f"cut{FILES[kind][0]}"
+    path.write_bytes(cut)
+    topics, said = rows_or_sentence(path)
+    _, _, name, columns, time, *_ = FILES[kind]
+    if not topics:
+        assert said
+        return
+    full = {topic.name: topic for topic in _read(tmp, kind, whole)}
+    # what is cut where a message ends is a whole file, and some bytes at the end of others mean nothing
+    at_end = any(whole[len(cut) :].startswith(begin) for begin in (b"\xa3\x95", b"MAG", b"BARO", b"\x22\x00D"))
+    same = [len(topic.table.series[0]) for topic in topics] == [len(topic.table.series[0]) for topic in full.values()]
+    assert said or at_end or same
+    for topic in topics:
+        if topic.name == name and kind in SEQUENTIAL:
+            for column in (time, *columns):
+                here = numbers(topic, column).tolist()
+                there = numbers(full[name], column).tolist()
+                last = -1 if kind == "DataFlash text" else None  # within a number, which is told
+                assert here[:last] == there[: len(here)][:last]
+
+
+@functools.cache
+def _read(tmp, kind, whole):
+    path = tmp / f"full{FILES[kind][0]}"
+    path.write_bytes(whole)
+    return read_topics(path)
+
+
+@pytest.mark.parametrize("kind", SEQUENTIAL)
+def test_what_is_whole_of_a_file_cut_in_its_middle_is_kept_and_the_loss_told(kind, tmp):
+    whole = content(kind, tmp)
+    path = tmp / f"half{FILES[kind][0]}"
+    path.write_bytes(whole[: (3 * len(whole)) // 4 + 1])
+    topics, said = rows_or_sentence(path)
+    found = next(topic for topic in topics if topic.name == FILES[kind][2])
+    # the index of a bag or an MCAP file takes some of its end
+    assert len(found.table.series[0]) >= (30 if kind not in ("MCAP", "ROS 1") else 15)
+    assert "cut off" in said
+
+
+@pytest.mark.parametrize("kind", FILES)
+@few
+@given(places=st.lists(st.tuples(st.floats(0.0, 1.0), st.binary(min_size=1, max_size=8)), min_size=1, max_size=4))
+def test_a_file_with_wrong_bytes_gives_rows_or_a_sentence(kind, tmp, places):
+    damaged = bytearray(content(kind, tmp))
+    for share, data in places:
+        at = int(share * (len(damaged) - 1))
+        damaged[at : at + len(data)] = data
+    path = tmp / f"wrong{FILES[kind][0]}"
+    path.write_bytes(damaged)
+    rows_or_sentence(path)
+
+
+def test_a_parquet_file_over_which_polars_breaks_off_is_damaged(tmp_path, capfd):
+    pl = pytest.importorskip("polars")
+    path = tmp_path / "table.parquet"
+    noise = np.random.default_rng(0).normal(size=1000)
+    pl.DataFrame({"time": np.arange(1000.0), "mag_x": noise}).write_parquet(path)
+    whole = path.read_bytes()
+    # the end, which says where all is, without the numbers themselves
+    end = 8 + int.from_bytes(whole[-8:-4], "little")
+    with pytest.raises((pl.exceptions.PanicException, pl.exceptions.PolarsError)):
+        pl.read_parquet(io.BytesIO(whole[:4] + whole[-end:]))
+    capfd.readouterr()
+    path.write_bytes(whole[:4] + whole[-end:])
+    assert "is damaged; copy it anew" in rows_or_sentence(path)[1]
+    assert capfd.readouterr().err == ""
+
+
+MAGIC = {
+    ".ulg": b"ULog\x01\x12\x35\x01",
+    ".bin": b"\xa3\x95\x80",
+    ".log": b"FMT, 128, 89, FMT, BBnNZ, ",
+    ".mcap": b"\x89MCAP0\r\n",
+    ".bag": b"#ROSBAG V2.0\n",
+    ".db3": b"SQLite format 3\x00",
+    ".mat": b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM",
+    ".h5": b"\x89HDF\r\n\x1a\n",
+    ".mf4": b"MDF     4.10    ",
+}
+
+
+@pytest.mark.parametrize("ending", MAGIC)
+@few
+@given(rest=st.binary(max_size=400))
+def test_random_bytes_behind_a_right_beginning_give_rows_or_a_sentence(ending, tmp, rest):
+    path = tmp / f"random{ending}"
+    path.write_bytes(MAGIC[ending] + rest)
+    rows_or_sentence(path)
+
+
+@pytest.mark.parametrize("ending", [*MAGIC, ".hdf5", ".mdf", ".ulog"])
+def test_an_empty_file_and_one_of_another_kind_are_named(ending, tmp):
+    path = tmp / f"foreign{ending}"
+    path.write_bytes(b"")
+    assert "empty" in rows_or_sentence(path)[1]
+    path.write_bytes(b"time,mag_x,mag_y,mag_z\n0,1,2,3\n")
+    said = rows_or_sentence(path)[1]
+    assert "this is no " in said
+    assert "rename it to end in .csv" in said
+    for other, magic in MAGIC.items():
+        if {ending, other} & {".log"} or {ending, other} in ({".h5", ".hdf5"}, {".mdf", ".mf4"}, {".ulg", ".ulog"}):
+            continue
+        if other != ending and (ending, other) != (".mat", ".h5"):  # version 7.3 is HDF5
+            path.write_bytes(magic + b"\0" * 700)
+            said = rows_or_sentence(path)[1]
+            assert f"rename it to end in {other}" in said, (ending, other, said)
+
+
+def test_a_folder_that_is_no_bag_and_a_bag_without_its_files_are_named(tmp_path):
+    (tmp_path / "folder").mkdir()
+    assert "this is a folder" in rows_or_sentence(tmp_path / "folder")[1]
+    (tmp_path / "folder" / "metadata.yaml").write_text("rosbag2_bagfile_information: {relative_file_paths: [a.db3]}")
+    assert "no file of messages" in rows_or_sentence(tmp_path / "folder")[1]
+
+
+def test_a_bag_whose_metadata_is_damaged_is_read_by_what_lies_in_it(tmp_path):
+    writers.rosbag2(tmp_path / "bag", GIVEN)
+    (tmp_path / "bag" / "metadata.yaml").write_text("{[")
+    topics, said = rows_or_sentence(tmp_path / "bag")
+    assert len(topics[0].table.series[0]) == len(GIVEN.time)
+    assert "metadata.yaml is damaged" in said
+
+
+def test_the_loss_of_a_dataflash_log_is_counted(tmp_path):
+    writers.dataflash(tmp_path / "log.bin", GIVEN)
+    whole = (tmp_path / "log.bin").read_bytes()
+    row = whole.rindex(b"\xa3\x95\x82")
+    # a message whose header is gone, in the middle of the log, and eleven bytes of one at its end
+    middle = whole.index(b"\xa3\x95\x82", len(whole) // 2)
+    damaged = whole[:middle] + b"\0\0" + whole[middle + 2 : row + 11]
+    (tmp_path / "log.bin").write_bytes(damaged)
+    topics, said = rows_or_sentence(tmp_path / "log.bin")
+    mag = next(topic for topic in topics if topic.name == "MAG[0]")
+    assert len(mag.table.series[0]) == len(GIVEN.time) - 2
+    assert f"{24 + 11} of its {len(damaged)} bytes" in said.replace(",", "")
