@@ -913,6 +913,10 @@ class Criterion(nn.Module):
         return self.loss(x, y)
 
 
+@pytest.mark.skipif(
+    tuple(map(int, torch.__version__.split(".")[:2])) < (2, 7),
+    reason="torch 2.6 loses the size of the batch in an autograd function",
+)
 @pytest.mark.parametrize("options", [{"d": 1.0}, {"d": 1.0, **FIXED}, {}], ids=["learned", "fixed", "as it comes"])
 def test_an_exported_loss_takes_batches_of_any_size(options):
     module = Criterion(MKCLoss(2, **options))
