@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from mkc_torch.cli.console import (
-    FAILURES,
     complain,
     err,
     interrupts_told,
@@ -20,6 +19,7 @@ from mkc_torch.cli.console import (
     refuse_same_names,
 )
 from mkc_torch.cli.loading import loading
+from mkc_torch.cli.units_option import HELP, METAVAR, SENSOR_HELP, parsed_units, without_units
 
 
 def calibrate(
@@ -33,41 +33,53 @@ def calibrate(
         float | None,
         typer.Option(metavar="µT", help="Length of the corrected field in µT; default: as measured."),
     ] = None,
-    unit: Annotated[str, typer.Option(help="Unit of the magnetometer's columns, such as counts.")] = "µT",
+    unit: Annotated[list[str] | None, typer.Option(metavar=METAVAR, help=HELP)] = None,
+    sensor: Annotated[str | None, typer.Option(metavar="NAME", help=SENSOR_HELP)] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
     """Find a magnetometer's offset, gains and cross-axis coupling in recordings of it being turned.
+
+    A file with several magnetometers gets a calibration of each, in a folder of its name in that of the file.
 
     Exits with 0 when every recording was calibrated and 1 when some were not.
     """
     names = parsed_columns(columns)
     if field_strength is not None and not (math.isfinite(field_strength) and field_strength > 0):
         raise typer.BadParameter(f"--field-strength must be a positive number of µT but is {field_strength:g}.")
-    if not unit.strip():
-        raise typer.BadParameter("--unit is empty; name the unit, such as counts.")
+    recordings, texts = without_units(recordings, unit or [])
+    units = parsed_units(texts)
     refuse_same_names(recordings)
     with loading():
         from mkc_torch._parallel.processes import keep_memory
-        from mkc_torch.cli.calibration_files import calibrate_file
+        from mkc_torch.cli.calibration_files import calibrations_of
         from mkc_torch.cli.calibration_summary import show
     keep_memory()
-    console, failed, left = out(), 0, list(recordings)
+    console, total, failed, left = out(), 0, 0, list(recordings)
     with progress(len(recordings), output) as step, interrupts_told(lambda: not_written(left, output)):
         for path in recordings:
             step(f"calibrating {path.name}")
-            try:
-                calibration, files = calibrate_file(
-                    path, output / path.stem, columns=names, unit=unit, field_strength=field_strength, force=force
-                )
-            except FAILURES as error:
-                failed += 1
+            outcomes = calibrations_of(
+                path,
+                output / path.stem,
+                columns=names,
+                units=units,
+                sensor=sensor,
+                field_strength=field_strength,
+                force=force,
+            )
+            for subject, outcome in outcomes:
+                total += 1
                 with step.aside():
-                    complain(path, error)
-            else:
-                with step.aside():
-                    show(console, calibration, files)
+                    if isinstance(outcome, Exception):
+                        failed += 1
+                        complain(subject, outcome)
+                    else:
+                        show(console, *outcome)
             left.remove(path)
             step(None)
-    if len(recordings) > 1 and failed:
-        err().print(f"mkc: {failed} of {len(recordings)} recordings were not calibrated.", soft_wrap=True)
+    if total > 1 and failed:
+        err().print(
+            f"mkc: {failed} of {total} {'recordings' if total == len(recordings) else 'sensors'} were not calibrated.",
+            soft_wrap=True,
+        )
     raise typer.Exit(1 if failed else 0)

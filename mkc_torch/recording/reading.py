@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from mkc_torch.recording.beside import beside_columns
 from mkc_torch.recording.choice import Choice, choose
 from mkc_torch.recording.clock import Clock, ClockError, clock_of
-from mkc_torch.recording.conversions import Units, converted, in_units, said_units, units_told
+from mkc_torch.recording.conversions import DEFAULT_UNITS, Units, converted, in_units, said_units, units_told
 from mkc_torch.recording.formats import read_topics
 from mkc_torch.recording.formats.base import RecordingError, Table, counted, listed
 from mkc_torch.recording.formats.cells import as_numbers, missing_warning, numbered, renamed, text_error
@@ -22,7 +22,10 @@ from mkc_torch.recording.formats.text_cells import SEPARATORS
 from mkc_torch.recording.given_columns import EXPERIMENT
 from mkc_torch.recording.runs import restarts
 
-__all__ = ["Reading", "read_file"]
+__all__ = ["ASKED", "Reading", "read_file"]
+
+ASKED = frozenset({*DEFAULT_UNITS, EXPERIMENT})
+"""Columns that are wanted wherever they are, so that text in them is an error."""
 
 _SHOWN = 5
 """Runs whose first rows a sentence names."""
@@ -36,6 +39,8 @@ class Reading(NamedTuple):
         units: of columns, where they differ from those that their names have.
         labels: what the numbers of ``experiment`` stand for.
         warnings: sentences about what was recognised, converted, skipped and left out.
+        topic: number of the topic that was read.
+        sensor: name of the magnetometer, where the file has several.
         said: columns whose unit the file or the caller says.
     """
 
@@ -43,12 +48,14 @@ class Reading(NamedTuple):
     units: dict[str, str]
     labels: dict[str, list[str]]
     warnings: list[str]
+    topic: int
+    sensor: str
     said: frozenset[str]
 
 
 def read_file(
     path: Path,
-    asked: set[str],
+    asked: Collection[str],
     *,
     columns: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
@@ -71,11 +78,14 @@ def read_file(
     table = topic.table
     taken, warnings = renamed(table, choice.columns, path)
     warnings = [*topic.warnings, *choice.warnings, *warnings]
-    known = in_units(path, taken, said_units(choice, topic, taken), units or {})
+    said = said_units(choice, topic, taken)
+    if not recognise:  # the caller knows what the columns are; a clock's unit is none of its business
+        said = {name: unit for name, unit in said.items() if name == "time"}
+    known = in_units(path, taken, said, units or {})
     values: dict[str, Tensor] = {}
     labels: dict[str, list[str]] = {}
     clock = None
-    wanted = asked | set(columns or {})
+    wanted = {*asked, *(columns or {})}
     for name, series in taken.items():
         if name == "time":
             clock = _clock(path, table, series, known)
@@ -107,9 +117,9 @@ def read_file(
         values |= {name: torch.tensor(column) for name, column in more.columns.items()}
         warnings += more.warnings
     warnings += _add_runs(values, table, topic.restarts, clock)
-    return Reading(
-        values, {k: u for k, u in known.labels.items() if k in values}, labels, warnings, known.said & set(values)
-    )
+    own = {name: unit for name, unit in known.labels.items() if name in values}
+    which = "" if choice.sensor is None else choice.sensor.name
+    return Reading(values, own, labels, warnings, choice.topic, which, known.said & set(values))
 
 
 def _clock(path: Path, table: Table, series: Any, known: Units) -> Clock | None:

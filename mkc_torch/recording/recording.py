@@ -18,15 +18,12 @@ from mkc_torch.recording.conversions import DEFAULT_UNITS
 from mkc_torch.recording.formats import check_ending, encoded
 from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, counted, listed
 from mkc_torch.recording.given_columns import EXPERIMENT, checked_columns, columns_of_frame
-from mkc_torch.recording.reading import read_file
+from mkc_torch.recording.reading import ASKED, read_file
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = ["DEFAULT_UNITS", "MissingColumnError", "Recording", "RecordingError", "write_table"]
-
-_ASKED = {*DEFAULT_UNITS, EXPERIMENT}
-"""Columns that are wanted wherever they are, so that text in them is an error."""
 
 _GAP = 10.0  # in median intervals
 
@@ -67,7 +64,7 @@ class Recording:
     ) -> None:
         units, labels = units or {}, labels or {}
         if is_frame(columns):
-            frame = columns_of_frame(columns, {}, _ASKED, name)
+            frame = columns_of_frame(columns, {}, ASKED, name)
             columns, labels, warnings = frame.columns, frame.labels | dict(labels), (*frame.warnings, *warnings)
         given = checked_columns(cast("Mapping[str, Data]", columns), name)
         for column in (*units, *labels):
@@ -118,7 +115,7 @@ class Recording:
             ImportError: the reader's library is not installed.
         """
         path = Path(path)
-        found = read_file(path, _ASKED, columns=columns, units=units, sensor=sensor, recognise=recognise)
+        found = read_file(path, ASKED, columns=columns, units=units, sensor=sensor, recognise=recognise)
         return cls(found.columns, name=path.stem, units=found.units, warnings=found.warnings, labels=found.labels)
 
     @classmethod
@@ -151,7 +148,7 @@ class Recording:
             >>> Recording.from_frame(pd.DataFrame({"mx": [20, 21]}), columns={"mag_x": "mx"})["mag_x"]
             tensor([20., 21.], dtype=torch.float64)
         """
-        found = columns_of_frame(frame, columns or {}, _ASKED, name)
+        found = columns_of_frame(frame, columns or {}, ASKED, name)
         return cls(found.columns, name=name, units=units, warnings=found.warnings, labels=found.labels)
 
     @property

@@ -67,7 +67,8 @@ def layout_of(path: Path, lines: list[Line]) -> Layout:
             f"{counted(len(head.above), 'line')} above the header skipped, the first {_shown(head.above[0])}."
         )
     if not rows:
-        raise RecordingError(f"{path}: the file has a header line but no rows of numbers.")
+        why = f" {' '.join(skipped)}" if skipped else ""
+        raise RecordingError(f"{path}: the file has a header line but no rows of numbers.{why}")
     return Layout(separator, head.names, head.units, rows, restarts, warnings + skipped)
 
 
