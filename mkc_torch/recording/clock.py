@@ -198,11 +198,11 @@ def _ticks(series: Any, digits: int) -> Any | None:
         return whole * 10**digits if _fits(whole, digits) else None
     if series.dtype != package.String:
         return None
-    plain = series.str.extract_groups(r"^([+-]?\d{1,18})(?:\.(\d*?)0*)?$").struct.unnest().get_columns()
+    plain = series.str.extract_groups(r"^([+-]?\d{1,19})(?:\.(\d*?)0*)?$").struct.unnest().get_columns()
     if (plain[0].is_null() & series.is_not_null()).any() or bool((plain[1].str.len_bytes() > digits).any()):
         return None
-    whole = plain[0].cast(package.Int64)
-    if not _fits(whole, digits):
+    whole = plain[0].cast(package.Int64, strict=False)
+    if whole.null_count() > plain[0].null_count() or not _fits(whole, digits):
         return None
     after = _whole(plain[1].fill_null("").str.slice(0, digits).str.pad_end(digits, "0")) if digits else 0
     sign = 1 - 2 * plain[0].str.starts_with("-").cast(package.Int64)

@@ -22,6 +22,9 @@ _COMMA = r"^\s*[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?\s*$"
 _POINT = r"^\s*[+-]?(\d+\.\d*|\.\d+)([eE][+-]?\d+)?\s*$"
 _THOUSANDS = r"^\s*[+-]?[1-9]\d{0,2},\d{3}\s*$"
 
+_BOTH_SIGNS = 5
+"""Rows of either sign from which a column is taken to go through nought."""
+
 
 def topic(path: Path) -> Topic:
     """The table in a text file, its cells as text.
@@ -65,7 +68,7 @@ def _with_points(path: Path, names: list[str], series: list[Any], lines: list[in
     with_commas = [one for one, has in zip(series, commas, strict=True) if bool(has.any())]
     if not with_commas:
         return series, []
-    if all(bool(one.filter(one.str.contains(_COMMA)).str.contains(_THOUSANDS).all()) for one in with_commas):
+    if all(_may_be_thousands(one.filter(one.str.contains(_COMMA)), len(one)) for one in with_commas):
         place, has = next((i, has) for i, has in enumerate(commas) if bool(has.any()))
         row = int(has.fill_null(False).arg_max())
         raise RecordingError(
@@ -78,6 +81,17 @@ def _with_points(path: Path, names: list[str], series: list[Any], lines: list[in
         for one, has in zip(series, commas, strict=True)
     ]
     return changed, ["Decimal commas were read as points."]
+
+
+def _may_be_thousands(cells: Any, rows: int) -> bool:
+    """Whether the commas of a column may set off thousands: always before three digits.
+
+    Not where every row has one and the signs differ: no quantity goes through nought without a number below 1000.
+    """
+    if not bool(cells.str.contains(_THOUSANDS).all()):
+        return False
+    negative = int(cells.str.contains(r"^\s*-").sum())
+    return not (len(cells) == rows and min(negative, rows - negative) >= _BOTH_SIGNS)
 
 
 def encoded(path: Path, columns: Mapping[str, np.ndarray]) -> str | bytes:

@@ -17,6 +17,9 @@ SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab", "|": "bar", WHITE: "s
 _ORDER = ("\t", ";", "|", ",", WHITE)
 """Of separators that explain a table equally well the first is it."""
 
+_BLANKS = 0.9
+"""What blanks explain counts less: a stamp of date and time has one within it."""
+
 _LOOKED_AT = 120
 """Lines at the beginning and in the middle by which the separator is found."""
 
@@ -77,7 +80,9 @@ def separator_of(lines: Sequence[str]) -> tuple[str, int]:
         (count, _), *_ = Counter(map(len, rows)).most_common(1)
         if count < 2:
             continue
-        score = sum(sum(map(is_value, cells)) / count for cells in rows if len(cells) == count)
+        rows = [cells for cells in rows if len(cells) == count]
+        filled = sum(any(cells[i].strip() for cells in rows) for i in range(count))
+        score = sum(sum(map(is_value, cells)) / filled for cells in rows) * (_BLANKS if separator == WHITE else 1.0)
         if score > best:
             best, found = score, (separator, count)
     if found is not None:

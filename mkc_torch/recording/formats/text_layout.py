@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mkc_torch.recording.formats.base import RecordingError, counted
-from mkc_torch.recording.formats.text_cells import SEPARATORS, cells_of, count_of, is_value, separator_of
+from mkc_torch.recording.formats.text_cells import SEPARATORS, WHITE, cells_of, count_of, is_value, separator_of
 from mkc_torch.recording.formats.text_lines import Line
 from mkc_torch.recording.unit_words import is_unit
 
@@ -56,8 +56,9 @@ def layout_of(path: Path, lines: list[Line]) -> Layout:
         ]
     marked = set(comments)
     plain = [line for line in lines if line not in marked]
+    plain, count, warnings = _without_trailing(plain, separator, count)
     head = _head(path, plain, comments, separator, count)
-    body, warnings = _without_trailing(head, [line for line in plain if line.number not in head.lines])
+    body = [line for line in plain if line.number not in head.lines]
     rows, restarts, skipped = _rows(path, head, body)
     told = [line for line in comments if line.number not in head.lines]
     if told:
@@ -176,21 +177,25 @@ def _names_among_numbers(cells: list[str], after: list[Line], separator: str) ->
     return len(below) == len(cells) and all(is_value(b) for a, b in pairs if not is_value(a))
 
 
-def _without_trailing(head: _Head, body: list[Line]) -> tuple[list[Line], list[str]]:
-    """Rows that all end with a separator more than the header has lose it."""
-    separator = head.separator
-    rows = [line for line in body if line.text.strip() not in (head.text, head.units_text)]
-    if separator == " " or len(rows) < 2:
-        return body, []
-    longer = [count_of(line.text, separator) == len(head.names) + 1 for line in rows[:-1]]
-    if not all(longer) or not all(line.text.rstrip(" ").endswith(separator) for line in rows[:-1]):
-        return body, []
+def _without_trailing(lines: list[Line], separator: str, count: int) -> tuple[list[Line], int, list[str]]:
+    """Rows that all end with a separator more than the header has lose it.
 
-    def stripped(line: Line) -> Line:
-        text = line.text.rstrip(" ")
-        return Line(line.number, text.removesuffix(separator)) if text != head.text else line
-
-    return [stripped(line) for line in body], [f"Every row ends with a {SEPARATORS[separator]} too many."]
+    Returns:
+        The lines, how many cells a row has then, and a sentence.
+    """
+    if separator == WHITE or count < 2:
+        return lines, count, []
+    ends = [line.text.rstrip(" ").endswith(separator) for line in lines]
+    counts = [count_of(line.text, separator) for line in lines]
+    names = {n for line, n in zip(lines, counts, strict=True) if not any(map(is_value, cells_of(line.text, separator)))}
+    rows = [end for end, n in zip(ends, counts, strict=True) if n == count]
+    if not all(rows) or count in names or count - 1 not in names:
+        return lines, count, []
+    told = [
+        Line(line.number, line.text.rstrip(" ").removesuffix(separator)) if end and n == count else line
+        for line, end, n in zip(lines, ends, counts, strict=True)
+    ]
+    return told, count - 1, [f"Every row ends with a {SEPARATORS[separator]} too many."]
 
 
 def _rows(path: Path, head: _Head, body: list[Line]) -> tuple[list[Line], tuple[int, ...], list[str]]:
