@@ -14,6 +14,7 @@ from mkc_torch.cli.calibrate import calibrate
 from mkc_torch.cli.challenge import challenge
 from mkc_torch.cli.demo import demo
 from mkc_torch.cli.diagnose import diagnose
+from mkc_torch.cli.inspect import inspect
 
 __all__ = ["app"]
 
@@ -58,5 +59,6 @@ def _all_commands(
 app.command()(diagnose)
 app.command()(calibrate)
 app.command()(apply)
+app.command()(inspect)
 app.command()(challenge)
 app.command()(demo)

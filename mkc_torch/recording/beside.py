@@ -96,7 +96,9 @@ def interpolated(
     share = ((at - times[right - 1]) / step)[:, None]
     found = values[right - 1] + share * (values[right] - values[right - 1])
     outside = ~((at >= times[0]) & (at <= times[-1])) | (step > _GAP * np.median(np.diff(times)))
-    found[outside] = np.nan
+    exact = times[right] == at
+    found[exact] = values[right][exact]
+    found[outside & ~exact] = np.nan
     return found
 
 

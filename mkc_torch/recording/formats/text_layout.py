@@ -121,8 +121,9 @@ def _head(path: Path, plain: list[Line], comments: list[Line], separator: str, c
 
 def _of_text(plain: list[Line], split: Callable[[Line], list[str]], separator: str) -> _Head:
     """A table without a row of numbers: its first line is the header."""
-    header = plain[0]
-    return _Head(separator, split(header), header.text.strip(), [], "", {header.number}, [], has_rows=False)
+    header, units = plain[0], plain[1] if len(plain) > 1 and _are_units(split(plain[1])) else None
+    used = {header.number} | ({units.number} if units else set())
+    return _Head(separator, split(header), header.text.strip(), [], "", used, [], has_rows=False)
 
 
 def _unusual_head(path: Path, plain: list[Line], comments: list[Line], first: int, separator: str, count: int) -> _Head:
