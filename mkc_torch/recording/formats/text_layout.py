@@ -15,6 +15,7 @@ from mkc_torch.recording.unit_words import is_unit
 __all__ = ["Layout", "layout_of"]
 
 _MARKS = ("#", "%", "//", ";")
+_DIGITS = frozenset("0123456789+-.")
 _CUT_NUMBER = re.compile(r"[+-]?(\d*[.,]?\d*([eE][+-]?)?|na?|in?)")
 """What is left of a number that ended anywhere."""
 
@@ -54,8 +55,8 @@ def layout_of(path: Path, lines: list[Line]) -> Layout:
         comments = [
             line for line in comments if line.text.lstrip()[0] != ";" or count_of(line.text, separator) != count
         ]
-    marked = set(comments)
-    plain = [line for line in lines if line not in marked]
+    marked = {line.number for line in comments}
+    plain = [line for line in lines if line.number not in marked] if marked else lines
     plain, count, warnings = _without_trailing(plain, separator, count)
     head = _head(path, plain, comments, separator, count)
     body = [line for line in plain if line.number not in head.lines]
@@ -87,7 +88,7 @@ class _Head(NamedTuple):
 
 
 def _is_marked(text: str) -> bool:
-    return text.lstrip().startswith(_MARKS)
+    return text[0] not in _DIGITS and text.lstrip().startswith(_MARKS)
 
 
 def _head(path: Path, plain: list[Line], comments: list[Line], separator: str, count: int) -> _Head:
@@ -186,6 +187,9 @@ def _without_trailing(lines: list[Line], separator: str, count: int) -> tuple[li
     """
     if separator == WHITE or count < 2:
         return lines, count, []
+    middle = lines[max(0, len(lines) // 2 - 2) : len(lines) // 2 + 3]
+    if not any(line.text.rstrip(" ").endswith(separator) for line in middle):
+        return lines, count, []
     ends = [line.text.rstrip(" ").endswith(separator) for line in lines]
     counts = [count_of(line.text, separator) for line in lines]
     names = {n for line, n in zip(lines, counts, strict=True) if not any(map(is_value, cells_of(line.text, separator)))}
@@ -227,7 +231,7 @@ def _rows(path: Path, head: _Head, body: list[Line]) -> tuple[list[Line], tuple[
                 raise RecordingError(f"{path}: line {line.number} has a quotation mark that does not end; correct it.")
             pending.append(line)
             continue
-        names = head.has_rows and _is_names(line.text, head.separator)
+        names = head.has_rows and text[0] not in _DIGITS and _is_names(line.text, head.separator)
         if count_of(line.text, head.separator) == count and not names:
             if pending:
                 raise _strange(path, head, pending[0])
