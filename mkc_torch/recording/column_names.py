@@ -38,7 +38,7 @@ _FILLERS = {
 """Words that say nothing of which sensor it is, or only in which form."""
 
 _TIME_UNITS = {"millis", "micros", "seconds", "milliseconds", "microseconds", "nanoseconds"}
-_TIME = {"time", "timestamp", "timestamps", "stamp", "datetime", "zeit", "zeitstempel", *_TIME_UNITS}
+_TIME = {"utc", "time", "timestamp", "timestamps", "stamp", "datetime", "zeit", "zeitstempel", *_TIME_UNITS}
 _TIME_FILLERS = {
     "header", "utc", "sample", "boot", "ros", "log", "logging", "logger", "elapsed", "since", "epoch", "unix", "system",
     "sys", "sensor", "recorded", "local", "gps", "date", "iso", "field", "and", "of", "reboot", "start",

@@ -14,6 +14,8 @@ __all__ = ["Found", "Sensor", "candidates", "recognised", "recorded_beside", "ti
 
 _MAG = ("mag_x", "mag_y", "mag_z")
 _SIZES = {"mag": "xyz", "gyro": "xyz", "accel": "xyz", "q": "wxyz"}
+_ROS = "magnetic_field"
+"""Of sensor_msgs/MagneticField of ROS, "Measurements in Teslas", which has a covariance beside it."""
 _DERIVED = {"vehicle_magnetometer": "sensor_mag", "sensor_combined": "sensor_mag"}
 """PX4's topics that repeat a sensor's own."""
 
@@ -174,6 +176,8 @@ def _with(name: str, place: int, letter: str) -> str:
 def _unit_of(topic: Topic, name: str, unit: str) -> str:
     if topic.units.get(name) or unit:
         return topic.units.get(name) or unit
+    if name.rpartition(".")[0].endswith(_ROS) and any(f"{_ROS}_covariance" in one for one in topic.table.names):
+        return "tesla"
     return PX4_UNITS["time"] if name.startswith("timestamp") and is_px4_message(topic.table.names) else ""
 
 

@@ -139,6 +139,14 @@ def test_a_device_of_px4_says_what_it_is(device, is_one):
         assert (found[0].units["mag_x"], found[0].units["time"]) == ("gauss", "us")
 
 
+def test_a_message_of_ros_is_in_tesla():
+    """sensor_msgs/MagneticField.msg: "Measurements in Teslas"."""
+    axes = [f"field.magnetic_field.{axis}" for axis in "xyz"]
+    said = recognised([names("%time", *axes, "field.magnetic_field_covariance0")]).sensors[0]
+    assert said.units["mag_x"] == "tesla"
+    assert "mag_x" not in recognised([names("%time", *axes)]).sensors[0].units
+
+
 # --- several topics
 
 
@@ -325,3 +333,4 @@ def test_a_header_that_stands_again_is_a_run_where_there_is_no_time(tmp_path):
     recording = read(tmp_path, "mx,my,mz\n1,2,3\n2,3,4\nmx,my,mz\n3,4,5\n")
     assert recording["experiment"].tolist() == [1.0, 1.0, 2.0]
     assert "there is no time" in recording.warnings[-1]
+    assert "experiment" not in read(tmp_path, "mx,my,mz\n1.25,2.25,3.25\nmx,my,mz\nmx,my,mz\n3,4\n")

@@ -243,7 +243,8 @@ def _rows(path: Path, head: _Head, body: list[Line]) -> tuple[list[Line], tuple[
         raise _strange(path, head, pending[0])
     if last is not None and last not in pending:
         rows.remove(last)
-    return rows, tuple(at), _told(restarts, at, cut, between, last)
+    begins = tuple(row for row in dict.fromkeys(at) if row < len(rows))
+    return rows, begins, _told(restarts, at, cut, between, last)
 
 
 def _told(restarts: list[Line], at: list[int], cut: list[Line], between: list[Line], last: Line | None) -> list[str]:
