@@ -7,11 +7,15 @@ import pytest
 pytest.importorskip("polars")
 pytest.importorskip("typer")
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from mkc_torch.cli.app import app
 from mkc_torch.cli.recorded import read_magnetometer
-from mkc_torch.recording.recording import RecordingError
+from mkc_torch.recording.inspection import inspect_file
+from mkc_torch.recording.recording import Recording, RecordingError
+from tests.recording.dialects import Dialect
 
 ROWS = "".join(f"{i / 50},{30 * (i % 3) - 20},{25 * (i % 5) - 40},{20 * (i % 7) - 50}\n" for i in range(30))
 HEAD = "time,mag_x,mag_y,mag_z\n"
@@ -141,3 +145,39 @@ def test_the_commands_say_it_in_a_line_and_write_nothing(tmp_path, kind, command
         assert result.exit_code == 1
         assert not list(tmp_path.rglob("calibration.json"))
     assert [one.name for one in tmp_path.iterdir() if one.name != "out"] == ["bad.csv"]
+
+
+SOURCES = (
+    Dialect(),
+    Dialect(separator=";", comma=True, unit="uT", unit_in="brackets", comments=2, time="iso zone"),
+    Dialect(separator=" ", time="epoch ns", header_again=True, above=2, cut=True),
+    Dialect(encoding="utf-16", separator="\t"),
+)
+PIECES = [b",", b";", b'"', b"\n", b"\r", b"\0", b"nan", b"-", b"1e999", b"9" * 25, b"#", b"%", b" ", b"\t", b"|",
+          b"time", b"mag_x", b"\xff", b"\xb5", b"2024-13-01", b"25:00", b"[uT]", b"]", b"experiment", b"inf", b"\x1a",
+          b".", b"T"]  # fmt: skip
+
+
+@settings(derandomize=True, deadline=None, max_examples=150)
+@given(
+    source=st.sampled_from(SOURCES),
+    length=st.sampled_from([60, 150, 400, 4000]),
+    changes=st.lists(st.tuples(st.integers(0, 400), st.sampled_from(PIECES), st.integers(0, 40)), max_size=10),
+)
+def test_damaged_text_is_read_or_refused_and_nothing_else(tmp_path_factory, source, length, changes):
+    data = bytearray(source.bytes()[:length])
+    for place, piece, gone in changes:
+        data[place : place + gone] = piece
+    path = tmp_path_factory.mktemp("damaged") / "rec.csv"
+    path.write_bytes(bytes(data))
+    for look in (Recording.read, inspect_file):
+        assert _refusal(look, path).startswith((str(path), "rec: "))
+
+
+def _refusal(look, path):
+    """What is said where a file is refused; its name where it is read."""
+    try:
+        look(path)
+    except RecordingError as error:
+        return str(error)
+    return str(path)
