@@ -170,6 +170,7 @@ def test_inspect_shows_columns_rates_units_and_the_command(folder):
         assert words in told, told
 
 
+@pytest.mark.slow
 def test_the_command_that_inspect_gives_does_what_it_says(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("two", "gauss"):
