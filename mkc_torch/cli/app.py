@@ -15,6 +15,7 @@ from mkc_torch.cli.challenge import challenge
 from mkc_torch.cli.demo import demo
 from mkc_torch.cli.diagnose import diagnose
 from mkc_torch.cli.export import export
+from mkc_torch.cli.inspect import inspect
 
 __all__ = ["app"]
 
@@ -60,5 +61,6 @@ app.command()(diagnose)
 app.command()(calibrate)
 app.command()(apply)
 app.command()(export)
+app.command()(inspect)
 app.command()(challenge)
 app.command()(demo)

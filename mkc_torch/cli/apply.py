@@ -10,6 +10,7 @@ import typer
 from mkc_torch.cli.console import FAILURES, complain, interrupts_told, parsed_columns, progress
 from mkc_torch.cli.diagnosis_request import SIMULATIONS
 from mkc_torch.cli.loading import loading
+from mkc_torch.cli.units_option import HELP, METAVAR, SENSOR_HELP, parsed_units
 
 
 def apply(
@@ -31,6 +32,8 @@ def apply(
         str | None,
         typer.Option(metavar="NAME=COLUMN,...", help="What the columns are called: mag_x=mx,mag_y=my,mag_z=mz"),
     ] = None,
+    unit: Annotated[list[str] | None, typer.Option(metavar=METAVAR, help=HELP)] = None,
+    sensor: Annotated[str | None, typer.Option(metavar="NAME", help=SENSOR_HELP)] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
     """Write what a calibration or a model makes of a recording, beside the recording's own columns.
@@ -39,13 +42,13 @@ def apply(
     simulator's output: the outputs, simulated with what was found, in the place of the columns of their names. Of a
     model's effects those are left out that belong to the time or the place of the diagnosed recording.
     """
-    names = parsed_columns(columns)
+    names, units = parsed_columns(columns), parsed_units(unit or [])
     if simulation is not None and simulated is not None:
         raise typer.BadParameter("--simulation and --simulated exclude each other; give the one that was diagnosed.")
     with loading():
-        from mkc_torch.cli.correction import correct, read_correction, show_correction, write_correction
+        from mkc_torch.cli.correction import correct, read_correction, show_correction, unit_of, write_correction
         from mkc_torch.cli.diagnosis_files import named_simulation, paired_simulation
-        from mkc_torch.recording.recording import Recording
+        from mkc_torch.cli.recorded import read_again
         from mkc_torch.simulation.load import raised_in
     subject: str | Path = model
     try:
@@ -60,10 +63,10 @@ def apply(
             subject = output
             _refuse_input(output, recording, model, simulated)
             subject = recording
-            table = Recording.read(recording, columns=names)
+            table, topic = read_again(recording, names, units, sensor, made_in=unit_of(known), of_field=own is None)
             corrected = correct(known, table)
             subject = output
-            corrected = write_correction(recording, output, table, corrected, force=force)
+            corrected = write_correction(recording, output, table, corrected, topic=topic, force=force)
     except Exception as error:
         told = raised_in(simulation, error) if simulation and simulation not in SIMULATIONS else None
         if told is None and not isinstance(error, FAILURES):

@@ -21,6 +21,7 @@ from mkc_torch.cli.console import (
 )
 from mkc_torch.cli.export_options import DEVICE_ID, INSTANCE, checked_exports
 from mkc_torch.cli.loading import loading
+from mkc_torch.cli.units_option import HELP, METAVAR, SENSOR_HELP, parsed_units, without_units
 
 
 def calibrate(
@@ -34,7 +35,6 @@ def calibrate(
         float | None,
         typer.Option(metavar="µT", help="Length of the corrected field in µT; default: as measured."),
     ] = None,
-    unit: Annotated[str, typer.Option(help="Unit of the magnetometer's columns, such as counts.")] = "µT",
     name: Annotated[
         str | None, typer.Option(help="What the sensor is called in all results; default: the recording's name.")
     ] = None,
@@ -51,25 +51,29 @@ def calibrate(
     ] = None,
     instance: INSTANCE = None,
     device_id: DEVICE_ID = None,
+    unit: Annotated[list[str] | None, typer.Option(metavar=METAVAR, help=HELP)] = None,
+    sensor: Annotated[str | None, typer.Option(metavar="NAME", help=SENSOR_HELP)] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
     """Find a magnetometer's offset, gains and cross-axis coupling in recordings of it being turned.
+
+    A file with several magnetometers gets a calibration of each, in a folder of its name in that of the file.
 
     Exits with 0 when every recording was calibrated and 1 when some were not.
     """
     names = parsed_columns(columns)
     if field_strength is not None and not (math.isfinite(field_strength) and field_strength > 0):
         raise typer.BadParameter(f"--field-strength must be a positive number of µT but is {field_strength:g}.")
-    if not unit.strip():
-        raise typer.BadParameter("--unit is empty; name the unit, such as counts.")
     if name is not None and (not name.strip() or len(recordings) > 1):
         raise typer.BadParameter("--name is the name of one sensor: give it with one REC, and not empty.")
     exports = checked_exports("--export", export or [], instance, device_id)
+    recordings, texts = without_units(recordings, unit or [])
+    units = parsed_units(texts)
     refuse_same_names(recordings)
     with loading():
         from mkc_torch._parallel.processes import keep_memory
         from mkc_torch.calibration.exports import Destination
-        from mkc_torch.cli.calibration_files import Asked, calibrate_file, read_calibration
+        from mkc_torch.cli.calibration_files import Asked, calibrations_of, read_calibration
         from mkc_torch.cli.calibration_summary import show
     keep_memory()
     try:
@@ -78,34 +82,35 @@ def calibrate(
         complain(str(against), error)
         raise typer.Exit(1) from None
     asked = Asked(
-        names,
-        unit,
-        field_strength,
-        None if name is None else name.strip(),
-        old,
-        against,
-        exports,
-        Destination(instance, device_id),
+        columns=names,
+        units=units,
+        sensor=sensor,
+        field_strength=field_strength,
+        name=None if name is None else name.strip(),
+        old=old,
+        old_file=against,
+        exports=exports,
+        to=Destination(instance, device_id),
     )
-    console, failed, left = out(), 0, list(recordings)
+    console, total, failed, left = out(), 0, 0, list(recordings)
     with progress(len(recordings), output) as step, interrupts_told(lambda: not_written(left, output)):
         for path in recordings:
             step(f"calibrating {path.name}")
-            try:
-                found = calibrate_file(path, output / path.stem, asked, force=force)
-            except FAILURES as error:
-                failed += 1
+            for subject, outcome in calibrations_of(path, output / path.stem, asked, force=force):
+                total += 1
                 with step.aside():
-                    complain(path, error)
-            else:
-                with step.aside():
-                    show(console, found.calibration, found.files, found.differences, found.notes)
-                    for refused in found.refused:
-                        complain(path, refused)
-                failed += bool(found.refused)
+                    if isinstance(outcome, Exception):
+                        failed += 1
+                        complain(subject, outcome)
+                        continue
+                    show(console, outcome.calibration, outcome.files, outcome.differences, outcome.notes)
+                    for refused in outcome.refused:
+                        complain(subject, refused)
+                    failed += bool(outcome.refused)
             left.remove(path)
             step(None)
-    if len(recordings) > 1 and failed:
+    if total > 1 and failed:
+        things = "recordings" if total == len(recordings) else "sensors"
         what = "not done in full" if asked.exports or asked.old else "not calibrated"
-        err().print(f"mkc: {failed} of {len(recordings)} recordings were {what}.", soft_wrap=True)
+        err().print(f"mkc: {failed} of {total} {things} were {what}.", soft_wrap=True)
     raise typer.Exit(1 if failed else 0)

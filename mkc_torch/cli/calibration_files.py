@@ -1,8 +1,8 @@
-"""From a recording's file to the files of its calibration."""
+"""From a recording's file to the files of its calibrations, one for each magnetometer in it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,19 +12,21 @@ from mkc_torch.calibration.calibrate import calibrate as fit
 from mkc_torch.calibration.differences import Differences, differences
 from mkc_torch.calibration.exports import EXPORTS, Destination, SensorCorrection
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
-from mkc_torch.cli.console import folder_written, with_unit
+from mkc_torch.cli.console import FAILURES, folder_names, folder_written, remove_if_empty
 from mkc_torch.cli.correction import read_correction
 from mkc_torch.cli.exported import exports_of, left_from_before
+from mkc_torch.cli.recorded import read_magnetometer, refuse_likely_size, sensor_names
 from mkc_torch.recording.recording import Recording
 
-__all__ = ["Asked", "Found", "calibrate_file", "read_calibration"]
+__all__ = ["Asked", "Found", "calibrations_of", "read_calibration"]
 
 
 class Asked(NamedTuple):
     """What a user asked for, of all recordings.
 
     Attributes:
-        columns, unit: of the recordings' files.
+        columns, units: of the recordings' files.
+        sensor: one of those in a file; None for all.
         field_strength: in µT, where it is known.
         name: of the sensor; None for the recording's.
         old, old_file: the calibration that the new one is set beside, and where it is from.
@@ -33,7 +35,8 @@ class Asked(NamedTuple):
     """
 
     columns: Mapping[str, str]
-    unit: str
+    units: Mapping[str, str]
+    sensor: str | None
     field_strength: float | None
     name: str | None = None
     old: Calibration | None = None
@@ -73,9 +76,43 @@ def read_calibration(path: Path) -> Calibration:
     return known
 
 
-def calibrate_file(path: Path, folder: Path, asked: Asked, *, force: bool) -> Found:
+def calibrations_of(path: Path, folder: Path, asked: Asked, *, force: bool) -> Iterator[tuple[str, Found | Exception]]:
+    """Calibrate each magnetometer of a file: one alone into the folder, several into folders of their names in it.
+
+    Yields:
+        What it is of, for messages, and the calibration with its files, or why there is none.
+    """
+    try:
+        names = sensor_names(path, asked.columns, asked.sensor)
+        if len(names) > 1:
+            _refuse_for_one(path, asked, [str(name) for name in names])
+            claim_folder(folder, overwrite=force)
+    except FAILURES as error:
+        yield str(path), error
+        return
+    places = [folder / name for name in folder_names([str(name) for name in names])] if len(names) > 1 else [folder]
+    for name, place in zip(names, places, strict=True):
+        subject = f"{path}, sensor {name}" if len(names) > 1 else str(path)
+        try:
+            yield subject, _calibrate(path, place, asked._replace(sensor=name), force=force)
+        except FAILURES as error:
+            yield subject, error
+    remove_if_empty(folder)
+
+
+def _refuse_for_one(path: Path, asked: Asked, names: list[str]) -> None:
+    """Refuse what is of one sensor where there are several."""
+    for option, given in (("--name", asked.name), ("--against", asked.old)):
+        if given is not None:
+            raise ValueError(
+                f"{path}: the file holds {len(names)} magnetometers, {', '.join(names)}, and {option} is of one; give "
+                f"`--sensor {names[0]}` beside it, and each of the others a call of its own."
+            )
+
+
+def _calibrate(path: Path, folder: Path, asked: Asked, *, force: bool) -> Found:
     """Write calibration.json and report.html of a recording; where it is refused, the report alone says why."""
-    recording = with_unit(Recording.read(path, columns=asked.columns), asked.unit)
+    recording, found = read_magnetometer(path, asked.columns, asked.units, asked.sensor)
     from mkc_torch.report import calibration_report, refusal_report
 
     report, result = folder / "report.html", folder / "calibration.json"
@@ -92,6 +129,8 @@ def calibrate_file(path: Path, folder: Path, asked: Asked, *, force: bool) -> Fo
             result.unlink(missing_ok=True)  # an old one beside a new refusal would be taken for its result
             told = " ".join([f"{error} See {report}.", *left_from_before(folder, ())])
             raise NotIdentifiableError(told, error.coverage, error.directions) from None
+        if not found.said & {"mag_x", "mag_y", "mag_z"}:
+            refuse_likely_size(path, calibration.radius)
         beside, refused = _beside(calibration, recording, asked.old)
         texts, notes, not_exported = exports_of(SensorCorrection.of(calibration), asked.exports, asked.to)
         page = calibration_report(calibration, recording, against=beside)

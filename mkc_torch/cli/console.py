@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -12,7 +13,6 @@ from datetime import datetime
 from pathlib import Path
 from threading import Event, RLock, Thread
 from time import monotonic
-from typing import TYPE_CHECKING
 
 import typer
 from rich.console import Console
@@ -20,9 +20,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from mkc_torch._support.files import folder_held
 from mkc_torch.report.words.terms import term
-
-if TYPE_CHECKING:
-    from mkc_torch.recording.recording import Recording
 
 FAILURES = (ValueError, OSError, ImportError, RuntimeError)
 """What bad input, a full disk or a numerical breakdown raises."""
@@ -140,20 +137,6 @@ def parsed_pairs(option: str, texts: Sequence[str], example: str) -> dict[str, s
     return pairs
 
 
-def with_unit(recording: Recording, unit: str) -> Recording:
-    """The recording with its magnetometer in a unit of the user's own."""
-    from mkc_torch.recording.recording import Recording
-
-    own = {name: unit for name in ("mag_x", "mag_y", "mag_z") if name in recording}
-    return Recording(
-        recording.columns,
-        name=recording.name,
-        units=dict(recording.units) | own,
-        warnings=recording.warnings,
-        labels=recording.labels,
-    )
-
-
 def refuse_same_names(recordings: Sequence[Path]) -> None:
     """Refuses recordings whose results would go to one place, or to one outside of ``--output``.
 
@@ -167,6 +150,26 @@ def refuse_same_names(recordings: Sequence[Path]) -> None:
         other = taken.setdefault(path.stem.casefold(), path)
         if other is not path:
             raise typer.BadParameter(term("command.same_folder", one=other, other=path, folder=path.stem))
+
+
+def folder_names(labels: list[str]) -> list[str]:
+    """A folder's name for each label, no two alike on any file system.
+
+    Example:
+        >>> folder_names(["run 1", "a/b", "A:B", "..", ""])
+        ['run 1', 'a_b', 'A_B_2', '_', '__2']
+    """
+    names: list[str] = []
+    taken: set[str] = set()
+    for label in labels:
+        plain = re.sub(r"[^\w .+-]", "_", label).strip(" .")[:100] or "_"
+        name, count = plain, 1
+        while name.casefold() in taken:
+            count += 1
+            name = f"{plain}_{count}"
+        taken.add(name.casefold())
+        names.append(name)
+    return names
 
 
 class Steps:
@@ -309,6 +312,12 @@ def not_written(recordings: Iterable[Path], output: Path) -> str:
     folders = ", ".join(str(output / path.stem) for path in there)
     told += [term("command.incomplete", folders=folders)] if there else []
     return f"{'; '.join(told)}." if told else term("command.all_written")
+
+
+def remove_if_empty(folder: Path) -> None:
+    """Remove a folder with nothing in it."""
+    with suppress(OSError):
+        folder.rmdir()
 
 
 @contextmanager

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from mkc_torch.simulation import Simulation
 
-__all__ = ["Corrected", "correct", "read_correction", "show_correction", "write_correction"]
+__all__ = ["Corrected", "correct", "read_correction", "show_correction", "unit_of", "write_correction"]
 
 _NOT_MEASURED = ("time", "experiment")
 
@@ -35,7 +35,7 @@ _OTHER_LENGTH = 1.5
 
 
 def write_correction(
-    recording: Path, output: Path, table: Recording, corrected: Corrected, *, force: bool
+    recording: Path, output: Path, table: Recording, corrected: Corrected, *, topic: int = 0, force: bool
 ) -> Corrected:
     """Writes the file, with the columns of the recording where the rows are its rows; says so where they are not."""
     if not _row_by_row(table, corrected):
@@ -44,7 +44,7 @@ def write_correction(
         return replace(corrected, notes=(*corrected.notes, note))
     of_file = {name for name in _NOT_MEASURED if name in table}
     own = {name: values for name, values in corrected.columns.items() if name not in of_file}
-    write_beside(recording, output, own, overwrite=force)
+    write_beside(recording, output, own, topic=topic, overwrite=force)
     return corrected
 
 
@@ -150,6 +150,11 @@ def correct(known: Calibration | DiagnosedModel, recording: Recording) -> Correc
     columns, notes = known.correct(recording)
     length = known.state.get("strength")
     return Corrected(columns, str(known.state.get("unit", "")), length if isinstance(length, float) else None, notes)
+
+
+def unit_of(known: Calibration | DiagnosedModel) -> str:
+    """The unit of the measurements that a calibration or a model was made from; empty where it has none."""
+    return known.unit if isinstance(known, Calibration) else str(known.state.get("unit", ""))
 
 
 def _text(path: Path) -> str:

@@ -27,6 +27,7 @@ from mkc_torch.cli.console import (
 )
 from mkc_torch.cli.diagnosis_request import BETWEEN, LEVEL, MAGNETOMETER, SIMULATIONS, SURROGATES, Outcome, Request
 from mkc_torch.cli.loading import loading
+from mkc_torch.cli.units_option import HELP, METAVAR, SENSOR_HELP, parsed_units, without_units
 
 
 def diagnose(
@@ -47,9 +48,8 @@ def diagnose(
         str | None,
         typer.Option(metavar="NAME=COLUMN,...", help="What the columns are called: mag_x=mx,temperature=IMU_T"),
     ] = None,
-    unit: Annotated[
-        str | None, typer.Option(help="Unit of the magnetometer's columns, such as counts; default: µT.")
-    ] = None,
+    unit: Annotated[list[str] | None, typer.Option(metavar=METAVAR, help=HELP)] = None,
+    sensor: Annotated[str | None, typer.Option(metavar="NAME", help=SENSOR_HELP)] = None,
     experiments: Annotated[
         str | None,
         typer.Option(metavar="COLUMN", help="Column that separates runs in one table; default: experiment, if any."),
@@ -77,11 +77,13 @@ def diagnose(
     Each REC gets diagnosis.json, model.json (for `mkc apply`) and report.html. Exits with 0 when every recording was
     diagnosed, whatever was found, and 1 when some were not.
     """
+    recordings, texts = without_units(recordings, unit or [])
     request = Request(
         simulation=_known(simulation, simulated),
         simulated=simulated,
         columns=_columns(columns, experiments),
-        unit=_unit(unit, simulation),
+        units=_units(texts, simulation),
+        sensor=_sensor(sensor, simulation),
         noise=_noise(noise or []),
         between=_between(between or []),
         level=_level(level),
@@ -175,16 +177,22 @@ def _columns(columns: str | None, experiments: str | None) -> dict[str, str]:
     return names
 
 
-def _unit(unit: str | None, simulation: str | None) -> str:
-    if unit is None:
-        return "µT"
-    if not unit.strip():
-        raise typer.BadParameter("--unit is empty; name the unit, such as counts.")
-    if simulation != MAGNETOMETER:
+def _units(texts: list[str], simulation: str | None) -> dict[str, str]:
+    units = parsed_units(texts)
+    if "mag" in units and simulation != MAGNETOMETER:
         raise typer.BadParameter(
-            "--unit is that of a magnetometer's columns; a simulation of your own says its units in its `units`."
+            "--unit is that of a magnetometer's columns; a simulation of your own says its units in its `units`. Its "
+            "time, and other columns by name, can be converted: --unit time=us."
         )
-    return unit
+    return units
+
+
+def _sensor(sensor: str | None, simulation: str | None) -> str | None:
+    if sensor is not None and simulation != MAGNETOMETER:
+        raise typer.BadParameter(
+            "--sensor names a magnetometer; a simulation of your own takes columns by their names."
+        )
+    return sensor
 
 
 def _noise(texts: list[str]) -> dict[str, float]:

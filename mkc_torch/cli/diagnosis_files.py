@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext, suppress
@@ -11,9 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkc_torch._support.files import claim_folder, write_atomically
-from mkc_torch.cli.console import FAILURES, Look, folder_written, sentence_of, with_unit
+from mkc_torch.cli.console import FAILURES, Look, folder_names, folder_written, remove_if_empty, sentence_of
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request
 from mkc_torch.cli.diagnosis_summary import show
+from mkc_torch.cli.recorded import read_magnetometer, read_table
 from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.diagnosis.files.python_source import SourceError
 from mkc_torch.recording.recording import Recording
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 __all__ = [
     "WRITTEN",
     "diagnose_file",
-    "folder_names",
     "named_simulation",
     "paired_simulation",
     "simulation_of",
@@ -45,10 +44,8 @@ def diagnose_file(
     that takes several at once. One that fails does not keep the others from being done. ``step`` is told what is done.
     """
     try:
-        recording = Recording.read(path, columns=request.columns)
+        recording = _read(path, request)
         simulation = simulation_of(request)
-        if request.simulated is None and request.simulation == MAGNETOMETER:
-            recording = with_unit(recording, request.unit)
         claim_folder(folder, overwrite=request.force, files=WRITTEN)
     except Exception as error:
         return [_failed(path, "", error)]
@@ -59,8 +56,14 @@ def diagnose_file(
             told = partial(_tell, step, f"diagnosing {path.name}{which}")
             outcomes.append(_outcome(path, label, simulation, part, place, request, look, told))
         if all(outcome.failed for outcome in outcomes):
-            _remove_if_empty(folder)
+            remove_if_empty(folder)
     return outcomes
+
+
+def _read(path: Path, request: Request) -> Recording:
+    if request.simulated is None and request.simulation == MAGNETOMETER:
+        return read_magnetometer(path, request.columns, request.units, request.sensor)[0]
+    return read_table(path, request.columns, request.units)
 
 
 def _tell(step: Callable[[str], None] | None, subject: str, stage: str) -> None:
@@ -90,26 +93,6 @@ def write_diagnosis(
     for name, text in texts.items():
         write_atomically(folder / name, text, overwrite=force)
     return [folder / name for name in texts]
-
-
-def folder_names(labels: list[str]) -> list[str]:
-    """A folder's name for each label, no two alike on any file system.
-
-    Example:
-        >>> folder_names(["run 1", "a/b", "A:B", "..", ""])
-        ['run 1', 'a_b', 'A_B_2', '_', '__2']
-    """
-    names: list[str] = []
-    taken: set[str] = set()
-    for label in labels:
-        plain = re.sub(r"[^\w .+-]", "_", label).strip(" .")[:100] or "_"
-        name, count = plain, 1
-        while name.casefold() in taken:
-            count += 1
-            name = f"{plain}_{count}"
-        taken.add(name.casefold())
-        names.append(name)
-    return names
 
 
 def _parts(recording: Recording, simulation: Simulation, folder: Path) -> Iterator[tuple[str, Recording, Path]]:
@@ -173,8 +156,9 @@ def paired_simulation(path: Path, columns: Mapping[str, str]) -> Simulation:
     """
     from mkc_torch.simulation import Paired
 
-    table = Recording.read(path)
-    return Paired(Recording.read(path, columns={name: column for name, column in columns.items() if column in table}))
+    table = Recording.read(path, recognise=False)
+    there = {name: column for name, column in columns.items() if column in table}
+    return Paired(Recording.read(path, columns=there, recognise=False))
 
 
 def simulation_of(request: Request) -> Simulation:
@@ -203,10 +187,3 @@ def _unexpected(error: Exception) -> str:
     return (
         f"an error of the program's own ({type(error).__name__}{where}{f': {told}' if told else ''}); please report it."
     )
-
-
-def _remove_if_empty(folder: Path) -> None:
-    try:
-        folder.rmdir()
-    except OSError:
-        return

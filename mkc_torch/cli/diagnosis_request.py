@@ -25,7 +25,8 @@ class Request:
     simulation: str = MAGNETOMETER
     simulated: Path | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
-    unit: str = "µT"
+    units: Mapping[str, str] = field(default_factory=dict)
+    sensor: str | None = None
     noise: Mapping[str, float] = field(default_factory=dict)
     between: Mapping[str, str] = field(default_factory=dict)
     level: float = LEVEL

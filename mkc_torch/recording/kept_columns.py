@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mkc_torch._support.files import write_atomically
-from mkc_torch.recording.formats import check_ending, encoded, read_table
+from mkc_torch.recording.formats import check_ending, encoded, read_topics
 from mkc_torch.recording.formats.base import polars
 from mkc_torch.recording.formats.cells import as_numbers
 from mkc_torch.recording.formats.csv import CSV
@@ -24,7 +24,7 @@ _LEADING_ZERO = r"^\s*[+-]?0\d"
 
 
 def write_beside(
-    source: Path, path: Path, columns: Mapping[str, Tensor], *, overwrite: bool = False
+    source: Path, path: Path, columns: Mapping[str, Tensor], *, topic: int = 0, overwrite: bool = False
 ) -> tuple[str, ...]:
     """Write the columns of a file, in its order, with others: in the place of one of that name, or after all.
 
@@ -35,6 +35,7 @@ def write_beside(
         source: the file that was read.
         path: the target; its ending says the format.
         columns: name to values, (N,) for the N rows of the file.
+        topic: number of the topic, where the file holds several.
         overwrite: replace an existing file.
 
     Returns:
@@ -45,7 +46,7 @@ def write_beside(
         FileExistsError: the target exists and ``overwrite`` is False.
     """
     check_ending(path)
-    table = read_table(source)
+    table = read_topics(source)[topic].table
     of_text, as_text = (file.suffix.lower() in CSV.endings for file in (source, path))
     told: dict[str, Any] = {}
     for name, series in zip(table.names, table.series, strict=True):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -15,36 +14,16 @@ from torch import Tensor
 
 from mkc_torch._support.arrays import ArrayLike, Data, is_frame
 from mkc_torch._support.files import write_atomically
-from mkc_torch.recording.formats import check_ending, encoded, read_table
+from mkc_torch.recording.conversions import DEFAULT_UNITS
+from mkc_torch.recording.formats import check_ending, encoded
 from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, counted, listed
-from mkc_torch.recording.formats.cells import as_numbers, missing_warning, numbered, renamed, text_error
-from mkc_torch.recording.formats.csv import SEPARATORS
 from mkc_torch.recording.given_columns import EXPERIMENT, checked_columns, columns_of_frame
+from mkc_torch.recording.reading import ASKED, read_file
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["MissingColumnError", "Recording", "RecordingError", "write_table"]
-
-DEFAULT_UNITS: Mapping[str, str] = MappingProxyType(
-    {"time": "s", "temperature": "°C", "current": "A"}
-    | {
-        f"{quantity}_{axis}": unit
-        for quantity, unit, axes in (
-            ("mag", "µT", "xyz"),
-            ("field", "µT", "xyz"),
-            ("gyro", "rad/s", "xyz"),
-            ("accel", "m/s²", "xyz"),
-            ("position", "m", "xyz"),
-            ("q", "1", "wxyz"),
-        )
-        for axis in axes
-    }
-)
-"""The units of the columns whose names have a meaning."""
-
-_ASKED = {*DEFAULT_UNITS, EXPERIMENT}
-"""Columns that are wanted wherever they are, so that text in them is an error."""
+__all__ = ["DEFAULT_UNITS", "MissingColumnError", "Recording", "RecordingError", "write_table"]
 
 _GAP = 10.0  # in median intervals
 
@@ -85,7 +64,7 @@ class Recording:
     ) -> None:
         units, labels = units or {}, labels or {}
         if is_frame(columns):
-            frame = columns_of_frame(columns, {}, _ASKED, name)
+            frame = columns_of_frame(columns, {}, ASKED, name)
             columns, labels, warnings = frame.columns, frame.labels | dict(labels), (*frame.warnings, *warnings)
         given = checked_columns(cast("Mapping[str, Data]", columns), name)
         for column in (*units, *labels):
@@ -100,52 +79,44 @@ class Recording:
         self._warnings = tuple(warnings)
 
     @classmethod
-    def read(cls, path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Recording:
-        """Read a table from a file: CSV (``.csv``, ``.tsv``, ``.txt``) or Parquet (``.parquet``).
+    def read(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        columns: Mapping[str, str] | None = None,
+        units: Mapping[str, str] | None = None,
+        sensor: str | None = None,
+        recognise: bool = True,
+    ) -> Recording:
+        """Read a table from a file: text (``.csv``, ``.tsv``, ``.txt``), Parquet (``.parquet``), or a log.
 
-        A CSV has a header line of column names, and values separated by comma, semicolon or tab. An empty cell and
-        ``nan`` become NaN; so do ``NA``, ``n/a`` and ``null``, of which ``warnings`` tells. Integers become float64.
-        Columns of text alone that nobody asked for are left out, which ``warnings`` tells; in the column ``experiment``
-        text is numbered, and ``labels`` has it.
+        Text is read in any dialect that can be told with certainty. A magnetometer, what stands beside it, and the time
+        are recognised by their columns' names, and converted where the name or the format says the unit. A time that
+        starts again begins a new run, in the column ``experiment``. An empty cell and ``nan`` become NaN; so do ``NA``,
+        ``n/a`` and ``null``. Columns of text alone that nobody asked for are left out; in the column ``experiment``
+        text is numbered, and ``labels`` has it. ``warnings`` tells all of this.
 
         Args:
             path: the file.
             columns: for each name a column is to get, the name it has in the file: ``{"mag_x": "mx"}``.
+            units: of quantities, or of columns, that are to be converted: ``{"mag": "gauss", "time": "us"}``. A unit of
+                the magnetometer that is not known, such as counts, is its name and converts nothing.
+            sensor: which magnetometer, where a file holds several.
+            recognise: False to leave the columns, but for the time, under the names that they have.
 
         Returns:
             The recording, with its rows as they are in the file.
 
         Raises:
-            RecordingError: a file that is no such table: of an unknown kind, empty, without header or rows, with
-                lines of different length, columns of the same name, or text among numbers.
-            MissingColumnError: ``columns`` names a column that the file does not have.
+            RecordingError: a file that is no such table: of an unknown kind, empty, without header or rows, with lines
+                of different length, columns of the same name, text among numbers, or several magnetometers.
+            MissingColumnError: ``columns`` or ``units`` names a column that the file does not have.
             FileNotFoundError: no such file.
             ImportError: the reader's library is not installed.
         """
         path = Path(path)
-        table = read_table(path)
-        taken, warnings = renamed(table, columns or {}, path)
-        asked = set(columns or {}) | _ASKED
-        values: dict[str, Tensor] = {}
-        labels: dict[str, list[str]] = {}
-        for name, series in taken.items():
-            numbers, bad = as_numbers(series)
-            if bad.any():
-                missing = numbers.is_null() & ~bad
-                if name == EXPERIMENT:
-                    numbers, labels[name] = numbered(series)
-                elif name not in asked and (bad | missing).all():
-                    warnings.append(f"Column `{name}` holds no numbers and is left out.")
-                    continue
-                else:
-                    raise text_error(path, table, name, series, int(bad.arg_max()))
-            elif told := missing_warning(table, name, series):
-                warnings.append(told)
-            values[name] = torch.tensor(numbers.fill_null(math.nan).to_numpy())
-        if not values:
-            known = ", ".join(SEPARATORS.values())
-            raise RecordingError(f"{path}: no column holds numbers; separators can be {known}.")
-        return cls(values, name=path.stem, warnings=warnings, labels=labels)
+        found = read_file(path, ASKED, columns=columns, units=units, sensor=sensor, recognise=recognise)
+        return cls(found.columns, name=path.stem, units=found.units, warnings=found.warnings, labels=found.labels)
 
     @classmethod
     def from_frame(
@@ -177,7 +148,7 @@ class Recording:
             >>> Recording.from_frame(pd.DataFrame({"mx": [20, 21]}), columns={"mag_x": "mx"})["mag_x"]
             tensor([20., 21.], dtype=torch.float64)
         """
-        found = columns_of_frame(frame, columns or {}, _ASKED, name)
+        found = columns_of_frame(frame, columns or {}, ASKED, name)
         return cls(found.columns, name=name, units=units, warnings=found.warnings, labels=found.labels)
 
     @property
@@ -254,7 +225,7 @@ class Recording:
             RecordingError: no row is left.
 
         Example:
-            >>> Recording({"a": torch.tensor([1.0, math.nan, math.inf])}).finite("a").warnings
+            >>> Recording({"a": torch.tensor([1.0, torch.nan, torch.inf])}).finite("a").warnings
             ('Dropped 2 of 3 samples that are not finite: `a` 1 NaN, 1 infinite.',)
         """
         names = names or self.names

@@ -10,7 +10,7 @@ from torch import Tensor
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.recording.recording import Recording
 
-__all__ = ["RECORDED", "field_warning", "time_warning", "unit_warnings"]
+__all__ = ["RECORDED", "field_size", "field_warning", "likely_unit", "time_warning", "unit_warnings"]
 
 RECORDED = "recorded units"
 """What measurements are in whose size does not fit the unit that they were taken for."""
@@ -21,11 +21,11 @@ _FIELD = (10.0, 200.0)
 """The Earth's field in µT is 22 to 67; iron nearby and a sensor's gains change it."""
 
 _GUESSES = (
-    (1e-5, 1e-4, "tesla (1 T = 1000000 µT)"),
-    (0.01, 0.1, "millitesla (1 mT = 1000 µT)"),
-    (0.1, 1.0, "gauss (1 gauss = 100 µT)"),
-    (200.0, 1000.0, "milligauss (10 mG = 1 µT)"),
-    (2e4, 1e5, "nanotesla (1000 nT = 1 µT)"),
+    (1e-5, 1e-4, "tesla (1 T = 1000000 µT)", "tesla"),
+    (0.01, 0.1, "millitesla (1 mT = 1000 µT)", "mT"),
+    (0.1, 1.0, "gauss (1 gauss = 100 µT)", "gauss"),
+    (200.0, 1000.0, "milligauss (10 mG = 1 µT)", "mG"),
+    (2e4, 1e5, "nanotesla (1000 nT = 1 µT)", "nT"),
 )
 
 
@@ -66,14 +66,22 @@ def _typical(recording: Recording, name: str) -> float | None:
 
 
 def _field(recording: Recording) -> str | None:
-    size = _field_size(recording)
+    size = field_size(recording)
     if size is None:
         return None
     return field_warning(size, recording.units["mag_x"], "magnetometer measures about", "sizes of effects")
 
 
-def _field_size(recording: Recording) -> float | None:
-    """Length of the field, without a large offset of the sensor where its turns tell the two apart."""
+def field_size(recording: Recording) -> float | None:
+    """Length of the field, without a large offset of the sensor where its turns tell the two apart.
+
+    In the unit of ``mag_x``; None where an axis is missing, or all of its samples.
+
+    Example:
+        >>> import torch
+        >>> field_size(Recording({f"mag_{axis}": torch.tensor([30.0, 30.0]) for axis in "xyz"}))
+        51.96...
+    """
     length = _typical(recording, "mag")
     if length is None:
         return None
@@ -128,12 +136,33 @@ def field_warning(size: float, unit: str, what: str, numbers: str) -> str | None
     """
     if unit != "µT" or _FIELD[0] <= size <= _FIELD[1]:
         return None
-    found = [f"; in {name} it would be" for low, high, name in _GUESSES if low <= size <= high]
+    guess = _guess(size)
+    likely = "these may be raw counts" if guess is None else f"in {guess[0]} it would be"
+    option = "name the unit with `--unit`, or" if guess is None else f"say `--unit mag={guess[1]}` if it is, or"
     return (
-        f"The {what} {_shown(size)} µT, which is not the size of the Earth's field"
-        f"{found[0] if found else '; these may be raw counts'}. Nothing was converted: name the unit with `--unit`, or "
-        f"convert the columns; {numbers} are in the columns' own unit."
+        f"The {what} {_shown(size)} µT, which is not the size of the Earth's field; {likely}. Nothing was converted: "
+        f"{option} convert the columns; {numbers} are in the columns' own unit."
     )
+
+
+def likely_unit(size: float) -> tuple[str, str] | None:
+    """The unit in which a field would be the Earth's, that is not so in µT; None where it is, or where none fits.
+
+    Args:
+        size: of the field, taken for µT.
+
+    Returns:
+        The unit in words, and as ``--unit mag=`` takes it.
+
+    Example:
+        >>> likely_unit(0.5), likely_unit(50.0), likely_unit(7000.0)
+        (('gauss (1 gauss = 100 µT)', 'gauss'), None, None)
+    """
+    return None if _FIELD[0] <= size <= _FIELD[1] else _guess(size)
+
+
+def _guess(size: float) -> tuple[str, str] | None:
+    return next(((name, option) for low, high, name, option in _GUESSES if low <= size <= high), None)
 
 
 def _rate(recording: Recording) -> str | None:
@@ -142,7 +171,7 @@ def _rate(recording: Recording) -> str | None:
         return None
     return (
         f"The gyroscope turns at about {size:.3g} rad/s, faster than a hand or a vehicle; it may be in °/s. Nothing "
-        "was converted."
+        "was converted: say `--unit gyro=deg/s` if it is."
     )
 
 
@@ -150,7 +179,10 @@ def _acceleration(recording: Recording) -> str | None:
     size = _typical(recording, "accel")
     if size is None or recording.units["accel_x"] != "m/s²" or 3.0 <= size <= 40.0:
         return None
-    return f"The accelerometer measures about {size:.3g} m/s² instead of 9.8; it may be in g. Nothing was converted."
+    return (
+        f"The accelerometer measures about {size:.3g} m/s² instead of 9.8; it may be in g. "
+        "Nothing was converted: say `--unit accel=g` if it is."
+    )
 
 
 def time_warning(recording: Recording) -> str | None:
@@ -169,9 +201,11 @@ def time_warning(recording: Recording) -> str | None:
     if interval < 1.0 or "mag_x" not in recording:
         return None
     unit, seconds = next((u, s) for limit, u, s in _TIMES if interval < limit)
+    option = unit.replace("µ", "u")
     return (
         f"The samples lie {_shown(interval)} s apart by the column `time`, which looks like {unit} "
-        f"({_shown(1.0 / (interval * seconds))} samples a second then). Nothing was converted: write seconds."
+        f"({_shown(1.0 / (interval * seconds))} samples a second then). Nothing was converted: "
+        f"say `--unit time={option}` if it is."
     )
 
 

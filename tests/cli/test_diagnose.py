@@ -219,15 +219,20 @@ def test_columns_that_can_drive_nothing(tmp_path):
         assert words in told
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(0.01, "gauss"), (1000.0, "nanotesla")])
-def test_other_units_are_named_not_guessed(tmp_path, factor, unit):
+@pytest.mark.parametrize(("factor", "unit", "option"), [(0.01, "gauss", "gauss"), (1000.0, "nanotesla", "nT")])
+def test_other_units_are_asked_for_and_converted(tmp_path, factor, unit, option):
     scaled = {name: factor * sensor(QUIET)[name] for name in AXES}
     path = quiet(tmp_path / "a.csv", **scaled)
-    told = warnings_of(path, tmp_path / "out")
-    for words in (unit, "Nothing was converted", "--unit"):
-        assert words in told
-    assert warnings_of(path, tmp_path / "own", "--unit", unit) == ""
-    assert content_of(tmp_path / "own" / "a")["baseline"]["rmse"] == pytest.approx(0.3 * factor, rel=0.2)
+    refused(diagnosed(path, "--output", tmp_path / "out"), unit, f"`--unit mag={option}`")
+    assert f"converted from {option}" in warnings_of(path, tmp_path / "own", "--unit", f"mag={option}")
+    assert content_of(tmp_path / "own" / "a")["baseline"]["rmse"] == pytest.approx(0.3, rel=0.2)
+
+
+def test_raw_counts_are_told_of_and_keep_their_name(tmp_path):
+    path = quiet(tmp_path / "a.csv", **{name: 100.0 * sensor(QUIET)[name] for name in AXES})
+    assert "may be raw counts" in warnings_of(path, tmp_path / "out")
+    assert warnings_of(path, tmp_path / "own", "--unit", "counts") == ""
+    assert content_of(tmp_path / "own" / "a")["baseline"]["rmse"] == pytest.approx(30.0, rel=0.2)
 
 
 @pytest.mark.parametrize(
@@ -280,10 +285,10 @@ def test_experiments_are_diagnosed_each_on_its_own(tmp_path):
 
 
 def test_columns_of_the_users_own(tmp_path):
-    columns = {name.replace("mag_", "m"): values for name, values in sensor(QUIET).items()}
+    columns = {name.replace("mag_", "u"): values for name, values in sensor(QUIET).items()}
     path = table(tmp_path / "a.csv", columns)
-    refused(diagnosed(path, "--output", tmp_path / "out"), "no column `mag_x`")
-    names = ("--columns", "mag_x=mx,mag_y=my,mag_z=mz")
+    refused(diagnosed(path, "--output", tmp_path / "out"), "no magnetometer", "`--columns mag_x=ux,mag_y=uy,mag_z=uz`")
+    names = ("--columns", "mag_x=ux,mag_y=uy,mag_z=uz")
     assert diagnosed(path, "--output", tmp_path / "out", *names).exit_code == 0
 
 

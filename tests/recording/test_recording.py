@@ -458,14 +458,16 @@ def test_renaming_an_absent_column_lists_those_present(tmp_path):
         ("time,a\n0,1\n1\n2,3\n", "line 3 has 1 value but the header names 2 columns"),
         ("time,a\n0,1\n\n1,2,3\n", "line 4 has 3 values but the header names 2 columns"),
         ('time,a\n0,"1,5",2\n', "line 2 has 3 values"),
-        ('time,a\n0,"1\n', "cannot be read"),
+        ('time,a\n0,"1\n', "a header line but no rows"),
+        ('time,a\n0,"1\n1,2\n', "line 2 has a quotation mark that does not end"),
         ("time,mag_x\n0,1\n\n1,abc\n2,def\n", 'column `mag_x` holds text at line 4, "abc"'),
         ("time,mag_x\n0,up\n1,down\n", 'column `mag_x` holds text at line 2, "up"'),
-        ("time,a\n2024-01-01,1\n", 'column `time` holds text at line 2, "2024-01-01"; times are numbers, in seconds'),
+        ("time,a\n01.02.2024,1\n", 'column `time` holds text at line 2, "01.02.2024"; times are numbers, in seconds'),
         ("time,a\n0,1\n1,bad\n", 'column `a` holds text at line 3, "bad"; correct it, or write nan'),
-        ("time;a\n0;1\n1;2,5\n", 'column `a` holds text at line 3, "2,5"; write decimals with a point'),
+        ("time;a\n0.5;1\n1;2,5\n", 'column `a` holds text at line 3, "2,5"; write decimals with a point'),
         ("a,b\nx,y\n", "no column holds numbers"),
-        (b"\xff\xfet\x00i\x00", "not UTF-8"),
+        (b"\xff\xfet\x00i\x00", "a header line but no rows"),
+        (b"time,a\n0,\x80\x81\n", "not UTF-8"),
     ],
 )
 def test_a_file_that_is_no_table_is_an_error_that_says_why(tmp_path, text, message):
@@ -682,19 +684,16 @@ def test_words_for_a_missing_value_are_told_of(tmp_path, word):
     )
 
 
-def test_lines_above_the_header_are_named(tmp_path):
-    with pytest.raises(RecordingError, match="the first line must hold the column names: remove what stands above"):
-        read(tmp_path, "# made by logger\n# fw 1.2\ntime,a\n0,1\n")
-
-
-@pytest.mark.parametrize("mark", ["utf-16-le", "utf-16-be"])
-def test_utf_16_is_refused_and_how_to_export_said(tmp_path, mark):
-    with pytest.raises(RecordingError, match="begins as UTF-16 does; export it as CSV in UTF-8"):
-        read(tmp_path, "\ufefftime,a\n0,1\n".encode(mark))
-
-
-def test_a_date_is_no_number(tmp_path):
+def test_a_moment_is_a_time(tmp_path):
     path = tmp_path / "a.parquet"
-    pl.DataFrame({"time": [0, 1], "a": [1.0, 2.0]}).with_columns(pl.col("time").cast(pl.Datetime)).write_parquet(path)
-    with pytest.raises(RecordingError, match=r"column `time` holds no number at row 1.*times are numbers, in seconds"):
+    frame = pl.DataFrame({"time": [10, 250_010], "a": [1.0, 2.0]})
+    frame.with_columns(pl.col("time").cast(pl.Datetime("us"))).write_parquet(path)
+    assert same(Recording.read(path).time, [0.0, 0.25])
+
+
+def test_a_moment_is_no_field(tmp_path):
+    path = tmp_path / "a.parquet"
+    frame = pl.DataFrame({"mag_x": [0, 1], "a": [1.0, 2.0]})
+    frame.with_columns(pl.col("mag_x").cast(pl.Datetime)).write_parquet(path)
+    with pytest.raises(RecordingError, match="column `mag_x` holds no number at row 1"):
         Recording.read(path)

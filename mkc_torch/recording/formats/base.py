@@ -51,12 +51,14 @@ class Topic(NamedTuple):
         table: its columns, among them the one that holds its own time.
         units: of columns, as the format writes them, where it does: ``{"timestamp": "us", "x": "gauss"}``.
         warnings: sentences about what was found or dropped while it was read.
+        restarts: rows, from 0, before which the file says that the logger started anew.
     """
 
     name: str
     table: Table
     units: Mapping[str, str] = MappingProxyType({})
     warnings: tuple[str, ...] = ()
+    restarts: tuple[int, ...] = ()
 
 
 class FileFormat(NamedTuple):

@@ -88,14 +88,12 @@ def numbered(series: Any) -> tuple[Any, list[str]]:
     return package.Series([numbers.get(cell or "") for cell in cells], dtype=package.Float64), list(numbers)
 
 
-def text_error(path: Path, table: Table, name: str, series: Any, row: int) -> RecordingError:
+def text_error(path: Path, table: Table, name: str, series: Any, row: int, advice: str = "") -> RecordingError:
     text = str(series[row]).strip()
     kind = "text" if series.dtype == polars().String else "no number"
-    advice = "correct it, or write nan where there is no value"
     if is_number(text.replace(",", ".")):
         advice = "write decimals with a point"
-    elif name == "time":
-        advice = "times are numbers, in seconds"
+    advice = advice or "correct it, or write nan where there is no value"
     shown = text if len(text) <= 40 else text[:39] + "…"
     return RecordingError(
         f'{path}: column `{name}` holds {kind} at {table.line} {table.lines[row]}, "{shown}"; {advice}.'

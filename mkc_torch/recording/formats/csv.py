@@ -1,70 +1,97 @@
-"""Text with separators: CSV, TSV and TXT."""
+"""Text with separators: CSV, TSV and TXT, of any dialect that can be told with certainty."""
 
 from __future__ import annotations
 
-import codecs
 import csv
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from mkc_torch.recording.formats.base import (
-    FileFormat,
-    RecordingError,
-    Table,
-    Topic,
-    counted,
-    is_number,
-    listed,
-    polars,
-)
+from mkc_torch.recording.formats.base import FileFormat, RecordingError, Table, Topic, is_number, listed, polars
+from mkc_torch.recording.formats.text_cells import WHITE, cells_of
+from mkc_torch.recording.formats.text_layout import layout_of
+from mkc_torch.recording.formats.text_lines import Line, lines_of
 
 __all__ = ["CSV"]
 
-SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab"}
+_COMMA = r"^\s*[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?\s*$"
+_POINT = r"^\s*[+-]?(\d+\.\d*|\.\d+)([eE][+-]?\d+)?\s*$"
+_THOUSANDS = r"^\s*[+-]?[1-9]\d{0,2},\d{3}\s*$"
+
+_BOTH_SIGNS = 5
+"""Rows of either sign from which a column is taken to go through nought."""
 
 
-def read(path: Path) -> Table:
-    """The table in a text file, its cells as text."""
+def topic(path: Path) -> Topic:
+    """The table in a text file, its cells as text.
+
+    Raises:
+        RecordingError: it is no table, or one whose cells cannot be told from one another.
+    """
     package = polars()
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            rows = [(number, line.rstrip("\n")) for number, line in enumerate(file, start=1) if line.strip(" \r\n")]
-    except UnicodeDecodeError as error:
-        begin = path.read_bytes()[:2]
-        found = " but begins as UTF-16 does" if begin in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else ""
-        raise RecordingError(f"{path}: the file is not UTF-8 text{found}; export it as CSV in UTF-8.") from error
-    if not rows:
-        raise RecordingError(f"{path}: the file is empty; it must hold a header line and rows of numbers.")
-    header = rows.pop(0)[1]
-    separator = max(SEPARATORS, key=re.sub('"[^"]*"', "", header).count)
-    names = [name.strip() for name in _cells(header, separator)]
+    lines, warnings = lines_of(path)
+    layout = layout_of(path, lines)
+    names = [name.strip() for name in layout.names]
     if all(is_number(name) for name in names):
         raise RecordingError(f"{path}: the first line holds numbers; it must hold the column names.")
-    if not rows:
-        raise RecordingError(f"{path}: the file has a header line but no rows of numbers.")
-    for number, line in rows:
-        count = len(_cells(line, separator)) if '"' in line else line.count(separator) + 1
-        if count != len(names):
-            advice = (
-                "correct or remove that line"
-                if len(names) > 1
-                else "the first line must hold the column names: remove what stands above them"
-            )
-            raise RecordingError(
-                f"{path}: line {number} has {counted(count, 'value')} but the header names "
-                f"{counted(len(names), 'column')} (the separator is the {SEPARATORS[separator]}); {advice}."
-            )
-    body = "\n".join(line for _, line in rows).encode()
+    body, separator = _body(layout.rows, layout.separator)
     try:
         frame = package.read_csv(body, separator=separator, has_header=False, infer_schema=False)
     except package.exceptions.PolarsError as error:
         raise RecordingError(f"{path}: the table cannot be read: {str(error).splitlines()[0]}") from error
-    return Table(names, frame.get_columns(), [number for number, _ in rows])
+    numbers = [line.number for line in layout.rows]
+    series, told = _with_points(path, names, frame.get_columns(), numbers)
+    units = {name: unit.strip(" []()") for name, unit in zip(names, layout.units, strict=False) if unit.strip(" -[]()")}
+    return Topic("", Table(names, series, numbers), units, (*warnings, *layout.warnings, *told), layout.restarts)
+
+
+def _body(rows: list[Line], separator: str) -> tuple[bytes, str]:
+    """The rows as one text for the parser, and its separator."""
+    if separator != WHITE:
+        return "\n".join(line.text for line in rows).encode(), separator
+    return "\n".join("\t".join(cells_of(line.text, separator)) for line in rows).encode(), "\t"
+
+
+def _with_points(path: Path, names: list[str], series: list[Any], lines: list[int]) -> tuple[list[Any], list[str]]:
+    """Columns with decimal commas, with points instead, where all of a file is written so.
+
+    Raises:
+        RecordingError: the commas may as well set off thousands.
+    """
+    if any(bool(one.str.contains(_POINT).any()) for one in series):
+        return series, []
+    commas = [one.str.contains(_COMMA) for one in series]
+    with_commas = [one for one, has in zip(series, commas, strict=True) if bool(has.any())]
+    if not with_commas:
+        return series, []
+    if all(_may_be_thousands(one.filter(one.str.contains(_COMMA)), len(one)) for one in with_commas):
+        place, has = next((i, has) for i, has in enumerate(commas) if bool(has.any()))
+        row = int(has.fill_null(False).arg_max())
+        raise RecordingError(
+            f'{path}: column `{names[place]}` holds "{series[place][row].strip()}" at line {lines[row]}, and so is '
+            "every comma of the file before three digits: they may be decimals or thousands; write decimals with a "
+            "point."
+        )
+    changed = [
+        one.str.replace(",", ".", literal=True) if bool(has.any()) else one
+        for one, has in zip(series, commas, strict=True)
+    ]
+    return changed, ["Decimal commas were read as points."]
+
+
+def _may_be_thousands(cells: Any, rows: int) -> bool:
+    """Whether the commas of a column may set off thousands: always before three digits.
+
+    Not where every row has one and the signs differ: no quantity goes through nought without a number below 1000.
+    """
+    if not bool(cells.str.contains(_THOUSANDS).all()):
+        return False
+    negative = int(cells.str.contains(r"^\s*-").sum())
+    return not (len(cells) == rows and min(negative, rows - negative) >= _BOTH_SIGNS)
 
 
 def encoded(path: Path, columns: Mapping[str, np.ndarray]) -> str | bytes:
@@ -73,9 +100,7 @@ def encoded(path: Path, columns: Mapping[str, np.ndarray]) -> str | bytes:
         raise RecordingError(f"{path}: a header of numbers alone, {listed(columns)}, reads as none; use words.")
     text = io.StringIO()
     separator = "\t" if path.suffix.lower() == ".tsv" else ","
-    # the reader finds the separator outside quotes
-    quoted = any(mark in name for name in columns for mark in (*SEPARATORS, '"'))
-    header: Literal[0, 1] = csv.QUOTE_ALL if quoted else csv.QUOTE_MINIMAL
+    header: Literal[0, 1] = csv.QUOTE_ALL if _needs_quotes(list(columns)) else csv.QUOTE_MINIMAL
     csv.writer(text, delimiter=separator, lineterminator="\n", quoting=header).writerow(columns)
     writer = csv.writer(text, delimiter=separator, lineterminator="\n")
     # repr, which csv uses for floats, is the shortest text that reads back as the same number
@@ -83,8 +108,9 @@ def encoded(path: Path, columns: Mapping[str, np.ndarray]) -> str | bytes:
     return text.getvalue()
 
 
-def _cells(line: str, separator: str) -> list[str]:
-    return next(csv.reader([line], delimiter=separator))
+def _needs_quotes(names: Sequence[str]) -> bool:
+    """The reader finds separators outside quotes, and takes a line that begins with certain signs for a comment."""
+    return any(re.search(r'[,;\t|"]', name) for name in names) or names[0].startswith(("#", "%", "//"))
 
 
-CSV = FileFormat((".csv", ".tsv", ".txt"), lambda path: [Topic("", read(path))], encoded)
+CSV = FileFormat((".csv", ".tsv", ".txt"), lambda path: [topic(path)], encoded)

@@ -1,0 +1,51 @@
+"""``mkc inspect``: what is in files, and what ``mkc calibrate`` would make of it by itself."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mkc_torch.cli.console import FAILURES, complain, err, out
+from mkc_torch.cli.loading import loading
+
+if TYPE_CHECKING:
+    from mkc_torch.recording.inspection import FileSeen
+
+
+def inspect(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Tables and logs.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+) -> None:
+    """Say what is in files: topics, columns, rates, gaps, units, and what `mkc calibrate` would take by itself.
+
+    Exits with 0 when every file was read and 1 when some were not.
+    """
+    with loading():
+        from mkc_torch.cli.inspection_summary import as_data, commands_of, show
+        from mkc_torch.recording.inspection import inspect_file
+    console, found, failed = out(), [], 0
+    for path in files:
+        seen = _seen(inspect_file, path)
+        if seen is None:
+            failed += 1
+        elif as_json:
+            found.append(as_data(seen))
+        else:
+            show(console, seen, commands_of(seen))
+    if as_json:
+        typer.echo(json.dumps(found, ensure_ascii=False, indent=2, allow_nan=False))
+    if len(files) > 1 and failed:
+        err().print(f"mkc: {failed} of {len(files)} files were not read.", soft_wrap=True)
+    raise typer.Exit(1 if failed else 0)
+
+
+def _seen(look: Any, path: Path) -> FileSeen | None:
+    try:
+        found: FileSeen = look(path)
+    except FAILURES as error:
+        complain(path, error)
+        return None
+    return found

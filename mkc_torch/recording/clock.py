@@ -1,0 +1,214 @@
+"""Times as they stand in a file, stamps or numbers of any unit, as seconds; differences are taken before rounding."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mkc_torch.recording.formats.base import MISSING, polars
+from mkc_torch.recording.formats.text_cells import is_stamp
+from mkc_torch.recording.unit_words import conversion
+
+__all__ = ["Clock", "ClockError", "clock_of"]
+
+_NANO = 10**9
+_DAY = 86_400
+_EPOCH = (10**9, 41 * 10**8)
+"""Seconds from 1970 to September 2001 and to 2099: what a count since 1970 lies between in one unit alone."""
+
+_INTERVALS = (1e-6, 3600.0)
+"""Median intervals in s that a sensor's samples have: a count since 1970 of the wrong unit misses them."""
+
+_ISO = (
+    r"^(\d{4})-?(\d\d)-?(\d\d)(?:[T ](\d\d):?(\d\d)(?::?(\d\d)(?:[.,](\d+))?)?\s*"
+    r"(?:(Z|UTC)|([+-])(\d\d):?(\d\d)?)?)?$"
+)
+_OF_DAY = r"^(\d{1,2}):(\d\d)(?::(\d\d)(?:[.,](\d+))?)?$"
+
+
+class ClockError(ValueError):
+    """A cell that is no time; ``row`` is where, from 0."""
+
+    def __init__(self, row: int, advice: str) -> None:
+        super().__init__(advice)
+        self.row = row
+
+
+class Clock(NamedTuple):
+    """The times of a table.
+
+    Attributes:
+        ticks: whole nanoseconds, (N,); None where the numbers are not so.
+        seconds: of a column that is in seconds already, or whose numbers are no whole nanoseconds; NaN where none is.
+        told: how the times were read, for a sentence; empty where they are seconds as they stand.
+    """
+
+    ticks: np.ndarray | None
+    seconds: np.ndarray
+    told: str
+
+    def since(self, row: int) -> np.ndarray:
+        """Seconds from the time of a row on."""
+        if self.ticks is None:
+            return self.seconds - self.seconds[row]
+        passed = (self.ticks - self.ticks[row]) / _NANO
+        return np.where(np.isnan(self.seconds), np.nan, passed)
+
+
+def clock_of(series: Any, unit: str = "") -> Clock:
+    """The times that a column holds: ISO 8601 stamps, times of the day, counts since 1970, or numbers of a unit.
+
+    A count since 1970 is known by its size: in one unit alone it lies between 2001 and 2099 and its samples lie a
+    microsecond to an hour apart. Other numbers without a unit are taken as seconds.
+
+    Args:
+        series: of polars.
+        unit: of its numbers, where it is known: s, ms, µs or ns.
+
+    Raises:
+        ClockError: a cell is no time, or stamps with and without a zone stand side by side.
+
+    Example:
+        >>> import polars as pl
+        >>> clock_of(pl.Series(["2024-05-03T10:00:00Z", "2024-05-03T12:00:00.25+02:00"])).since(0)
+        array([0.  , 0.25])
+    """
+    package = polars()
+    if series.dtype.is_temporal():
+        return _of_type(series)
+    if series.dtype == package.String:
+        text = series.str.strip_chars()
+        text = text.set(text.str.to_lowercase().is_in(MISSING).fill_null(False), None)
+        first = next((one for one in text if one is not None), "")
+        return _of_stamps(text) if is_stamp(first) else _of_numbers(text, unit)
+    return _of_numbers(series, unit)
+
+
+def _of_type(series: Any) -> Clock:
+    package = polars()
+    if series.dtype == package.Date:
+        series = series.cast(package.Datetime("ns"))
+    if series.dtype == package.Time:
+        ticks = series.cast(package.Int64)
+    else:
+        same = package.Duration if series.dtype == package.Duration else package.Datetime
+        ticks = series.cast(same("ns")).cast(package.Int64)
+    return _exact(ticks, "stamps")
+
+
+def _exact(ticks: Any, told: str) -> Clock:
+    none = ticks.is_null().to_numpy()
+    whole = ticks.fill_null(0).to_numpy().astype(np.int64)
+    return Clock(whole, np.where(none, np.nan, whole / _NANO), told)
+
+
+def _of_stamps(text: Any) -> Clock:
+    package = polars()
+    if ":" in next(one for one in text if one is not None)[:3]:
+        return _of_days(text)
+    parts = text.str.extract_groups(_ISO).struct.unnest()
+    year, month, day, hour, minute, second, digits, zulu, sign, off_hour, off_minute = parts.get_columns()
+    date = package.select(package.date(*(one.cast(package.Int32) for one in (year, month, day)))).to_series() if (
+        _dates_exist(year, month, day)
+    ) else (year + "-" + month + "-" + day).str.to_date("%Y-%m-%d", strict=False)  # fmt: skip
+    bad = text.is_not_null() & date.is_null()
+    clock = [_whole(hour), _whole(minute), _whole(second)]
+    bad = bad | (clock[0] > 24) | (clock[1] > 59) | (clock[2] > 60)
+    if bad.any():
+        raise ClockError(int(bad.arg_max()), "write times as seconds, or as 2024-05-03T10:00:00.25")
+    zoned = (zulu.is_not_null() | sign.is_not_null()) & text.is_not_null()
+    if zoned.any() and not (zoned | text.is_null()).all():
+        unlike = zoned != zoned[int(text.is_not_null().arg_max())]
+        raise ClockError(int((unlike & text.is_not_null()).arg_max()), "write all stamps with a zone, or none")
+    offset = (_whole(off_hour) * 3600 + _whole(off_minute) * 60) * (1 - 2 * (sign == "-").fill_null(False).cast(int))
+    seconds = date.cast(package.Int64) * _DAY + clock[0] * 3600 + clock[1] * 60 + clock[2] - offset
+    return _exact(seconds * _NANO + _fraction(digits), "ISO 8601 stamps")
+
+
+def _dates_exist(year: Any, month: Any, day: Any) -> bool:
+    """Whether no day is one that no calendar has, so that it need not be asked for one by one."""
+    months, days = _whole(month), _whole(day)
+    return bool(year.is_not_null().all() and months.is_between(1, 12).all() and days.is_between(1, 28).all())
+
+
+def _of_days(text: Any) -> Clock:
+    """Times of the day; a fall of more than half a day is midnight."""
+    hour, minute, second, digits = text.str.extract_groups(_OF_DAY).struct.unnest().get_columns()
+    bad = text.is_not_null() & (hour.is_null() | (_whole(hour) > 24) | (_whole(minute) > 59) | (_whole(second) > 60))
+    if bad.any():
+        raise ClockError(int(bad.arg_max()), "write times as seconds, or as 10:00:00.25")
+    package = polars()
+    ticks = (_whole(hour) * 3600 + _whole(minute) * 60 + _whole(second)) * _NANO + _fraction(digits)
+    ticks = ticks.set(text.is_null(), None)
+    known = ticks.drop_nulls().to_numpy()
+    nights = np.concatenate([[0], np.cumsum(np.diff(known) < -_DAY * _NANO // 2)]) if len(known) else known
+    whole = ticks.to_numpy().copy() if not ticks.null_count() else ticks.fill_null(0).to_numpy().copy()
+    whole[ticks.is_not_null().to_numpy()] += (nights * _DAY * _NANO).astype(np.int64)
+    return _exact(package.Series(whole).set(ticks.is_null(), None), "times of the day")
+
+
+def _whole(digits: Any) -> Any:
+    return digits.cast(polars().Int64).fill_null(0)
+
+
+def _fraction(digits: Any) -> Any:
+    """Digits after the point as nanoseconds."""
+    return _whole(digits.fill_null("0").str.slice(0, 9).str.pad_end(9, "0"))
+
+
+def _of_numbers(series: Any, unit: str) -> Clock:
+    package = polars()
+    values = series.cast(package.Float64, strict=False)
+    if series.dtype == package.String and (bad := series.is_not_null() & values.is_null()).any():
+        raise ClockError(int(bad.arg_max()), "times are numbers, in seconds, or stamps such as 2024-05-03T10:00:00.25")
+    seconds = values.fill_null(np.nan).to_numpy()
+    epoch = _epoch_unit(seconds)
+    known = conversion("time", unit)
+    if known is None and epoch is None:
+        return Clock(None, seconds, "")
+    if known is not None and known.unit == "s" and epoch != "s":
+        return Clock(None, seconds, "")
+    name = known.unit if known is not None else str(epoch)
+    told = f"{name} since 1970" if epoch == name else name
+    digits = {"s": 9, "ms": 6, "µs": 3, "ns": 0}[name]
+    exact = _ticks(series, digits)
+    if exact is not None:
+        return _exact(exact, told)
+    return Clock(None, seconds * 10.0**digits / _NANO, told)
+
+
+def _epoch_unit(values: np.ndarray) -> str | None:
+    """The unit of a count since 1970; None where the numbers are none."""
+    finite = values[np.isfinite(values)]
+    if len(finite) < 2:
+        return None
+    first, interval = float(finite[0]), float(np.median(np.abs(np.diff(finite))))
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9)):
+        if _EPOCH[0] <= first * size < _EPOCH[1] and _INTERVALS[0] <= interval * size <= _INTERVALS[1]:
+            return unit
+    return None
+
+
+def _ticks(series: Any, digits: int) -> Any | None:
+    """Whole nanoseconds of numbers of 10^digits nanoseconds; None where there are parts of one."""
+    package = polars()
+    if series.dtype.is_integer():
+        whole = series.cast(package.Int64)
+        return whole * 10**digits if _fits(whole, digits) else None
+    if series.dtype != package.String:
+        return None
+    plain = series.str.extract_groups(r"^([+-]?\d{1,19})(?:\.(\d*?)0*)?$").struct.unnest().get_columns()
+    if (plain[0].is_null() & series.is_not_null()).any() or bool((plain[1].str.len_bytes() > digits).any()):
+        return None
+    whole = plain[0].cast(package.Int64, strict=False)
+    if whole.null_count() > plain[0].null_count() or not _fits(whole, digits):
+        return None
+    after = _whole(plain[1].fill_null("").str.slice(0, digits).str.pad_end(digits, "0")) if digits else 0
+    sign = 1 - 2 * plain[0].str.starts_with("-").cast(package.Int64)
+    return whole * 10**digits + sign * after
+
+
+def _fits(whole: Any, digits: int) -> bool:
+    largest = whole.abs().max()
+    return largest is None or int(largest) < 9 * 10 ** (18 - digits)

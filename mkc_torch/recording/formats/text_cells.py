@@ -1,0 +1,91 @@
+"""Cells of a line of text: where they are cut, and which of them are values."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Sequence
+
+from mkc_torch.recording.formats.base import MISSING
+
+__all__ = ["SEPARATORS", "WHITE", "cells_of", "count_of", "is_stamp", "is_value", "separator_of"]
+
+WHITE = " "
+SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab", "|": "bar", WHITE: "space"}
+
+_ORDER = ("\t", ";", "|", ",", WHITE)
+"""Of separators that explain a table equally well the first is it."""
+
+_BLANKS = 0.9
+"""What blanks explain counts less: a stamp of date and time has one within it."""
+
+_LOOKED_AT = 120
+"""Lines at the beginning and in the middle by which the separator is found."""
+
+_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?|[+-]?(inf|infinity)", re.IGNORECASE)
+_STAMP = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d.*)?|\d{8}T\d\d.*|\d{1,2}:\d\d(:\d\d([.,]\d+)?)?")
+_WHITE_WORDS = re.compile(r'"[^"]*"|[^\s"]+(?:\s*[\[(][^\])]*[\])])?')
+"""Between blanks; a unit in brackets belongs to the word before it."""
+
+
+def cells_of(line: str, separator: str) -> list[str]:
+    """The cells of a line, without quotes."""
+    if separator == WHITE:
+        return [word.strip('"') for word in _WHITE_WORDS.findall(line)]
+    if '"' not in line:
+        return line.split(separator)
+    return next(csv.reader([line], delimiter=separator))
+
+
+def count_of(line: str, separator: str) -> int:
+    """How many cells a line has."""
+    if separator == WHITE or '"' in line:
+        return len(cells_of(line, separator))
+    return line.count(separator) + 1
+
+
+def is_value(cell: str) -> bool:
+    """Whether a cell holds a number, a time stamp, or a word for a missing value.
+
+    Example:
+        >>> [is_value(cell) for cell in ("-1.5e3", "0,5", "2024-05-03T10:00:00Z", "nan", "", "mag_x", "1_000")]
+        [True, True, True, True, False, False, False]
+    """
+    cell = cell.strip()
+    return bool(cell) and (
+        _NUMBER.fullmatch(cell) is not None or cell.lower() in MISSING or _STAMP.fullmatch(cell) is not None
+    )
+
+
+def is_stamp(cell: str) -> bool:
+    """Whether a cell holds a date, or a time of the day."""
+    return _STAMP.fullmatch(cell.strip()) is not None
+
+
+def separator_of(lines: Sequence[str]) -> tuple[str, int]:
+    """The separator by which most lines fall into equally many cells that hold values, and how many that is.
+
+    Example:
+        >>> separator_of(["time;mag", "0,1;2,5", "0,2;2,6"])
+        (';', 2)
+    """
+    half = len(lines) // 2
+    seen = [*lines[:_LOOKED_AT], *lines[max(_LOOKED_AT, half) : max(_LOOKED_AT, half) + _LOOKED_AT]]
+    best, found = 0.0, None
+    for separator in _ORDER:
+        rows = [cells for cells in (cells_of(line, separator) for line in seen) if any(map(is_value, cells))]
+        if not rows:
+            continue
+        (count, _), *_ = Counter(map(len, rows)).most_common(1)
+        if count < 2:
+            continue
+        rows = [cells for cells in rows if len(cells) == count]
+        filled = sum(any(cells[i].strip() for cells in rows) for i in range(count))
+        score = sum(sum(map(is_value, cells)) / filled for cells in rows) * (_BLANKS if separator == WHITE else 1.0)
+        if score > best:
+            best, found = score, (separator, count)
+    if found is not None:
+        return found
+    separator = max((one for one in SEPARATORS if one != WHITE), key=re.sub('"[^"]*"', "", seen[0]).count)
+    return separator, count_of(seen[0], separator)

@@ -1,0 +1,287 @@
+"""Which columns of a file are what: the magnetometers in it, and what belongs to each."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from mkc_torch.recording.column_names import Meaning, form, is_about_magnetometer, meaning, split_unit
+from mkc_torch.recording.formats.base import Topic
+from mkc_torch.recording.px4 import PX4_UNITS, is_px4_magnetometer, is_px4_message
+
+__all__ = ["Found", "Sensor", "candidates", "recognised", "recorded_beside", "time_column"]
+
+_MAG = ("mag_x", "mag_y", "mag_z")
+_SIZES = {"mag": "xyz", "gyro": "xyz", "accel": "xyz", "q": "wxyz"}
+_ROS = "magnetic_field"
+"""Of sensor_msgs/MagneticField of ROS, "Measurements in Teslas", which has a covariance beside it."""
+_DERIVED = {"vehicle_magnetometer": "sensor_mag", "sensor_combined": "sensor_mag"}
+"""PX4's topics that repeat a sensor's own."""
+
+
+class Sensor(NamedTuple):
+    """A magnetometer in a file, and what was recorded beside it.
+
+    Attributes:
+        name: by which it is chosen; empty where a file has one alone.
+        topic: number of its topic.
+        columns: for each name that a column is to have, the name it has in the topic.
+        units: of these columns by their new names, where the file says them.
+    """
+
+    name: str
+    topic: int
+    columns: Mapping[str, str]
+    units: Mapping[str, str]
+
+
+class Found(NamedTuple):
+    """What was recognised in a file.
+
+    Attributes:
+        sensors: its magnetometers.
+        several: whether they are several of one kind; else, where there is more than one, nobody can tell which is
+            meant.
+        left_out: sentences about topics that only repeat others.
+    """
+
+    sensors: tuple[Sensor, ...]
+    several: bool
+    left_out: tuple[str, ...] = ()
+
+
+class _Group(NamedTuple):
+    """Columns of one vector, or of one number: axis to column, and the unit."""
+
+    sensor: str
+    columns: dict[str, str]
+    units: dict[str, str]
+    sure: bool
+
+
+def recognised(topics: Sequence[Topic], file: str = "") -> Found:
+    """The magnetometers in a file's topics, by the names of columns and topics, and of the file.
+
+    A column that has a name of a recording's own is what it says. Columns x, y, z are a magnetometer's where the topic,
+    the file, or other columns say so. Axes are complete or nothing.
+
+    Args:
+        topics: of the file.
+        file: its name without the ending.
+
+    Example:
+        >>> from mkc_torch.recording.formats.base import Table
+        >>> table = Table(["t", "mag0_x", "mag0_y", "mag0_z", "mag1_x", "mag1_y", "mag1_z"], [], [])
+        >>> [(sensor.name, sensor.columns["mag_x"]) for sensor in recognised([Topic("", table)]).sensors]
+        [('mag0', 'mag0_x'), ('mag1', 'mag1_x')]
+    """
+    found = [
+        (number, group) for number, topic in enumerate(topics) for group in _magnetometers(topic, file, len(topics))
+    ]
+    found, left_out = _without_derived(topics, found)
+    if any(group.sure for _, group in found):
+        found = [(number, group) for number, group in found if group.sure]
+    own = [(number, group) for number, group in found if _is_own(group)]
+    forms = {(number, form(group.sensor)) for number, group in found}
+    several = len(topics) > 1 or len(forms) == 1
+    if own and not several:
+        found, several = own, True
+    names = _names(topics, found)
+    sensors = [
+        _sensor(topics, number, group, name if len(found) > 1 else "")
+        for (number, group), name in zip(found, names, strict=True)
+    ]
+    return Found(tuple(sensors), several, left_out)
+
+
+def candidates(topic: Topic) -> list[dict[str, str]]:
+    """Three columns each that differ by x, y, z alone and may be a magnetometer's; for a question to the user.
+
+    Example:
+        >>> from mkc_torch.recording.formats.base import Table
+        >>> candidates(Topic("", Table(["time", "ux", "uy", "uz"], [], [])))
+        [{'mag_x': 'ux', 'mag_y': 'uy', 'mag_z': 'uz'}]
+    """
+    names = [name for name in topic.table.names if name]
+    found = []
+    for name in names:
+        for place in [i for i, letter in enumerate(name) if letter in "xX"]:
+            triple = [_with(name, place, letter) for letter in ("y", "z")]
+            if all(other in names for other in triple):
+                found.append(dict(zip(_MAG, (name, *triple), strict=True)))
+    return found
+
+
+def time_column(topic: Topic, *, weak: bool = True) -> tuple[str, str] | None:
+    """The column of a topic that holds its time, and the unit where the file says it; None where there is none.
+
+    Args:
+        topic: of a file.
+        weak: take a column ``t`` too.
+
+    Example:
+        >>> from mkc_torch.recording.formats.base import Table
+        >>> time_column(Topic("", Table(["timestamp [ns]", "x"], [], [])))
+        ('timestamp [ns]', 'ns')
+    """
+    found = []
+    for place, name in enumerate(topic.table.names):
+        said = meaning(name) if name else None
+        if said is None or said.quantity != "time" or not (weak or said.sure):
+            continue
+        rank = next(
+            (i for i, one in enumerate(("time", "timestamp", "header_stamp")) if said.sensor == one),
+            3 if said.sure else 4,
+        )
+        found.append((rank, place, name, _unit_of(topic, name, said.unit)))
+    if not found:
+        return None
+    _, _, name, unit = min(found)
+    return name, unit
+
+
+def recorded_beside(topics: Sequence[Topic], own: int) -> list[tuple[int, dict[str, str], dict[str, str]]]:
+    """What topics beside a magnetometer's hold: number of the topic, new names to its own, and units that are said.
+
+    Of several topics of one quantity, the one whose number is that of the magnetometer's is first, then in their order.
+    """
+    last = re.search(r"\d*$", topics[own].name)
+    mine = last[0] if last else ""
+    order = sorted(
+        (number for number in range(len(topics)) if number != own),
+        key=lambda number: not (mine and re.search(rf"(?<!\d){mine}$", topics[number].name)),
+    )
+    return [
+        (number, columns, units)
+        for number in order
+        for columns, units in _beside([*_groups(topics[number]), *_by_topic(topics[number])], "", set())
+    ]
+
+
+def _by_topic(topic: Topic) -> list[tuple[str, _Group]]:
+    """The gyroscope or accelerometer whose columns are x, y, z and whose topic says what it is."""
+    axes = {name.lower(): name for name in topic.table.names if name.lower() in ("x", "y", "z")}
+    said = meaning(f"{topic.name}_x") if len(axes) == 3 else None
+    if said is None or said.quantity not in ("gyro", "accel"):
+        return []
+    units = {axis: _unit_of(topic, name, "") for axis, name in axes.items()}
+    return [(said.quantity, _Group(said.sensor, axes, units, True))]
+
+
+def _with(name: str, place: int, letter: str) -> str:
+    return name[:place] + (letter.upper() if name[place].isupper() else letter) + name[place + 1 :]
+
+
+def _unit_of(topic: Topic, name: str, unit: str) -> str:
+    if topic.units.get(name) or unit:
+        return topic.units.get(name) or unit
+    if name.rpartition(".")[0].endswith(_ROS) and any(f"{_ROS}_covariance" in one for one in topic.table.names):
+        return "tesla"
+    return PX4_UNITS["time"] if name.startswith("timestamp") and is_px4_message(topic.table.names) else ""
+
+
+def _magnetometers(topic: Topic, file: str, topics: int) -> list[_Group]:
+    """The magnetometers of a topic by its columns; by its name, or the file's, where the columns are x, y, z."""
+    groups = [group for quantity, group in _groups(topic) if quantity == "mag"]
+    if any(group.sure for group in groups):
+        return groups
+    plain = {name: split_unit(name) for name in topic.table.names if name}
+    axes = {base.lower(): (name, unit) for name, (base, unit) in plain.items() if base.lower() in ("x", "y", "z")}
+    known = topic.name if topics > 1 or topic.name else file
+    px4 = is_px4_magnetometer(topic.table)
+    if len(axes) == 3 and (px4 or is_about_magnetometer(known)):
+        units = {axis: _unit_of(topic, name, unit) for axis, (name, unit) in axes.items()}
+        if is_px4_message(topic.table.names):
+            units = {axis: unit or PX4_UNITS["mag"] for axis, unit in units.items()}
+        return [_Group("mag", {axis: name for axis, (name, _) in axes.items()}, units, True)]
+    return groups
+
+
+def _groups(topic: Topic) -> list[tuple[str, _Group]]:
+    """The complete vectors and the single numbers of a topic, each with its quantity."""
+    found: dict[tuple[str, str, bool], _Group] = {}
+    for name in topic.table.names:
+        said = meaning(name) if name else None
+        if said is None or said.quantity == "time":
+            continue
+        key = (said.quantity, said.sensor, said.sure)
+        group = found.setdefault(key, _Group(said.sensor, {}, {}, said.sure))
+        if said.axis in group.columns:  # two spellings of one name
+            group.columns[said.axis] = ""
+            continue
+        group.columns[said.axis] = name
+        group.units[said.axis] = _unit_of(topic, name, said.unit)
+    return [
+        (quantity, group)
+        for (quantity, _, _), group in found.items()
+        if all(group.columns.get(axis) for axis in _SIZES.get(quantity, ("",)))
+    ]
+
+
+def _without_derived(
+    topics: Sequence[Topic], found: list[tuple[int, _Group]]
+) -> tuple[list[tuple[int, _Group]], tuple[str, ...]]:
+    """Leave out what PX4 derives from sensors that are there themselves."""
+    kinds = {number: re.sub(r"_?\d+$", "", topics[number].name) for number, _ in found}
+    gone = {number for number, kind in kinds.items() if _DERIVED.get(kind) in kinds.values()}
+    told = tuple(
+        f"Topic `{topics[number].name}` is left out: it is made of `{_DERIVED[kinds[number]]}`, which is there."
+        for number in sorted(gone)
+    )
+    return [(number, group) for number, group in found if number not in gone], told
+
+
+def _is_own(group: _Group) -> bool:
+    return [group.columns.get(axis) for axis in "xyz"] == list(_MAG)
+
+
+def _names(topics: Sequence[Topic], found: Sequence[tuple[int, _Group]]) -> list[str]:
+    """A name for each sensor: of its topic, where that has one sensor alone, else of its columns, or of both."""
+    numbers = [number for number, _ in found]
+    names = []
+    for number, group in found:
+        topic = topics[number].name.strip("/")
+        if not topic or len(topics) == 1:
+            names.append(group.sensor)
+        else:
+            names.append(topic if numbers.count(number) == 1 else f"{topic}/{group.sensor}")
+    return names
+
+
+def _sensor(topics: Sequence[Topic], number: int, group: _Group, name: str) -> Sensor:
+    topic = topics[number]
+    columns = {f"mag_{axis}": group.columns[axis] for axis in "xyz"}
+    units = {f"mag_{axis}": group.units[axis] for axis in "xyz" if group.units[axis]}
+    if (time := time_column(topic)) is not None:
+        columns["time"] = time[0]
+        units |= {"time": time[1]} if time[1] else {}
+    for beside in _beside(_groups(topic), group.sensor, set(columns.values())):
+        columns |= beside[0]
+        units |= beside[1]
+    return Sensor(name, number, columns, units)
+
+
+def _beside(
+    groups: Iterable[tuple[str, _Group]], sensor: str, taken: set[str]
+) -> Iterable[tuple[dict[str, str], dict[str, str]]]:
+    """What else a topic holds: of several of a quantity the one that goes by the sensor's number, or none."""
+    number = re.search(r"\d*$", sensor)
+    mine = number[0] if number else ""
+    by_quantity: dict[str, list[_Group]] = {}
+    for quantity, group in groups:
+        if quantity != "mag" and not taken & set(group.columns.values()):
+            by_quantity.setdefault(quantity, []).append(group)
+    for quantity, found in by_quantity.items():
+        sure = [group for group in found if group.sure] or found
+        own = [group for group in sure if all(name == _called(quantity, axis) for axis, name in group.columns.items())]
+        same = [group for group in sure if mine and group.sensor.endswith(mine)]
+        chosen = own or (same if len(same) == 1 else sure)
+        if len(chosen) == 1:
+            group = chosen[0]
+            columns = {_called(quantity, axis): name for axis, name in group.columns.items()}
+            yield columns, {_called(quantity, axis): unit for axis, unit in group.units.items() if unit}
+
+
+def _called(quantity: str, axis: str) -> str:
+    return Meaning(quantity, axis, "", "", True).column

@@ -1,0 +1,76 @@
+"""Runs of a recording: where its time starts again."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["restarts"]
+
+_FEWEST = 3
+"""Samples that a run has at least."""
+
+_BACK = 10.0
+"""Median intervals by which a time falls back at least where it starts again: less is jitter."""
+
+_BEGINNING = 0.1
+"""Share of a run, from its first sample on, to which a time falls that starts again."""
+
+_OVERLAP = 20
+"""Samples of each of two runs that lie between one another's in time, from which they are two wherever one begins."""
+
+_MANY = 0.05
+"""Share of backward steps from which the rows are in no order, and nothing starts again."""
+
+
+def restarts(time: Float[np.ndarray, " N"]) -> list[int]:
+    """The rows at which a new run begins, without the first.
+
+    A run begins where the time falls to near the beginning of the run before it, or below; and where it falls into
+    the midst of it and samples of both lie between one another's. A block of rows that fills a hole was only written
+    late, and single samples that step back are jitter.
+
+    Args:
+        time: in any unit, in the order of the rows; NaN where there is none.
+
+    Example:
+        >>> restarts(np.concatenate([np.arange(23.0, 43.0), np.arange(22.5, 42.5)]))
+        [20]
+        >>> restarts(np.array([0.0, 2.0, 1.0, 4.0, 3.0]))
+        []
+    """
+    rows = np.flatnonzero(np.isfinite(time))
+    t = time[rows]
+    steps = np.diff(t)
+    backward = np.flatnonzero(steps < 0) + 1
+    forward = steps[steps > 0]
+    if len(backward) == 0 or len(forward) == 0 or len(backward) > max(_MANY * len(t), 3.0):
+        return []
+    interval = float(np.median(forward))
+    ends = np.append(backward[1:], len(t))
+    found: list[int] = []
+    start = 0
+    for i, end in zip(backward.tolist(), ends.tolist(), strict=True):
+        falls = t[i - 1] - t[i] >= _BACK * interval or (t[i] <= t[start] and i - start >= _FEWEST)
+        if falls and _begins(t[start:i], t[i:end], interval):
+            found.append(i)
+            start = i
+    return [int(rows[i]) for i in found]
+
+
+def _begins(before: np.ndarray, after: np.ndarray, interval: float) -> bool:
+    """Whether what comes after a step back is a run of its own."""
+    if min(len(before), len(after)) < _FEWEST:
+        return False
+    high, begin = float(before.max()), float(before[0])
+    between = before[(before > after[0]) & (before < after[-1])]
+    if not len(between) and begin < after[0] and after[-1] < high:
+        return False
+    if after[0] <= begin + max(_BEGINNING * (high - begin), _BACK * interval):
+        return True
+    repeated = float(np.isin(after, before).mean())
+    return len(between) >= _OVERLAP and int((after < high).sum()) >= _OVERLAP and repeated < 0.5

@@ -1,0 +1,114 @@
+"""A real recording, written as people have it: each file is calibrated as the whole is, or refused with what to do."""
+
+import pytest
+
+pytest.importorskip("polars")
+pytest.importorskip("typer")
+
+from mkc_torch.calibration.calibrate import calibrate
+from mkc_torch.cli.recorded import read_magnetometer, sensor_names
+from mkc_torch.recording.recording import Recording, RecordingError
+from tests.shared_data import shared_case, shared_data
+
+SAMPLES = {
+    "comment_lines": 682, "decimal_comma": 684, "frozen_sensor": 2730, "header_again": 2730, "iso_timestamps": 684,
+    "last_line_cut": 2729, "names_with_units": 684, "no_time": 684, "time_restarts": 2730,
+    "timestamp_in_microseconds": 684, "two_topics": 684, "clipped": 2730,
+}  # fmt: skip
+
+TOLD = {
+    "comment_lines": ['3 comment lines skipped, the first line 1, "# logger v1.3"'],
+    "decimal_comma": ["Decimal commas were read as points", "`magX [uT]`, `magY [uT]`, `magZ [uT]` are taken as"],
+    "header_again": ["The header stands again in line 1367", "starts again at row 1366 (line 1368)", "2 runs"],
+    "iso_timestamps": ["`timestamp` is taken as `time`", "ISO 8601 stamps", "in seconds from the first sample"],
+    "last_line_cut": ['The last line is cut short and left out, line 2731, "106.2740,-26.7"'],
+    "names_with_units": ["`magX [uT]`, `magY [uT]`, `magZ [uT]` are taken as `mag_x`, `mag_y`, `mag_z`"],
+    "time_restarts": ["The time starts again at row 1366 (line 1367)", "2 runs"],
+    "timestamp_in_microseconds": ["µs since 1970"],
+    "two_topics": ["`x`, `y`, `z` are taken as `mag_x`", "converted from gauss, as the file says", "The times are µs"],
+}
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return calibrate(Recording.read(shared_data("magnetometer/full_sphere.csv")))
+
+
+def file(name):
+    return shared_case(f"messy/{name}.csv")
+
+
+def read(name, units=None, sensor=None):
+    return read_magnetometer(file(name), {}, units or {}, sensor)[0]
+
+
+def assert_centre(found, whole):
+    """Within two standard errors of the part's own centre, or of the whole's."""
+    for mine, other, error, other_error in zip(
+        found.center, whole.center, found.center_se, whole.center_se, strict=True
+    ):
+        assert abs(mine - other) <= 2.0 * max(error, other_error)
+
+
+@pytest.mark.parametrize("name", sorted(set(SAMPLES) - {"clipped", "frozen_sensor"}))
+def test_the_centre_is_that_of_the_whole_recording(name, whole):
+    recording = read(name)
+    assert len(recording) == SAMPLES[name]
+    found = calibrate(recording)
+    assert found.unit == "µT"
+    assert_centre(found, whole)
+
+
+@pytest.mark.parametrize("name", sorted(TOLD))
+def test_what_was_done_to_read_it_is_told(name):
+    told = " ".join(read(name).warnings)
+    for words in TOLD[name]:
+        assert words in told, told
+
+
+def test_a_field_in_gauss_is_asked_for_and_then_converted(whole):
+    with pytest.raises(RecordingError, match=r"in gauss .* it would be.*`--unit mag=gauss`"):
+        read("gauss")
+    assert_centre(calibrate(read("gauss", {"mag": "gauss"})), whole)
+
+
+def test_two_sensors_are_two_calibrations(whole):
+    assert sensor_names(file("two_sensors"), {}, None) == ["mag0", "mag1"]
+    assert_centre(calibrate(read("two_sensors", sensor="mag0")), whole)
+    other = calibrate(read("two_sensors", sensor="mag1"))
+    assert other.center == pytest.approx((-6.59, 2.34, -17.76), abs=0.1)
+    with pytest.raises(RecordingError, match="2 magnetometers, `mag0`, `mag1`; choose one with `--sensor mag0`"):
+        read("two_sensors")
+
+
+@pytest.mark.parametrize("name", ["header_again", "time_restarts"])
+def test_a_time_that_starts_again_is_a_second_run(name):
+    runs = read(name).experiments()
+    assert [len(run) for run in runs.values()] == [1365, 1365]
+    assert all((run.time.diff() >= 0).all() for run in runs.values())
+    in_order = read(name).sorted_by_time()
+    assert in_order["mag_x"][:1365].tolist() == runs["1"]["mag_x"].tolist()
+
+
+@pytest.mark.parametrize("name", ["iso_timestamps", "timestamp_in_microseconds", "two_topics"])
+def test_times_are_seconds_from_the_first_sample_without_loss(name):
+    expected = read("gauss", {"mag": "gauss"}).time
+    assert (read(name).time - expected).abs().max() <= 1e-6 + 1e-12  # written with one digit less
+
+
+@pytest.mark.parametrize("name", ["clipped", "frozen_sensor"])
+def test_what_the_sensor_got_wrong_is_read_as_it_stands(name):
+    recording = read(name)
+    assert len(recording) == SAMPLES[name]
+    assert recording.warnings == ()
+    frozen = (recording.magnetometer().diff(dim=0) == 0).all(-1).sum()
+    assert (frozen > 700) == (name == "frozen_sensor")
+    assert (recording.magnetometer().abs().max() == 40.0) == (name == "clipped")
+
+
+@pytest.mark.parametrize("name", ["one_block", "one_block_no_time"])
+def test_the_order_of_rows_is_kept(name):
+    recording = read(name)
+    assert len(recording) == 400
+    assert recording["mag_x"][:3].tolist() == [8.49677, 8.60255, 40.04067]
+    assert recording.warnings == ()
