@@ -122,10 +122,11 @@ def test_a_column_of_that_name_is_replaced_in_its_place(tmp_path):
 
 
 cell = st.text(st.characters(exclude_categories=("Cs", "Cc", "Zl", "Zp")), max_size=8)
+first = cell.filter(lambda text: not text.strip().startswith(("#", "%", "//", ";")))  # no line of comments
 
 
 @settings(max_examples=40)
-@given(rows=st.lists(st.tuples(cell, cell), min_size=1, max_size=6))
+@given(rows=st.lists(st.tuples(first, cell), min_size=1, max_size=6))
 def test_every_cell_of_a_csv_is_written_as_it_stands(tmp_path_factory, rows):
     folder = tmp_path_factory.mktemp("cells")
     source, target = folder / "in.csv", folder / "out.csv"
