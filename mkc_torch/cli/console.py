@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from mkc_torch.report.words.terms import term
+from mkc_torch._words.terms import term
 
 if TYPE_CHECKING:
     from mkc_torch.recording.recording import Recording

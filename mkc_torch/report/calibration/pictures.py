@@ -10,11 +10,11 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from mkc_torch._words.terms import term
 from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.coverage import NEAR_DEGREES, Coverage, nearest_axis
 from mkc_torch.functional import mkc_nll
 from mkc_torch.report.drawing import BLUE, GREY, INK, ORANGE, PALE, SHADE, STYLE, svg
-from mkc_torch.report.words.terms import term
 
 _MOST_POINTS = 20_000
 _BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.9}

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from mkc_torch._support.unit_text import tidy
+from mkc_torch._words.terms import term
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.world import Curve, Forcing
 from mkc_torch.report.diagnosis.panels import MOST_LETTERS, Grid, array, draw_curve, named, short, style, title
 from mkc_torch.report.drawing import BLUE, GREY, ORANGE, svg
-from mkc_torch.report.words.terms import term
 
 __all__ = ["of_forcing", "of_shape"]
 

@@ -13,10 +13,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from mkc_torch._words.terms import term
+from mkc_torch._words.typesetting import plain
 from mkc_torch.diagnosis.world import Curve
 from mkc_torch.report.drawing import BLUE, GREY, INK, ORANGE, STYLE
-from mkc_torch.report.words.terms import term
-from mkc_torch.report.words.typesetting import plain
 
 __all__ = ["BETWEEN", "CURVE_COLORS", "LEFT", "MOST_LETTERS", "RIGHT", "ROW", "WIDTH", "Grid", "array", "draw_curve",
            "named", "short", "style", "title"]  # fmt: skip

@@ -11,11 +11,11 @@ import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
+from mkc_torch._words.terms import term
+from mkc_torch._words.typesetting import capital
 from mkc_torch.diagnosis.result import Diagnosis, Finding, Traces
 from mkc_torch.report.diagnosis.panels import LEFT, MOST_LETTERS, Grid, array, draw_curve, named, short, style, title
 from mkc_torch.report.drawing import BLUE, GREY, INK, ORANGE, SHADE, svg
-from mkc_torch.report.words.terms import term
-from mkc_torch.report.words.typesetting import capital
 
 __all__ = ["Panel", "driver_panels", "floors", "numbered", "of_finding", "over_states", "over_time"]
 
