@@ -151,6 +151,7 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
             *(sentence for sentence in (size, time_warning(usable)) if sentence),
             *_warnings(fit, found, float(rejected.double().mean())),
         ),
+        used=usable,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -20,6 +20,7 @@ from mkc_torch.calibration.file import (
     finite_or_none,
     refuse_constant,
 )
+from mkc_torch.calibration.plot import CalibrationPlot
 from mkc_torch.functional import mkc_weight
 from mkc_torch.recording.disturbance import Interval
 from mkc_torch.recording.recording import Recording
@@ -62,6 +63,7 @@ class Calibration:
         disturbed: where rejected samples stand close together in time.
         coverage: of directions, by the samples in use.
         warnings: sentences about the recording and the fit.
+        used: the samples that it was made from, which the pictures show; None where it was read from a file.
     """
 
     recording: str
@@ -86,6 +88,12 @@ class Calibration:
     disturbed: tuple[Interval, ...]
     coverage: Coverage
     warnings: tuple[str, ...]
+    used: Recording | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def plot(self) -> CalibrationPlot:
+        """The pictures of the report as axes of matplotlib, such as ``calibration.plot.residual()``."""
+        return CalibrationPlot(self, self.used)
 
     @property
     def rejected_share(self) -> float:

@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 from mkc_torch._parallel.pool import shared
 from mkc_torch._words.typesetting import several, typeset
+from mkc_torch.diagnosis.plot.curves import CURVE_COLORS
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability
 from mkc_torch.report.diagnosis import (
     evidence,
@@ -24,7 +25,6 @@ from mkc_torch.report.diagnosis import (
     verdict,
     world,
 )
-from mkc_torch.report.diagnosis.panels import CURVE_COLORS
 from mkc_torch.report.rendering import render
 from mkc_torch.report.words.markup import marked, unbroken
 
