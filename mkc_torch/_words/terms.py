@@ -50,6 +50,7 @@ TERMS: dict[str, str] = {
     "verdict.unnamed": "Something is there that noise alone rarely makes, but no effect that also predicts"
     " [unit.unseen_blocks]: nothing is named.",
     "verdict.course_alone": "Its course over time is all that is known of it.",
+    "verdict.explained": "What was found explains what the simulation left over.",
     "verdict.structure": "Structure remains that no effect in the catalogue accounts for.",
     "verdict.yet_structure": "Yet structure remains that no effect in the catalogue accounts for.",
     "verdict.residual": "{residual}, [unit.root_mean_square] on [unit.unseen_data].",

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from mkc_torch._support.html_table import html_table, with_error
 from mkc_torch.calibration.coverage import Coverage, Gap, nearest_axis
 from mkc_torch.calibration.file import (
     CalibrationFileError,
@@ -94,6 +95,25 @@ class Calibration:
     def plot(self) -> CalibrationPlot:
         """The pictures of the report as axes of matplotlib, such as ``calibration.plot.residual()``."""
         return CalibrationPlot(self, self.used)
+
+    def __repr__(self) -> str:
+        return f"Calibration({self.recording!r}, {self.samples} samples: center {self.center} {self.unit})"
+
+    def _repr_html_(self) -> str:
+        c = self
+        rows = [
+            (name, *(with_error(v, e) for v, e in zip(values, errors, strict=True)))
+            for name, values, errors in (
+                ("offset x, y, z", c.center, c.center_se),
+                ("semi-axes, ascending", c.semi_axes, c.semi_axes_se),
+            )
+        ]
+        below = (
+            f"Residual {c.before.robust:.3g} → {c.after.robust:.3g} {c.unit} robust; {100 * c.rejected_share:.1f} % of "
+            f"{c.samples:,} samples rejected; {100 * c.coverage.fraction:.0f} % of all directions covered.",
+            *c.warnings,
+        )
+        return html_table(f"Calibration of {c.recording or 'a recording'}, {c.unit}", ("", "", "", ""), rows, below)
 
     @property
     def rejected_share(self) -> float:

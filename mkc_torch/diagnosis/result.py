@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from mkc_torch.diagnosis.correcting_model import CorrectingModel
+from mkc_torch.diagnosis.in_a_notebook import as_html
 from mkc_torch.diagnosis.parts import (
     Alternative,
     Candidate,
@@ -114,6 +115,13 @@ class Diagnosis:
     model: CorrectingModel | None = field(default=None, repr=False, compare=False)
     evidence: tuple[Told, ...] = ()
     world: World = field(default_factory=World)
+
+    def __repr__(self) -> str:
+        found = ", ".join(finding.effect for finding in self.findings) or "nothing found"
+        return f"Diagnosis({self.recording!r} against {self.simulation!r}: {self.verdict}; {found})"
+
+    def _repr_html_(self) -> str:
+        return as_html(self.recording, self.simulation, self.verdict, self.findings, (*self.advice, *self.warnings))
 
     @property
     def plot(self) -> DiagnosisPlot:
