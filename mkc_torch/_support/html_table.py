@@ -31,7 +31,7 @@ def html_table(caption: str, columns: Sequence[str], rows: Sequence[Sequence[str
     )
     table = (
         '<div style="overflow-x:auto"><table style="border-collapse:collapse;font-variant-numeric:tabular-nums">'
-        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+        f"{f'<thead><tr>{head}</tr></thead>' if any(columns) else ''}<tbody>{body}</tbody></table></div>"
     )
     sentences = "".join(f'<p style="margin:4px 0 0;max-width:76ch">{escape(one)}</p>' for one in below)
     return (

@@ -330,7 +330,7 @@ TERMS: dict[str, str] = {
     "picture.curve": "What was found, 95 % band",
     "picture.curve_of": "{effect}, 95 % band",
     "picture.gain": "gain ([unit.nats_a_sample])",
-    "picture.held_out": "What each finding gains on [unit.unseen_blocks], 95 % interval",
+    "picture.held_out": "Gains on [unit.unseen_blocks], 95 % interval",
     "picture.left": "share that is left",
     "picture.push": "push",
     "picture.forcing": "What pushes the rate of {place}, 95 % band",

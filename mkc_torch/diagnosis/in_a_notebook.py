@@ -26,9 +26,11 @@ def as_html(
 ) -> str:
     """The table, with sentences below it: advice and warnings."""
     names = term("label.against", recording=plain(recording) or term("label.recording"), simulation=plain(simulation))
-    heads = ("", "grade", "p", "on unseen data", "first acts")
+    heads = ("", "grade", "p", "on unseen data")
     rows = [_row(finding) for finding in findings]
-    below = (term(_VERDICTS[verdict]), *(typeset(one) for one in sentences))
+    below = [term(_VERDICTS[verdict]), *(typeset(one) for one in sentences)]
+    for finding in findings:
+        below = [one.replace(finding.effect, words_of(finding.effect)) for one in below]
     return html_table(names, heads, rows, below)
 
 
@@ -36,5 +38,4 @@ def _row(f: Finding) -> tuple[str, ...]:
     drivers = f" ({', '.join(plain(name) for name in f.drivers)})" if f.drivers else ""
     held = f.held_out
     change = "" if held is None else f"{held.rmse_before:.3g} → {held.rmse_after:.3g} {plain(held.unit)}".rstrip()
-    onset = "" if f.onset is None else f"{f.onset:.4g}"
-    return words_of(f.effect) + drivers, f.grade, f"{f.p_value:.2g}", change, onset
+    return words_of(f.effect) + drivers, f.grade, f"{f.p_value:.2g}", change
