@@ -96,3 +96,14 @@ def test_pictures_are_there_and_nothing_is_fetched(site):
 def test_style_sheets_name_no_other_place(site):
     for path in site.rglob("*.css"):
         assert not re.search(r"url\(\s*[\"']?https?:|@import", path.read_text(encoding="utf-8")), path.name
+
+
+def test_no_page_needs_more_than_a_telephone_has(site):
+    width = pytest.importorskip("tests.report.test_phone_width")
+    if width.CHROMIUM is None:
+        pytest.skip("no chromium on this machine: widths are not measured")
+    pages = [path.relative_to(site).as_posix() for path in [*site.glob("*.html"), *(site / "api").glob("l*.html")]]
+    pages.remove("404.html")
+    assert len(pages) > 15
+    found = width.widths_of({page: page for page in pages}, site)
+    assert {page: needed for page, needed in found.items() if needed > width.WIDTH} == {}
