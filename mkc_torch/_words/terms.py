@@ -348,7 +348,7 @@ TERMS: dict[str, str] = {
     "picture.corrected": "Corrected, {plane} plane",
     "picture.about_sphere": "Samples before and after calibration in three planes, with the fitted outline",
     "picture.in_use": "in use",
-    "picture.length": "Length of the corrected field less its nominal length",
+    "picture.length": "Length of the field less its nominal length",
     "picture.all_samples": "[picture.length]: all samples",
     "picture.weight": "weight",
     "picture.close_up": "Close up: within ±{limit} {unit}, five times its robust scatter",

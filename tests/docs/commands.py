@@ -49,6 +49,7 @@ EXAMPLES = {
     "examples/calibration/passing_magnet.py": "RECORDING.csv --output picture.png",
     "examples/calibration/least_squares_beside.py": "RECORDING.csv ANOTHER.csv",
     "examples/lightning/any_unit.py": "--help",
+    "examples/gallery.py": "--help",  # minutes, on recordings that are not part of the project
     # minutes each, on recordings that are not part of the project
     "examples/concealed_physics/dynamics/heaters.py": "--help",
     "examples/concealed_physics/dynamics/silverbox.py": "--help",

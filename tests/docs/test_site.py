@@ -11,7 +11,7 @@ from importlib.util import find_spec
 import pytest
 
 from tests.docs.commands import BUILD
-from tests.docs.pages import ROOT
+from tests.docs.pages import PAGES, ROOT
 
 API = ROOT / "docs" / "api"
 ROOMS = re.findall(r"^::: (\S+)\n(?! )", "\n".join(page.read_text(encoding="utf-8") for page in API.glob("*.md")), re.M)
@@ -65,6 +65,13 @@ def test_every_public_room_has_a_page():
 def test_every_page_is_in_the_navigation():
     told = set(re.findall(r'"([\w/]+\.md)"', (ROOT / ".zensical.toml").read_text(encoding="utf-8")))
     assert told == {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+
+
+def test_pictures_are_small_and_shown():
+    kept = {path.name: path.stat().st_size for path in (ROOT / "docs" / "pictures").iterdir()}
+    assert {name: size for name, size in kept.items() if size > 100_000} == {}
+    shown = {name for page in PAGES[1:] for name in re.findall(r"\(pictures/(.+?)\)", page.read_text(encoding="utf-8"))}
+    assert shown == set(kept)
 
 
 def test_every_public_name_has_a_place(site):
