@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import numbers
 import reprlib
+from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 import torch
@@ -309,11 +310,11 @@ def refuse_other_shapes(**given: Tensor) -> None:
     """
     if torch.compiler.is_compiling():
         return
-    try:
-        torch.broadcast_shapes(*(value.shape for value in given.values()))
-    except RuntimeError:
+    # not torch.broadcast_shapes, which loads sympy
+    sizes = zip_longest(*(reversed(value.shape) for value in given.values()), fillvalue=1)
+    if any(len({size for size in along if size != 1}) > 1 for along in sizes):
         shapes = ", ".join(f"`{name}` {tuple(value.shape)}" for name, value in given.items())
-        raise ValueError(f"Expected arguments of shapes that broadcast but got {shapes}.") from None
+        raise ValueError(f"Expected arguments of shapes that broadcast but got {shapes}.")
 
 
 def _extremes(value: Tensor) -> tuple[float, float] | None:

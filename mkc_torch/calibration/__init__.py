@@ -4,6 +4,14 @@ from mkc_torch.calibration.calibrate import calibrate
 from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
 from mkc_torch.calibration.file import CalibrationFileError
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.calibration.plot import CalibrationPlot
 from mkc_torch.calibration.result import Calibration
 
-__all__ = ["Calibration", "CalibrationFileError", "EllipsoidFit", "NotIdentifiableError", "calibrate"]
+__all__ = [
+    "Calibration",
+    "CalibrationFileError",
+    "CalibrationPlot",
+    "EllipsoidFit",
+    "NotIdentifiableError",
+    "calibrate",
+]

@@ -156,6 +156,7 @@ def calibrate(
             *_warnings(fit, found, float(rejected.double().mean())),
         ),
         name=usable.name if name is None else name,
+        used=usable,
     )
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
+from mkc_torch._support.html_table import html_table, with_error
 from mkc_torch.calibration.coverage import Coverage, Gap, nearest_axis
 from mkc_torch.calibration.file import (
     CalibrationFileError,
@@ -20,6 +21,7 @@ from mkc_torch.calibration.file import (
     finite_or_none,
     refuse_constant,
 )
+from mkc_torch.calibration.plot import CalibrationPlot
 from mkc_torch.functional import mkc_weight
 from mkc_torch.recording.disturbance import Interval
 from mkc_torch.recording.recording import Recording
@@ -63,6 +65,7 @@ class Calibration:
         coverage: of directions, by the samples in use.
         warnings: sentences about the recording and the fit.
         name: what the sensor is called: the recording's name, unless another was given.
+        used: the samples that it was made from, which the pictures show; None where it was read from a file.
     """
 
     recording: str
@@ -88,6 +91,31 @@ class Calibration:
     coverage: Coverage
     warnings: tuple[str, ...]
     name: str = ""
+    used: Recording | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def plot(self) -> CalibrationPlot:
+        """The pictures of the report as axes of matplotlib, such as ``calibration.plot.residual()``."""
+        return CalibrationPlot(self, self.used)
+
+    def __repr__(self) -> str:
+        return f"Calibration({self.recording!r}, {self.samples} samples: center {self.center} {self.unit})"
+
+    def _repr_html_(self) -> str:
+        c = self
+        rows = [
+            (name, *(with_error(v, e) for v, e in zip(values, errors, strict=True)))
+            for name, values, errors in (
+                ("offset x, y, z", c.center, c.center_se),
+                ("semi-axes, ascending", c.semi_axes, c.semi_axes_se),
+            )
+        ]
+        below = (
+            f"Residual {c.before.robust:.3g} → {c.after.robust:.3g} {c.unit} robust; {100 * c.rejected_share:.1f} % of "
+            f"{c.samples:,} samples rejected; {100 * c.coverage.fraction:.0f} % of all directions covered.",
+            *c.warnings,
+        )
+        return html_table(f"Calibration of {c.recording or 'a recording'}, {c.unit}", ("", "", "", ""), rows, below)
 
     @property
     def rejected_share(self) -> float:

@@ -9,11 +9,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from mkc_torch._words.terms import term
 from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.differences import Differences
 from mkc_torch.report.words import numbers as w
 from mkc_torch.report.words.beside import difference_rows, difference_sentences
-from mkc_torch.report.words.terms import term
 
 
 def show(

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from mkc_torch._support.files import folder_held
-from mkc_torch.report.words.terms import term
+from mkc_torch._words.terms import term
 
 FAILURES = (ValueError, OSError, ImportError, RuntimeError)
 """What bad input, a full disk or a numerical breakdown raises."""

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from mkc_torch._support.files import write_atomically
 from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch._words.terms import term
 from mkc_torch.calibration.calibrate import Calibration, Vector, calibrate
 from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
 from mkc_torch.cli import diagnosis_summary
@@ -25,7 +26,6 @@ from mkc_torch.recording.kept_columns import write_beside
 from mkc_torch.recording.recording import Recording, write_table
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.words.numbers import number
-from mkc_torch.report.words.terms import term
 from mkc_torch.simulation import Magnetometer
 
 if TYPE_CHECKING:

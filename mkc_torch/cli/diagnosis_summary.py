@@ -9,13 +9,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from mkc_torch._words.terms import term
+from mkc_torch._words.typesetting import plain, typeset
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.report.diagnosis import findings as say
 from mkc_torch.report.diagnosis import noise, numbers, unseen, world
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.evidence import rows
-from mkc_torch.report.words.terms import term
-from mkc_torch.report.words.typesetting import plain, typeset
 
 _LABEL = 11  # letters of the longest label
 _MOST_LINES = 6

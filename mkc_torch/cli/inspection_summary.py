@@ -10,10 +10,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from mkc_torch._words.terms import term
 from mkc_torch.cli.recorded import read_magnetometer
 from mkc_torch.recording.formats.base import RecordingError
 from mkc_torch.recording.inspection import FileSeen, SensorSeen, TopicSeen
-from mkc_torch.report.words.terms import term
 
 __all__ = ["as_data", "commands_of", "show"]
 

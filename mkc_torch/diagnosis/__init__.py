@@ -2,7 +2,8 @@
 
 from mkc_torch.diagnosis.diagnose import diagnose
 from mkc_torch.diagnosis.files.model import DiagnosedModel
+from mkc_torch.diagnosis.plot.accessor import DiagnosisPlot
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.settings import Settings
 
-__all__ = ["DiagnosedModel", "Diagnosis", "Settings", "diagnose"]
+__all__ = ["DiagnosedModel", "Diagnosis", "DiagnosisPlot", "Settings", "diagnose"]

@@ -53,14 +53,21 @@ __all__ = [
     "words_of",
 ]
 
-# users' own files import these; what each of them asked for has a default in every effect
+# what each of them asked for has a default in every effect
 AnchoredEffect = Effect
+"""Another name of :class:`Effect`, for files of users that import it."""
 ContinuousEffect = Effect
+"""Another name of :class:`Effect`, for files of users that import it."""
 LastingEffect = Effect
+"""Another name of :class:`Effect`, for files of users that import it."""
 LinearEffect = Effect
+"""Another name of :class:`Effect`, for files of users that import it."""
 NestedEffect = Effect
+"""Another name of :class:`Effect`, for files of users that import it."""
 ShapedEffect = Effect
+"""Another name of :class:`Effect`, for files of users that import it."""
 SignalEffect = Effect
+"""Another name of :class:`Effect`, for files of users that import it."""
 
 CATALOGUE: tuple[Effect, ...] = (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED)
 """All effects; each is tried where a simulation has its port."""

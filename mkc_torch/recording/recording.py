@@ -19,6 +19,7 @@ from mkc_torch.recording.formats import check_ending, encoded
 from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, counted, listed
 from mkc_torch.recording.given_columns import EXPERIMENT, checked_columns, columns_of_frame
 from mkc_torch.recording.reading import ASKED, read_file
+from mkc_torch.recording.shown import Shown
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -28,7 +29,7 @@ __all__ = ["DEFAULT_UNITS", "MissingColumnError", "Recording", "RecordingError",
 _GAP = 10.0  # in median intervals
 
 
-class Recording:
+class Recording(Shown):
     """A table of named columns of equal length: what a sensor, or a simulator, wrote down.
 
     It does not change: each operation gives a new recording, and says in ``warnings`` what it dropped.
@@ -195,9 +196,6 @@ class Recording:
         if name not in self._columns:
             raise _missing(name, self._columns, self._name)
         return self._columns[name]
-
-    def __repr__(self) -> str:
-        return f"Recording({self._name!r}, {len(self)} samples: {', '.join(self._columns)})"
 
     def stack(self, *names: str) -> Float[Tensor, "N k"]:
         """The named columns side by side, as a new tensor.

@@ -1,4 +1,4 @@
-"""How every picture of a report looks, and how it becomes an element of a page."""
+"""How a picture becomes an element of a page."""
 
 from __future__ import annotations
 
@@ -8,33 +8,7 @@ import re
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-__all__ = ["BLUE", "GREY", "INK", "ORANGE", "PALE", "SHADE", "STYLE", "svg"]
-
-# Okabe and Ito's colours, told apart with any colour vision
-BLUE, ORANGE, INK, GREY, PALE = "#0072B2", "#D55E00", "#222222", "#8A8A8A", "#D7DEE4"
-SHADE = "#F3D9C6"
-STYLE = {
-    "font.family": "sans-serif",
-    "font.size": 10.0,
-    "axes.edgecolor": GREY,
-    "axes.labelcolor": INK,
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlesize": 10.5,
-    "axes.titlelocation": "left",
-    "axes.unicode_minus": True,
-    "xtick.color": GREY,
-    "ytick.color": GREY,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "hatch.color": "#D9B79D",
-    "hatch.linewidth": 0.7,
-    "legend.frameon": False,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "mkc",
-    "savefig.transparent": True,
-}
+__all__ = ["svg"]
 
 
 def svg(figure: Figure, name: str, description: str) -> str:

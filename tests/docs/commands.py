@@ -20,6 +20,9 @@ from tests.docs.pages import ROOT
 
 MKC = typer.main.get_command(app).commands
 
+BUILD = ("--config-file", ".zensical.toml")
+"""What the site is built with, beside that nothing may be amiss."""
+
 SMALL = {
     "mkc challenge --output proof": "--cases 1 --empty 1 --duration 10 --workers 1",
     "mkc challenge --family dynamics --output proof_of_dynamics": "--cases 0 --empty 1 --workers 1",
@@ -46,6 +49,7 @@ EXAMPLES = {
     "examples/calibration/passing_magnet.py": "RECORDING.csv --output picture.png",
     "examples/calibration/least_squares_beside.py": "RECORDING.csv ANOTHER.csv",
     "examples/lightning/any_unit.py": "--help",
+    "examples/gallery.py": "--help",  # minutes, on recordings that are not part of the project
     # minutes each, on recordings that are not part of the project
     "examples/concealed_physics/dynamics/heaters.py": "--help",
     "examples/concealed_physics/dynamics/silverbox.py": "--help",
@@ -120,6 +124,8 @@ def run(words: list[str], folder: Path) -> None:
             words = [sys.executable, "-m", "torch.distributed.run", *arguments]
             done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
             assert done.returncode == 0, f"torchrun {shlex.join(arguments)}:\n{done.stdout}\n{done.stderr}"
+        case ["zensical", *arguments]:
+            assert arguments == ["build", "--strict", *BUILD], "test_site.py builds it otherwise"
         case ["cp", source, target]:
             shutil.copy(folder / source, folder / target)
         case _:

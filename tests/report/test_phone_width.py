@@ -10,7 +10,16 @@ import pytest
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
+from mkc_torch.calibration.calibrate import calibrate
+from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.challenge.page import challenge_page
+from mkc_torch.challenge.score import score
+from mkc_torch.challenge.worlds.page import worlds_page
+from mkc_torch.recording.demonstration import simulated_recording
+from mkc_torch.report import Comparison, calibration_report, refusal_report
 from mkc_torch.report.diagnosis.page import diagnosis_report
+from tests.challenge.test_score import NOTHING, finding, key, says
+from tests.challenge.worlds import test_score as of_worlds
 from tests.diagnosis.factory import make_diagnosis, make_follows, make_unfit, make_world, nearest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -34,18 +43,44 @@ document.getElementById("phone").onload = (event) => {{
 }};</script>"""
 
 
-def width_of(page, folder, *, opened):
-    """The width that a page needs where it has that of a telephone, its details open or not."""
-    (folder / "page.html").write_text(page, encoding="utf-8")
-    (folder / "frame.html").write_text(FRAME.format(width=WIDTH, open=str(opened).lower()), encoding="utf-8")
+def dumped(folder):
+    """The frame in a folder as the browser has it in the end."""
     command = [
         CHROMIUM, *FLAGS, f"--user-data-dir={folder / 'profile'}", "--allow-file-access-from-files",
         "--virtual-time-budget=5000", "--dump-dom", (folder / "frame.html").as_uri(),
     ]  # fmt: skip
-    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def width_of(page, folder, *, opened):
+    """The width that a page needs where it has that of a telephone, its details open or not."""
+    (folder / "page.html").write_text(page, encoding="utf-8")
+    (folder / "frame.html").write_text(FRAME.format(width=WIDTH, open=str(opened).lower()), encoding="utf-8")
+    result = dumped(folder)
     found = re.search(r"width (\d+) end", result.stdout)
     assert found, f"{CHROMIUM} measured nothing: {result.stderr[-1000:]}"
     return int(found[1])
+
+
+MANY = """<!doctype html><body style="margin:0">{frames}<p id="told"></p><script>
+window.onload = () => {{
+  const told = [...document.querySelectorAll("iframe")].map((one) =>
+    one.id + " " + one.contentDocument.documentElement.scrollWidth);
+  document.getElementById("told").textContent = "widths " + told.join(", ") + " end";
+}};</script>"""
+
+
+def widths_of(places, folder):
+    """The widths that pages of several places need, measured by one browser."""
+    frames = "".join(
+        f'<iframe id="{name}" src="{place}" style="width:{WIDTH}px;height:900px;border:0"></iframe>'
+        for name, place in places.items()
+    )
+    (folder / "frame.html").write_text(MANY.format(frames=frames), encoding="utf-8")
+    result = dumped(folder)
+    found = re.search(r"widths (.+?) end", result.stdout)
+    assert found, f"{CHROMIUM} measured nothing: {result.stderr[-1000:]}"
+    return {name: int(width) for name, width in (one.rsplit(" ", 1) for one in found[1].split(", "))}
 
 
 def long_names():
@@ -69,6 +104,32 @@ PAGES = {
     "nearest": first_nearest,
     "long names": long_names,
 }
+
+
+def others():
+    """The pages beside the diagnosis: of a calibration, a refusal and the blind proofs, names too long in each."""
+    recording, _ = simulated_recording()
+    named = type(recording)(recording.columns, name=LONG, warnings=(LONG,))
+    row = Comparison(LONG, (12.0, -7.5, 21.0), (45.0, 48.5, 51.5))
+    yield "calibration", calibration_report(calibrate(named), named, note=LONG, comparison=[row])
+    flat = named.rows(range(0, 4500, 5), f"about {LONG}")
+    flat = type(flat)(dict(flat.columns) | {"mag_z": 0.0 * flat["mag_z"]}, name=LONG, warnings=(LONG,))
+    with pytest.raises(NotIdentifiableError) as refused:
+        calibrate(flat)
+    yield "refusal", refusal_report(flat, refused.value)
+    keys = [key(name, kind) for name, kind in (("a", "single"), ("b", "empty"), ("c", "single"), (LONG, "single"))]
+    settings = {"seed": 1, "key_sha256": "0" * 64, "hidden": 3, "empty": 1, LONG: LONG}
+    result = score(keys, {"a": says(finding("hard_iron_step")), "b": NOTHING, "c": says(finding("offset_drift"))})
+    yield "challenge", challenge_page(result, {LONG: result}, keys, settings)
+    yield "worlds", worlds_page(of_worlds.all_kinds(), of_worlds.SETTINGS | {LONG: LONG})
+
+
+def test_no_other_page_needs_more_than_a_telephone_has(tmp_path):
+    places = {}
+    for name, page in others():
+        places[name] = f"{name}.html"
+        (tmp_path / places[name]).write_text(page, encoding="utf-8")
+    assert widths_of(places, tmp_path) == dict.fromkeys(places, WIDTH)
 
 
 @pytest.mark.parametrize("opened", [False, True])

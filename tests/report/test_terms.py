@@ -12,13 +12,13 @@ pytest.importorskip("rich")
 from rich.console import Console
 
 import mkc_torch
+from mkc_torch._words.terms import TERMS, term
 from mkc_torch.cli import diagnosis_summary
 from mkc_torch.report.diagnosis.page import diagnosis_report
-from mkc_torch.report.words.terms import TERMS, term
 from tests.diagnosis.factory import make_diagnosis
 
 PACKAGE = Path(mkc_torch.__file__).parent
-TABLE = PACKAGE / "report" / "words" / "terms.py"
+TABLE = PACKAGE / "_words" / "terms.py"
 REFERENCE = re.compile(r"\[([a-z]+\.[a-z_]+)\]")
 KEY = re.compile(r"""["']([a-z]+\.[a-z_]+)["']""")
 FILES = {"calibration.json", "calibration.page"}  # names of a file and of a module that look like keys
@@ -26,7 +26,7 @@ GROUPS = {key.partition(".")[0] for key in TERMS}
 
 
 def sources():
-    folders = (PACKAGE / "report", PACKAGE / "cli")
+    folders = [PACKAGE / room for room in ("_words", "calibration", "diagnosis", "report", "cli")]
     return [p for folder in folders for p in folder.rglob("*") if p.suffix in (".py", ".j2") and p != TABLE]
 
 

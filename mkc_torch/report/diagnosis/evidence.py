@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from mkc_torch._words.typesetting import typeset
 from mkc_torch.diagnosis.result import Row, Table, Told
-from mkc_torch.report.words.typesetting import typeset
 
 __all__ = ["of_driver", "rows", "tables"]
 

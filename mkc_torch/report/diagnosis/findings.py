@@ -6,14 +6,14 @@ import re
 import unicodedata
 from collections.abc import Collection, Sequence
 
+from mkc_torch._words.terms import term
+from mkc_torch._words.typesetting import plain, several, typeset
 from mkc_torch.diagnosis.result import Alternative, Candidate, Finding, Region
 from mkc_torch.diagnosis.world import Grade
 from mkc_torch.effects import is_curve, words_of
 from mkc_torch.report.diagnosis.evidence import of_driver
 from mkc_torch.report.diagnosis.numbers import Clock, probability
 from mkc_torch.report.words.numbers import number, size
-from mkc_torch.report.words.terms import term
-from mkc_torch.report.words.typesetting import plain, several, typeset
 
 __all__ = [
     "acts_on",

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
+from mkc_torch._support.drawing import ORANGE, array, style
 from mkc_torch._support.unit_text import tidy
+from mkc_torch._words.terms import term
+from mkc_torch.diagnosis.plot.curves import MOST_LETTERS, draw_course, draw_curve, named, short
 from mkc_torch.diagnosis.result import Diagnosis
-from mkc_torch.diagnosis.world import Curve, Forcing
-from mkc_torch.report.diagnosis.panels import MOST_LETTERS, Grid, array, draw_curve, named, short, style, title
-from mkc_torch.report.drawing import BLUE, GREY, ORANGE, svg
-from mkc_torch.report.words.terms import term
+from mkc_torch.diagnosis.world import Curve
+from mkc_torch.report.diagnosis.panels import Grid, title
+from mkc_torch.report.drawing import svg
 
 __all__ = ["of_forcing", "of_shape"]
 
-_MOST_POINTS = 2_000
 _IN_A_ROW = 3
 _MOST_CURVES = 9
-_GAP = 5.0
-"""Times the usual step beyond which two samples are not joined."""
 
 
 def of_forcing(diagnosis: Diagnosis, index: int) -> str:
@@ -30,7 +27,7 @@ def of_forcing(diagnosis: Diagnosis, index: int) -> str:
     grid = Grid(rows, _IN_A_ROW, top=0.35, below=0.72, own_axes=True)
     with style():
         figure = grid.figure()
-        _course(grid.axes(figure, 0, 0, wide=True), forcing, has_time)
+        draw_course(grid.axes(figure, 0, 0, wide=True), forcing, has_time)
         for number, curve in enumerate(curves):
             ax = grid.axes(figure, 1 + number // _IN_A_ROW, number % _IN_A_ROW)
             draw_curve(ax, curve, has_time)
@@ -38,31 +35,6 @@ def of_forcing(diagnosis: Diagnosis, index: int) -> str:
             title(ax, term("picture.over", name=short(curve.driver)))
         _same_height(list(figure.axes[1:]))
         return svg(figure, f"forcing{index + 1}", term("picture.about_forcing"))
-
-
-def _course(ax: Any, forcing: Forcing, has_time: bool) -> None:
-    course = array(forcing.time)
-    time, value, band = (_joined(course, array(one)) for one in (forcing.time, forcing.value, forcing.band))
-    ax.axhline(0.0, color=GREY, lw=0.7, zorder=1)
-    ax.fill_between(time, value - band, value + band, color=BLUE, alpha=0.2, lw=0, zorder=2)
-    ax.plot(time, value, color=BLUE, lw=1.2, zorder=3)
-    ax.margins(x=0.01)
-    ax.set_xlabel(term("picture.time" if has_time else "unit.sample"))
-    ax.set_ylabel(short(tidy(forcing.unit)))
-    ax.locator_params(axis="y", nbins=5)
-    key = "picture.forcing" if forcing.at_rate else "picture.forcing_of_output"
-    title(ax, term(key, place=short(forcing.place)))
-
-
-def _joined(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Of a long course some samples, and nothing between runs, over which a line would lead."""
-    step = max(-(-len(time) // _MOST_POINTS), 1)
-    time, values = time[::step], values[::step].astype(float)
-    steps = np.diff(time)
-    if not len(steps):
-        return values
-    apart = np.flatnonzero((steps <= 0.0) | (steps > _GAP * np.median(steps))) + 1
-    return np.insert(values, apart, np.nan)
 
 
 def _same_height(axes: list[Any]) -> None:

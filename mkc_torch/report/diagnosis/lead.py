@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from mkc_torch._words.terms import term
+from mkc_torch._words.typesetting import capital, plain
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.effects import is_curve
 from mkc_torch.report.diagnosis.findings import acts_on, finding_name, grade, inseparable, rivals, where
@@ -14,8 +16,6 @@ from mkc_torch.report.diagnosis.unseen import better, left, residual_of_all, res
 from mkc_torch.report.diagnosis.verdict import reasons
 from mkc_torch.report.diagnosis.world import noise_lines, output_lines
 from mkc_torch.report.words.numbers import share, size
-from mkc_torch.report.words.terms import term
-from mkc_torch.report.words.typesetting import capital, plain
 
 __all__ = ["Row", "chance", "lead", "residual_alone"]
 

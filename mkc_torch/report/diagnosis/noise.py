@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from mkc_torch._words.terms import term
+from mkc_torch._words.typesetting import plain, several
 from mkc_torch.diagnosis.result import Diagnosis, Noise, Number
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.words.numbers import bandwidth, number, size
-from mkc_torch.report.words.terms import term
-from mkc_torch.report.words.typesetting import plain, several
 
 __all__ = [
     "channel_notes",

@@ -7,10 +7,10 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from mkc_torch._words.terms import term
+from mkc_torch._words.typesetting import plain, superscript
 from mkc_torch.diagnosis.result import Candidate, HeldOut, Number, Parameter, Traces
 from mkc_torch.report.words.numbers import decimals, number, share, size
-from mkc_torch.report.words.terms import term
-from mkc_torch.report.words.typesetting import plain, superscript
 
 __all__ = [
     "Clock",

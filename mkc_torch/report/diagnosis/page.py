@@ -10,6 +10,8 @@ from typing import NamedTuple
 from markupsafe import Markup
 
 from mkc_torch._parallel.pool import shared
+from mkc_torch._words.typesetting import several, typeset
+from mkc_torch.diagnosis.plot.curves import CURVE_COLORS
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability
 from mkc_torch.report.diagnosis import (
     evidence,
@@ -23,10 +25,8 @@ from mkc_torch.report.diagnosis import (
     verdict,
     world,
 )
-from mkc_torch.report.diagnosis.panels import CURVE_COLORS
 from mkc_torch.report.rendering import render
 from mkc_torch.report.words.markup import marked, unbroken
-from mkc_torch.report.words.typesetting import several, typeset
 
 __all__ = ["Bar", "Cell", "bars", "diagnosis_report", "heat_map"]
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
+from mkc_torch._words.terms import term
+from mkc_torch._words.typesetting import plain
 from mkc_torch.diagnosis.findings.worth import SMALL, change, confirmation
 from mkc_torch.diagnosis.result import Diagnosis, HeldOut, Sizes
 from mkc_torch.diagnosis.world import World
 from mkc_torch.report.diagnosis.numbers import improvement
 from mkc_torch.report.words.numbers import size
-from mkc_torch.report.words.terms import term
-from mkc_torch.report.words.typesetting import plain
 
 __all__ = ["better", "left", "residual_of_all", "residuals"]
 

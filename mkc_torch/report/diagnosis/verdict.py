@@ -7,14 +7,14 @@ import re
 from collections.abc import Sequence
 from typing import Literal
 
+from mkc_torch._words.terms import term
+from mkc_torch._words.typesetting import capital, plain, several
 from mkc_torch.diagnosis.findings.advice import nothing_shows
 from mkc_torch.diagnosis.findings.following import follows_all
 from mkc_torch.diagnosis.findings.worth import carries_over, small, worth_correcting
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.report.diagnosis.findings import finding_name, inseparable, rivals, unrecorded, with_names
 from mkc_torch.report.words.numbers import size
-from mkc_torch.report.words.terms import term
-from mkc_torch.report.words.typesetting import capital, plain, several
 
 __all__ = ["Tone", "apply_command", "headline", "left_in_short", "left_open", "reasons", "to_do", "tone", "warned"]
 

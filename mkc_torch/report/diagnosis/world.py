@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 from mkc_torch._support.unit_text import tidy
+from mkc_torch._words.terms import term
+from mkc_torch._words.typesetting import plain
 from mkc_torch.diagnosis.result import Diagnosis, Table
 from mkc_torch.diagnosis.world import Follows, Push, World
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.words.numbers import number, size
-from mkc_torch.report.words.terms import term
-from mkc_torch.report.words.typesetting import plain
 
 __all__ = [
     "between_sentence",

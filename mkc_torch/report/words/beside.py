@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from mkc_torch._words.terms import term
 from mkc_torch.calibration.differences import LEVEL, Difference, Differences
 from mkc_torch.report.words.numbers import decimals, in_power, number, power, share, size, with_errors
-from mkc_torch.report.words.terms import term
 
 __all__ = ["difference_rows", "difference_sentences"]
 

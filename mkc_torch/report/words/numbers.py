@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from mkc_torch._words.terms import term
 from mkc_torch.calibration.calibrate import Calibration, Spread
 from mkc_torch.recording.disturbance import Interval
-from mkc_torch.report.words.terms import term
 
 _MOST_DECIMALS = 9
 _LEAST, _MOST = 0.01, 1e6

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from mkc_torch.report.words.terms import term
+from mkc_torch._words.terms import term
 
 __all__ = ["capital", "plain", "several", "superscript", "typeset"]
 

@@ -1,0 +1,270 @@
+"""``diagnosis.plot``: each picture of the report on axes of matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from mkc_torch._support.drawing import BLUE, GREY, ORANGE, array, axes_or_new
+from mkc_torch._support.unit_text import tidy
+from mkc_torch._words.terms import term
+from mkc_torch._words.typesetting import capital, plain
+from mkc_torch.diagnosis.parts import Candidate, Finding, Separability, Traces
+from mkc_torch.diagnosis.plot.curves import MOST_LETTERS, draw_course, draw_curve, draw_map, named, of_time, short
+from mkc_torch.diagnosis.plot.residual import (
+    MOMENTS,
+    acting_channels,
+    draw_floor,
+    draw_residual,
+    mark_findings,
+    of_channel,
+)
+from mkc_torch.diagnosis.world import World
+from mkc_torch.effects import words_of
+
+__all__ = ["DiagnosisPlot"]
+
+_MOST_SHOWN = 12
+
+
+class DiagnosisPlot:
+    """The pictures of a diagnosis. Each method draws on ``ax``, or on a new figure of pyplot, and returns the axes.
+
+    Needs matplotlib, which the extra ``cli`` has. What is not there to be drawn is a ValueError that says so; axes that
+    are none a TypeError.
+
+    Example:
+        >>> import torch
+        >>> from matplotlib import pyplot
+        >>> from mkc_torch import Recording, diagnose
+        >>> from mkc_torch.simulation import Static
+        >>> time = torch.arange(100) / 10.0
+        >>> noise = 0.01 * torch.randn(100, generator=torch.Generator().manual_seed(0))
+        >>> recording = Recording({"time": time, "heat": torch.sin(time), "voltage": 2.0 * torch.sin(time) + noise})
+        >>> line = Static(torch.nn.Linear(1, 1), inputs=("heat",), outputs=("voltage",))
+        >>> axes = diagnose(line, recording, effects=(), surrogates=19).plot.residual()
+        >>> axes.get_xlabel(), axes.get_title()
+        ('time (s)', 'Residual, voltage')
+        >>> pyplot.close(axes.figure)
+    """
+
+    def __init__(
+        self,
+        traces: Traces,
+        findings: tuple[Finding, ...],
+        candidates: tuple[Candidate, ...],
+        separability: Separability,
+        world: World,
+    ) -> None:
+        self._traces, self._findings, self._candidates = traces, findings, candidates
+        self._separability, self._world = separability, world
+
+    def residual(self, channel: int | str = 0, *, corrected: bool | None = None, ax: Any = None) -> Any:
+        """Recording less simulation over time, in the unit of the output, with the findings' moments and intervals.
+
+        Samples in use are blue, rejected ones orange; the black line is their mean, those to either side their root
+        mean square. Of the corrected simulation the residual before stands behind, dashed. Dotted is the sensor's
+        noise floor.
+
+        Args:
+            channel: number or name of an output.
+            corrected: with the findings in the simulation; default where there are any.
+            ax: axes of matplotlib.
+
+        Raises:
+            ValueError: there is no such channel, or nothing was found that could correct the simulation.
+        """
+        t, which = self._traces, self._channel(channel)
+        after = bool(self._findings) if corrected is None else corrected
+        if after and not self._findings:
+            raise ValueError("Expected argument `corrected` to be False: nothing was found that corrects it.")
+        ax = axes_or_new(ax)
+        mark_findings(ax, self._findings)
+        draw_residual(ax, t, array(t.time), which, after=after)
+        floor = [one.noise_floor for one in self._world.follows if one.output == t.channels[which]]
+        draw_floor(ax, floor[0] if floor else None)
+        ax.set_title(of_channel(MOMENTS[after] if self._findings else "label.residual", t.channels[which]))
+        ax.set_xlabel(of_time(t.has_time))
+        return ax
+
+    def over_driver(
+        self,
+        finding: int = 0,
+        *,
+        driver: str | None = None,
+        channel: int | str | None = None,
+        corrected: bool = True,
+        ax: Any = None,
+    ) -> Any:
+        """The residual over what drives a finding, in the units of both; colours as in :meth:`residual`.
+
+        Args:
+            finding: its number, from 0.
+            driver: a recorded column; default the finding's first.
+            channel: number or name of an output; default the one that the finding changes most.
+            corrected: with the findings in the simulation.
+            ax: axes of matplotlib.
+
+        Raises:
+            ValueError: there is no such finding, channel or column, or the finding has no recorded driver.
+        """
+        t, found = self._traces, self._finding(finding)
+        known = [name for name in found.drivers if name in t.drivers]
+        name = driver if driver is not None else (known[0] if known else None)
+        if name is None:
+            raise ValueError(f"Finding {finding}, {words_of(found.effect)}, has no recorded driver to draw it over.")
+        if name not in t.drivers:
+            there = ", ".join(t.drivers) or "none"
+            raise ValueError(
+                f"Expected argument `driver` to be a recorded column but got {name!r}; there are: {there}."
+            )
+        which = acting_channels(t, found)[0] if channel is None else self._channel(channel)
+        ax = axes_or_new(ax)
+        draw_residual(ax, t, array(t.drivers[name]), which, after=corrected)
+        ax.set_title(of_channel(MOMENTS[corrected], t.channels[which]))
+        ax.set_xlabel(named(name, t.driver_units.get(name, "")))
+        return ax
+
+    def effect(self, finding: int = 0, ax: Any = None) -> Any:
+        """The curve of a finding over what drives it, a colour a channel, with the band in which it lies with 95 %.
+
+        Raises:
+            ValueError: there is no such finding, or it has no curve.
+        """
+        found = self._finding(finding)
+        if found.curve is None:
+            raise ValueError(f"Finding {finding}, {words_of(found.effect)}, has no curve to draw.")
+        ax = axes_or_new(ax)
+        draw_curve(ax, found.curve, self._traces.has_time, most=2 * MOST_LETTERS)
+        ax.set_title(term("picture.curve_of", effect=capital(words_of(found.effect))))
+        if len(found.curve.channels) > 1:
+            ax.legend(frameon=False)
+        return ax
+
+    def gain_map(self, finding: int = 0, ax: Any = None) -> Any:
+        """Where in the plane of two states the gain of a finding arises, in nats a cell.
+
+        Raises:
+            ValueError: there is no such finding, or it has no map: the simulation has fewer than two states.
+        """
+        found = self._finding(finding)
+        if found.map is None:
+            raise ValueError(f"Finding {finding}, {words_of(found.effect)}, has no map over two states to draw.")
+        ax = axes_or_new(ax)
+        draw_map(ax, found.map)
+        return ax
+
+    def held_out(self, ax: Any = None) -> Any:
+        """What each finding gains on blocks that the fit has not seen, in nats a sample, with its 95 % interval.
+
+        Raises:
+            ValueError: there is no finding whose gain was measured.
+        """
+        known = [(f, f.held_out) for f in self._findings if f.held_out is not None]
+        if not known:
+            raise ValueError("There is no finding whose gain on unseen blocks was measured.")
+        ax = axes_or_new(ax)
+        ax.axvline(0.0, color=GREY, lw=0.7, zorder=1)
+        for row, (_, held) in enumerate(known):
+            ax.plot(held.confidence_interval, (row, row), color=BLUE, lw=2.2, solid_capstyle="butt")
+            ax.plot(held.log_likelihood_gain, row, "o", color=BLUE, ms=6)
+        _rows(ax, [_with_drivers(f.effect, f.drivers) for f, _ in known])
+        ax.set_xlabel(term("picture.gain"))
+        ax.set_title(term("picture.held_out"))
+        return ax
+
+    def candidates(self, most: int = _MOST_SHOWN, ax: Any = None) -> Any:
+        """What the leading candidates of the search gain, in nats; those that became findings in orange.
+
+        Args:
+            most: of how many at the most.
+            ax: axes of matplotlib.
+
+        Raises:
+            ValueError: there are no candidates, or ``most`` is less than one.
+        """
+        if isinstance(most, bool) or most < 1:
+            raise ValueError(f"Expected argument `most` to be at least 1 but got {most}; 12 is what the report shows.")
+        if not self._candidates:
+            raise ValueError("There are no candidates to draw: none was tried.")
+        shown = sorted(self._candidates[:most], key=lambda one: -one.log_likelihood_gain)
+        found = {(finding.effect, finding.drivers) for finding in self._findings}
+        ax = axes_or_new(ax)
+        for row, one in enumerate(shown):
+            color = ORANGE if (one.effect, one.drivers) in found else BLUE
+            ax.barh(row, max(one.log_likelihood_gain, 0.0), color=color, height=0.66)
+        _rows(ax, [_with_drivers(one.effect, one.drivers) for one in shown])
+        ax.set_xlabel(term("table.gain"))
+        ax.set_title(term("section.candidates"))
+        return ax
+
+    def separability(self, most: int = _MOST_SHOWN, ax: Any = None) -> Any:
+        """What is left of each row's candidate once that of the column may take over what it can: 0 is inseparable.
+
+        Args:
+            most: of how many candidates at the most.
+            ax: axes of matplotlib.
+
+        Raises:
+            ValueError: there are no candidates to compare, or ``most`` is less than one.
+        """
+        if isinstance(most, bool) or most < 1:
+            raise ValueError(f"Expected argument `most` to be at least 1 but got {most}; 12 is what the report shows.")
+        labels = [_label(one) for one in self._separability.labels[:most]]
+        if not labels:
+            raise ValueError("There are no candidates to compare.")
+        share = array(self._separability.share)[: len(labels), : len(labels)].copy()
+        ax = axes_or_new(ax)
+        drawn = ax.imshow(share, cmap="cividis", vmin=0.0, vmax=1.0)
+        ax.set_xticks(range(len(labels)), labels, rotation=45, ha="right", rotation_mode="anchor")
+        ax.set_yticks(range(len(labels)), labels)
+        ax.figure.colorbar(drawn, ax=ax).ax.set_ylabel(term("picture.left"))
+        ax.set_title(term("section.separability"))
+        return ax
+
+    def forcing(self, index: int = 0, ax: Any = None) -> Any:
+        """The course of what pushes a rate unrecorded, or is added to an output, with its 95 % band, in its unit.
+
+        Raises:
+            ValueError: there is no such forcing.
+        """
+        known = self._world.forcing
+        _check_number("index", index, len(known), "forcing was found")
+        ax = axes_or_new(ax)
+        draw_course(ax, known[index], self._traces.has_time)
+        ax.set_ylabel(named(term("picture.push"), tidy(known[index].unit)))
+        return ax
+
+    def _finding(self, number: int) -> Finding:
+        _check_number("finding", number, len(self._findings), "finding was made")
+        return self._findings[number]
+
+    def _channel(self, channel: int | str) -> int:
+        names = self._traces.channels
+        if isinstance(channel, str):
+            if channel not in names:
+                raise ValueError(f"Expected argument `channel` to be one of {', '.join(names)} but got {channel!r}.")
+            return names.index(channel)
+        _check_number("channel", channel, len(names), "channel is there")
+        return channel
+
+
+def _check_number(argument: str, number: int, count: int, what: str) -> None:
+    if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < count:
+        there = f"no {what}" if count == 0 else f"1 {what}: 0" if count == 1 else f"they are 0 to {count - 1}"
+        raise ValueError(f"Expected argument `{argument}` to be the number of one, but got {number!r}; {there}.")
+
+
+def _with_drivers(effect: str, drivers: Sequence[str]) -> str:
+    return words_of(effect) + (f" ({', '.join(short(name) for name in drivers)})" if drivers else "")
+
+
+def _label(label: str) -> str:
+    effect, space, rest = label.partition(" ")
+    return words_of(plain(effect)) + space + plain(rest)
+
+
+def _rows(ax: Any, names: Sequence[str]) -> None:
+    """A name a row, the first at the top."""
+    ax.set_yticks(range(len(names)), names)
+    ax.set_ylim(len(names) - 0.4, -0.6)

@@ -1,0 +1,103 @@
+"""Curves of effects and courses of forcings with their bands, the map of a gain, and names of axes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mkc_torch._support.drawing import BLUE, GREY, INK, ORANGE, array
+from mkc_torch._support.unit_text import tidy
+from mkc_torch._words.terms import term
+from mkc_torch._words.typesetting import plain
+from mkc_torch.diagnosis.parts import StateMap
+from mkc_torch.diagnosis.world import Curve, Forcing
+
+__all__ = ["CURVE_COLORS", "MOST_LETTERS", "draw_course", "draw_curve", "draw_map", "named", "of_time", "short"]
+
+CURVE_COLORS = (BLUE, ORANGE, "#009E73", "#A8558A", "#B58900", INK)
+MOST_LETTERS = 26
+_MOST_POINTS = 2_000
+_GAP = 5.0
+"""Times the usual step beyond which two samples are not joined."""
+_NEVER = "#E3E3E3"
+
+
+def draw_curve(ax: Any, curve: Curve, has_time: bool, most: int = MOST_LETTERS) -> None:
+    """A curve with its band, a colour a channel, over what drives it."""
+    x, value, band = array(curve.x), array(curve.value), array(curve.band)
+    ax.axhline(0.0, color=GREY, lw=0.7, zorder=1)
+    for i in range(value.shape[1]):
+        color = CURVE_COLORS[i % len(CURVE_COLORS)]
+        label = short(curve.channels[i]) if i < len(curve.channels) else None
+        ax.fill_between(x, value[:, i] - band[:, i], value[:, i] + band[:, i], color=color, alpha=0.18, lw=0)
+        ax.plot(x, value[:, i], color=color, lw=1.6, label=label)
+    ax.margins(x=0.01)
+    sampled = curve.driver == "time" and not has_time
+    ax.set_xlabel(term("unit.sample") if sampled else named(curve.driver, curve.unit, most))
+    ax.set_ylabel(named(term("finding.effect"), curve.value_unit))
+    ax.locator_params(axis="x", nbins=6)
+    ax.locator_params(axis="y", nbins=5)
+
+
+def draw_course(ax: Any, forcing: Forcing, has_time: bool) -> None:
+    """What pushes a rate, or is added to an output, over time with its band."""
+    course = array(forcing.time)
+    time, value, band = (_joined(course, array(one)) for one in (forcing.time, forcing.value, forcing.band))
+    ax.axhline(0.0, color=GREY, lw=0.7, zorder=1)
+    ax.fill_between(time, value - band, value + band, color=BLUE, alpha=0.2, lw=0, zorder=2)
+    ax.plot(time, value, color=BLUE, lw=1.2, zorder=3)
+    ax.margins(x=0.01)
+    ax.set_xlabel(of_time(has_time))
+    ax.set_ylabel(short(tidy(forcing.unit)))
+    ax.locator_params(axis="y", nbins=5)
+    key = "picture.forcing" if forcing.at_rate else "picture.forcing_of_output"
+    ax.set_title(term(key, place=short(forcing.place)))
+
+
+def _joined(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Of a long course some samples, and nothing between runs, over which a line would lead."""
+    step = max(-(-len(time) // _MOST_POINTS), 1)
+    time, values = time[::step], values[::step].astype(float)
+    steps = np.diff(time)
+    if not len(steps):
+        return values
+    apart = np.flatnonzero((steps <= 0.0) | (steps > _GAP * np.median(steps))) + 1
+    return np.insert(values, apart, np.nan)
+
+
+def draw_map(ax: Any, found: StateMap, beside: Any = None) -> None:
+    """Nats gained or lost in each cell of two states, and their scale on axes beside it or taken from it."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    # pictures are transparent, so a ground of that colour would be lost
+    gain = LinearSegmentedColormap.from_list("gain", [ORANGE, "#FFFFFF", BLUE]).with_extremes(bad=_NEVER)
+    nats = array(found.nats)
+    shown = np.sign(nats) * np.sqrt(np.abs(nats))  # by the root: a few cells hold most
+    limit = float(np.nanmax(np.abs(shown)))
+    x, y = (array(edge) for edge in found.edges)
+    drawn = ax.pcolormesh(x, y, shown.T, cmap=gain, vmin=-limit, vmax=limit, rasterized=True)
+    for axis, name, unit in zip((ax.xaxis, ax.yaxis), found.states, found.units, strict=True):
+        axis.set_label_text(named(name, unit))
+    ax.set_title(term("picture.map"))
+    bar = ax.figure.colorbar(drawn, cax=beside, ax=None if beside is not None else ax)
+    bar.ax.set_ylim(min(0.0, float(np.nanmin(shown))), limit)
+    ticks = [tick for tick in bar.get_ticks() if bar.ax.get_ylim()[0] <= tick <= limit]
+    bar.set_ticks(ticks, labels=[f"{np.sign(tick) * tick**2:.3g}".replace("-", "−") for tick in ticks])
+    bar.ax.set_ylabel(term("unit.nats"))
+
+
+def of_time(has_time: bool) -> str:
+    """The name of an axis of time."""
+    return term("picture.time" if has_time else "unit.sample")
+
+
+def named(name: str, unit: str, most: int = MOST_LETTERS) -> str:
+    """A name with its unit, as an axis has it."""
+    return f"{short(name, most)} ({short(unit)})" if unit else short(name, most)
+
+
+def short(text: str, most: int = MOST_LETTERS) -> str:
+    """A text from a file, cut where there is no room."""
+    told = plain(text)
+    return told if len(told) <= most else told[: most - 1] + "…"

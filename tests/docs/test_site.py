@@ -1,0 +1,116 @@
+"""The manual as a site: it builds without a warning, fetches nothing, and has a place for every public name."""
+
+import importlib
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+from importlib.util import find_spec
+
+import pytest
+
+from tests.docs.commands import BUILD
+from tests.docs.pages import PAGES, ROOT
+
+API = ROOT / "docs" / "api"
+ROOMS = re.findall(r"^::: (\S+)\n(?! )", "\n".join(page.read_text(encoding="utf-8") for page in API.glob("*.md")), re.M)
+LOADS = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source": "src", "object": "data"}
+
+
+def public():
+    """The public rooms, as the page on architecture has them."""
+    text = " ".join((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split())
+    told = re.search(r"Public names are those of (.+?); a name with an underscore", text)[1]
+    return [name if name.startswith("mkc_torch") else f"mkc_torch{name}" for name in re.findall(r"`(.+?)`", told)]
+
+
+class Page(HTMLParser):
+    """The ids of a page, and what a browser loads of its own accord."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.ids, self.loads = set(), set()
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.ids.add(found.get("id"))
+        if tag in LOADS and found.get("rel") not in ("canonical", "prev", "next"):
+            self.loads.add(found.get(LOADS[tag]) or "")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The pages as built from a copy, for the command writes beside its sources."""
+    if find_spec("zensical") is None or find_spec("mkdocstrings_handlers") is None:
+        pytest.skip("the extra `docs` is not installed")
+    folder = tmp_path_factory.mktemp("site")
+    shutil.copytree(ROOT / "docs", folder / "docs")
+    shutil.copy(ROOT / ".zensical.toml", folder)
+    (folder / "mkc_torch").symlink_to(ROOT / "mkc_torch")
+    words = [sys.executable, "-m", "zensical", "build", "--strict", *BUILD]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=300, check=False)
+    told = re.sub(r"\x1b\[[\d;]*m", "", done.stdout + done.stderr)
+    assert done.returncode == 0, told
+    assert "griffe:" not in told, told  # an argument that is explained and not there
+    return folder / "build" / "site"
+
+
+def test_every_public_room_has_a_page():
+    assert {*public(), "mkc_torch.density", "mkc_torch.challenge", "mkc_torch.report"} == {"mkc_torch", *ROOMS}
+    assert len(ROOMS) == len(set(ROOMS))
+
+
+def test_every_page_is_in_the_navigation():
+    told = set(re.findall(r'"([\w/]+\.md)"', (ROOT / ".zensical.toml").read_text(encoding="utf-8")))
+    assert told == {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+
+
+def test_pictures_are_small_and_shown():
+    kept = {path.name: path.stat().st_size for path in (ROOT / "docs" / "pictures").iterdir()}
+    assert {name: size for name, size in kept.items() if size > 100_000} == {}
+    shown = {name for page in PAGES[1:] for name in re.findall(r"\(pictures/(.+?)\)", page.read_text(encoding="utf-8"))}
+    assert shown == set(kept)
+
+
+def test_every_public_name_has_a_place(site):
+    pytest.importorskip("lightning")
+    ids = set().union(*(Page(path).ids for path in (site / "api").glob("*.html")))
+    names = {f"{room}.{name}" for room in ("mkc_torch", *ROOMS) for name in importlib.import_module(room).__all__}
+    assert len(names) > 150
+    assert names - ids == set()
+
+
+def test_the_parts_of_a_docstring_are_told_apart(site):
+    page = (site / "api" / "losses.html").read_text(encoding="utf-8")
+    assert "Example:" not in page  # read as a section, and so set as code
+    assert ":class:" not in page
+    for name in ("input", "target"):  # explained together, listed each
+        assert re.search(rf"<b><code>{name}</code></b>|<code>{name}</code>", page)
+
+
+def test_pictures_are_there_and_nothing_is_fetched(site):
+    for path in site.rglob("*.html"):
+        for target in Page(path).loads:
+            assert "://" not in target, f"{path.name} loads {target}"
+            # the page for what is not found is shown at any address
+            if path.name != "404.html" and target and not target.startswith("data:"):
+                place = (path.parent / target.partition("?")[0].partition("#")[0]).resolve()
+                assert place.exists(), f"{path.name}: {target}"
+
+
+def test_style_sheets_name_no_other_place(site):
+    for path in site.rglob("*.css"):
+        assert not re.search(r"url\(\s*[\"']?https?:|@import", path.read_text(encoding="utf-8")), path.name
+
+
+def test_no_page_needs_more_than_a_telephone_has(site):
+    width = pytest.importorskip("tests.report.test_phone_width")
+    if width.CHROMIUM is None:
+        pytest.skip("no chromium on this machine: widths are not measured")
+    pages = [path.relative_to(site).as_posix() for path in [*site.glob("*.html"), *(site / "api").glob("l*.html")]]
+    pages.remove("404.html")
+    assert len(pages) > 15
+    found = width.widths_of({page: page for page in pages}, site)
+    assert {page: needed for page, needed in found.items() if needed > width.WIDTH} == {}

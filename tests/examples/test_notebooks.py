@@ -1,0 +1,57 @@
+"""The notebooks run as they stand, on simulated recordings, and are kept without what a machine printed."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "examples" / "notebooks").glob("*.ipynb"))
+each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+def test_there_is_one_for_each_kind_of_user():
+    assert [path.stem for path in NOTEBOOKS] == ["network", "sensor", "simulation"]
+
+
+@each_notebook
+def test_nothing_of_a_run_is_kept(path):
+    text = path.read_text(encoding="utf-8")
+    content = json.loads(text)
+    for cell in content["cells"]:
+        assert not cell.get("outputs")
+        assert cell.get("execution_count") is None
+    assert not re.search(r"/(home|root|tmp|work|Users)/|[A-Z]:\\", text)
+    assert set(content["metadata"]) == {"kernelspec", "language_info"}
+
+
+@each_notebook
+def test_every_cell_runs(path, tmp_path, monkeypatch):
+    """As plain Python in this process, which spares a kernel; what the cells assert is asserted."""
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": path.stem}
+    try:
+        for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+            if cell["cell_type"] == "code":
+                exec(compile("".join(cell["source"]), path.name, "exec"), names)
+        assert len(pyplot.get_fignums()) >= 1
+    finally:
+        pyplot.close("all")
+
+
+@pytest.mark.slow
+@each_notebook
+def test_a_kernel_shows_pictures_and_tables(path, tmp_path):
+    nbformat, client = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    pytest.importorskip("matplotlib")
+    notebook = nbformat.read(path, as_version=4)
+    client.NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) >= 2
+    if path.stem != "network":  # recordings and results show themselves as tables
+        assert sum("<table" in output.get("data", {}).get("text/html", "") for output in outputs) == 2
+    told = "".join(output.get("text", "") for output in outputs if output.output_type == "stream")
+    assert told
+    assert "Warning" not in told
