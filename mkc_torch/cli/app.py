@@ -14,6 +14,7 @@ from mkc_torch.cli.calibrate import calibrate
 from mkc_torch.cli.challenge import challenge
 from mkc_torch.cli.demo import demo
 from mkc_torch.cli.diagnose import diagnose
+from mkc_torch.cli.new import new_effect, new_simulation
 
 __all__ = ["app"]
 
@@ -60,3 +61,5 @@ app.command()(calibrate)
 app.command()(apply)
 app.command()(challenge)
 app.command()(demo)
+app.command()(new_simulation)
+app.command()(new_effect)

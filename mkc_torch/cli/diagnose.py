@@ -25,7 +25,16 @@ from mkc_torch.cli.console import (
     progress,
     refuse_same_names,
 )
-from mkc_torch.cli.diagnosis_request import BETWEEN, LEVEL, MAGNETOMETER, SIMULATIONS, SURROGATES, Outcome, Request
+from mkc_torch.cli.diagnosis_request import (
+    BETWEEN,
+    LEVEL,
+    MAGNETOMETER,
+    SIMULATIONS,
+    SURROGATES,
+    Outcome,
+    Request,
+    is_file_of_a_simulation,
+)
 from mkc_torch.cli.loading import loading
 
 
@@ -36,7 +45,8 @@ def diagnose(
         str | None,
         typer.Option(
             metavar="NAME",
-            help=f"What they are compared with: {', '.join(SIMULATIONS)}, or FILE.py:CLASS, whose code is run.",
+            help=f"What they are compared with: {', '.join(SIMULATIONS)} (default where mag_x, mag_y and mag_z are "
+            "there), FILE.py:CLASS, or MODEL.fmu; the code in either file is run.",
         ),
     ] = None,
     simulated: Annotated[
@@ -135,6 +145,8 @@ def _waited_for(result: Callable[[], list[Outcome]], path: Path) -> list[Outcome
 
 def _tell(outcomes: list[Outcome], step: Steps) -> None:
     with step.aside():
+        for note in dict.fromkeys(outcome.note for outcome in outcomes if outcome.note):
+            err().print(f"mkc: {note}", soft_wrap=True)
         for outcome in outcomes:
             if outcome.failed:
                 err().print(f"mkc: {outcome.text}", soft_wrap=True)
@@ -143,20 +155,22 @@ def _tell(outcomes: list[Outcome], step: Steps) -> None:
 
 
 def _known(simulation: str | None, simulated: Path | None) -> str:
-    if (simulation is None) == (simulated is None):
+    if simulation is not None and simulated is not None:
         raise typer.BadParameter(
             "give one of --simulation and --simulated: a simulation's name, or the table that one wrote."
         )
-    if simulation is not None and simulation not in SIMULATIONS and ".py:" not in simulation:
+    if simulation is not None and simulation not in SIMULATIONS and not is_file_of_a_simulation(simulation):
         raise typer.BadParameter(
             f'--simulation "{simulation}" is not known; known: {", ".join(SIMULATIONS)}. Name one of them, or one of '
-            "your own as FILE.py:CLASS."
+            "your own as FILE.py:CLASS or MODEL.fmu."
         )
     return simulation or ""
 
 
 def _refuse_unusable(request: Request, simulation_of: Callable[[Request], object]) -> None:
     """Said once, before anything is written, and not again for each recording."""
+    if request.undecided:
+        return
     try:
         simulation_of(request)
     except FAILURES as error:
@@ -180,7 +194,7 @@ def _unit(unit: str | None, simulation: str | None) -> str:
         return "µT"
     if not unit.strip():
         raise typer.BadParameter("--unit is empty; name the unit, such as counts.")
-    if simulation != MAGNETOMETER:
+    if simulation not in (None, MAGNETOMETER):
         raise typer.BadParameter(
             "--unit is that of a magnetometer's columns; a simulation of your own says its units in its `units`."
         )

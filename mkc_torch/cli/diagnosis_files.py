@@ -6,13 +6,14 @@ import re
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkc_torch._support.files import claim_folder, write_atomically
 from mkc_torch.cli.console import FAILURES, Look, folder_removed_on_failure, sentence_of, with_unit
-from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request
+from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request, is_file_of_a_simulation
 from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.diagnosis.files.python_source import SourceError
@@ -33,6 +34,7 @@ __all__ = [
 ]
 
 _EXPERIMENT = "experiment"
+_FIELD = ("mag_x", "mag_y", "mag_z")
 WRITTEN = ("diagnosis.json", "model.json", "corrected.py", "report.html")
 
 
@@ -46,6 +48,7 @@ def diagnose_file(
     """
     try:
         recording = Recording.read(path, columns=request.columns)
+        request, note = _decided(request, recording)
         simulation = simulation_of(request)
         if request.simulated is None and request.simulation == MAGNETOMETER:
             recording = with_unit(recording, request.unit)
@@ -60,7 +63,21 @@ def diagnose_file(
             outcomes.append(_outcome(path, label, simulation, part, place, request, look, told))
         if all(outcome.failed for outcome in outcomes):
             _remove_if_empty(folder)
-    return outcomes
+    return [replace(outcome, note=note) for outcome in outcomes]
+
+
+def _decided(request: Request, recording: Recording) -> tuple[Request, str]:
+    """The request with a simulation, by the recording's columns where none is named, and what to say of that."""
+    if not request.undecided:
+        return request, ""
+    if not all(name in recording for name in _FIELD):
+        raise ValueError(
+            "give one of --simulation and --simulated: without them a recording is compared with the magnetometer, "
+            f"but this one has no columns {', '.join(_FIELD)}; it has {', '.join(recording.names)}. If it is of a "
+            "magnetometer, say what these are called, --columns mag_x=NAME,mag_y=NAME,mag_z=NAME."
+        )
+    note = f"no --simulation is given; {', '.join(_FIELD)} are there, so it is `--simulation {MAGNETOMETER}`."
+    return replace(request, simulation=MAGNETOMETER), note
 
 
 def _tell(step: Callable[[str], None] | None, subject: str, stage: str) -> None:
@@ -82,7 +99,7 @@ def write_diagnosis(
     if diagnosis.model is not None:
         texts["model.json"] = diagnosis.model.to_json()
         with suppress(SourceError):
-            texts["corrected.py"] = diagnosis.model.to_python()
+            texts["corrected.py"] = diagnosis.model.to_python(folder=folder)
     for name in {"model.json", "corrected.py"} - set(texts):
         (folder / name).unlink(missing_ok=True)  # an old one would be taken for this diagnosis' own
     if report:
@@ -149,7 +166,7 @@ def _outcome(
             progress("writing the report")
             files = write_diagnosis(diagnosis, folder, force=request.force, report=request.report)
     except Exception as error:
-        own = raised_in(request.simulation, error) if ".py:" in request.simulation else None
+        own = raised_in(request.simulation, error) if is_file_of_a_simulation(request.simulation) else None
         return _failed(path, label, own or error)
     return Outcome(look.set(lambda console: show(console, diagnosis, files)), failed=False)
 
