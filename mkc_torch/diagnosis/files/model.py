@@ -350,7 +350,8 @@ def refuse_unknown(name: str, simulation: Simulation | None) -> None:
     if simulation is None and name != Magnetometer.name:
         raise ValueError(
             f'the model is of the simulation "{name}", which is not this package\'s own: no code is run because a '
-            f"model's file names it. Give it with `--simulation FILE.py:{name}` (in Python `simulation=`)."
+            f"model's file names it. Give it with `--simulation FILE.py:{name}`, or the FMU that was diagnosed "
+            "(in Python `simulation=`)."
         )
     if simulation is not None and simulation.name != name:
         raise ValueError(f'the model is of the simulation "{name}" but "{simulation.name}" was given.')

@@ -13,6 +13,7 @@ from mkc_torch.simulation.dynamics.definition import Dynamics
 from mkc_torch.simulation.dynamics.ports import memory_at
 from mkc_torch.simulation.dynamics.surroundings import surroundings
 from mkc_torch.simulation.dynamics.user_functions import kinematic
+from mkc_torch.simulation.fmu import is_of_an_fmu
 from mkc_torch.simulation.load import file_of
 from mkc_torch.simulation.parameter import Parameter
 
@@ -25,7 +26,6 @@ __all__ = ["SourceError", "python_source"]
 
 _DIGITS = 9
 """Significant digits of a number in the source."""
-_BASE_CLASS = "from mkc_torch.simulation import base_class"
 _FROM_HERE: Mapping[str, str] = {
     "lagged(": "from mkc_torch.effects import lagged",
     "played(": "from mkc_torch.effects import played",
@@ -84,12 +84,12 @@ def python_source(
         *_sensed(outputs),
     ]
     text = "\n".join(body)
-    loaded = None if module or folder is None else _loaded(kind, folder)
+    loaded = None if module else _loaded(kind, folder)
     base = loaded or f"from {module or kind.__module__.removeprefix('_simulation_')} import {kind.__name__}"
     # in the order of standard library, torch, the package, the user's own file
     used = [line for name, line in _FROM_HERE.items() if name in text]
     first = [line for line in used if "mkc_torch" not in line]
-    own = sorted([line for line in used if "mkc_torch" in line] + [_BASE_CLASS] * bool(loaded))
+    own = sorted([line for line in used if "mkc_torch" in line] + [_of_class(loaded)] * bool(loaded))
     torch = ["import torch"] if "torch." in text else []
     groups = [first, [*torch, *own], [base]]
     imports = "\n\n".join("\n".join(group) for group in groups if group)
@@ -99,20 +99,26 @@ def python_source(
     )
 
 
-def _loaded(kind: type, folder: Path) -> str | None:
+def _of_class(line: str | None) -> str:
+    return f"from mkc_torch.simulation import {'fmu_class' if ' = fmu_class(' in (line or '') else 'base_class'}"
+
+
+def _loaded(kind: type, folder: Path | None) -> str | None:
     """A line that loads a class from its own file, by the way from a folder; None where there is no such file or way.
 
     A way within one tree says nothing of the machine, and both can be moved together.
     """
-    file = file_of(kind)
-    if file is None:
+    fmu = kind.evaluation.description.path if is_of_an_fmu(kind) else None
+    file = fmu or file_of(kind)
+    if file is None or (folder is None and fmu is None):
         return None
     try:
-        way = os.path.relpath(file.resolve(), folder.resolve())
+        way = Path(file.name if folder is None else os.path.relpath(file.resolve(), folder.resolve())).as_posix()
     except ValueError:  # on another drive
         return None
-    source = json.dumps(f"{Path(way).as_posix()}:{kind.__name__}", ensure_ascii=False)
-    return f"{kind.__name__} = base_class({source}, __file__)"
+    if fmu is not None:
+        return f"{kind.__name__} = fmu_class({json.dumps(way, ensure_ascii=False)}, __file__)"
+    return f"{kind.__name__} = base_class({json.dumps(f'{way}:{kind.__name__}', ensure_ascii=False)}, __file__)"
 
 
 def _parameters(system: Dynamics, theta: Sequence[float]) -> list[str]:

@@ -2,6 +2,6 @@
 
 from mkc_torch.simulation.fmu.cosimulation import Simulated
 from mkc_torch.simulation.fmu.description import FmuError
-from mkc_torch.simulation.fmu.equations import FmuDynamics, fmu_class, load_fmu
+from mkc_torch.simulation.fmu.equations import FmuDynamics, fmu_class, is_of_an_fmu, load_fmu
 
-__all__ = ["FmuDynamics", "FmuError", "Simulated", "fmu_class", "load_fmu"]
+__all__ = ["FmuDynamics", "FmuError", "Simulated", "fmu_class", "is_of_an_fmu", "load_fmu"]

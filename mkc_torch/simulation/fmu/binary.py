@@ -59,6 +59,7 @@ class Binary:
         self.model = self._loaded()
         self._parameters: tuple[float, ...] | None = None
         self._begun = False
+        self.timed = True
         self._prepare_functions()
 
     # what is asked of it
@@ -110,17 +111,24 @@ class Binary:
         n, m, references = states.shape[1], inputs.shape[1], self._input_references
         rows = zip(time.tolist(), _addresses(states), _addresses(inputs), _addresses(found), strict=True)
         bad, settle = 0, self._settle if self.description.events else None
+        timed = self.timed
         get, wanted = self._get_rates, self._output_references
+        simple = m > 0 and not outputs and not timed and settle is None
         for t, x, u, f in rows:
-            status = set_time(component, t) | set_states(component, x, n)
-            if m:
-                status |= set_inputs(component, references, m, u, m)
-            if settle is not None:
-                status |= settle()
-            if outputs:
-                status |= self._get_reals(component, wanted, count, f, count)
+            if simple:  # most of all rows
+                status = set_states(component, x, n) | set_inputs(component, references, m, u, m) | get(component, f, n)
             else:
-                status |= get(component, f, n)
+                status = set_states(component, x, n)
+                if timed:
+                    status |= set_time(component, t)
+                if m:
+                    status |= set_inputs(component, references, m, u, m)
+                if settle is not None:
+                    status |= settle()
+                if outputs:
+                    status |= self._get_reals(component, wanted, count, f, count)
+                else:
+                    status |= get(component, f, n)
             if status > _WARNING:
                 bad = max(bad, status)
                 found[(f - found.ctypes.data) // (8 * count)] = np.nan
@@ -141,10 +149,13 @@ class Binary:
         n, m, references = states.shape[1], inputs.shape[1], self._input_references
         rows = zip(time.tolist(), _addresses(states), _addresses(inputs), _addresses(found), strict=True)
         bad, settle = 0, self._settle if self.description.events else None
+        timed = self.timed
         directional, three = self._directional, self.description.version == 3
         width = 8 * count
         for t, x, u, f in rows:
-            status = set_time(component, t) | set_states(component, x, n)
+            status = set_states(component, x, n)
+            if timed:
+                status |= set_time(component, t)
             if m:
                 status |= set_inputs(component, references, m, u, m)
             if settle is not None:

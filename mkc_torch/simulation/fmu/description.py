@@ -55,6 +55,7 @@ class Description:
         parameters: the fixed and tunable ones, with what each starts from.
         events: number of its event indicators.
         derivatives: whether it gives directional derivatives.
+        timeless: whether it says of all rates and outputs what they depend on, and time is not among it.
     """
 
     path: Path
@@ -70,6 +71,7 @@ class Description:
     parameters: Mapping[Quantity, Parameter]
     events: int
     derivatives: bool
+    timeless: bool
 
 
 def the_library() -> Any:
@@ -129,6 +131,8 @@ def read_description(path: Path) -> Description:
         events=len(told.eventIndicators) if version == 3 else int(told.numberOfEventIndicators or 0),
         derivatives=bool(getattr(kind, "providesDirectionalDerivative", False)
                          or getattr(kind, "providesDirectionalDerivatives", False)),
+        timeless=all(one.dependencies is not None and not any(by.causality == "independent" for by in one.dependencies)
+                     for one in (*told.outputs, *told.derivatives)),
     )  # fmt: skip
 
 

@@ -27,6 +27,9 @@ _REMEMBERED = 8
 _STEP = float(np.finfo(np.float64).eps) ** (1.0 / 3.0)
 """Of a central difference, as a share of the size of what is moved: rounding and curvature then do about the same."""
 
+_STRAIGHT = 1e-8
+"""Share by which slopes over steps of two sizes may differ where a curve is held to be straight."""
+
 _AGREE = 1e-4
 """Share by which a directional derivative may be off a difference before it is not trusted."""
 
@@ -49,6 +52,15 @@ class Moments:
         new[1:] = (table[1:] != table[:-1]).any(1)
         return new
 
+    def same(self, other: Moments) -> NDArray[np.bool_]:
+        """(S,), which of these are the same in another: the ends of intervals, where their middles have moved."""
+        if len(other.parts[0]) != len(self.parts[0]) or not np.array_equal(self.parts[3], other.parts[3]):
+            return np.zeros(len(self.parts[0]), np.bool_)
+        alike = self.parts[0] == other.parts[0]
+        for k in (1, 2):
+            alike &= (self.parts[k] == other.parts[k]).all(1)
+        return alike
+
     def rows(self, which: Any) -> tuple[Array, Array, Array]:
         time, states, inputs, _ = self.parts
         return _rows((time, states, inputs), which)
@@ -65,6 +77,8 @@ class Evaluation:
         self.description = description
         self._binary: Binary | None = None
         self._trusted: dict[tuple[bool, int], bool] = {}
+        self._affine: dict[tuple[bool, int], bool] = {}
+        self._last: dict[bool, tuple[Moments, Array]] = {}
         self._known: deque[tuple[Any, Moments, Array]] = deque(maxlen=_REMEMBERED)
 
     def __getstate__(self) -> Description:
@@ -84,7 +98,17 @@ class Evaluation:
 
         def computed() -> Array:
             new = at.new()
-            return self._plain(outputs, at.rows(new), at.parts[3])[new.cumsum() - 1]
+            before, known = self._last.get(outputs, (None, None))
+            same = at.same(before) if before is not None else np.zeros_like(new)
+            asked = new & ~same
+            told = self.description
+            found = np.empty((len(new), len(told.outputs if outputs else told.rates)))
+            if known is not None and same.any():
+                found[same] = known[same]
+            found[asked] = self._plain(outputs, at.rows(asked), at.parts[3])
+            found = found[np.maximum.accumulate(np.where(new, np.arange(len(new)), 0))]
+            self._last[outputs] = at, found
+            return found
 
         return self._remembered(("values", outputs), at, computed)
 
@@ -93,8 +117,9 @@ class Evaluation:
 
         def computed() -> Array:
             new = at.new()
-            rows, given = at.rows(new), at.parts[3]
-            columns = self._columns(outputs, rows, given, group)
+            given = at.parts[3]
+            base = self.values(outputs, at)[new] if group == "parameters" else None
+            columns = self._columns(outputs, at.rows(new), given, group, base)
             return columns[new.cumsum() - 1]
 
         return self._remembered(("slopes", outputs, group), at, computed)
@@ -113,7 +138,9 @@ class Evaluation:
             return np.full((len(rows[0]), len(told.outputs if outputs else told.rates)), np.nan)
         return self.binary.values(outputs, *rows)
 
-    def _columns(self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group) -> Array:
+    def _columns(
+        self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, base: Array | None
+    ) -> Array:
         told = self.description
         quantities = list(getattr(told, group))
         trusted = [self._is_trusted(outputs, rows, given, group, k) for k in range(len(quantities))]
@@ -126,9 +153,42 @@ class Evaluation:
         elif by:
             found[:, :, by] = np.nan
         for k in range(len(quantities)):
-            if not trusted[k]:
+            if trusted[k]:
+                continue
+            if base is not None and self._is_affine(outputs, rows, given, k):
+                found[:, :, k] = self._beyond(outputs, rows, given, k, base, self._step_within(given, k))
+            else:
                 found[:, :, k] = self._difference(outputs, rows, given, group, k)
         return found
+
+    def _is_affine(self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, place: int) -> bool:
+        """Whether rates go straight with a parameter, tried once at a few moments: one step then tells the slope.
+
+        Where they do not after all, elsewhere, the step is still a small one.
+        """
+        if (outputs, place) not in self._affine:
+            few = _rows(rows, slice(None, None, max(1, len(rows[0]) // 16)))
+            base = self._plain(outputs, few, given)
+            step = self._step_within(given, place)
+            one, other = (self._beyond(outputs, few, given, place, base, step * more) for more in (1.0, 30.0))
+            rounding = 8.0 * np.finfo(np.float64).eps * np.abs(base).max(initial=0.0) / abs(step)
+            close = np.abs(one - other) <= _STRAIGHT * np.abs(other).max(initial=0.0) + rounding
+            self._affine[outputs, place] = bool(close.all())
+        return self._affine[outputs, place]
+
+    def _beyond(
+        self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, place: int, base: Array, step: float
+    ) -> Array:
+        """The slope by a parameter, (S, k), by one step from where it is."""
+        moved = given.copy()
+        moved[place] += step
+        return (self._plain(outputs, rows, moved) - base) / (moved[place] - given[place])
+
+    def _step_within(self, given: Array, place: int) -> float:
+        """A step of a parameter that stays below its greatest value."""
+        parameter = list(self.description.parameters.values())[place]
+        step = _STEP * (abs(given[place]) or abs(parameter.value) or 1.0)
+        return step if given[place] + 30.0 * step <= parameter.upper else -step
 
     def _is_trusted(
         self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, place: int
@@ -155,10 +215,11 @@ class Evaluation:
         """The slope by one quantity, (S, k), by a central difference."""
         time, states, inputs = rows
         if group == "parameters":
-            step = _step(np.array([given[place]]))
+            step = abs(self._step_within(given, place))
+            parameter = list(self.description.parameters.values())[place]
             ends = [given.copy(), given.copy()]
-            ends[0][place] -= step
-            ends[1][place] += step
+            ends[0][place] = max(given[place] - step, parameter.lower)
+            ends[1][place] = min(given[place] + step, parameter.upper)
             low, high = (self._plain(outputs, rows, one) for one in ends)
             return (high - low) / (ends[1][place] - ends[0][place])
         table = states if group == "states" else inputs

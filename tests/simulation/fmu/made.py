@@ -109,8 +109,10 @@ def description(
         variables.append((name, OUTPUTS + k, "output", "continuous", "", None, ("", "", "")))
     for k, (name, (start, least, most, unit)) in enumerate(model.parameters.items()):
         variables.append((name, PARAMETERS + k, "parameter", model.variability, "", start, (least, most, unit)))
-    for k in range(len(model.events) if version == 3 else 0):
-        variables.append((f"event {k}", EVENTS + k, "local", "continuous", "", None, ("", "", "")))
+    variables += [
+        (f"event {k}", EVENTS + k, "local", "continuous", "", None, ("", "", ""))
+        for k in range(len(model.events) if version == 3 else 0)
+    ]
     place = {one[0]: number for number, one in enumerate(variables, 1)}
     lines = []
     for name, reference, causality, variability, of, start, (least, most, unit) in variables:
@@ -148,14 +150,29 @@ def description(
 
 
 def _structure(model: Model, version: int, place: Mapping[str, int]) -> str:
+    def depends(text: str) -> str:
+        """On which of time, states and inputs, as texts tell."""
+        words = set(re.findall(r"[A-Za-z_]\w*", text))
+        by = [name for name in ("time", *model.states, *model.inputs) if name in words or model.events]
+        kinds = {"time": 0} | {name: STATES + k for k, name in enumerate(model.states)}
+        kinds |= {name: INPUTS + k for k, name in enumerate(model.inputs)}
+        return f"dependencies='{' '.join(str((place if version == 2 else kinds)[name]) for name in by)}'"
+
     if version == 2:
-        outputs = "".join(f"<Unknown index='{place[name]}'/>" for name in model.outputs)
-        rates = "".join(f"<Unknown index='{place[f'der({name})']}'/>" for name in model.states)
+        outputs = "".join(f"<Unknown index='{place[name]}' {depends(text)}/>" for name, text in model.outputs.items())
+        rates = "".join(
+            f"<Unknown index='{place[f'der({name})']}' {depends(text)}/>" for name, text in model.rates.items()
+        )
         outputs = f"<Outputs>{outputs}</Outputs>" if outputs else ""
         rates = f"<Derivatives>{rates}</Derivatives>" if rates else ""
         return f"<ModelStructure>{outputs}{rates}</ModelStructure>"
-    outputs = "".join(f"<Output valueReference='{OUTPUTS + k}'/>" for k in range(len(model.outputs)))
-    rates = "".join(f"<ContinuousStateDerivative valueReference='{RATES + k}'/>" for k in range(len(model.states)))
+    outputs = "".join(
+        f"<Output valueReference='{OUTPUTS + k}' {depends(text)}/>" for k, text in enumerate(model.outputs.values())
+    )
+    rates = "".join(
+        f"<ContinuousStateDerivative valueReference='{RATES + k}' {depends(text)}/>"
+        for k, text in enumerate(model.rates.values())
+    )
     events = "".join(f"<EventIndicator valueReference='{EVENTS + k}'/>" for k in range(len(model.events)))
     return f"<ModelStructure>{outputs}{rates}{events}</ModelStructure>"
 
