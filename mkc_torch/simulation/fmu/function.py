@@ -7,6 +7,7 @@ exact, for it is linear in these weights; one by states, inputs or parameters is
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -46,6 +47,7 @@ class _Values(torch.autograd.Function):
         ctx.save_for_backward(*inputs[2:])
         ctx.save_for_forward(*inputs[2:])
         ctx.set_materialize_grads(False)
+        ctx.kept = {}
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
@@ -53,7 +55,7 @@ class _Values(torch.autograd.Function):
         found: list[Tensor | None] = [None, None, None]
         for k, group in enumerate(GROUPS):
             if weights is not None and ctx.needs_input_grad[3 + k]:
-                slopes = _slopes(ctx.evaluation, ctx.outputs, group, *ctx.saved_tensors)
+                slopes = _kept_slopes(ctx, group)
                 weighed = weights.unsqueeze(-1) * slopes
                 found[k] = weighed.sum((-3, -2)) if group == "parameters" else weighed.sum(-2)
         return None, None, None, *found
@@ -107,6 +109,21 @@ class _Slopes(torch.autograd.Function):
 
 _values: Callable[..., Tensor] = _Values.apply
 _slopes: Callable[..., Tensor] = _Slopes.apply
+
+
+for _kind in (_Values, _Slopes):
+    # torch asks for it at every call, and it takes longer to find than a few rows to compute
+    _kind.forward.__signature__ = inspect.signature(_kind.forward)  # type: ignore[attr-defined]
+
+
+def _kept_slopes(ctx: Any, group: Group) -> Tensor:
+    """The slopes at a context's moments: a Jacobian asks for them once for each of its rows."""
+    found: Tensor | None = ctx.kept.get(group)
+    if found is None:
+        found = _slopes(ctx.evaluation, ctx.outputs, group, *ctx.saved_tensors)
+        if not (found.requires_grad or torch._C._functorch.is_functorch_wrapped_tensor(found)):
+            ctx.kept[group] = found
+    return found
 
 
 def _over_batch(info: Any, in_dims: Any, function: Any, parts: tuple[Tensor, ...]) -> Tensor:
