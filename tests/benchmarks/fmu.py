@@ -24,6 +24,9 @@ from tests.simulation.fmu.made import Model, make_fmu
 SEED = 350
 """Of the recordings, which nothing in the adapter was set by."""
 
+FIRST = 0
+"""Number of the first of them."""
+
 _OUTLET = "sqrt(Piecewise(({0}, {0} > 1e-4), (1e-4, True)))"
 RATES: Mapping[str, Mapping[str, str]] = {
     "pendulum": {"angle": "speed", "speed": "gain*torque - stiffness*sin(angle) - damping*speed"},
@@ -91,7 +94,7 @@ def pairs(count: int, version: int = 2, *, derivatives: bool = True, surrogates:
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as place:
         fmus: dict[str, Simulation] = {}
-        for index in range(count):
+        for index in range(FIRST, FIRST + count):
             case = generator.draw(SEED, index)
             system = case.key.mode
             if system not in fmus:
@@ -99,7 +102,7 @@ def pairs(count: int, version: int = 2, *, derivatives: bool = True, surrogates:
             results, seconds = [], []
             for simulation in (NAIVE[system](), fmus[system]):
                 began = time.process_time()
-                results.append(diagnose(simulation, case.recording, surrogates=surrogates))
+                results.append(diagnose(simulation, case.recording, surrogates=surrogates, max_findings=1))
                 seconds.append(time.process_time() - began)
             yield Pair(case.recording.name, _firsts(results), _off(results), (seconds[0], seconds[1]))
 
