@@ -16,6 +16,7 @@ from mkc_torch.cli.demo import demo
 from mkc_torch.cli.diagnose import diagnose
 from mkc_torch.cli.export import export
 from mkc_torch.cli.inspect import inspect
+from mkc_torch.cli.new import new_effect, new_simulation
 
 __all__ = ["app"]
 
@@ -64,3 +65,5 @@ app.command()(export)
 app.command()(inspect)
 app.command()(challenge)
 app.command()(demo)
+app.command()(new_simulation)
+app.command()(new_effect)

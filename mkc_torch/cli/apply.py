@@ -22,7 +22,10 @@ def apply(
     output: Annotated[Path, typer.Option(help="File to write, .csv or .parquet.")],
     simulation: Annotated[
         str | None,
-        typer.Option(metavar="FILE.py:CLASS", help="The simulation of your own that was diagnosed; its code is run."),
+        typer.Option(
+            metavar="FILE.py:CLASS",
+            help="The simulation of your own that was diagnosed, or MODEL.fmu; the code in it is run.",
+        ),
     ] = None,
     simulated: Annotated[
         Path | None,

@@ -25,7 +25,16 @@ from mkc_torch.cli.console import (
     progress,
     refuse_same_names,
 )
-from mkc_torch.cli.diagnosis_request import BETWEEN, LEVEL, MAGNETOMETER, SIMULATIONS, SURROGATES, Outcome, Request
+from mkc_torch.cli.diagnosis_request import (
+    BETWEEN,
+    LEVEL,
+    MAGNETOMETER,
+    SIMULATIONS,
+    SURROGATES,
+    Outcome,
+    Request,
+    is_file_of_a_simulation,
+)
 from mkc_torch.cli.loading import loading
 from mkc_torch.cli.units_option import HELP, METAVAR, SENSOR_HELP, parsed_units, without_units
 
@@ -37,7 +46,8 @@ def diagnose(
         str | None,
         typer.Option(
             metavar="NAME",
-            help=f"What they are compared with: {', '.join(SIMULATIONS)}, or FILE.py:CLASS, whose code is run.",
+            help=f"What they are compared with: {', '.join(SIMULATIONS)} (default where mag_x, mag_y and mag_z are "
+            "there), FILE.py:CLASS, or MODEL.fmu; the code in either file is run.",
         ),
     ] = None,
     simulated: Annotated[
@@ -137,6 +147,8 @@ def _waited_for(result: Callable[[], list[Outcome]], path: Path) -> list[Outcome
 
 def _tell(outcomes: list[Outcome], step: Steps) -> None:
     with step.aside():
+        for note in dict.fromkeys(outcome.note for outcome in outcomes if outcome.note):
+            err().print(f"mkc: {note}", soft_wrap=True)
         for outcome in outcomes:
             if outcome.failed:
                 err().print(f"mkc: {outcome.text}", soft_wrap=True)
@@ -145,20 +157,22 @@ def _tell(outcomes: list[Outcome], step: Steps) -> None:
 
 
 def _known(simulation: str | None, simulated: Path | None) -> str:
-    if (simulation is None) == (simulated is None):
+    if simulation is not None and simulated is not None:
         raise typer.BadParameter(
             "give one of --simulation and --simulated: a simulation's name, or the table that one wrote."
         )
-    if simulation is not None and simulation not in SIMULATIONS and ".py:" not in simulation:
+    if simulation is not None and simulation not in SIMULATIONS and not is_file_of_a_simulation(simulation):
         raise typer.BadParameter(
             f'--simulation "{simulation}" is not known; known: {", ".join(SIMULATIONS)}. Name one of them, or one of '
-            "your own as FILE.py:CLASS."
+            "your own as FILE.py:CLASS or MODEL.fmu."
         )
     return simulation or ""
 
 
 def _refuse_unusable(request: Request, simulation_of: Callable[[Request], object]) -> None:
     """Said once, before anything is written, and not again for each recording."""
+    if request.undecided:
+        return
     try:
         simulation_of(request)
     except FAILURES as error:
@@ -179,7 +193,7 @@ def _columns(columns: str | None, experiments: str | None) -> dict[str, str]:
 
 def _units(texts: list[str], simulation: str | None) -> dict[str, str]:
     units = parsed_units(texts)
-    if "mag" in units and simulation != MAGNETOMETER:
+    if "mag" in units and simulation not in (None, MAGNETOMETER):
         raise typer.BadParameter(
             "--unit is that of a magnetometer's columns; a simulation of your own says its units in its `units`. Its "
             "time, and other columns by name, can be converted: --unit time=us."
@@ -188,7 +202,7 @@ def _units(texts: list[str], simulation: str | None) -> dict[str, str]:
 
 
 def _sensor(sensor: str | None, simulation: str | None) -> str | None:
-    if sensor is not None and simulation != MAGNETOMETER:
+    if sensor is not None and simulation not in (None, MAGNETOMETER):
         raise typer.BadParameter(
             "--sensor names a magnetometer; a simulation of your own takes columns by their names."
         )

@@ -5,18 +5,19 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkc_torch._support.files import claim_folder, write_atomically
 from mkc_torch.cli.console import FAILURES, Look, folder_names, folder_written, remove_if_empty, sentence_of
-from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request
+from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request, is_file_of_a_simulation
 from mkc_torch.cli.diagnosis_summary import show
-from mkc_torch.cli.recorded import read_magnetometer, read_table
+from mkc_torch.cli.recorded import read_magnetometer, read_table, refuse_no_magnetometer
 from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.diagnosis.files.python_source import SourceError
-from mkc_torch.recording.recording import Recording
+from mkc_torch.recording.recording import Recording, RecordingError
 from mkc_torch.simulation.load import load_simulation, raised_in
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ def diagnose_file(
     that takes several at once. One that fails does not keep the others from being done. ``step`` is told what is done.
     """
     try:
+        request, note = _decided(path, request)
         recording = _read(path, request)
         simulation = simulation_of(request)
         claim_folder(folder, overwrite=request.force, files=WRITTEN)
@@ -57,7 +59,22 @@ def diagnose_file(
             outcomes.append(_outcome(path, label, simulation, part, place, request, look, told))
         if all(outcome.failed for outcome in outcomes):
             remove_if_empty(folder)
-    return outcomes
+    return [replace(outcome, note=note) for outcome in outcomes]
+
+
+def _decided(path: Path, request: Request) -> tuple[Request, str]:
+    """The request with a simulation, by the recording's columns where none is named, and what to say of that."""
+    if not request.undecided:
+        return request, ""
+    try:
+        refuse_no_magnetometer(path, request.columns, request.sensor)
+    except RecordingError as error:
+        raise RecordingError(
+            "give one of --simulation and --simulated: without them a recording is compared with the magnetometer, and "
+            f"this one is of none. {error}"
+        ) from None
+    note = f"no --simulation is given; the recording is of a magnetometer, so it is `--simulation {MAGNETOMETER}`."
+    return replace(request, simulation=MAGNETOMETER), note
 
 
 def _read(path: Path, request: Request) -> Recording:
@@ -85,7 +102,7 @@ def write_diagnosis(
     if diagnosis.model is not None:
         texts["model.json"] = diagnosis.model.to_json()
         with suppress(SourceError):
-            texts["corrected.py"] = diagnosis.model.to_python()
+            texts["corrected.py"] = diagnosis.model.to_python(folder=folder)
     for name in {"model.json", "corrected.py"} - set(texts):
         (folder / name).unlink(missing_ok=True)  # an old one would be taken for this diagnosis' own
     if report:
@@ -132,7 +149,7 @@ def _outcome(
             progress("writing the report")
             files = write_diagnosis(diagnosis, folder, force=request.force, report=request.report)
     except Exception as error:
-        own = raised_in(request.simulation, error) if ".py:" in request.simulation else None
+        own = raised_in(request.simulation, error) if is_file_of_a_simulation(request.simulation) else None
         return _failed(path, label, own or error)
     return Outcome(look.set(lambda console: show(console, diagnosis, files)), failed=False)
 

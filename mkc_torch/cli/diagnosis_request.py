@@ -6,7 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-__all__ = ["BETWEEN", "LEVEL", "MAGNETOMETER", "SIMULATIONS", "SURROGATES", "Outcome", "Request"]
+__all__ = [
+    "BETWEEN",
+    "LEVEL",
+    "MAGNETOMETER",
+    "SIMULATIONS",
+    "SURROGATES",
+    "Outcome",
+    "Request",
+    "is_file_of_a_simulation",
+]
 
 MAGNETOMETER = "magnetometer"
 SIMULATIONS = (MAGNETOMETER,)
@@ -20,7 +29,10 @@ SURROGATES = 99
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of each recording: to be compared with a simulation, or with what ``simulated`` holds of one."""
+    """What is asked of each recording: to be compared with a simulation, or with what ``simulated`` holds of one.
+
+    Where there is neither, it is compared with the magnetometer if it is of one.
+    """
 
     simulation: str = MAGNETOMETER
     simulated: Path | None = None
@@ -35,10 +47,31 @@ class Request:
     force: bool = False
     report: bool = True
 
+    @property
+    def undecided(self) -> bool:
+        """Whether the recording's columns decide what it is compared with."""
+        return not self.simulation and self.simulated is None
+
 
 @dataclass(frozen=True)
 class Outcome:
-    """A recording, or one experiment of it: its summary, or the sentence that says why there is none."""
+    """A recording, or one experiment of it: its summary, or the sentence that says why there is none.
+
+    ``note`` is a sentence on what was decided for the user.
+    """
 
     text: str
     failed: bool
+    note: str = ""
+
+
+def is_file_of_a_simulation(name: str) -> bool:
+    """Whether ``--simulation`` names a file, whose code is run: ``FILE.py:CLASS`` or ``MODEL.fmu``.
+
+    Example:
+        >>> is_file_of_a_simulation("my.py:Pendulum"), is_file_of_a_simulation("arm.fmu")
+        (True, True)
+        >>> is_file_of_a_simulation("magnetometer")
+        False
+    """
+    return ".py:" in name or name.casefold().endswith(".fmu")

@@ -9,10 +9,18 @@ from mkc_torch.recording.choice import sensors_in, which_columns
 from mkc_torch.recording.formats import read_topics
 from mkc_torch.recording.formats.base import RecordingError
 from mkc_torch.recording.reading import ASKED, Reading, read_file
+from mkc_torch.recording.recognise import recognised
 from mkc_torch.recording.recording import Recording
 from mkc_torch.recording.unit_warnings import RECORDED, field_size, likely_unit
 
-__all__ = ["read_again", "read_magnetometer", "read_table", "refuse_likely_size", "sensor_names"]
+__all__ = [
+    "read_again",
+    "read_magnetometer",
+    "read_table",
+    "refuse_likely_size",
+    "refuse_no_magnetometer",
+    "sensor_names",
+]
 
 _AXES = ("mag_x", "mag_y", "mag_z")
 
@@ -27,6 +35,17 @@ def sensor_names(path: Path, columns: Mapping[str, str], sensor: str | None) -> 
         return [sensor]
     names = sensors_in(path, read_topics(path), columns)
     return [None] if len(names) == 1 else list(names)
+
+
+def refuse_no_magnetometer(path: Path, columns: Mapping[str, str], sensor: str | None) -> None:
+    """Refuse a file in which no magnetometer is recognised or named.
+
+    Raises:
+        RecordingError: none is; the sentence has the option that names its columns.
+    """
+    topics = read_topics(path)
+    if sensor is None and not set(_AXES) & set(columns) and not recognised(topics, path.stem).sensors:
+        raise RecordingError(which_columns(path, topics))
 
 
 def read_magnetometer(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torch import Tensor, nn
@@ -27,5 +28,5 @@ class CorrectingModel(nn.Module):
         """The text of model.json."""
 
     @abstractmethod
-    def to_python(self, module: str | None = None) -> str:
+    def to_python(self, module: str | None = None, folder: Path | None = None) -> str:
         """The simulation with the findings as Python."""

@@ -1,7 +1,8 @@
 """Simulations: what predicts a recording, with ports through which an effect can act on it."""
 
 from mkc_torch.simulation.dynamics.definition import Dynamics
-from mkc_torch.simulation.load import SimulationFileError, load_simulation
+from mkc_torch.simulation.fmu import FmuError, fmu_class, load_fmu
+from mkc_torch.simulation.load import SimulationFileError, base_class, load_simulation
 from mkc_torch.simulation.magnetometer import Magnetometer
 from mkc_torch.simulation.paired import Paired
 from mkc_torch.simulation.parameter import Parameter, SimulationError
@@ -11,6 +12,7 @@ from mkc_torch.simulation.static import Static
 __all__ = [
     "Correction",
     "Dynamics",
+    "FmuError",
     "Magnetometer",
     "Paired",
     "Parameter",
@@ -20,5 +22,8 @@ __all__ = [
     "SimulationError",
     "SimulationFileError",
     "Static",
+    "base_class",
+    "fmu_class",
+    "load_fmu",
     "load_simulation",
 ]

@@ -2,7 +2,6 @@
 
 import importlib.util
 import json
-import sys
 
 import pytest
 import torch
@@ -16,8 +15,9 @@ from typer.testing import CliRunner
 from mkc_torch.cli.app import app
 from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.files.diagnosis_json import validate
+from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.recording.recording import Recording, write_table
-from mkc_torch.simulation import load_simulation
+from mkc_torch.simulation import SimulationFileError, load_simulation
 
 STATIC = """
 from mkc_torch.simulation import Static
@@ -146,17 +146,15 @@ def test_a_model_simulates_another_recording(tank, tmp_path):
     assert float((corrected["level"] - Recording.read(new)["level"]).square().mean().sqrt()) < 0.008
 
 
-def test_the_python_that_is_written_runs_and_gives_the_same(tank, monkeypatch):
+def test_the_python_that_is_written_runs_and_gives_the_same(tank):
     folder, source, _ = tank
     place = folder / "out" / "runs"
     text = (place / "corrected.py").read_text(encoding="utf-8")
     assert 'rates["level"] = rates["level"] - 0.1' in text
     assert "# quadratic_drag: δv̇ = −γ v |v|" in text
-    monkeypatch.syspath_prepend(str(folder))
     spec = importlib.util.spec_from_file_location("corrected_tank", place / "corrected.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    sys.modules.pop("vessel")
     recording = Recording.read(folder / "runs.csv")
     written = module.CorrectedTank().prepare(recording)
     model = DiagnosedModel.from_json(
@@ -168,6 +166,56 @@ def test_the_python_that_is_written_runs_and_gives_the_same(tank, monkeypatch):
     assert float((written.simulated(theta, {})[:, 0] - expected).abs().max()) < 2e-3
     plain = load_simulation(source).prepare(recording)
     assert float((plain.simulated(theta, {})[:, 0] - expected).abs().max()) > 0.02
+
+
+def test_what_was_corrected_is_diagnosed_again_from_anywhere(tank, tmp_path, monkeypatch):
+    """From where the base class lies, from the results, and from elsewhere; and what comes of it once more."""
+    folder, _, _ = tank
+    place = folder / "out" / "runs"
+    text = (place / "corrected.py").read_text(encoding="utf-8")
+    assert 'Tank = base_class("../../vessel.py:Tank", __file__)' in text
+    assert str(folder) not in text
+    for stand, source in (
+        (folder, "out/runs/corrected.py:CorrectedTank"),
+        (place, "corrected.py:CorrectedTank"),
+        (tmp_path, f"{place / 'corrected.py'}:CorrectedTank"),
+    ):
+        monkeypatch.chdir(stand)
+        again = load_simulation(source)
+        assert (again.name, again.states) == ("CorrectedTank", ("level",))
+    new = tank_table(tmp_path / "new.csv", drag=0.15, seed=3)
+    result = mkc("diagnose", new, "--simulation", source, "--output", tmp_path / "again", "--surrogates", 19)
+    assert result.exit_code == 0, result.output
+    second = tmp_path / "again" / "new" / "corrected.py"
+    assert "class CorrectedCorrectedTank(CorrectedTank)" in second.read_text(encoding="utf-8")
+    assert load_simulation(f"{second}:CorrectedCorrectedTank").parameters["drain"].value == pytest.approx(0.3, abs=0.1)
+    # what is moved alone finds its base class beside it, and without it says what to do
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    (alone / "corrected.py").write_text(text, encoding="utf-8")
+    with pytest.raises(SimulationFileError, match=r"nor beside it, nor in the folder of the call; put vessel\.py"):
+        load_simulation(f"{alone / 'corrected.py'}:CorrectedTank")
+    (alone / "vessel.py").write_text(TANK, encoding="utf-8")
+    assert load_simulation(f"{alone / 'corrected.py'}:CorrectedTank").name == "CorrectedTank"
+
+
+def test_without_a_simulation_columns_decide(thermistor, tmp_path):
+    _, table, output = thermistor
+    result = mkc("diagnose", table, "--output", output)
+    assert result.exit_code == 1
+    assert "give one of --simulation and --simulated" in flat(result.stderr)
+    assert "no magnetometer is recognised among `time`, `temperature`, `current`, `voltage`" in flat(result.stderr)
+    assert not output.exists()
+    sensor = tmp_path / "sensor.csv"
+    columns = simulated_recording()[0].columns
+    write_table(sensor, {name.replace("mag_", "axis_"): values[:700] for name, values in columns.items()})
+    assert "--columns mag_x=axis_x,mag_y=axis_y" in flat(mkc("diagnose", sensor, "--output", output).stderr)
+    named = "mag_x=axis_x,mag_y=axis_y,mag_z=axis_z"
+    result = mkc("diagnose", sensor, "--output", output, "--columns", named, "--surrogates", 19)
+    assert result.exit_code == 0, result.output
+    assert "the recording is of a magnetometer, so it is `--simulation magnetometer`" in flat(result.stderr)
+    content = json.loads((output / "sensor" / "diagnosis.json").read_text(encoding="utf-8"))
+    assert content["simulation"] == "magnetometer"
 
 
 def test_a_function_of_inputs(thermistor):
@@ -270,9 +318,8 @@ def test_code_that_fails_is_told_and_nothing_is_written(tmp_path, text, name, wo
 def test_usage_errors(thermistor):
     source, table, output = thermistor
     for more, words in (
-        ((), "give one of --simulation and --simulated"),
         (("--simulation", source, "--simulated", table), "give one of --simulation and --simulated"),
-        (("--simulation", "bench.py"), "or one of your own as FILE.py:CLASS"),
+        (("--simulation", "bench.py"), "or one of your own as FILE.py:CLASS or MODEL.fmu"),
     ):
         result = mkc("diagnose", table, "--output", output, *more)
         assert result.exit_code == 2

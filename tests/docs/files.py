@@ -13,6 +13,7 @@ from mkc_torch.recording import write_table
 
 # the only place of these tests that knows where the simulated sensors live
 from mkc_torch.recording.demonstration import concealed_recording, simulated_recording
+from tests.simulation.fmu.made import COMPILER, PENDULUM, make_fmu
 
 DRAG = 0.35  # 1/rad, of a pendulum that is told to have none
 
@@ -40,6 +41,8 @@ def write_examples(folder: Path) -> None:
         "NEW_REC": new_recorded,
     }.items():
         write_table(folder / f"{name}.csv", columns)
+    if COMPILER is not None:
+        make_fmu(folder / "pendulum.fmu", PENDULUM)
 
 
 def supplied() -> dict[str, Tensor]:

@@ -9,6 +9,7 @@ pytest.importorskip("polars")
 from tests.docs.commands import EXAMPLES, SMALL, TESTED, commands, run
 from tests.docs.files import write_examples
 from tests.docs.pages import PAGES, ROOT, RUN, SHOWN, blocks
+from tests.simulation.fmu.made import COMPILER
 
 pytestmark = [
     # advice such as more workers for the loader
@@ -26,7 +27,7 @@ FOUND = {
 """What the diagnoses of a page find first in the tables that were made for it, by the name that the page gives them."""
 
 
-NEEDS = {"large_data": "pyarrow"}
+NEEDS = {"large_data": "pyarrow", "own_simulation": "fmpy"}
 """Packages that a page needs beside those of all."""
 
 
@@ -66,6 +67,8 @@ def run_shell(block, folder):
 def test_every_block_of_a_page_runs(page, folder):
     if page.stem in NEEDS:
         pytest.importorskip(NEEDS[page.stem])
+    if page.stem == "own_simulation" and COMPILER is None:
+        pytest.skip("there is no compiler of C for its FMU")
     names = {"__name__": page.stem}
     for block in blocks(page):
         print(f"{block}:")  # shown where it fails

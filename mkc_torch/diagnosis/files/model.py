@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -146,7 +147,7 @@ class DiagnosedModel(CorrectingModel):
         }
         return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
-    def to_python(self, module: str | None = None) -> str:
+    def to_python(self, module: str | None = None, folder: Path | None = None) -> str:
         """The simulation with what was found as Python: a class derived from the diagnosed one.
 
         Its parameters have the fitted values, and each effect is a line of torch, so that a person can read, keep and
@@ -155,6 +156,8 @@ class DiagnosedModel(CorrectingModel):
 
         Args:
             module: to import the diagnosed class from; default the one it was defined in.
+            folder: where the text will be written: a class that was loaded from a file is then loaded from it again,
+                by the way from there.
 
         Raises:
             SourceError: no differential equations, or an effect that has no line of its own.
@@ -166,7 +169,7 @@ class DiagnosedModel(CorrectingModel):
                 f"{'' if system else '; give its simulation with `simulation=`'}."
             )
         measured = tuple(map(str, self.state.get("outputs", system.outputs or system.states)))
-        return python_source(system, self.theta.tolist(), self.terms, tuple(self.gammas), measured, module)
+        return python_source(system, self.theta.tolist(), self.terms, tuple(self.gammas), measured, module, folder)
 
     @staticmethod
     def from_json(
@@ -347,7 +350,8 @@ def refuse_unknown(name: str, simulation: Simulation | None) -> None:
     if simulation is None and name != Magnetometer.name:
         raise ValueError(
             f'the model is of the simulation "{name}", which is not this package\'s own: no code is run because a '
-            f"model's file names it. Give it with `--simulation FILE.py:{name}` (in Python `simulation=`)."
+            f"model's file names it. Give it with `--simulation FILE.py:{name}`, or the FMU that was diagnosed "
+            "(in Python `simulation=`)."
         )
     if simulation is not None and simulation.name != name:
         raise ValueError(f'the model is of the simulation "{name}" but "{simulation.name}" was given.')

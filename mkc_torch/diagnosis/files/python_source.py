@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkc_torch.recording.recording import DEFAULT_UNITS
@@ -11,6 +13,8 @@ from mkc_torch.simulation.dynamics.definition import Dynamics
 from mkc_torch.simulation.dynamics.ports import memory_at
 from mkc_torch.simulation.dynamics.surroundings import surroundings
 from mkc_torch.simulation.dynamics.user_functions import kinematic
+from mkc_torch.simulation.fmu import is_of_an_fmu
+from mkc_torch.simulation.load import file_of
 from mkc_torch.simulation.parameter import Parameter
 
 if TYPE_CHECKING:
@@ -45,6 +49,7 @@ def python_source(
     gammas: Sequence[Tensor],
     measured: Sequence[str],
     module: str | None = None,
+    folder: Path | None = None,
 ) -> str:
     """The text of a module with a class derived from the diagnosed one, see :meth:`DiagnosedModel.to_python`.
 
@@ -54,6 +59,7 @@ def python_source(
         terms, gammas: the effects.
         measured: the outputs that were compared.
         module: to import the diagnosed class from.
+        folder: where the text will be, if that is known.
     """
     kind = type(system)
     rates: list[str] = []
@@ -78,18 +84,41 @@ def python_source(
         *_sensed(outputs),
     ]
     text = "\n".join(body)
-    module = module or kind.__module__.removeprefix("_simulation_")
+    loaded = None if module else _loaded(kind, folder)
+    base = loaded or f"from {module or kind.__module__.removeprefix('_simulation_')} import {kind.__name__}"
     # in the order of standard library, torch, the package, the user's own file
     used = [line for name, line in _FROM_HERE.items() if name in text]
     first = [line for line in used if "mkc_torch" not in line]
-    own = sorted(line for line in used if "mkc_torch" in line)
+    own = sorted([line for line in used if "mkc_torch" in line] + [_of_class(loaded)] * bool(loaded))
     torch = ["import torch"] if "torch." in text else []
-    groups = [first, [*torch, *own], [f"from {module} import {kind.__name__}"]]
+    groups = [first, [*torch, *own], [base]]
     imports = "\n\n".join("\n".join(group) for group in groups if group)
     return (
         f'"""{kind.__name__}, corrected by what `mkc diagnose` found; every number is of that recording."""\n\n'
         f"{imports}\n\n\n{text}\n"
     )
+
+
+def _of_class(line: str | None) -> str:
+    return f"from mkc_torch.simulation import {'fmu_class' if ' = fmu_class(' in (line or '') else 'base_class'}"
+
+
+def _loaded(kind: type, folder: Path | None) -> str | None:
+    """A line that loads a class from its own file, by the way from a folder; None where there is no such file or way.
+
+    A way within one tree says nothing of the machine, and both can be moved together.
+    """
+    fmu = kind.evaluation.description.path if is_of_an_fmu(kind) else None
+    file = fmu or file_of(kind)
+    if file is None or (folder is None and fmu is None):
+        return None
+    try:
+        way = Path(file.name if folder is None else os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return None
+    if fmu is not None:
+        return f"{kind.__name__} = fmu_class({json.dumps(way, ensure_ascii=False)}, __file__)"
+    return f"{kind.__name__} = base_class({json.dumps(f'{way}:{kind.__name__}', ensure_ascii=False)}, __file__)"
 
 
 def _parameters(system: Dynamics, theta: Sequence[float]) -> list[str]:

@@ -1,0 +1,85 @@
+"""``mkc new-simulation`` and ``mkc new-effect``: a file to begin with, and its test."""
+
+from __future__ import annotations
+
+import keyword
+import sys
+from importlib.machinery import PathFinder
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Annotated
+
+import typer
+
+from mkc_torch._support.files import write_atomically
+from mkc_torch.cli.console import FAILURES, complain, out
+
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Of the file and, in capitals, of the class in it: kite.")]
+Folder = Annotated[Path, typer.Option(help="Folder to write into.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+
+
+def new_simulation(name: Name, output: Folder = Path(), force: Force = False) -> None:
+    """Write NAME.py, a simulation of your own to begin with, and test_NAME.py, which simulates and diagnoses it."""
+    _write("simulation", name, output, force=force)
+
+
+def new_effect(name: Name, output: Folder = Path(), force: Force = False) -> None:
+    """Write NAME.py, an effect of your own to begin with, and test_NAME.py, which finds it in a simulated recording."""
+    _write("effect", name, output, force=force)
+
+
+def _write(kind: str, name: str, folder: Path, *, force: bool) -> None:
+    _refuse_name(name)
+    words = {"name": name, "class": _in_capitals(name)}
+    targets = {folder / f"{name}.py": kind, folder / f"test_{name}.py": f"test_{kind}"}
+    try:
+        for path in targets:  # neither is written where one cannot be
+            if path.exists() and not (force and path.is_file()):
+                raise FileExistsError(f"{path} exists; choose another name, or replace it with `--force`.")
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, template in targets.items():
+            write_atomically(path, _text(template, words), overwrite=force)
+    except FAILURES as error:
+        complain(path, error)
+        raise typer.Exit(1) from None
+    out().print("\n".join(str(path) for path in targets), soft_wrap=True)
+
+
+def _text(template: str, words: dict[str, str]) -> str:
+    text = (files("mkc_torch.cli") / "templates" / f"{template}.txt").read_text(encoding="utf-8")
+    return Template(text).substitute(words)
+
+
+def _in_capitals(name: str) -> str:
+    """Of a class.
+
+    Example:
+        >>> _in_capitals("two_tanks"), _in_capitals("kite")
+        ('TwoTanks', 'Kite')
+    """
+    return "".join(part[:1].upper() + part[1:] for part in name.split("_"))
+
+
+def _refuse_name(name: str) -> None:
+    """Refuses what cannot be imported by its name, or is something else by that name.
+
+    Raises:
+        typer.BadParameter: no name of a module, or one that is taken.
+    """
+    if not name.isidentifier() or keyword.iskeyword(name) or not _in_capitals(name).isidentifier():
+        raise typer.BadParameter(
+            f'"{name}" cannot be the name of a module; write a word of letters, digits and _, such as kite. The folder '
+            "is told by --output."
+        )
+    places = [place for place in sys.path if place and Path(place).resolve() != Path.cwd()]
+    taken = name in sys.builtin_module_names or name in sys.stdlib_module_names
+    if taken or PathFinder.find_spec(name, places) is not None:
+        raise typer.BadParameter(
+            f"a module {name} is installed, and a file of that name would hide it; choose another."
+        )
+    if _in_capitals(name) == name:
+        raise typer.BadParameter(
+            f"\"{name}\" would be the file's name and the class's; write it in small letters, {name.lower()}."
+        )

@@ -1,0 +1,108 @@
+"""An FMU for co-simulation alone: simulated by its own solver, and compared as what a simulator wrote."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.fmu.description import Description, FmuError, the_library
+from mkc_torch.simulation.paired import Paired, PairedCorrection, PreparedPaired
+from mkc_torch.simulation.parameter import SimulationError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["Simulated"]
+
+
+class Simulated:
+    """An FMU with a solver of its own, driven by a recording's inputs; its parameters stay as they are.
+
+    Args:
+        description: of the FMU.
+    """
+
+    name = Paired.name
+    joins_experiments = True
+
+    def __init__(self, description: Description) -> None:
+        self.description = description
+
+    @property
+    def columns(self) -> frozenset[str]:
+        told = self.description
+        return frozenset({"time", "experiment", *(one.label for one in (*told.inputs, *told.outputs))})
+
+    def prepare(self, recording: Recording) -> PreparedPaired:
+        """What the FMU makes of the recording's inputs, beside the recording.
+
+        Raises:
+            MissingColumnError: the recording lacks ``time`` or an input.
+            SimulationError: it cannot be simulated, or none of its outputs is a column of the recording.
+        """
+        return Paired(self.simulated(recording)).prepare(recording)
+
+    def correction(self, state: Mapping[str, Any], recording: Recording) -> PairedCorrection:
+        """The same with known parameters on a new recording."""
+        return Paired(self.simulated(recording)).correction(state, recording)
+
+    def simulated(self, recording: Recording) -> Recording:
+        """The outputs that the recording has too, and the inputs, at its times."""
+        told = self.description
+        outputs = [one.label for one in told.outputs if one.label in recording]
+        if not outputs:
+            raise SimulationError(
+                f"{told.path}: none of the FMU's outputs is a column of the recording. It has "
+                f"{', '.join(one.label for one in told.outputs) or 'none'}; the recording has "
+                f"{', '.join(recording.names)}. Say which column is which, --columns NAME=COLUMN."
+            )
+        inputs = [one.label for one in told.inputs]
+        table = recording.finite("time", *inputs)
+        runs = table["experiment"] if "experiment" in table else torch.zeros(len(table))
+        parts = [self._run(table, runs == run, inputs, outputs) for run in runs.unique(sorted=True)]
+        names = ["time", *outputs, *inputs]
+        columns = {name: torch.cat([part[name] for part in parts]) for name in names}
+        labels = {}
+        if "experiment" in table:
+            columns["experiment"] = torch.cat([part["experiment"] for part in parts])
+            labels = {name: label for name, label in table.labels.items() if name == "experiment"}
+        return Recording(columns, name=told.path.stem, labels=labels)
+
+    def _run(self, table: Recording, rows: Tensor, inputs: list[str], outputs: list[str]) -> dict[str, Tensor]:
+        time, order = table["time"][rows].sort()
+        first = float(time[0])
+        given = {name: table[name][rows][order] for name in inputs}
+        signals = None
+        if inputs:
+            kinds = [("time", np.float64), *((name, np.float64) for name in inputs)]
+            signals = np.zeros(len(time), dtype=kinds)
+            signals["time"] = (time - first).numpy()
+            for name in inputs:
+                signals[name] = given[name].numpy()
+        step = float(time.diff().median()) if len(time) > 1 else 1.0
+        try:
+            found = the_library().simulate_fmu(
+                str(self.description.path),
+                fmi_type="CoSimulation",
+                start_time=0.0,
+                stop_time=float(time[-1]) - first,
+                output_interval=step,
+                input=signals,
+                output=outputs,
+                logger=lambda *_: None,
+            )
+        except Exception as error:
+            told = " ".join(str(error).split())
+            raise FmuError(f"{self.description.path}: its simulation failed: {told}.") from None
+        at = torch.from_numpy(np.ascontiguousarray(found["time"])).double()
+        columns = {name: torch.from_numpy(np.ascontiguousarray(found[name])).double() for name in outputs}
+        columns |= {
+            name: torch.from_numpy(np.interp(at.numpy(), (time - first).numpy(), values.numpy()))
+            for name, values in given.items()
+        }
+        own = {"experiment": torch.full_like(at, float(table["experiment"][rows][0]))} if "experiment" in table else {}
+        return {"time": at + first, **columns, **own}

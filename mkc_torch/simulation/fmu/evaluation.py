@@ -1,0 +1,245 @@
+"""Values and slopes of an FMU's equations at many moments at once, none of them computed twice in a row."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from mkc_torch.simulation.fmu.binary import Binary
+from mkc_torch.simulation.fmu.description import Description
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+__all__ = ["GROUPS", "Evaluation", "Group", "Moments"]
+
+Group = Literal["states", "inputs", "parameters"]
+GROUPS: tuple[Group, ...] = ("states", "inputs", "parameters")
+
+_REMEMBERED = 8
+"""Answers that are kept: Newton's method asks again where it has just been, and a fit where it ended."""
+
+_STEP = float(np.finfo(np.float64).eps) ** (1.0 / 3.0)
+"""Of a central difference, as a share of the size of what is moved: rounding and curvature then do about the same."""
+
+_STRAIGHT = 1e-8
+"""Share by which slopes over steps of two sizes may differ where a curve is held to be straight."""
+
+_AGREE = 1e-4
+"""Share by which a directional derivative may be off a difference before it is not trusted."""
+
+
+class Moments:
+    """Times (S,), states (S, n), inputs (S, m) and parameters (p,), in one piece each."""
+
+    def __init__(self, time: Array, states: Array, inputs: Array, parameters: Array) -> None:
+        self.parts = tuple(np.ascontiguousarray(one, np.float64) for one in (time, states, inputs, parameters))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Moments) and all(map(np.array_equal, self.parts, other.parts))
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def new(self) -> NDArray[np.bool_]:
+        """(S,), whether a moment is another than the one before it: the end of an interval is the next one's start."""
+        table = np.concatenate([self.parts[0][:, None], *self.parts[1:3]], 1)
+        new = np.ones(len(table), np.bool_)
+        new[1:] = (table[1:] != table[:-1]).any(1)
+        return new
+
+    def same(self, other: Moments) -> NDArray[np.bool_]:
+        """(S,), which of these are the same in another: the ends of intervals, where their middles have moved."""
+        if len(other.parts[0]) != len(self.parts[0]) or not np.array_equal(self.parts[3], other.parts[3]):
+            return np.zeros(len(self.parts[0]), np.bool_)
+        alike = self.parts[0] == other.parts[0]
+        for k in (1, 2):
+            alike &= (self.parts[k] == other.parts[k]).all(1)
+        return alike
+
+    def rows(self, which: Any) -> tuple[Array, Array, Array]:
+        time, states, inputs, _ = self.parts
+        return _rows((time, states, inputs), which)
+
+
+class Evaluation:
+    """An FMU as a function: of time, states, inputs and parameters to rates, or to outputs.
+
+    Args:
+        description: of the FMU; its binary is loaded when it is first needed, in each process.
+    """
+
+    def __init__(self, description: Description) -> None:
+        self.description = description
+        self._binary: Binary | None = None
+        self._trusted: dict[tuple[bool, int], bool] = {}
+        self._affine: dict[tuple[bool, int], bool] = {}
+        self._last: dict[bool, tuple[Moments, Array]] = {}
+        self._known: deque[tuple[Any, Moments, Array]] = deque(maxlen=_REMEMBERED)
+
+    def __getstate__(self) -> Description:
+        return self.description
+
+    def __setstate__(self, description: Description) -> None:
+        Evaluation.__init__(self, description)
+
+    @property
+    def binary(self) -> Binary:
+        if self._binary is None:
+            self._binary = Binary(self.description)
+        return self._binary
+
+    def values(self, outputs: bool, at: Moments) -> Array:
+        """Rates of the states, or outputs, (S, k); NaN where the FMU has none."""
+
+        def computed() -> Array:
+            new = at.new()
+            before, known = self._last.get(outputs, (None, None))
+            same = at.same(before) if before is not None else np.zeros_like(new)
+            asked = new & ~same
+            told = self.description
+            found = np.empty((len(new), len(told.outputs if outputs else told.rates)))
+            if known is not None and same.any():
+                found[same] = known[same]
+            found[asked] = self._plain(outputs, at.rows(asked), at.parts[3])
+            found = found[np.maximum.accumulate(np.where(new, np.arange(len(new)), 0))]
+            self._last[outputs] = at, found
+            return found
+
+        return self._remembered(("values", outputs), at, computed)
+
+    def slopes(self, outputs: bool, at: Moments, group: Group) -> Array:
+        """Of rates or outputs by each of a group, (S, k, size of the group)."""
+
+        def computed() -> Array:
+            new = at.new()
+            given = at.parts[3]
+            base = self.values(outputs, at)[new] if group == "parameters" else None
+            columns = self._columns(outputs, at.rows(new), given, group, base)
+            return columns[new.cumsum() - 1]
+
+        return self._remembered(("slopes", outputs, group), at, computed)
+
+    def _remembered(self, what: Any, at: Moments, compute: Any) -> Array:
+        for known, moments, answer in self._known:
+            if known == what and moments == at:
+                return answer
+        found: Array = compute()
+        self._known.append((what, at, found))
+        return found
+
+    def _plain(self, outputs: bool, rows: tuple[Array, Array, Array], parameters: Array) -> Array:
+        if not self.binary.begin(parameters.tolist()):
+            told = self.description
+            return np.full((len(rows[0]), len(told.outputs if outputs else told.rates)), np.nan)
+        return self.binary.values(outputs, *rows)
+
+    def _columns(
+        self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, base: Array | None
+    ) -> Array:
+        told = self.description
+        quantities = list(getattr(told, group))
+        trusted = [self._is_trusted(outputs, rows, given, group, k) for k in range(len(quantities))]
+        count = len(told.outputs if outputs else told.rates)
+        found = np.empty((len(rows[0]), count, len(quantities)))
+        by = [k for k, one in enumerate(trusted) if one]
+        if by and self.binary.begin(given.tolist()):
+            references = [quantities[k].reference for k in by]
+            found[:, :, by] = self.binary.slopes(outputs, *rows, references).swapaxes(1, 2)
+        elif by:
+            found[:, :, by] = np.nan
+        for k in range(len(quantities)):
+            if trusted[k]:
+                continue
+            if base is not None and self._is_affine(outputs, rows, given, k):
+                found[:, :, k] = self._beyond(outputs, rows, given, k, base, self._step_within(given, k))
+            else:
+                found[:, :, k] = self._difference(outputs, rows, given, group, k)
+        return found
+
+    def _is_affine(self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, place: int) -> bool:
+        """Whether rates go straight with a parameter, tried once at a few moments: one step then tells the slope.
+
+        Where they do not after all, elsewhere, the step is still a small one.
+        """
+        if (outputs, place) not in self._affine:
+            few = _rows(rows, slice(None, None, max(1, len(rows[0]) // 16)))
+            base = self._plain(outputs, few, given)
+            step = self._step_within(given, place)
+            one, other = (self._beyond(outputs, few, given, place, base, step * more) for more in (1.0, 30.0))
+            rounding = 8.0 * np.finfo(np.float64).eps * np.abs(base).max(initial=0.0) / abs(step)
+            close = np.abs(one - other) <= _STRAIGHT * np.abs(other).max(initial=0.0) + rounding
+            self._affine[outputs, place] = bool(close.all())
+        return self._affine[outputs, place]
+
+    def _beyond(
+        self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, place: int, base: Array, step: float
+    ) -> Array:
+        """The slope by a parameter, (S, k), by one step from where it is."""
+        moved = given.copy()
+        moved[place] += step
+        return (self._plain(outputs, rows, moved) - base) / (moved[place] - given[place])
+
+    def _step_within(self, given: Array, place: int) -> float:
+        """A step of a parameter that stays below its greatest value."""
+        parameter = list(self.description.parameters.values())[place]
+        step = _STEP * (abs(given[place]) or abs(parameter.value) or 1.0)
+        return step if given[place] + 30.0 * step <= parameter.upper else -step
+
+    def _is_trusted(
+        self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, place: int
+    ) -> bool:
+        """Whether the FMU's own derivative is there and agrees with a difference, tried once at a few moments."""
+        told = self.description
+        if not told.derivatives or (group == "parameters" and told.version == 2):
+            return False  # FMI 2.0 has them by states and inputs alone
+        reference = list(getattr(told, group))[place].reference
+        if (outputs, reference) not in self._trusted:
+            every = max(1, len(rows[0]) // 4)
+            few = _rows(rows, slice(None, None, every))
+            difference = self._difference(outputs, few, given, group, place)
+            self.binary.begin(given.tolist())
+            own = self.binary.slopes(outputs, few[0], few[1], few[2], [reference])[:, 0]
+            size = np.abs(difference).max(initial=1e-300)
+            close = bool((np.abs(own - difference) <= _AGREE * size).all())
+            self._trusted[outputs, reference] = close
+        return self._trusted[outputs, reference]
+
+    def _difference(
+        self, outputs: bool, rows: tuple[Array, Array, Array], given: Array, group: Group, place: int
+    ) -> Array:
+        """The slope by one quantity, (S, k), by a central difference."""
+        time, states, inputs = rows
+        if group == "parameters":
+            step = abs(self._step_within(given, place))
+            parameter = list(self.description.parameters.values())[place]
+            ends = [given.copy(), given.copy()]
+            ends[0][place] = max(given[place] - step, parameter.lower)
+            ends[1][place] = min(given[place] + step, parameter.upper)
+            low, high = (self._plain(outputs, rows, one) for one in ends)
+            return (high - low) / (ends[1][place] - ends[0][place])
+        table = states if group == "states" else inputs
+        step = _step(table[:, place])
+        answers, places = [], []
+        for sign in (-1.0, 1.0):
+            moved = table.copy()
+            moved[:, place] += sign * step
+            places.append(moved[:, place])
+            pair = (moved, inputs) if group == "states" else (states, moved)
+            answers.append(self._plain(outputs, (time, *pair), given))
+        return (answers[1] - answers[0]) / (places[1] - places[0])[:, None]
+
+
+def _rows(parts: tuple[Array, Array, Array], which: Any) -> tuple[Array, Array, Array]:
+    time, states, inputs = (np.ascontiguousarray(one[which]) for one in parts)
+    return time, states, inputs
+
+
+def _step(values: Sequence[float] | Array) -> float:
+    """One step for a whole column: a size that is typical of it, for a value near 0 says nothing of its scale."""
+    size = float(np.abs(values).mean()) if len(values) else 1.0
+    return _STEP * (size if 0.0 < size < np.inf else 1.0)

@@ -1,0 +1,152 @@
+"""An FMU as a function of torch: its values, with first derivatives in reverse mode, forward mode and under ``vmap``.
+
+The slopes by states, inputs and parameters are numbers that are asked for where a derivative is; they have no
+derivative of their own. A derivative in reverse mode of a derivative in reverse mode by what it is weighed with is
+exact, for it is linear in these weights; one by states, inputs or parameters is refused in reverse mode.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mkc_torch.simulation.fmu.evaluation import GROUPS, Evaluation, Group, Moments
+
+__all__ = ["evaluated"]
+
+
+def evaluated(
+    evaluation: Evaluation, outputs: bool, time: Tensor, states: Tensor, inputs: Tensor, parameters: Tensor
+) -> Tensor:
+    """Rates (S, n), or outputs (S, k), of an FMU.
+
+    Args:
+        evaluation: of the FMU.
+        outputs: which of the two.
+        time: (S,) in s.
+        states, inputs: (S, n), (S, m).
+        parameters: (p,).
+    """
+    return _values(evaluation, outputs, time, states, inputs, parameters)
+
+
+class _Values(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        evaluation: Evaluation, outputs: bool, time: Tensor, states: Tensor, inputs: Tensor, parameters: Tensor
+    ) -> Tensor:
+        return _tensor(evaluation.values(outputs, _moments(time, states, inputs, parameters)), states)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # noqa: ARG004
+        ctx.evaluation, ctx.outputs = inputs[:2]
+        ctx.save_for_backward(*inputs[2:])
+        ctx.save_for_forward(*inputs[2:])
+        ctx.set_materialize_grads(False)
+        ctx.kept = {}
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> Any:
+        (weights,) = grads
+        found: list[Tensor | None] = [None, None, None]
+        for k, group in enumerate(GROUPS):
+            if weights is not None and ctx.needs_input_grad[3 + k]:
+                slopes = _kept_slopes(ctx, group)
+                weighed = weights.unsqueeze(-1) * slopes
+                found[k] = weighed.sum((-3, -2)) if group == "parameters" else weighed.sum(-2)
+        return None, None, None, *found
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        total = None
+        for group, tangent in zip(GROUPS, tangents[3:], strict=True):
+            if tangent is None:
+                continue
+            slopes = _slopes(ctx.evaluation, ctx.outputs, group, *ctx.saved_tensors)
+            part = (slopes * tangent.unsqueeze(-2)).sum(-1)
+            total = part if total is None else total + part
+        return total
+
+    @staticmethod
+    def vmap(info: Any, in_dims: Any, evaluation: Evaluation, outputs: bool, *parts: Tensor) -> Any:
+        return _over_batch(info, in_dims[2:], lambda *one: _values(evaluation, outputs, *one), parts), 0
+
+
+class _Slopes(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        evaluation: Evaluation,
+        outputs: bool,
+        group: Group,
+        time: Tensor,
+        states: Tensor,
+        inputs: Tensor,
+        parameters: Tensor,
+    ) -> Tensor:
+        return _tensor(evaluation.slopes(outputs, _moments(time, states, inputs, parameters), group), states)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # noqa: ARG004
+        ctx.shape = output.shape
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> Any:  # noqa: ARG004
+        raise RuntimeError("An FMU has first derivatives only; the second ones of its equations are not known.")
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        known = next(one for one in tangents if isinstance(one, Tensor))
+        return known.new_zeros(ctx.shape)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: Any, evaluation: Evaluation, outputs: bool, group: Group, *parts: Tensor) -> Any:
+        return _over_batch(info, in_dims[3:], lambda *one: _slopes(evaluation, outputs, group, *one), parts), 0
+
+
+_values: Callable[..., Tensor] = _Values.apply
+_slopes: Callable[..., Tensor] = _Slopes.apply
+
+
+for _kind in (_Values, _Slopes):
+    # torch asks for it at every call, and it takes longer to find than a few rows to compute
+    _forward: Any = _kind.forward
+    _forward.__signature__ = inspect.signature(_forward)
+
+
+def _kept_slopes(ctx: Any, group: Group) -> Tensor:
+    """The slopes at a context's moments: a Jacobian asks for them once for each of its rows."""
+    found: Tensor | None = ctx.kept.get(group)
+    if found is None:
+        found = _slopes(ctx.evaluation, ctx.outputs, group, *ctx.saved_tensors)
+        if not (found.requires_grad or torch._C._functorch.is_functorch_wrapped_tensor(found)):
+            ctx.kept[group] = found
+    return found
+
+
+def _over_batch(info: Any, in_dims: Any, function: Any, parts: tuple[Tensor, ...]) -> Tensor:
+    """All rows of a batch at once where it has the same parameters throughout, else one after the other."""
+    size = info.batch_size
+    first = [one if dim is None else one.movedim(dim, 0) for one, dim in zip(parts, in_dims, strict=True)]
+    batched = [dim is not None for dim in in_dims]
+    if batched[3]:
+        each = [one.unbind(0) if many else [one] * size for one, many in zip(first, batched, strict=True)]
+        return torch.stack([function(*one) for one in zip(*each, strict=True)])
+    rows = [
+        one.flatten(0, 1) if many else one.expand(size, *one.shape).flatten(0, 1)
+        for one, many in zip(first[:3], batched[:3], strict=True)
+    ]
+    found: Tensor = function(*rows, first[3]).unflatten(0, (size, -1))
+    return found
+
+
+def _moments(time: Tensor, states: Tensor, inputs: Tensor, parameters: Tensor) -> Moments:
+    return Moments(*(one.detach().cpu().double().numpy() for one in (time, states, inputs, parameters)))
+
+
+def _tensor(values: Any, like: Tensor) -> Tensor:
+    # answers are remembered, and what is done in place to one is not to change the other
+    return torch.from_numpy(values.copy()).to(like)

@@ -1,0 +1,149 @@
+"""The challenge's naive simulations diagnosed twice: as they are, and as FMUs that are compiled here.
+
+    python -m tests.benchmarks.fmu --recordings 60
+
+For each recording: what is found first, by how much parameters differ, and the time on one core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from mkc_torch import Diagnosis, diagnose
+from mkc_torch.challenge.dynamics import generator, naive
+from mkc_torch.simulation import Dynamics, Parameter, Simulation, load_fmu
+from tests.simulation.fmu.made import Model, make_fmu
+
+SEED = 350
+"""Of the recordings, which nothing in the adapter was set by."""
+
+FIRST = 0
+"""Number of the first of them."""
+
+_OUTLET = "sqrt(Piecewise(({0}, {0} > 1e-4), (1e-4, True)))"
+RATES: Mapping[str, Mapping[str, str]] = {
+    "pendulum": {"angle": "speed", "speed": "gain*torque - stiffness*sin(angle) - damping*speed"},
+    "cart_pole": {
+        "position": "speed",
+        "speed": "gain*force - drag*speed",
+        "angle": "turn",
+        "turn": "-((gain*force - drag*speed)*cos(angle) + 9.81*sin(angle))/length - damping*turn",
+    },
+    "tanks": {
+        "level_1": f"gain_1*pump_1 - outlet_1*{_OUTLET.format('level_1')}",
+        "level_2": f"gain_2*pump_2 - outlet_2*{_OUTLET.format('level_2')}",
+    },
+    "motor": {
+        "angle": "speed",
+        "speed": "torque*current - damping*speed",
+        "current": "drive*voltage - resistance*current - back_emf*speed",
+    },
+    "projectile": {"distance": "speed", "height": "climb", "speed": "0.0", "climb": "-9.81"},
+    "thermal": {
+        "temperature_1": "gain_1*heater_1 - loss_1*(temperature_1 - room)",
+        "temperature_2": "gain_2*heater_2 - loss_2*(temperature_2 - room)",
+    },
+}
+"""The equations of ``mkc_torch.challenge.dynamics.naive``, as texts."""
+
+NAIVE: Mapping[str, type[Dynamics]] = {
+    "pendulum": naive.Pendulum,
+    "cart_pole": naive.CartPole,
+    "tanks": naive.Tanks,
+    "motor": naive.Motor,
+    "projectile": naive.Projectile,
+    "thermal": naive.Thermal,
+}
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One recording, diagnosed twice: first findings, the largest difference of a parameter, and seconds."""
+
+    name: str
+    effects: tuple[str, str]
+    off: float
+    seconds: tuple[float, float]
+
+    @property
+    def same(self) -> bool:
+        return self.effects[0] == self.effects[1]
+
+
+def as_fmu(system: str, folder: Path, version: int = 2, *, derivatives: bool = True) -> Path:
+    """The naive simulation of a system as an FMU."""
+    kind = NAIVE[system]
+    known = {name: one if isinstance(one, Parameter) else Parameter(one) for name, one in kind.parameters.items()}
+    bounds = {
+        name: (one.value, *(None if abs(end) == float("inf") else end for end in (one.lower, one.upper)), one.unit)
+        for name, one in known.items()
+    }
+    model = Model(kind.__name__, RATES[system], bounds, kind.inputs, units=dict(kind.units))
+    return make_fmu(folder / f"{system}_{version}.fmu", model, version, derivatives=derivatives)
+
+
+def pairs(count: int, version: int = 2, *, derivatives: bool = True, surrogates: int = 19) -> Iterator[Pair]:
+    """The first recordings of the seed, one after the other."""
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as place:
+        fmus: dict[str, Simulation] = {}
+        for index in range(FIRST, FIRST + count):
+            case = generator.draw(SEED, index)
+            system = case.key.mode
+            if system not in fmus:
+                fmus[system] = load_fmu(as_fmu(system, Path(place), version, derivatives=derivatives))
+            results, seconds = [], []
+            for simulation in (NAIVE[system](), fmus[system]):
+                began = time.process_time()
+                results.append(diagnose(simulation, case.recording, surrogates=surrogates, max_findings=1))
+                seconds.append(time.process_time() - began)
+            yield Pair(case.recording.name, _firsts(results), _off(results), (seconds[0], seconds[1]))
+
+
+def _firsts(results: list[Diagnosis]) -> tuple[str, str]:
+    one, other = (result.findings[0].effect if result.findings else "nothing" for result in results)
+    return one, other
+
+
+def _off(results: list[Diagnosis]) -> float:
+    """By what share of themselves the parameters of the simulation differ at most; 0 where there are none."""
+    one, other = (result.model.theta for result in results)
+    if len(one) != len(other) or not len(one):
+        return 0.0 if len(one) == len(other) else float("inf")
+    return float(((one - other).abs() / one.abs().clamp(min=1e-12)).max())
+
+
+def main() -> None:
+    """Print a line for each recording, and the sums."""
+    parser = argparse.ArgumentParser(description="Diagnoses of the same equations as torch and as FMU")
+    parser.add_argument("--recordings", type=int, default=60)
+    parser.add_argument("--version", type=int, choices=(2, 3), default=2, help="of FMI")
+    parser.add_argument("--differences", action="store_true", help="without directional derivatives")
+    given = parser.parse_args()
+    known: list[Pair] = []
+    for pair in pairs(given.recordings, given.version, derivatives=not given.differences):
+        known.append(pair)
+        ratio = pair.seconds[1] / pair.seconds[0]
+        print(
+            f"{pair.name:18} {pair.effects[0]:26} {pair.effects[1]:26} {100 * pair.off:8.4f} % "
+            f"{pair.seconds[0]:7.1f} s {pair.seconds[1]:7.1f} s {ratio:5.2f}",
+            flush=True,
+        )
+    same = sum(pair.same for pair in known)
+    close = sum(pair.off <= 0.01 for pair in known)
+    torchs, fmus = (sum(pair.seconds[k] for pair in known) for k in (0, 1))
+    print(
+        f"{same} of {len(known)} with the same first finding; parameters within 1 % in {close}; "
+        f"{torchs:.0f} s as torch, {fmus:.0f} s as FMU, {fmus / torchs:.2f} times"
+    )
+
+
+if __name__ == "__main__":
+    main()

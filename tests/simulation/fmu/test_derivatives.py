@@ -1,0 +1,170 @@
+"""An FMU as a function of torch: its values and slopes are those of the equations it was made of, by SymPy."""
+
+import numpy as np
+import pytest
+import sympy
+import torch
+
+pytest.importorskip("fmpy")
+
+
+from mkc_torch._support.forward_mode import _trusted, twice_reverse_tangents
+from mkc_torch.simulation import load_fmu
+from mkc_torch.simulation.fmu.evaluation import Moments
+from mkc_torch.simulation.fmu.function import evaluated
+from tests.simulation.fmu.made import COMPILER, PENDULUM, Model, make_fmu
+
+pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no compiler of C (cc, gcc or clang)")
+
+MOTOR = Model(
+    "Motor",
+    {
+        "angle": "speed",
+        "speed": "torque*current - damping*speed",
+        "current": "drive*voltage - resistance*current - emf*speed",
+    },
+    {"torque": (12.0, None, None, ""), "damping": (0.6, 0.0, None, "1/s"), "drive": (7.0, None, None, ""),
+     "resistance": (12.0, 0.0, 100.0, ""), "emf": (0.6, None, None, "")},
+    ("voltage",),
+    {"power": "voltage*current"},
+    variability="fixed",
+)  # fmt: skip
+TANKS = Model(
+    "Tanks",
+    {"upper": "gain*pump - outlet*sqrt(upper)", "lower": "outlet*sqrt(upper) - second*sqrt(lower)"},
+    {"gain": (0.1, None, None, ""), "outlet": (0.2, 0.0, None, ""), "second": (0.3, 0.0, None, "")},
+    ("pump",),
+    start={"upper": 0.5, "lower": 0.4},
+)
+HEATER = Model(
+    "Heater", {"warmth": "gain*power - loss*(warmth - room)*(1 + time/100)"},
+    {"gain": (0.5, None, None, "K/J"), "loss": (0.1, 0.0, None, "1/s")}, ("power", "room"),
+)  # fmt: skip
+CART = Model(
+    "Cart",
+    {
+        "place": "speed", "speed": "push - drag*speed", "angle": "turn",
+        "turn": "-((push - drag*speed)*cos(angle) + 9.81*sin(angle))/length",
+    },
+    {"drag": (0.5, 0.0, None, ""), "length": (1.0, 0.1, None, "m")},
+    ("push",),
+)  # fmt: skip
+
+MODELS = (PENDULUM, MOTOR, TANKS, HEATER, CART)
+KINDS = ((2, True), (2, False), (3, True), (3, False))
+
+
+def moments(model, rows=6):
+    g = torch.Generator().manual_seed(3)
+    time, states, inputs = (
+        torch.rand(rows, count, generator=g, dtype=torch.float64) + 0.2
+        for count in (1, len(model.states), len(model.inputs))
+    )
+    parameters = torch.tensor([one[0] for one in model.parameters.values()], dtype=torch.float64) * 1.1
+    return time[:, 0], states, inputs, parameters
+
+
+def by_sympy(model, texts, at):
+    """Values (S, k), and slopes by states, inputs and parameters, each (S, k, size)."""
+    names = ["time", *model.states, *model.inputs, *model.parameters]
+    symbols = {name: sympy.Symbol(name, real=True) for name in names}
+    whole = [sympy.sympify(text, locals=symbols) for text in texts]
+    time, states, inputs, parameters = (one.numpy() for one in at)
+    given = [time, *states.T, *inputs.T, *(np.full_like(time, one) for one in parameters)]
+
+    def numbers(expressions):
+        function = sympy.lambdify(list(symbols.values()), expressions, "numpy")
+        return torch.tensor(np.stack([np.broadcast_to(one, time.shape) for one in function(*given)], -1)).double()
+
+    slopes = []
+    for group in (model.states, model.inputs, model.parameters):
+        flat = [sympy.diff(one, symbols[name]) for one in whole for name in group]
+        slopes.append(numbers(flat).unflatten(-1, (len(whole), len(group))))
+    return numbers(whole), slopes
+
+
+@pytest.fixture(scope="module", params=KINDS, ids=lambda kind: f"FMI {kind[0]}{'' if kind[1] else ', differences'}")
+def fmus(request, tmp_path_factory):
+    version, derivatives = request.param
+    folder = tmp_path_factory.mktemp("fmus")
+    return {
+        model.name: load_fmu(make_fmu(folder / f"{model.name}.fmu", model, version, derivatives=derivatives)).evaluation
+        for model in MODELS
+    }
+
+
+@pytest.mark.parametrize(("model", "outputs"), [*((one, False) for one in MODELS), (MOTOR, True)])
+def test_values_and_slopes_are_those_of_the_equations(fmus, model, outputs):
+    texts = list((model.outputs if outputs else model.rates).values())
+    evaluation, at = fmus[model.name], moments(model)
+    values, slopes = by_sympy(model, texts, at)
+
+    def function(*parts):
+        return evaluated(evaluation, outputs, at[0], *parts)
+
+    torch.testing.assert_close(function(*at[1:]), values, rtol=1e-13, atol=1e-13)
+    rows = torch.arange(len(values))
+    for transform in (torch.func.jacrev, torch.func.jacfwd):
+        states, inputs, parameters = transform(function, argnums=(0, 1, 2))(*at[1:])
+        found = [states[rows, :, rows], inputs[rows, :, rows], parameters]
+        for one, expected in zip(found, slopes, strict=True):
+            torch.testing.assert_close(one, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_whole_batches_are_rows_like_others(fmus):
+    evaluation, (time, states, inputs, parameters) = fmus["Pendulum"], moments(PENDULUM)
+
+    def function(states, parameters):
+        return evaluated(evaluation, False, time, states, inputs, parameters)
+
+    many = torch.stack([states, 2.0 * states, -states])
+    expected = torch.stack([function(one, parameters) for one in many])
+    assert torch.equal(torch.func.vmap(function, (0, None))(many, parameters), expected)
+    other = torch.stack([parameters, 1.5 * parameters, 0.5 * parameters])
+    expected = torch.stack([function(*one) for one in zip(many, other, strict=True)])
+    assert torch.equal(torch.func.vmap(function)(many, other), expected)
+    slopes = torch.func.vmap(torch.func.jacfwd(function), (0, None))(many, parameters)
+    torch.testing.assert_close(slopes[1], torch.func.jacrev(function)(many[1], parameters))
+
+
+def test_reverse_mode_of_reverse_mode_is_trusted_and_second_derivatives_are_refused(fmus):
+    evaluation, (time, states, inputs, parameters) = fmus["Cart"], moments(CART)
+
+    def function(parameters):
+        return evaluated(evaluation, False, time, states, inputs, parameters)
+
+    rows = twice_reverse_tangents(function)(parameters)
+    assert _trusted[function] is True
+    torch.testing.assert_close(rows.movedim(0, -1), torch.func.jacfwd(function)(parameters))
+    at = parameters.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(function(at).sum(), at, create_graph=True)
+    with pytest.raises(RuntimeError, match="first derivatives only"):
+        torch.autograd.grad(slope.sum(), at)
+
+
+def test_a_wrong_derivative_of_the_fmu_is_not_trusted(tmp_path):
+    """As of tools that leave out what an algebraic loop adds: differences take its place."""
+    wrong = tmp_path / "wrong.fmu"
+    make_fmu(wrong, PENDULUM)
+    evaluation = load_fmu(wrong).evaluation
+    plain = evaluation.binary.slopes
+    evaluation.binary.slopes = lambda *how: 1.01 * plain(*how)
+    at = moments(PENDULUM)
+    _, (expected, _, _) = by_sympy(PENDULUM, list(PENDULUM.rates.values()), at)
+    found = evaluation.slopes(False, Moments(*(one.numpy() for one in at)), "states")
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
+    assert not any(evaluation._trusted.values())
+
+
+def test_a_moment_that_comes_again_is_not_computed_again(fmus, monkeypatch):
+    evaluation, (time, states, inputs, parameters) = fmus["Motor"], moments(MOTOR)
+    asked = []
+    plain = evaluation.binary.values
+    monkeypatch.setattr(evaluation.binary, "values", lambda *how: asked.append(len(how[1])) or plain(*how))
+    twice = torch.arange(len(time)).repeat_interleave(2)
+    parts = (time[twice], states[twice] + 0.123, inputs[twice])
+    first = evaluated(evaluation, False, *parts, parameters)
+    assert torch.equal(first[::2], first[1::2])
+    first.zero_()  # what is given away is no longer what is remembered
+    assert float(evaluated(evaluation, False, *parts, parameters).abs().sum()) > 0
+    assert asked == [len(time)]

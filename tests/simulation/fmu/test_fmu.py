@@ -1,0 +1,212 @@
+"""FMUs as simulations: what is read of them, what is refused, and what their recordings are compared with."""
+
+import pickle
+import zipfile
+from dataclasses import replace
+
+import pytest
+import torch
+
+pytest.importorskip("fmpy")
+pytest.importorskip("sympy")
+
+from mkc_torch import Recording
+from mkc_torch.simulation import Dynamics, FmuError, Parameter, SimulationError, load_fmu, load_simulation
+from mkc_torch.simulation.fmu import binary
+from tests.simulation.fmu.made import COMPILER, PENDULUM, Model, description, make_fmu
+
+pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no compiler of C (cc, gcc or clang)")
+
+
+class Pendulum(Dynamics):
+    states = ("angle", "speed")
+    inputs = ("torque",)
+    outputs = ("angle",)
+    parameters = {"stiffness": 9.0, "damping": Parameter(0.1, lower=0.0, unit="1/s")}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"angle": x.speed, "speed": u.torque - p.stiffness * torch.sin(x.angle) - p.damping * x.speed}
+
+
+def swing(count=60, **renamed):
+    time = 0.05 * torch.arange(count, dtype=torch.float64)
+    columns = {"time": time, "torque": torch.sin(2.0 * time), "angle": 0.4 * torch.cos(3.0 * time)}
+    return Recording({renamed.get(name, name): values for name, values in columns.items()})
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_it_is_what_it_says_of_itself(tmp_path, version):
+    simulation = load_simulation(str(make_fmu(tmp_path / "p.fmu", PENDULUM, version)))
+    assert (simulation.name, simulation.states, simulation.inputs) == ("Pendulum", ("angle", "speed"), ("torque",))
+    assert simulation.units == {"angle": "rad", "speed": "rad/s", "torque": "N·m"}
+    assert simulation.parameters["damping"] == Parameter(0.1, lower=0.0, unit="1/s")
+    assert simulation.initial == {"angle": 0.0, "speed": 0.0}
+
+
+@pytest.mark.parametrize(("version", "derivatives"), [(2, True), (2, False), (3, True)])
+def test_it_simulates_as_the_same_equations_in_torch_do(tmp_path, version, derivatives):
+    simulation = load_fmu(make_fmu(tmp_path / "p.fmu", PENDULUM, version, derivatives=derivatives))
+    one, other = simulation.prepare(swing()), Pendulum().prepare(swing())
+    theta = other.start()
+    assert one.parameter_names == other.parameter_names
+    assert one.kinematic == {"angle": "speed"}
+    torch.testing.assert_close(one.start(), theta, rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close(one.residual(theta, {}), other.residual(theta, {}), rtol=1e-9, atol=1e-9)
+    slopes = [torch.func.jacfwd(lambda at, which=which: which.residual(at, {}))(theta) for which in (one, other)]
+    torch.testing.assert_close(*slopes, rtol=1e-7, atol=1e-7)
+
+
+def test_a_state_has_the_name_of_the_output_that_shows_it(tmp_path):
+    model = replace(PENDULUM, outputs={"load.phi": "angle", "height": "1 - cos(angle)"})
+    simulation = load_fmu(make_fmu(tmp_path / "p.fmu", model))
+    assert simulation.states == ("load_phi", "speed")
+    # a column may be called as the FMU calls it
+    prepared = simulation.prepare(swing(angle="load.phi"))
+    assert prepared.channels == ("load_phi",)
+    assert torch.equal(prepared.guess[prepared.rows][:, 0], swing()["angle"])
+    raised = simulation.prepare(swing(angle="height"))
+    assert raised.channels == ("height",)
+    states = torch.tensor([[0.3, 0.1]], dtype=torch.float64).expand(60, 2)
+    x = type("X", (), {"load_phi": states[:, 0], "speed": states[:, 1]})()
+    u, p = (
+        type("U", (), {"torque": states[:, 0]})(),
+        type("P", (), {"stiffness": states[0, 0], "damping": states[0, 0]})(),
+    )
+    shown = raised.system.output(torch.zeros(60), x, u, p)["height"]
+    torch.testing.assert_close(shown, 1.0 - torch.cos(states[:, 0]))
+
+
+def test_outputs_that_were_not_recorded_are_listed(tmp_path):
+    model = replace(PENDULUM, outputs={"body.height": "1 - cos(angle)"})
+    simulation = load_fmu(make_fmu(tmp_path / "p.fmu", model))
+    with pytest.raises(
+        SimulationError, match=r"It has body\.height, angle, speed; the recording has time, torque, phi"
+    ):
+        simulation.prepare(swing(angle="phi"))
+
+
+def test_another_process_can_be_given_it(tmp_path):
+    simulation = load_fmu(make_fmu(tmp_path / "p.fmu", PENDULUM))
+    again = pickle.loads(pickle.dumps(simulation))
+    assert again.states == simulation.states
+    theta = Pendulum().prepare(swing()).start()
+    assert torch.equal(again.prepare(swing()).residual(theta, {}), simulation.prepare(swing()).residual(theta, {}))
+
+
+STOP = Model(
+    "Stop",
+    {"level": "inflow - loss*level - r0*spill*(level - rim)"},
+    {"loss": (0.3, 0.0, None, "1/s"), "spill": (2.0, None, None, ""), "rim": (0.5, None, None, "")},
+    ("inflow",),
+    events=("level - rim",),
+)
+"""Above the rim it spills; which side it is on is frozen between events, as tools do."""
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_what_switches_is_looked_at_in_each_moment(tmp_path, version):
+    simulation = load_fmu(make_fmu(tmp_path / "s.fmu", STOP, version))
+    level = torch.tensor([0.2, 0.9, 0.3, 0.7], dtype=torch.float64)
+    x, u = type("X", (), {"level": level})(), type("U", (), {"inflow": torch.zeros_like(level)})()
+    p = type("P", (), {name: torch.tensor(one[0]).double() for name, one in STOP.parameters.items()})()
+    found = simulation.derivative(torch.zeros_like(level), x, u, p)["level"]
+    torch.testing.assert_close(found, -0.3 * level - 2.0 * (level - 0.5).clamp(min=0.0))
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_jumps_and_memory_are_refused(tmp_path, version):
+    bouncing = replace(STOP, reset={"level": "-0.8*level"})
+    with pytest.raises(SimulationError, match=r"resets its states at an event.*`--simulated SIM.csv`"):
+        load_fmu(make_fmu(tmp_path / "b.fmu", bouncing, version))
+    with pytest.raises(FmuError, match=r"depend on events before.*`--simulated SIM.csv`"):
+        load_fmu(make_fmu(tmp_path / "m.fmu", replace(STOP, memory=True), version))
+
+
+def zipped(path, text, *more):
+    with zipfile.ZipFile(path, "w") as archive:
+        if text is not None:
+            archive.writestr("modelDescription.xml", text)
+        for name in more:
+            archive.writestr(name, "")
+
+
+TEXT = description(PENDULUM)
+STILL = Model("Still", {}, {"gain": (1.0, None, None, "")}, ("torque",), {"force": "gain*torque"})
+
+
+@pytest.mark.parametrize(
+    ("text", "more", "words"),
+    [
+        (None, (), "this is no FMU, or a damaged one: it has no modelDescription.xml"),
+        ("<fmiModelDescription fmiVersion='2.0'", (), "its modelDescription.xml cannot be understood"),
+        (description(PENDULUM, fmi="1.0"), (), "this FMU is of FMI 1.0; FMI 2.0 and 3.0 are read"),
+        ("<model/>", (), "this FMU is of FMI no version that it tells"),
+        (description(PENDULUM, 3, kind="ScheduledExecution"), (), "for scheduled execution only; export it for model"),
+        (description(STILL), (), "no continuous states, so there is no differential equation in it"),
+        (TEXT.replace("start=\"9.0\"", ""), (), "its parameter stiffness has no start, which FMI asks for"),
+        (TEXT.replace("start=\"9.0\"", "start=\"nine\""), (), "of its parameter stiffness a value is 'nine'"),
+        (TEXT.replace("start=\"0.1\"", "start=\"-0.1\""), (), "its parameter damping cannot be fitted"),
+        (TEXT, (), "it has no binaries, and none for"),
+        (TEXT, ("binaries/mars64/Pendulum.so",), "it has binaries for mars64 alone, and none for"),
+        (TEXT, ("sources/all.c",), "its sources are in it; `fmpy compile MODEL.fmu` makes one of them"),
+        (TEXT, ("binaries/PLATFORM/Pendulum.so",), "its binary cannot be used"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_used_is_told_in_a_sentence(tmp_path, text, more, words):
+    path = tmp_path / "model.fmu"
+    zipped(path, text, *(name.replace("PLATFORM", binary._platform(2)) for name in more))
+    with pytest.raises(FmuError) as caught:
+        load_fmu(path)
+    told = str(caught.value)
+    assert told.startswith(f"{path}: ")
+    assert words in told
+    assert told.endswith(".")
+    assert "\n" not in told
+
+
+def test_neither_is_what_is_no_archive(tmp_path):
+    (tmp_path / "model.fmu").write_bytes(b"PK\x03\x04 cut off")
+    with pytest.raises(FmuError, match=r"damaged one: it is no zip archive"):
+        load_fmu(tmp_path / "model.fmu")
+    with pytest.raises(FmuError, match=r"there is no such file"):
+        load_fmu(tmp_path / "other.fmu")
+
+
+def test_without_fmpy_it_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "fmpy", None)
+    (tmp_path / "model.fmu").write_bytes(b"")
+    with pytest.raises(ImportError, match=r'install it with `pip install "mkc-torch\[fmu\]"`'):
+        load_fmu(tmp_path / "model.fmu")
+
+
+COSIMULATION = """
+from pythonfmu import Fmi2Causality, Fmi2Slave, Real
+
+
+class Lag(Fmi2Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.push, self.level = 0.0, 0.0
+        self.register_variable(Real("push", causality=Fmi2Causality.input))
+        self.register_variable(Real("level", causality=Fmi2Causality.output))
+
+    def do_step(self, current_time, step_size):
+        self.level += step_size * (self.push - self.level)
+        return True
+"""
+
+
+def test_one_with_its_own_solver_is_compared_as_what_a_simulator_wrote(tmp_path):
+    builder = pytest.importorskip("pythonfmu.builder")
+    (tmp_path / "lag.py").write_text(COSIMULATION, encoding="utf-8")
+    path = builder.FmuBuilder.build_FMU(str(tmp_path / "lag.py"), dest=str(tmp_path))
+    simulation = load_fmu(path)
+    time = 0.05 * torch.arange(80, dtype=torch.float64)
+    push = torch.ones_like(time)
+    level = 1.0 - torch.exp(-time)  # of the same equation without steps
+    prepared = simulation.prepare(Recording({"time": time, "push": push, "level": level}))
+    assert (simulation.name, prepared.channels) == ("simulated", ("level",))
+    left = prepared.residual(prepared.start(), {})
+    assert float(left.abs().max()) < 0.02
+    with pytest.raises(SimulationError, match=r"It has level; the recording has time, push, height"):
+        simulation.prepare(Recording({"time": time, "push": push, "height": level}))

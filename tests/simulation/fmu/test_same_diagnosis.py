@@ -1,0 +1,40 @@
+"""The challenge's naive simulations as FMUs: the same equations, and the same diagnoses."""
+
+import pytest
+import torch
+
+pytest.importorskip("fmpy")
+
+from mkc_torch.simulation import Parameter, load_fmu
+from mkc_torch.simulation.dynamics.user_functions import namespace
+from mkc_torch.simulation.names import Names
+from tests.benchmarks import fmu
+from tests.simulation.fmu.made import COMPILER
+
+pytestmark = pytest.mark.skipif(COMPILER is None, reason="there is no compiler of C (cc, gcc or clang)")
+
+
+@pytest.mark.parametrize("system", fmu.RATES)
+def test_the_texts_are_the_naive_equations(tmp_path, system):
+    one, other = fmu.NAIVE[system](), load_fmu(fmu.as_fmu(system, tmp_path))
+    assert (one.states, one.inputs, list(one.parameters)) == (other.states, other.inputs, list(other.parameters))
+    generator = torch.Generator().manual_seed(0)
+    states, inputs = (
+        torch.rand(9, len(names), generator=generator, dtype=torch.float64) - 0.1 for names in (one.states, one.inputs)
+    )
+    values = {k: p.value if isinstance(p, Parameter) else p for k, p in one.parameters.items()}
+    p = Names(**{name: torch.tensor(1.3 * value, dtype=torch.float64) for name, value in values.items()})
+    given = torch.zeros(9), namespace(one.states, states), namespace(one.inputs, inputs), p
+    expected, found = one.derivative(*given), other.derivative(*given)
+    for state in one.states:
+        torch.testing.assert_close(found[state], expected[state], rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.slow
+def test_what_is_found_is_the_same(monkeypatch):
+    """A throw, the quickest of the systems; `python -m tests.benchmarks.fmu` does all of them."""
+    monkeypatch.setattr(fmu, "FIRST", 18)
+    (pair,) = fmu.pairs(1)
+    assert pair.name.startswith("projectile")
+    assert pair.same
+    assert pair.off < 0.01
