@@ -59,7 +59,8 @@ class Calibration:
         before: of the measured norm about its median.
         after: of :meth:`norm_residual`, rejected samples included.
         rejected: number of samples of weight below one half.
-        disturbed: where rejected samples stand close together in time.
+        disturbed: where rejected samples stand close together.
+        disturbed_unit: of it: "s", or "row", counted from 1, where the recording has no time.
         coverage: of directions, by the samples in use.
         warnings: sentences about the recording and the fit.
     """
@@ -86,6 +87,7 @@ class Calibration:
     disturbed: tuple[Interval, ...]
     coverage: Coverage
     warnings: tuple[str, ...]
+    disturbed_unit: str = "s"
 
     @property
     def rejected_share(self) -> float:
@@ -173,7 +175,12 @@ def calibration_to_json(calibration: Calibration) -> str:
             "bound": c.bound,
         },
         "residual": {"before": c.before._asdict(), "after": c.after._asdict()},
-        "rejected": {"count": c.rejected, "share": c.rejected_share, "intervals": c.disturbed},
+        "rejected": {
+            "count": c.rejected,
+            "share": c.rejected_share,
+            "intervals": c.disturbed,
+            "interval_unit": c.disturbed_unit,
+        },
         "coverage": {
             "fraction": c.coverage.fraction,
             "information": c.coverage.information,
@@ -234,4 +241,5 @@ def calibration_from_json(text: str) -> Calibration:
             information=c.number("coverage", "information"),
         ),
         warnings=tuple(c.text("warnings", i) for i in c.each("warnings")),
+        disturbed_unit=c.text("rejected", "interval_unit") if c.has("rejected", "interval_unit") else "s",
     )

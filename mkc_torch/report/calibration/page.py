@@ -9,6 +9,7 @@ from markupsafe import Markup
 
 from mkc_torch.calibration.calibrate import ENOUGH_INFORMATION, MAX_REJECTED, Calibration, Vector, prepared
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.calibration.places import numbered, places
 from mkc_torch.recording.recording import Recording
 from mkc_torch.report.calibration import pictures
 from mkc_torch.report.rendering import render
@@ -46,7 +47,7 @@ def calibration_report(
         >>> calibration_report(calibrate(recording), recording).startswith("<!doctype html>")
         True
     """
-    usable = prepared(recording)
+    usable = prepared(numbered(recording))
     points = usable.magnetometer()
     in_use = calibration.corrected(points)[calibration.weight(points) >= 0.5]
     return render(
@@ -60,7 +61,7 @@ def calibration_report(
         comparison=comparison,
         figures={
             "sphere": Markup(pictures.sphere(calibration, points)),
-            "residual": Markup(pictures.residual(calibration, points, usable.time)),
+            "residual": Markup(pictures.residual(calibration, points, places(usable))),
             "density": Markup(pictures.density(calibration, points)),
             "coverage": Markup(pictures.coverage_map(calibration.coverage, in_use)),
         },

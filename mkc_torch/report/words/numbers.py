@@ -151,18 +151,23 @@ def noise(calibration: Calibration) -> str:
     return term("noise.along_the_field", size=f"{size(0.5 * c.radius * c.d)} {c.unit}", kind=kind)
 
 
-def when(intervals: Sequence[Interval]) -> str:
-    """Intervals of time as one phrase; empty where there are none.
+def when(intervals: Sequence[Interval], unit: str = "s") -> str:
+    """Intervals of time, or of rows, as one phrase; empty where there are none.
 
     Example:
         >>> when([Interval(12.13, 15.3)]), when([Interval(0, 1), Interval(5, 5.5)])
         ('between 12.1 s and 15.3 s', 'from 0.0 to 1.0 s and from 5.0 to 5.5 s')
         >>> when([Interval(0, 1), Interval(5, 5.5), Interval(9, 9.5), Interval(20, 24)])
         'in 4 intervals, the longest from 20.0 to 24.0 s'
+        >>> when([Interval(101, 140)], "row")
+        'between row 101 and row 140'
     """
+    rows = unit == "row"
+    ends = [tuple(f"{end:.0f}" if rows else f"{end:.1f}" for end in one) for one in intervals]
     if len(intervals) == 1:
-        return term("where.between", start=f"{intervals[0].start:.1f}", end=f"{intervals[0].end:.1f}")
-    spans = [term("where.interval", start=f"{i.start:.1f}", end=f"{i.end:.1f}") for i in intervals]
+        return term("where.between_rows" if rows else "where.between", start=ends[0][0], end=ends[0][1])
+    name = "where.interval_of_rows" if rows else "where.interval"
+    spans = [term(name, start=start, end=end) for start, end in ends]
     each = [term("where.from", interval=span) for span in spans]
     if len(intervals) > 3:
         longest = max(range(len(each)), key=lambda k: intervals[k].end - intervals[k].start)
@@ -178,7 +183,7 @@ def rejection(calibration: Calibration) -> str:
     key = "calibration.one_rejected" if c.rejected == 1 else "calibration.rejected"
     told = term(key, share=share(c.rejected_share), samples=f"{c.samples:,}")
     if c.disturbed:
-        return term("calibration.mainly", rejected=told, when=when(c.disturbed))
+        return term("calibration.mainly", rejected=told, when=when(c.disturbed, c.disturbed_unit))
     return term("calibration.scattered", rejected=told)
 
 

@@ -153,6 +153,7 @@ TERMS: dict[str, str] = {
     "where.moment": "{moment} s",
     "where.moment_of_samples": "[unit.sample] {moment}",
     "where.interval": "{start} to {end} s",
+    "where.interval_of_rows": "row {start} to {end}",
     "where.interval_of_samples": "[unit.sample] {start} to {end}",
     "where.anew": "anew at {moments}",
     "where.first": "first at {moment}",
@@ -171,6 +172,7 @@ TERMS: dict[str, str] = {
     "where.experiment": "experiment {number}: {share} %",
     "where.more_experiments": "{experiments}, and {count} more",
     "where.between": "between {start} s and {end} s",
+    "where.between_rows": "between row {start} and row {end}",
     "where.in_intervals": "in {count} intervals, the longest {longest}",
     # numbers and lists
     "number.none": "–",
@@ -325,6 +327,7 @@ TERMS: dict[str, str] = {
     "section.directions": "Directions covered",
     # titles, axes and legends of pictures, and what is read aloud instead of them
     "picture.time": "time (s)",
+    "picture.row": "row of the recording",
     "picture.of_channel": "{name}, {channel}",
     "picture.curve": "What was found, 95 % band",
     "picture.forcing": "What pushes the rate of {place}, 95 % band",
