@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.calibration.aided.fallback import with_aid
 from mkc_torch.calibration.clipped_samples import CLIPPED, without_clipped
 from mkc_torch.calibration.coverage import Coverage
 from mkc_torch.calibration.ellipsoid import ellipsoid_from_coefficients
@@ -102,6 +103,9 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
     errors allow for autocorrelation, but not from one ``experiment`` to the next. Where the radius does not fit the
     unit, it is called "recorded units", and a warning says why.
 
+    Where the turns do not determine an ellipsoid, as those of a vehicle that hardly tilts, an attitude ``q_*`` or a
+    gyroscope ``gyro_*`` stands in for them; ``aid`` says what it determined, and what not.
+
     Args:
         recording: with columns ``mag_x``, ``mag_y``, ``mag_z``, in any one unit, and ``time`` in s where it has one.
         field_strength: length of the corrected field in µT; default the radius of the ellipsoid, in its own unit.
@@ -110,7 +114,7 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
     Raises:
         MissingColumnError: a column of the magnetometer is not there.
         RecordingError: fewer than nine usable samples.
-        NotIdentifiableError: the samples do not determine an ellipsoid.
+        NotIdentifiableError: the samples do not determine an ellipsoid, and nothing stands in for what is missing.
         ValueError: a field strength that is not positive.
 
     Example:
@@ -125,11 +129,17 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
     if field_strength is not None and not (math.isfinite(field_strength) and field_strength > 0):
         raise ValueError(f"Expected argument `field_strength` to be positive but got {field_strength}.")
     usable = prepared(numbered(recording))
-    points = usable.magnetometer()
     try:
         fit = recorded_ellipsoid(usable, seed)
     except NotIdentifiableError as error:
-        raise _with_faults(error, usable) from None
+        refusal = _with_faults(error, usable)
+    else:
+        return _of_ellipsoid(fit, usable, field_strength)
+    return with_aid(usable, refusal, field_strength=field_strength)
+
+
+def _of_ellipsoid(fit: EllipsoidFit, usable: Recording, field_strength: float | None) -> Calibration:
+    points = usable.magnetometer()
     radius = float(fit.radius_)
     strength = radius if field_strength is None else field_strength
     scale = strength / radius

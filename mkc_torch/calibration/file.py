@@ -49,6 +49,13 @@ class CheckedValues:
             value = value[key]
         return True
 
+    def names(self, *path: str) -> tuple[str, ...]:
+        """Of the values that stand under a name."""
+        value = self._at(*path)
+        if not isinstance(value, Mapping):
+            raise self._wrong(path, "an object")
+        return tuple(value)
+
     def _wrong(self, path: tuple[str | int, ...], expected: str) -> CalibrationFileError:
         shown = json.dumps(self._at(*path), ensure_ascii=False)
         shown = shown if len(shown) <= 40 else shown[:39] + "…"

@@ -6,11 +6,12 @@ import json
 import math
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from mkc_torch.calibration.aid import Aid, aid_from_json, aid_to_json
 from mkc_torch.calibration.coverage import Coverage, Gap, nearest_axis
 from mkc_torch.calibration.file import (
     CalibrationFileError,
@@ -61,6 +62,8 @@ class Calibration:
         rejected: number of samples of weight below one half.
         disturbed: where rejected samples stand close together.
         disturbed_unit: of it: "s", or "row", counted from 1, where the recording has no time.
+        aid: what stood in for turns that are missing, and what it did not determine; None of an ellipsoid. The matrix
+            then also turns the sensor's axes into those of the gyroscope or the attitude, and need not be symmetric.
         coverage: of directions, by the samples in use.
         warnings: sentences about the recording and the fit.
     """
@@ -88,6 +91,7 @@ class Calibration:
     coverage: Coverage
     warnings: tuple[str, ...]
     disturbed_unit: str = "s"
+    aid: Aid | None = None
 
     @property
     def rejected_share(self) -> float:
@@ -157,7 +161,7 @@ class Calibration:
 def calibration_to_json(calibration: Calibration) -> str:
     """The text of calibration.json; see :meth:`Calibration.to_json`."""
     c = calibration
-    content = {
+    content: dict[str, Any] = {
         "schema": SCHEMA,
         "recording": c.recording,
         "samples": c.samples,
@@ -191,6 +195,8 @@ def calibration_to_json(calibration: Calibration) -> str:
         },
         "warnings": c.warnings,
     }
+    if c.aid is not None:
+        content["aided"] = aid_to_json(c.aid)
     text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
     # lists of numbers on one line; a text in JSON holds no line end, so none is touched
     return re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda m: "[" + " ".join(m[1].split()) + "]", text) + "\n"
@@ -242,4 +248,5 @@ def calibration_from_json(text: str) -> Calibration:
         ),
         warnings=tuple(c.text("warnings", i) for i in c.each("warnings")),
         disturbed_unit=c.text("rejected", "interval_unit") if c.has("rejected", "interval_unit") else "s",
+        aid=aid_from_json(c),
     )

@@ -42,6 +42,8 @@ def show(console: Console, c: Calibration, files: list[Path]) -> None:
         (term("label.coverage"), term("calibration.coverage", share=w.share(c.coverage.fraction))),
     ):
         facts.add_row(name, Text(value))
+    if c.aid is not None:
+        facts.add_row(term("label.aided"), Text(" ".join(w.aided(c))))
     for warning in c.warnings:
         facts.add_row(Text(term("label.warning"), style="bold yellow"), Text(warning))
     console.print(facts)

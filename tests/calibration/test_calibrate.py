@@ -333,8 +333,3 @@ def test_broad_28_semi_axes_are_those_of_the_undisturbed_recording():
     assert c.semi_axes == pytest.approx((44.17, 44.50, 45.61), abs=0.6)
     assert 0.02 < c.rejected_share < 0.1
     assert c.disturbed
-
-
-def test_quadrotor_is_refused_naming_the_direction():
-    with pytest.raises(NotIdentifiableError, match=r"\+z"):
-        calibrate(Recording.read(shared_data("magnetometer/quadrotor_compass1.csv")))

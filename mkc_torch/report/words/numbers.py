@@ -78,7 +78,8 @@ def matrix_with_errors(
 ) -> list[list[str]]:
     """Rows of a matrix with their standard errors, all to the same digits, in a power of ten."""
     scale = 10.0**exponent
-    places = decimals(max(e for row in errors for e in row) / scale)
+    known = [e for row in errors for e in row if math.isfinite(e)]
+    places = decimals(max(known, default=math.nan) / scale)
     return [
         [_with_error(v / scale, e / scale, places) for v, e in zip(row, error, strict=True)]
         for row, error in zip(matrix, errors, strict=True)
@@ -113,7 +114,9 @@ def listed(values: Sequence[float], errors: Sequence[float], exponent: int = 0) 
         '1.23, −2.00, 0.50'
     """
     scale = 10.0**exponent
-    return ", ".join(number(v / scale, decimals(max(errors) / scale)) for v in values)
+    return ", ".join(
+        number(v / scale, decimals(max(filter(math.isfinite, errors), default=math.nan) / scale)) for v in values
+    )
 
 
 def share(value: float) -> str:
@@ -185,6 +188,23 @@ def rejection(calibration: Calibration) -> str:
     if c.disturbed:
         return term("calibration.mainly", rejected=told, when=when(c.disturbed, c.disturbed_unit))
     return term("calibration.scattered", rejected=told)
+
+
+def aided(calibration: Calibration) -> list[str]:
+    """How a calibration came about that the ellipsoid alone does not determine, in sentences; empty of an ellipsoid."""
+    aid = calibration.aid
+    if aid is None:
+        return []
+    rivals = [
+        term("aided.rival", response=term(f"aided.{name}"), nats=f"{-value:.0f}")
+        for name, value in aid.evidence
+        if name != aid.response
+    ]
+    told = [term("aided.by", by=aid.by, response=term(f"aided.{aid.response}"), rivals="; ".join(rivals))]
+    told.append(term("aided.heading", change=size(aid.heading_error), constant=size(aid.constant_error)))
+    if aid.gyro_bias is not None and aid.gyro_bias_se is not None:
+        told.append(term("aided.bias", bias=listed(aid.gyro_bias, aid.gyro_bias_se)))
+    return told
 
 
 def headline(calibration: Calibration) -> list[str]:
