@@ -1,9 +1,10 @@
 """Calibration of a magnetometer: the ellipsoid of its readings, what the motion determines, and calibration.json."""
 
+from mkc_torch.calibration.aided.place import earth_field
 from mkc_torch.calibration.calibrate import calibrate
 from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
 from mkc_torch.calibration.file import CalibrationFileError
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.calibration.result import Calibration
 
-__all__ = ["Calibration", "CalibrationFileError", "EllipsoidFit", "NotIdentifiableError", "calibrate"]
+__all__ = ["Calibration", "CalibrationFileError", "EllipsoidFit", "NotIdentifiableError", "calibrate", "earth_field"]

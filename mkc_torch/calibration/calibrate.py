@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.calibration.aided.fallback import with_aid
+from mkc_torch.calibration.aided.place import Field
 from mkc_torch.calibration.clipped_samples import CLIPPED, without_clipped
 from mkc_torch.calibration.coverage import Coverage
 from mkc_torch.calibration.ellipsoid import ellipsoid_from_coefficients
@@ -95,7 +96,9 @@ def _refuse_few(usable: Recording) -> None:
     )
 
 
-def calibrate(recording: Recording, *, field_strength: float | None = None, seed: int = 0) -> Calibration:
+def calibrate(
+    recording: Recording, *, field_strength: float | None = None, seed: int = 0, earth: Field | None = None
+) -> Calibration:
     """Calibrate the magnetometer of a recording by MKC-EM on the linear ellipsoid fit.
 
     Samples that are not finite, that no field explains, of a frozen sensor, or at the end of its range are left out and
@@ -110,6 +113,9 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
         recording: with columns ``mag_x``, ``mag_y``, ``mag_z``, in any one unit, and ``time`` in s where it has one.
         field_strength: length of the corrected field in µT; default the radius of the ellipsoid, in its own unit.
         seed: of the robust start.
+        earth: the field at the place of the recording, as :func:`mkc_torch.calibration.earth_field` has it: its length
+            is that of the corrected field, unless ``field_strength`` is given, and helps where the turns do not
+            determine an ellipsoid; its inclination is compared with what an attitude finds.
 
     Raises:
         MissingColumnError: a column of the magnetometer is not there.
@@ -128,6 +134,8 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
     """
     if field_strength is not None and not (math.isfinite(field_strength) and field_strength > 0):
         raise ValueError(f"Expected argument `field_strength` to be positive but got {field_strength}.")
+    if earth is not None and field_strength is None:
+        field_strength = earth.strength
     usable = prepared(numbered(recording))
     try:
         fit = recorded_ellipsoid(usable, seed)
@@ -135,7 +143,7 @@ def calibrate(recording: Recording, *, field_strength: float | None = None, seed
         refusal = _with_faults(error, usable)
     else:
         return _of_ellipsoid(fit, usable, field_strength)
-    return with_aid(usable, refusal, field_strength=field_strength)
+    return with_aid(usable, refusal, field_strength=field_strength, earth=earth)
 
 
 def _of_ellipsoid(fit: EllipsoidFit, usable: Recording, field_strength: float | None) -> Calibration:

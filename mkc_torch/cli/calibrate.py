@@ -34,6 +34,13 @@ def calibrate(
         typer.Option(metavar="µT", help="Length of the corrected field in µT; default: as measured."),
     ] = None,
     unit: Annotated[str, typer.Option(help="Unit of the magnetometer's columns, such as counts.")] = "µT",
+    place: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LAT,LON[,ALT]", help="Where it was recorded, in ° and m: the field's length, with --date."
+        ),
+    ] = None,
+    date: Annotated[str | None, typer.Option(metavar="YYYY-MM-DD", help="When it was recorded, with --place.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
     """Find a magnetometer's offset, gains and cross-axis coupling in recordings of it being turned.
@@ -45,19 +52,34 @@ def calibrate(
         raise typer.BadParameter(f"--field-strength must be a positive number of µT but is {field_strength:g}.")
     if not unit.strip():
         raise typer.BadParameter("--unit is empty; name the unit, such as counts.")
+    if (place is None) != (date is None):
+        raise typer.BadParameter("--place and --date belong together: the field changes from year to year.")
     refuse_same_names(recordings)
     with loading():
         from mkc_torch._parallel.processes import keep_memory
+        from mkc_torch.calibration.aided.place import earth_field, parsed_date, parsed_place
         from mkc_torch.cli.calibration_files import calibrate_file
         from mkc_torch.cli.calibration_summary import show
     keep_memory()
+    earth = None
+    if place is not None and date is not None:
+        try:
+            earth = earth_field(*parsed_place(place), parsed_date(date))
+        except (ValueError, ImportError) as error:
+            raise typer.BadParameter(f"--place {place} --date {date}: {error}") from None
     console, failed, left = out(), 0, list(recordings)
     with progress(len(recordings), output) as step, interrupts_told(lambda: not_written(left, output)):
         for path in recordings:
             step(f"calibrating {path.name}")
             try:
                 calibration, files = calibrate_file(
-                    path, output / path.stem, columns=names, unit=unit, field_strength=field_strength, force=force
+                    path,
+                    output / path.stem,
+                    columns=names,
+                    unit=unit,
+                    field_strength=field_strength,
+                    force=force,
+                    earth=earth,
                 )
             except FAILURES as error:
                 failed += 1

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from mkc_torch._support.files import claim_folder, write_atomically
+from mkc_torch.calibration.aided.place import Field
 from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.calibrate import calibrate as fit
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
@@ -16,7 +17,14 @@ __all__ = ["calibrate_file"]
 
 
 def calibrate_file(
-    path: Path, folder: Path, *, columns: Mapping[str, str], unit: str, field_strength: float | None, force: bool
+    path: Path,
+    folder: Path,
+    *,
+    columns: Mapping[str, str],
+    unit: str,
+    field_strength: float | None,
+    force: bool,
+    earth: Field | None = None,
 ) -> tuple[Calibration, list[Path]]:
     """Write calibration.json and report.html of a recording; where it is refused, the report alone says why."""
     recording = with_unit(Recording.read(path, columns=columns), unit)
@@ -26,7 +34,7 @@ def calibrate_file(
     claim_folder(folder, overwrite=force, files=(report.name, result.name))
     with folder_removed_on_failure(folder):
         try:
-            calibration = fit(recording, field_strength=field_strength)
+            calibration = fit(recording, field_strength=field_strength, earth=earth)
         except NotIdentifiableError as error:
             page = refusal_report(recording, error)
             write_atomically(report, page, overwrite=force)

@@ -12,10 +12,11 @@ from torch import Tensor
 from mkc_torch.calibration.aid import Aid
 from mkc_torch.calibration.aided.choose import Chosen, chosen_response
 from mkc_torch.calibration.aided.evidence import Judged
-from mkc_torch.calibration.aided.heading import evenly, heading_errors, turning_axis
+from mkc_torch.calibration.aided.heading import heading_errors, turning_axis
 from mkc_torch.calibration.aided.misfit import robust_size
-from mkc_torch.calibration.aided.mounting import mounting, turned_by
+from mkc_torch.calibration.aided.mounting import exchanged, mounting, turned_by
 from mkc_torch.calibration.aided.response import ERRORS, SOFT_IRON, Place
+from mkc_torch.calibration.aided.rotation import from_quaternion
 from mkc_torch.calibration.aided.start import offset_by_turns
 from mkc_torch.calibration.aided.turns import Turns, turns_of_attitude, turns_of_gyroscope
 from mkc_torch.calibration.coverage import coverage
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["GYRO", "QUATERNION", "aided_calibration", "aids"]
 
 GYRO = ("gyro_x", "gyro_y", "gyro_z")
+ACCEL = ("accel_x", "accel_y", "accel_z")
 QUATERNION = ("q_w", "q_x", "q_y", "q_z")
 
 MAX_HEADING_ERROR = 5.0
@@ -42,6 +44,13 @@ MAX_HEADING_ERROR = 5.0
 
 MAX_MISFIT = 0.1
 """Share of the field that is left in each axis, from which the turns are not those of the field."""
+
+HARDLY_TURNS = 0.1
+"""Share of the field within which half of the measurements stay where a sensor has hardly turned."""
+
+MAX_UNEXPLAINED, _FEW = 0.3, 1500
+"""Share of the field by which half of the samples may be off before gains are fitted: soft iron of 10 % and a bias of
+1 °/s leave a tenth. It is looked at on so many samples."""
 
 _KNOWN = 0.5
 """Share of what was known beforehand, of a standard deviation, above which the recording has not determined a value."""
@@ -97,16 +106,19 @@ def aided_calibration(
         on Control Systems Technology 26 (2018), for what a gyroscope determines.
     """
     usable = recording.finite(*(QUATERNION if by == "attitude" else GYRO))
+    upwards = None if place is None else _upwards(usable, by)
     points, runs = usable.magnetometer(), run_slices(usable)
     taken = in_each_run(points, runs, thin_at_rest)
     assert taken is not None
     if by == "attitude":
         whole = turns_of_attitude(usable.stack(*QUATERNION))
-        chosen = chosen_response(points, lambda _: whole, taken, place=place)
+        _refuse_other_turns(points, whole, by)
+        chosen = chosen_response(points, lambda _: whole, taken, place=place, upwards=upwards)
     else:
         assert usable.time is not None
         at = partial(turns_of_gyroscope, usable.time, usable.stack(*GYRO), runs)
-        chosen = chosen_response(points, at, taken, place=place)
+        _refuse_other_turns(points, at(points.new_zeros(ERRORS)), by)
+        chosen = chosen_response(points, at, taken, place=place, upwards=upwards)
         whole = at(chosen.errors)
     best = chosen.best
     theta, model = best.fit.theta, best.model
@@ -115,7 +127,7 @@ def aided_calibration(
     if left > MAX_MISFIT:
         raise NotIdentifiableError(
             f"Not identifiable: the {by} does not turn as the field does; {100.0 * left:.0f} % of the field are left "
-            f"in each axis, more than {100.0 * MAX_MISFIT:.0f} %. {_reason(usable, whole, chosen, by)}"
+            f"in each axis, more than {100.0 * MAX_MISFIT:.0f} %. See that both are of one sensor and of one time."
         )
     errors = _heading(chosen, points, whole, usable, by)
     if errors[0] > MAX_HEADING_ERROR:
@@ -126,31 +138,57 @@ def aided_calibration(
     return _result(usable, chosen, whole, by, errors, field_strength)
 
 
-def _reason(usable: Recording, whole: Turns, chosen: Chosen, by: str) -> str:
-    """What seems to be wrong with the turns, as a sentence."""
-    points, turns = usable.magnetometer()[chosen.rows], whole.rows(chosen.rows)
-    _, length = offset_by_turns(points, turns)
+def _upwards(usable: Recording, by: str) -> Float[Tensor, " 3"] | None:
+    """The middle direction of the vertical in the body's axes, by an attitude or an accelerometer; None without."""
+    if by == "attitude":
+        return torch.nn.functional.normalize(from_quaternion(usable.stack(*QUATERNION))[:, 2, :].mean(0), dim=0)
+    if not all(name in usable for name in ACCEL):
+        return None
+    return torch.nn.functional.normalize(usable.stack(*ACCEL).nanmedian(0).values, dim=0)
+
+
+def _refuse_other_turns(points: Tensor, turns: Turns, by: str) -> None:
+    """Refuse turns that are not those of the field, before anything is fitted to them.
+
+    Raises:
+        NotIdentifiableError: with what seems to be wrong.
+    """
+    few = torch.arange(0, len(points), max(1, len(points) // _FEW))
+    points, turns = points[few], turns.rows(few)
+    _, length, left = offset_by_turns(points, turns)
+    reach = float(torch.linalg.vector_norm(points - points.median(0).values, dim=-1).median())
+    if reach < HARDLY_TURNS * length:
+        raise NotIdentifiableError(
+            f"Not identifiable: half of the measurements stay within {100.0 * reach / length:.0f} % of the field of "
+            "one value. Turn the vehicle about its vertical axis, once round at least."
+        )
+    if left <= MAX_UNEXPLAINED * length:
+        return
     # one offset for all, for it is constant
     found = mounting(points, turns, torch.zeros_like(turns.window), length, by)
     if found is not None:
-        return f"{found.sentence} Mend that to use it."
-    if by == "gyroscope":
-        return "See that the rates are in rad/s, and of this sensor."
-    return "See that the quaternions turn the body into the world, in the order w, x, y, z, and are of this sensor."
+        reason = f"{found.sentence} Mend that to use it."
+    elif by == "gyroscope":
+        reason = "See that the rates are in rad/s, and of this sensor."
+    else:
+        reason = (
+            "See that the quaternions turn the body into the world, in the order w, x, y, z, and are of this sensor."
+        )
+    raise NotIdentifiableError(
+        f"Not identifiable: the {by} does not turn as the field does; half of the samples are off by "
+        f"{100.0 * left / length:.0f} % of the field or more. {reason}"
+    )
 
 
 def _heading(chosen: Chosen, points: Tensor, whole: Turns, usable: Recording, by: str) -> tuple[float, float]:
-    best = chosen.best
-    rows = chosen.rows[evenly(len(chosen.rows))]
+    best = chosen.full
+    theta = best.fit.theta
     if by == "attitude":
-        vertical = whole.to_frame[rows][:, 2, :]
+        vertical = torch.nn.functional.normalize(whole.to_frame[chosen.rows][:, 2, :].mean(0), dim=0)
     else:
         vertical = turning_axis(usable.stack(*GYRO)[chosen.rows] - chosen.errors[:3])
-
-    def field_of(theta: Tensor) -> Tensor:
-        return torch.linalg.solve(best.model.response(theta), (points[rows] - theta[:3]).mT).mT
-
-    return heading_errors(best.fit.theta, best.covariance, field_of, vertical)
+    field = torch.linalg.solve(best.model.response(theta), (points[chosen.rows] - theta[:3]).mT).mT
+    return heading_errors(best.model, theta, best.covariance, field, vertical)
 
 
 def _result(
@@ -162,32 +200,26 @@ def _result(
     field_strength: float | None,
 ) -> Calibration:
     best, points = chosen.best, usable.magnetometer()
-    theta, covariance = best.fit.theta, best.covariance
+    theta = best.fit.theta
     root = torch.linalg.inv(best.model.response(theta))
     semi_axes, rotation = axes_of(root.mT @ root)
     radius = float(semi_axes.log().mean().exp())
     strength = radius if field_strength is None else field_strength
     field = (points - theta[:3]) @ root.mT
 
+    # of any matrix, for a simpler one is likelier, not sure
+    full = chosen.full
+
     def derived(at: Tensor) -> Tensor:
-        inverse = torch.linalg.inv(best.model.response(at))
+        inverse = torch.linalg.inv(full.model.response(at))
         size = torch.linalg.det(inverse).abs().pow(-1.0 / 3.0)
         axes = torch.linalg.eigvalsh(inverse.mT @ inverse).flip(-1).rsqrt()
-        return torch.cat([at[:3], axes / radius, (size * inverse).flatten()])
+        return torch.cat([at[:3], axes * size.reciprocal(), (size * inverse).flatten()])
 
     with torch.enable_grad():
-        slopes = torch.autograd.functional.jacobian(derived, theta)
-    spread = torch.einsum("ip,pq,iq->i", slopes, covariance, slopes).clamp(min=0.0).sqrt()
-    free = best.model.entries.abs().sum(-1) > 0
-    unknown = torch.cat(
-        [
-            spread[:3] > _OFFSET_KNOWN * radius,
-            spread[3:6] > _KNOWN * SOFT_IRON,
-            (spread[6:] > _KNOWN * SOFT_IRON) | ~free | (best.model.name == "offset"),
-        ]
-    )
-    if best.model.name == "offset":
-        unknown[3:6] = False
+        slopes = torch.autograd.functional.jacobian(derived, full.fit.theta)
+    spread = torch.einsum("ip,pq,iq->i", slopes, full.covariance, slopes).clamp(min=0.0).sqrt()
+    unknown = torch.cat([spread[:3] > _OFFSET_KNOWN * radius, spread[3:] > _KNOWN * SOFT_IRON])
     known = torch.where(unknown, torch.inf, spread)
     names = [f"offset_{a}" for a in _AXES] + [""] * 3 + [f"matrix_{a}{b}" for a in _AXES for b in _AXES]
     residual = best.model.residual(
@@ -204,7 +236,7 @@ def _result(
     found = coverage(field[~rejected] if bool((~rejected).any()) else field)
     unit = usable.units["mag_x"]
     bias = chosen.errors[:3] if best.model.biased else None
-    bias_se = covariance.diagonal()[-ERRORS:][:3].sqrt()
+    bias_se = full.covariance.diagonal()[-ERRORS:][:3].sqrt()
     return Calibration(
         recording=usable.name,
         samples=len(points),
@@ -243,8 +275,11 @@ def _result(
 
 
 def _misaligned(best: Judged, spread: Tensor, by: str) -> tuple[str, ...]:
-    """A sentence about a magnetometer that is turned against what says how it turns."""
-    angle, axis = turned_by(best.model.response(best.fit.theta))
+    """Sentences about a magnetometer whose axes are not those of what says how it turns."""
+    told, response = exchanged(best.model.response(best.fit.theta), by)
+    if told:
+        return (f"{told} The matrix mends it: the corrected field is in the axes of the {by}.",)
+    angle, axis = turned_by(response)
     sure = math.degrees(float(spread[6:].square().mean().sqrt()))
     if best.model.name != "full matrix" or angle < max(MISALIGNED, 3.0 * sure):
         return ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -39,6 +40,7 @@ class Chosen:
 
     Attributes:
         best: the likeliest.
+        full: the full matrix, whose standard errors are those of all that could be otherwise.
         tried: evidence of each, in nats, by name; without those that leave far more than the full matrix does.
         turns: with the gyroscope's bias taken off, of the rows.
         rows: which samples the fits took.
@@ -46,6 +48,7 @@ class Chosen:
     """
 
     best: Judged
+    full: Judged
     tried: dict[str, float]
     turns: Turns
     rows: Int[Tensor, " n"]
@@ -58,6 +61,7 @@ def chosen_response(
     taken: Tensor,
     *,
     place: Place | None = None,
+    upwards: Float[Tensor, " 3"] | None = None,
 ) -> Chosen:
     """Fit the three responses and keep the one with the most evidence.
 
@@ -65,15 +69,23 @@ def chosen_response(
         measured: in one unit, in the order of time.
         turns_at: the turns of all samples, at errors of the rates.
         taken: (N,), which samples may count: of a rest a few.
-        place: what is known of the field.
+        place: what is known of the field; used where ``upwards`` is known too, for a length does not tell above from
+            below.
+        upwards: the middle direction of the vertical in the body's axes.
     """
     rows = taken.nonzero().flatten()
     rows = rows[:: max(1, -(-len(rows) // _MOST))]
     points, errors = measured[rows], measured.new_zeros(ERRORS)
     turns = turns_at(errors).rows(rows)
     biased = turns.summed is not None
-    offset, length = offset_by_turns(points, turns)
-    scale = length if place is None else place.strength
+    offset, length, _ = offset_by_turns(points, turns)
+    if place is None or upwards is None:
+        place, scale = None, length
+    else:
+        scale = length = place.strength
+        # what turns about the vertical leave open is where the field's vertical part begins
+        vertical = float((points @ upwards).median()) + scale * math.sin(place.inclination)
+        offset = offset + (vertical - offset @ upwards) * upwards
     full = Model("full matrix", scale, biased)
     theta = full.start(offset, length * torch.eye(3, dtype=points.dtype))
     weight = full.first_weight(theta, points, turns)
@@ -110,7 +122,7 @@ def chosen_response(
             )
     likeliest = max(judgements, key=lambda one: one.evidence)
     return Chosen(
-        likeliest, {one.model.name: one.evidence for one in judgements}, turns, rows, errors + _errors(likeliest)
+        likeliest, best, {one.model.name: one.evidence for one in judgements}, turns, rows, errors + _errors(likeliest)
     )
 
 

@@ -7,6 +7,7 @@ import dataclasses
 import torch
 
 from mkc_torch.calibration.aided.calibration import aided_calibration, aids
+from mkc_torch.calibration.aided.place import Field
 from mkc_torch.calibration.aided.response import Place
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.calibration.result import Calibration
@@ -15,13 +16,19 @@ from mkc_torch.recording.recording import Recording, RecordingError
 
 __all__ = ["with_aid"]
 
+_GROUND = 0.01
+"""Standard deviation of what rock and buildings add to the field, as a share of it, and of its inclination in rad."""
+
+_OTHER = 0.15
+"""Share by which a field is another one than the place's; gains of a chip are off by some per cent."""
+
 
 def with_aid(
     usable: Recording,
     refusal: NotIdentifiableError,
     *,
     field_strength: float | None = None,
-    place: Place | None = None,
+    earth: Field | None = None,
 ) -> Calibration:
     """The calibration by an attitude, or else by a gyroscope, with a warning that says so and why.
 
@@ -29,12 +36,12 @@ def with_aid(
         usable: as prepared for a calibration.
         refusal: of the ellipsoid.
         field_strength: length of the corrected field in µT, if given.
-        place: what is known of the field, in the recording's unit.
+        earth: the field at the place of the recording.
 
     Raises:
         NotIdentifiableError: the refusal, and why nothing of the recording stands in for what is missing.
     """
-    tried = []
+    tried, place = [], _known(usable, earth)
     for by in aids(usable):
         try:
             found = aided_calibration(usable, by, field_strength=field_strength, place=place)
@@ -46,8 +53,27 @@ def with_aid(
             f"The ellipsoid alone is not identifiable; the {by} stands in for the turns that are missing. "
             f"{reason[:1].upper()}{reason[1:]}"
         )
-        return dataclasses.replace(found, warnings=(*found.warnings, told, *_undetermined(found)))
+        return dataclasses.replace(
+            found, warnings=(*found.warnings, told, *_undetermined(found), *_other(found, earth))
+        )
     raise NotIdentifiableError(" ".join([str(refusal), *tried]), refusal.coverage, refusal.directions)
+
+
+def _known(usable: Recording, earth: Field | None) -> Place | None:
+    """The field in the recording's unit, where that is µT."""
+    if earth is None or usable.units["mag_x"] != "µT":
+        return None
+    return Place(earth.strength, earth.inclination, _GROUND * earth.strength, _GROUND)
+
+
+def _other(found: Calibration, earth: Field | None) -> tuple[str, ...]:
+    """A sentence about a field that is another one than the place's."""
+    if earth is None or found.unit != "µT" or abs(found.radius / earth.strength - 1.0) < _OTHER:
+        return ()
+    return (
+        f"The field found is {found.radius:.3g} µT long, that of the place {earth.strength:.3g} µT: check the unit, "
+        "the place and what of iron is near.",
+    )
 
 
 def _undetermined(found: Calibration) -> tuple[str, ...]:
@@ -66,5 +92,6 @@ def _undetermined(found: Calibration) -> tuple[str, ...]:
     return (
         f"Not determined: {' and '.join(told)}, which {'is' if len(told) == 1 else 'are'} what was likely beforehand. "
         f"A heading is good while the vehicle tilts as it did: to {aid.heading_error:.2g}°, and a constant to "
-        f"{aid.constant_error:.2g}°. Tilt it more, or give the field's length and inclination by place and date.",
+        f"{aid.constant_error:.2g}°. Tilt it more, or give place and date of the recording, beside an "
+        "attitude or an accelerometer.",
     )

@@ -1,19 +1,21 @@
-"""How well a heading is known by a calibration: how it changes with the turns, and a constant."""
+"""How well a heading is known by a calibration: how it changes over a level turn, and a constant."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+
+from mkc_torch.calibration.aided.response import Model
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = ["heading_errors", "turning_axis"]
 
-_DRAWS, _ROWS = 200, 300
+_STEPS = 36
 
 
 def turning_axis(rate: Float[Tensor, "N 3"]) -> Float[Tensor, " 3"]:
@@ -27,38 +29,39 @@ def turning_axis(rate: Float[Tensor, "N 3"]) -> Float[Tensor, " 3"]:
 
 
 def heading_errors(
+    model: Model,
     theta: Float[Tensor, " p"],
     covariance: Float[Tensor, "p p"],
-    field_of: Callable[[Tensor], Tensor],
-    vertical: Float[Tensor, " 3"] | Float[Tensor, "N 3"],
+    field: Float[Tensor, "N 3"],
+    vertical: Float[Tensor, " 3"],
 ) -> tuple[float, float]:
-    """Standard errors in ° of the heading less its mean over the samples, and of that mean.
+    """Standard errors in ° of the heading over a whole level turn, less its mean, and of that mean; to first order.
 
     Args:
-        theta: parameters.
+        model: of the sensor.
+        theta: its parameters.
         covariance: of their errors.
-        field_of: the corrected field (N, 3) by parameters.
-        vertical: in the body's axes, a unit vector, one or of each sample.
+        field: corrected, of the recording, in the body's axes.
+        vertical: in the body's axes, a unit vector.
     """
-    draws = torch.Generator().manual_seed(0)
-    values, vectors = torch.linalg.eigh(covariance)
-    root = vectors * values.clamp(min=0.0).sqrt()
-    level = _level(field_of(theta), vertical)
-    changes = []
-    for _ in range(_DRAWS):
-        drawn = theta + root @ torch.randn(len(theta), generator=draws, dtype=theta.dtype)
-        other = _level(field_of(drawn), vertical)
-        cross = (torch.linalg.cross(level, other) * vertical).sum(-1)
-        changes.append(torch.atan2(cross, (level * other).sum(-1)))
-    turned = torch.rad2deg(torch.stack(changes))
-    mean = turned.mean(-1, keepdim=True)
-    return float((turned - mean).square().mean().sqrt()), float(mean.square().mean().sqrt())
+    up = (field @ vertical).median()
+    flat = field - (field @ vertical)[:, None] * vertical
+    across = torch.linalg.vector_norm(flat, dim=-1).median()
+    first = torch.linalg.svd(vertical[None]).Vh[1]
+    second = torch.linalg.cross(vertical, first)
+    angle = torch.arange(_STEPS, dtype=field.dtype) * (2.0 * math.pi / _STEPS)
+    level = across * (angle.cos()[:, None] * first + angle.sin()[:, None] * second) + up * vertical
+    measured = (level @ model.response(theta).mT + theta[:3]).detach()
 
+    def heading(at: Tensor) -> Tensor:
+        seen = torch.linalg.solve(model.response(at), (measured - at[:3]).mT).mT
+        ahead, aside = seen @ first, seen @ second
+        # from the angle that it is, so that none jumps by a turn
+        return torch.atan2(angle.cos() * aside - angle.sin() * ahead, angle.cos() * ahead + angle.sin() * aside)
 
-def _level(field: Tensor, vertical: Tensor) -> Tensor:
-    return field - (field * vertical).sum(-1, keepdim=True) * vertical
-
-
-def evenly(count: int) -> Tensor:
-    """Numbers of some of so many rows."""
-    return torch.arange(0, count, max(1, count // _ROWS))
+    with torch.enable_grad():
+        slopes = torch.autograd.functional.jacobian(heading, theta)
+    mean = slopes.mean(0, keepdim=True)
+    spread = [torch.einsum("ip,pq,iq->i", rows, covariance, rows) for rows in (slopes - mean, mean)]
+    change, constant = (math.degrees(math.sqrt(max(0.0, float(one.mean())))) for one in spread)
+    return change, constant

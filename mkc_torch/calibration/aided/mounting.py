@@ -15,7 +15,7 @@ from mkc_torch.calibration.aided.turns import Turns
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Mounting", "mounting", "turned_by"]
+__all__ = ["Mounting", "exchanged", "mounting", "turned_by"]
 
 EXPLAINED = 0.08
 """Share of the field that may be left in each axis for the axes to be right: twice what soft iron of 10 % leaves."""
@@ -100,6 +100,26 @@ def _sentence(order: tuple[int, ...], signs: tuple[float, ...], by: str) -> str:
         f"{_AXES[k]} is {'minus ' if signs[k] < 0 else ''}{_AXES[order[k]]} of the magnetometer" for k in range(3)
     )
     return f"The magnetometer's axes seem to be others than the {by}'s, of which {told}."
+
+
+def exchanged(response: Float[Tensor, "3 3"], by: str) -> tuple[str, Float[Tensor, "3 3"]]:
+    """What a response says of exchanged axes and signs, empty where there are none, and the response without them.
+
+    Args:
+        response: from the field in the axes of a gyroscope or an attitude to the magnetometer's.
+        by: "gyroscope" or "attitude", for the sentence.
+
+    Example:
+        >>> told, rest = exchanged(torch.tensor([[0.1, 9.0, 0.0], [9.0, 0.0, 0.0], [0.0, 0.0, 9.0]]), "gyroscope")
+        >>> told, rest[0].tolist()
+        ("The magnetometer's x and y seem exchanged.", [9.0, 0.0, 0.0])
+    """
+    columns = torch.arange(3)
+    order = max(itertools.permutations(range(3)), key=lambda one: float(response[list(one), columns].abs().sum()))
+    chosen = response[list(order)]
+    signs = tuple(1.0 if float(v) >= 0.0 else -1.0 for v in chosen.diagonal())
+    plain = order == (0, 1, 2) and min(signs) > 0.0
+    return "" if plain else _sentence(order, signs, by), chosen * chosen.new_tensor(signs)[:, None]
 
 
 def turned_by(response: Float[Tensor, "3 3"]) -> tuple[float, Float[Tensor, " 3"]]:

@@ -21,8 +21,8 @@ _PULL = 1e-4
 """Towards no offset, of what moves it most: enough where nothing turns, and nothing where something does."""
 
 
-def offset_by_turns(measured: Float[Tensor, "N 3"], turns: Turns) -> tuple[Float[Tensor, " 3"], float]:
-    """Offset, and the length of the field without it, of a sensor whose response is a multiple of the identity.
+def offset_by_turns(measured: Float[Tensor, "N 3"], turns: Turns) -> tuple[Float[Tensor, " 3"], float, float]:
+    """Offset, length of the field, and what is left, of a sensor whose response is a multiple of the identity.
 
     A field that turns with the body, less the offset, stands still once it is turned back: linear equations for the
     offset. Where the sensor turns about one axis alone, the offset along it shows nowhere, and is taken for 0.
@@ -30,6 +30,10 @@ def offset_by_turns(measured: Float[Tensor, "N 3"], turns: Turns) -> tuple[Float
     Args:
         measured: in any unit.
         turns: of the body.
+
+    Returns:
+        Offset, length of the field without it, and by how much half of the samples are off a field that stands still,
+        in the unit of the measurement.
 
     References:
         Kok & Schön, "Magnetometer calibration using inertial sensors", IEEE Sensors Journal 16 (2016), use the same
@@ -40,6 +44,7 @@ def offset_by_turns(measured: Float[Tensor, "N 3"], turns: Turns) -> tuple[Float
     size = float(torch.linalg.vector_norm(measured, dim=-1).median()) or 1.0
     weight = measured.new_ones(len(measured), 1)
     offset = measured.new_zeros(3)
+    left = measured.new_zeros(1)
     for step in range(_ABSOLUTE + _REWEIGHTED):
         target = seen - _mean(seen, weight, turns)
         by = turned - _mean(turned.flatten(1), weight, turns).unflatten(-1, (3, 3))
@@ -53,7 +58,7 @@ def offset_by_turns(measured: Float[Tensor, "N 3"], turns: Turns) -> tuple[Float
         else:
             scale = 2.0 * left.median().clamp(min=1e-9 * size)
             weight = torch.exp(-0.5 * (left / scale).square()).clamp(min=1e-9)
-    return offset, float(torch.linalg.vector_norm(measured - offset, dim=-1).median())
+    return offset, float(torch.linalg.vector_norm(measured - offset, dim=-1).median()), float(left.median())
 
 
 def _mean(values: Tensor, weight: Tensor, turns: Turns) -> Tensor:

@@ -7,13 +7,22 @@ import pytest
 import torch
 
 from mkc_torch.calibration import Calibration, NotIdentifiableError, calibrate
-from mkc_torch.calibration.aided.mounting import mounting
+from mkc_torch.calibration.aided import choose
+from mkc_torch.calibration.aided.mounting import exchanged, mounting
 from mkc_torch.calibration.aided.turns import turns_of_attitude, turns_of_gyroscope
 from mkc_torch.report import calibration_report
 from tests.calibration.aided.vehicle import changed, example, quaternions
 from tests.shared_data import shared_data
 
 MAG, GYRO, Q = (tuple(f"{name}_{a}" for a in axes) for name, axes in (("mag", "xyz"), ("gyro", "xyz"), ("q", "wxyz")))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_samples():
+    """Fits on a third of the samples, for speed."""
+    kept, choose._MOST = choose._MOST, 1000
+    yield
+    choose._MOST = kept
 
 
 @pytest.fixture(scope="module")
@@ -71,10 +80,10 @@ def test_json_round_trips_and_old_files_are_read(found):
 def test_the_report_says_what_stood_in(drawn, found):
     page = calibration_report(found, drawn.recording)
     assert "By the gyroscope: offset and full matrix" in page
-    assert "nan" not in page.lower().replace("nanotesla", "")
+    assert "Gyroscope's bias" in page.replace("&#39;", "'").replace("’", "'")
 
 
-def level(seconds=60.0, rate=50.0, noise=0.3):
+def level(seconds=30.0, rate=50.0, noise=0.3):
     """A vehicle that turns about its vertical alone, and its heading."""
     draw = torch.Generator().manual_seed(3)
     t = torch.arange(round(seconds * rate), dtype=torch.float64) / rate
@@ -123,18 +132,28 @@ def test_the_simplest_response_that_explains_the_recording_is_chosen(drawn, gain
     columns = dict(zip((*MAG, *Q), torch.cat([seen, q], -1).unbind(-1), strict=True))
     c = calibrate(changed(drawn.recording, drop=(*GYRO, *MAG), **columns))
     assert c.aid.response == chosen
-    assert c.center == pytest.approx((10.0, -5.0, 3.0), abs=0.3)
+    off = (torch.tensor(c.center).double() - torch.tensor([10.0, -5.0, 3.0])) / torch.tensor(c.center_se).double()
+    assert float(off.abs().max()) < 4.0
     assert torch.tensor(c.semi_axes).div(c.radius).tolist() == pytest.approx(
         sorted(g / math.prod(gains) ** (1 / 3) for g in gains), abs=0.01
     )
-    unknown = {name for name in c.aid.undetermined if name.startswith("matrix")}
-    assert len(unknown) == (9 if chosen == "offset" else 6)
+    assert c.aid.undetermined == ()
 
 
-def test_rates_of_other_axes_are_refused_with_the_reason(drawn):
-    swapped = {"mag_x": drawn.recording["mag_y"], "mag_y": drawn.recording["mag_x"]}
-    with pytest.raises(NotIdentifiableError, match="x and y seem exchanged"):
-        calibrate(changed(drawn.recording, **swapped))
+def test_turns_of_other_axes_or_sign_are_refused_with_the_reason(drawn):
+    r = drawn.recording
+    swapped = {"mag_x": r["mag_y"], "mag_y": r["mag_x"]}
+    with pytest.raises(NotIdentifiableError, match=r"With the gyroscope: .*x and y seem exchanged"):
+        calibrate(changed(r, **swapped))
+    with pytest.raises(NotIdentifiableError, match="With the gyroscope: the gyroscope does not turn as the field does"):
+        calibrate(changed(r, **{name: 57.3 * r[name] for name in GYRO}))
+
+
+def test_a_response_that_exchanges_axes_is_told():
+    told, rest = exchanged(torch.tensor([[0.1, 9.0, 0.0], [0.0, 0.0, -8.0], [7.0, 0.0, 0.2]]).double(), "gyroscope")
+    assert "x is z of the magnetometer, y is x of the magnetometer, z is minus y" in told
+    assert bool((rest.diagonal() > 6.0).all())
+    assert exchanged(torch.eye(3).double(), "gyroscope")[0] == ""
 
 
 @pytest.mark.parametrize(
@@ -143,7 +162,7 @@ def test_rates_of_other_axes_are_refused_with_the_reason(drawn):
         ((0, 1, 2), (1, 1, 1), None),
         ((0, 2, 1), (1, 1, 1), "y and z seem exchanged"),
         ((0, 1, 2), (1, -1, 1), "y seems to have the other sign"),
-        ((1, 2, 0), (1, 1, -1), "axes seem to be others"),
+        ((2, 0, 1), (1, 1, 1), "axes seem to be others"),
     ],
 )
 def test_axes_are_checked_against_the_attitude(drawn, order, signs, told):
