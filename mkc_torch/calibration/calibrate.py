@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import torch
@@ -18,6 +19,7 @@ from mkc_torch.calibration.file import Matrix, Vector
 from mkc_torch.calibration.frozen_samples import FROZEN, without_frozen
 from mkc_torch.calibration.impossible_samples import without_impossible
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.calibration.other_sensors import GRAVITY, accelerometer, rest_bias
 from mkc_torch.calibration.places import disturbed_places, numbered
 from mkc_torch.calibration.recorded_ellipsoid import recorded_ellipsoid
 from mkc_torch.calibration.result import Calibration, Spread
@@ -97,7 +99,12 @@ def _refuse_few(usable: Recording) -> None:
 
 
 def calibrate(
-    recording: Recording, *, field_strength: float | None = None, seed: int = 0, earth: Field | None = None
+    recording: Recording,
+    *,
+    field_strength: float | None = None,
+    seed: int = 0,
+    earth: Field | None = None,
+    sensor: str = "mag",
 ) -> Calibration:
     """Calibrate the magnetometer of a recording by MKC-EM on the linear ellipsoid fit.
 
@@ -117,6 +124,9 @@ def calibrate(
             is that of the corrected field, unless ``field_strength`` is given, and helps where the turns do not
             determine an ellipsoid; its inclination is compared with what an attitude finds.
 
+        sensor: "mag", or "accel" for an accelerometer ``accel_*``, in whose place the field is gravity and
+            ``field_strength`` its length in m/s², 9.80665 if not given.
+
     Raises:
         MissingColumnError: a column of the magnetometer is not there.
         RecordingError: fewer than nine usable samples.
@@ -134,6 +144,16 @@ def calibrate(
     """
     if field_strength is not None and not (math.isfinite(field_strength) and field_strength > 0):
         raise ValueError(f"Expected argument `field_strength` to be positive but got {field_strength}.")
+    if sensor not in ("mag", "accel"):
+        raise ValueError(f"Expected argument `sensor` to be 'mag' or 'accel' but got {sensor!r}.")
+    if sensor == "accel":
+        strength = GRAVITY if field_strength is None else field_strength
+        return accelerometer(recording, lambda table: calibrate(table, field_strength=strength, seed=seed))
+    found = _of_magnetometer(recording, field_strength, seed, earth)
+    return dataclasses.replace(found, rest_bias=rest_bias(recording))
+
+
+def _of_magnetometer(recording: Recording, field_strength: float | None, seed: int, earth: Field | None) -> Calibration:
     if earth is not None and field_strength is None:
         field_strength = earth.strength
     usable = prepared(numbered(recording))

@@ -28,9 +28,17 @@ from mkc_torch.recording.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["SCHEMA", "Calibration", "Spread", "calibration_from_json", "calibration_to_json"]
+__all__ = ["SCHEMA", "Calibration", "RestBias", "Spread", "calibration_from_json", "calibration_to_json"]
 
 SCHEMA = "mkc-calibration/1"
+
+
+class RestBias(NamedTuple):
+    """Bias of a gyroscope at rest and its standard errors, in rad/s, and for how long it rested, in s."""
+
+    value: Vector
+    standard_error: Vector
+    seconds: float
 
 
 class Spread(NamedTuple):
@@ -64,6 +72,8 @@ class Calibration:
         disturbed_unit: of it: "s", or "row", counted from 1, where the recording has no time.
         aid: what stood in for turns that are missing, and what it did not determine; None of an ellipsoid. The matrix
             then also turns the sensor's axes into those of the gyroscope or the attitude, and need not be symmetric.
+        sensor: "mag", or "accel" of an accelerometer, whose field is gravity.
+        rest_bias: of the gyroscope, while it rested; None without one, or without a rest.
         coverage: of directions, by the samples in use.
         warnings: sentences about the recording and the fit.
     """
@@ -92,6 +102,8 @@ class Calibration:
     warnings: tuple[str, ...]
     disturbed_unit: str = "s"
     aid: Aid | None = None
+    sensor: str = "mag"
+    rest_bias: RestBias | None = None
 
     @property
     def rejected_share(self) -> float:
@@ -117,7 +129,8 @@ class Calibration:
 
     def apply(self, recording: Recording) -> dict[str, Float[Tensor, " N"]]:
         """The corrected field of a recording, row by row: ``time`` where it has one, ``field_x``, ``field_y``,
-        ``field_z`` in ``field_unit``. No row is dropped; where a measurement is missing, so is the field.
+        ``field_z`` in ``field_unit``. No row is dropped; where a measurement is missing, so is the field. Of an
+        accelerometer, what ``accel_*`` measured is corrected.
 
         Raises:
             MissingColumnError: the recording has no ``mag_x``, ``mag_y`` or ``mag_z``.
@@ -131,7 +144,8 @@ class Calibration:
             >>> list(field), round(float(torch.stack(list(field.values())[1:]).norm(dim=0).median()), 1)
             (['time', 'field_x', 'field_y', 'field_z'], 48.0)
         """
-        field = self.corrected(recording.magnetometer())
+        measured = recording.stack(*(f"{self.sensor}_{axis}" for axis in "xyz"))
+        field = self.corrected(measured)
         time = {} if recording.time is None else {"time": recording.time}
         return time | dict(zip(("field_x", "field_y", "field_z"), field.unbind(-1), strict=True))
 
@@ -195,6 +209,14 @@ def calibration_to_json(calibration: Calibration) -> str:
         },
         "warnings": c.warnings,
     }
+    if c.sensor != "mag":
+        content["sensor"] = c.sensor
+    if c.rest_bias is not None:
+        content["gyroscope"] = {
+            "bias": {"value": c.rest_bias.value, "standard_error": finite_or_none(c.rest_bias.standard_error)},
+            "unit": "rad/s",
+            "rest_seconds": c.rest_bias.seconds,
+        }
     if c.aid is not None:
         content["aided"] = aid_to_json(c.aid)
     text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
@@ -249,4 +271,12 @@ def calibration_from_json(text: str) -> Calibration:
         warnings=tuple(c.text("warnings", i) for i in c.each("warnings")),
         disturbed_unit=c.text("rejected", "interval_unit") if c.has("rejected", "interval_unit") else "s",
         aid=aid_from_json(c),
+        sensor=c.text("sensor") if c.has("sensor") else "mag",
+        rest_bias=RestBias(
+            c.vector("gyroscope", "bias", "value"),
+            c.vector("gyroscope", "bias", "standard_error", unknown=True),
+            c.number("gyroscope", "rest_seconds"),
+        )
+        if c.has("gyroscope")
+        else None,
     )

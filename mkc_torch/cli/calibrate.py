@@ -34,6 +34,9 @@ def calibrate(
         typer.Option(metavar="µT", help="Length of the corrected field in µT; default: as measured."),
     ] = None,
     unit: Annotated[str, typer.Option(help="Unit of the magnetometer's columns, such as counts.")] = "µT",
+    sensor: Annotated[
+        str, typer.Option(metavar="mag|accel", help="accel: an accelerometer, accel_x, accel_y, accel_z, by gravity.")
+    ] = "mag",
     place: Annotated[
         str | None,
         typer.Option(
@@ -52,6 +55,8 @@ def calibrate(
         raise typer.BadParameter(f"--field-strength must be a positive number of µT but is {field_strength:g}.")
     if not unit.strip():
         raise typer.BadParameter("--unit is empty; name the unit, such as counts.")
+    if sensor not in ("mag", "accel"):
+        raise typer.BadParameter(f"--sensor must be mag or accel but is {sensor}.")
     if (place is None) != (date is None):
         raise typer.BadParameter("--place and --date belong together: the field changes from year to year.")
     refuse_same_names(recordings)
@@ -80,6 +85,7 @@ def calibrate(
                     field_strength=field_strength,
                     force=force,
                     earth=earth,
+                    sensor=sensor,
                 )
             except FAILURES as error:
                 failed += 1

@@ -42,6 +42,8 @@ def show(console: Console, c: Calibration, files: list[Path]) -> None:
         (term("label.coverage"), term("calibration.coverage", share=w.share(c.coverage.fraction))),
     ):
         facts.add_row(name, Text(value))
+    if c.rest_bias is not None:
+        facts.add_row(term("label.gyroscope"), Text(w.rest_bias(c.rest_bias)))
     if c.aid is not None:
         facts.add_row(term("label.aided"), Text(" ".join(w.aided(c))))
     for warning in c.warnings:

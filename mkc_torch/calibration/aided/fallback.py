@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-import torch
+from torch.linalg import LinAlgError  # type: ignore[attr-defined]
 
 from mkc_torch.calibration.aided.calibration import aided_calibration, aids
 from mkc_torch.calibration.aided.place import Field
@@ -45,7 +45,7 @@ def with_aid(
     for by in aids(usable):
         try:
             found = aided_calibration(usable, by, field_strength=field_strength, place=place)
-        except (ValueError, NoFitError, RecordingError, torch.linalg.LinAlgError) as error:
+        except (ValueError, NoFitError, RecordingError, LinAlgError) as error:
             tried.append(str(error).replace("Not identifiable: ", f"With the {by}: ", 1))
             continue
         reason = str(refusal).removeprefix("Not identifiable: ")

@@ -9,6 +9,7 @@ from markupsafe import Markup
 
 from mkc_torch.calibration.calibrate import ENOUGH_INFORMATION, MAX_REJECTED, Calibration, Vector, prepared
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.calibration.other_sensors import as_magnetometer
 from mkc_torch.calibration.places import numbered, places
 from mkc_torch.recording.recording import Recording
 from mkc_torch.report.calibration import pictures
@@ -47,7 +48,8 @@ def calibration_report(
         >>> calibration_report(calibrate(recording), recording).startswith("<!doctype html>")
         True
     """
-    usable = prepared(numbered(recording))
+    table = as_magnetometer(recording) if calibration.sensor == "accel" else recording
+    usable = prepared(numbered(table))
     points = usable.magnetometer()
     in_use = calibration.corrected(points)[calibration.weight(points) >= 0.5]
     return render(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from mkc_torch.calibration.calibrate import Calibration, Spread
+from mkc_torch.calibration.result import Calibration, RestBias, Spread
 from mkc_torch.recording.disturbance import Interval
 from mkc_torch.report.words.terms import term
 
@@ -188,6 +188,16 @@ def rejection(calibration: Calibration) -> str:
     if c.disturbed:
         return term("calibration.mainly", rejected=told, when=when(c.disturbed, c.disturbed_unit))
     return term("calibration.scattered", rejected=told)
+
+
+def rest_bias(found: RestBias) -> str:
+    """A gyroscope's bias from rest, as a phrase."""
+    return term(
+        "calibration.rest_bias",
+        bias=listed(found.value, found.standard_error),
+        errors=", ".join(size(error) for error in found.standard_error),
+        seconds=size(found.seconds),
+    )
 
 
 def aided(calibration: Calibration) -> list[str]:

@@ -225,6 +225,8 @@ TERMS: dict[str, str] = {
     "aided.full matrix": "offset and full matrix",
     "aided.heading": "Heading ± {change}° as it turned, and a constant ± {constant}°.",
     "aided.bias": "Gyroscope's bias ({bias}) rad/s.",
+    "calibration.rest_bias": "bias ({bias}) ± ({errors}) rad/s, from {seconds} s of rest",
+    "label.gyroscope": "gyroscope",
     "label.aided": "aided",
     "label.recording": "recording",
     "label.a_recording": "a recording",
