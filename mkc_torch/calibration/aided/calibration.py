@@ -110,14 +110,15 @@ def aided_calibration(
     points, runs = usable.magnetometer(), run_slices(usable)
     taken = in_each_run(points, runs, thin_at_rest)
     assert taken is not None
+    moved = taken.nonzero().flatten()
     if by == "attitude":
         whole = turns_of_attitude(usable.stack(*QUATERNION))
-        _refuse_other_turns(points, whole, by)
+        _refuse_other_turns(points[moved], whole.rows(moved), by)
         chosen = chosen_response(points, lambda _: whole, taken, place=place, upwards=upwards)
     else:
         assert usable.time is not None
         at = partial(turns_of_gyroscope, usable.time, usable.stack(*GYRO), runs)
-        _refuse_other_turns(points, at(points.new_zeros(ERRORS)), by)
+        _refuse_other_turns(points[moved], at(points.new_zeros(ERRORS)).rows(moved), by)
         chosen = chosen_response(points, at, taken, place=place, upwards=upwards)
         whole = at(chosen.errors)
     best = chosen.best

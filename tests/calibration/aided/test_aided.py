@@ -58,6 +58,7 @@ def test_it_tells_by_what_and_its_standard_errors_hold(drawn, found):
     assert 0.05 < found.rejected_share < 0.25
 
 
+@pytest.mark.slow
 def test_the_gyroscopes_bias_is_told():
     draw = example().drawn(2, 8.0, 15.0, seconds=60.0)
     bias = torch.tensor([0.01, -0.02, 0.03]).double()
@@ -199,6 +200,7 @@ def test_slopes_of_the_turns_are_those_of_differences():
         assert torch.allclose(skew, at.summed[:, :, k], atol=2e-3 * float(at.summed.abs().max()))
 
 
+@pytest.mark.slow
 def test_a_real_quadrotor_is_calibrated_by_what_it_has():
     from mkc_torch import Recording
 
