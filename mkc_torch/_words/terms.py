@@ -154,6 +154,7 @@ TERMS: dict[str, str] = {
     "where.moment": "{moment} s",
     "where.moment_of_samples": "[unit.sample] {moment}",
     "where.interval": "{start} to {end} s",
+    "where.interval_of_rows": "row {start} to {end}",
     "where.interval_of_samples": "[unit.sample] {start} to {end}",
     "where.anew": "anew at {moments}",
     "where.first": "first at {moment}",
@@ -172,6 +173,7 @@ TERMS: dict[str, str] = {
     "where.experiment": "experiment {number}: {share} %",
     "where.more_experiments": "{experiments}, and {count} more",
     "where.between": "between {start} s and {end} s",
+    "where.between_rows": "between row {start} and row {end}",
     "where.in_intervals": "in {count} intervals, the longest {longest}",
     # numbers and lists
     "number.none": "–",
@@ -227,6 +229,16 @@ TERMS: dict[str, str] = {
     "beside.field": "Over the directions of the {samples} samples in use, the corrected fields differ by {angle_max}°"
     " and {length_max} at most, {angle_rms}° and {length_rms} [unit.rms].",
     # names of lines, on the terminal and on a page
+    "aided.by": "By the {by}: {response} ({rivals}).",
+    "aided.rival": "{response}: less likely by {nats} nats",
+    "aided.offset": "offset alone",
+    "aided.offset and scale": "offset and scale",
+    "aided.full matrix": "offset and full matrix",
+    "aided.heading": "Heading ± {change}° as it turned, and a constant ± {constant}°.",
+    "aided.bias": "Gyroscope's bias ({bias}) rad/s.",
+    "calibration.rest_bias": "bias ({bias}) ± ({errors}) rad/s, from {seconds} s of rest",
+    "label.gyroscope": "gyroscope",
+    "label.aided": "aided",
     "label.recording": "recording",
     "label.a_recording": "a recording",
     "label.against": "{recording} against {simulation}",
@@ -340,6 +352,7 @@ TERMS: dict[str, str] = {
     "section.directions": "Directions covered",
     # titles, axes and legends of pictures, and what is read aloud instead of them
     "picture.time": "time (s)",
+    "picture.row": "row of the recording",
     "picture.of_channel": "{name}, {channel}",
     "picture.curve": "What was found, 95 % band",
     "picture.curve_of": "{effect}, 95 % band",

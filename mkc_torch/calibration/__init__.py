@@ -1,5 +1,6 @@
 """Calibration of a magnetometer: the ellipsoid of its readings, what the motion determines, and calibration.json."""
 
+from mkc_torch.calibration.aided.place import earth_field
 from mkc_torch.calibration.calibrate import calibrate
 from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
 from mkc_torch.calibration.file import CalibrationFileError
@@ -14,4 +15,5 @@ __all__ = [
     "EllipsoidFit",
     "NotIdentifiableError",
     "calibrate",
+    "earth_field",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import torch
@@ -9,16 +10,22 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number
 from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.calibration.aided.fallback import with_aid
+from mkc_torch.calibration.aided.place import Field
+from mkc_torch.calibration.clipped_samples import CLIPPED, without_clipped
 from mkc_torch.calibration.coverage import Coverage
 from mkc_torch.calibration.ellipsoid import ellipsoid_from_coefficients
 from mkc_torch.calibration.ellipsoid_fit import MIN_POINTS, EllipsoidFit
 from mkc_torch.calibration.file import Matrix, Vector
+from mkc_torch.calibration.frozen_samples import FROZEN, without_frozen
 from mkc_torch.calibration.impossible_samples import without_impossible
+from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.calibration.other_sensors import GRAVITY, accelerometer, rest_bias
+from mkc_torch.calibration.places import disturbed_places, numbered
 from mkc_torch.calibration.recorded_ellipsoid import recorded_ellipsoid
 from mkc_torch.calibration.result import Calibration, Spread
 from mkc_torch.functional import mkc_weight
 from mkc_torch.linear import MKCRegression
-from mkc_torch.recording.disturbance import disturbed_intervals
 from mkc_torch.recording.recording import Recording, RecordingError
 from mkc_torch.recording.unit_warnings import RECORDED, field_warning, time_warning
 
@@ -47,6 +54,8 @@ _AXES = ("mag_x", "mag_y", "mag_z")
 def prepared(recording: Recording) -> Recording:
     """The samples a calibration uses: those with a finite and possible field, in the order of time if there is a time.
 
+    Samples of a frozen sensor and clipped ones are left out too.
+
     Raises:
         MissingColumnError: no ``mag_x``, ``mag_y`` or ``mag_z``.
         RecordingError: fewer than nine samples are left, or values whose squares no number holds.
@@ -60,15 +69,9 @@ def prepared(recording: Recording) -> Recording:
     usable = recording.finite(*_AXES)
     if usable.time is not None:
         usable = usable.sorted_by_time()
-    if len(usable) < MIN_POINTS:
-        where = f"{recording.name}: " if recording.name else ""
-        found = "1 sample is" if len(usable) == 1 else f"{len(usable)} samples are"
-        reasons = " ".join(usable.warnings)
-        raise RecordingError(
-            f"{where}{found} too few, an ellipsoid needs at least {MIN_POINTS}; record while turning the sensor "
-            f"through all directions.{' ' + reasons if reasons else ''}"
-        )
-    usable = without_impossible(usable, *_AXES)
+    _refuse_few(usable)
+    usable = without_clipped(without_frozen(without_impossible(usable, *_AXES), *_AXES), *_AXES)
+    _refuse_few(usable)
     largest = float(usable.magnetometer().abs().max())
     if largest > 1.0 / _LEAST or 0.0 < largest < _LEAST:
         where = f"{recording.name}: " if recording.name else ""
@@ -79,25 +82,58 @@ def prepared(recording: Recording) -> Recording:
     return usable
 
 
+def _refuse_few(usable: Recording) -> None:
+    """Refuse samples that are too few for an ellipsoid.
+
+    Raises:
+        RecordingError: with what was dropped.
+    """
+    if len(usable) >= MIN_POINTS:
+        return
+    where = f"{usable.name}: " if usable.name else ""
+    found = "1 sample is" if len(usable) == 1 else f"{len(usable)} samples are"
+    reasons = " ".join(usable.warnings)
+    raise RecordingError(
+        f"{where}{found} too few, an ellipsoid needs at least {MIN_POINTS}; record while turning the sensor "
+        f"through all directions.{' ' + reasons if reasons else ''}"
+    )
+
+
 def calibrate(
-    recording: Recording, *, field_strength: float | None = None, name: str | None = None, seed: int = 0
+    recording: Recording,
+    *,
+    field_strength: float | None = None,
+    name: str | None = None,
+    seed: int = 0,
+    earth: Field | None = None,
+    sensor: str = "mag",
 ) -> Calibration:
     """Calibrate the magnetometer of a recording by MKC-EM on the linear ellipsoid fit.
 
-    Samples that are not finite, or that no field explains, are left out and the rest is sorted by time, which the
-    warnings tell. Standard errors allow for autocorrelation where there is a time; without one, samples count as
-    independent. Where the radius does not fit the unit, it is called "recorded units", and a warning says why.
+    Samples that are not finite, that no field explains, of a frozen sensor, or at the end of its range are left out and
+    the rest is sorted by time, which the warnings tell. Without a time, rows count as in the order of time. Standard
+    errors allow for autocorrelation, but not from one ``experiment`` to the next. Where the radius does not fit the
+    unit, it is called "recorded units", and a warning says why.
+
+    Where the turns do not determine an ellipsoid, as those of a vehicle that hardly tilts, an attitude ``q_*`` or a
+    gyroscope ``gyro_*`` stands in for them; ``aid`` says what it determined, and what not.
 
     Args:
         recording: with columns ``mag_x``, ``mag_y``, ``mag_z``, in any one unit, and ``time`` in s where it has one.
         field_strength: length of the corrected field in µT; default the radius of the ellipsoid, in its own unit.
         name: what the sensor is called; default the recording's name.
         seed: of the robust start.
+        earth: the field at the place of the recording, as :func:`mkc_torch.calibration.earth_field` has it: its length
+            is that of the corrected field, unless ``field_strength`` is given, and helps where the turns do not
+            determine an ellipsoid; its inclination is compared with what an attitude finds.
+
+        sensor: "mag", or "accel" for an accelerometer ``accel_*``, in whose place the field is gravity and
+            ``field_strength`` its length in m/s², 9.80665 if not given.
 
     Raises:
         MissingColumnError: a column of the magnetometer is not there.
         RecordingError: fewer than nine usable samples.
-        NotIdentifiableError: the samples do not determine an ellipsoid.
+        NotIdentifiableError: the samples do not determine an ellipsoid, and nothing stands in for what is missing.
         TypeError, ValueError: a field strength that is no number, or not positive.
 
     Example:
@@ -111,9 +147,30 @@ def calibrate(
     """
     if field_strength is not None:
         field_strength = checked_number("field_strength", field_strength, advice="it is a length in µT")
-    usable = prepared(recording)
+    if sensor not in ("mag", "accel"):
+        raise ValueError(f"Expected argument `sensor` to be 'mag' or 'accel' but got {sensor!r}.")
+    if sensor == "accel":
+        strength = GRAVITY if field_strength is None else field_strength
+        return accelerometer(recording, lambda table: calibrate(table, field_strength=strength, name=name, seed=seed))
+    found = _of_magnetometer(recording, field_strength, seed, earth)
+    return dataclasses.replace(found, name=recording.name if name is None else name, rest_bias=rest_bias(recording))
+
+
+def _of_magnetometer(recording: Recording, field_strength: float | None, seed: int, earth: Field | None) -> Calibration:
+    if earth is not None and field_strength is None:
+        field_strength = earth.strength
+    usable = prepared(numbered(recording))
+    try:
+        fit = recorded_ellipsoid(usable, seed)
+    except NotIdentifiableError as error:
+        refusal = _with_faults(error, usable)
+    else:
+        return _of_ellipsoid(fit, usable, field_strength)
+    return dataclasses.replace(with_aid(usable, refusal, field_strength=field_strength, earth=earth), used=usable)
+
+
+def _of_ellipsoid(fit: EllipsoidFit, usable: Recording, field_strength: float | None) -> Calibration:
     points = usable.magnetometer()
-    fit = recorded_ellipsoid(usable, seed)
     radius = float(fit.radius_)
     strength = radius if field_strength is None else field_strength
     scale = strength / radius
@@ -148,14 +205,14 @@ def calibrate(
         before=_spread(norm - norm.median()),
         after=_spread(length - radius),
         rejected=int(rejected.sum()),
-        disturbed=() if usable.time is None else disturbed_intervals(usable.time, rejected),
+        disturbed=disturbed_places(usable, rejected),
+        disturbed_unit="row" if usable.time is None else "s",
         coverage=found,
         warnings=(
             *usable.warnings,
             *(sentence for sentence in (size, time_warning(usable)) if sentence),
-            *_warnings(fit, found, float(rejected.double().mean())),
+            *_warnings(fit, found, length - radius, float(rejected.double().mean())),
         ),
-        name=usable.name if name is None else name,
         used=usable,
     )
 
@@ -172,7 +229,15 @@ def _density(fit: EllipsoidFit) -> tuple[float, float, float]:
     return float(estimator.sigma_), factor * float(estimator.d_), factor * float(estimator.bound_)
 
 
-def _warnings(fit: EllipsoidFit, found: Coverage, rejected_share: float) -> list[str]:
+def _with_faults(error: NotIdentifiableError, usable: Recording) -> NotIdentifiableError:
+    """The refusal, and which faults of the sensor took samples away that might have been enough."""
+    faults = [sentence for sentence in usable.warnings if FROZEN in sentence or CLIPPED in sentence]
+    if any(CLIPPED in sentence for sentence in faults):
+        faults.append("Set the sensor to a wider range, or take away what magnetises it, and record again.")
+    return NotIdentifiableError(" ".join([str(error), *faults]), error.coverage, error.directions)
+
+
+def _warnings(fit: EllipsoidFit, found: Coverage, residual: Tensor, rejected_share: float) -> list[str]:
     warnings = []
     if rejected_share > MAX_REJECTED:
         warnings.append(
@@ -180,7 +245,7 @@ def _warnings(fit: EllipsoidFit, found: Coverage, rejected_share: float) -> list
             "changed during the recording, or something magnetic was near for long. `mkc diagnose` says what changed, "
             "and when; or record again away from it, or calibrate the parts of the recording separately."
         )
-    scatter = float(robust_scale(fit.residual_.unsqueeze(-1))) / float(fit.radius_)
+    scatter = float(robust_scale(residual.unsqueeze(-1))) / float(fit.radius_)
     if scatter > MUCH_SCATTER:
         warnings.append(
             f"The length of the calibrated field scatters by {100.0 * scatter:.0f} % of the radius; that of a sensor "
@@ -194,9 +259,9 @@ def _warnings(fit: EllipsoidFit, found: Coverage, rejected_share: float) -> list
             "and iron nearby seldom adds more than some ten: check that all three columns are in one unit, that none "
             "is cut off at the end of its range, and the directions covered."
         )
-    if len(fit.weights_) < FEW_SAMPLES:
+    if len(residual) < FEW_SAMPLES:
         warnings.append(
-            f"{len(fit.weights_)} samples are few for nine unknowns: the true errors can be far larger than the "
+            f"{len(residual)} samples are few for nine unknowns: the true errors can be far larger than the "
             f"standard errors say. Record {FEW_SAMPLES} at least."
         )
     if found.gaps:

@@ -40,6 +40,22 @@ class CheckedValues:
             value = value[key]
         return value
 
+    def has(self, *path: str) -> bool:
+        """Whether there is such a value: what older files do not have is none of theirs."""
+        value: Any = self.content
+        for key in path:
+            if not (isinstance(value, Mapping) and key in value):
+                return False
+            value = value[key]
+        return True
+
+    def names(self, *path: str) -> tuple[str, ...]:
+        """Of the values that stand under a name."""
+        value = self._at(*path)
+        if not isinstance(value, Mapping):
+            raise self._wrong(path, "an object")
+        return tuple(value)
+
     def _wrong(self, path: tuple[str | int, ...], expected: str) -> CalibrationFileError:
         shown = json.dumps(self._at(*path), ensure_ascii=False)
         shown = shown if len(shown) <= 40 else shown[:39] + "…"

@@ -13,6 +13,7 @@ from mkc_torch._support.drawing import BLUE, GREY, INK, ORANGE, PALE, SHADE, arr
 from mkc_torch._words.terms import term
 from mkc_torch.calibration.coverage import NEAR_DEGREES, Coverage, nearest_axis
 from mkc_torch.calibration.file import Matrix, Vector
+from mkc_torch.calibration.places import numbered, places
 from mkc_torch.functional import mkc_nll
 from mkc_torch.recording.recording import Recording
 
@@ -120,13 +121,13 @@ class CalibrationPlot:
         samples = self._drawn(recording)
         points = samples.magnetometer()
         ax = axes_or_new(ax)
-        draw_residual(ax, self._calibration, points, samples.time)
+        draw_residual(ax, self._calibration, points, places(samples))
         if close:
             scatter = 1.4826 * float(self._calibration.norm_residual(points).abs().median())
             if scatter > 0.0:
                 ax.set_ylim(-_CLOSE * scatter, _CLOSE * scatter)
         ax.set_title(term("picture.length"))
-        ax.set_xlabel(term("unit.sample" if samples.time is None else "picture.time"))
+        ax.set_xlabel(term("picture.row" if samples.time is None else "picture.time"))
         ax.legend(markerscale=4, frameon=False)
         return ax
 
@@ -138,14 +139,14 @@ class CalibrationPlot:
         """
         samples = self._drawn(recording)
         weight = array(self._calibration.weight(samples.magnetometer()))
-        x = np.arange(len(weight)) if samples.time is None else array(samples.time)
+        x = array(places(samples))
         ax = axes_or_new(ax)
         _shade(ax, self._calibration)
         for mask, color, label in _kinds(weight < 0.5):
             ax.plot(x[mask], weight[mask], ".", ms=2.2, color=color, label=label, rasterized=True)
         ax.set_ylim(-0.03, 1.03)
         ax.margins(x=0.01)
-        ax.set_xlabel(term("unit.sample" if samples.time is None else "picture.time"))
+        ax.set_xlabel(term("picture.row" if samples.time is None else "picture.time"))
         ax.set_ylabel(term("picture.weight"))
         ax.legend(markerscale=4, frameon=False)
         return ax
@@ -188,7 +189,7 @@ class CalibrationPlot:
 
     def _drawn(self, recording: Recording | None) -> Recording:
         if recording is not None:
-            return recording.finite("mag_x", "mag_y", "mag_z")
+            return numbered(recording).finite("mag_x", "mag_y", "mag_z")
         if self._samples is None:
             raise ValueError(
                 "A calibration that was read from a file holds no samples to draw; give its recording, as in "
@@ -219,10 +220,10 @@ def draw_sphere(ax: Any, c: Calibrated, points: Tensor, plane: str, *, corrected
     ax.set_title(term("picture.corrected" if corrected else "picture.measured", plane=plane))
 
 
-def draw_residual(ax: Any, c: Calibrated, points: Tensor, time: Tensor | None) -> None:
-    """Residual of the norm over time, rejected samples and disturbed intervals told apart."""
+def draw_residual(ax: Any, c: Calibrated, points: Tensor, place: Tensor) -> None:
+    """Residual of the norm over time, or over rows, rejected samples and disturbed intervals told apart."""
     r = array(c.norm_residual(points))
-    x = np.arange(len(r)) if time is None else array(time)
+    x = array(place)
     _shade(ax, c)
     ax.axhline(0.0, color=GREY, lw=0.7)
     for mask, color, label in _kinds(array(c.weight(points) < 0.5)):

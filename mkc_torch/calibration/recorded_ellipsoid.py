@@ -8,6 +8,7 @@ from torch import Tensor
 from mkc_torch.calibration.coverage import Coverage
 from mkc_torch.calibration.ellipsoid_fit import MAX_SCATTER, MAX_STANDARD_ERROR, EllipsoidFit
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.calibration.runs import apart, in_each_run, run_slices
 from mkc_torch.calibration.turning import refuse_at_rest, thin_at_rest, turning, way
 from mkc_torch.linear import MKCRegression
 from mkc_torch.recording.recording import Recording
@@ -19,10 +20,11 @@ _ERRORS = 3.0
 
 
 def recorded_ellipsoid(recording: Recording, seed: int = 0) -> EllipsoidFit:
-    """The ellipsoid through the samples of a magnetometer by MKC-EM, in their order where there is a time.
+    """The ellipsoid through the samples of a magnetometer by MKC-EM, a time series in the order of its rows.
 
     Args:
-        recording: finite ``mag_x``, ``mag_y``, ``mag_z``, sorted by ``time`` where there is one.
+        recording: finite ``mag_x``, ``mag_y``, ``mag_z``, sorted by ``time`` where there is one; standard errors do not
+            reach from one ``experiment`` to the next.
         seed: of the robust start.
 
     Raises:
@@ -33,28 +35,29 @@ def recorded_ellipsoid(recording: Recording, seed: int = 0) -> EllipsoidFit:
         >>> recorded_ellipsoid(simulated_recording()[0]).center_.round()
         tensor([12., -8., 21.], dtype=torch.float64)
     """
-    points = recording.magnetometer()
-    if recording.time is None:
-        return _fitted(EllipsoidFit(MKCRegression(covariance="sandwich", seed=seed)), points, None)
-    estimator, taken = MKCRegression(covariance="hac", seed=seed), thin_at_rest(points).to(points)
+    points, runs = recording.magnetometer(), run_slices(recording)
+    estimator, taken = MKCRegression(covariance="hac", seed=seed), in_each_run(points, runs, thin_at_rest)
+    assert taken is not None
+    series, weight = apart(runs, points, taken)
     try:
-        fit = _fitted(EllipsoidFit(estimator), points, taken)
+        fit = EllipsoidFit(estimator).fit(series, weight)
+        _refuse_lattice(fit, points)
     except NotIdentifiableError:
         refuse_at_rest(points, turning(points), recording.units["mag_x"])  # says it better
         raise
-    went = way(points)
+    went = in_each_run(points, runs, way)
     if went is not None:
-        _refuse_other(fit, _along(EllipsoidFit(estimator), went, taken), went)
+        series, weight = apart(runs, went, taken)
+        _refuse_other(fit, _along(EllipsoidFit(estimator), series, weight), series)
     return fit
 
 
-def _fitted(fit: EllipsoidFit, points: Tensor, taken: Tensor | None) -> EllipsoidFit:
-    """Fit an ellipsoid, but none no wider than a few steps of the digits: one passes through the points of a lattice.
+def _refuse_lattice(fit: EllipsoidFit, points: Tensor) -> None:
+    """Refuse an ellipsoid no wider than a few steps of the digits: one passes through the points of a lattice.
 
     Raises:
         NotIdentifiableError: the steps of a column are a large share of the shortest semi-axis.
     """
-    fit.fit(points, taken)
     steps = [column.unique().diff() for column in points.unbind(-1)]
     share = max(float(step.min()) for step in steps if len(step) > 0) / float(fit.semi_axes_[0])
     # few points can be as far apart without any steps, but hardly two of them are equal then
@@ -64,7 +67,6 @@ def _fitted(fit: EllipsoidFit, points: Tensor, taken: Tensor | None) -> Ellipsoi
             f"semi-axis, more than {100.0 * MAX_SCATTER:.0f} %, as those of a sensor that hardly turns do. Turn the "
             "sensor through all directions."
         )
-    return fit
 
 
 def _along(fit: EllipsoidFit, went: Tensor, taken: Tensor) -> EllipsoidFit:

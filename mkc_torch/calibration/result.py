@@ -6,12 +6,13 @@ import json
 import math
 import re
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from mkc_torch._support.html_table import html_table, with_error
+from mkc_torch.calibration.aid import Aid, aid_from_json, aid_to_json
 from mkc_torch.calibration.coverage import Coverage, Gap, nearest_axis
 from mkc_torch.calibration.file import (
     CalibrationFileError,
@@ -29,9 +30,17 @@ from mkc_torch.recording.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["SCHEMA", "Calibration", "Spread", "calibration_from_json", "calibration_to_json"]
+__all__ = ["SCHEMA", "Calibration", "RestBias", "Spread", "calibration_from_json", "calibration_to_json"]
 
 SCHEMA = "mkc-calibration/1"
+
+
+class RestBias(NamedTuple):
+    """Bias of a gyroscope at rest and its standard errors, in rad/s, and for how long it rested, in s."""
+
+    value: Vector
+    standard_error: Vector
+    seconds: float
 
 
 class Spread(NamedTuple):
@@ -61,7 +70,12 @@ class Calibration:
         before: of the measured norm about its median.
         after: of :meth:`norm_residual`, rejected samples included.
         rejected: number of samples of weight below one half.
-        disturbed: where rejected samples stand close together in time.
+        disturbed: where rejected samples stand close together.
+        disturbed_unit: of it: "s", or "row", counted from 1, where the recording has no time.
+        aid: what stood in for turns that are missing, and what it did not determine; None of an ellipsoid. The matrix
+            then also turns the sensor's axes into those of the gyroscope or the attitude, and need not be symmetric.
+        sensor: "mag", or "accel" of an accelerometer, whose field is gravity.
+        rest_bias: of the gyroscope, while it rested; None without one, or without a rest.
         coverage: of directions, by the samples in use.
         warnings: sentences about the recording and the fit.
         name: what the sensor is called: the recording's name, unless another was given.
@@ -91,6 +105,10 @@ class Calibration:
     coverage: Coverage
     warnings: tuple[str, ...]
     name: str = ""
+    disturbed_unit: str = "s"
+    aid: Aid | None = None
+    sensor: str = "mag"
+    rest_bias: RestBias | None = None
     used: Recording | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -141,7 +159,8 @@ class Calibration:
 
     def apply(self, recording: Recording) -> dict[str, Float[Tensor, " N"]]:
         """The corrected field of a recording, row by row: ``time`` where it has one, ``field_x``, ``field_y``,
-        ``field_z`` in ``field_unit``. No row is dropped; where a measurement is missing, so is the field.
+        ``field_z`` in ``field_unit``. No row is dropped; where a measurement is missing, so is the field. Of an
+        accelerometer, what ``accel_*`` measured is corrected.
 
         Raises:
             MissingColumnError: the recording has no ``mag_x``, ``mag_y`` or ``mag_z``.
@@ -155,7 +174,8 @@ class Calibration:
             >>> list(field), round(float(torch.stack(list(field.values())[1:]).norm(dim=0).median()), 1)
             (['time', 'field_x', 'field_y', 'field_z'], 48.0)
         """
-        field = self.corrected(recording.magnetometer())
+        measured = recording.stack(*(f"{self.sensor}_{axis}" for axis in "xyz"))
+        field = self.corrected(measured)
         time = {} if recording.time is None else {"time": recording.time}
         return time | dict(zip(("field_x", "field_y", "field_z"), field.unbind(-1), strict=True))
 
@@ -185,7 +205,7 @@ class Calibration:
 def calibration_to_json(calibration: Calibration) -> str:
     """The text of calibration.json; see :meth:`Calibration.to_json`."""
     c = calibration
-    content = {
+    content: dict[str, Any] = {
         "schema": SCHEMA,
         "recording": c.recording,
         "name": c.name,
@@ -204,7 +224,12 @@ def calibration_to_json(calibration: Calibration) -> str:
             "bound": c.bound,
         },
         "residual": {"before": c.before._asdict(), "after": c.after._asdict()},
-        "rejected": {"count": c.rejected, "share": c.rejected_share, "intervals": c.disturbed},
+        "rejected": {
+            "count": c.rejected,
+            "share": c.rejected_share,
+            "intervals": c.disturbed,
+            "interval_unit": c.disturbed_unit,
+        },
         "coverage": {
             "fraction": c.coverage.fraction,
             "information": c.coverage.information,
@@ -215,6 +240,16 @@ def calibration_to_json(calibration: Calibration) -> str:
         },
         "warnings": c.warnings,
     }
+    if c.sensor != "mag":
+        content["sensor"] = c.sensor
+    if c.rest_bias is not None:
+        content["gyroscope"] = {
+            "bias": {"value": c.rest_bias.value, "standard_error": finite_or_none(c.rest_bias.standard_error)},
+            "unit": "rad/s",
+            "rest_seconds": c.rest_bias.seconds,
+        }
+    if c.aid is not None:
+        content["aided"] = aid_to_json(c.aid)
     text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
     # lists of numbers on one line; a text in JSON holds no line end, so none is touched
     return re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda m: "[" + " ".join(m[1].split()) + "]", text) + "\n"
@@ -266,4 +301,14 @@ def calibration_from_json(text: str) -> Calibration:
         ),
         warnings=tuple(c.text("warnings", i) for i in c.each("warnings")),
         name=c.text("name") if "name" in content else c.text("recording"),
+        disturbed_unit=c.text("rejected", "interval_unit") if c.has("rejected", "interval_unit") else "s",
+        aid=aid_from_json(c),
+        sensor=c.text("sensor") if c.has("sensor") else "mag",
+        rest_bias=RestBias(
+            c.vector("gyroscope", "bias", "value"),
+            c.vector("gyroscope", "bias", "standard_error", unknown=True),
+            c.number("gyroscope", "rest_seconds"),
+        )
+        if c.has("gyroscope")
+        else None,
     )

@@ -53,6 +53,13 @@ def calibrate(
     device_id: DEVICE_ID = None,
     unit: Annotated[list[str] | None, typer.Option(metavar=METAVAR, help=HELP)] = None,
     sensor: Annotated[str | None, typer.Option(metavar="NAME", help=SENSOR_HELP)] = None,
+    place: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LAT,LON[,ALT]", help="Where it was recorded, in ° and m: the field's length, with --date."
+        ),
+    ] = None,
+    date: Annotated[str | None, typer.Option(metavar="YYYY-MM-DD", help="When it was recorded, with --place.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
     """Find a magnetometer's offset, gains and cross-axis coupling in recordings of it being turned.
@@ -66,16 +73,25 @@ def calibrate(
         raise typer.BadParameter(f"--field-strength must be a positive number of µT but is {field_strength:g}.")
     if name is not None and (not name.strip() or len(recordings) > 1):
         raise typer.BadParameter("--name is the name of one sensor: give it with one REC, and not empty.")
+    if (place is None) != (date is None):
+        raise typer.BadParameter("--place and --date belong together: the field changes from year to year.")
     exports = checked_exports("--export", export or [], instance, device_id)
     recordings, texts = without_units(recordings, unit or [])
     units = parsed_units(texts)
     refuse_same_names(recordings)
     with loading():
         from mkc_torch._parallel.processes import keep_memory
+        from mkc_torch.calibration.aided.place import earth_field, parsed_date, parsed_place
         from mkc_torch.calibration.exports import Destination
         from mkc_torch.cli.calibration_files import Asked, calibrations_of, read_calibration
         from mkc_torch.cli.calibration_summary import show
     keep_memory()
+    earth = None
+    if place is not None and date is not None:
+        try:
+            earth = earth_field(*parsed_place(place), parsed_date(date))
+        except (ValueError, ImportError) as error:
+            raise typer.BadParameter(f"--place {place} --date {date}: {error}") from None
     try:
         old = None if against is None else read_calibration(against)
     except FAILURES as error:
@@ -91,6 +107,7 @@ def calibrate(
         old_file=against,
         exports=exports,
         to=Destination(instance, device_id),
+        earth=earth,
     )
     console, total, failed, left = out(), 0, 0, list(recordings)
     with progress(len(recordings), output) as step, interrupts_told(lambda: not_written(left, output)):

@@ -7,18 +7,23 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mkc_torch._support.files import claim_folder, write_atomically
-from mkc_torch.calibration.calibrate import Calibration, prepared
+from mkc_torch.calibration.aided.place import Field
+from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.calibrate import calibrate as fit
 from mkc_torch.calibration.differences import Differences, differences
 from mkc_torch.calibration.exports import EXPORTS, Destination, SensorCorrection
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.calibration.other_sensors import as_magnetometer
 from mkc_torch.cli.console import FAILURES, folder_names, folder_written, remove_if_empty
 from mkc_torch.cli.correction import read_correction
 from mkc_torch.cli.exported import exports_of, left_from_before
-from mkc_torch.cli.recorded import read_magnetometer, refuse_likely_size, sensor_names
-from mkc_torch.recording.recording import Recording
+from mkc_torch.cli.recorded import read_accelerometer, read_magnetometer, refuse_likely_size, sensor_names
 
 __all__ = ["Asked", "Found", "calibrations_of", "read_calibration"]
+
+
+ACCELEROMETER = "accel"
+"""The sensor that is no magnetometer."""
 
 
 class Asked(NamedTuple):
@@ -26,12 +31,13 @@ class Asked(NamedTuple):
 
     Attributes:
         columns, units: of the recordings' files.
-        sensor: one of those in a file; None for all.
+        sensor: one of those in a file, or "accel"; None for all magnetometers.
         field_strength: in µT, where it is known.
         name: of the sensor; None for the recording's.
         old, old_file: the calibration that the new one is set beside, and where it is from.
         exports: kinds of further files.
         to: for these.
+        earth: the field at the place of the recordings, where it is known.
     """
 
     columns: Mapping[str, str]
@@ -43,6 +49,7 @@ class Asked(NamedTuple):
     old_file: Path | None = None
     exports: tuple[str, ...] = ()
     to: Destination = Destination()
+    earth: Field | None = None
 
 
 class Found(NamedTuple):
@@ -112,7 +119,12 @@ def _refuse_for_one(path: Path, asked: Asked, names: list[str]) -> None:
 
 def _calibrate(path: Path, folder: Path, asked: Asked, *, force: bool) -> Found:
     """Write calibration.json and report.html of a recording; where it is refused, the report alone says why."""
-    recording, found = read_magnetometer(path, asked.columns, asked.units, asked.sensor)
+    accel = asked.sensor == ACCELEROMETER
+    if accel:
+        recording, said = read_accelerometer(path, asked.columns, asked.units), True
+    else:
+        recording, found = read_magnetometer(path, asked.columns, asked.units, asked.sensor)
+        said = bool(found.said & {"mag_x", "mag_y", "mag_z"})
     from mkc_torch.report import calibration_report, refusal_report
 
     report, result = folder / "report.html", folder / "calibration.json"
@@ -122,16 +134,22 @@ def _calibrate(path: Path, folder: Path, asked: Asked, *, force: bool) -> Found:
     claim_folder(folder, overwrite=force, files=files)
     with folder_written(folder):
         try:
-            calibration = fit(recording, field_strength=asked.field_strength, name=asked.name)
+            calibration = fit(
+                recording,
+                field_strength=asked.field_strength,
+                name=asked.name,
+                earth=asked.earth,
+                sensor=ACCELEROMETER if accel else "mag",
+            )
         except NotIdentifiableError as error:
-            page = refusal_report(recording, error)
+            page = refusal_report(as_magnetometer(recording) if accel else recording, error)
             write_atomically(report, page, overwrite=force)
             result.unlink(missing_ok=True)  # an old one beside a new refusal would be taken for its result
             told = " ".join([f"{error} See {report}.", *left_from_before(folder, ())])
             raise NotIdentifiableError(told, error.coverage, error.directions) from None
-        if not found.said & {"mag_x", "mag_y", "mag_z"}:
+        if not said:
             refuse_likely_size(path, calibration.radius)
-        beside, refused = _beside(calibration, recording, asked.old)
+        beside, refused = _beside(calibration, asked.old)
         texts, notes, not_exported = exports_of(SensorCorrection.of(calibration), asked.exports, asked.to)
         page = calibration_report(calibration, recording, against=beside)
         write_atomically(result, calibration.to_json(), overwrite=force)
@@ -143,13 +161,11 @@ def _calibrate(path: Path, folder: Path, asked: Asked, *, force: bool) -> Found:
     return Found(calibration, written, beside, notes, [*refused, *not_exported])
 
 
-def _beside(
-    calibration: Calibration, recording: Recording, old: Calibration | None
-) -> tuple[Differences | None, list[ValueError]]:
+def _beside(calibration: Calibration, old: Calibration | None) -> tuple[Differences | None, list[ValueError]]:
     """The differences from an old one, over the samples in use; or why there are none."""
-    if old is None:
+    if old is None or calibration.used is None:
         return None, []
-    points = prepared(recording).magnetometer()
+    points = calibration.used.magnetometer()
     try:
         return differences(calibration, old, points[calibration.weight(points) >= 0.5]), []
     except ValueError as error:

@@ -51,6 +51,10 @@ def show(
         (term("label.coverage"), term("calibration.coverage", share=w.share(c.coverage.fraction))),
     ):
         facts.add_row(name, Text(value))
+    if c.rest_bias is not None:
+        facts.add_row(term("label.gyroscope"), Text(w.rest_bias(c.rest_bias)))
+    if c.aid is not None:
+        facts.add_row(term("label.aided"), Text(" ".join(w.aided(c))))
     for warning in (*c.warnings, *notes):
         facts.add_row(Text(term("label.warning"), style="bold yellow"), Text(warning))
     console.print(facts)

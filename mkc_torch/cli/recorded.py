@@ -14,6 +14,7 @@ from mkc_torch.recording.recording import Recording
 from mkc_torch.recording.unit_warnings import RECORDED, field_size, likely_unit
 
 __all__ = [
+    "read_accelerometer",
     "read_again",
     "read_magnetometer",
     "read_table",
@@ -66,6 +67,17 @@ def read_magnetometer(
         if size is not None:
             refuse_likely_size(path, size)
     return recording, found
+
+
+def read_accelerometer(path: Path, columns: Mapping[str, str], units: Mapping[str, str]) -> Recording:
+    """Read a recording of an accelerometer.
+
+    Raises:
+        MissingColumnError: no column of one is recognised or named.
+    """
+    recording = _recording(path, read_file(path, ASKED, columns=columns, units=units))
+    recording.stack("accel_x", "accel_y", "accel_z")
+    return recording
 
 
 def read_table(path: Path, columns: Mapping[str, str], units: Mapping[str, str]) -> Recording:

@@ -14,7 +14,7 @@ METAVAR = "UNIT or QUANTITY=UNIT,..."
 HELP = (
     "Units that are converted: mag=gauss,time=us. One that is not known, such as counts, is the magnetometer's label."
 )
-SENSOR_HELP = "Which magnetometer, where a file holds several; `mkc inspect` names them."
+SENSOR_HELP = "Which magnetometer, where a file holds several, as `mkc inspect` names them; accel: the accelerometer."
 
 # those of mkc_torch.recording.unit_words, which cannot be imported without torch; a test holds them together
 QUANTITIES = ("time", "mag", "field", "gyro", "accel", "position", "temperature", "current", "q")

@@ -48,6 +48,7 @@ EXAMPLES = {
     "examples/paper/density.py": "",
     "examples/calibration/passing_magnet.py": "RECORDING.csv --output picture.png",
     "examples/calibration/least_squares_beside.py": "RECORDING.csv ANOTHER.csv",
+    "examples/calibration/hardly_tilting.py": "--draws 1 --tilt 8 15",
     "examples/lightning/any_unit.py": "--help",
     "examples/gallery.py": "--help",  # minutes, on recordings that are not part of the project
     # minutes each, on recordings that are not part of the project

@@ -32,6 +32,8 @@ def write_examples(folder: Path) -> None:
         "FLIGHT": concealed_recording(0).columns,
         "BENCH": concealed_recording(2).columns,
         "NEW": concealed_recording(1).columns,
+        "VEHICLE": vehicle(),
+        "SIDES": sides(),
         "SUPPLY": supplied(),
         "RUNS": joined(pendulum(0), pendulum(1)),
         "NEW_RUN": pendulum(2),
@@ -43,6 +45,32 @@ def write_examples(folder: Path) -> None:
         write_table(folder / f"{name}.csv", columns)
     if COMPILER is not None:
         make_fmu(folder / "pendulum.fmu", PENDULUM)
+
+
+def vehicle(samples: int = 1500, rate: float = 25.0) -> dict[str, Tensor]:
+    """A magnetometer and a gyroscope that lean by ten degrees and turn round."""
+    draw = torch.Generator().manual_seed(0)
+    time = torch.arange(samples, dtype=torch.float64) / rate
+    lean, zero = 0.17 * torch.sin(0.9 * time), torch.zeros(samples, dtype=torch.float64)
+    yaw = 0.4 * time
+    # about z, then about x
+    north = torch.stack([yaw.sin(), yaw.cos() * lean.cos(), -yaw.cos() * lean.sin()], -1)
+    up = torch.stack([zero, lean.sin(), lean.cos()], -1)
+    field = 20.0 * north - 43.0 * up + 0.3 * torch.randn(samples, 3, generator=draw)
+    rates = torch.stack([0.153 * torch.cos(0.9 * time), zero, zero], -1) + 0.4 * up
+    rates = rates + 0.002 * torch.randn(samples, 3, generator=draw)
+    names = ("mag_x", "mag_y", "mag_z", "gyro_x", "gyro_y", "gyro_z")
+    columns = torch.cat([field + torch.tensor([10.0, -5.0, 20.0]), rates], -1).unbind(-1)
+    return {"time": time, **dict(zip(names, columns, strict=True))}
+
+
+def sides() -> dict[str, Tensor]:
+    """An accelerometer that is turned through all directions."""
+    draw = torch.Generator().manual_seed(0)
+    way = torch.nn.functional.normalize(torch.randn(400, 3, generator=draw, dtype=torch.float64), dim=-1)
+    force = 9.80665 * way * torch.tensor([1.01, 0.99, 1.0]) + torch.tensor([0.1, -0.2, 0.05])
+    force = force + 0.01 * torch.randn(400, 3, generator=draw)
+    return dict(zip(("accel_x", "accel_y", "accel_z"), force.unbind(-1), strict=True))
 
 
 def supplied() -> dict[str, Tensor]:

@@ -11,6 +11,8 @@ from mkc_torch.calibration.calibrate import ENOUGH_INFORMATION, MAX_REJECTED, Ca
 from mkc_torch.calibration.differences import Differences
 from mkc_torch.calibration.exports.units import is_known
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.calibration.other_sensors import as_magnetometer
+from mkc_torch.calibration.places import numbered, places
 from mkc_torch.recording.recording import Recording
 from mkc_torch.report.calibration import pictures
 from mkc_torch.report.rendering import render
@@ -55,7 +57,8 @@ def calibration_report(
         >>> calibration_report(calibrate(recording), recording).startswith("<!doctype html>")
         True
     """
-    usable = prepared(recording)
+    table = as_magnetometer(recording) if calibration.sensor == "accel" else recording
+    usable = prepared(numbered(table))
     points = usable.magnetometer()
     in_use = calibration.corrected(points)[calibration.weight(points) >= 0.5]
     return render(
@@ -73,7 +76,7 @@ def calibration_report(
         difference_sentences=[] if against is None else difference_sentences(against),
         figures={
             "sphere": Markup(pictures.sphere(calibration, points)),
-            "residual": Markup(pictures.residual(calibration, points, usable.time)),
+            "residual": Markup(pictures.residual(calibration, points, places(usable))),
             "density": Markup(pictures.density(calibration, points)),
             "coverage": Markup(pictures.coverage_map(calibration.coverage, in_use)),
         },

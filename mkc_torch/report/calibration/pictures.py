@@ -26,20 +26,20 @@ def sphere(calibration: Calibration, points: Tensor) -> str:
         return svg(figure, "sphere", term("picture.about_sphere"))
 
 
-def residual(calibration: Calibration, points: Tensor, time: Tensor | None) -> str:
-    """Residual of the norm over time: all of it above, close up below."""
+def residual(calibration: Calibration, points: Tensor, place: Tensor) -> str:
+    """Residual of the norm over time, or over rows: all of it above, close up below."""
     c = calibration
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 4.8), layout="constrained")
         top, close = figure.subplots(2, 1, sharex=True)
         for ax in (top, close):
-            draw_residual(ax, c, points, time)
+            draw_residual(ax, c, points, place)
         limit = 5.0 * c.after.robust
         if limit > 0:
             close.set_ylim(-limit, limit)
         top.set_title(term("picture.all_samples"))
         close.set_title(term("picture.close_up", limit=f"{limit:.3g}", unit=c.unit))
-        close.set_xlabel(term("unit.sample" if time is None else "picture.time"))
+        close.set_xlabel(term("picture.row" if c.disturbed_unit == "row" else "picture.time"))
         _legend_above(top)
         return svg(figure, "residual", term("picture.about_residual"))
 

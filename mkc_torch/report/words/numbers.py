@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from mkc_torch._words.terms import term
-from mkc_torch.calibration.calibrate import Calibration, Spread
+from mkc_torch.calibration.result import Calibration, RestBias, Spread
 from mkc_torch.recording.disturbance import Interval
 
 _MOST_DECIMALS = 9
@@ -78,7 +78,8 @@ def matrix_with_errors(
 ) -> list[list[str]]:
     """Rows of a matrix with their standard errors, all to the same digits, in a power of ten."""
     scale = 10.0**exponent
-    places = decimals(max(e for row in errors for e in row) / scale)
+    known = [e for row in errors for e in row if math.isfinite(e)]
+    places = decimals(max(known, default=math.nan) / scale)
     return [
         [_with_error(v / scale, e / scale, places) for v, e in zip(row, error, strict=True)]
         for row, error in zip(matrix, errors, strict=True)
@@ -113,7 +114,9 @@ def listed(values: Sequence[float], errors: Sequence[float], exponent: int = 0) 
         '1.23, −2.00, 0.50'
     """
     scale = 10.0**exponent
-    return ", ".join(number(v / scale, decimals(max(errors) / scale)) for v in values)
+    return ", ".join(
+        number(v / scale, decimals(max(filter(math.isfinite, errors), default=math.nan) / scale)) for v in values
+    )
 
 
 def share(value: float) -> str:
@@ -151,18 +154,23 @@ def noise(calibration: Calibration) -> str:
     return term("noise.along_the_field", size=f"{size(0.5 * c.radius * c.d)} {c.unit}", kind=kind)
 
 
-def when(intervals: Sequence[Interval]) -> str:
-    """Intervals of time as one phrase; empty where there are none.
+def when(intervals: Sequence[Interval], unit: str = "s") -> str:
+    """Intervals of time, or of rows, as one phrase; empty where there are none.
 
     Example:
         >>> when([Interval(12.13, 15.3)]), when([Interval(0, 1), Interval(5, 5.5)])
         ('between 12.1 s and 15.3 s', 'from 0.0 to 1.0 s and from 5.0 to 5.5 s')
         >>> when([Interval(0, 1), Interval(5, 5.5), Interval(9, 9.5), Interval(20, 24)])
         'in 4 intervals, the longest from 20.0 to 24.0 s'
+        >>> when([Interval(101, 140)], "row")
+        'between row 101 and row 140'
     """
+    rows = unit == "row"
+    ends = [tuple(f"{end:.0f}" if rows else f"{end:.1f}" for end in one) for one in intervals]
     if len(intervals) == 1:
-        return term("where.between", start=f"{intervals[0].start:.1f}", end=f"{intervals[0].end:.1f}")
-    spans = [term("where.interval", start=f"{i.start:.1f}", end=f"{i.end:.1f}") for i in intervals]
+        return term("where.between_rows" if rows else "where.between", start=ends[0][0], end=ends[0][1])
+    name = "where.interval_of_rows" if rows else "where.interval"
+    spans = [term(name, start=start, end=end) for start, end in ends]
     each = [term("where.from", interval=span) for span in spans]
     if len(intervals) > 3:
         longest = max(range(len(each)), key=lambda k: intervals[k].end - intervals[k].start)
@@ -178,8 +186,35 @@ def rejection(calibration: Calibration) -> str:
     key = "calibration.one_rejected" if c.rejected == 1 else "calibration.rejected"
     told = term(key, share=share(c.rejected_share), samples=f"{c.samples:,}")
     if c.disturbed:
-        return term("calibration.mainly", rejected=told, when=when(c.disturbed))
+        return term("calibration.mainly", rejected=told, when=when(c.disturbed, c.disturbed_unit))
     return term("calibration.scattered", rejected=told)
+
+
+def rest_bias(found: RestBias) -> str:
+    """A gyroscope's bias from rest, as a phrase."""
+    return term(
+        "calibration.rest_bias",
+        bias=listed(found.value, found.standard_error),
+        errors=", ".join(size(error) for error in found.standard_error),
+        seconds=size(found.seconds),
+    )
+
+
+def aided(calibration: Calibration) -> list[str]:
+    """How a calibration came about that the ellipsoid alone does not determine, in sentences; empty of an ellipsoid."""
+    aid = calibration.aid
+    if aid is None:
+        return []
+    rivals = [
+        term("aided.rival", response=term(f"aided.{name}"), nats=f"{-value:.0f}")
+        for name, value in aid.evidence
+        if name != aid.response
+    ]
+    told = [term("aided.by", by=aid.by, response=term(f"aided.{aid.response}"), rivals="; ".join(rivals))]
+    told.append(term("aided.heading", change=size(aid.heading_error), constant=size(aid.constant_error)))
+    if aid.gyro_bias is not None and aid.gyro_bias_se is not None:
+        told.append(term("aided.bias", bias=listed(aid.gyro_bias, aid.gyro_bias_se)))
+    return told
 
 
 def headline(calibration: Calibration) -> list[str]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.calibration.aided.rotation import from_quaternion, rotated
 from mkc_torch.calibration.coverage import coverage
 from mkc_torch.calibration.ellipsoid_fit import MIN_INFORMATION
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
@@ -17,7 +18,6 @@ from mkc_torch.nonlinear import GaussianPrior, NoFitError, beside
 from mkc_torch.recording.recording import Recording, RecordingError
 from mkc_torch.simulation.magnetometer.heading import HeadingJump, heading_jumps
 from mkc_torch.simulation.magnetometer.matrix import SOFT_IRON
-from mkc_torch.simulation.magnetometer.rotation import from_quaternion, rotated
 from mkc_torch.simulation.magnetometer.view import AXES, GYRO, INDEPENDENT, QUATERNION, VECTOR, View, thinned
 from mkc_torch.simulation.protocol import Changes, Nearby, Port
 

@@ -8,13 +8,13 @@ from typing import Generic, TypeVar
 
 from torch import Tensor
 
+from mkc_torch.calibration.aided.mend import LAG, Mend, mend_of_attitude, mend_of_gyroscope
+from mkc_torch.calibration.aided.misfit import left_by_attitude, left_by_gyroscope, robust_size, stretches
 from mkc_torch.calibration.calibrate import prepared
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.attitude import AttitudeView, with_attitude
 from mkc_torch.simulation.magnetometer.gyro import GyroView
-from mkc_torch.simulation.magnetometer.mend import LAG, Mend, mend_of_attitude, mend_of_gyroscope
-from mkc_torch.simulation.magnetometer.misfit import left_by_attitude, left_by_gyroscope, robust_size, stretches
 from mkc_torch.simulation.magnetometer.norm import NormView
 from mkc_torch.simulation.magnetometer.view import GYRO, QUATERNION, View
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.calibration.aided.rotation import gaps, rotated, rotation_since
 from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.nonlinear import GaussianPrior
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.matrix import SOFT_IRON
-from mkc_torch.simulation.magnetometer.rotation import gaps, rotated, rotation_since
 from mkc_torch.simulation.magnetometer.view import AXES, GYRO, INDEPENDENT, VECTOR, View
 from mkc_torch.simulation.protocol import Changes, Port
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
-from mkc_torch.simulation.magnetometer.rotation import gaps, turns
+from mkc_torch.calibration.aided.rotation import gaps, turns
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from mkc_torch.simulation.magnetometer.misfit import left_by_attitude, left_by_gyroscope, stretches
-from mkc_torch.simulation.magnetometer.rotation import from_quaternion, gaps, rotation_since
-from mkc_torch.simulation.magnetometer.view import AXES
+from mkc_torch.calibration.aided.misfit import left_by_attitude, left_by_gyroscope, stretches
+from mkc_torch.calibration.aided.rotation import from_quaternion, gaps, rotation_since
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
+
+AXES = ("x", "y", "z")
 
 __all__ = ["LAG", "Mend", "mend_of_attitude", "mend_of_gyroscope"]
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mkc_torch.simulation.magnetometer.rotation import from_quaternion, rotation_since
+from mkc_torch.calibration.aided.rotation import from_quaternion, rotation_since
 
 RANDOM = np.random.default_rng(0)
 

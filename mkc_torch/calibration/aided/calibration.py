@@ -1,0 +1,312 @@
+"""A calibration with a gyroscope or an attitude in the place of the tilts that are missing."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.calibration.aid import Aid
+from mkc_torch.calibration.aided.choose import Chosen, chosen_response
+from mkc_torch.calibration.aided.evidence import Judged
+from mkc_torch.calibration.aided.heading import heading_errors, turning_axis
+from mkc_torch.calibration.aided.misfit import robust_size
+from mkc_torch.calibration.aided.mounting import exchanged, mounting, turned_by
+from mkc_torch.calibration.aided.response import ERRORS, SOFT_IRON, Place
+from mkc_torch.calibration.aided.rotation import from_quaternion
+from mkc_torch.calibration.aided.start import offset_by_turns
+from mkc_torch.calibration.aided.turns import Turns, turns_of_attitude, turns_of_gyroscope
+from mkc_torch.calibration.coverage import coverage
+from mkc_torch.calibration.ellipsoid import axes_of
+from mkc_torch.calibration.file import Matrix, Vector
+from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.calibration.places import disturbed_places
+from mkc_torch.calibration.result import Calibration, Spread
+from mkc_torch.calibration.runs import in_each_run, run_slices
+from mkc_torch.calibration.turning import thin_at_rest
+from mkc_torch.density import fit_density
+from mkc_torch.recording.recording import Recording
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["GYRO", "QUATERNION", "aided_calibration", "aids"]
+
+GYRO = ("gyro_x", "gyro_y", "gyro_z")
+ACCEL = ("accel_x", "accel_y", "accel_z")
+QUATERNION = ("q_w", "q_x", "q_y", "q_z")
+
+MAX_HEADING_ERROR = 5.0
+"""Standard error in ° of the heading's changes, above which the turns have not determined enough for a compass."""
+
+MAX_MISFIT = 0.1
+"""Share of the field that is left in each axis, from which the turns are not those of the field."""
+
+HARDLY_TURNS = 0.1
+"""Share of the field within which half of the measurements stay where a sensor has hardly turned."""
+
+MAX_UNEXPLAINED, _FEW = 0.3, 1500
+"""Share of the field by which half of the samples may be off before gains are fitted: soft iron of 10 % and a bias of
+1 °/s leave a tenth. It is looked at on so many samples."""
+
+_KNOWN = 0.5
+"""Share of what was known beforehand, of a standard deviation, above which the recording has not determined a value."""
+
+_OFFSET_KNOWN = 0.25
+"""The same of an offset, in lengths of the field."""
+
+MISALIGNED = 3.0
+"""Angle in ° between the axes of two sensors from which it is told."""
+
+_REJECTED_BELOW = 0.5
+_AXES = "xyz"
+
+
+def aids(recording: Recording) -> tuple[str, ...]:
+    """What a recording has that stands in for tilts, the attitude first.
+
+    Example:
+        >>> aids(Recording({name: torch.zeros(3) for name in ("time", *GYRO)}))
+        ('gyroscope',)
+    """
+    found = []
+    if all(name in recording for name in QUATERNION):
+        found.append("attitude")
+    if recording.time is not None and all(name in recording for name in GYRO):
+        found.append("gyroscope")
+    return tuple(found)
+
+
+def aided_calibration(
+    recording: Recording, by: str, *, field_strength: float | None = None, place: Place | None = None
+) -> Calibration:
+    """Calibrate a sensor that hardly tilts by how it turned.
+
+    The measurement is ``offset + response @ field``; the field stands still in the world, or, along the rates of a
+    gyroscope, for ten seconds or half a turn. Offset, response and what a gyroscope is off by are fitted together by
+    maximum likelihood of the MKC density, and of three responses, a multiple of the identity, a diagonal and any
+    matrix, the one with the most evidence is taken. What the recording does not determine is what is likely beforehand,
+    no offset and the unit matrix, and has no standard error.
+
+    Args:
+        recording: as prepared for a calibration.
+        by: "attitude" or "gyroscope".
+        field_strength: length of the corrected field in µT; default the geometric mean of the semi-axes.
+        place: what is known of the field, in the recording's unit.
+
+    Raises:
+        NotIdentifiableError: the turns do not explain the field, or leave a heading uncertain by more than 5°.
+
+    References:
+        Kok & Schön, "Magnetometer calibration using inertial sensors", IEEE Sensors Journal 16 (2016); Wu, Zou, Liu &
+        Hu, "Dynamic magnetometer calibration and alignment to inertial sensors by Kalman filtering", IEEE Transactions
+        on Control Systems Technology 26 (2018), for what a gyroscope determines.
+    """
+    usable = recording.finite(*(QUATERNION if by == "attitude" else GYRO))
+    upwards = None if place is None else _upwards(usable, by)
+    points, runs = usable.magnetometer(), run_slices(usable)
+    taken = in_each_run(points, runs, thin_at_rest)
+    assert taken is not None
+    moved = taken.nonzero().flatten()
+    if by == "attitude":
+        whole = turns_of_attitude(usable.stack(*QUATERNION))
+        _refuse_other_turns(points[moved], whole.rows(moved), by)
+        chosen = chosen_response(points, lambda _: whole, taken, place=place, upwards=upwards)
+    else:
+        assert usable.time is not None
+        at = partial(turns_of_gyroscope, usable.time, usable.stack(*GYRO), runs)
+        _refuse_other_turns(points[moved], at(points.new_zeros(ERRORS)).rows(moved), by)
+        chosen = chosen_response(points, at, taken, place=place, upwards=upwards)
+        whole = at(chosen.errors)
+    best = chosen.best
+    theta, model = best.fit.theta, best.model
+    response = model.response(theta)
+    left = robust_size(best.fit.residual) / float(torch.linalg.det(response).abs()) ** (1.0 / 3.0)
+    if left > MAX_MISFIT:
+        raise NotIdentifiableError(
+            f"Not identifiable: the {by} does not turn as the field does; {100.0 * left:.0f} % of the field are left "
+            f"in each axis, more than {100.0 * MAX_MISFIT:.0f} %. See that both are of one sensor and of one time."
+        )
+    errors = _heading(chosen, points, whole, usable, by)
+    if errors[0] > MAX_HEADING_ERROR:
+        raise NotIdentifiableError(
+            f"Not identifiable: with the {by} a heading is known to {errors[0]:.0f}° only, more than "
+            f"{MAX_HEADING_ERROR:g}°. Turn the vehicle about its vertical axis, once round at least."
+        )
+    return _result(usable, chosen, whole, by, errors, field_strength)
+
+
+def _upwards(usable: Recording, by: str) -> Float[Tensor, " 3"] | None:
+    """The middle direction of the vertical in the body's axes, by an attitude or an accelerometer; None without."""
+    if by == "attitude":
+        return torch.nn.functional.normalize(from_quaternion(usable.stack(*QUATERNION))[:, 2, :].mean(0), dim=0)
+    if not all(name in usable for name in ACCEL):
+        return None
+    return torch.nn.functional.normalize(usable.stack(*ACCEL).nanmedian(0).values, dim=0)
+
+
+def _refuse_other_turns(points: Tensor, turns: Turns, by: str) -> None:
+    """Refuse turns that are not those of the field, before anything is fitted to them.
+
+    Raises:
+        NotIdentifiableError: with what seems to be wrong.
+    """
+    few = torch.arange(0, len(points), max(1, len(points) // _FEW))
+    points, turns = points[few], turns.rows(few)
+    _, length, left = offset_by_turns(points, turns)
+    reach = float(torch.linalg.vector_norm(points - points.median(0).values, dim=-1).median())
+    if reach < HARDLY_TURNS * length:
+        raise NotIdentifiableError(
+            f"Not identifiable: half of the measurements stay within {100.0 * reach / length:.0f} % of the field of "
+            "one value. Turn the vehicle about its vertical axis, once round at least."
+        )
+    if left <= MAX_UNEXPLAINED * length:
+        return
+    # one offset for all, for it is constant
+    found = mounting(points, turns, torch.zeros_like(turns.window), length, by)
+    if found is not None:
+        reason = f"{found.sentence} Mend that to use it."
+    elif by == "gyroscope":
+        reason = "See that the rates are in rad/s, and of this sensor."
+    else:
+        reason = (
+            "See that the quaternions turn the body into the world, in the order w, x, y, z, and are of this sensor."
+        )
+    raise NotIdentifiableError(
+        f"Not identifiable: the {by} does not turn as the field does; half of the samples are off by "
+        f"{100.0 * left / length:.0f} % of the field or more. {reason}"
+    )
+
+
+def _heading(chosen: Chosen, points: Tensor, whole: Turns, usable: Recording, by: str) -> tuple[float, float]:
+    best = chosen.full
+    theta = best.fit.theta
+    if by == "attitude":
+        vertical = torch.nn.functional.normalize(whole.to_frame[chosen.rows][:, 2, :].mean(0), dim=0)
+    else:
+        vertical = turning_axis(usable.stack(*GYRO)[chosen.rows] - chosen.errors[:3])
+    field = torch.linalg.solve(best.model.response(theta), (points[chosen.rows] - theta[:3]).mT).mT
+    return heading_errors(best.model, theta, best.covariance, field, vertical)
+
+
+def _result(
+    usable: Recording,
+    chosen: Chosen,
+    whole: Turns,
+    by: str,
+    errors: tuple[float, float],
+    field_strength: float | None,
+) -> Calibration:
+    best, points = chosen.best, usable.magnetometer()
+    theta = best.fit.theta
+    root = torch.linalg.inv(best.model.response(theta))
+    semi_axes, rotation = axes_of(root.mT @ root)
+    radius = float(semi_axes.log().mean().exp())
+    strength = radius if field_strength is None else field_strength
+    field = (points - theta[:3]) @ root.mT
+
+    # of any matrix, for a simpler one is likelier, not sure
+    full = chosen.full
+
+    def derived(at: Tensor) -> Tensor:
+        inverse = torch.linalg.inv(full.model.response(at))
+        size = torch.linalg.det(inverse).abs().pow(-1.0 / 3.0)
+        axes = torch.linalg.eigvalsh(inverse.mT @ inverse).flip(-1).rsqrt()
+        return torch.cat([at[:3], axes * size.reciprocal(), (size * inverse).flatten()])
+
+    with torch.enable_grad():
+        slopes = torch.autograd.functional.jacobian(derived, full.fit.theta)
+    spread = torch.einsum("ip,pq,iq->i", slopes, full.covariance, slopes).clamp(min=0.0).sqrt()
+    unknown = torch.cat([spread[:3] > _OFFSET_KNOWN * radius, spread[3:] > _KNOWN * SOFT_IRON])
+    known = torch.where(unknown, torch.inf, spread)
+    names = [f"offset_{a}" for a in _AXES] + [""] * 3 + [f"matrix_{a}{b}" for a in _AXES for b in _AXES]
+    residual = best.model.residual(
+        torch.cat([theta[:-ERRORS], torch.zeros(ERRORS, dtype=theta.dtype)]) if best.model.biased else theta,
+        points,
+        whole,
+        _weights(chosen, points, whole),
+    )
+    weight = torch.exp(-0.5 * (residual / (best.fit.d * best.fit.sigma)).square()).amin(-1)
+    rejected = weight < _REJECTED_BELOW
+    length = torch.linalg.vector_norm(field, dim=-1)
+    norm = torch.linalg.vector_norm(points, dim=-1)
+    density = fit_density((length.square() - 1.0).unsqueeze(-1))
+    found = coverage(field[~rejected] if bool((~rejected).any()) else field)
+    unit = usable.units["mag_x"]
+    bias = chosen.errors[:3] if best.model.biased else None
+    bias_se = full.covariance.diagonal()[-ERRORS:][:3].sqrt()
+    return Calibration(
+        recording=usable.name,
+        samples=len(points),
+        unit=unit,
+        center=_vector(theta[:3]),
+        center_se=_vector(known[:3]),
+        semi_axes=_vector(semi_axes),
+        semi_axes_se=_vector(radius * known[3:6]),
+        rotation=_matrix(rotation),
+        matrix=_matrix(strength * root),
+        matrix_se=_matrix((strength / radius) * known[6:].unflatten(0, (3, 3))),
+        radius=radius,
+        field_strength=strength,
+        field_unit=unit if field_strength is None else "µT",
+        sigma=float(density.sigma),
+        d=float(density.d),
+        bound=float(density.bound),
+        before=_spread(norm - norm.median()),
+        after=_spread(radius * (length - 1.0)),
+        rejected=int(rejected.sum()),
+        disturbed=disturbed_places(usable, rejected),
+        disturbed_unit="row" if usable.time is None else "s",
+        coverage=found,
+        warnings=(*usable.warnings, *_misaligned(best, spread, by)),
+        aid=Aid(
+            by=by,
+            response=best.model.name,
+            evidence=tuple((name, value - best.evidence) for name, value in chosen.tried.items()),
+            undetermined=tuple(n for n, u in zip(names, unknown.tolist(), strict=True) if n and u),
+            heading_error=errors[0],
+            constant_error=errors[1],
+            gyro_bias=None if bias is None else _vector(bias),
+            gyro_bias_se=None if bias is None else _vector(bias_se),
+        ),
+    )
+
+
+def _misaligned(best: Judged, spread: Tensor, by: str) -> tuple[str, ...]:
+    """Sentences about a magnetometer whose axes are not those of what says how it turns."""
+    told, response = exchanged(best.model.response(best.fit.theta), by)
+    if told:
+        return (f"{told} The matrix mends it: the corrected field is in the axes of the {by}.",)
+    angle, axis = turned_by(response)
+    sure = math.degrees(float(spread[6:].square().mean().sqrt()))
+    if best.model.name != "full matrix" or angle < max(MISALIGNED, 3.0 * sure):
+        return ()
+    x, y, z = axis.tolist()
+    return (
+        f"The magnetometer seems to be turned by {angle:.1f}° about ({x:+.2f}, {y:+.2f}, {z:+.2f}) against the {by}; "
+        "the matrix turns it back.",
+    )
+
+
+def _weights(chosen: Chosen, points: Tensor, whole: Turns) -> Float[Tensor, " N"]:
+    """Of all samples in the direction of their stretch."""
+    theta, model = chosen.best.fit.theta, chosen.best.model
+    at = torch.cat([theta[:-ERRORS], torch.zeros(ERRORS, dtype=theta.dtype)]) if model.biased else theta
+    return model.first_weight(at, points, whole)
+
+
+def _spread(residual: Tensor) -> Spread:
+    return Spread(1.4826 * float(residual.abs().median()), float(residual.square().mean().sqrt()))
+
+
+def _vector(values: Tensor) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def _matrix(values: Tensor) -> Matrix:
+    a, b, c = values
+    return _vector(a), _vector(b), _vector(c)

@@ -1,0 +1,171 @@
+"""What a turned sensor makes of a field: offset, and a response of one, three or nine numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor
+
+from mkc_torch.calibration.aided.turns import Turns
+from mkc_torch.nonlinear import GaussianPrior
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["ERRORS", "GYRO_BIAS", "SOFT_IRON", "Model", "ModelName", "Place", "steady"]
+
+ModelName = Literal["offset", "offset and scale", "full matrix"]
+
+SOFT_IRON = 0.1
+"""Standard deviation, before the data speak, of what soft iron, gains and misalignment add to the unit matrix."""
+
+OFFSET = 1.0
+"""The same of the offset, in lengths of the field: hard iron on a vehicle is seldom more."""
+
+_FREE = 1e-8
+"""Precision of what is not known beforehand: enough for rounding not to make it negative."""
+
+GYRO_BIAS = 0.02
+"""The same of a gyroscope's bias, in rad/s."""
+
+GYRO_GAIN = 0.01
+"""The same of a gyroscope's gains and of the angles between its axes, each as a share or in rad."""
+
+ERRORS = 12
+"""Parameters of a gyroscope: bias, gains and axes."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """What is known of the field at a place, in the unit of the measurement.
+
+    Attributes:
+        strength: length of the field.
+        inclination: angle below the horizon in rad.
+        strength_error, inclination_error: standard deviations of both: of the model, and of what the ground adds to it.
+    """
+
+    strength: float
+    inclination: float
+    strength_error: float
+    inclination_error: float
+
+
+@dataclass(frozen=True)
+class Model:
+    """``measured = offset + response @ direction``, the direction of the field in the body's axes.
+
+    Parameters are the offset (3), the response over ``scale`` (1, 3 or 9), and with a gyroscope its bias (3) and what
+    its gains and axes are off (9). Offset and residual are in the unit of the measurement.
+
+    Attributes:
+        name: what of the response is free: a multiple of the identity, its diagonal, or all of it.
+        scale: a rough length of the field in the unit of the measurement.
+        biased: whether there is a gyroscope.
+    """
+
+    name: ModelName
+    scale: float
+    biased: bool
+
+    @property
+    def entries(self) -> Float[Tensor, "9 k"]:
+        """What the parameters of the response make of its nine entries, in columns of length 1: volumes compare."""
+        eye = torch.eye(9, dtype=torch.float64)
+        diagonal = eye[:, [0, 4, 8]]
+        return {"offset": diagonal.sum(-1, keepdim=True) / 3.0**0.5, "offset and scale": diagonal, "full matrix": eye}[
+            self.name
+        ]
+
+    @property
+    def size(self) -> int:
+        return 3 + self.entries.shape[1] + (ERRORS if self.biased else 0)
+
+    def response(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "3 3"]:
+        """In the unit of the measurement."""
+        count = self.entries.shape[1]
+        return self.scale * (self.entries.to(theta) @ theta[3 : 3 + count]).unflatten(0, (3, 3))
+
+    def start(self, offset: Float[Tensor, " 3"], response: Float[Tensor, "3 3"]) -> Float[Tensor, " p"]:
+        """Parameters at an offset and near a response, and no bias."""
+        entries = self.entries
+        found = torch.linalg.lstsq(entries, response.flatten()[:, None] / self.scale).solution[:, 0]
+        return torch.cat([offset, found, offset.new_zeros(ERRORS if self.biased else 0)])
+
+    def prior(self, place: Place | None = None, errors: Float[Tensor, " 12"] | None = None) -> GaussianPrior:
+        """A response near a multiple of the identity, an offset and errors of a gyroscope near zero.
+
+        ``errors`` are taken off the rates already, so that the parameters are what is left of them.
+
+        How long the field is, is not known beforehand but with a place: the mean of the diagonal is free without one.
+        """
+        count, entries = self.entries.shape[1], self.entries
+        precision = torch.zeros(self.size, self.size, dtype=torch.float64)
+        mean = torch.zeros(self.size, dtype=torch.float64)
+        mean[3 : 3 + count] = torch.linalg.lstsq(entries, torch.eye(3).double().flatten()[:, None]).solution[:, 0]
+        identity = torch.eye(3, dtype=torch.float64).flatten() / 3.0**0.5
+        along = torch.outer(identity, identity)
+        shape = (torch.eye(9, dtype=torch.float64) - along) / SOFT_IRON**2
+        if place is not None:
+            mean[3 : 3 + count] *= place.strength / self.scale
+            # gains are alike but for some per cent, the less so the longer they are averaged
+            spread = (SOFT_IRON**2 / 3.0 + (place.strength_error / place.strength) ** 2) * 3.0
+            shape = shape + along / spread
+        precision[3 : 3 + count, 3 : 3 + count] = entries.mT @ shape @ entries + _FREE * torch.eye(count)
+        precision[:3, :3] = torch.eye(3) / (OFFSET * self.scale) ** 2
+        if self.biased:
+            spreads = torch.tensor([GYRO_BIAS] * 3 + [GYRO_GAIN] * 9, dtype=torch.float64)
+            precision[-ERRORS:, -ERRORS:] = torch.diag(spreads**-2)
+            mean[-ERRORS:] = 0.0 if errors is None else -errors
+        return GaussianPrior(mean, precision)
+
+    def residual(
+        self, theta: Float[Tensor, " p"], measured: Float[Tensor, "N 3"], turns: Turns, weight: Float[Tensor, " N"]
+    ) -> Float[Tensor, "N 3"]:
+        """Of the measurement, in its unit.
+
+        Args:
+            theta: the parameters.
+            measured: of each sample.
+            turns: of each sample.
+            weight: with which each enters into the direction of its stretch; constant, so that slopes are exact.
+        """
+        response = self.response(theta)
+        # not the measured field, whose noise would shrink the response, but what each stretch shows on the whole
+        along, turned = self._along(theta, measured, turns)
+        direction = steady(along, turns, weight)
+        direction = (direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True))[turns.window]
+        if turned is not None:
+            direction = direction + torch.linalg.cross(turned, direction)
+        body = (turns.to_frame.mT @ direction.unsqueeze(-1)).squeeze(-1)
+        return measured - theta[:3] - body @ response.mT
+
+    def first_weight(
+        self, theta: Float[Tensor, " p"], measured: Float[Tensor, "N 3"], turns: Turns
+    ) -> Float[Tensor, " N"]:
+        """Weights to begin with: of the distances from a robust middle of each stretch."""
+        along, _ = self._along(theta, measured, turns)
+        weight = along.new_ones(len(along))
+        for cut in (2.0, 1.0, 1.0, 1.0):
+            distance = torch.linalg.vector_norm(along - steady(along, turns, weight)[turns.window], dim=-1)
+            weight = 1.0 / torch.clamp(distance / (cut * (distance.median() + 1e-9)), min=1.0).square()
+        return weight
+
+    def _along(self, theta: Tensor, measured: Tensor, turns: Turns) -> tuple[Tensor, Tensor | None]:
+        """The field in the axes of its stretch, in its own lengths, and what errors of the rates turned it by."""
+        field = torch.linalg.solve(self.response(theta), (measured - theta[:3]).mT).mT
+        along = (turns.to_frame @ field.unsqueeze(-1)).squeeze(-1)
+        if turns.summed is None:
+            return along, None
+        # an error of the rates, small, turns what has been summed up by its integral
+        turned = turns.summed @ theta[-ERRORS:]
+        return along - torch.linalg.cross(turned, along), turned
+
+
+def steady(along: Float[Tensor, "N 3"], turns: Turns, weight: Float[Tensor, " N"]) -> Float[Tensor, "W 3"]:
+    """The weighted mean of each stretch."""
+    share = weight.unsqueeze(-1)
+    total = along.new_zeros(turns.count, 3).index_add(0, turns.window, share * along)
+    return total / share.new_zeros(turns.count, 1).index_add(0, turns.window, share)

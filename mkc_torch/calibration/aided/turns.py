@@ -1,0 +1,122 @@
+"""How a sensor was turned, as a gyroscope or an attitude says, in stretches in which the field is one vector."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.calibration.aided.rotation import from_quaternion, gaps, rotation_since
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+__all__ = ["Turns", "turns_of_attitude", "turns_of_gyroscope"]
+
+WINDOW = 10.0
+"""Longest stretch in s over which the rotation of a gyroscope is trusted: its noise makes 0.1° of it."""
+
+HALF_A_TURN = math.pi
+"""Angle in rad at which a stretch ends too: what a gain wrong by one per cent makes of it is 2°, of which the stretch's
+own direction takes up half."""
+
+_FEWEST = 5
+
+
+@dataclass(frozen=True)
+class Turns:
+    """Rotations of N samples.
+
+    Attributes:
+        to_frame: (N, 3, 3), from the body at each sample to axes that stand still within its stretch.
+        window: (N,), number of the stretch, ascending.
+        summed: (N, 3, 12), rotation in rad since the stretch's first sample, in its axes, by each error of the rates:
+            a bias of each axis in rad/s, and the nine entries, row by row, of gains and axes that are off; None of an
+            attitude, which has none.
+        vertical: (3,), upwards in axes that do not depend on the stretch; None where they do, as those of a gyroscope.
+    """
+
+    to_frame: Float[Tensor, "N 3 3"]
+    window: Int[Tensor, " N"]
+    summed: Float[Tensor, "N 3 12"] | None
+    vertical: Float[Tensor, " 3"] | None
+
+    @property
+    def count(self) -> int:
+        """Number of stretches."""
+        return int(self.window[-1]) + 1
+
+    def rows(self, chosen: Int[Tensor, " n"]) -> Turns:
+        """Of some samples; stretches without any go."""
+        _, window = torch.unique_consecutive(self.window[chosen], return_inverse=True)
+        summed = None if self.summed is None else self.summed[chosen]
+        return Turns(self.to_frame[chosen], window, summed, self.vertical)
+
+
+def turns_of_gyroscope(
+    time: Float[Tensor, " N"], rate: Float[Tensor, "N 3"], runs: tuple[slice, ...], errors: Float[Tensor, " 12"]
+) -> Turns:
+    """Turns by angular rates, from the first sample of each stretch of ten seconds or half a turn.
+
+    Args:
+        time: in s, ascending within each run.
+        rate: in rad/s, in the body's axes.
+        runs: where each run lies.
+        errors: bias in rad/s and, row by row, the matrix of gains and axes less the identity, taken off the rates.
+
+    Example:
+        >>> time = torch.linspace(0.0, 1.0, 101).double()
+        >>> rate = torch.tensor([0.0, 0.0, torch.pi / 2]).double().expand(101, 3)
+        >>> turns = turns_of_gyroscope(time, rate, (slice(0, 101),), torch.zeros(12).double())
+        >>> turns.count, (turns.to_frame[-1] @ torch.tensor([1.0, 0.0, 0.0]).double()).round(decimals=3) + 0.0
+        (1, tensor([0., 1., 0.], dtype=torch.float64))
+    """
+    bias, gains = errors[:3], errors[3:].unflatten(0, (3, 3))
+    frames, windows, sums, count = [], [], [], 0
+    for run in runs:
+        t, w = time[run], rate[run] - bias
+        w = w - w @ gains.mT
+        window, first = _stretches(t, w)
+        turned = rotation_since(t, w, first)
+        # what a gain of row i for axis j adds: the axis i, turned along, times the rate about j
+        by = torch.cat([turned, torch.einsum("kai,kj->kaij", turned, w).flatten(2)], -1)
+        step = 0.5 * (by[1:] + by[:-1]) * t.diff()[:, None, None]
+        total = torch.cat([torch.zeros_like(by[:1]), step.cumsum(0)])
+        frames.append(turned)
+        windows.append(window + count)
+        # between stretches the axes differ, but what was summed before one's first sample is taken off
+        sums.append(total - total[first])
+        count += int(window[-1]) + 1
+    return Turns(torch.cat(frames), torch.cat(windows), torch.cat(sums), None)
+
+
+def turns_of_attitude(quaternion: Float[Tensor, "N 4"]) -> Turns:
+    """Turns into the world by a recorded attitude, one stretch.
+
+    Args:
+        quaternion: w, x, y, z of any length but 0, from the body to a world whose third axis points upwards.
+    """
+    to_world = from_quaternion(quaternion)
+    window = torch.zeros(len(quaternion), dtype=torch.int64)
+    return Turns(to_world, window, None, to_world.new_tensor([0.0, 0.0, 1.0]))
+
+
+def _stretches(time: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
+    """The stretch of each sample, and the first sample of that stretch; a gap starts a new one."""
+    if len(time) == 1:
+        zero = torch.zeros(1, dtype=torch.int64)
+        return zero, zero
+    turn = torch.linalg.vector_norm(0.5 * (rate[1:] + rate[:-1]), dim=-1) * time.diff()
+    angle = torch.cat([turn.new_zeros(1), turn.cumsum(0)]).tolist()
+    gap = [False, *gaps(time).tolist()]
+    first, number, begin, window = [], [], 0, 0
+    for k, t in enumerate(time.tolist()):
+        far = t - float(time[begin]) > WINDOW or angle[k] - angle[begin] > HALF_A_TURN
+        if gap[k] or (far and k - begin >= _FEWEST):
+            begin, window = k, window + 1
+        first.append(begin)
+        number.append(window)
+    return torch.tensor(number), torch.tensor(first)

@@ -1,0 +1,70 @@
+"""Samples at the end of a sensor's range, where one value stands for all beyond it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.recording.formats.base import counted
+from mkc_torch.recording.recording import Recording
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["CLIPPED", "clipped_entries", "without_clipped"]
+
+CLIPPED = "clipped samples"
+
+_LEAST = 20
+"""Different samples at an end from which it is looked at. Ten real recordings of six sensors have five at most."""
+
+_TIMES = 5.0
+"""Times as many as any of the next values has, from which an end is a limit: at the top of a smooth swing, which is
+the worst case of a sensor with coarse digits, the last value has 2.4 times as many as the one before."""
+
+_NEXT = 3
+
+
+def without_clipped(recording: Recording, *names: str) -> Recording:
+    """The samples but for those at the end of a column's range, where it is cut off; ``warnings`` names value and axis.
+
+    An end is a limit where far more different samples have exactly its value than have those next to it. Equal
+    samples, as of a sensor at rest, count once.
+
+    Args:
+        recording: finite in these columns.
+        names: the columns of one sensor.
+
+    Example:
+        >>> angle = torch.linspace(0.0, 20.0, 1000).double()
+        >>> table = Recording({"x": angle.cos().clamp(max=0.8), "y": angle.sin()})
+        >>> without_clipped(table, "x", "y").warnings
+        ('Left out 225 of 1000 clipped samples: `x` is cut off at 0.8 (225 samples).',)
+    """
+    values = recording.stack(*names)
+    clipped = clipped_entries(values)
+    if not bool(clipped.any()):
+        return recording
+    told = []
+    for k, name in enumerate(names):
+        for end in values[clipped[:, k], k].unique().tolist():
+            count = int((values[:, k] == end).sum())
+            told.append(f"`{name}` is cut off at {end:.6g} ({counted(count, 'sample')})")
+    left_out = clipped.any(-1)
+    return recording.rows(
+        ~left_out, f"Left out {int(left_out.sum())} of {len(recording)} {CLIPPED}: {'; '.join(told)}."
+    )
+
+
+def clipped_entries(values: Float[Tensor, "N k"]) -> Bool[Tensor, "N k"]:
+    """Which values stand at an end at which their column is cut off."""
+    different = values.unique(dim=0)
+    clipped = torch.zeros_like(values, dtype=torch.bool)
+    for k, column in enumerate(different.unbind(-1)):
+        for sign in (1.0, -1.0):
+            levels, counts = (sign * column).unique(return_counts=True)
+            if len(levels) > _NEXT and int(counts[-1]) >= max(_LEAST, _TIMES * int(counts[-1 - _NEXT : -1].max())):
+                clipped[:, k] |= sign * values[:, k] == levels[-1]
+    return clipped

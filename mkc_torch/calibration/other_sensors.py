@@ -1,0 +1,148 @@
+"""An accelerometer by the same ellipsoid, gravity in the place of the field; a gyroscope's bias from rest."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.calibration.result import Calibration, RestBias
+from mkc_torch.calibration.turning import turning
+from mkc_torch.recording.recording import Recording
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["ACCEL", "GRAVITY", "accelerometer", "as_magnetometer", "rest_bias"]
+
+GRAVITY = 9.80665
+"""Standard gravity in m/s²; at a place it is within 0.3 % of it."""
+
+MAG = ("mag_x", "mag_y", "mag_z")
+ACCEL = ("accel_x", "accel_y", "accel_z")
+GYRO = ("gyro_x", "gyro_y", "gyro_z")
+
+_GRAVITY = (8.0, 12.0)
+"""What the radius is in m/s², with the gains of a chip that is not calibrated."""
+
+_FEWEST_RESTS = 9
+"""Rests from which samples of the turns between them, which motion accelerates, are left out: as many as unknowns."""
+
+_WINDOW = 1.0
+"""Of a rest of a gyroscope, in s."""
+
+_STILL = 3.0
+"""Times the scatter of the quietest window within which a gyroscope is still."""
+
+_FEWEST_WINDOWS = 3
+
+
+def as_magnetometer(recording: Recording) -> Recording:
+    """The recording with ``accel_*`` in the place of ``mag_*``, and the samples of turns left out between rests."""
+    axes = dict(zip(MAG, recording.stack(*ACCEL).unbind(-1), strict=True))
+    kept = {name: recording[name] for name in ("time", "experiment") if name in recording}
+    unit = recording.units[ACCEL[0]] or "m/s²"
+    table = Recording(
+        {**kept, **axes},
+        name=recording.name,
+        units=dict.fromkeys(MAG, unit),
+        warnings=recording.warnings,
+        labels={name: values for name, values in recording.labels.items() if name in kept},
+    )
+    finite = table.finite(*MAG)
+    resting = _rests(finite.magnetometer())
+    if resting is None or bool(resting.all()):
+        return table
+    return finite.rows(
+        resting,
+        f"Left out {int((~resting).sum())} of {len(finite)} samples between rests, where motion accelerates the "
+        "sensor.",
+    )
+
+
+def accelerometer(recording: Recording, calibrate: Callable[[Recording], Calibration]) -> Calibration:
+    """Calibrate ``accel_*`` by the ellipsoid that gravity draws.
+
+    Where the recording has nine rests or more, as one has that is turned from side to side by hand and laid down in
+    between, the samples of the turns are left out, for motion accelerates the sensor then.
+
+    Args:
+        recording: with ``accel_x``, ``accel_y``, ``accel_z``.
+        calibrate: of a magnetometer whose columns they are taken for, in m/s².
+    """
+    found = calibrate(as_magnetometer(recording))
+    warnings = found.warnings
+    if found.unit == "m/s²" and not _GRAVITY[0] < found.radius < _GRAVITY[1]:
+        warnings = (
+            f"The radius of the ellipsoid is {found.radius:.3g} m/s², which is not gravity; these may be g, or counts. "
+            "The corrected acceleration is in m/s² all the same; offset and semi-axes are in the columns' own unit.",
+            *warnings,
+        )
+    return dataclasses.replace(found, warnings=warnings, field_unit="m/s²", sensor="accel")
+
+
+def _rests(points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"] | None:
+    """Which samples are of a rest; None where there are too few rests."""
+    turns = turning(points)
+    if turns is None:
+        return None
+    kinds, _ = torch.unique_consecutive(turns, return_counts=True)
+    return ~turns if int((~kinds).sum()) >= _FEWEST_RESTS else None
+
+
+def rest_bias(recording: Recording) -> RestBias | None:
+    """What a gyroscope says while nothing turns; None without a time or a rest of three seconds.
+
+    A window of a second is one of rest where its rates scatter little more than in the quietest one and, less their
+    bias, are those of the other such windows.
+
+    Args:
+        recording: with ``time`` and ``gyro_*``, in the order of time.
+
+    Example:
+        >>> draw = torch.Generator().manual_seed(0)
+        >>> rate = 0.01 * torch.randn(1000, 3, generator=draw) + torch.tensor([0.02, 0.0, -0.01])
+        >>> rate[300:700] += torch.sin(torch.arange(400.0) / 30.0)[:, None]
+        >>> columns = dict(zip(GYRO, rate.unbind(-1)))
+        >>> found = rest_bias(Recording({"time": torch.arange(1000) / 50.0, **columns}))
+        >>> [round(v, 2) for v in found.value], found.seconds > 10.0
+        ([0.02, 0.0, -0.01], True)
+    """
+    if recording.time is None or not all(name in recording for name in GYRO):
+        return None
+    rate, time = recording.stack(*GYRO), recording.time
+    step = float(time.diff().clamp(min=0.0).median()) if len(time) > 1 else 0.0
+    if not step > 0.0:
+        return None
+    count = max(8, round(_WINDOW / step))
+    known = rate.isfinite().all(-1)
+    rate = rate[known]
+    windows = len(rate) // count
+    if windows < _FEWEST_WINDOWS:
+        return None
+    parts = rate[: windows * count].unflatten(0, (windows, count))
+    middle, scatter = parts.mean(1), parts.std(1)
+    quiet = (scatter <= _STILL * scatter.amin(0)).all(-1)
+    # a turn at a steady rate is as quiet; the smallest rates are those of rest
+    size = torch.linalg.vector_norm(middle, dim=-1)
+    slowest = middle[quiet][size[quiet].argmin()] if bool(quiet.any()) else middle[0]
+    noise = _STILL * scatter.amin(0) * (0.5 + 3.0 * count**-0.5)
+    still = quiet & ((middle - slowest).abs() <= noise).all(-1)
+    if int(still.sum()) < _FEWEST_WINDOWS or float(torch.linalg.vector_norm(slowest)) > _MOST_BIAS:
+        return None
+    chosen = middle[still]
+    error = chosen.std(0) / math.sqrt(len(chosen))
+    return RestBias(_vector(chosen.mean(0)), _vector(error), float(len(chosen) * count * step))
+
+
+_MOST_BIAS = 0.2
+"""Rate in rad/s, 11 °/s, beyond which the slowest is no bias but a turn."""
+
+
+def _vector(values: Tensor) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z

@@ -1,0 +1,78 @@
+"""The runs of a recording: what follows one another in one run does, what lies in two does not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.recording.recording import Recording
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["apart", "in_each_run", "run_ends", "run_slices"]
+
+_EXPERIMENT = "experiment"
+
+_FARTHEST = 1.1447 * 1078.0 ** (1.0 / 3.0)
+"""Times the cube root of the number of samples: the widest bandwidth that Andrews' rule gives, at the correlation of
+0.97 at which it stops."""
+
+
+def run_slices(recording: Recording) -> tuple[slice, ...]:
+    """Where each run lies: the rows between two changes of ``experiment``, or all of them without that column.
+
+    Example:
+        >>> run_slices(Recording({"experiment": torch.tensor([1, 1, 2])}))
+        (slice(0, 2, None), slice(2, 3, None))
+    """
+    if _EXPERIMENT not in recording:
+        return (slice(0, len(recording)),)
+    _, counts = torch.unique_consecutive(recording[_EXPERIMENT], return_counts=True)
+    ends = counts.cumsum(0).tolist()
+    return tuple(slice(begin, end) for begin, end in zip([0, *ends[:-1]], ends, strict=True))
+
+
+def in_each_run(
+    points: Float[Tensor, "N 3"], runs: tuple[slice, ...], of_one: Callable[[Tensor], Tensor | None]
+) -> Tensor | None:
+    """What a function of consecutive samples says of each run, joined; None where it says nothing of one of them."""
+    found = [of_one(points[run]) for run in runs]
+    return None if any(one is None for one in found) else torch.cat([one for one in found if one is not None])
+
+
+def apart(
+    runs: tuple[slice, ...], points: Float[Tensor, "N 3"], weight: Bool[Tensor, " N"]
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, " M"]]:
+    """Points and weights with samples of weight 0 between the runs, so many that no bandwidth reaches over them.
+
+    Standard errors of a time series sum the products of samples that follow one another; of two runs none do.
+
+    Args:
+        runs: of :func:`run_slices`.
+        points: in the order of time within each run.
+        weight: which of them to take.
+
+    Example:
+        >>> points, weight = apart((slice(0, 2), slice(2, 5)), torch.ones(5, 3), torch.ones(5, dtype=torch.bool))
+        >>> len(points) > 5, int(weight.sum()), weight[:3].tolist()
+        (True, 5, [1.0, 1.0, 0.0])
+    """
+    taken = weight.to(points)
+    if len(runs) == 1:
+        return points, taken
+    far = math.ceil(min(_FARTHEST * len(points) ** (1.0 / 3.0), len(points) / 4)) + 1
+    parts, shares = [], []
+    for run in runs:
+        parts += [points[run], points[run][-1:].expand(far, 3)]
+        shares += [taken[run], taken.new_zeros(far)]
+    return torch.cat(parts[:-1]), torch.cat(shares[:-1])
+
+
+def run_ends(recording: Recording) -> Iterator[int]:
+    """The first row of each run but the first."""
+    yield from (run.start for run in run_slices(recording)[1:])

@@ -1,0 +1,160 @@
+"""Frozen and clipped samples: named and left out; rest and coarse digits are neither."""
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from mkc_torch import Recording
+from mkc_torch.calibration import NotIdentifiableError, calibrate
+from mkc_torch.calibration.calibrate import prepared
+from mkc_torch.calibration.clipped_samples import CLIPPED
+from mkc_torch.calibration.frozen_samples import FROZEN
+from tests.shared_data import shared_case, shared_data
+
+AXES = ("mag_x", "mag_y", "mag_z")
+REAL = (
+    "broad_02_undisturbed", "broad_28_stationary_magnet", "broad_34_attached_magnet_3cm", "full_sphere",
+    "quadrotor_compass1", "quadrotor_compass3", "raw_counts",
+)  # fmt: skip
+
+
+def turned(count=2000, noise=0.3, seed=0, speed=1.0):
+    """A sensor that is turned through all directions at 50 Hz, and its noise, in µT."""
+    draw = torch.Generator().manual_seed(seed)
+    t = torch.arange(count, dtype=torch.float64) / 50.0 * speed
+    a, b = 0.9 * t, 2.0 * torch.sin(0.31 * t) + 0.7 * t
+    way = torch.stack([a.cos() * b.cos(), a.sin() * b.cos(), b.sin()], -1)
+    return 45.0 * way + torch.tensor([4.0, -7.0, 11.0]) + noise * torch.randn(count, 3, generator=draw)
+
+
+def recorded(points, rate=50.0, **columns):
+    time = torch.arange(len(points), dtype=torch.float64) / rate
+    return Recording({"time": time, **dict(zip(AXES, points.unbind(-1), strict=True)), **columns})
+
+
+def test_a_sensor_that_freezes_to_the_end_is_named_where_its_noise_would_not_let_it():
+    points = turned()
+    points[1500:] = points[1500]
+    (told,) = faults(recorded(points))
+    assert "from 30 to 39.98 s (500)" in told
+    points = digits(turned(noise=0.05), 0.5)
+    points[1500:] = points[1500]
+    assert faults(recorded(points)) == []
+
+
+def faults(recording):
+    return [w for w in prepared(recording).warnings if FROZEN in w or CLIPPED in w]
+
+
+def digits(points, step):
+    return (points / step).round() * step
+
+
+def test_a_frozen_sensor_of_the_kept_case_is_named_and_left_out():
+    c = calibrate(Recording.read(shared_case("messy/frozen_sensor.csv")))
+    (told,) = c.warnings
+    assert "800 of 2730" in told
+    assert "from 38.8633 to 70.0038 s (800)" in told
+    assert c.samples == 1930
+    whole = (-0.63, -10.54, 2.04)  # of the recording before it was frozen
+    assert max(abs(a - b) / s for a, b, s in zip(c.center, whole, c.center_se, strict=True)) < 2.0
+
+
+def test_clipping_of_the_kept_case_is_named_in_the_refusal():
+    with pytest.raises(NotIdentifiableError) as caught:
+        calibrate(Recording.read(shared_case("messy/clipped.csv")))
+    for told in ("`mag_x` is cut off at 40", "`mag_y` is cut off at -40 (924", "wider range"):
+        assert told in str(caught.value)
+
+
+def test_without_time_standard_errors_and_block_are_those_with_it():
+    timed = calibrate(Recording.read(shared_case("messy/one_block.csv")))
+    rows = calibrate(Recording.read(shared_case("messy/one_block_no_time.csv")))
+    assert rows.center == timed.center
+    assert rows.center_se == timed.center_se
+    assert (timed.disturbed_unit, rows.disturbed_unit) == ("s", "row")
+    ((begin, end),), ((first, last),) = timed.disturbed, rows.disturbed
+    assert (first, last) == pytest.approx((1 + 50.0 * begin, 1 + 50.0 * end))
+    assert type(rows).from_json(rows.to_json()) == rows
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_recordings_are_neither_frozen_nor_clipped(name):
+    assert faults(Recording.read(shared_data(f"magnetometer/{name}.csv"))) == []
+
+
+@given(st.sampled_from(REAL), st.floats(0.0, 5.0), st.integers(1, 4), st.booleans())
+@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
+def test_nor_are_they_with_coarser_digits_polled_oftener_or_with_a_rest(name, coarse, polled, rests):
+    points = Recording.read(shared_data(f"magnetometer/{name}.csv")).magnetometer()[:3000]
+    size = float(torch.linalg.vector_norm(points - points.median(0).values, dim=-1).median())
+    if rests:
+        points = torch.cat([points[:1000], points[1000:1001].expand(400, 3), points[1000:]])
+    if coarse > 0.05:
+        points = digits(points, 0.01 * coarse * size)
+    assert faults(recorded(points.repeat_interleave(polled, 0))) == []
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.05, 4.0), st.floats(0.2, 3.0), st.integers(0, 99))
+@settings(max_examples=15, deadline=None)
+def test_a_turning_sensor_of_any_digits_and_noise_has_no_fault(noise, step, speed, seed):
+    assert faults(recorded(digits(turned(noise=noise, seed=seed, speed=speed), step))) == []
+
+
+@given(
+    st.sampled_from([None, 0, 1, 2]), st.integers(60, 400), st.integers(100, 1400), st.integers(0, 99), st.booleans()
+)
+@settings(max_examples=15, deadline=None)
+def test_a_freeze_of_all_axes_or_of_one_is_named_with_its_place(axis, length, begin, seed, coarse):
+    points = turned(seed=seed)
+    if coarse:
+        points = digits(points, 0.15)
+    columns = [0, 1, 2] if axis is None else [axis]
+    for k in columns:
+        points[begin : begin + length, k] = points[begin, k]
+    (told,) = faults(recorded(points))
+    names = "all of `mag_x`, `mag_y`, `mag_z`" if axis is None else f"`{AXES[axis]}`"
+    assert f"{FROZEN}: {names} from " in told
+    # by chance the values before and after may be equal to it
+    start, end = map(float, told.split(" from ")[1].split(" s ")[0].split(" to "))
+    assert (start, end) == pytest.approx((begin / 50.0, (begin + length - 1) / 50.0), abs=0.1)
+    left = len(prepared(recorded(points)))
+    assert len(points) - length - 5 <= left <= len(points) - length
+
+
+@given(st.sampled_from([0, 1, 2]), st.sampled_from([-1.0, 1.0]), st.floats(0.6, 0.9), st.integers(0, 99))
+@settings(max_examples=12, deadline=None)
+def test_one_axis_that_is_cut_off_is_named_and_the_rest_is_calibrated(axis, side, share, seed):
+    points = digits(turned(seed=seed), 0.1)
+    center = torch.tensor([4.0, -7.0, 11.0])
+    limit = round(float(center[axis]) + side * share * 45.0, 1)
+    points[:, axis] = points[:, axis].clamp(max=limit) if side > 0 else points[:, axis].clamp(min=limit)
+    recording = recorded(points)
+    (told,) = faults(recording)
+    assert f"`{AXES[axis]}` is cut off at {limit:.6g} (" in told
+    assert told.count("cut off") == 1
+
+
+def test_what_is_left_of_a_clipped_recording_is_calibrated():
+    points = digits(turned(4000), 0.1)
+    points[:, 0] = points[:, 0].clamp(max=40.0)
+    c = calibrate(recorded(points))
+    assert any(CLIPPED in w for w in c.warnings)
+    assert c.center == pytest.approx((4.0, -7.0, 11.0), abs=0.3)
+    assert c.semi_axes == pytest.approx((45.0, 45.0, 45.0), abs=0.4)
+
+
+def test_standard_errors_do_not_reach_from_one_run_to_the_next():
+    # two runs that begin with what is left over from the one before: joined, the lags between them would count
+    points = turned(1200, noise=0.2)
+    drift = torch.cat([torch.linspace(1.0, 0.0, 600), torch.linspace(0.0, 1.0, 600)]).double()
+    points = points * (1.0 + 0.03 * drift[:, None])
+    run = (torch.arange(1200) >= 600).double()
+    forward = calibrate(recorded(points, experiment=run))
+    swapped = torch.cat([torch.arange(600, 1200), torch.arange(600)])
+    backward = calibrate(recorded(points[swapped], experiment=run))
+    assert forward.center_se == pytest.approx(backward.center_se, rel=1e-9)
+    joined, other = calibrate(recorded(points)), calibrate(recorded(points[swapped]))
+    assert joined.center_se != pytest.approx(other.center_se, rel=1e-4)
+    assert forward.samples == 1200
