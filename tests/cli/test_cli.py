@@ -250,8 +250,9 @@ def test_columns_and_units_of_the_users_own(tmp_path):
 
 
 def test_not_identifiable_writes_a_report_and_no_calibration(tmp_path):
-    path = shared_data("magnetometer/quadrotor_compass1.csv")
-    folder = tmp_path / "quadrotor_compass1"
+    recording = Recording.read(shared_data("magnetometer/quadrotor_compass1.csv"))
+    path = table(tmp_path / "quadrotor.csv", recording.magnetometer(), time=recording.time)  # and nothing to aid it
+    folder = tmp_path / "quadrotor"
     folder.mkdir()
     (folder / "calibration.json").write_text('{"schema": "mkc-calibration/1"}')
     result = mkc("calibrate", path, "--output", tmp_path, "--force")
@@ -496,5 +497,5 @@ def test_place_date_and_sensor_are_checked_in_one_sentence(good, tmp_path):
     refused(mkc("calibrate", good, *out, "--place", "48", "--date", "2026-01-01"), "LAT,LON", code=2)
     refused(mkc("calibrate", good, *out, "--place", "48,11", "--date", "1.1.26"), "YYYY-MM-DD", code=2)
     refused(mkc("calibrate", good, *out, "--place", "48,11", "--date", "1999-01-01"), "2015-01-01", code=2)
-    refused(mkc("calibrate", good, *out, "--sensor", "sonar"), "mag or accel", code=2)
+    refused(mkc("calibrate", good, *out, "--sensor", "sonar"), "sonar")
     refused(mkc("calibrate", good, *out, "--sensor", "accel"), "no column `accel_x`")
