@@ -111,10 +111,9 @@ _values: Callable[..., Tensor] = _Values.apply
 _slopes: Callable[..., Tensor] = _Slopes.apply
 
 
-for _kind in (_Values, _Slopes):
+for _function in (_Values.forward, _Slopes.forward):
     # torch asks for it at every call, and it takes longer to find than a few rows to compute
-    _forward: Any = _kind.forward
-    _forward.__signature__ = inspect.signature(_forward)
+    setattr(_function, "__signature__", inspect.signature(_function))  # noqa: B010 - no type knows of it
 
 
 def _kept_slopes(ctx: Any, group: Group) -> Tensor:
