@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.forward_mode import forward_jacobian
 from mkc_torch.diagnosis.evidence.held_out import HeldOutBlocks
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.joint import JointModel, port_jacobian, through_port
@@ -103,7 +104,9 @@ class _Around:
             name: port_jacobian(model, parameters, name) if port.pointwise else None
             for name, port in model.prepared.ports.items()
         }
-        return cls(model, parameters, torch.func.jacfwd(model.residual)(parameters), pointwise)
+        values = len(model.prepared.time) * len(model.prepared.independent)
+        own = forward_jacobian(model.residual, parameters, values)
+        return cls(model, parameters, own, pointwise)
 
     @property
     def ports(self) -> dict[str, Port]:
