@@ -68,7 +68,9 @@ def forward_tangents(function: Residual, values: int = 1) -> Residual:
             return torch.func.jvp(lambda t: function(t, *data), (theta,), (direction,))[1]
 
         basis = torch.eye(theta.shape[0], dtype=theta.dtype, device=theta.device)
-        return torch.func.vmap(along, chunk_size=directions_at_once(values))(basis)
+        few = directions_at_once(values)
+        # all of them in one chunk would lie otherwise in memory, and be rounded otherwise in what follows
+        return torch.func.vmap(along, chunk_size=None if few >= len(basis) else few)(basis)
 
     return tangents
 

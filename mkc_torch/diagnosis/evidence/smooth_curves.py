@@ -156,10 +156,14 @@ def smooth_tangents(
     joined = torch.cat([curves[name] for name in names], -1)
     tangents, groups, roughness, start = [around.own], [], [joined.new_zeros(own)], own
     for port in ports:
-        c = len(ports[port].channels)
-        courses = joined[:, None, :, None] * torch.eye(c, dtype=joined.dtype)[:, None, :]
-        entering = ports[port].at(courses.flatten(2))
-        tangents.append(through_port(model, parameters, port, entering, around.pointwise[port]))
+        c, known = len(ports[port].channels), around.pointwise[port]
+        if known is not None and ports[port].clock is None:
+            # each course in each channel: a product, for which none is spread over all channels
+            tangents.append((known[:, :, None, :] * joined[:, None, :, None]).flatten(2))
+        else:
+            courses = joined[:, None, :, None] * torch.eye(c, dtype=joined.dtype)[:, None, :]
+            entering = ports[port].at(courses.flatten(2))
+            tangents.append(through_port(model, parameters, port, entering, known))
         for name in names:
             degree = torch.arange(curves[name].shape[-1], dtype=joined.dtype)
             groups.append(torch.arange(start, start + c * len(degree)))
