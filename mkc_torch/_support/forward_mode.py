@@ -11,7 +11,16 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-__all__ = ["Residual", "beside", "forward_tangents", "load_forward_mode", "reverse_tangents", "twice_reverse_tangents"]
+__all__ = [
+    "Residual",
+    "beside",
+    "directions_at_once",
+    "forward_jacobian",
+    "forward_tangents",
+    "load_forward_mode",
+    "reverse_tangents",
+    "twice_reverse_tangents",
+]
 
 Residual = Callable[..., Tensor]
 
@@ -36,7 +45,22 @@ def beside(constant: Tensor, moving: Tensor) -> Tensor:
     return torch.where(torch.ones((), dtype=torch.bool, device=constant.device), constant, moving)
 
 
-def forward_tangents(function: Residual) -> Residual:
+_CELLS = 250_000
+"""Numbers of the tangents that are made together: on the way to them a function holds several times as many."""
+
+
+def directions_at_once(values: int) -> int:
+    """Directions along which so many values are differentiated together.
+
+    Example:
+        >>> directions_at_once(4_500), directions_at_once(360_000)
+        (55, 1)
+    """
+    return max(1, _CELLS // max(values, 1))
+
+
+def forward_tangents(function: Residual, values: int = 1) -> Residual:
+    """The transposed Jacobian, a row for each parameter; of a function of many ``values`` a few rows at a time."""
     load_forward_mode()
 
     def tangents(theta: Tensor, *data: Any) -> Tensor:
@@ -44,9 +68,16 @@ def forward_tangents(function: Residual) -> Residual:
             return torch.func.jvp(lambda t: function(t, *data), (theta,), (direction,))[1]
 
         basis = torch.eye(theta.shape[0], dtype=theta.dtype, device=theta.device)
-        return torch.func.vmap(along)(basis)
+        few = directions_at_once(values)
+        # all of them in one chunk would lie otherwise in memory, and be rounded otherwise in what follows
+        return torch.func.vmap(along, chunk_size=None if few >= len(basis) else few)(basis)
 
     return tangents
+
+
+def forward_jacobian(function: Residual, theta: Tensor, values: int) -> Tensor:
+    """As ``torch.func.jacfwd`` has it, of a function of so many values."""
+    return forward_tangents(function, values)(theta).movedim(0, -1)
 
 
 def twice_reverse_tangents(function: Residual) -> Residual:

@@ -60,11 +60,12 @@ class Problem:
         residual = self.raw_residual(theta)
         return residual if self.used is None else torch.where(self.used, residual, 0.0)
 
-    def tangents(self, theta: Float[Tensor, "B p"]) -> Float[Tensor, "B p N*m"]:
-        """The transposed Jacobian: a row for each parameter, as forward mode makes them."""
+    def tangents(self, theta: Float[Tensor, "B p"], values: int) -> Float[Tensor, "B p N*m"]:
+        """The transposed Jacobian: a row for each parameter, as forward mode makes them; ``values`` is B N m."""
         # a batch is differentiated in one, which reverse mode of reverse mode cannot be
         way = "forward" if self.jacobian == "reverse twice" and len(theta) > 1 else self.jacobian
-        rows = self._over_batch(TANGENTS[way](self.function), theta)
+        function = forward_tangents(self.function, values) if way == "forward" else TANGENTS[way](self.function)
+        rows = self._over_batch(function, theta)
         if self.used is not None:
             rows = torch.where(self.used.unsqueeze(1), rows, 0.0)
         return rows.flatten(2)
@@ -82,13 +83,16 @@ class Problem:
         return replace(self, data=None)._over_batch(torch.func.jacrev(self._constraints), theta)
 
     def at(self, theta: Float[Tensor, "B p"]) -> Point:
-        return Point(theta, self.residual(theta), self.tangents(theta), self.constraints(theta), self.normals(theta))
+        residual = self.residual(theta)
+        tangents = self.tangents(theta, residual.numel())
+        return Point(theta, residual, tangents, self.constraints(theta), self.normals(theta))
 
     def refreshed(self, point: Point) -> Point:
         """The point with derivatives taken at its own parameters."""
         if not point.stale:
             return point
-        return replace(point, tangents=self.tangents(point.theta), normals=self.normals(point.theta), stale=False)
+        tangents = self.tangents(point.theta, point.residual.numel())
+        return replace(point, tangents=tangents, normals=self.normals(point.theta), stale=False)
 
     def select(self, index: Tensor) -> Problem:
         def take(value: Tensor | None) -> Tensor | None:

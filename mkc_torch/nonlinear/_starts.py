@@ -57,7 +57,8 @@ def drawn(problem: Problem, theta: Float[Tensor, "B p"], starts: int, seed: int)
     found = torch.cat([theta.unsqueeze(1), others.expand(len(theta), -1, -1)], 1)
 
     def finite(at: Tensor) -> Tensor:
-        seen = torch.cat([problem.residual(at).flatten(1), problem.tangents(at).flatten(1)], -1)
+        residual = problem.residual(at)
+        seen = torch.cat([residual.flatten(1), problem.tangents(at, residual.numel()).flatten(1)], -1)
         return torch.isfinite(seen).all(-1, keepdim=True)
 
     fit_for_a_start = torch.stack([finite(found[:, i]) for i in range(starts)], 1)

@@ -113,7 +113,8 @@ class _Problem:
 def _problem(
     model: JointModel, parameters: Tensor, residual: Float[Tensor, "N m"], smooth: Smooth, d: Float[Tensor, " m"]
 ) -> _Problem:
-    tangents = (smooth.tangents / d.unsqueeze(-1)).flatten(0, 1)
+    # in their place: of a long recording they are most of what there is, and nobody asks for them again
+    tangents = smooth.tangents.div_(d.unsqueeze(-1)).flatten(0, 1)
     samples = len(tangents)
     size = (torch.linalg.vector_norm(tangents, dim=0) / math.sqrt(samples)).clamp(min=_TINY)
     own = size[: smooth.own]

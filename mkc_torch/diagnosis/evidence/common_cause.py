@@ -14,7 +14,7 @@ from mkc_torch.diagnosis.linearised.linear_search import log_survival
 from mkc_torch.diagnosis.linearised.linearise import Linearised
 from mkc_torch.diagnosis.linearised.tangents import Slow
 from mkc_torch.diagnosis.linearised.wander import SlowPart
-from mkc_torch.diagnosis.noise.cosine_basis import cosines
+from mkc_torch.diagnosis.noise.cosine_basis import course_of
 from mkc_torch.effects.context import Shape
 from mkc_torch.effects.sensor.unrecorded import COURSE
 
@@ -87,7 +87,7 @@ def common_cause(linearised: Linearised, slow: Slow | None) -> CommonCause | Non
     along = torch.linalg.eigh(likely).eigenvectors[:, -1]
     relative = part.scale[:c] / part.scale[0]
     amplitudes = part.scale[::c] * (courses @ along)
-    course = cosines(len(amplitudes), len(slow.tangents)) @ amplitudes
+    course = course_of(amplitudes, len(slow.tangents))
     span = float(course.max() - course.min())
     told = amplitudes.abs() > _TOLD * amplitudes.abs().max()
     shape = {

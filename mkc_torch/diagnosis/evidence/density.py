@@ -34,6 +34,9 @@ _FREEDOM = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 _ROUNDS, _NODES = 30, 2001
 """Of the EM algorithm for a Student-t's scale, and nodes of the integral of its density."""
 
+_AT_ONCE = 10_000
+"""Samples whose distribution function is computed together: each takes an integral over tens of nodes."""
+
 _COLUMNS = ("channel", "distance of the density", "distance of a Student-t", "by chance up to", "")
 _NOTE = (
     "The largest distance between the distribution function of the residuals and that of the density fitted to them, "
@@ -120,7 +123,7 @@ def density_checks(
     """
     size = residual.abs()
     density = MKCDistribution(sigma, d, bound, validate_args=False)
-    uniform = 2.0 * density.cdf(size) - 1.0
+    uniform = torch.cat([2.0 * density.cdf(part) - 1.0 for part in size.split(_AT_ONCE)])
     # beyond the domain it is as on its edge
     likelihood = density.log_prob(torch.minimum(size, bound)).mean(0)
     found = []

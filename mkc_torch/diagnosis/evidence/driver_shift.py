@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.base import Case, Row, Told
+from mkc_torch.diagnosis.linearised.candidates import Candidates
 from mkc_torch.diagnosis.linearised.linearise import linearise
-from mkc_torch.diagnosis.linearised.tangents import Tangents, candidate_tangents
+from mkc_torch.diagnosis.linearised.tangents import Tangents
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import DriverShift
@@ -94,7 +95,7 @@ def shifted(model: JointModel, located: Located) -> DriverShift | None:
 
     def gains(steps: Sequence[int]) -> Float[Tensor, " steps"]:
         copies = [_moved(term, by) for by in steps]
-        moved = candidate_tangents(model, parameters, copies, located.scene.tangents.pointwise)
+        moved = Candidates(model, parameters, copies, located.scene.tangents.pointwise)
         return search.gains_of([one[middle] for one in moved], counts).ratio[:, 0]
 
     steps = [most * k // _COPIES for k in range(-_COPIES, _COPIES + 1) if k]

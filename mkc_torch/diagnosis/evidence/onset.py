@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.base import Case, Told
-from mkc_torch.diagnosis.linearised.tangents import candidate_tangents
+from mkc_torch.diagnosis.linearised.candidates import Candidates
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.search.locate import Located
 
@@ -71,7 +71,7 @@ def onset_interval(model: JointModel, located: Located) -> tuple[float, float] |
     def ratios(numbers: Sequence[int]) -> Float[Tensor, " n"]:
         """Of a change that comes with the sample of each number."""
         shapes = [replace(term, shape={**term.shape, "onset": float(time[number])}) for number in numbers]
-        tangents = candidate_tangents(model, parameters, shapes, pointwise)
+        tangents = Candidates(model, parameters, shapes, pointwise)
         return located.look.linearised.gains_of(tangents, located.scene.counts).ratio[:, 0]
 
     tried = _spread(place, len(time))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.forward_mode import forward_jacobian
 from mkc_torch.diagnosis.evidence.held_out import HeldOutBlocks
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.joint import JointModel, port_jacobian, through_port
@@ -103,7 +104,9 @@ class _Around:
             name: port_jacobian(model, parameters, name) if port.pointwise else None
             for name, port in model.prepared.ports.items()
         }
-        return cls(model, parameters, torch.func.jacfwd(model.residual)(parameters), pointwise)
+        values = len(model.prepared.time) * len(model.prepared.independent)
+        own = forward_jacobian(model.residual, parameters, values)
+        return cls(model, parameters, own, pointwise)
 
     @property
     def ports(self) -> dict[str, Port]:
@@ -153,10 +156,14 @@ def smooth_tangents(
     joined = torch.cat([curves[name] for name in names], -1)
     tangents, groups, roughness, start = [around.own], [], [joined.new_zeros(own)], own
     for port in ports:
-        c = len(ports[port].channels)
-        courses = joined[:, None, :, None] * torch.eye(c, dtype=joined.dtype)[:, None, :]
-        entering = ports[port].at(courses.flatten(2))
-        tangents.append(through_port(model, parameters, port, entering, around.pointwise[port]))
+        c, known = len(ports[port].channels), around.pointwise[port]
+        if known is not None and ports[port].clock is None:
+            # each course in each channel: a product, for which none is spread over all channels
+            tangents.append((known[:, :, None, :] * joined[:, None, :, None]).flatten(2))
+        else:
+            courses = joined[:, None, :, None] * torch.eye(c, dtype=joined.dtype)[:, None, :]
+            entering = ports[port].at(courses.flatten(2))
+            tangents.append(through_port(model, parameters, port, entering, known))
         for name in names:
             degree = torch.arange(curves[name].shape[-1], dtype=joined.dtype)
             groups.append(torch.arange(start, start + c * len(degree)))

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from mkc_torch._parallel.pool import shared
 from mkc_torch.diagnosis.linearised.linear_search import Gains, LinearSearch
-from mkc_torch.diagnosis.linearised.tangents import AT_ONCE, Slow, Tangents, in_blocks
+from mkc_torch.diagnosis.linearised.seen import FILLED_AT_ONCE, Seen, each
+from mkc_torch.diagnosis.linearised.tangents import Slow, Tangents
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.noise.colour import (
     Colour,
@@ -23,20 +24,13 @@ from mkc_torch.diagnosis.noise.colour import (
     port_colour,
 )
 from mkc_torch.diagnosis.noise.cosine_basis import dct
-from mkc_torch.diagnosis.noise.gaps import Filling, Gaps
+from mkc_torch.diagnosis.noise.gaps import Filling
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = ["Linearised", "linearise"]
 
-
-_MOST, _MARGIN, _FEWEST = 0.9, 3.0, 1000
-"""Share of what moves that the slowest cosine coefficients hold, times as many that are kept, and how many at least."""
-
-_FILLED_AT_ONCE = 64
-"""Candidates whose tangents are moved about together: they stay in a core's own memory. To fill them, a large matrix
-passes by each time."""
 
 _ALTERNATIONS, _SETTLED = 8, 10.0
 """Steps at most between the colour and a wander beside it, and the nats that a step has to bring: as many as a colour,
@@ -131,7 +125,7 @@ class Linearised:
 
     def _columns(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> list[Tensor]:
         rows = len(self.series) - self.colour.root.numel()
-        columns = _each(lambda joined: self._whitened(counts.unsqueeze(-1) * joined), tangents)
+        columns = each(lambda joined: self._whitened(counts.unsqueeze(-1) * joined), tangents)
         return [torch.cat([c, c.new_zeros(rows, c.shape[1])]) for c in columns]
 
     def _whitened(self, values: Float[Tensor, "N m c"]) -> Float[Tensor, "Km c"]:
@@ -163,6 +157,7 @@ def linearise(
     white: bool = False,
     wander: bool = True,
     joint: bool = False,
+    seen: Seen | None = None,
 ) -> Linearised:
     """A search around a fit.
 
@@ -176,27 +171,22 @@ def linearise(
         white: beside the wander, noise counts as white.
         wander: allow for noise that wanders at the ports.
         joint: the one candidate is all of the parameters, to be estimated together.
+        seen: what :meth:`Seen.of` gives of the same, where it is known.
     """
     m = pseudo.shape[1]
     pull = _Pull.of(model, parameters)
-    kept = _bandwidth(tangents.nuisance)
     slow = tangents.slow if wander else None
-    seen = _Seen.of(pseudo, counts, tangents, slow, kept)
-    gaps = Gaps(counts, kept)
-    plain = Colour(tuple(pseudo.new_zeros(0) for _ in range(m)), pseudo.new_ones(kept, m) * _level(pseudo))
+    seen = Seen.of(pseudo, counts, tangents, slow) if seen is None else seen
+    level = pseudo.new_ones(seen.kept, m) * _level(pseudo)
+    plain = Colour(tuple(pseudo.new_zeros(0) for _ in range(m)), level)
     if white:
-        return _searching(plain, pull, seen, slow, gaps)
+        return _searching(plain, pull, seen, slow)
     bare = replace(seen, candidates=())
     if joint:
-        own = _coloured(plain, near, pull, bare, slow, gaps).colour if colour is None else colour
-        return _searching(own, pull, seen, slow, gaps, joint=True)
-    if colour is None:
-        found = _coloured(plain, near, pull, bare, slow, gaps)
-    else:
-        found = _searching(colour, pull, bare, slow, gaps)
-    candidates = [
-        pull.below(found.colour.scaled(one)) for one in _each(found.filling, seen.candidates, _FILLED_AT_ONCE)
-    ]
+        own = _coloured(plain, near, pull, bare, slow).colour if colour is None else colour
+        return _searching(own, pull, seen, slow, joint=True)
+    found = _coloured(plain, near, pull, bare, slow) if colour is None else _searching(colour, pull, bare, slow)
+    candidates = [pull.below(found.colour.scaled(one)) for one in each(found.filling, seen.candidates, FILLED_AT_ONCE)]
     found = replace(found, search=found.search.with_candidates(candidates))
     pointwise = None if slow is None else tangents.pointwise[slow.port]
     if slow is None or pointwise is None or not tangents.candidates:
@@ -209,46 +199,9 @@ def linearise(
     return replace(found, entrance=(block, port_colour(beside, block)))
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """What a search is about, in the K slowest coefficients of the cosine basis, where a colour is a division."""
-
-    pseudo: Tensor  # (K, m)
-    nuisance: Tensor  # (K, m, p)
-    candidates: tuple[Tensor, ...]  # (K, m, q)
-    slow: Tensor  # (K, m, k)
-
-    @classmethod
-    def of(cls, pseudo: Tensor, counts: Tensor, tangents: Tangents, slow: Slow | None, kept: int) -> _Seen:
-        values = dct(pseudo, kept)
-        nuisance, *candidates = _each(
-            lambda joined: dct(counts.unsqueeze(-1) * joined, kept), [tangents.nuisance, *tangents.candidates]
-        )
-        moved = nuisance[..., :0] if slow is None else slow.transformed(counts, kept)
-        return cls(values, nuisance, tuple(candidates), moved)
-
-    def filled(self, filling: Filling) -> _Seen:
-        """The same with what noise is expected at rejected samples, in all of it alike."""
-        pseudo, nuisance, *candidates = _each(
-            filling, [self.pseudo.unsqueeze(-1), self.nuisance, *self.candidates], _FILLED_AT_ONCE
-        )
-        return _Seen(pseudo.squeeze(-1), nuisance, tuple(candidates), filling(self.slow))
-
-
-def _each(function: Callable[[Tensor], Tensor], columns: Sequence[Tensor], at_once: int = AT_ONCE) -> list[Tensor]:
-    """A function of columns, of each of these matrices."""
-    return [
-        done
-        for block in in_blocks(columns, at_once)
-        for done in function(torch.cat([*block], -1)).split([c.shape[-1] for c in block], -1)
-    ]
-
-
-def _searching(
-    colour: Colour, pull: _Pull, seen: _Seen, slow: Slow | None, gaps: Gaps, *, joint: bool = False
-) -> Linearised:
+def _searching(colour: Colour, pull: _Pull, seen: Seen, slow: Slow | None, *, joint: bool = False) -> Linearised:
     """A search of what has its rejected samples filled."""
-    filling = gaps.filling(colour)
+    filling = seen.gaps.filling(colour)
     seen = seen.filled(filling)
     flat = colour.scaled(seen.pseudo)
     parameters = pull.under(colour.scaled(seen.nuisance), flat)
@@ -263,29 +216,27 @@ def _searching(
     return Linearised(search, pull.beside(flat), colour, None, filling)
 
 
-def _coloured(
-    plain: Colour, near: Colour | None, pull: _Pull, seen: _Seen, slow: Slow | None, gaps: Gaps
-) -> Linearised:
+def _coloured(plain: Colour, near: Colour | None, pull: _Pull, seen: Seen, slow: Slow | None) -> Linearised:
     """With the likeliest colour of the noise beside a wander at the port, by alternating between the two."""
     alone = replace(seen, slow=seen.slow[..., :0])
 
     def beside_nothing() -> Colour:
-        best = _searching(plain, pull, alone, None, gaps).colour_beside()
+        best = _searching(plain, pull, alone, None).colour_beside()
         for _ in range(_REFILLED):
-            found = _searching(best, pull, alone, None, gaps)
+            found = _searching(best, pull, alone, None)
             if found.filling.nothing:
                 break
             best = found.colour_beside()
         return best
 
     if slow is None:
-        return _searching(beside_nothing(), pull, seen, None, gaps)
+        return _searching(beside_nothing(), pull, seen, None)
 
     def beside_wander() -> Colour:
-        return _searching(plain, pull, seen, slow, gaps).colour_beside() if near is None else near
+        return _searching(plain, pull, seen, slow).colour_beside() if near is None else near
 
     def tried(colour: Callable[[], Colour]) -> Linearised:
-        return _searching(colour(), pull, seen, slow, gaps)
+        return _searching(colour(), pull, seen, slow)
 
     def beyond_wander() -> Colour:
         spread = (seen.slow.square() * slow.scales[0].square()).sum(-1)
@@ -327,15 +278,6 @@ def _settled_in(found: Linearised) -> Linearised:
 def _level(pseudo: Tensor) -> Tensor:
     """Root mean square of each channel: noisy channels count for less from the start."""
     return pseudo.square().mean(0).sqrt().clamp(min=1e-300)
-
-
-def _bandwidth(nuisance: Float[Tensor, "N m p"]) -> int:
-    """How many of the slowest cosine coefficients hold what moves: three times as many as hold nine tenths of it."""
-    N = len(nuisance)
-    power = dct(nuisance).square().sum(1)
-    share = (power / power.sum(0).clamp(min=1e-300)).cumsum(0)
-    typical = (share < _MOST).sum(0).double().median()
-    return int(min(N, max(_FEWEST, _MARGIN * float(typical))))
 
 
 @dataclass(frozen=True)

@@ -4,26 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.model.joint import JointModel, directions, port_jacobian, through_port
+from mkc_torch._support.forward_mode import forward_jacobian
+from mkc_torch.diagnosis.linearised.candidates import Candidates, parts_of
+from mkc_torch.diagnosis.model.joint import JointModel, port_jacobian, through_port
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.noise.cosine_basis import cosines, dct, dct_of_courses
+from mkc_torch.diagnosis.noise.cosine_basis import cosines, course_of, dct, dct_of_courses
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Slow", "Tangents", "candidate_tangents", "tangents_of"]
-
-T = TypeVar("T")
-
-AT_ONCE = 8
-"""Candidates whose tangents are computed together: they stay in a core's own memory."""
+__all__ = ["Slow", "Tangents", "tangents_of"]
 
 
 @dataclass(frozen=True)
@@ -32,21 +29,26 @@ class Tangents:
 
     Attributes:
         nuisance: with the parameters, (N, m, p).
-        candidates: with each candidate's γ, (N, m, q).
+        candidates: with each candidate's γ, (N, m, q); those of many samples are made when they are asked for.
         pointwise: through each port whose samples are apart, (N, m, channels); of the others None.
         slow: with slow courses at the port that wanders; None where none does.
     """
 
     nuisance: Float[Tensor, "N m p"]
-    candidates: tuple[Float[Tensor, "N m q"], ...]
+    candidates: Sequence[Float[Tensor, "N m q"]]
     pointwise: dict[str, Tensor | None]
     slow: Slow | None
 
     @property
-    def parts(self) -> tuple[Tensor, ...]:
-        """All that are numbers of their own."""
+    def parts(self) -> tuple[object, ...]:
+        """All that is large of it."""
         slow = () if self.slow is None else (self.slow.tangents, self.slow.scales)
-        return (self.nuisance, *self.candidates, *(one for one in self.pointwise.values() if one is not None), *slow)
+        return (
+            self.nuisance,
+            *parts_of(self.candidates),
+            *(one for one in self.pointwise.values() if one is not None),
+            *slow,
+        )
 
     @property
     def bare(self) -> Tangents:
@@ -83,7 +85,7 @@ class Slow:
         """What courses of these amplitudes add to the residual."""
         if not self.pointwise:
             return self.tangents @ amplitudes
-        wander = cosines(self.count, len(self.tangents)) @ amplitudes.unflatten(0, (-1, self.channels))
+        wander = course_of(amplitudes.unflatten(0, (-1, self.channels)), len(self.tangents))
         return torch.einsum("nmc,nc->nm", self.tangents, wander)
 
     def with_shares(self, shares: Float[Tensor, " c"]) -> Slow:
@@ -114,7 +116,8 @@ def tangents_of(
         for name, port in prepared.ports.items()
     }
     independent = parameters.new_tensor([float(one) for one in prepared.independent])
-    nuisance = torch.func.jacfwd(model.residual)(parameters)
+    values = len(prepared.time) * len(prepared.independent)
+    nuisance = forward_jacobian(model.residual, parameters, values)
     if not bool(nuisance.isfinite().all()):
         effects = [
             f"the size of {t.effect.id}" for t, n in zip(model.terms, model.sizes, strict=True) for _ in range(n)
@@ -132,43 +135,7 @@ def tangents_of(
             nuisance[..., start : start + size] *= independent[:, None]
         start += size
     slow = _slow_courses(model, parameters, pointwise, settings)
-    return Tangents(nuisance, candidate_tangents(model, parameters, terms, pointwise), pointwise, slow)
-
-
-def candidate_tangents(
-    model: JointModel, parameters: Float[Tensor, " p"], terms: Sequence[Term], pointwise: dict[str, Tensor | None]
-) -> tuple[Float[Tensor, "N m q"], ...]:
-    """Those of each candidate's γ; zeros where they are not finite.
-
-    Args:
-        model, parameters: where.
-        terms: the candidates.
-        pointwise: as :class:`Tangents` has it.
-    """
-    prepared, model = model.prepared, model.around(parameters)
-    signals = model.signals(parameters)
-    independent = parameters.new_tensor([float(one) for one in prepared.independent])
-    courses = [directions(t, t.context(prepared, signals.get(t.port))) for t in terms]
-    found: list[Tensor | None] = [None] * len(terms)
-    for name, known in pointwise.items():
-        members = [i for i, term in enumerate(terms) if term.port == name]
-        # trajectories are solved for side by side; products of samples are small enough for a core's own memory
-        for block in [members] if known is None else in_blocks(members):
-            if not block:
-                continue
-            joined = torch.cat([courses[i] for i in block], -1)
-            moved = through_port(model, parameters, name, joined, known)
-            finite = bool(moved.isfinite().all())
-            for i, part in zip(block, moved.split([courses[i].shape[-1] for i in block], -1), strict=True):
-                part = independent[:, None] * part if terms[i].effect.follows_signal else part
-                # one that has no slope here is none that could be named
-                found[i] = part if finite or bool(part.isfinite().all()) else torch.zeros_like(part)
-    return tuple(t for t in found if t is not None)
-
-
-def in_blocks(items: Sequence[T], at_once: int = AT_ONCE) -> list[Sequence[T]]:
-    """A few at a time."""
-    return [items[first : first + at_once] for first in range(0, len(items), at_once)]
+    return Tangents(nuisance, Candidates(model, parameters, terms, pointwise), pointwise, slow)
 
 
 def _slow_courses(

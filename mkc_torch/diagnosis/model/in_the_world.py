@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -238,11 +237,16 @@ def freed(fit: FittedModel) -> FittedModel | None:
     prepared = at_liberty(fit.model.prepared)
     if prepared is fit.model.prepared:
         return fit
-    model, found = JointModel(prepared, fit.model.terms, fit.model.near), []
-    for graduate in (False, True):
-        with suppress(NoFitError):
-            found.append(fitted(model, fit.parameters, fit.bound, graduate=graduate))
-    return max(found, key=lambda one: one.log_likelihood) if found else None
+    model = JointModel(prepared, fit.model.terms, fit.model.near)
+
+    def tried(graduate: bool) -> FittedModel | None:
+        try:
+            return fitted(model, fit.parameters, fit.bound, graduate=graduate)
+        except NoFitError:
+            return None
+
+    both = at_once([partial(tried, False), partial(tried, True)], prepared, fit.model.terms)
+    return max((one for one in both if one is not None), key=lambda one: one.log_likelihood, default=None)
 
 
 def _free(model: JointModel, start: Float[Tensor, " p"]) -> FittedModel | None:

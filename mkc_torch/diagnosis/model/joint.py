@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.forward_mode import forward_jacobian
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.courses import combined, gained
@@ -208,7 +209,7 @@ def directions(term: Term, context: Context) -> Float[Tensor, "N c q"]:
     def change(gamma: Tensor) -> Tensor:
         return term.effect.change(gamma, term.shape, replace(context, signal=beside(context.signal, gamma[0])))
 
-    return torch.func.jacfwd(change)(context.signal.new_zeros(term.size(context)))
+    return forward_jacobian(change, context.signal.new_zeros(term.size(context)), context.signal.numel())
 
 
 def through_port(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.diagnosis.noise.running_median import running_median
 from mkc_torch.diagnosis.settings import NoiseSettings
 
 if TYPE_CHECKING:
@@ -21,9 +22,7 @@ _NEAR = 3.0
 
 def near_median(residual: Float[Tensor, "N m"], width: int, settings: NoiseSettings) -> Float[Tensor, "N m"]:
     """1 where a residual is within three robust scales of its running median over about ``width`` samples."""
-    half = max(width // 2, 1)
-    padded = torch.nn.functional.pad(residual.mT, (half, half), mode="reflect")
-    away = residual - padded.unfold(-1, 2 * half + 1, 1).median(-1).values.mT
+    away = residual - running_median(residual, max(width // 2, 1))
     return of_all(out_of_bursts((away.abs() <= _NEAR * robust_scale(away)).to(residual.dtype), settings), settings)
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["cosines", "dct", "dct_of_courses", "inverse_dct"]
+__all__ = ["cosines", "course_of", "dct", "dct_of_courses", "inverse_dct"]
 
 
 def dct(values: Float[Tensor, N * rest], count: int | None = None) -> Float[Tensor, count * rest]:
@@ -64,6 +64,18 @@ def cosines(count: int, N: int, dtype: torch.dtype = torch.float64) -> Float[Ten
     k = torch.arange(1, count + 1, dtype=dtype)
     n = torch.arange(N, dtype=dtype) + 0.5
     return math.sqrt(2.0) * torch.cos(math.pi / N * n.unsqueeze(-1) * k)
+
+
+def course_of(amplitudes: Float[Tensor, k * rest], N: int) -> Float[Tensor, N * rest]:
+    """``cosines(k, N) @ amplitudes``, by one transform.
+
+    Example:
+        >>> amplitudes = torch.tensor([[1.0, 0.0], [0.5, 2.0]], dtype=torch.float64)
+        >>> torch.allclose(course_of(amplitudes, 20), cosines(2, 20) @ amplitudes)
+        True
+    """
+    slow = torch.cat([torch.zeros_like(amplitudes[:1]), amplitudes])
+    return inverse_dct(math.sqrt(N) * torch.cat([slow, slow.new_zeros(N - len(slow), *slow.shape[1:])]))
 
 
 def dct_of_courses(values: Float[Tensor, "N m c"], courses: int, count: int) -> Float[Tensor, "count m k"]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.diagnosis.noise.colour import autoregression, filtered
+from mkc_torch.diagnosis.noise.running_median import running_median
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -28,7 +29,7 @@ def innovation_gain(before: Float[Tensor, "N m"], after: Float[Tensor, "N m"]) -
     Both residuals, clipped around their running medians, are filtered by the autoregression of the latter; what is left
     of each is compared by squares, which end at three scales (Hampel et al., "Robust Statistics", 1986, 2.6).
     """
-    courses = [_running_median(residual) for residual in (before, after)]
+    courses = [running_median(residual, min(_NEAR, len(residual) - 1)) for residual in (before, after)]
     reach = _CLIPPED * robust_scale(after - courses[1])
     tame = [
         course + (residual - course).clamp(-reach, reach)
@@ -41,12 +42,6 @@ def innovation_gain(before: Float[Tensor, "N m"], after: Float[Tensor, "N m"]) -
         size = (new / robust_scale(new[1].unsqueeze(-1))).square().clamp(max=_CLIPPED**2).sum(-1)
         total += 0.5 * float(size[0] - size[1])
     return total
-
-
-def _running_median(values: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
-    near = min(_NEAR, len(values) - 1)
-    padded = torch.nn.functional.pad(values.mT, (near, near), mode="reflect")
-    return padded.unfold(-1, 2 * near + 1, 1).median(-1).values.mT
 
 
 def either_way(one: Float[Tensor, "N m"], other: Float[Tensor, "N m"]) -> float:

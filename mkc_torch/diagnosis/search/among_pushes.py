@@ -182,7 +182,9 @@ def _own(
     if free is None or not pushed(under):
         return under
     start = torch.cat([free.parameters, gamma])
-    tried = [fitted_beside(free, free.model.with_term(term), one) for one in (start, _with_none(free, term))]
+    model = free.model.with_term(term)
+    works = [partial(fitted_beside, free, model, one) for one in (start, _with_none(free, term))]
+    tried = at_once(works, model.prepared, [term])
     running = shape_fitted(max(tried, key=lambda one: one.log_likelihood))
     left = noise_around(running, declared, settings.noise)
     white = left is not None and left.observer is None

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from mkc_torch._parallel.pool import meanwhile
 from mkc_torch.diagnosis.linearised.beside_wander import beside_wander
+from mkc_torch.diagnosis.linearised.candidates import Candidates, one_after_the_other
 from mkc_torch.diagnosis.linearised.linearise import Linearised
-from mkc_torch.diagnosis.linearised.tangents import Tangents, candidate_tangents, tangents_of
+from mkc_torch.diagnosis.linearised.tangents import Tangents, tangents_of
 from mkc_torch.diagnosis.linearised.wander import NoiseFit
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
@@ -163,8 +164,11 @@ def _scene(
         best = around = fits[0]
         around, own = base, best.model.terms[-1]
         if own not in terms:
-            more = candidate_tangents(base.model, base.parameters, [own], tangents.pointwise)
-            terms, tangents = (*terms, own), replace(tangents, candidates=(*tangents.candidates, *more))
+            more = Candidates(base.model, base.parameters, [own], tangents.pointwise)
+            terms, tangents = (
+                (*terms, own),
+                replace(tangents, candidates=one_after_the_other(tangents.candidates, more)),
+            )
     else:
         best, terms, tangents = _with_tangents(fits, terms, settings)
         around = best

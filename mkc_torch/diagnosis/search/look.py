@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.diagnosis.linearised.candidates import Candidates, one_after_the_other
 from mkc_torch.diagnosis.linearised.linear_search import Gains
 from mkc_torch.diagnosis.linearised.linearise import Linearised, linearise
-from mkc_torch.diagnosis.linearised.tangents import Tangents, candidate_tangents
+from mkc_torch.diagnosis.linearised.seen import Seen
+from mkc_torch.diagnosis.linearised.tangents import Tangents
 from mkc_torch.diagnosis.linearised.wander import NoiseFit
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
@@ -47,14 +49,21 @@ class Scene:
     settings: Settings
 
     @property
-    def parts(self) -> tuple[Tensor, ...]:
-        """All that are numbers of their own."""
-        return (self.values, self.counts, *self.tangents.parts)
+    def parts(self) -> tuple[object, ...]:
+        """All that is large of it."""
+        return (self.values, self.counts, *self.tangents.parts, *self._seen.parts)
+
+    @cached_property
+    def _seen(self) -> Seen:
+        """The same for noise of any colour."""
+        return Seen.of(self.values, self.counts, self.tangents, self.tangents.slow)
 
     def under(self, colour: Colour | None = None) -> Look:
         """The search of it under noise of a colour, default the likeliest one."""
         parameters = self.around.parameters[: self.base.model.size]
-        found = linearise(self.base.model, parameters, self.values, self.counts, self.tangents, colour=colour)
+        found = linearise(
+            self.base.model, parameters, self.values, self.counts, self.tangents, colour=colour, seen=self._seen
+        )
         return Look(self, found)
 
     def without(self, stretch: tuple[int, int]) -> Scene:
@@ -67,9 +76,9 @@ class Scene:
         """Whether an effect bends a trajectory, so that its tangents hold for small sizes alone."""
         return self.tangents.pointwise[term.port] is None
 
-    def tangents_of(self, terms: Sequence[Term]) -> tuple[Float[Tensor, "N m q"], ...]:
+    def tangents_of(self, terms: Sequence[Term]) -> Sequence[Float[Tensor, "N m q"]]:
         """Those of other candidates."""
-        return candidate_tangents(self.around.model, self.around.parameters, terms, self.tangents.pointwise)
+        return Candidates(self.around.model, self.around.parameters, terms, self.tangents.pointwise)
 
 
 @dataclass(frozen=True)
@@ -119,13 +128,13 @@ class Look:
     def with_more(self, terms: Sequence[Term]) -> Look:
         """The same with other candidates after its own."""
         beside, scene = self.scene.tangents_of(terms), self.scene
-        tangents = replace(scene.tangents, candidates=(*scene.tangents.candidates, *beside))
+        tangents = replace(scene.tangents, candidates=one_after_the_other(scene.tangents.candidates, beside))
         more = replace(scene, terms=(*scene.terms, *terms), tangents=tangents)
         return Look(more, self.linearised.with_more(beside, scene.counts))
 
     def beside(self, term: Term, fit: FittedModel) -> Look:
         """The same with the tangents of a term taken out of everything, at a fit with it."""
-        own = candidate_tangents(fit.model, fit.parameters, [term], self.scene.tangents.pointwise)
+        own = Candidates(fit.model, fit.parameters, [term], self.scene.tangents.pointwise)
         return Look(self.scene, self.linearised.without(own, self.scene.counts))
 
     def own_p(self, term: Term) -> float:

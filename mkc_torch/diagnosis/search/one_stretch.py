@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.linearised.beside_wander import explained
@@ -50,7 +51,8 @@ def telling_stretch(
     own = counts * (trace - explained(trace, counts, nuisance))
     gain = (own * (left - 0.5 * own)).sum(-1)
     width = max(N // settings.search.stretches, 1)
-    within = gain.unfold(0, width, 1).sum(-1)
+    total = torch.cat([torch.zeros_like(gain[:1]), gain.cumsum(0)])
+    within = total[width:] - total[:-width]
     first = int(within.argmax())
     if not float(within[first]) > settings.search.in_one_stretch * float(gain.sum()) > 0.0:
         return None

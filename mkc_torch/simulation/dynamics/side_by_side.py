@@ -1,10 +1,11 @@
-"""A filter over a whole flow, whose stretches run side by side until each begins where the one before it ends.
+"""A filter over a whole flow: its runs side by side, or stretches until each begins where the one before it ends.
 
 Multiple shooting: where stretches begin is found by Newton's method, with what a stretch keeps of its beginning.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ import numpy as np
 from mkc_torch.simulation.dynamics.kalman import End, Filtered, Flow, Models, Parts, Start, filtered, run, start_of
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
 __all__ = ["filtered_whole"]
 
@@ -33,13 +34,14 @@ _SAME = 1e-7
 def filtered_whole(flow: Flow, models: Models, *, keep: bool = False) -> Filtered:
     """What :func:`filtered` leaves of a flow in one stretch, N steps of a few matrices, in steps of many.
 
-    It takes three or four runs of a stretch's length, whatever N; where that is not enough, one of the flow's.
+    It takes three or four runs of a stretch's length, whatever N; where that is not enough, or N is small, as many
+    steps as the longest run of the recording has samples.
     """
     N = len(flow.new)
     if not models.white.any() and not models.place.shape[1]:
         return _unpushed(flow, models)
     if _FEW * _STRETCH > N:
-        return filtered(flow.whole, models, keep=keep)
+        return _run_by_run(flow, models, keep=keep)
     stretches = _stretches(flow)
     start = _guess(flow, models)
     for _ in range(_ROUNDS):
@@ -47,17 +49,53 @@ def filtered_whole(flow: Flow, models: Models, *, keep: bool = False) -> Filtere
         if _same(start, end):
             return _in_one(found, N)
         start = _passed_on(start, end)
-    return filtered(flow.whole, models, keep=keep)
+    return _run_by_run(flow, models, keep=keep)
+
+
+def _runs(flow: Flow) -> tuple[Int[np.ndarray, " G"], Int[np.ndarray, " G"]]:
+    """First sample and length of each run: nothing of a state, nor of a disturbance, goes on from one to the next."""
+    arrays = (flow.carried, flow.pushed, flow.shift)
+    apart = (flow.step <= 0) & ~np.any([one.reshape(len(one), -1).any(-1) for one in arrays], 0)
+    first = np.concatenate([[0], np.flatnonzero(apart) + 1])
+    return first, np.diff(np.concatenate([first, [len(flow.new)]]))
+
+
+def _run_by_run(flow: Flow, models: Models, *, keep: bool) -> Filtered:
+    first, length = _runs(flow)
+    if len(first) == 1:
+        return filtered(flow.whole, models, keep=keep)
+    row = np.arange(length.max())[:, None]
+    there = row < length
+    found = filtered(_gathered(flow, np.minimum(first + row, len(flow.new) - 1), there, there), models, keep=keep)
+
+    def joined(values: np.ndarray) -> np.ndarray:
+        return values.swapaxes(0, 1)[there.T][:, None] if len(values) else values
+
+    return _each_array(found, joined)
 
 
 def _stretches(flow: Flow) -> Parts:
     """Of equal length; the last sample of each is the first of the next one, and is not taken up."""
     N = len(flow.new)
     index = _STRETCH * np.arange(-(-N // _STRETCH)) + np.arange(_STRETCH + 1)[:, None]
-    there, at = index < N, np.minimum(index, N - 1)
+    there = index < N
     own = there.copy()
     own[-1] = False
-    step, gone = np.minimum(index[:-1], N - 2), there[1:]
+    return replace(_gathered(flow, np.minimum(index, N - 1), there, own), inside=index[0] > 0)
+
+
+def _gathered(
+    flow: Flow, at: Int[np.ndarray, "L G"], there: Bool[np.ndarray, "L G"], own: Bool[np.ndarray, "L G"]
+) -> Parts:
+    """Samples of these numbers, where there are any, as stretches that begin where a run does.
+
+    Args:
+        flow: the whole.
+        at: numbers of the samples.
+        there: whether a stretch goes on to a sample.
+        own: whether it takes the sample up.
+    """
+    step, gone = np.minimum(at[:-1], len(flow.new) - 2), there[1:]
     counts = np.where(own[..., None], flow.counts[at], 0.0)
     return Parts(
         np.where(gone[..., None, None], flow.carried[step], 0.0),
@@ -68,7 +106,7 @@ def _stretches(flow: Flow) -> Parts:
         np.where(gone, flow.step[step], 0.0),
         counts,
         counts,
-        index[0] > 0,
+        np.zeros(at.shape[1], dtype=bool),
         flow.spread,
     )
 
@@ -142,6 +180,10 @@ def _in_one(found: Filtered, N: int) -> Filtered:
     def joined(values: np.ndarray) -> np.ndarray:
         return values[:-1].swapaxes(0, 1).reshape(-1, 1, *values.shape[2:])[:N] if len(values) else values
 
+    return _each_array(found, joined)
+
+
+def _each_array(found: Filtered, joined: Callable[[np.ndarray], np.ndarray]) -> Filtered:
     return Filtered(
         joined(found.standard),
         joined(found.log_spread),

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from mkc_torch.diagnosis.linearised.candidates import Candidates
 from mkc_torch.diagnosis.linearised.linearise import linearise
-from mkc_torch.diagnosis.linearised.tangents import candidate_tangents, tangents_of
+from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
@@ -84,7 +85,7 @@ def test_gains_of_other_candidates_are_those_of_a_search_with_them():
     tangents = tangents_of(model, fit.parameters, NoiseSettings(), STEPS)
     whole = linearise(model, fit.parameters, values, counts, tangents)
     bare = linearise(model, fit.parameters, values, counts, tangents.bare, colour=whole.colour)
-    beside = candidate_tangents(model, fit.parameters, STEPS, tangents.pointwise)
+    beside = Candidates(model, fit.parameters, STEPS, tangents.pointwise)
     assert len(beside) == 3
     torch.testing.assert_close(
         bare.gains_of(beside, counts).ratio, whole.search.gains(whole.series.unsqueeze(-1)).ratio

@@ -82,3 +82,29 @@ def test_what_is_not_kept_is_not_there():
     found = filtered_whole(recorded(flow(1400)), MODELS["white push"])
     assert found.standard.shape == (1400, 1, 1, 1)
     assert not found.prior.size
+
+
+@pytest.mark.parametrize("name", [*MODELS, "several"])
+def test_runs_are_filtered_side_by_side(name, monkeypatch):
+    models = together(MODELS["white push"], model(white=4.0)) if name == "several" else MODELS[name]
+    along, cut = recorded(flow(150, runs=4)), 40
+    between = ("carried", "pushed", "shift", "step")
+    along = replace(along, shift=np.where(along.step[:, None] > 0, along.shift, 0.0))
+    # the first one is shorter
+    along = replace(along, **{one: getattr(along, one)[cut:] for one in (*between, "seen", "new", "counts")})
+    expected, steps = filtered(along.whole, models, keep=True), []
+
+    def counted(parts, *args, **kwargs):
+        steps.append(parts.new.shape[:2])
+        return filtered(parts, *args, **kwargs)
+
+    monkeypatch.setattr(side_by_side, "filtered", counted)
+    alike(filtered_whole(along, models, keep=True), expected)
+    assert steps == [(150, 4)] or not (models.white.any() or models.place.shape[1])
+
+
+def test_runs_that_hang_together_are_not_taken_apart():
+    along = recorded(flow(150, runs=3))
+    assert along.shift[149].any()
+    assert along.step[149] == 0
+    assert len(side_by_side._runs(along)[0]) == 1
