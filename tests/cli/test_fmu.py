@@ -24,6 +24,7 @@ TANK = Model(
 """That of tests/cli/test_own_simulation.py."""
 
 
+@pytest.mark.slow
 def test_an_fmu_is_diagnosed_applied_and_corrected(tmp_path, monkeypatch):
     model = make_fmu(tmp_path / "tank.fmu", TANK)
     table = tank_table(tmp_path / "runs.csv", drag=0.15)
