@@ -166,8 +166,7 @@ def _of_magnetometer(recording: Recording, field_strength: float | None, seed: i
         refusal = _with_faults(error, usable)
     else:
         return _of_ellipsoid(fit, usable, field_strength)
-    found = with_aid(usable, refusal, field_strength=field_strength, earth=earth)
-    return dataclasses.replace(found, warnings=(*_rejected(found.rejected_share), *found.warnings), used=usable)
+    return dataclasses.replace(with_aid(usable, refusal, field_strength=field_strength, earth=earth), used=usable)
 
 
 def _of_ellipsoid(fit: EllipsoidFit, usable: Recording, field_strength: float | None) -> Calibration:
@@ -239,7 +238,13 @@ def _with_faults(error: NotIdentifiableError, usable: Recording) -> NotIdentifia
 
 
 def _warnings(fit: EllipsoidFit, found: Coverage, residual: Tensor, rejected_share: float) -> list[str]:
-    warnings = _rejected(rejected_share)
+    warnings = []
+    if rejected_share > MAX_REJECTED:
+        warnings.append(
+            f"{100.0 * rejected_share:.0f} % of the samples do not fit one ellipsoid: the sensor's offset may have "
+            "changed during the recording, or something magnetic was near for long. `mkc diagnose` says what changed, "
+            "and when; or record again away from it, or calibrate the parts of the recording separately."
+        )
     scatter = float(robust_scale(residual.unsqueeze(-1))) / float(fit.radius_)
     if scatter > MUCH_SCATTER:
         warnings.append(
@@ -264,16 +269,6 @@ def _warnings(fit: EllipsoidFit, found: Coverage, residual: Tensor, rejected_sha
     if not bool(torch.as_tensor(getattr(fit.estimator_, "converged_", True)).all()):
         warnings.append("The fit stopped before it came to rest; its last digits are uncertain.")
     return warnings
-
-
-def _rejected(share: float) -> list[str]:
-    if share <= MAX_REJECTED:
-        return []
-    return [
-        f"{100.0 * share:.0f} % of the samples do not fit one ellipsoid: the sensor's offset may have changed during "
-        "the recording, or something magnetic was near for long. `mkc diagnose` says what changed, and when; or record "
-        "again away from it, or calibrate the parts of the recording separately."
-    ]
 
 
 def _gaps(fit: EllipsoidFit, found: Coverage) -> str:

@@ -19,6 +19,9 @@ __all__ = ["with_aid"]
 _GROUND = 0.01
 """Standard deviation of what rock and buildings add to the field, as a share of it, and of its inclination in rad."""
 
+_MANY = 0.2
+"""Share of rejected samples above which a steady sensor is a doubtful model, as for an ellipsoid."""
+
 _OTHER = 0.15
 """Share by which a field is another one than the place's; gains of a chip are off by some per cent."""
 
@@ -54,7 +57,7 @@ def with_aid(
             f"{reason[:1].upper()}{reason[1:]}"
         )
         return dataclasses.replace(
-            found, warnings=(*found.warnings, told, *_undetermined(found), *_other(found, earth))
+            found, warnings=(*found.warnings, told, *_rejected(found), *_undetermined(found), *_other(found, earth))
         )
     raise NotIdentifiableError(" ".join([str(refusal), *tried]), refusal.coverage, refusal.directions)
 
@@ -64,6 +67,17 @@ def _known(usable: Recording, earth: Field | None) -> Place | None:
     if earth is None or usable.units["mag_x"] != "µT":
         return None
     return Place(earth.strength, earth.inclination, _GROUND * earth.strength, _GROUND)
+
+
+def _rejected(found: Calibration) -> tuple[str, ...]:
+    """A sentence about many samples that the turns do not explain."""
+    if found.rejected_share <= _MANY:
+        return ()
+    return (
+        f"{100.0 * found.rejected_share:.0f} % of the samples do not fit how the vehicle turned: currents, or a change "
+        "of the offset, may be in them, and errors may be larger than the standard errors say. `mkc diagnose` says what "
+        "changed, and when.",
+    )
 
 
 def _other(found: Calibration, earth: Field | None) -> tuple[str, ...]:
