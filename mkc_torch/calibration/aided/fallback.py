@@ -75,8 +75,8 @@ def _rejected(found: Calibration) -> tuple[str, ...]:
         return ()
     return (
         f"{100.0 * found.rejected_share:.0f} % of the samples do not fit how the vehicle turned: currents, or a change "
-        "of the offset, may be in them, and errors may be larger than the standard errors say. `mkc diagnose` says what "
-        "changed, and when.",
+        "of the offset, may be in them, and errors may be larger than the standard errors say. `mkc diagnose` says "
+        "what changed, and when.",
     )
 
 
