@@ -125,8 +125,7 @@ def calibrate(
         seed: of the robust start.
         earth: the field at the place of the recording, as :func:`mkc_torch.calibration.earth_field` has it: its length
             is that of the corrected field, unless ``field_strength`` is given, and helps where the turns do not
-            determine an ellipsoid; its inclination is compared with what an attitude finds.
-
+            determine an ellipsoid; its inclination chooses where that fit starts.
         sensor: "mag", or "accel" for an accelerometer ``accel_*``, in whose place the field is gravity and
             ``field_strength`` its length in m/s², 9.80665 if not given.
 

@@ -117,7 +117,9 @@ def run(words: list[str], folder: Path) -> None:
             run_mkc(arguments)
         case ["python", script, *arguments] if script.startswith("examples/"):
             run_example(script, arguments, folder)
-        case ["python", "-m", module, *_] if module.startswith(("tests.benchmarks", "tests.fuzz")):
+        case ["python", "-m", module, *_] if module.startswith(
+            ("tests.benchmarks", "tests.fuzz", "tests.mutation", "tests.wheel")
+        ):
             # minutes each: here only whether it is there
             name = f"{module}.__main__" if module == "tests.benchmarks" else module
             assert callable(importlib.import_module(name).main)
