@@ -25,6 +25,7 @@ from mkc_torch.effects import words_of
 __all__ = ["DiagnosisPlot"]
 
 _MOST_SHOWN = 12
+"""Candidates that are drawn unless more are asked for."""
 
 
 class DiagnosisPlot:

@@ -17,7 +17,11 @@ __all__ = ["CURVE_COLORS", "MOST_LETTERS", "draw_course", "draw_curve", "draw_ma
 
 CURVE_COLORS = (BLUE, ORANGE, "#009E73", "#A8558A", "#B58900", INK)
 MOST_LETTERS = 26
+"""Of a name in a picture; longer ones are cut."""
+
 _MOST_POINTS = 2_000
+"""Of a course that is drawn; of more, some are left out evenly."""
+
 _GAP = 5.0
 """Times the usual step beyond which two samples are not joined."""
 _NEVER = "#E3E3E3"

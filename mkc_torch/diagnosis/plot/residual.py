@@ -30,6 +30,8 @@ MOMENTS = ("table.before", "table.after")
 _USED, _REJECTED = "#7FB8DA", "#F2C7AA"
 _MOST_POINTS = 5_000  # of a panel
 _MOST_BINS, _FEWEST_IN_A_BIN = 60, 12
+"""Bins over a driver, and how many samples one has at least."""
+
 _MOST_LEVELS = 24  # of a driver that takes few values, such as a switch
 
 

@@ -200,17 +200,25 @@ def rest_bias(found: RestBias) -> str:
     )
 
 
+_RESPONSES = {
+    "offset": "aided.offset",
+    "offset and scale": "aided.offset_and_scale",
+    "full matrix": "aided.full_matrix",
+}
+"""The words for what an aided calibration chose."""
+
+
 def aided(calibration: Calibration) -> list[str]:
     """How a calibration came about that the ellipsoid alone does not determine, in sentences; empty of an ellipsoid."""
     aid = calibration.aid
     if aid is None:
         return []
     rivals = [
-        term("aided.rival", response=term(f"aided.{name}"), nats=f"{-value:.0f}")
+        term("aided.rival", response=term(_RESPONSES[name]), nats=f"{-value:.0f}")
         for name, value in aid.evidence
         if name != aid.response
     ]
-    told = [term("aided.by", by=aid.by, response=term(f"aided.{aid.response}"), rivals="; ".join(rivals))]
+    told = [term("aided.by", by=aid.by, response=term(_RESPONSES[aid.response]), rivals="; ".join(rivals))]
     told.append(term("aided.heading", change=size(aid.heading_error), constant=size(aid.constant_error)))
     if aid.gyro_bias is not None and aid.gyro_bias_se is not None:
         told.append(term("aided.bias", bias=listed(aid.gyro_bias, aid.gyro_bias_se)))
