@@ -104,8 +104,16 @@ def test_residuals_that_are_hit_exactly_do_not_make_a_spike():
         (torch.tensor([[1.0], [math.nan]]), None, "not finite must be left out"),
         (torch.tensor([[0.0], [0.0], [0.0], [1.0]]), None, "a robust scale above 0"),
         (torch.tensor([[-1.0], [1.0], [2.0]]), 3.0, "at least four robust scales"),
+        (torch.tensor([[-1.0], [1.0], [2.0]]), torch.tensor([90.0, 90.0]), r"a number or of shape \(1,\)"),
+        (torch.tensor([[-1.0], [1.0], [2.0]]), 1e200, "beyond which squares overflow"),
     ],
 )
 def test_what_has_no_density_is_refused(error, bound, match):
     with pytest.raises(ValueError, match=match):
         fit_kernels(error, bound=bound)
+
+
+def test_a_bound_of_one_channel_is_that_of_all():
+    both = torch.cat([drawn(0, 1.0), drawn(1, 1.0)], -1)
+    of_one, of_each = (fit_kernels(both, bound=torch.full((count,), 90.0)) for count in (1, 2))
+    assert of_one.bound.tolist() == of_each.bound.tolist() == [90.0, 90.0]
