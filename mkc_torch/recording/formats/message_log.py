@@ -82,7 +82,8 @@ class MessageLog:
                 topics.append(topic if names[name] == 1 else topic._replace(name=f"{name} ({kind})"))
             elif told:
                 self._left_out[name] = told[0][0].lower() + told[0][1:-1]
-        warnings = [f"Topic {name} is left out: {why}." for name, why in self._left_out.items()]
+        # names of a damaged file may hold line ends
+        warnings = [" ".join(f"Topic {name} is left out: {why}.".split()) for name, why in self._left_out.items()]
         return topics, warnings
 
 

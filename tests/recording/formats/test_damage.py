@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip("polars")
@@ -107,6 +107,7 @@ def test_what_is_whole_of_a_file_cut_in_its_middle_is_kept_and_the_loss_told(kin
 @pytest.mark.parametrize("kind", FILES)
 @few
 @given(places=st.lists(st.tuples(st.floats(0.0, 1.0), st.binary(min_size=1, max_size=8)), min_size=1, max_size=4))
+@example(places=[(0.03125, b"\xc2\x80\n")])  # a line end in the name of a message
 def test_a_file_with_wrong_bytes_gives_rows_or_a_sentence(kind, tmp, places):
     damaged = bytearray(content(kind, tmp))
     for share, data in places:
