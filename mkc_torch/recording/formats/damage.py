@@ -28,7 +28,7 @@ def guarded(path: Path, what: str) -> Iterator[None]:
             yield
     except (RecordingError, ImportError, FileNotFoundError, IsADirectoryError, PermissionError):
         raise
-    except Exception as error:
+    except Exception as error:  # what each library raises over bytes that are damaged
         lines = str(error).strip().splitlines()
         said = f" ({lines[0][:120]})" if lines else ""
         raise RecordingError(

@@ -83,7 +83,7 @@ class Binary:
             model.exitInitializationMode()
             self._settle_first()
             model.enterContinuousTimeMode()
-        except Exception as error:
+        except Exception as error:  # FMPy: a plain one of FMI 3, one with a status of FMI 2
             if getattr(error, "status", 0) >= _FATAL:
                 raise self._failed("could not be initialised") from None
             return False
@@ -196,7 +196,7 @@ class Binary:
                 model.instantiate(callbacks=self._callbacks(fmi2))
             else:
                 model.instantiate(logMessage=self._log_of_3)
-        except Exception as error:
+        except Exception as error:  # of FMPy, or of loading the binary
             reason = " ".join(str(error).split())
             raise FmuError(
                 f"{told.path}: its binary cannot be used ({reason}{self._said()}). Export it again."
@@ -361,7 +361,7 @@ def _extracted(description: Description) -> Path:
     atexit.register(_remove, folder, os.getpid())
     try:
         the_library().extract(str(description.path), str(folder))
-    except Exception as error:
+    except Exception as error:  # of FMPy or zipfile, over a damaged archive
         told = " ".join(str(error).split())
         raise FmuError(f"{description.path}: the FMU cannot be unpacked ({told}). Export it again.") from None
     return folder

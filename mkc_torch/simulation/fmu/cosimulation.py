@@ -95,7 +95,7 @@ class Simulated:
                 output=outputs,
                 logger=lambda *_: None,
             )
-        except Exception as error:
+        except Exception as error:  # FMPy has a plain Exception for most of what fails
             told = " ".join(str(error).split())
             raise FmuError(f"{self.description.path}: its simulation failed: {told}.") from None
         at = torch.from_numpy(np.ascontiguousarray(found["time"])).double()
