@@ -22,6 +22,7 @@ from mkc_torch.diagnosis.search.look import Scene
 from mkc_torch.diagnosis.search.preference import Preference
 from mkc_torch.diagnosis.search.profiled import Profiled, profiled
 from mkc_torch.diagnosis.search.ranking import Ranked
+from mkc_torch.diagnosis.search.ties import in_order
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.noise import noise_of
@@ -109,7 +110,7 @@ def _ranked(found: Profiled, terms: tuple[Term, ...], prefer: Preference) -> tup
     score = found.gain - found.dof - numbers - found.gain.new_tensor(handicap)
     score = torch.where(found.dof > 0, score, -torch.inf)
     best: dict[Key, int] = {}
-    for number in score.argsort(descending=True).tolist():
+    for number in in_order(score.tolist(), terms):
         best.setdefault(terms[number].key, number)
     return tuple(Ranked(n, float(found.gain[n]), float(score.max() - score[n])) for n in best.values())
 
@@ -226,7 +227,7 @@ def _by_own_noise(
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
     """The likeliest of the fits, and the ranking with how far each is behind it; others are behind all of them."""
     scores = [prefer.score_with_shape(fit, base) for fit in fits]
-    best = max(range(len(fits)), key=scores.__getitem__)
+    best = in_order(scores, [fit.model.terms[-1] for fit in fits])[0]
     behind: dict[Key, tuple[float, int]] = {}
     for number, score in zip(chosen, scores, strict=True):
         key, gap = terms[number].key, scores[best] - score

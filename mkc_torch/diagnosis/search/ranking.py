@@ -9,6 +9,7 @@ import torch
 from mkc_torch.diagnosis.model.term import Key, continuous
 from mkc_torch.diagnosis.search.look import Look
 from mkc_torch.diagnosis.search.preference import Preference
+from mkc_torch.diagnosis.search.ties import in_order
 
 __all__ = ["Ranked", "ranked"]
 
@@ -32,6 +33,6 @@ def ranked(look: Look, prefer: Preference) -> tuple[Ranked, ...]:
     score = gain - found.dof - numbers - gain.new_tensor(handicap)
     score = torch.where((found.dof > 0) & look.possible, score, -torch.inf)
     best: dict[Key, int] = {}
-    for number in score.argsort(descending=True).tolist():
+    for number in in_order(score.tolist(), terms):
         best.setdefault(terms[number].key, number)
     return tuple(Ranked(number, float(gain[number]), float(score.max() - score[number])) for number in best.values())

@@ -20,6 +20,7 @@ from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.search.closing_in import refined
 from mkc_torch.diagnosis.search.look import Look
 from mkc_torch.diagnosis.search.preference import Preference
+from mkc_torch.diagnosis.search.ties import best_first, in_order
 from mkc_torch.diagnosis.settings import SearchSettings, Settings
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.protocol import Beginning
@@ -76,12 +77,12 @@ def strongest(
         _refit_all(fits, base, [*chain(*(chosen for chosen, _ in more))], prefer)
         lists += more
     likeliest = torch.stack([log_p for _, log_p in lists]).amin(0)
-    order = [terms[number] for number in likeliest.argsort().tolist()]
+    order = [terms[number] for number in in_order((-likeliest).tolist(), terms)]
     leading = _at_best_shapes(_leading(list(fits.values()), base, prefer, search), base, order, prefer, search.shapes)
     shaped = at_once([partial(refined, fit, base) for fit in leading], base.model.prepared, terms)
     keys = {fit.model.terms[-1].key for fit in shaped}
     parted = shaped, [fit for key, fit in fits.items() if key not in keys]
-    fitted = [fit for part in parted for fit in sorted(part, key=lambda fit: prefer.score(fit, base), reverse=True)]
+    fitted = [fit for part in parted for fit in best_first(part, base, prefer)]
     return fitted, tangents
 
 
@@ -93,7 +94,7 @@ def _short_list(
     plain = linearise(base.model, parameters, pseudo, counts, tangents, white=True, wander=False)
     log_p = plain.search.gains(plain.series.unsqueeze(-1)).log_p[:, 0]
     chosen: dict[Key, Listed] = {}
-    for number in log_p.argsort().tolist():
+    for number in in_order((-log_p).tolist(), terms):
         term = terms[number]
         if term.key not in chosen:
             gamma, _ = plain.search.estimate(number, plain.series)
@@ -171,7 +172,7 @@ def _leading(
 ) -> list[FittedModel]:
     """The first ones, and another that is close behind."""
     leading = settings.leading
-    first = sorted(fits, key=lambda fit: prefer.score(fit, base), reverse=True)[: leading + 1]
+    first = best_first(fits, base, prefer)[: leading + 1]
     close = max(settings.third_share * prefer.score(first[0], base), settings.third_nats)
     return [fit for place, fit in enumerate(first) if place < leading or prefer.score(fit, base) > close]
 
