@@ -134,6 +134,18 @@ def test_a_parquet_file_over_which_polars_breaks_off_is_damaged(tmp_path, capfd)
     assert capfd.readouterr().err == ""
 
 
+def test_a_parquet_file_over_which_polars_would_end_this_process_is_damaged(tmp_path, capfd):
+    pl = pytest.importorskip("polars")
+    path = tmp_path / "table.parquet"
+    pl.DataFrame({"time": np.arange(1000.0)}).write_parquet(path)
+    damaged = bytearray(path.read_bytes())
+    assert damaged[13:16] == b"\x15\xd0\x0f"  # 1000 values in the first page, twice that as a zigzag number
+    damaged[14] |= 1  # as many below zero: more than the memory there is
+    path.write_bytes(damaged)
+    assert "is damaged; copy it anew" in rows_or_sentence(path)[1]
+    assert capfd.readouterr().err == ""
+
+
 MAGIC = {
     ".ulg": b"ULog\x01\x12\x35\x01",
     ".bin": b"\xa3\x95\x80",
