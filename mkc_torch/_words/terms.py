@@ -231,6 +231,7 @@ TERMS: dict[str, str] = {
     # names of lines, on the terminal and on a page
     "aided.by": "By the {by}: {response} ({rivals}).",
     "aided.rival": "{response}: less likely by {nats} nats",
+    "aided.hardly": "{response}: likelier by {nats} nats, too few to be sure",
     "aided.offset": "offset alone",
     "aided.offset_and_scale": "offset and scale",
     "aided.full_matrix": "offset and full matrix",

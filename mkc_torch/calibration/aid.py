@@ -17,9 +17,10 @@ class Aid:
     """How a calibration came about that the ellipsoid alone does not determine.
 
     Attributes:
-        by: "gyroscope" or "attitude".
+        by: "gyroscope", "attitude" or "place".
         response: what of the sensor is free: "offset", "offset and scale" or "full matrix".
-        evidence: of each response, in nats, less that of the likeliest.
+        evidence: of each response, in nats, less that of the one taken: the likeliest, but by place and date the full
+            matrix unless another one is clearly likelier.
         undetermined: offsets and entries of the matrix, as "offset_z" or "matrix_zz", that the recording says little or
             nothing of; they are what was likely beforehand, no offset and the unit matrix, and have no standard error.
         heading_error: standard error in ° of how the heading changes as the vehicle turns as it did.

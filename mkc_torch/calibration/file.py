@@ -99,7 +99,7 @@ class CheckedValues:
         fine = isinstance(value, list) and len(value) == length
         if not fine or not all(_is_number(v) or (unknown and v is None) for v in value):
             raise self._wrong(path, f"a list of {length} numbers")
-        return tuple(math.nan if v is None else float(v) for v in value)
+        return tuple(math.inf if v is None else float(v) for v in value)
 
     def vector(self, *path: str | int, unknown: bool = False) -> Vector:
         x, y, z = self.numbers(*path, length=3, unknown=unknown)

@@ -10,15 +10,17 @@ import torch
 from torch import Tensor
 
 from mkc_torch.calibration.aid import Aid
+from mkc_torch.calibration.aided.by_place import chosen_by_place
 from mkc_torch.calibration.aided.choose import Chosen, chosen_response
 from mkc_torch.calibration.aided.evidence import Judged
 from mkc_torch.calibration.aided.heading import heading_errors, turning_axis
+from mkc_torch.calibration.aided.lengths import LengthModel
 from mkc_torch.calibration.aided.misfit import robust_size
 from mkc_torch.calibration.aided.mounting import exchanged, mounting, turned_by
 from mkc_torch.calibration.aided.response import ERRORS, SOFT_IRON, Place
 from mkc_torch.calibration.aided.rotation import from_quaternion
 from mkc_torch.calibration.aided.start import offset_by_turns
-from mkc_torch.calibration.aided.turns import Turns, turns_of_attitude, turns_of_gyroscope
+from mkc_torch.calibration.aided.turns import Turns, still, turns_of_attitude, turns_of_gyroscope
 from mkc_torch.calibration.coverage import coverage
 from mkc_torch.calibration.ellipsoid import axes_of
 from mkc_torch.calibration.file import Matrix, Vector
@@ -93,9 +95,9 @@ def aided_calibration(
 
     Args:
         recording: as prepared for a calibration.
-        by: "attitude" or "gyroscope".
+        by: "attitude", "gyroscope" or "place".
         field_strength: length of the corrected field in µT; default the geometric mean of the semi-axes.
-        place: what is known of the field, in the recording's unit.
+        place: what is known of the field, in the recording's unit; needed where it is calibrated by.
 
     Raises:
         NotIdentifiableError: the turns do not explain the field, or leave a heading uncertain by more than 5°.
@@ -105,13 +107,17 @@ def aided_calibration(
         Hu, "Dynamic magnetometer calibration and alignment to inertial sensors by Kalman filtering", IEEE Transactions
         on Control Systems Technology 26 (2018), for what a gyroscope determines.
     """
-    usable = recording.finite(*(QUATERNION if by == "attitude" else GYRO))
+    usable = recording if by == "place" else recording.finite(*(QUATERNION if by == "attitude" else GYRO))
     upwards = None if place is None else _upwards(usable, by)
     points, runs = usable.magnetometer(), run_slices(usable)
     taken = in_each_run(points, runs, thin_at_rest)
     assert taken is not None
     moved = taken.nonzero().flatten()
-    if by == "attitude":
+    if by == "place":
+        assert place is not None
+        whole = still(len(points))
+        chosen = chosen_by_place(points, taken, place)
+    elif by == "attitude":
         whole = turns_of_attitude(usable.stack(*QUATERNION))
         _refuse_other_turns(points[moved], whole.rows(moved), by)
         chosen = chosen_response(points, lambda _: whole, taken, place=place, upwards=upwards)
@@ -124,11 +130,21 @@ def aided_calibration(
     best = chosen.best
     theta, model = best.fit.theta, best.model
     response = model.response(theta)
-    left = robust_size(best.fit.residual) / float(torch.linalg.det(response).abs()) ** (1.0 / 3.0)
+    # tilts are no misfit
+    off = best.fit.residual[:, :1] if by == "place" else best.fit.residual
+    left = robust_size(off) / float(torch.linalg.det(response).abs()) ** (1.0 / 3.0)
     if left > MAX_MISFIT:
+        reason = (
+            "what is measured does not have the length of the place's field"
+            if by == "place"
+            else f"the {by} does not turn as the field does"
+        )
+        advice = (
+            "Check the place and the unit." if by == "place" else "See that both are of one sensor and of one time."
+        )
         raise NotIdentifiableError(
-            f"Not identifiable: the {by} does not turn as the field does; {100.0 * left:.0f} % of the field are left "
-            f"in each axis, more than {100.0 * MAX_MISFIT:.0f} %. See that both are of one sensor and of one time."
+            f"Not identifiable: {reason}; {100.0 * left:.0f} % of the field are left in each axis, more than "
+            f"{100.0 * MAX_MISFIT:.0f} %. {advice}"
         )
     errors = _heading(chosen, points, whole, usable, by)
     if errors[0] > MAX_HEADING_ERROR:
@@ -184,7 +200,9 @@ def _refuse_other_turns(points: Tensor, turns: Turns, by: str) -> None:
 def _heading(chosen: Chosen, points: Tensor, whole: Turns, usable: Recording, by: str) -> tuple[float, float]:
     best = chosen.full
     theta = best.fit.theta
-    if by == "attitude":
+    if isinstance(best.model, LengthModel):
+        vertical = torch.nn.functional.normalize(best.model.response(theta).mT @ best.model.circle.axis, dim=0)
+    elif by == "attitude":
         vertical = torch.nn.functional.normalize(whole.to_frame[chosen.rows][:, 2, :].mean(0), dim=0)
     else:
         vertical = turning_axis(usable.stack(*GYRO)[chosen.rows] - chosen.errors[:3])
@@ -219,7 +237,8 @@ def _result(
 
     with torch.enable_grad():
         slopes = torch.autograd.functional.jacobian(derived, full.fit.theta)
-    spread = torch.einsum("ip,pq,iq->i", slopes, full.covariance, slopes).clamp(min=0.0).sqrt()
+    covariance = full.covariance if chosen.between is None else full.covariance + chosen.between
+    spread = torch.einsum("ip,pq,iq->i", slopes, covariance, slopes).clamp(min=0.0).sqrt()
     unknown = torch.cat([spread[:3] > _OFFSET_KNOWN * radius, spread[3:] > _KNOWN * SOFT_IRON])
     known = torch.where(unknown, torch.inf, spread)
     names = [f"offset_{a}" for a in _AXES] + [""] * 3 + [f"matrix_{a}{b}" for a in _AXES for b in _AXES]
@@ -229,7 +248,8 @@ def _result(
         whole,
         _weights(chosen, points, whole),
     )
-    weight = torch.exp(-0.5 * (residual / (best.fit.d * best.fit.sigma)).square()).amin(-1)
+    weight = torch.exp(-0.5 * (residual / (best.fit.d * best.fit.sigma)).square())
+    weight = (weight[:, :1] if by == "place" else weight).amin(-1)
     rejected = weight < _REJECTED_BELOW
     length = torch.linalg.vector_norm(field, dim=-1)
     norm = torch.linalg.vector_norm(points, dim=-1)

@@ -20,7 +20,7 @@ from mkc_torch.nonlinear import NoFitError
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Chosen", "chosen_response"]
+__all__ = ["NAMES", "Chosen", "chosen_response", "rows_of"]
 
 _MOST = 3000
 """Samples that a fit takes, evenly: the offset is known to a hundredth of the noise from these, and what limits it is
@@ -31,7 +31,8 @@ _ROUNDS = 2
 
 _LEAST_WEIGHT = 1e-6
 
-_NAMES: tuple[ModelName, ...] = ("offset", "offset and scale", "full matrix")
+NAMES: tuple[ModelName, ...] = ("offset", "offset and scale", "full matrix")
+"""From the simplest to the one that has the others as special cases."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,8 @@ class Chosen:
         turns: with the gyroscope's bias taken off, of the rows.
         rows: which samples the fits took.
         errors: of the gyroscope's rates, bias in rad/s and gains; zero of an attitude.
+        between: what it adds to the covariance of ``full`` that its parameters may be altogether others; they would
+            make the same headings.
     """
 
     best: Judged
@@ -53,6 +56,7 @@ class Chosen:
     turns: Turns
     rows: Int[Tensor, " n"]
     errors: Float[Tensor, " 12"]
+    between: Float[Tensor, "p p"] | None = None
 
 
 def chosen_response(
@@ -73,8 +77,7 @@ def chosen_response(
             below.
         upwards: the middle direction of the vertical in the body's axes.
     """
-    rows = taken.nonzero().flatten()
-    rows = rows[:: max(1, -(-len(rows) // _MOST))]
+    rows = rows_of(taken)
     points, errors = measured[rows], measured.new_zeros(ERRORS)
     turns = turns_at(errors).rows(rows)
     biased = turns.summed is not None
@@ -102,7 +105,7 @@ def chosen_response(
         best = judged(full, theta, points, turns, weight, place=place, errors=errors, inflation=inflation)
     judgements = [best]
     offset, response = best.fit.theta[:3], full.response(best.fit.theta)
-    for name in _NAMES[:-1]:
+    for name in NAMES[:-1]:
         model = Model(name, scale, biased)
         start = model.start(offset, response)
         # what leaves more than the density reaches over is no rival
@@ -124,6 +127,12 @@ def chosen_response(
     return Chosen(
         likeliest, best, {one.model.name: one.evidence for one in judgements}, turns, rows, errors + _errors(likeliest)
     )
+
+
+def rows_of(taken: Tensor) -> Int[Tensor, " n"]:
+    """Of the samples that may count, those that a fit takes."""
+    rows = taken.nonzero().flatten()
+    return rows[:: max(1, -(-len(rows) // _MOST))]
 
 
 def _errors(one: Judged) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 from torch.linalg import LinAlgError  # type: ignore[attr-defined]
 
@@ -45,19 +46,28 @@ def with_aid(
         NotIdentifiableError: the refusal, and why nothing of the recording stands in for what is missing.
     """
     tried, place = [], _known(usable, earth)
-    for by in aids(usable):
+    for by in (*aids(usable), *(["place"] if place else [])):
         try:
             found = aided_calibration(usable, by, field_strength=field_strength, place=place)
         except (ValueError, NoFitError, RecordingError, LinAlgError) as error:
             tried.append(str(error).replace("Not identifiable: ", f"With the {by}: ", 1))
             continue
         reason = str(refusal).removeprefix("Not identifiable: ")
+        stands = "the field of the place" if by == "place" else f"the {by}"
         told = (
-            f"The ellipsoid alone is not identifiable; the {by} stands in for the turns that are missing. "
+            f"The ellipsoid alone is not identifiable; {stands} stands in for the turns that are missing. "
             f"{reason[:1].upper()}{reason[1:]}"
         )
         return dataclasses.replace(
-            found, warnings=(*found.warnings, told, *_rejected(found), *_undetermined(found), *_other(found, earth))
+            found,
+            warnings=(
+                *found.warnings,
+                told,
+                *([_taken(place)] if by == "place" and place else []),
+                *_rejected(found),
+                *_undetermined(found),
+                *_other(found, earth),
+            ),
         )
     raise NotIdentifiableError(" ".join([str(refusal), *tried]), refusal.coverage, refusal.directions)
 
@@ -67,6 +77,15 @@ def _known(usable: Recording, earth: Field | None) -> Place | None:
     if earth is None or usable.units["mag_x"] != "µT":
         return None
     return Place(earth.strength, earth.inclination, _GROUND * earth.strength, _GROUND)
+
+
+def _taken(place: Place) -> str:
+    """What a calibration by place and date takes for true."""
+    return (
+        "The vehicle is taken to turn on level ground, and the sensor's axes for those of the vehicle: lengths do not "
+        "tell how it is turned in it. Each degree about the vertical is one of every heading, and each that it leans "
+        f"against the vehicle up to {abs(math.tan(place.inclination)):.2g}°. Compare one heading with a known one."
+    )
 
 
 def _rejected(found: Calibration) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from mkc_torch.calibration.aided.rotation import from_quaternion, gaps, rotation
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Turns", "turns_of_attitude", "turns_of_gyroscope"]
+__all__ = ["Turns", "still", "turns_of_attitude", "turns_of_gyroscope"]
 
 WINDOW = 10.0
 """Longest stretch in s over which the rotation of a gyroscope is trusted: its noise makes 0.1° of it."""
@@ -102,6 +102,17 @@ def turns_of_attitude(quaternion: Float[Tensor, "N 4"]) -> Turns:
     to_world = from_quaternion(quaternion)
     window = torch.zeros(len(quaternion), dtype=torch.int64)
     return Turns(to_world, window, None, to_world.new_tensor([0.0, 0.0, 1.0]))
+
+
+def still(count: int) -> Turns:
+    """No turns at all, of so many samples, where none are known.
+
+    Example:
+        >>> still(2).to_frame[1].tolist()
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    identity = torch.eye(3, dtype=torch.float64).expand(count, 3, 3)
+    return Turns(identity, torch.zeros(count, dtype=torch.int64), None, None)
 
 
 def _stretches(time: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:

@@ -214,7 +214,9 @@ def aided(calibration: Calibration) -> list[str]:
     if aid is None:
         return []
     rivals = [
-        term("aided.rival", response=term(_RESPONSES[name]), nats=f"{-value:.0f}")
+        term(
+            "aided.rival" if value <= 0.0 else "aided.hardly", response=term(_RESPONSES[name]), nats=f"{abs(value):.0f}"
+        )
         for name, value in aid.evidence
         if name != aid.response
     ]

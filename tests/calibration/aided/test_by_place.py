@@ -1,0 +1,150 @@
+"""Place and date alone: the field's length and how far it points down, for a vehicle that turns on level ground."""
+
+import math
+
+import pytest
+import torch
+
+from mkc_torch import Recording
+from mkc_torch.calibration import Calibration, NotIdentifiableError, calibrate
+from mkc_torch.calibration.aided import by_place, choose, lengths
+from mkc_torch.calibration.aided.lengths import Circle, LengthModel
+from mkc_torch.calibration.aided.place import Field
+from mkc_torch.calibration.aided.response import Place
+from mkc_torch.report.words.numbers import aided
+from tests.calibration.aided.vehicle import changed, example
+
+GYRO = ("gyro_x", "gyro_y", "gyro_z")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_samples():
+    """Fits on a third of the samples, for speed."""
+    kept, choose._MOST = choose._MOST, 1000
+    yield
+    choose._MOST = kept
+
+
+def field_of(draw, strength=1.0):
+    length = float(torch.linalg.vector_norm(draw.field))
+    return Field(strength * length, -math.asin(float(draw.field[2]) / length), 0.0)
+
+
+def level(tilt=0.0, count=1200, vertical=-42.0):
+    """A vehicle that turns on level ground, and leans to and fro by so many rad."""
+    g = torch.Generator().manual_seed(4)
+    yaw = torch.linspace(0.0, 20.0, count, dtype=torch.float64)
+    lean = tilt * torch.sin(3.7 * yaw)
+    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
+    field = torch.stack([20.0 * yaw.sin(), 20.0 * yaw.cos(), vertical * one], -1)
+    turn = torch.stack([one, zero, zero, zero, lean.cos(), lean.sin(), zero, -lean.sin(), lean.cos()], -1)
+    seen = (turn.unflatten(-1, (3, 3)) @ field.unsqueeze(-1)).squeeze(-1)
+    seen = seen + torch.tensor([5.0, -8.0, 15.0]).double() + 0.2 * torch.randn(count, 3, generator=g).double()
+    names = ("time", "mag_x", "mag_y", "mag_z")
+    return Recording(dict(zip(names, (torch.arange(count) / 20.0, *seen.unbind(-1)), strict=True)))
+
+
+EARTH = Field(math.hypot(20.0, 42.0), math.atan2(42.0, 20.0), 0.0)
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    return example().drawn(100_301, 8.0, 15.0, seconds=60.0)
+
+
+@pytest.fixture(scope="module")
+def found(drawn):
+    return calibrate(changed(drawn.recording, drop=GYRO), earth=field_of(drawn, 1.005))
+
+
+def test_it_gives_offsets_and_headings_but_for_a_constant(drawn, found):
+    off = (torch.tensor(found.center).double() - drawn.offset) / torch.tensor(found.center_se).double()
+    assert float(off.abs().max()) < 4.0
+    error = torch.deg2rad(
+        example().heading_errors(drawn, torch.tensor(found.center).double(), torch.tensor(found.matrix).double())
+    )
+    constant = torch.atan2(error.sin().mean(), error.cos().mean())
+    assert math.degrees(float((error - constant).sin().square().mean().sqrt())) < 3.0
+    with pytest.raises(NotIdentifiableError):
+        calibrate(changed(drawn.recording, drop=GYRO))
+
+
+def test_it_says_by_what_and_what_it_takes_for_true(found):
+    assert found.aid.by == "place"
+    assert any("field of the place stands in" in warning for warning in found.warnings)
+    assert any("level ground" in warning and "known one" in warning for warning in found.warnings)
+    assert "By the place" in " ".join(aided(found))
+    matrix = torch.tensor(found.matrix)
+    assert torch.allclose(matrix, matrix.mT, atol=1e-6)
+    assert Calibration.from_json(found.to_json()) == found
+
+
+def test_without_any_tilt_nobody_knows_on_which_side_of_the_circle_the_offset_lies():
+    c = calibrate(level(), earth=EARTH)
+    assert "offset_z" in c.aid.undetermined
+    assert math.isinf(c.center_se[2])
+    assert abs(c.center[0] - 5.0) < 4.0 * c.center_se[0] < 16.0
+    assert abs(c.center[1] + 8.0) < 4.0 * c.center_se[1] < 16.0
+
+
+@pytest.mark.parametrize("vertical", [-42.0, 42.0])
+def test_tilts_show_on_which_side_it_lies(vertical):
+    c = calibrate(level(0.15, vertical=vertical), earth=EARTH)
+    assert "offset_z" not in c.aid.undetermined
+    assert abs(c.center[2] - 15.0) < 4.0 * c.center_se[2] < 24.0
+
+
+def test_another_place_is_refused_with_both_widths():
+    with pytest.raises(NotIdentifiableError, match=r"circle of radius 20.*of the place is 40"):
+        calibrate(level(0.15), earth=Field(math.hypot(40.0, 20.0), math.atan2(20.0, 40.0), 0.0))
+
+
+def test_a_vehicle_that_hardly_turned_is_refused():
+    part = level(0.15, count=4000)
+    part = Recording({name: values[:100] for name, values in part.columns.items()})
+    with pytest.raises(NotIdentifiableError, match=r"vertical axis, once round"):
+        calibrate(part, earth=EARTH)
+
+
+def model(rises=0.6):
+    axis = torch.tensor([0.0, 0.6, 0.8]).double()
+    drawn = Circle(axis, torch.tensor([4.0, -2.0, 9.0]).double(), 35.0)
+    return LengthModel("full matrix", 50.0, biased=False, circle=drawn, rises=rises, rises_error=0.02)
+
+
+def test_residuals_are_distances_from_the_ellipsoid_and_along_it_from_the_circle():
+    one, g = model(), torch.Generator().manual_seed(0)
+    response = 50.0 * torch.tensor([[1.1, 0.05, 0.0], [0.05, 0.9, 0.1], [0.0, 0.1, 1.2]]).double()
+    theta = one.start(torch.tensor([3.0, 4.0, 5.0]).double(), response)
+    assert torch.allclose(one.response(theta), response)
+    axis = torch.nn.functional.normalize(response.mT @ one.circle.axis, dim=0)
+    first = torch.nn.functional.normalize(torch.linalg.cross(axis, torch.tensor([1.0, 0.0, 0.0]).double()), dim=0)
+    second = torch.linalg.cross(axis, first)
+    angle = torch.linspace(0.0, 6.0, 50).double()[:, None]
+    level = angle.cos() * first + angle.sin() * second
+    off, tilt = torch.randn(2, 50, 1, generator=g).double()
+    tilt = 0.02 * tilt
+    on, drawn = (torch.cos(a) * level + torch.sin(a) * axis for a in (0.6 + tilt, torch.tensor(0.6).double()))
+    outwards = torch.nn.functional.normalize(torch.linalg.solve(response, on.mT).mT, dim=-1)
+    found = one.residual(theta, on @ response.mT + theta[:3] + off * outwards)
+    assert torch.allclose(found[:, :1], off, atol=0.03 * float(off.square().max()))
+    moved = torch.linalg.vector_norm((on - drawn) @ response.mT, dim=-1, keepdim=True)
+    plain = one.residual(theta, on @ response.mT + theta[:3])
+    assert torch.allclose(plain[:, 1:].abs(), moved, rtol=0.03)
+    assert torch.equal(plain[:, 1:].sign(), tilt.sign())
+
+
+@pytest.mark.parametrize("rises", [0.6, -0.6])
+def test_a_turn_without_tilts_is_as_likely_on_either_side(rises):
+    """Mirrored at the plane of the circle, offset and all, nothing changes: the noise of lengths decides nothing."""
+    recording = level()
+    points, place = recording.magnetometer(), Place(EARTH.strength, EARTH.inclination, 0.5, 0.01)
+    first = by_place._judged(*_mirrored(points, rises, place))
+    other = by_place._judged(*_mirrored(points, -rises, place))
+    assert float(first.fit.log_likelihood) == pytest.approx(float(other.fit.log_likelihood), abs=2.0 / len(points))
+
+
+def _mirrored(points, rises, place):
+    one = by_place._model(lengths.circle(points), place, math.copysign(1.0, rises))
+    offset = one.circle.center - math.sin(one.rises) * one.scale * one.circle.axis
+    return one, one.start(offset, one.scale * torch.eye(3).double()), points, place
