@@ -11,7 +11,7 @@ from mkc_torch.recording.formats.base import FileFormat, Topic
 from mkc_torch.recording.formats.begins import begins_with, foreign
 from mkc_torch.recording.formats.damage import guarded, no_rows
 from mkc_torch.recording.formats.groups import Group, group_topics
-from mkc_torch.recording.formats.hdf5 import h5py, hdf5_group
+from mkc_torch.recording.formats.hdf5 import h5py, hdf5_root
 
 __all__ = ["MAT"]
 
@@ -50,10 +50,7 @@ def _told(group: Group) -> list[str]:
 
 
 def _of_hdf5(path: Path) -> Group:
-    package = h5py("mat")
-    with guarded(path, "MATLAB file of version 7.3"), package.File(str(path), "r") as file:
-        root = hdf5_group(package, file, "", upright=False, count=[0])
-        return _dotted(root)
+    return _dotted(hdf5_root(path, h5py("mat"), "MATLAB file of version 7.3", upright=False))
 
 
 def _dotted(group: Group) -> Group:

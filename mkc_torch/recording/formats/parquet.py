@@ -6,8 +6,6 @@ So a file is read in a process of its own first: what survives that is read here
 from __future__ import annotations
 
 import io
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -16,12 +14,11 @@ import numpy as np
 from mkc_torch.recording.formats.base import FileFormat, RecordingError, Table, Topic, polars
 from mkc_torch.recording.formats.begins import begins_with, foreign
 from mkc_torch.recording.formats.damage import quiet_terminal
+from mkc_torch.recording.formats.trial import broken, survives
 
 __all__ = ["PARQUET"]
 
 _TRIAL = "import io, sys, polars; polars.read_parquet(io.BytesIO(open(sys.argv[1], 'rb').read()))"
-_PATIENCE = 60.0, 0.5
-"""Seconds, and seconds for each MB of the file."""
 
 
 def read(path: Path) -> Table:
@@ -29,8 +26,8 @@ def read(path: Path) -> Table:
     package = polars()
     if not begins_with(path, b"PAR1"):
         raise foreign(path, "Parquet file")
-    if not _survived(path):
-        raise _damaged(path)
+    if not survives(path, _TRIAL):
+        raise broken(path, "Parquet file")
     try:
         with quiet_terminal():
             frame = package.read_parquet(io.BytesIO(path.read_bytes()))  # a path would be a pattern
@@ -39,26 +36,10 @@ def read(path: Path) -> Table:
             f"{path}: this is no Parquet file, or a damaged one: {str(error).splitlines()[0]}"
         ) from error
     except package.exceptions.PanicException as error:  # polars breaks off over some damaged files
-        raise _damaged(path) from error
+        raise broken(path, "Parquet file") from error
     if not len(frame):
         raise RecordingError(f"{path}: the table has no rows.")
     return Table([name.strip() for name in frame.columns], frame.get_columns(), range(1, len(frame) + 1), "row")
-
-
-def _survived(path: Path) -> bool:
-    """Whether a process that reads the file comes to its end, with an error or without."""
-    command = [sys.executable, "-c", _TRIAL, str(path)]
-    patience = _PATIENCE[0] + _PATIENCE[1] * path.stat().st_size / 1e6
-    try:
-        done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=patience)
-    except subprocess.TimeoutExpired:
-        return False
-    # Python itself ends with 0 or 1; polars' abort is a signal here and another code on Windows
-    return done.returncode in (0, 1)
-
-
-def _damaged(path: Path) -> RecordingError:
-    return RecordingError(f"{path}: the Parquet file is damaged; copy it anew from where it was written.")
 
 
 def encoded(_path: Path, columns: Mapping[str, np.ndarray]) -> bytes:

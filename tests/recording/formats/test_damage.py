@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("polars")
 
-from mkc_torch.recording.formats import RecordingError, read_topics
+from mkc_torch.recording.formats import RecordingError, read_topics, trial
 from tests.recording.formats import writers
 from tests.recording.formats.test_same_samples import KINDS, numbers
 from tests.recording.formats.writers import samples
@@ -144,6 +144,21 @@ def test_a_parquet_file_over_which_polars_would_end_this_process_is_damaged(tmp_
     path.write_bytes(damaged)
     assert "is damaged; copy it anew" in rows_or_sentence(path)[1]
     assert capfd.readouterr().err == ""
+
+
+def test_an_hdf5_file_that_leads_its_library_round_in_a_circle_is_damaged(tmp_path, monkeypatch):
+    h5py = pytest.importorskip("h5py")
+    monkeypatch.setattr(trial, "_PATIENCE", (4.0, 0.0))
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as file:
+        for name in ("time", "mag_x"):
+            file.create_dataset(name, data=np.arange(20.0)).attrs["units"] = "s"
+    assert rows_or_sentence(path)[0]
+    damaged = bytearray(path.read_bytes())
+    heap = damaged.index(b"GCOL")  # where texts lie, each after its length: one that leads from the first to itself
+    damaged[heap + 24 : heap + 32] = (2**64 - 16).to_bytes(8, "little")
+    path.write_bytes(damaged)
+    assert "is damaged; copy it anew" in rows_or_sentence(path)[1]
 
 
 MAGIC = {
