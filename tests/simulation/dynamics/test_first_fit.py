@@ -43,7 +43,8 @@ def test_parameters_ten_times_off_are_brought_home(pendulum, stiffness, damping)
     assert found[2:].tolist() == pytest.approx(FIRST, abs=0.15)
     # a free run from there keeps step to the end
     assert float(pendulum.residual(found, {}).abs().max()) < 0.5
-    assert float(pendulum.residual(guess, {}).abs().max()) > 1.5
+    # or is lost on the way, by a last bit
+    assert not float(pendulum.residual(guess, {}).abs().max()) <= 1.5
 
 
 def test_bounds_are_kept(pendulum):
