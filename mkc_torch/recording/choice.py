@@ -63,7 +63,9 @@ def choose(
     mine = {
         new: old
         for new, old in chosen.columns.items()
-        if new not in said and old not in said.values() and (new == old or new not in topic.table.names)
+        if new not in said
+        and old not in said.values()
+        and (new == old or new in _MAG or new not in topic.table.names)  # the sensor that was chosen wins
     }
     return Choice(
         chosen.topic,
