@@ -18,6 +18,8 @@ _CLOSE = 5.0
 _STILL = 0.5
 """Share of rows with the time of the row before from which the clock is slower than the samples."""
 
+_LARGEST = 1e100
+
 _PERIODS = (2, 3, 4)
 _APART = 4.0
 """Times as far from the row before as from the one of the same sensor, from which rows are of sensors in turn. What
@@ -82,7 +84,7 @@ def spread(
         [0.0, 0.5, 1.0, 1.25, 1.5, 1.75]
     """
     steps = np.diff(time)
-    still = (steps == 0) & (np.diff(values, axis=0) != 0).any(-1)
+    still = (steps == 0) & (values[1:] != values[:-1]).any(-1)
     if len(still) < 2 or still.mean() < _STILL or not (steps >= 0).all() or interleaved(values):
         return None
     begins = np.flatnonzero(np.concatenate([[True], steps > 0]))
@@ -104,9 +106,10 @@ def interleaved(values: Float[np.ndarray, "N k"]) -> int:
         >>> interleaved(np.stack([np.cos(turn), np.cos(turn) + 9.0], -1).reshape(-1, 1)), interleaved(turn[:, None])
         (2, 0)
     """
+    values = values[np.isfinite(values).all(-1) & (np.abs(values) < _LARGEST).all(-1)]
     if len(values) < 40 * max(_PERIODS):
         return 0
-    size = {lag: float(np.nanmedian(np.linalg.norm(values[lag:] - values[:-lag], axis=-1))) for lag in (1, *_PERIODS)}
+    size = {lag: float(np.median(np.linalg.norm(values[lag:] - values[:-lag], axis=-1))) for lag in (1, *_PERIODS)}
     for period in _PERIODS:
         if size[1] > _APART * size[period] > 0:
             return period

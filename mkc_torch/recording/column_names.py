@@ -262,6 +262,8 @@ def form(sensor: str) -> str:
         "external",
         "int",
         "ext",
+        "l",
+        "r",
         "a",
         "b",
     }

@@ -18,6 +18,7 @@ from mkc_torch.recording.formats.cells import as_numbers
 from mkc_torch.recording.formats.text_cells import is_stamp
 from mkc_torch.recording.joined_times import with_joined_times
 from mkc_torch.recording.recognise import time_column
+from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.runs import restarts
 
 __all__ = ["ColumnSeen", "FileSeen", "SensorSeen", "TopicSeen", "inspect_file"]
@@ -123,7 +124,7 @@ def inspect_file(path: Path) -> FileSeen:
         >>> seen.topics[0].rate, dict(seen.sensors[0].columns)
         (2.0, {'mag_x': 'mx', 'mag_y': 'my', 'mag_z': 'mz', 'time': 't'})
     """
-    raw = read_topics(path)
+    raw = with_row_sensors(read_topics(path))
     topics = with_joined_times(raw)
     sensors, question = [], ""
     try:

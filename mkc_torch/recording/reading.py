@@ -14,7 +14,7 @@ from torch import Tensor
 from mkc_torch.recording.beside import beside_columns
 from mkc_torch.recording.choice import Choice, choose
 from mkc_torch.recording.clock import Clock, ClockError, clock_of
-from mkc_torch.recording.clock_faults import spread
+from mkc_torch.recording.clock_faults import interleaved, spread
 from mkc_torch.recording.conversions import DEFAULT_UNITS, Units, converted, in_units, said_units, units_told
 from mkc_torch.recording.formats import read_topics
 from mkc_torch.recording.formats.base import RecordingError, Table, Topic, counted, listed
@@ -22,12 +22,15 @@ from mkc_torch.recording.formats.cells import as_numbers, missing_warning, numbe
 from mkc_torch.recording.formats.text_cells import SEPARATORS
 from mkc_torch.recording.given_columns import EXPERIMENT
 from mkc_torch.recording.joined_times import with_joined_times
+from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.runs import restarts
 
 __all__ = ["ASKED", "Reading", "read_file", "reading_of"]
 
 ASKED = frozenset({*DEFAULT_UNITS, EXPERIMENT})
 """Columns that are wanted wherever they are, so that text in them is an error."""
+
+_MAG = ("mag_x", "mag_y", "mag_z")
 
 _SHOWN = 5
 """Runs whose first rows a sentence names."""
@@ -74,7 +77,10 @@ def read_file(
     Raises:
         RecordingError, MissingColumnError, FileNotFoundError, ImportError: as there.
     """
-    return reading_of(path, read_topics(path), asked, columns=columns, units=units, sensor=sensor, recognise=recognise)
+    topics = read_topics(path)
+    if recognise and not set(_MAG) & set(columns or {}):
+        topics = with_row_sensors(topics)
+    return reading_of(path, topics, asked, columns=columns, units=units, sensor=sensor, recognise=recognise)
 
 
 def reading_of(
@@ -140,7 +146,7 @@ def reading_of(
             f"{path}: no column holds numbers; {separators if what == 'file' else f'it has {listed(taken)}'}."
         )
     if clock is not None and choice.sensor is not None:
-        slow = spread(values["time"].numpy(), torch.stack([values[f"mag_{axis}"] for axis in "xyz"], -1).numpy())
+        slow = spread(values["time"].numpy(), torch.stack([values[name] for name in _MAG], -1).numpy())
         if slow is not None:
             values["time"] = torch.tensor(slow[0])
             clock = clock.spread(slow[0])
@@ -148,6 +154,11 @@ def reading_of(
                 f"The clock stands still over up to {slow[1]} samples; samples of one time were spread evenly up to "
                 "the next."
             )
+    if choice.sensor is not None and (turns := interleaved(torch.stack([values[name] for name in _MAG], -1).numpy())):
+        warnings.append(
+            f"Every row is far from the one before and near to that {turns} rows before: rows of {turns} sensors "
+            "seem to take turns. Write them into files of their own, or say by a column `sensor` which a row is of."
+        )
     warnings += _taken_told(choice, taken)
     warnings += units_told(known, values)
     if choice.sensor is not None and clock is not None and len(topics) > 1:

@@ -105,14 +105,33 @@ def candidates(topic: Topic) -> list[dict[str, str]]:
         >>> candidates(Topic("", Table(["time", "ux", "uy", "uz"], [], [])))
         [{'mag_x': 'ux', 'mag_y': 'uy', 'mag_z': 'uz'}]
     """
-    names = [name for name in topic.table.names if name]
-    found = []
+    names = [name for name in topic.table.names if name and not _is_other(name)]
+    found = _numbered(names)
     for name in names:
         for place in [i for i, letter in enumerate(name) if letter in "xX"]:
             triple = [_with(name, place, letter) for letter in ("y", "z")]
             if all(other in names for other in triple):
                 found.append(dict(zip(_MAG, (name, *triple), strict=True)))
     return found
+
+
+def _is_other(name: str) -> bool:
+    """Whether a name says that it is of another sensor."""
+    said = meaning(name)
+    return said is not None and said.quantity != "mag"
+
+
+def _numbered(names: Sequence[str]) -> list[dict[str, str]]:
+    """Columns of one name that end with 0, 1, 2 or 1, 2, 3."""
+    stems: dict[tuple[str, str], dict[int, str]] = {}
+    for name in names:
+        if found := re.fullmatch(r"(.*?)(\d+)([\])]?)", name):
+            stems.setdefault((found[1], found[3]), {})[int(found[2])] = name
+    return [
+        dict(zip(_MAG, [by_number[n] for n in sorted(by_number)], strict=True))
+        for by_number in stems.values()
+        if sorted(by_number) in ([0, 1, 2], [1, 2, 3])
+    ]
 
 
 def time_column(topic: Topic, *, weak: bool = True) -> tuple[str, str] | None:

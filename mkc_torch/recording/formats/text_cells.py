@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from mkc_torch.recording.formats.base import MISSING
+from mkc_torch.recording.formats.text_numbers import is_written_number
 
 __all__ = [
     "SEPARATORS",
@@ -66,7 +67,10 @@ def is_value(cell: str) -> bool:
     """
     cell = cell.strip()
     return bool(cell) and (
-        _NUMBER.fullmatch(cell) is not None or cell.lower() in MISSING or _STAMP.fullmatch(cell) is not None
+        _NUMBER.fullmatch(cell) is not None
+        or cell.lower() in MISSING
+        or _STAMP.fullmatch(cell) is not None
+        or is_written_number(cell)
     )
 
 
