@@ -158,6 +158,7 @@ def calibrate(
 def _of_magnetometer(recording: Recording, field_strength: float | None, seed: int, earth: Field | None) -> Calibration:
     if earth is not None and field_strength is None:
         field_strength = earth.strength
+    recording.stack(*_AXES)  # refused before a column is added
     usable = prepared(numbered(recording))
     try:
         fit = recorded_ellipsoid(usable, seed)

@@ -73,7 +73,9 @@ def layout_of(path: Path, lines: list[Line]) -> Layout:
         )
     if not rows:
         why = f" {' '.join(skipped)}" if skipped else ""
-        raise RecordingError(f"{path}: the file has a header line but no rows of numbers.{why}")
+        raise RecordingError(
+            f"{path}: the file has a header line but no rows of numbers; copy it whole, or export it anew.{why}"
+        )
     return Layout(separator, head.names, head.units, rows, restarts, warnings + skipped)
 
 
@@ -97,7 +99,9 @@ def _is_marked(text: str) -> bool:
 def _head(path: Path, plain: list[Line], comments: list[Line], separator: str, count: int) -> _Head:
     """Find the header: the last line of names above the first row, or a comment there, or names further down."""
     if not plain:
-        raise RecordingError(f"{path}: the file has a header line but no rows of numbers.")
+        raise RecordingError(
+            f"{path}: the file has a header line but no rows of numbers; copy it whole, or export it anew."
+        )
 
     def split(line: Line) -> list[str]:
         return cells_of(line.text, separator)
