@@ -4,26 +4,17 @@ import re
 
 import pytest
 
-for extra in (
-    "typer",
-    "polars",
-    "pandas",
-    "fmpy",
-    "pyulog",
-    "pymavlink",
-    "mcap",
-    "rosbags",
-    "scipy",
-    "h5py",
-    "asammdf",
-):
-    pytest.importorskip(extra)
+pytest.importorskip("typer")
+pytest.importorskip("polars")
+pytest.importorskip("pandas")
 
 from tests.bad_inputs import HEAD, PAGE, bad_inputs, page, row, rows
 
 
 @pytest.fixture(scope="module")
 def found():
+    for reader in ("fmpy", "pyulog", "pymavlink", "mcap", "rosbags", "scipy", "h5py", "asammdf"):
+        pytest.importorskip(reader)
     return list(rows())
 
 
