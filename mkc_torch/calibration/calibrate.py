@@ -27,7 +27,7 @@ from mkc_torch.calibration.result import Calibration, Spread
 from mkc_torch.functional import mkc_weight
 from mkc_torch.linear import MKCRegression
 from mkc_torch.recording.recording import Recording, RecordingError
-from mkc_torch.recording.unit_warnings import RECORDED, field_warning, time_warning
+from mkc_torch.recording.unit_warnings import RECORDED, converted_from, field_warning, time_warning
 
 __all__ = ["Calibration", "Matrix", "Spread", "Vector", "calibrate", "prepared"]
 
@@ -158,6 +158,7 @@ def calibrate(
 def _of_magnetometer(recording: Recording, field_strength: float | None, seed: int, earth: Field | None) -> Calibration:
     if earth is not None and field_strength is None:
         field_strength = earth.strength
+    recording.stack(*_AXES)  # refused before a column is added
     usable = prepared(numbered(recording))
     try:
         fit = recorded_ellipsoid(usable, seed)
@@ -181,7 +182,7 @@ def _of_ellipsoid(fit: EllipsoidFit, usable: Recording, field_strength: float | 
     found = fit.coverage_
     assert isinstance(found, Coverage)
     unit = usable.units[_AXES[0]]
-    size = field_warning(radius, unit, "radius of the ellipsoid is", "all numbers")
+    size = field_warning(radius, unit, "radius of the ellipsoid is", "all numbers", converted_from(usable))
     unit = unit if size is None else RECORDED
     norm = torch.linalg.vector_norm(points, dim=-1)
     return Calibration(

@@ -69,6 +69,7 @@ def _console(
 def complain(subject: str | Path, error: BaseException) -> None:
     """One line on standard error: which file, and why."""
     sentence = sentence_of(error)
+    sentence = sentence.removeprefix(f"{Path(subject).stem}: ")  # a recording is called so in Python
     if not sentence.startswith(str(subject)):
         sentence = f"{subject}: {sentence}"
     err().print(term("command.failed", sentence=sentence), soft_wrap=True)

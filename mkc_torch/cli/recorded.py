@@ -11,6 +11,7 @@ from mkc_torch.recording.formats.base import RecordingError
 from mkc_torch.recording.reading import ASKED, Reading, read_file
 from mkc_torch.recording.recognise import recognised
 from mkc_torch.recording.recording import Recording
+from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.unit_warnings import RECORDED, field_size, likely_unit
 
 __all__ = [
@@ -34,7 +35,7 @@ def sensor_names(path: Path, columns: Mapping[str, str], sensor: str | None) -> 
     """
     if sensor is not None:
         return [sensor]
-    names = sensors_in(path, read_topics(path), columns)
+    names = sensors_in(path, with_row_sensors(read_topics(path)), columns)
     return [None] if len(names) == 1 else list(names)
 
 
@@ -44,7 +45,7 @@ def refuse_no_magnetometer(path: Path, columns: Mapping[str, str], sensor: str |
     Raises:
         RecordingError: none is; the sentence has the option that names its columns.
     """
-    topics = read_topics(path)
+    topics = with_row_sensors(read_topics(path))
     if sensor is None and not set(_AXES) & set(columns) and not recognised(topics, path.stem).sensors:
         raise RecordingError(which_columns(path, topics))
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from mkc_torch.recording.column_names import meaning
 from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, Topic, listed
 from mkc_torch.recording.recognise import Found, Sensor, candidates, recognised, time_column
 
@@ -63,7 +64,9 @@ def choose(
     mine = {
         new: old
         for new, old in chosen.columns.items()
-        if new not in said and old not in said.values() and (new == old or new not in topic.table.names)
+        if new not in said
+        and old not in said.values()
+        and (new == old or new in _MAG or new not in topic.table.names)  # the sensor that was chosen wins
     }
     return Choice(
         chosen.topic,
@@ -92,6 +95,8 @@ def sensors_in(path: Path, topics: Sequence[Topic], columns: Mapping[str, str]) 
 def which_columns(path: Path, topics: Sequence[Topic]) -> str:
     """What to say where no magnetometer was recognised: the option that names columns which may be one."""
     options = [columns_option(triple) for topic in topics for triple in candidates(topic)]
+    if any(_has(topic, "accel") for topic in topics):
+        options.append("--sensor accel")
     named = listed(name for topic in topics for name in topic.table.names if name)
     where = "" if len(topics) == 1 else f" in {len(topics)} topics"
     if not options:
@@ -99,10 +104,18 @@ def which_columns(path: Path, topics: Sequence[Topic]) -> str:
             f"{path}: no magnetometer is recognised among {named}{where}; name its columns: "
             "`--columns mag_x=...,mag_y=...,mag_z=...`."
         )
+    accel = options == ["--sensor accel"]
+    mean = "An accelerometer is calibrated by" if accel else "If one is meant, name its columns"
     return (
-        f"{path}: no magnetometer is recognised among {named}{where}. If one is meant, name its columns: "
+        f"{path}: no magnetometer is recognised among {named}{where}. {mean}: "
         f"{' or '.join(f'`{option}`' for option in options[:6])}."
     )
+
+
+def _has(topic: Topic, quantity: str) -> bool:
+    """Whether the names of a topic say that it holds all axes of a quantity."""
+    said = [meaning(name) for name in topic.table.names if name]
+    return {one.axis for one in said if one is not None and one.quantity == quantity} >= {"x", "y", "z"}
 
 
 def columns_option(columns: Mapping[str, str]) -> str:

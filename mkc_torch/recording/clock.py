@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from mkc_torch.recording.clock_faults import turned_over
 from mkc_torch.recording.formats.base import MISSING, polars
 from mkc_torch.recording.formats.text_cells import is_stamp
+from mkc_torch.recording.stamps import as_iso
 from mkc_torch.recording.unit_words import conversion
 
 __all__ = ["Clock", "ClockError", "clock_of"]
@@ -20,10 +23,19 @@ _EPOCH = (10**9, 41 * 10**8)
 _INTERVALS = (1e-6, 3600.0)
 """Median intervals in s that a sensor's samples have: a count since 1970 of the wrong unit misses them."""
 
+_FEW = 10
+_DAYS = ((36_526, 73_051), (730_486, 767_011))
+_DAY_STEPS = (1e-8, 1e-5)
+
+_LONG = {"min": 60.0, "h": 3600.0, "days": 86_400.0}
+
 _ISO = (
     r"^(\d{4})-?(\d\d)-?(\d\d)(?:[T ](\d\d):?(\d\d)(?::?(\d\d)(?:[.,](\d+))?)?\s*"
     r"(?:(Z|UTC)|([+-])(\d\d):?(\d\d)?)?)?$"
 )
+_PLAIN = re.compile(r"\d{4}-?\d\d-?\d\d|\d{1,2}:\d\d")
+_MINUTES = re.compile(r"\d{1,3}:\d\d[.,]\d+")
+_HALF = re.compile(r"[AaPp]\.?[Mm]\.?$")
 _OF_DAY = r"^(\d{1,2}):(\d\d)(?::(\d\d)(?:[.,](\d+))?)?$"
 
 
@@ -47,6 +59,13 @@ class Clock(NamedTuple):
     ticks: np.ndarray | None
     seconds: np.ndarray
     told: str
+
+    def spread(self, seconds: np.ndarray) -> Clock:
+        """The clock with other times, in s, that differ by parts of a step of its own."""
+        if self.ticks is None:
+            return self._replace(seconds=seconds)
+        added = np.nan_to_num(seconds - self.seconds)
+        return self._replace(ticks=self.ticks + np.rint(added * _NANO).astype(np.int64), seconds=seconds)
 
     def since(self, row: int) -> np.ndarray:
         """Seconds from the time of a row on."""
@@ -81,7 +100,11 @@ def clock_of(series: Any, unit: str = "") -> Clock:
         text = series.str.strip_chars()
         text = text.set(text.str.to_lowercase().is_in(MISSING).fill_null(False), None)
         first = next((one for one in text if one is not None), "")
-        return _of_stamps(text) if is_stamp(first) else _of_numbers(text, unit)
+        if not is_stamp(first):
+            return _of_numbers(text, unit)
+        minutes = bool(_MINUTES.fullmatch(first))
+        iso = as_iso(text.to_list()) if minutes or not _PLAIN.match(first) or _HALF.search(first) else None
+        return _of_stamps(text if iso is None else package.Series(iso, dtype=package.String), minutes)
     return _of_numbers(series, unit)
 
 
@@ -103,10 +126,10 @@ def _exact(ticks: Any, told: str) -> Clock:
     return Clock(whole, np.where(none, np.nan, whole / _NANO), told)
 
 
-def _of_stamps(text: Any) -> Clock:
+def _of_stamps(text: Any, minutes: bool) -> Clock:
     package = polars()
     if ":" in next(one for one in text if one is not None)[:3]:
-        return _of_days(text)
+        return _of_days(text, 3600 if minutes else _DAY)
     parts = text.str.extract_groups(_ISO).struct.unnest()
     year, month, day, hour, minute, second, digits, zulu, sign, off_hour, off_minute = parts.get_columns()
     date = package.select(package.date(*(one.cast(package.Int32) for one in (year, month, day)))).to_series() if (
@@ -132,8 +155,8 @@ def _dates_exist(year: Any, month: Any, day: Any) -> bool:
     return bool(year.is_not_null().all() and months.is_between(1, 12).all() and days.is_between(1, 28).all())
 
 
-def _of_days(text: Any) -> Clock:
-    """Times of the day; a fall of more than half a day is midnight."""
+def _of_days(text: Any, turn: int) -> Clock:
+    """Times of the day, or of the hour; a fall of more than half of it is midnight, or the next hour."""
     hour, minute, second, digits = text.str.extract_groups(_OF_DAY).struct.unnest().get_columns()
     bad = text.is_not_null() & (hour.is_null() | (_whole(hour) > 24) | (_whole(minute) > 59) | (_whole(second) > 60))
     if bad.any():
@@ -142,10 +165,10 @@ def _of_days(text: Any) -> Clock:
     ticks = (_whole(hour) * 3600 + _whole(minute) * 60 + _whole(second)) * _NANO + _fraction(digits)
     ticks = ticks.set(text.is_null(), None)
     known = ticks.drop_nulls().to_numpy()
-    nights = np.concatenate([[0], np.cumsum(np.diff(known) < -_DAY * _NANO // 2)]) if len(known) else known
+    nights = np.concatenate([[0], np.cumsum(np.diff(known) < -turn * _NANO // 2)]) if len(known) else known
     whole = ticks.to_numpy().copy() if not ticks.null_count() else ticks.fill_null(0).to_numpy().copy()
-    whole[ticks.is_not_null().to_numpy()] += (nights * _DAY * _NANO).astype(np.int64)
-    return _exact(package.Series(whole).set(ticks.is_null(), None), "times of the day")
+    whole[ticks.is_not_null().to_numpy()] += (nights * turn * _NANO).astype(np.int64)
+    return _exact(package.Series(whole).set(ticks.is_null(), None), "times of the day" if turn == _DAY else "minutes")
 
 
 def _whole(digits: Any) -> Any:
@@ -158,6 +181,18 @@ def _fraction(digits: Any) -> Any:
 
 
 def _of_numbers(series: Any, unit: str) -> Clock:
+    clock, size = _counted(series, unit)
+    raw = clock.seconds / size if clock.ticks is None else clock.ticks / (size * _NANO)
+    added, end = turned_over(np.where(np.isnan(clock.seconds), np.nan, raw), size)
+    if not end:
+        return clock
+    ticks = None if clock.ticks is None else clock.ticks + np.rint(added * size * _NANO).astype(np.int64)
+    told = f"{clock.told or 's'}, whose counter turned over at {end} and is counted on"
+    return Clock(ticks, clock.seconds + added * size, told)
+
+
+def _counted(series: Any, unit: str) -> tuple[Clock, float]:
+    """The times of a column of numbers, and the seconds that one of them is."""
     package = polars()
     values = series.cast(package.Float64, strict=False)
     if series.dtype == package.String and (bad := series.is_not_null() & values.is_null()).any():
@@ -166,16 +201,32 @@ def _of_numbers(series: Any, unit: str) -> Clock:
     epoch = _epoch_unit(seconds)
     known = conversion("time", unit)
     if known is None and epoch is None:
-        return Clock(None, seconds, "")
+        if _are_days(seconds):
+            return Clock(None, seconds * _DAY, "days, as spreadsheets count them"), float(_DAY)
+        return Clock(None, seconds, ""), 1.0
     if known is not None and known.unit == "s" and epoch != "s":
-        return Clock(None, seconds, "")
+        return Clock(None, seconds, ""), 1.0
+    if known is not None and known.unit in _LONG:
+        return Clock(None, seconds * _LONG[known.unit], known.unit), _LONG[known.unit]
     name = known.unit if known is not None else str(epoch)
     told = f"{name} since 1970" if epoch == name else name
     digits = {"s": 9, "ms": 6, "µs": 3, "ns": 0}[name]
     exact = _ticks(series, digits)
     if exact is not None:
-        return _exact(exact, told)
-    return Clock(None, seconds * 10.0**digits / _NANO, told)
+        return _exact(exact, told), 10.0**digits / _NANO
+    return Clock(None, seconds * 10.0**digits / _NANO, told), 10.0**digits / _NANO
+
+
+def _are_days(values: np.ndarray) -> bool:
+    """Whether numbers are days since 1900, as of spreadsheets, or since the year 0, as of MATLAB, in this century.
+
+    Taken for seconds, the samples would lie less than ten microseconds apart.
+    """
+    finite = values[np.isfinite(values)]
+    if len(finite) < _FEW:
+        return False
+    first, interval = float(finite[0]), float(np.median(np.abs(np.diff(finite))))
+    return any(low <= first < high for low, high in _DAYS) and _DAY_STEPS[0] <= interval <= _DAY_STEPS[1]
 
 
 def _epoch_unit(values: np.ndarray) -> str | None:

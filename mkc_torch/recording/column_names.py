@@ -11,12 +11,27 @@ from mkc_torch.recording.unit_words import CANONICAL, conversion
 __all__ = ["Meaning", "is_about_magnetometer", "meaning", "split_unit"]
 
 _STRONG = {
-    "mag": {"mag", "mags", "magn", "magnet", "magnetometer", "magnetic", "magneto", "magfield", "compass"},
+    "mag": {
+        "mag",
+        "mags",
+        "magn",
+        "magnet",
+        "magnetometer",
+        "magnetic",
+        "magneto",
+        "magfield",
+        "compass",
+        "magnetfeld",
+        "hmc",
+        "qmc",
+        "bmm",
+        "mmc",
+    },
     "gyro": {"gyro", "gyr", "gyroscope", "angularvelocity", "angularrate", "rotationrate", "omega"},
     "accel": {"accel", "acc", "acce", "accelerometer", "acceleration", "linearacceleration"},
     "q": {"q", "quat", "quaternion", "orientation", "attitude"},
 }
-_WEAK = {"mag": {"m", "b"}, "gyro": {"g", "w"}, "accel": {"a"}}
+_WEAK = {"mag": {"m", "b", "h"}, "gyro": {"g", "w"}, "accel": {"a"}}
 """Letters that stand for a quantity where an axis follows them: mx, Bx, gx, ax."""
 
 _AXES = {"mag": "xyz", "gyro": "xyz", "accel": "xyz", "q": "wxyz"}
@@ -38,11 +53,25 @@ _FILLERS = {
 """Words that say nothing of which sensor it is, or only in which form."""
 
 _TIME_UNITS = {"millis", "micros", "seconds", "milliseconds", "microseconds", "nanoseconds"}
-_TIME = {"utc", "time", "timestamp", "timestamps", "stamp", "datetime", "zeit", "zeitstempel", *_TIME_UNITS}
+_TIME = {
+    "utc",
+    "time",
+    "timestamp",
+    "timestamps",
+    "stamp",
+    "datetime",
+    "zeit",
+    "zeitstempel",
+    "uhrzeit",
+    "temps",
+    "tow",
+    "itow",
+    *_TIME_UNITS,
+}
 _TIME_FILLERS = {
     "header", "utc", "sample", "boot", "ros", "log", "logging", "logger", "elapsed", "since", "epoch", "unix", "system",
     "sys", "sensor", "recorded", "local", "gps", "date", "iso", "field", "and", "of", "reboot", "start",
-    "1970", "rel", "relative", "host", "device",
+    "1970", "rosbag", "rel", "relative", "host", "device",
 }  # fmt: skip
 _SCALARS = {"temperature": {"temperature", "temp"}, "current": {"current", "curr"}}
 _SCALAR_FILLERS = {"imu", "sensor", "mag", "magnetometer", "battery", "bat", "batt", "board", "chip", "value", "field"}
@@ -126,6 +155,8 @@ def _is_unit_of(found: Meaning, told: str) -> bool:
 def _unit_of_time(found: Meaning, words: list[str]) -> str:
     """Arduino's millis and micros, and seconds_elapsed, are units by themselves."""
     told = [word.lower() for word in words if word.lower() in _TIME_UNITS]
+    if found.quantity == "time" and any(word.lower() == "itow" for word in words):
+        return "ms"  # of UBX and other GNSS receivers
     return told[0] if found.quantity == "time" and told else ""
 
 
@@ -231,6 +262,8 @@ def form(sensor: str) -> str:
         "external",
         "int",
         "ext",
+        "l",
+        "r",
         "a",
         "b",
     }

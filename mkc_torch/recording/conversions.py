@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mkc_torch.recording.column_names import split_unit
 from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, Topic, listed, polars
-from mkc_torch.recording.unit_words import CANONICAL, Conversion, conversion, known_units
+from mkc_torch.recording.unit_words import CANONICAL, Conversion, conversion, is_unit, known_units
 
 if TYPE_CHECKING:
     from mkc_torch.recording.choice import Choice
@@ -139,7 +139,12 @@ def converted(series: Any, numbers: Any, known: Conversion | None) -> Any:
 
 def units_told(units: Units, values: Mapping[str, Any]) -> list[str]:
     """Sentences about what was converted, and about units that stay."""
-    told = []
+    told = [
+        f"`{name}` and the others keep their numbers: {unit} is no unit of a magnetic field that is known; known: "
+        f"{known_units('mag')}."
+        for name, unit in units.labels.items()
+        if name == "mag_x" and name in units.asked and not is_unit(unit)
+    ]
     done: set[tuple[str, str]] = set()
     for name, known in units.conversions.items():
         quantity = quantity_of(name) or ""

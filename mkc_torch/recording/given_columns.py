@@ -12,10 +12,10 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import told
 from mkc_torch._support.arrays import Data, absent, is_array, is_frame, numbers_of, series_of
-from mkc_torch.recording.formats.base import RecordingError, Table, listed
+from mkc_torch.recording.formats.base import RecordingError, Table, listed, polars
 from mkc_torch.recording.formats.cells import renamed
 
-__all__ = ["EXPERIMENT", "FrameColumns", "checked_columns", "columns_of_frame"]
+__all__ = ["EXPERIMENT", "FrameColumns", "checked_columns", "columns_of_frame", "table_of_frame"]
 
 EXPERIMENT = "experiment"
 """The column that says which samples belong together; the one in which text is welcome."""
@@ -66,12 +66,7 @@ def columns_of_frame(frame: Any, names: Mapping[str, str], asked: Collection[str
         MissingColumnError: ``names`` has a column that the frame does not have.
     """
     where = f"{name}: " if name else ""
-    if not is_frame(frame):
-        raise RecordingError(f"{where}expected a DataFrame but got {told(frame)}; columns are Recording({{...}}).")
-    found = _with_index(frame)
-    if nameless := [label for label, _ in found if not isinstance(label, str)]:
-        raise RecordingError(f"{where}the columns of a frame need names of text but one is {nameless[0]!r}; rename it.")
-    table = Table([label.strip() for label, _ in found], [series for _, series in found], range(len(frame)), "row")
+    table = _table(frame, where)
     taken, warnings = renamed(table, names, name or "The frame", "frame")
     columns: dict[str, Tensor] = {}
     labels: dict[str, tuple[str, ...]] = {}
@@ -88,6 +83,46 @@ def columns_of_frame(frame: Any, names: Mapping[str, str], asked: Collection[str
     if not columns:
         raise RecordingError(f"{where}no column of the frame holds numbers; it has {listed(taken)}.")
     return FrameColumns(columns, labels, tuple(warnings))
+
+
+def table_of_frame(frame: Any, name: str) -> Table:
+    """A data frame as a file's table: its columns as series of polars, to the last digit.
+
+    Raises:
+        RecordingError: no frame, one without rows, or columns without names.
+        ImportError: polars is not installed.
+    """
+    where = f"{name}: " if name else ""
+    table = _table(frame, where)
+    if not len(table.lines):
+        raise RecordingError(f"{where}the columns hold no samples.")
+    return table._replace(series=[_polars_series(series) for series in table.series])
+
+
+def _table(frame: Any, where: str) -> Table:
+    if not is_frame(frame):
+        raise RecordingError(f"{where}expected a DataFrame but got {told(frame)}; columns are Recording({{...}}).")
+    found = _with_index(frame)
+    if nameless := [label for label, _ in found if not isinstance(label, str)]:
+        raise RecordingError(f"{where}the columns of a frame need names of text but one is {nameless[0]!r}; rename it.")
+    return Table([label.strip() for label, _ in found], [series for _, series in found], range(len(frame)), "row")
+
+
+def _polars_series(series: Any) -> Any:
+    package = polars()
+    if isinstance(series, package.Series):
+        return series
+    kind = getattr(series.dtype, "kind", "O")
+    if kind in "mM":  # with a zone too, in UTC then
+        return package.Series(series.to_numpy(dtype=f"{'datetime' if kind == 'M' else 'timedelta'}64[ns]"))
+    if kind in "iuf" and absent(series) is None:
+        return package.Series(np.asarray(series.to_numpy()))
+    numbers = _numbers("", series)
+    if isinstance(numbers, Tensor):
+        return package.Series(numbers.numpy())
+    return package.Series(
+        [None if one is None or one != one else str(one) for one in _cells(series)], dtype=package.String
+    )
 
 
 def _checked(key: object, values: object, where: str) -> Tensor:

@@ -16,7 +16,9 @@ from mkc_torch.recording.formats import read_topics
 from mkc_torch.recording.formats.base import RecordingError, Topic, polars
 from mkc_torch.recording.formats.cells import as_numbers
 from mkc_torch.recording.formats.text_cells import is_stamp
+from mkc_torch.recording.joined_times import with_joined_times
 from mkc_torch.recording.recognise import time_column
+from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.runs import restarts
 
 __all__ = ["ColumnSeen", "FileSeen", "SensorSeen", "TopicSeen", "inspect_file"]
@@ -122,7 +124,8 @@ def inspect_file(path: Path) -> FileSeen:
         >>> seen.topics[0].rate, dict(seen.sensors[0].columns)
         (2.0, {'mag_x': 'mx', 'mag_y': 'my', 'mag_z': 'mz', 'time': 't'})
     """
-    topics = read_topics(path)
+    raw = with_row_sensors(read_topics(path))
+    topics = with_joined_times(raw)
     sensors, question = [], ""
     try:
         for name in sensors_in(path, topics, {}):
@@ -134,13 +137,14 @@ def inspect_file(path: Path) -> FileSeen:
                 sensors.append(SensorSeen(name, topics[choice.topic].name, columns, choice.units))
     except RecordingError as error:
         question = str(error)
-    return FileSeen(path, tuple(_topic(topic) for topic in topics), tuple(sensors), question)
+    return FileSeen(path, tuple(map(_topic, topics, raw)), tuple(sensors), question)
 
 
-def _topic(topic: Topic) -> TopicSeen:
+def _topic(topic: Topic, raw: Topic) -> TopicSeen:
+    """What is seen of a topic: its columns as they stand in the file, the time as it is read."""
     table = topic.table
     columns = tuple(
-        _column(topic, name, series) for name, series in zip(table.names, table.series, strict=True) if name
+        _column(raw, name, series) for name, series in zip(raw.table.names, raw.table.series, strict=True) if name
     )
     named = time_column(topic)
     seconds = rate = None

@@ -13,6 +13,7 @@ from mkc_torch.recording.formats import check_ending, encoded, read_topics
 from mkc_torch.recording.formats.base import polars
 from mkc_torch.recording.formats.cells import as_numbers
 from mkc_torch.recording.formats.csv import CSV
+from mkc_torch.recording.row_sensors import with_row_sensors
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -46,7 +47,10 @@ def write_beside(
         FileExistsError: the target exists and ``overwrite`` is False.
     """
     check_ending(path)
-    table = read_topics(source)[topic].table
+    topics = read_topics(source)
+    if any(len(values) != len(topics[min(topic, len(topics) - 1)].table.lines) for values in columns.values()):
+        topics = with_row_sensors(topics)  # those of one sensor, where rows are of several
+    table = topics[topic].table
     of_text, as_text = (file.suffix.lower() in CSV.endings for file in (source, path))
     told: dict[str, Any] = {}
     for name, series in zip(table.names, table.series, strict=True):

@@ -14,18 +14,23 @@ from torch import Tensor
 from mkc_torch.recording.beside import beside_columns
 from mkc_torch.recording.choice import Choice, choose
 from mkc_torch.recording.clock import Clock, ClockError, clock_of
+from mkc_torch.recording.clock_faults import interleaved, spread
 from mkc_torch.recording.conversions import DEFAULT_UNITS, Units, converted, in_units, said_units, units_told
 from mkc_torch.recording.formats import read_topics
-from mkc_torch.recording.formats.base import RecordingError, Table, counted, listed
+from mkc_torch.recording.formats.base import RecordingError, Table, Topic, counted, listed
 from mkc_torch.recording.formats.cells import as_numbers, missing_warning, numbered, renamed, text_error
 from mkc_torch.recording.formats.text_cells import SEPARATORS
 from mkc_torch.recording.given_columns import EXPERIMENT
+from mkc_torch.recording.joined_times import with_joined_times
+from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.runs import restarts
 
-__all__ = ["ASKED", "Reading", "read_file"]
+__all__ = ["ASKED", "Reading", "read_file", "reading_of"]
 
 ASKED = frozenset({*DEFAULT_UNITS, EXPERIMENT})
 """Columns that are wanted wherever they are, so that text in them is an error."""
+
+_MAG = ("mag_x", "mag_y", "mag_z")
 
 _SHOWN = 5
 """Runs whose first rows a sentence names."""
@@ -73,10 +78,38 @@ def read_file(
         RecordingError, MissingColumnError, FileNotFoundError, ImportError: as there.
     """
     topics = read_topics(path)
+    if recognise and not set(_MAG) & set(columns or {}):
+        topics = with_row_sensors(topics)
+    return reading_of(path, topics, asked, columns=columns, units=units, sensor=sensor, recognise=recognise)
+
+
+def reading_of(
+    path: Path,
+    topics: Sequence[Topic],
+    asked: Collection[str],
+    *,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    sensor: str | None = None,
+    recognise: bool = True,
+    what: str = "file",
+) -> Reading:
+    """Read the tables of a file, or of a data frame.
+
+    Args:
+        path: what they are called in messages.
+        topics: the tables.
+        asked, columns, units, sensor, recognise: as :func:`read_file` takes them.
+        what: file or frame.
+
+    Raises:
+        RecordingError, MissingColumnError: as :func:`read_file`.
+    """
+    topics = with_joined_times(topics, (columns or {}).values())
     choice = choose(path, topics, columns or {}, sensor, recognise=recognise)
     topic = topics[choice.topic]
     table = topic.table
-    taken, warnings = renamed(table, choice.columns, path)
+    taken, warnings = renamed(table, choice.columns, path, what)
     warnings = [*topic.warnings, *choice.warnings, *warnings]
     said = said_units(choice, topic, taken)
     if not recognise:  # the caller knows what the columns are; a clock's unit is none of its business
@@ -108,8 +141,24 @@ def read_file(
             converted(series, numbers, known.conversions.get(name)).fill_null(math.nan).to_numpy()
         )
     if not values:
-        separators = ", ".join(SEPARATORS.values())
-        raise RecordingError(f"{path}: no column holds numbers; separators can be {separators}.")
+        separators = f"separators can be {', '.join(SEPARATORS.values())}"
+        raise RecordingError(
+            f"{path}: no column holds numbers; {separators if what == 'file' else f'it has {listed(taken)}'}."
+        )
+    if clock is not None and choice.sensor is not None:
+        slow = spread(values["time"].numpy(), torch.stack([values[name] for name in _MAG], -1).numpy())
+        if slow is not None:
+            values["time"] = torch.tensor(slow[0])
+            clock = clock.spread(slow[0])
+            warnings.append(
+                f"The clock stands still over up to {slow[1]} samples; samples of one time were spread evenly up to "
+                "the next."
+            )
+    if choice.sensor is not None and (turns := interleaved(torch.stack([values[name] for name in _MAG], -1).numpy())):
+        warnings.append(
+            f"Every row is far from the one before and near to that {turns} rows before: rows of {turns} sensors "
+            "seem to take turns. Write them into files of their own, or say by a column `sensor` which a row is of."
+        )
     warnings += _taken_told(choice, taken)
     warnings += units_told(known, values)
     if choice.sensor is not None and clock is not None and len(topics) > 1:

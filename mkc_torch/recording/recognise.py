@@ -9,6 +9,7 @@ from typing import NamedTuple
 from mkc_torch.recording.column_names import Meaning, form, is_about_magnetometer, meaning, split_unit
 from mkc_torch.recording.formats.base import Topic
 from mkc_torch.recording.px4 import PX4_UNITS, is_px4_magnetometer, is_px4_message
+from mkc_torch.recording.unit_words import conversion
 
 __all__ = ["Found", "Sensor", "candidates", "recognised", "recorded_beside", "time_column"]
 
@@ -16,6 +17,7 @@ _MAG = ("mag_x", "mag_y", "mag_z")
 _SIZES = {"mag": "xyz", "gyro": "xyz", "accel": "xyz", "q": "wxyz"}
 _ROS = "magnetic_field"
 """Of sensor_msgs/MagneticField of ROS, "Measurements in Teslas", which has a covariance beside it."""
+_OF_ROS = (f"{_ROS}_covariance", "header.stamp", "header.seq", "frame_id", "rosbagTimestamp")
 _DERIVED = {"vehicle_magnetometer": "sensor_mag", "sensor_combined": "sensor_mag"}
 """PX4's topics that repeat a sensor's own."""
 
@@ -103,14 +105,33 @@ def candidates(topic: Topic) -> list[dict[str, str]]:
         >>> candidates(Topic("", Table(["time", "ux", "uy", "uz"], [], [])))
         [{'mag_x': 'ux', 'mag_y': 'uy', 'mag_z': 'uz'}]
     """
-    names = [name for name in topic.table.names if name]
-    found = []
+    names = [name for name in topic.table.names if name and not _is_other(name)]
+    found = _numbered(names)
     for name in names:
         for place in [i for i, letter in enumerate(name) if letter in "xX"]:
             triple = [_with(name, place, letter) for letter in ("y", "z")]
             if all(other in names for other in triple):
                 found.append(dict(zip(_MAG, (name, *triple), strict=True)))
     return found
+
+
+def _is_other(name: str) -> bool:
+    """Whether a name says that it is of another sensor."""
+    said = meaning(name)
+    return said is not None and said.quantity != "mag"
+
+
+def _numbered(names: Sequence[str]) -> list[dict[str, str]]:
+    """Columns of one name that end with 0, 1, 2 or 1, 2, 3."""
+    stems: dict[tuple[str, str], dict[int, str]] = {}
+    for name in names:
+        if found := re.fullmatch(r"(.*?)(\d+)([\])]?)", name):
+            stems.setdefault((found[1], found[3]), {})[int(found[2])] = name
+    return [
+        dict(zip(_MAG, [by_number[n] for n in sorted(by_number)], strict=True))
+        for by_number in stems.values()
+        if sorted(by_number) in ([0, 1, 2], [1, 2, 3])
+    ]
 
 
 def time_column(topic: Topic, *, weak: bool = True) -> tuple[str, str] | None:
@@ -176,7 +197,7 @@ def _with(name: str, place: int, letter: str) -> str:
 def _unit_of(topic: Topic, name: str, unit: str) -> str:
     if topic.units.get(name) or unit:
         return topic.units.get(name) or unit
-    if name.rpartition(".")[0].endswith(_ROS) and any(f"{_ROS}_covariance" in one for one in topic.table.names):
+    if name.rpartition(".")[0].endswith(_ROS) and any(sign in one for one in topic.table.names for sign in _OF_ROS):
         return "tesla"
     return PX4_UNITS["time"] if name.startswith("timestamp") and is_px4_message(topic.table.names) else ""
 
@@ -190,12 +211,35 @@ def _magnetometers(topic: Topic, file: str, topics: int) -> list[_Group]:
     axes = {base.lower(): (name, unit) for name, (base, unit) in plain.items() if base.lower() in ("x", "y", "z")}
     known = topic.name if topics > 1 or topic.name else file
     px4 = is_px4_magnetometer(topic.table)
-    if len(axes) == 3 and (px4 or is_about_magnetometer(known)):
+    parent = _parent(topic, [name for name, _ in axes.values()])
+    if len(axes) == 3 and parent:
+        unit = "tesla" if parent == _ROS and any(sign in topic.table.names for sign in _OF_ROS) else ""
+        units = {axis: one or unit for axis, (_, one) in axes.items()}
+        return [_Group("mag", {axis: name for axis, (name, _) in axes.items()}, units, True)]
+    if len(axes) == 3 and (px4 or is_about_magnetometer(known) or all(_is_magnetic(one) for _, one in axes.values())):
         units = {axis: _unit_of(topic, name, unit) for axis, (name, unit) in axes.items()}
         if is_px4_message(topic.table.names):
             units = {axis: unit or PX4_UNITS["mag"] for axis, unit in units.items()}
         return [_Group("mag", {axis: name for axis, (name, _) in axes.items()}, units, True)]
     return groups
+
+
+def _is_magnetic(unit: str) -> bool:
+    """Whether a unit is one of a magnetic field, and of no acceleration, as g may be."""
+    return bool(unit) and conversion("mag", unit) is not None and conversion("accel", unit) is None
+
+
+def _parent(topic: Topic, axes: Sequence[str]) -> str:
+    """The column without values before x, y, z, by which flattened ROS messages name what these are of."""
+    names = topic.table.names
+    places = [names.index(name) for name in axes]
+    if len(places) != 3 or sorted(places) != list(range(min(places), min(places) + 3)) or min(places) == 0:
+        return ""
+    place = min(places) - 1
+    if not is_about_magnetometer(names[place]) or not topic.table.series:
+        return ""
+    cells = topic.table.series[place]
+    return names[place] if all(cell is None or not str(cell).strip() for cell in cells) else ""
 
 
 def _groups(topic: Topic) -> list[tuple[str, _Group]]:

@@ -16,9 +16,10 @@ from mkc_torch._support.arrays import ArrayLike, Data, is_frame
 from mkc_torch._support.files import write_atomically
 from mkc_torch.recording.conversions import DEFAULT_UNITS
 from mkc_torch.recording.formats import check_ending, encoded
-from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, counted, listed
-from mkc_torch.recording.given_columns import EXPERIMENT, checked_columns, columns_of_frame
-from mkc_torch.recording.reading import ASKED, read_file
+from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, Topic, counted, listed
+from mkc_torch.recording.given_columns import EXPERIMENT, checked_columns, columns_of_frame, table_of_frame
+from mkc_torch.recording.reading import ASKED, read_file, reading_of
+from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.shown import Shown
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class Recording(Shown):
 
     Args:
         columns: name to values, 1-D tensors or NumPy arrays of one length >= 1, which are copied to the CPU as float64;
-            or a DataFrame, as :meth:`from_frame` takes it.
+            or a DataFrame, whose columns keep their names and numbers; :meth:`from_frame` recognises them.
         name: what the recording is called in messages and reports; a file's is its stem.
         units: units of columns, beside or instead of the default ones: ``time`` s; ``mag_*`` and ``field_*`` µT;
             ``gyro_*`` rad/s; ``accel_*`` m/s²; ``position_*`` m; ``q_*`` 1; ``temperature`` °C; ``current`` A.
@@ -127,30 +128,54 @@ class Recording(Shown):
         columns: Mapping[str, str] | None = None,
         name: str = "",
         units: Mapping[str, str] | None = None,
+        sensor: str | None = None,
+        recognise: bool = True,
     ) -> Recording:
-        """The columns of a DataFrame of pandas or polars, with the rules of :meth:`read`.
+        """The columns of a DataFrame of pandas or polars, recognised, converted and told as :meth:`read` does a file's.
 
-        Missing values become NaN. Columns without numbers that nobody asked for are left out, which ``warnings`` tells;
-        in the column ``experiment`` text is numbered, and ``labels`` has it. An index that has a name, such as
-        ``time``, is a column too.
+        Missing values become NaN, stamps seconds from the first sample on. An index that has a name, such as ``time``,
+        is a column too. Polars is needed, of a pandas frame too.
 
         Args:
             frame: the table.
             columns: for each name a column is to get, the name it has in the frame: ``{"mag_x": "mx"}``.
-            name, units: as of a recording; units by the new names.
+            name: what the recording is called.
+            units, sensor, recognise: as :meth:`read` takes them.
 
         Raises:
-            RecordingError: a frame without rows or numbers, columns of the same name or of none, or text or times where
-                numbers are needed.
-            MissingColumnError: ``columns`` names a column that the frame does not have, or ``units`` one of neither.
+            RecordingError: a frame without rows or numbers, columns of the same name or of none, text or times where
+                numbers are needed, or several magnetometers.
+            MissingColumnError: ``columns`` or ``units`` names a column that the frame does not have.
+            ImportError: polars is not installed.
 
         Example:
             >>> import pandas as pd
-            >>> Recording.from_frame(pd.DataFrame({"mx": [20, 21]}), columns={"mag_x": "mx"})["mag_x"]
-            tensor([20., 21.], dtype=torch.float64)
+            >>> frame = pd.DataFrame(
+            ...     {
+            ...         "stamp": pd.to_datetime(["2024-05-03 10:00", "2024-05-03 10:01"]),
+            ...         "mx [mG]": [200, 210],
+            ...         "my [mG]": [0, 1],
+            ...         "mz [mG]": [5, 5],
+            ...     }
+            ... )
+            >>> recording = Recording.from_frame(frame)
+            >>> recording.time, recording["mag_x"]
+            (tensor([ 0., 60.], dtype=torch.float64), tensor([20., 21.], dtype=torch.float64))
         """
-        found = columns_of_frame(frame, columns or {}, ASKED, name)
-        return cls(found.columns, name=name, units=units, warnings=found.warnings, labels=found.labels)
+        topics = [Topic("", table_of_frame(frame, name))]
+        if recognise:
+            topics = with_row_sensors(topics)
+        found = reading_of(
+            Path(name or "the frame"),
+            topics,
+            ASKED,
+            columns=columns,
+            units=units,
+            sensor=sensor,
+            recognise=recognise,
+            what="frame",
+        )
+        return cls(found.columns, name=name, units=found.units, warnings=found.warnings, labels=found.labels)
 
     @property
     def columns(self) -> Mapping[str, Tensor]:

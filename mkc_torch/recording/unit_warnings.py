@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+import re
 
 import torch
 from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.recording.recording import Recording
+from mkc_torch.recording.unit_words import conversion
 
-__all__ = ["RECORDED", "field_size", "field_warning", "likely_unit", "time_warning", "unit_warnings"]
+__all__ = ["RECORDED", "converted_from", "field_size", "field_warning", "likely_unit", "time_warning", "unit_warnings"]
 
 RECORDED = "recorded units"
 """What measurements are in whose size does not fit the unit that they were taken for."""
@@ -19,6 +21,8 @@ _AXES = "xyz"
 
 _FIELD = (10.0, 200.0)
 """The Earth's field in µT is 22 to 67; iron nearby and a sensor's gains change it."""
+
+_EARTH = (20.0, 70.0)
 
 _GUESSES = (
     (1e-5, 1e-4, "tesla (1 T = 1000000 µT)", "tesla"),
@@ -69,7 +73,9 @@ def _field(recording: Recording) -> str | None:
     size = field_size(recording)
     if size is None:
         return None
-    return field_warning(size, recording.units["mag_x"], "magnetometer measures about", "sizes of effects")
+    return field_warning(
+        size, recording.units["mag_x"], "magnetometer measures about", "sizes of effects", converted_from(recording)
+    )
 
 
 def field_size(recording: Recording) -> float | None:
@@ -119,7 +125,20 @@ def _center(field: Tensor) -> Tensor:
     return middle + size * known[:3]
 
 
-def field_warning(size: float, unit: str, what: str, numbers: str) -> str | None:
+def converted_from(recording: Recording) -> str:
+    """The unit that the magnetometer was converted from; empty where it was not.
+
+    Example:
+        >>> import torch
+        >>> told = ("`mag_x`, `mag_y`, `mag_z`: converted from gauss, as the file says, to µT.",)
+        >>> converted_from(Recording({"mag_x": torch.zeros(3)}, warnings=told))
+        'gauss'
+    """
+    found = [re.match(r"`mag_x`.*: converted from (\S+), ", sentence) for sentence in recording.warnings]
+    return next((one[1] for one in found if one), "")
+
+
+def field_warning(size: float, unit: str, what: str, numbers: str, before: str = "") -> str | None:
     """A sentence about a field that is in another unit than is said; None where it may be right.
 
     Args:
@@ -127,6 +146,7 @@ def field_warning(size: float, unit: str, what: str, numbers: str) -> str | None
         unit: that is said; any but µT is believed.
         what: the subject and verb of the sentence.
         numbers: what is in the columns' own unit.
+        before: the unit that was said, and that the columns were converted from.
 
     Example:
         >>> field_warning(46.0, "µT", "radius is", "offset") is None
@@ -136,6 +156,13 @@ def field_warning(size: float, unit: str, what: str, numbers: str) -> str | None
     """
     if unit != "µT" or _FIELD[0] <= size <= _FIELD[1]:
         return None
+    if before:
+        option = _other_unit(size, before)
+        mend = f"; say `--unit mag={option}` if that is what they are in" if option else ""
+        return (
+            f"The {what} {_shown(size)} µT, which is not the size of the Earth's field, since the columns "
+            f"were converted from {before}; they may be in another unit than was said{mend}."
+        )
     guess = _guess(size)
     likely = "these may be raw counts" if guess is None else f"in {guess[0]} it would be"
     option = "name the unit with `--unit`, or" if guess is None else f"say `--unit mag={guess[1]}` if it is, or"
@@ -143,6 +170,17 @@ def field_warning(size: float, unit: str, what: str, numbers: str) -> str | None
         f"The {what} {_shown(size)} µT, which is not the size of the Earth's field; {likely}. Nothing was converted: "
         f"{option} convert the columns; {numbers} are in the columns' own unit."
     )
+
+
+def _other_unit(size: float, before: str) -> str:
+    """The unit in which the numbers would be the Earth's field; empty where there is none."""
+    known = conversion("mag", before)
+    raw = size / float(known.factor) if known is not None else math.nan
+    for option in ("uT", "gauss", "mG", "nT", "tesla", "mT"):
+        other = conversion("mag", option)
+        if other is not None and _EARTH[0] <= raw * float(other.factor) <= _EARTH[1]:
+            return option
+    return ""
 
 
 def likely_unit(size: float) -> tuple[str, str] | None:

@@ -53,7 +53,7 @@ class Conversion(NamedTuple):
 
 _Words = Mapping[str, tuple["Fraction | int | float", str]]
 _MAG: _Words = {
-    "µT": (1, "ut utesla microtesla microteslas"),
+    "µT": (1, "ut utesla microtesla microteslas æt âut \ufffdt ?t 10^-6t 1e-6t"),
     "nT": (Fraction(1, 1000), "nt ntesla nanotesla nanoteslas"),
     "mT": (1000, "mt mtesla millitesla milliteslas"),
     "tesla": (10**6, "t tesla teslas"),
@@ -65,7 +65,10 @@ _WORDS: Mapping[str, _Words] = {
         "s": (1, "s sec secs second seconds"),
         "ms": (Fraction(1, 10**3), "ms msec msecs milli millis millisecond milliseconds"),
         "µs": (Fraction(1, 10**6), "us usec usecs micro micros microsecond microseconds"),
-        "ns": (Fraction(1, 10**9), "ns nsec nsecs nano nanos nanosecond nanoseconds"),
+        "ns": (Fraction(1, 10**9), "ns nsec nsecs nano nanos nanosecond nanoseconds nanosec"),
+        "min": (60, "min mins minute minutes"),
+        "h": (3600, "h hr hrs hour hours"),
+        "days": (86_400, "d day days"),
     },
     "mag": _MAG,
     "field": _MAG,
@@ -134,6 +137,8 @@ def known_units(quantity: str) -> str:
 
 def _tidied(text: str) -> str:
     """A unit's spelling without what differs between hands: micro signs, blanks, raised digits, capitals.
+
+    A µ that was read in another encoding than it was written in is one: æT, ÂµT, �T.
 
     Nothing is measured in megatesla or megaseconds, so that capitals say nothing.
     """

@@ -161,7 +161,7 @@ def test_absent_file_unknown_kind_and_folder(tmp_path):
     refused(mkc("calibrate", tmp_path / "a.xyz", *out), ".xyz", ".csv")
     (tmp_path / "b.csv").mkdir()
     refused(mkc("calibrate", tmp_path / "b.csv", *out), "this is a folder")
-    (tmp_path / "c.csv").write_bytes(b"mag_x\n\x80\n")
+    (tmp_path / "c.csv").write_bytes(b"mag_x\n\x81\n")
     refused(mkc("calibrate", tmp_path / "c.csv", *out), "UTF-8")
 
 

@@ -15,6 +15,7 @@ from tests.docs.pages import PAGES, README, ROOT, anchors, blocks, inline, links
 
 MANUAL = {
     "architecture.md",
+    "bad_inputs.md",
     "calibrate.md",
     "diagnose.md",
     "estimators.md",

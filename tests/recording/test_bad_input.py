@@ -42,8 +42,14 @@ BAD = {
     "one row that is cut": (HEAD + "0,1,2\n", "no rows of numbers.*cut short.*line 2"),
     "prose": ("Once upon a time there was\na sensor, in a box.\n", "no column holds numbers|header names|no rows"),
     "binary": (bytes(range(256)) * 16, "not text|not UTF-8"),
-    "an archive": (b"PK\x03\x04\x14\x00\x06\x00\x08\x00" + bytes(range(64)) * 9, "not text|not UTF-8|UTF-16"),
-    "windows-1252": (b"time,mag_x\n0,\x93one\x94\n", "line 2 holds the byte 0x93; export it as CSV in UTF-8"),
+    "an archive": (
+        b"PK\x03\x04\x14\x00\x06\x00\x08\x00" + bytes(range(64)) * 9,
+        "begins as a ZIP archive does; unpack it first",
+    ),
+    "an encoding that is not known": (
+        b"time,mag_x\n0,\x81one\x94\n",
+        "line 2 holds the byte 0x81; export it as CSV in UTF-8",
+    ),
     "broken UTF-16": (b"\xff\xfe" + "time\n".encode("utf-16-le") + b"\x00\xdc" * 4, "begins as UTF-16 does.*UTF-8"),
     # the header
     "no header": (ROWS, "the first line holds numbers; it must hold the column names"),
@@ -76,7 +82,7 @@ BAD = {
         "may be decimals or thousands; write decimals with a point",
     ),
     # time
-    "a day as people write it": (changed(2, "03.05.2024,1,2,3"), 'column `time` holds text at line 2, "03.05.2024"'),
+    "a day as people write it": (changed(2, "3 May,1,2,3"), 'column `time` holds text at line 2, "3 May"'),
     "a day that is none": (
         HEAD + "2024-02-30T10:00:00,1,2,3\n2024-02-30T10:00:01,1,2,3\n",
         'column `time` holds text at line 2, "2024-02-30T10:00:00"; write times as seconds, or as',

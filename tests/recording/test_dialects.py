@@ -107,7 +107,7 @@ def test_every_skipped_line_is_told_with_its_number(tmp_path):
     told = " ".join(read(tmp_path, Dialect(comments=2, above=1, among=True, header_again=True, cut=True)).warnings)
     for words in (
         '3 comment lines skipped, the first line 1, "# recorded by a logger, 0"',
-        '1 line above the header skipped, the first line 3, "Logger v1.3"',
+        '1 line above the first row skipped, the first line 3, "Logger v1.3"',
         "The header stands again in line",
         '1 line of text before it skipped, the first line 56, "Logger v1.3"',
         "The last line is cut short and left out, line 68",

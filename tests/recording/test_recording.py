@@ -462,7 +462,7 @@ def test_renaming_an_absent_column_lists_those_present(tmp_path):
         ('time,a\n0,"1\n1,2\n', "line 2 has a quotation mark that does not end"),
         ("time,mag_x\n0,1\n\n1,abc\n2,def\n", 'column `mag_x` holds text at line 4, "abc"'),
         ("time,mag_x\n0,up\n1,down\n", 'column `mag_x` holds text at line 2, "up"'),
-        ("time,a\n01.02.2024,1\n", 'column `time` holds text at line 2, "01.02.2024"; times are numbers, in seconds'),
+        ("time,a\nyesterday,1\n", 'column `time` holds text at line 2, "yesterday"; times are numbers, in seconds'),
         ("time,a\n0,1\n1,bad\n", 'column `a` holds text at line 3, "bad"; correct it, or write nan'),
         ("time;a\n0.5;1\n1;2,5\n", 'column `a` holds text at line 3, "2,5"; write decimals with a point'),
         ("a,b\nx,y\n", "no column holds numbers"),
@@ -493,7 +493,9 @@ def test_a_folder_is_refused(tmp_path):
 
 @pytest.mark.parametrize(("name", "kind"), [("rec.xlsx", "files ending in .xlsx"), ("rec", "files without an ending")])
 def test_an_unknown_ending_lists_what_can_be_read(tmp_path, name, kind):
-    with pytest.raises(RecordingError, match=rf"{kind} are not known; known are \.csv, \.tsv, \.txt, \.parquet"):
+    with pytest.raises(
+        RecordingError, match=rf"{kind} are not known; .*; known are \.csv, \.tsv, \.txt, \.dat, \.asc, \.parquet"
+    ):
         read(tmp_path, "a\n1\n", name)
 
 

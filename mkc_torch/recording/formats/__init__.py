@@ -33,6 +33,13 @@ __all__ = [
 FORMATS: tuple[FileFormat, ...] = (CSV, PARQUET, ULOG, DATAFLASH, MCAP, ROSBAG1, ROSBAG2, MAT, HDF5, MDF)
 """All formats; the ending of a file says which it is of."""
 
+_ADVICE = (
+    ((".gz", ".zip", ".7z", ".bz2", ".xz", ".zst", ".tar", ".tgz", ".rar"), "unpack it first"),
+    ((".xlsx", ".xls", ".ods", ".numbers"), "export the sheet as CSV"),
+    ((".json", ".jsonl", ".xml", ".html", ".yaml"), "export it as CSV"),
+)
+_RENAME = "if it is text with separators, rename it to end in .csv"
+
 _WRITTEN = "a .csv or a .parquet"
 
 
@@ -84,7 +91,8 @@ def _format_of(path: Path) -> FileFormat:
     by_ending = {ending: file_format for file_format in FORMATS for ending in file_format.endings}
     if path.suffix.lower() not in by_ending:
         kind = f"files ending in {path.suffix}" if path.suffix else "files without an ending"
-        raise RecordingError(f"{path}: {kind} are not known; known are {', '.join(by_ending)}.")
+        advice = next((what for endings, what in _ADVICE if path.suffix.lower() in endings), _RENAME)
+        raise RecordingError(f"{path}: {kind} are not known; {advice}; known are {', '.join(by_ending)}.")
     return by_ending[path.suffix.lower()]
 
 

@@ -21,7 +21,13 @@ __all__ = [
     "polars",
 ]
 
-MISSING_WORDS = ["na", "n/a", "null"]
+MISSING_WORDS = [
+    "na", "n/a", "null", "none", "nil", "<na>", "#n/a", "#na", "#value!", "#num!", "#div/0!", "1.#qnan", "-1.#ind",
+    "1.#ind",
+]  # fmt: skip
+MISSING_SIGNS = ["-", "--", "---", "?"]
+"""What stands for a missing value among numbers; elsewhere it may be a name or a unit."""
+
 MISSING = ["", "nan", "-nan", *MISSING_WORDS]
 """Cells without a value, in lower case; C's printf writes -nan."""
 

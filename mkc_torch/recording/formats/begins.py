@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mkc_torch.recording.formats.base import RecordingError
 
-__all__ = ["begins_with", "check_begins", "foreign"]
+__all__ = ["begins_with", "check_begins", "foreign", "is_of_another_kind"]
 
 _BEGINS: tuple[tuple[bytes, str, str], ...] = (
     (b"ULog\x01\x12\x35", "a PX4 ULog", ".ulg"),
@@ -41,6 +41,17 @@ def check_begins(path: Path, what: str, *magic: bytes) -> None:
     """
     if not begins_with(path, *magic):
         raise foreign(path, what)
+
+
+def is_of_another_kind(data: bytes) -> bool:
+    """Whether what should be text begins as one of these, and is no text that only has the same letters.
+
+    Example:
+        >>> is_of_another_kind(b"\\x1f\\x8b\\x08\\x00"), is_of_another_kind(b"MATLAB export\\ntime,mag_x")
+        (True, False)
+    """
+    same = data.startswith(tuple(magic for magic, _, _ in _BEGINS))
+    return same and any(byte < 9 or byte > 126 for byte in data[:4096])
 
 
 def foreign(path: Path, what: str) -> RecordingError:

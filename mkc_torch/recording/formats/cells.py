@@ -9,6 +9,7 @@ from typing import Any
 
 from mkc_torch.recording.formats.base import (
     MISSING,
+    MISSING_SIGNS,
     MISSING_WORDS,
     MissingColumnError,
     RecordingError,
@@ -55,7 +56,7 @@ def as_numbers(series: Any) -> tuple[Any, Any]:
     package = polars()
     if series.dtype == package.String:
         text = series.str.strip_chars()
-        missing = text.is_null() | text.str.to_lowercase().is_in(MISSING)
+        missing = text.is_null() | text.str.to_lowercase().is_in([*MISSING, *MISSING_SIGNS])
         numbers = text.cast(package.Float64, strict=False)
         return numbers, numbers.is_null() & ~missing
     if series.dtype.is_numeric() or series.dtype in (package.Boolean, package.Null):
@@ -69,7 +70,7 @@ def missing_warning(table: Table, name: str, series: Any) -> str | None:
     if series.dtype != package.String:
         return None
     cells = series.str.strip_chars()
-    words = cells.str.to_lowercase().is_in(MISSING_WORDS)
+    words = cells.str.to_lowercase().is_in([*MISSING_WORDS, *MISSING_SIGNS])
     count = int(words.sum() or 0)
     if not count:
         return None
@@ -91,7 +92,7 @@ def numbered(series: Any) -> tuple[Any, list[str]]:
 def text_error(path: Path, table: Table, name: str, series: Any, row: int, advice: str = "") -> RecordingError:
     text = str(series[row]).strip()
     kind = "text" if series.dtype == polars().String else "no number"
-    if is_number(text.replace(",", ".")):
+    if "," in text and is_number(text.replace(",", ".")):
         advice = "write decimals with a point"
     advice = advice or "correct it, or write nan where there is no value"
     shown = text if len(text) <= 40 else text[:39] + "…"

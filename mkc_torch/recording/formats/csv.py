@@ -15,12 +15,18 @@ from mkc_torch.recording.formats.base import FileFormat, RecordingError, Table, 
 from mkc_torch.recording.formats.text_cells import WHITE, cells_of
 from mkc_torch.recording.formats.text_layout import layout_of
 from mkc_torch.recording.formats.text_lines import Line, lines_of
+from mkc_torch.recording.formats.text_numbers import without_thousands, without_units
 
 __all__ = ["CSV"]
 
 _COMMA = r"^\s*[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?\s*$"
 _POINT = r"^\s*[+-]?(\d+\.\d*|\.\d+)([eE][+-]?\d+)?\s*$"
 _THOUSANDS = r"^\s*[+-]?[1-9]\d{0,2},\d{3}\s*$"
+
+_COMMA_SECONDS = re.compile(r"(?<=\d:\d\d:\d\d),(?=\d{1,9}(?:,|\s*$))")
+"""As Python's logging writes times."""
+
+_EXAMPLE = "add a first line such as time,mag_x,mag_y,mag_z"
 
 _BOTH_SIGNS = 5
 """Rows of either sign from which a column is taken to go through nought."""
@@ -34,19 +40,45 @@ def topic(path: Path) -> Topic:
     """
     package = polars()
     lines, warnings = lines_of(path)
+    lines, more = _plainly_quoted(lines)
+    warnings += more
     layout = layout_of(path, lines)
     names = [name.strip() for name in layout.names]
     if all(is_number(name) for name in names):
-        raise RecordingError(f"{path}: the first line holds numbers; it must hold the column names.")
+        raise RecordingError(f"{path}: the first line holds numbers; it must hold the column names: {_EXAMPLE}.")
     body, separator = _body(layout.rows, layout.separator)
     try:
         frame = package.read_csv(body, separator=separator, has_header=False, infer_schema=False)
     except package.exceptions.PolarsError as error:
         raise RecordingError(f"{path}: the table cannot be read: {str(error).splitlines()[0]}") from error
     numbers = [line.number for line in layout.rows]
-    series, told = _with_points(path, names, frame.get_columns(), numbers)
-    units = {name: unit.strip(" []()") for name, unit in zip(names, layout.units, strict=False) if unit.strip(" -[]()")}
+    grouped, thousands = without_thousands(frame.get_columns())
+    series, told = _with_points(path, names, grouped, numbers)
+    told = ["Signs between thousands were taken out of the numbers.", *told] if thousands else told
+    bare = [without_units(one) for one in series]
+    series = [one for one, _ in bare]
+    units = {name: unit for name, (_, unit) in zip(names, bare, strict=True) if unit}
+    units |= {
+        name: unit.strip(" []()") for name, unit in zip(names, layout.units, strict=False) if unit.strip(" -[]()")
+    }
     return Topic("", Table(names, series, numbers), units, (*warnings, *layout.warnings, *told), layout.restarts)
+
+
+def _plainly_quoted(lines: list[Line]) -> tuple[list[Line], list[str]]:
+    """Lines whose cells are not in single quotes, nor have commas before the parts of a second, and what was done."""
+    told = []
+    if len(lines) > 1 and all(
+        line.text[:1] == line.text.rstrip()[-1:] == "'" and '"' not in line.text for line in lines
+    ):
+        lines = [line._replace(text=line.text.replace("'", '"')) for line in lines]
+    stamped = [line for line in lines if _COMMA_SECONDS.search(line.text)]
+    if 2 * len(stamped) > len(lines):
+        row, names = stamped[len(stamped) // 2].text, [line.text for line in lines if line not in stamped]
+        commas = row.count(",") - len(_COMMA_SECONDS.findall(row))
+        if row.count(";") + row.count("\t") == 0 and any(name.count(",") == commas for name in names[:20]):
+            lines = [line._replace(text=_COMMA_SECONDS.sub(".", line.text)) for line in lines]
+            told.append("A comma before the parts of a second was read as a point.")
+    return lines, told
 
 
 def _body(rows: list[Line], separator: str) -> tuple[bytes, str]:
@@ -113,4 +145,4 @@ def _needs_quotes(names: Sequence[str]) -> bool:
     return any(re.search(r'[,;\t|"]', name) for name in names) or names[0].startswith(("#", "%", "//"))
 
 
-CSV = FileFormat((".csv", ".tsv", ".txt"), lambda path: [topic(path)], encoded)
+CSV = FileFormat((".csv", ".tsv", ".txt", ".dat", ".asc"), lambda path: [topic(path)], encoded)

@@ -8,8 +8,19 @@ from collections import Counter
 from collections.abc import Sequence
 
 from mkc_torch.recording.formats.base import MISSING
+from mkc_torch.recording.formats.text_numbers import is_written_number
 
-__all__ = ["SEPARATORS", "WHITE", "cells_of", "count_of", "is_stamp", "is_value", "separator_of"]
+__all__ = [
+    "SEPARATORS",
+    "WHITE",
+    "cells_of",
+    "count_of",
+    "is_date",
+    "is_stamp",
+    "is_time_of_day",
+    "is_value",
+    "separator_of",
+]
 
 WHITE = " "
 SEPARATORS = {",": "comma", ";": "semicolon", "\t": "tab", "|": "bar", WHITE: "space"}
@@ -24,7 +35,9 @@ _LOOKED_AT = 120
 """Lines at the beginning and in the middle by which the separator is found."""
 
 _NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?|[+-]?(inf|infinity)", re.IGNORECASE)
-_STAMP = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d.*)?|\d{8}T\d\d.*|\d{1,2}:\d\d(:\d\d([.,]\d+)?)?")
+_DATE = r"\d{4}-\d\d-\d\d|\d{4}([/.]\d{1,2}){2}|(\d{1,2}[/.]){2}\d{4}|\d{1,2}-[A-Za-z]{3}-\d{4}"
+_OF_DAY = r"(\d{1,2}:\d\d(:\d\d([.,]\d+)?)?(\s?[AaPp]\.?[Mm]\.?)?|\d{1,3}:\d\d[.,]\d+)"
+_STAMP = re.compile(rf"({_DATE})(,?[T ]\s*\d{{1,2}}.*)?|\d{{8}}T\d\d.*|{_OF_DAY}")
 _WHITE_WORDS = re.compile(r'"[^"]*"|[^\s"]+(?:\s*[\[(][^\])]*[\])])?')
 """Between blanks; a unit in brackets belongs to the word before it."""
 
@@ -54,13 +67,26 @@ def is_value(cell: str) -> bool:
     """
     cell = cell.strip()
     return bool(cell) and (
-        _NUMBER.fullmatch(cell) is not None or cell.lower() in MISSING or _STAMP.fullmatch(cell) is not None
+        _NUMBER.fullmatch(cell) is not None
+        or cell.lower() in MISSING
+        or _STAMP.fullmatch(cell) is not None
+        or is_written_number(cell)
     )
 
 
 def is_stamp(cell: str) -> bool:
     """Whether a cell holds a date, or a time of the day."""
     return _STAMP.fullmatch(cell.strip()) is not None
+
+
+def is_date(cell: str) -> bool:
+    """Whether a cell holds a date alone."""
+    return re.fullmatch(_DATE, cell.strip()) is not None
+
+
+def is_time_of_day(cell: str) -> bool:
+    """Whether a cell holds a time of the day alone."""
+    return re.fullmatch(_OF_DAY, cell.strip()) is not None
 
 
 def separator_of(lines: Sequence[str]) -> tuple[str, int]:

@@ -19,6 +19,9 @@ _DIGITS = frozenset("0123456789+-.")
 _CUT_NUMBER = re.compile(r"[+-]?(\d*[.,]?\d*([eE][+-]?)?|na?|in?)")
 """What is left of a number that ended anywhere."""
 
+_MANY = 10
+"""Lines from which it is the header that is wrong."""
+
 _FIXED, _MOST = 20, 300
 """Rows from which as many decimals everywhere are the format's, and how many are looked at."""
 
@@ -66,11 +69,13 @@ def layout_of(path: Path, lines: list[Line]) -> Layout:
         warnings.append(f"{counted(len(told), 'comment line')} skipped, the first {_shown(told[0])}.")
     if head.above:
         warnings.append(
-            f"{counted(len(head.above), 'line')} above the header skipped, the first {_shown(head.above[0])}."
+            f"{counted(len(head.above), 'line')} above the first row skipped, the first {_shown(head.above[0])}."
         )
     if not rows:
         why = f" {' '.join(skipped)}" if skipped else ""
-        raise RecordingError(f"{path}: the file has a header line but no rows of numbers.{why}")
+        raise RecordingError(
+            f"{path}: the file has a header line but no rows of numbers; copy it whole, or export it anew.{why}"
+        )
     return Layout(separator, head.names, head.units, rows, restarts, warnings + skipped)
 
 
@@ -94,7 +99,9 @@ def _is_marked(text: str) -> bool:
 def _head(path: Path, plain: list[Line], comments: list[Line], separator: str, count: int) -> _Head:
     """Find the header: the last line of names above the first row, or a comment there, or names further down."""
     if not plain:
-        raise RecordingError(f"{path}: the file has a header line but no rows of numbers.")
+        raise RecordingError(
+            f"{path}: the file has a header line but no rows of numbers; copy it whole, or export it anew."
+        )
 
     def split(line: Line) -> list[str]:
         return cells_of(line.text, separator)
@@ -107,6 +114,8 @@ def _head(path: Path, plain: list[Line], comments: list[Line], separator: str, c
     header = _last_unique(names, split)
     if header is None:
         return _unusual_head(path, plain, comments, first, separator, count)
+    if units is None:
+        units = next((line for line in names if line.number < header.number and _are_units(split(line))), None)
     used = {header.number} | ({units.number} if units else set())
     above = [line for line in plain[:first] if line.number not in used]
     return _Head(
@@ -146,7 +155,10 @@ def _unusual_head(path: Path, plain: list[Line], comments: list[Line], first: in
             above = plain[:first]
             return _Head(separator, cells, line.text.strip(), [], "", {one.number for one in above}, above)
     if first == 0:
-        raise RecordingError(f"{path}: the first line holds numbers; it must hold the column names.")
+        raise RecordingError(
+            f"{path}: the first line holds numbers; it must hold the column names: add a first line such as "
+            "time,mag_x,mag_y,mag_z."
+        )
     line = plain[first - 1]
     used = {one.number for one in plain[:first]}
     return _Head(separator, cells_of(line.text, separator), line.text.strip(), [], "", used, plain[: first - 1])
@@ -212,8 +224,12 @@ def _rows(path: Path, head: _Head, body: list[Line]) -> tuple[list[Line], tuple[
     cut: list[Line] = []
     between: list[Line] = []
     count = len(head.names)
+    broken: list[Line] = []
     for line in body:
         text = line.text.strip()
+        if line.cut and not text.endswith(head.text):
+            broken.append(line)
+            continue
         if text == head.text or (len(head.text) > 2 and text.endswith(head.text)):
             if text != head.text:
                 pending.append(Line(line.number, text.removesuffix(head.text)))
@@ -240,11 +256,14 @@ def _rows(path: Path, head: _Head, body: list[Line]) -> tuple[list[Line], tuple[
             pending.append(line)
     last = _last_cut(head, rows, pending)
     if pending and last is not pending[0]:
-        raise _strange(path, head, pending[0])
+        raise _strange(path, head, pending[0], len(pending))
     if last is not None and last not in pending:
         rows.remove(last)
     begins = tuple(row for row in dict.fromkeys(at) if row < len(rows))
-    return rows, begins, _told(restarts, at, cut, between, last)
+    told = _told(restarts, at, cut, between, last)
+    if broken:
+        told.append(f"{counted(len(broken), 'line')} cut short by zero bytes left out, the first {_shown(broken[0])}.")
+    return rows, begins, told
 
 
 def _told(restarts: list[Line], at: list[int], cut: list[Line], between: list[Line], last: Line | None) -> list[str]:
@@ -301,17 +320,18 @@ def _decimals(cell: str) -> int:
     return 99 if found is None else len(found[1] or "")
 
 
-def _strange(path: Path, head: _Head, line: Line) -> RecordingError:
+def _strange(path: Path, head: _Head, line: Line, alike: int = 1) -> RecordingError:
     if count_of(line.text, head.separator) == len(head.names):
         return RecordingError(
             f"{path}: line {line.number} holds words and no numbers, {_quoted(line)}: another header, or text; split "
             "the file there, or remove the line."
         )
     count = count_of(line.text, head.separator)
+    mend = "correct or remove that line" if alike < _MANY else "other lines are like it, so correct the header"
     return RecordingError(
         f"{path}: line {line.number} has {counted(count, 'value')} but the header names "
-        f"{counted(len(head.names), 'column')} (the separator is the {SEPARATORS[head.separator]}); correct or remove "
-        f"that line.{_comma_advice(head, line)}"
+        f"{counted(len(head.names), 'column')} (the separator is the {SEPARATORS[head.separator]}); {mend}."
+        f"{_comma_advice(head, line)}"
     )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mkc_torch.recording.formats.base import RecordingError, counted
+from mkc_torch.recording.formats.begins import foreign, is_of_another_kind
 
 __all__ = ["Line", "lines_of"]
 
@@ -15,14 +16,17 @@ _SAMPLE = 4096
 _UTF_16 = 0.4
 """Share of zero bytes at the even, or at the odd, places from which text without a mark is UTF-16: ASCII has 1."""
 
+_FEW_CUTS = 3
+
 _PLAIN = {"\t", "\n", "\r", "\f", "\0", "\x1a"}
 
 
 class Line(NamedTuple):
-    """A line that is not blank, and its number in the file, from 1."""
+    """A line that is not blank, its number in the file, from 1, and whether zero bytes took its end."""
 
     number: int
     text: str
+    cut: bool = False
 
 
 def lines_of(path: Path) -> tuple[list[Line], list[str]]:
@@ -34,7 +38,13 @@ def lines_of(path: Path) -> tuple[list[Line], list[str]]:
     Raises:
         RecordingError: the file is no text, or holds none.
     """
-    text, warnings = _decoded(path, path.read_bytes())
+    data = path.read_bytes()
+    if is_of_another_kind(data):
+        raise foreign(path, "text")
+    text, warnings = _decoded(path, data)
+    if "\u2212" in text:
+        text = text.replace("\u2212", "-")
+        warnings.append("Typographic minus signs were read as minus signs.")
     lines: list[Line] = []
     zeros: list[int] = []
     for number, line in enumerate(io.StringIO(text, newline=None), start=1):
@@ -42,9 +52,12 @@ def lines_of(path: Path) -> tuple[list[Line], list[str]]:
         if "\0" in line or "\x1a" in line:
             zeros.append(number)
             parts = line.replace("\x1a", "\0").split("\0")
-            lines += [Line(number, part) for part in parts if part.strip()]
+            ends = [place < len(parts) - 1 and bool("".join(parts[:-1])) for place in range(len(parts))]
+            lines += [Line(number, part, cut) for part, cut in zip(parts, ends, strict=True) if part.strip()]
         elif line.strip():
             lines.append(Line(number, line))
+    if sum(line.cut for line in lines) > max(_FEW_CUTS, len(lines) // 100):  # a program's way of ending lines
+        lines = [line._replace(cut=False) for line in lines]
     if zeros:
         warnings.append(
             f"Zero bytes, as a power-off leaves them, are skipped in {counted(len(zeros), 'line')}, the first "
@@ -97,6 +110,12 @@ def _latin_1(path: Path, data: bytes, start: int) -> tuple[str, list[str]]:
     line = 1 + data[:start].count(b"\n")
     strange = sorted({byte for byte in data if byte >= 0x80})
     if any(byte < 0xA0 for byte in strange):
+        try:
+            text = data.decode("cp1252")
+        except UnicodeDecodeError:
+            text = ""
+        if text and all(one.isprintable() or one in _PLAIN for one in text):
+            return text, [f"The file is not UTF-8 and was read as Windows-1252, first in line {line}."]
         raise RecordingError(
             f"{path}: the file is not UTF-8 text: line {line} holds the byte 0x{data[start]:02x}; export it as CSV in "
             "UTF-8."
