@@ -5,7 +5,9 @@ Source: docs.px4.io, "ULog File Format".
 
 from __future__ import annotations
 
+import io
 import mmap
+import os
 import re
 from collections import Counter
 from pathlib import Path
@@ -23,6 +25,10 @@ _MAGIC = b"ULog\x01\x12\x35"
 _HEADER = 16
 _MOST_FIELDS = 65536
 _DEEPEST = 8
+_LOOK, _MOST_READS = 4096, 4
+"""Reads after which, and reads a byte from which, it is known that a file is read in a circle: a message is two reads,
+and a step of one byte over damage is two."""
+
 _FIELD = re.compile(r"(?P<kind>\w+)(\[(?P<count>\d{1,9})\])? ")
 _KINDS = frozenset(b"BFIMPQAARDLCSO")
 """Kinds of messages of the specification; all others are damage, or a version to come."""
@@ -45,7 +51,7 @@ def read(path: Path) -> list[Topic]:
         raise ImportError(
             'ULog files are read with pyulog; install it with `pip install "mkc-torch[ulog]"`.'
         ) from error
-    with guarded(path, "PX4 ULog"), path.open("rb") as file:
+    with guarded(path, "PX4 ULog"), _GoingOn(path.open("rb", buffering=0)) as file:
         walk = _walk(path)
         log = pyulog.ULog(file)
         warnings = _losses(log, walk)
@@ -53,6 +59,18 @@ def read(path: Path) -> list[Topic]:
     if not topics:
         raise no_rows(path, "PX4 ULog", warnings)
     return with_warnings(_named_once(topics), warnings)
+
+
+class _GoingOn(io.BufferedReader):
+    """A file that is read to its end in a while: pyulog steps back from damage, over some again and again."""
+
+    _reads = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        self._reads += 1
+        if self._reads % _LOOK == 0 and self._reads > _MOST_READS * os.fstat(self.fileno()).st_size:
+            raise RuntimeError("its messages lead round in a circle")
+        return super().read(size)
 
 
 def _topic(data: Any) -> Topic | None:

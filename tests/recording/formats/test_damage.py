@@ -161,6 +161,14 @@ def test_an_hdf5_file_that_leads_its_library_round_in_a_circle_is_damaged(tmp_pa
     assert "is damaged; copy it anew" in rows_or_sentence(path)[1]
 
 
+def test_a_ulog_that_ends_within_an_unknown_message_leads_nobody_round_in_a_circle(tmp_path):
+    pytest.importorskip("pyulog")
+    path = tmp_path / "log.ulg"
+    flags = b"\x28\x00B" + bytes(40)
+    path.write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8) + flags + b"\x20\x00\x00" + b"\x01" * 5)
+    assert "copy it anew" in rows_or_sentence(path)[1]
+
+
 MAGIC = {
     ".ulg": b"ULog\x01\x12\x35\x01",
     ".bin": b"\xa3\x95\x80",
