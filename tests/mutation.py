@@ -1,26 +1,41 @@
 """Do the tests see a change of the code? `python -m tests.mutation density tests/density -n 40`
 
 Each mutant is one change in one file of a room: an operator or a comparison exchanged, a number moved, a condition
-turned round. The named tests run on a copy of the package with it, until one fails; a mutant that none fails on is
-listed. Mutants are drawn by a seed; without `-n` all are tried. A library such as mutmut puts a switch into each
-function, which torch.compile(fullgraph=True) cannot trace.
+turned round. The named tests run once under coverage; then those that reach the changed statement run on a copy of the
+package with the mutant in it, the quickest first, until one fails. A mutant that none fails on is listed; one that no
+test reaches is tried with all of them. Mutants are drawn by a seed; without `-n` all are tried. A library such as
+mutmut puts a switch into each function, which torch.compile(fullgraph=True) cannot trace.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import compileall
+import contextlib
+import importlib
 import os
+import pickle
+import py_compile
 import random
+import resource
 import shutil
-import subprocess
+import signal
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+PYTEST = ("-q", "-p", "no:cacheprovider", "--assert=plain")  # assertions need no words here, and rewriting takes time
+LOADED = ("torch", "torch._dynamo", "numpy", "scipy.stats", "scipy.optimize", "hypothesis", "sklearn.linear_model")
+SLACK = 30  # seconds that a test may take beyond five times what it takes under coverage
+OUTPUT = Path("output.txt")  # in the copy: what the last tests wrote
+MEMORY = 16 << 30  # bytes of addresses that a mutant may ask for, lest it takes the machine's memory
 OPERATORS: dict[type[ast.operator], type[ast.operator]] = {
     ast.Add: ast.Sub,
     ast.Sub: ast.Add,
@@ -46,11 +61,12 @@ COMPARISONS: dict[type[ast.cmpop], type[ast.cmpop]] = {
 
 
 class Mutant(NamedTuple):
-    """A file, the text it becomes, and the change in words."""
+    """A file of the copy, the text it becomes, the change in words, and the lines of the statement that is changed."""
 
     path: Path
     text: str
     change: str
+    lines: range
 
 
 def _nodes(tree: ast.AST) -> Iterator[ast.AST]:
@@ -77,10 +93,18 @@ def mutant_of(path: Path, number: int) -> Mutant:
     """The mutant of a file with this node changed."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     node = list(_nodes(tree))[number]
-    before = ast.unparse(node)
+    before, lines = ast.unparse(node), _lines_of_statement(tree, node)
     _changed(node)
-    where = f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 0)}"
-    return Mutant(path, ast.unparse(tree), f"{where}  {before}  ->  {ast.unparse(node)}")
+    where = f"{path}:{getattr(node, 'lineno', 0)}"
+    return Mutant(path, ast.unparse(tree), f"{where}  {before}  ->  {ast.unparse(node)}", lines)
+
+
+def _lines_of_statement(tree: ast.AST, node: ast.AST) -> range:
+    """Lines of the innermost statement around a node, without the statements within it."""
+    inner = [one for one in ast.walk(tree) if isinstance(one, ast.stmt) and any(each is node for each in ast.walk(one))]
+    statement = inner[-1]  # ast.walk goes from the outside inwards
+    body = getattr(statement, "body", [])
+    return range(statement.lineno, body[0].lineno if body else statement.end_lineno + 1)
 
 
 def _changed(node: ast.AST) -> bool:
@@ -104,20 +128,127 @@ def _changed(node: ast.AST) -> bool:
     return True
 
 
-def survives(mutant: Mutant, package: Path, tests: list[str], seconds: float) -> bool:
-    """Whether no test fails on a copy of the package with the mutant in it; one that takes too long is seen too."""
-    target = package / mutant.path.relative_to(ROOT)
-    own = target.read_text(encoding="utf-8")
-    target.write_text(mutant.text, encoding="utf-8")
-    environment = os.environ | {"PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
+class Reach(NamedTuple):
+    """What the tests reach: (file, line) to tests or files of tests, and the seconds that each test took."""
+
+    by_line: dict[tuple[str, int], set[str]]
+    seconds: dict[str, float]
+
+    def tests_of(self, mutant: Mutant) -> list[str]:
+        """Tests that run the statement of a mutant, the quickest first."""
+        found = set().union(*(self.by_line.get((str(mutant.path), line), set()) for line in mutant.lines))
+        tests = [test for test in self.seconds if test in found or test.split("::")[0] in found]
+        return sorted(tests, key=self.seconds.__getitem__)
+
+
+class _Recorder:
+    """A plugin of pytest that tells coverage which test runs; what a fixture runs, every test of its file may need."""
+
+    def __init__(self, coverage: Any) -> None:
+        self.coverage = coverage
+        self.seconds: dict[str, float] = {}
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_setup(self, item: pytest.Item) -> Iterator[None]:
+        self.coverage.switch_context(item.nodeid.split("::")[0])
+        return (yield)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self, item: pytest.Item) -> Iterator[None]:
+        self.coverage.switch_context(item.nodeid)
+        return (yield)
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
+
+
+class _Clock:
+    """A plugin of pytest that ends the process when a test takes far longer than it should."""
+
+    def __init__(self, seconds: dict[str, float]) -> None:
+        self.seconds = seconds
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
+        signal.alarm(SLACK + int(5 * self.seconds.get(item.nodeid, 0.0)))
+        return (yield)
+
+
+def reach(tests: list[str]) -> Reach:
+    """Run the tests on the copy as it is, and note what each reaches."""
+    noted = Path("reach.pickle")
+
+    def record() -> int:
+        from coverage import Coverage
+
+        coverage = Coverage(data_file=None, source=["mkc_torch"], config_file=False)
+        recorder = _Recorder(coverage)
+        coverage.start()
+        done = pytest.main([*PYTEST, *tests], plugins=[recorder])
+        coverage.stop()
+        data, by_line = coverage.get_data(), defaultdict(set)
+        for file in data.measured_files():
+            path = str(Path(file).relative_to(Path.cwd()))
+            for line, contexts in data.contexts_by_lineno(file).items():
+                by_line[path, line] |= set(contexts) - {""}
+        noted.write_bytes(pickle.dumps((dict(by_line), recorder.seconds)))
+        return int(done)
+
+    if status := _in_a_fork(record):
+        said = OUTPUT.read_text(encoding="utf-8", errors="replace")[-3000:]
+        raise SystemExit(f"{said}\nthe tests fail on the code as it is, or under coverage (status {status})")
+    return Reach(*pickle.loads(noted.read_bytes()))
+
+
+def survives(mutant: Mutant, tests: list[str], seconds: dict[str, float]) -> bool:
+    """Whether no test fails on the copy with the mutant in it; one that takes too long is seen too."""
+    own = mutant.path.read_text(encoding="utf-8")
+
+    def run() -> int:
+        signal.alarm(SLACK)
+        return int(pytest.main(["-x", *PYTEST, *tests], plugins=[_Clock(seconds)]))
+
+    mutant.path.write_text(mutant.text, encoding="utf-8")
     try:
-        done = subprocess.run(command, cwd=package, env=environment, capture_output=True, check=False, timeout=seconds)
-        return done.returncode == 0
-    except subprocess.TimeoutExpired:
-        return False
+        return _in_a_fork(run) == 0
     finally:
-        target.write_text(own, encoding="utf-8")
+        mutant.path.write_text(own, encoding="utf-8")
+
+
+def _in_a_fork(task: Callable[[], int]) -> int:
+    """What a task returns in a process of its own, which finds torch loaded and the package of this folder not yet."""
+    child = os.fork()
+    if child:
+        _, status = os.waitpid(child, 0)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child, signal.SIGKILL)  # what a test that was broken off had started
+        return status
+    status = 1
+    try:
+        os.setsid()
+        sys.path.insert(0, str(Path.cwd()))
+        del sys.modules["tests"]  # the copy has its own
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        output = os.open(OUTPUT, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        status = task()
+    finally:
+        os._exit(status)
+
+
+def go_to_a_copy(package: Path) -> None:
+    """Copy what the tests need, compiled by content: a file changed twice in a second is compiled anew."""
+    for name in ("mkc_torch", "tests", "pyproject.toml"):
+        (shutil.copytree if (ROOT / name).is_dir() else shutil.copy)(ROOT / name, package / name)
+    by_content = py_compile.PycInvalidationMode.CHECKED_HASH
+    os.chdir(package)
+    compileall.compile_dir(package, quiet=1, invalidation_mode=by_content)
+    os.environ |= {"PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1"}
+    sys.dont_write_bytecode = True
+    for name in LOADED:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
 
 
 def main() -> None:
@@ -127,25 +258,25 @@ def main() -> None:
     parser.add_argument("tests", nargs="+", help="paths of the tests that should see a change")
     parser.add_argument("-n", type=int, default=0, help="how many are drawn; 0 tries all")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=300.0, help="that the tests of one mutant may take")
     asked = parser.parse_args()
-    room = ROOT / "mkc_torch" / asked.room
-    files = sorted(room.rglob("*.py")) if room.is_dir() else [room]
-    found = [place for file in files for place in places(file)]
-    if asked.n:
-        found = random.Random(asked.seed).sample(found, min(asked.n, len(found)))
     left = 0
     with tempfile.TemporaryDirectory() as folder:
-        package = Path(folder)
-        for name in ("mkc_torch", "tests", "pyproject.toml"):
-            (shutil.copytree if (ROOT / name).is_dir() else shutil.copy)(ROOT / name, package / name)
+        go_to_a_copy(Path(folder).resolve())
+        room = Path("mkc_torch", asked.room)
+        files = sorted(room.rglob("*.py")) if room.is_dir() else [room]
+        found = [place for file in files for place in places(file)]
+        if asked.n:
+            found = random.Random(asked.seed).sample(found, min(asked.n, len(found)))
+        reached = reach(asked.tests)
         for number, (path, node) in enumerate(found, start=1):
             mutant = mutant_of(path, node)
-            if survives(mutant, package, asked.tests, asked.seconds):
+            tests = reached.tests_of(mutant)
+            if survives(mutant, tests or asked.tests, reached.seconds):
                 left += 1
-                print(f"survives: {mutant.change}", flush=True)
-            elif number % 10 == 0:
+                print(f"survives {len(tests)} tests: {mutant.change}", flush=True)
+            if number % 10 == 0:
                 print(f"{number} of {len(found)} tried, {left} survive", flush=True)
+        os.chdir(ROOT)
     print(f"{len(found) - left} of {len(found)} were seen, {100 * (1 - left / max(len(found), 1)):.0f} %")
 
 

@@ -241,8 +241,8 @@ def _quantile_chunk(probability: Tensor, kappa: Tensor, length: Tensor) -> Tenso
         inside = (newton > low) & (newton < high)
         following = torch.where(inside, newton, 0.5 * (low + high))
         moved = (following - u).abs()
-        u = torch.where(excess == 0, u, following)
-        if bool(((moved <= tolerance * u.abs()) | (excess == 0)).all()):
+        u = following  # where nothing is in excess, both ends of the bracket
+        if bool((moved <= tolerance * u.abs()).all()):
             break
     u = torch.where(mass >= total, length, u)
     return torch.where(probability < 0.5, -u, u)

@@ -77,9 +77,7 @@ def _log_gap(a: Tensor, q: Tensor, r: Tensor) -> tuple[Tensor, Tensor]:
     gap = r - lost
     valid = gap > 0
     near_one = torch.log1p(-torch.where(gap > 0.5, q + lost, 0.0))
-    value = torch.where(gap > 0.5, near_one, torch.log(torch.where(valid, gap, 1.0)))
-    # without outliers it is log p, where p itself underflows too
-    return torch.where(q == 0, -a, value), valid | (q == 0)
+    return torch.where(gap > 0.5, near_one, torch.log(torch.where(valid, gap, 1.0))), valid
 
 
 def phi(p: Float[Tensor, "*batch"] | float, q: Float[Tensor, "*batch"] | float) -> Float[Tensor, "*batch"]:

@@ -57,6 +57,14 @@ def test_a_domain_without_room_gets_least_squares_and_leaves_the_other_channels_
     torch.testing.assert_close((found.kappa[1], found.d[1]), (alone.kappa[1], alone.d[1]))
 
 
+def test_one_residual_is_two_of_its_size():
+    error, weight = torch.tensor([[0.5, -2.0]]).double(), torch.tensor([[3.0, 1.0]]).double()
+    found = expectation_step(error, weight, **DOMAIN)
+    twice = expectation_step(error.repeat(2, 1), weight.repeat(2, 1), **DOMAIN)
+    torch.testing.assert_close((found.kappa, found.d), (twice.kappa, twice.d))
+    assert bool((found.d > DOMAIN["d_min"]).all())
+
+
 def test_residuals_of_zero_end_at_the_floor():
     found = expectation_step(torch.zeros(50, 2).double(), torch.ones(50, 2).double(), **DOMAIN)
     torch.testing.assert_close(found.d, DOMAIN["d_min"])

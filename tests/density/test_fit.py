@@ -1,5 +1,6 @@
 """The density fit: derivatives equal to automatic ones, the optimum equal to BFGS, and the remarks of the paper."""
 
+import itertools
 import math
 
 import numpy as np
@@ -173,6 +174,31 @@ def test_the_optimum_is_that_of_bfgs(name):
     assert float(fit.d) == pytest.approx(d, rel=1e-3)
 
 
+def test_steps_from_every_edge_of_the_parameters_arrive_at_the_optimum():
+    edges = torch.tensor(list(itertools.product([0.0, 400.0], [0.1, 1.0, 40.0])), dtype=torch.float64)
+    kappa, d = edges.unbind(-1)
+    for name in ("heavy_tailed", "very_heavy_tailed"):
+        error = SAMPLES[name][0].unsqueeze(-1)
+        fit = fit_density(error, bound=40.0, d_min=0.1)
+        log_bound, log_d_min = torch.full_like(d, math.log(40.0)), torch.full_like(d, math.log(0.1))
+        state = DensityState(kappa, torch.log(d), log_bound, log_d_min, torch.full_like(d, 1e-3), d)
+        for _ in range(80):
+            state = newton_step(error.expand(-1, 6), None, state)
+        torch.testing.assert_close(torch.exp(state.log_d), fit.d.expand(6), rtol=1e-6, atol=0)
+        torch.testing.assert_close(state.kappa, fit.sigma.pow(-2).expand(6), rtol=1e-6, atol=0)
+
+
+def test_steps_are_counted_and_a_fit_that_is_cut_short_is_said_not_to_have_converged():
+    error = SAMPLES["one_sided_wide_domain"][0].unsqueeze(-1)
+    cut = fit_density(error, max_iter=3)
+    assert cut.n_iter == 3
+    assert not bool(cut.converged.any())
+    whole = fit_density(error)
+    assert bool(whole.converged.all())
+    assert 3 < whole.n_iter < 50
+    assert float(whole.log_likelihood) > float(cut.log_likelihood)
+
+
 @pytest.mark.parametrize("name", SAMPLES)
 def test_the_log_likelihood_is_the_mean_log_density(name):
     error, bound = SAMPLES[name]
@@ -304,6 +330,13 @@ def test_weight_zero_is_removal(share):
     torch.testing.assert_close(fit.bound, alone.bound)
     torch.testing.assert_close(fit.d, alone.d, rtol=1e-6, atol=0)
     torch.testing.assert_close(fit.sigma, alone.sigma, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+def test_the_unit_of_the_weights_does_not_matter(factor):
+    error, weight = contaminated(0, 60).unsqueeze(-1), uniform(7, 60).unsqueeze(-1)
+    one, other = fit_density(error, weight=weight), fit_density(error, weight=factor * weight)
+    torch.testing.assert_close((one.sigma, one.d), (other.sigma, other.d), rtol=1e-6, atol=0)
 
 
 def test_d_stays_above_its_floor_where_the_likelihood_is_unbounded():

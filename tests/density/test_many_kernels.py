@@ -117,3 +117,10 @@ def test_a_bound_of_one_channel_is_that_of_all():
     both = torch.cat([drawn(0, 1.0), drawn(1, 1.0)], -1)
     of_one, of_each = (fit_kernels(both, bound=torch.full((count,), 90.0)) for count in (1, 2))
     assert of_one.bound.tolist() == of_each.bound.tolist() == [90.0, 90.0]
+
+
+def test_there_is_a_kernel_of_every_octave_up_to_the_bound():
+    bandwidth = fit_kernels(drawn(0, 2.0), bound=300.0).bandwidth[0]
+    torch.testing.assert_close(bandwidth[1:-1], 2.0 * bandwidth[:-2])
+    assert 150.0 < float(bandwidth[-2]) <= 300.0
+    assert math.isinf(float(bandwidth[-1]))

@@ -167,6 +167,30 @@ def test_intervals_cover(estimator, outliers):
     assert 0.925 <= float(covered) <= 0.975
 
 
+@pytest.mark.parametrize(
+    ("estimator", "widest"), [(LeastTrimmedSquares(starts=40), 1.4), (SRegression(starts=40), 1.8)], ids=label
+)
+def test_standard_errors_of_few_samples_are_those_of_the_draws(estimator, widest):
+    """They are widened for few samples, and that is no licence for any width."""
+    X, y = line(5, 80, 4, 200)
+    fit = estimator.fit(X, y)
+    spread = (fit.coef_ - torch.arange(1.0, 5.0, dtype=torch.float64)).square().mean(0).sqrt()
+    ratio = fit.standard_error_.median(0).values / spread
+    assert bool(((ratio > 0.85) & (ratio < widest)).all()), ratio
+
+
+def test_a_prediction_adds_the_scale_of_its_channel_to_the_error_of_the_mean():
+    X, Y = sample(1, 3, 20, 2, 3), sample(2, 3, 20, 2)
+    fit = MEstimator().fit(X, Y * torch.tensor([1.0, 9.0]))
+
+    def half(interval: Tensor) -> Tensor:
+        return 0.5 * (interval[..., 1] - interval[..., 0])
+
+    more = half(fit.prediction_interval(X)).square() - half(fit.mean_interval(X)).square()
+    expected = (fit.scale_ / fit.scale_[:, :1]).square().unsqueeze(-2).expand(-1, 20, -1)
+    torch.testing.assert_close(more / more[..., :1, :1], expected)
+
+
 def test_predictions_of_good_values_are_covered():
     X, y = line(14, 200, 3, 100, outliers=0.1)
     fit = MMRegression(starts=40).fit(X, y)
@@ -235,6 +259,7 @@ def test_p_values_are_uniform_where_the_restrictions_hold():
         (([3],), "numbers below 3 but got 3"),
         (([0.5],), "whole number of at least -3"),
         (([1, 1],), "independent but got 2 of rank 1"),
+        (([],), "independent but got 0 of rank 0"),
         ((torch.ones(2, 4),), r"of shape \(q, 3\) but got \(2, 4\)"),
         (([0, 1], torch.ones(3)), r"of shape \(2,\) but got \(3,\)"),
     ],

@@ -116,6 +116,15 @@ def test_the_gradient_is_that_of_least_squares_on_what_counts():
         torch.testing.assert_close(got, expected)
 
 
+def test_the_least_coverage_is_one_sample_more_than_coefficients():
+    X, y = sample(1, 9, 2), sample(2, 9)
+    assert int(LeastTrimmedSquares(h=3).fit(X, y).weights_.sum()) == 3
+    assert int(LeastTrimmedSquares(h=9).fit(X, y).weights_.sum()) == 9
+    for h in (2, 10):
+        with pytest.raises(ValueError, match=f"`h` between 3 and the 9 samples but got {h}"):
+            LeastTrimmedSquares(h=h).fit(X, y)
+
+
 def test_coverage_of_all_samples_is_least_squares():
     X, y = contaminated_line(0)
     torch.testing.assert_close(LeastTrimmedSquares(h=40).fit(X, y).coef_, LeastSquares().fit(X, y).coef_)

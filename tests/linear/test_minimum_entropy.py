@@ -92,6 +92,16 @@ def test_scipy_finds_the_same_minimum(kind, location):
     np.testing.assert_allclose(found.x[first:], fit.coef_.numpy()[first:], rtol=0, atol=1e-5)
 
 
+def test_weights_count_by_their_share_and_samples_of_weight_zero_not_at_all():
+    X, Y = sample(1, 40, 2, 3), sample(2, 40, 2)
+    X[..., 0] = 1.0
+    kept = MinimumEntropy(bandwidth=0.5).fit(X[:30], Y[:30])
+    weight = torch.cat([torch.full((30, 2), 0.01), torch.zeros(10, 2)]).double()
+    fit = MinimumEntropy(bandwidth=0.5).fit(X, Y, weight)
+    torch.testing.assert_close(fit.coef_, kept.coef_, rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close(fit.entropy_, kept.entropy_)
+
+
 @pytest.mark.parametrize(("kind", "location"), KINDS)
 def test_outliers_lose_their_pull(kind, location):
     X, y = line(7)

@@ -11,6 +11,7 @@ from scipy.stats import norm
 from mkc_torch.linear._psi import (
     BISQUARE_50,
     TUNING_95,
+    Psi,
     bisquare_for_breakdown,
     bisquare_for_efficiency,
     checked_tuning,
@@ -119,3 +120,11 @@ def test_bad_tuning_is_refused(name, tuning, wanted):
 def test_an_unknown_psi_is_refused():
     with pytest.raises(ValueError, match=r"`psi` to be one of 'huber', .*'welsch' but got 'cauchy'"):
         checked_tuning("cauchy", None)
+
+
+@pytest.mark.parametrize("name", PSI)
+def test_the_slope_is_the_derivative_of_the_value(name):
+    psi = Psi(name, TUNING_95[name])
+    z = torch.linspace(-9.97, 9.97, 400, dtype=torch.float64)  # no kink within a difference
+    differences = (psi.value(z + 1e-6) - psi.value(z - 1e-6)) / 2e-6
+    torch.testing.assert_close(psi.slope(z), differences, rtol=0, atol=1e-7)

@@ -288,3 +288,20 @@ def test_many_problems_in_one_call_are_fitted_as_each_alone():
         alone = SRegression().fit(X[i], y[i])
         torch.testing.assert_close(together.coef_[i], alone.coef_, rtol=1e-9, atol=1e-9)
         torch.testing.assert_close(together.scale_[i], alone.scale_, rtol=1e-12, atol=0.0)
+
+
+def test_derivatives_of_several_channels_are_those_of_refitting():
+    """Channels that disagree each have a slope where their sum has none, and it enters the derivative."""
+    X, Y = sample(3, 12, 2, 2), sample(4, 12, 2)
+    Y[:, 0] += 2.0 * X[:, 0, 0]
+
+    def fitted(Y: Tensor) -> Tensor:
+        return SRegression(starts=50).fit(X, Y).coef_
+
+    slopes = torch.autograd.functional.jacobian(fitted, Y)
+    for k in (0, 5):
+        for channel in range(2):
+            change = torch.zeros_like(Y)
+            change[k, channel] = 1e-5
+            refitted = (fitted(Y + change) - fitted(Y - change)) / 2e-5
+            torch.testing.assert_close(slopes[:, k, channel], refitted, rtol=0, atol=1e-7)

@@ -251,6 +251,12 @@ def test_predictions_weights_intervals_and_summary():
         fit.weights(X, Y[:-1])
 
 
+def test_weights_of_several_channels_are_those_of_memory():
+    X, Y = problem(3, m=2)
+    fit, memory = StreamedMKCRegression().fit(cut(X, Y)), in_memory(X, Y)
+    torch.testing.assert_close(fit.weights(X, Y), memory.weights_.detach(), rtol=0, atol=1e-8)
+
+
 def test_parameters_are_shown_and_set():
     fit = StreamedMKCRegression(pilot=100)
     assert "pilot=100" in repr(fit)

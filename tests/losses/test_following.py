@@ -218,6 +218,14 @@ def test_the_scale_is_robust_in_each_channel_and_about_nothing():
     assert offset.d.item() == pytest.approx(1000.0 / 0.5244, rel=1e-3)
 
 
+def test_the_least_scale_is_a_thousandth_of_the_spread_about_an_offset():
+    error = 1000.0 + 2.0 * torch.randn(500, 1, generator=generator())
+    loss = MKCLoss(1)
+    loss(error, torch.zeros(500, 1))
+    spread = (error - error.mean()).abs().mean()
+    assert float(loss.d_min) == pytest.approx(1e-3 * float(spread), rel=1e-3)
+
+
 def test_the_scale_follows_residuals_that_shrink():
     loss = MKCLoss(1)
     noise = torch.randn(100, 1, generator=generator())

@@ -13,6 +13,7 @@ from torch.func import functional_call, grad, stack_module_state, vmap
 from mkc_torch import MKCDistribution, MKCLoss
 from mkc_torch.density.energy import KAPPA_MAX
 from mkc_torch.functional import log_normalizer, mkc_energy, mkc_nll, mkc_weight
+from mkc_torch.losses._watch import WATCH_EVERY
 
 INF, NAN = math.inf, math.nan
 REDUCTIONS = ["none", "mean", "sum"]
@@ -796,6 +797,18 @@ def test_ordinary_noise_is_no_collapse():
         loss(torch.zeros(256, 1), target).backward()
         optimiser.step()
     assert 0.7 < float(loss.d.detach()) < 1.3
+
+
+@pytest.mark.parametrize("options", [{"learn_sigma": False}, {"learn_d": False}, {}, FIXED])
+def test_parameters_that_an_optimiser_moves_or_that_are_not_learned_are_no_cause_to_warn(options):
+    loss = MKCLoss(1, d=1.0, **options)
+    target = torch.randn(64, 1, generator=torch.Generator().manual_seed(0))
+    place = torch.zeros(1, requires_grad=True)
+    optimiser = torch.optim.SGD([place, *loss.parameters()], lr=1e-3)
+    for _ in range(2 * WATCH_EVERY + 1):
+        optimiser.zero_grad()
+        loss(place.expand(64, 1), target).backward()
+        optimiser.step()
 
 
 # --- values that are refused, and where

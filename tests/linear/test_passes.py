@@ -1,0 +1,60 @@
+"""Parts of a fit of many rows: a step within limits, and the triangle of the rows in use."""
+
+import pytest
+import torch
+
+from mkc_torch.linear._blocks import Block, triangle
+from mkc_torch.linear._implicit.at_rest import Point, Rest
+from mkc_torch.linear._passes import Place, _newton_move
+
+GRADIENTS = {
+    "inside": [1.0, 0.1, -0.3],
+    "κ to 0": [1.0, 5.0, -0.3],
+    "log d to its least": [1.0, -0.1, 3.0],
+    "both": [0.5, 4.0, 5.0],
+    "log d to the bound": [0.0, 0.0, -3.0],
+    "held at once, as the coefficient moves": [-9.0, 0.4, 0.1],
+}
+
+
+def double(*values: float) -> torch.Tensor:
+    return torch.tensor([values], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("gradient", GRADIENTS.values(), ids=GRADIENTS)
+def test_a_step_is_newtons_in_the_unknowns_that_no_limit_stops(gradient):
+    """κ = 0.5 may fall to 0, log d = 0 to -1 and rise to 2."""
+    point = Point(double(3.0), double(0.5), double(0.0))
+    rest = Rest(
+        point.beta,
+        point.kappa,
+        point.log_d,
+        torch.tensor([True]),
+        double(2.0),
+        double(-1.0),
+        free_kappa=True,
+        free_d=True,
+    )
+    slope = double(*gradient)
+    hessian = torch.tensor([[[2.0, 0.5, 0.3], [0.5, 1.0, 0.2], [0.3, 0.2, 1.0]]], dtype=torch.float64)
+    move = _newton_move(rest, Place(point, 0.0, torch.tensor(0.0), slope, hessian, None))
+    low, high = double(-torch.inf, -0.5, -1.0), double(torch.inf, 399.5, 2.0)
+    assert bool(((move >= low) & (move <= high)).all())
+    stopped = (move == low) | (move == high)
+    left = slope + torch.matmul(hessian, move.unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(left[~stopped], torch.zeros_like(left[~stopped]), rtol=0, atol=1e-12)
+    newton = -torch.linalg.solve(hessian, slope.unsqueeze(-1)).squeeze(-1)
+    assert bool(stopped.any()) == bool(((newton < low) | (newton > high)).any())
+
+
+@pytest.mark.parametrize("channels", [1, 2])
+def test_the_triangle_is_that_of_the_rows_of_a_weight(channels):
+    rows = torch.randn(40, channels, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weight = 0.5 * torch.ones(40, channels, dtype=torch.float64)
+    weight[::3, -1] = 0.0
+    upper = None
+    for part in (slice(25), slice(25, None)):
+        upper = triangle(Block(rows[part], rows[part, :, 0], weight[part]), upper)
+    used = rows[weight > 0]
+    torch.testing.assert_close(upper.mT @ upper, used.mT @ used)
+    assert bool((upper.tril(-1) == 0).all())
