@@ -22,8 +22,9 @@ from mkc_torch.calibration.impossible_samples import without_impossible
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.calibration.other_sensors import GRAVITY, accelerometer, rest_bias
 from mkc_torch.calibration.places import disturbed_places, numbered
+from mkc_torch.calibration.plain_values import Spread, matrix_of, spread_of, vector_of
 from mkc_torch.calibration.recorded_ellipsoid import recorded_ellipsoid
-from mkc_torch.calibration.result import Calibration, Spread
+from mkc_torch.calibration.result import Calibration
 from mkc_torch.functional import mkc_weight
 from mkc_torch.linear import MKCRegression
 from mkc_torch.recording.recording import Recording, RecordingError
@@ -189,21 +190,21 @@ def _of_ellipsoid(fit: EllipsoidFit, usable: Recording, field_strength: float | 
         recording=usable.name,
         samples=len(points),
         unit=unit,
-        center=_vector(fit.center_),
-        center_se=_vector(fit.center_se_),
-        semi_axes=_vector(fit.semi_axes_),
-        semi_axes_se=_vector(fit.semi_axes_se_),
-        rotation=_matrix(fit.rotation_),
-        matrix=_matrix(scale * fit.calibration_matrix_),
-        matrix_se=_matrix(matrix_se),
+        center=vector_of(fit.center_),
+        center_se=vector_of(fit.center_se_),
+        semi_axes=vector_of(fit.semi_axes_),
+        semi_axes_se=vector_of(fit.semi_axes_se_),
+        rotation=matrix_of(fit.rotation_),
+        matrix=matrix_of(scale * fit.calibration_matrix_),
+        matrix_se=matrix_of(matrix_se),
         radius=radius,
         field_strength=strength,
         field_unit=unit if field_strength is None else "µT",
         sigma=density[0],
         d=density[1],
         bound=density[2],
-        before=_spread(norm - norm.median()),
-        after=_spread(length - radius),
+        before=spread_of(norm - norm.median()),
+        after=spread_of(length - radius),
         rejected=int(rejected.sum()),
         disturbed=disturbed_places(usable, rejected),
         disturbed_unit="row" if usable.time is None else "s",
@@ -287,17 +288,3 @@ def _gaps(fit: EllipsoidFit, found: Coverage) -> str:
     return (
         f"Directions not covered: {missing}. {means}. To be sure, turn the sensor so that the field points there too."
     )
-
-
-def _spread(residual: Tensor) -> Spread:
-    return Spread(1.4826 * float(residual.abs().median()), float(residual.square().mean().sqrt()))
-
-
-def _vector(values: Tensor) -> Vector:
-    x, y, z = values.tolist()
-    return x, y, z
-
-
-def _matrix(values: Tensor) -> Matrix:
-    a, b, c = values
-    return _vector(a), _vector(b), _vector(c)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.calibration.plain_values import vector_of
 from mkc_torch.calibration.result import Calibration, RestBias
 from mkc_torch.calibration.turning import turning
 from mkc_torch.recording.recording import Recording
@@ -136,13 +137,8 @@ def rest_bias(recording: Recording) -> RestBias | None:
         return None
     chosen = middle[still]
     error = chosen.std(0) / math.sqrt(len(chosen))
-    return RestBias(_vector(chosen.mean(0)), _vector(error), float(len(chosen) * count * step))
+    return RestBias(vector_of(chosen.mean(0)), vector_of(error), float(len(chosen) * count * step))
 
 
 _MOST_BIAS = 0.2
 """Rate in rad/s, 11 °/s, beyond which the slowest is no bias but a turn."""
-
-
-def _vector(values: Tensor) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z

@@ -22,6 +22,7 @@ from mkc_torch.calibration.file import (
     finite_or_none,
     refuse_constant,
 )
+from mkc_torch.calibration.plain_values import Spread
 from mkc_torch.calibration.plot import CalibrationPlot
 from mkc_torch.functional import mkc_weight
 from mkc_torch.recording.disturbance import Interval
@@ -41,13 +42,6 @@ class RestBias(NamedTuple):
     value: Vector
     standard_error: Vector
     seconds: float
-
-
-class Spread(NamedTuple):
-    """The size of residuals: 1.4826 times their median absolute value, and their root mean square."""
-
-    robust: float
-    rms: float
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,10 @@ from mkc_torch.calibration.aided.start import offset_by_turns
 from mkc_torch.calibration.aided.turns import Turns, still, turns_of_attitude, turns_of_gyroscope
 from mkc_torch.calibration.coverage import coverage
 from mkc_torch.calibration.ellipsoid import axes_of
-from mkc_torch.calibration.file import Matrix, Vector
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.calibration.places import disturbed_places
-from mkc_torch.calibration.result import Calibration, Spread
+from mkc_torch.calibration.plain_values import matrix_of, spread_of, vector_of
+from mkc_torch.calibration.result import Calibration
 from mkc_torch.calibration.runs import in_each_run, run_slices
 from mkc_torch.calibration.turning import thin_at_rest
 from mkc_torch.density import fit_density
@@ -262,21 +262,21 @@ def _result(
         recording=usable.name,
         samples=len(points),
         unit=unit,
-        center=_vector(theta[:3]),
-        center_se=_vector(known[:3]),
-        semi_axes=_vector(semi_axes),
-        semi_axes_se=_vector(radius * known[3:6]),
-        rotation=_matrix(rotation),
-        matrix=_matrix(strength * root),
-        matrix_se=_matrix((strength / radius) * known[6:].unflatten(0, (3, 3))),
+        center=vector_of(theta[:3]),
+        center_se=vector_of(known[:3]),
+        semi_axes=vector_of(semi_axes),
+        semi_axes_se=vector_of(radius * known[3:6]),
+        rotation=matrix_of(rotation),
+        matrix=matrix_of(strength * root),
+        matrix_se=matrix_of((strength / radius) * known[6:].unflatten(0, (3, 3))),
         radius=radius,
         field_strength=strength,
         field_unit=unit if field_strength is None else "µT",
         sigma=float(density.sigma),
         d=float(density.d),
         bound=float(density.bound),
-        before=_spread(norm - norm.median()),
-        after=_spread(radius * (length - 1.0)),
+        before=spread_of(norm - norm.median()),
+        after=spread_of(radius * (length - 1.0)),
         rejected=int(rejected.sum()),
         disturbed=disturbed_places(usable, rejected),
         disturbed_unit="row" if usable.time is None else "s",
@@ -289,8 +289,8 @@ def _result(
             undetermined=tuple(n for n, u in zip(names, unknown.tolist(), strict=True) if n and u),
             heading_error=errors[0],
             constant_error=errors[1],
-            gyro_bias=None if bias is None else _vector(bias),
-            gyro_bias_se=None if bias is None else _vector(bias_se),
+            gyro_bias=None if bias is None else vector_of(bias),
+            gyro_bias_se=None if bias is None else vector_of(bias_se),
         ),
     )
 
@@ -316,17 +316,3 @@ def _weights(chosen: Chosen, points: Tensor, whole: Turns) -> Float[Tensor, " N"
     theta, model = chosen.best.fit.theta, chosen.best.model
     at = torch.cat([theta[:-ERRORS], torch.zeros(ERRORS, dtype=theta.dtype)]) if model.biased else theta
     return model.first_weight(at, points, whole)
-
-
-def _spread(residual: Tensor) -> Spread:
-    return Spread(1.4826 * float(residual.abs().median()), float(residual.square().mean().sqrt()))
-
-
-def _vector(values: Tensor) -> Vector:
-    x, y, z = values.tolist()
-    return x, y, z
-
-
-def _matrix(values: Tensor) -> Matrix:
-    a, b, c = values
-    return _vector(a), _vector(b), _vector(c)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from mkc_torch._support.unit_text import ratio
 from mkc_torch.calibration.exports import CurrentField, ExportError, SensorCorrection
-from mkc_torch.calibration.file import Matrix, Vector
+from mkc_torch.calibration.plain_values import matrix_of, vector_of
 from mkc_torch.diagnosis.files.model import DiagnosedModel, correction_of
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.recording.recording import Recording
@@ -51,8 +51,8 @@ def sensor_correction(model: DiagnosedModel, name: str) -> SensorCorrection:
     return SensorCorrection(
         name=name,
         unit=unit,
-        offset=_vector(offset),
-        matrix=_matrix(matrix),
+        offset=vector_of(offset),
+        matrix=matrix_of(matrix),
         field_unit=unit,
         field_strength=strength if isinstance(strength, float) else None,
         current=field,
@@ -112,7 +112,7 @@ def _field_of_current(model: DiagnosedModel, kept: list[int], number: int, unit:
     amperes = ratio(driver.units[0], "A")
     assert amperes is not None
     _, more = _affine(_reduced(model, kept), unit, driver.columns[0])
-    return CurrentField(_vector((more - offset) / amperes), float(driver.reference[0]) * amperes, driver.columns[0])
+    return CurrentField(vector_of((more - offset) / amperes), float(driver.reference[0]) * amperes, driver.columns[0])
 
 
 def _reduced(model: DiagnosedModel, kept: list[int]) -> DiagnosedModel:
@@ -142,13 +142,3 @@ def _probe(unit: str, drivers: dict[str, float]) -> Recording:
     return Recording(
         columns | {name: torch.full((4,), value, dtype=torch.float64) for name, value in drivers.items()}, units=units
     )
-
-
-def _vector(values: Tensor) -> Vector:
-    x, y, z = values.tolist()
-    return x, y, z
-
-
-def _matrix(values: Tensor) -> Matrix:
-    a, b, c = values
-    return _vector(a), _vector(b), _vector(c)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mkc_torch.recording.formats.base import FileFormat, MissingColumnError, RecordingError, Table, Topic, listed
+from mkc_torch.recording.formats.base import FileFormat, MissingColumnError, RecordingError, Topic
 from mkc_torch.recording.formats.csv import CSV
 from mkc_torch.recording.formats.dataflash import DATAFLASH
 from mkc_torch.recording.formats.hdf5 import HDF5
@@ -26,7 +26,6 @@ __all__ = [
     "Topic",
     "check_ending",
     "encoded",
-    "read_table",
     "read_topics",
 ]
 
@@ -55,19 +54,6 @@ def read_topics(path: Path) -> list[Topic]:
     if not topics:
         raise RecordingError(f"{path}: no column has a name; the first line must hold the column names.")
     return topics
-
-
-def read_table(path: Path) -> Table:
-    """The table in a file that holds one alone.
-
-    Raises:
-        RecordingError: no file of a known kind, a damaged or empty one, or one of several tables.
-        FileNotFoundError: no such file.
-    """
-    topics = read_topics(path)
-    if len(topics) > 1:
-        raise RecordingError(f"{path}: the file holds {len(topics)} tables, {listed(topic.name for topic in topics)}.")
-    return topics[0].table
 
 
 def encoded(path: Path, columns: Mapping[str, np.ndarray]) -> str | bytes:

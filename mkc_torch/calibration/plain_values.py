@@ -1,0 +1,44 @@
+"""Tensors as the plain numbers that a result holds, and the size of residuals."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from torch import Tensor
+
+from mkc_torch.calibration.file import Matrix, Vector
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["Spread", "matrix_of", "spread_of", "vector_of"]
+
+
+class Spread(NamedTuple):
+    """The size of residuals: 1.4826 times their median absolute value, and their root mean square."""
+
+    robust: float
+    rms: float
+
+
+def spread_of(residual: Float[Tensor, " N"]) -> Spread:
+    """The size of residuals.
+
+    Example:
+        >>> import torch
+        >>> spread_of(torch.tensor([4.0, -2.0, 2.0, -4.0, 1.0, 0.0, 2.0, 2.0])).robust
+        2.9652
+    """
+    return Spread(1.4826 * float(residual.abs().median()), float(residual.square().mean().sqrt()))
+
+
+def vector_of(values: Float[Tensor, " 3"]) -> Vector:
+    """The three numbers of a tensor."""
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def matrix_of(values: Float[Tensor, "3 3"]) -> Matrix:
+    """The rows of a tensor."""
+    a, b, c = values
+    return vector_of(a), vector_of(b), vector_of(c)
