@@ -1,6 +1,6 @@
-"""Vehicles that hardly tilt, with a gyroscope: `calibrate` beside an ellipsoid by least squares.
+"""Vehicles that hardly tilt, with a gyroscope or at a known place: `calibrate` beside an ellipsoid by least squares.
 
-python examples/calibration/hardly_tilting.py [--draws 200] [--picture hardly_tilting.png]
+python examples/calibration/hardly_tilting.py [--draws 200] [--by place] [--picture hardly_tilting.png]
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from torch import Generator, Tensor
 
 from mkc_torch import NotIdentifiableError, Recording
 from mkc_torch.calibration import calibrate
+from mkc_torch.calibration.aided.place import Field
 from mkc_torch.calibration.aided.rotation import from_quaternion
 from mkc_torch.calibration.ellipsoid import ellipsoid_from_coefficients, monomials, symmetric_root
 
@@ -147,6 +148,21 @@ def by_calibrate(draw: Draw) -> Tensor | None:
     return heading_errors(draw, torch.tensor(found.center).double(), torch.tensor(found.matrix).double())
 
 
+def by_place(draw: Draw) -> Tensor | None:
+    """The same without the gyroscope, at a known place, less a constant: lengths do not tell how a sensor is turned."""
+    kept = {name: values for name, values in draw.recording.columns.items() if not name.startswith("gyro")}
+    strength = float(torch.linalg.vector_norm(draw.field))
+    earth = Field(strength, -math.asin(float(draw.field[2]) / strength), 0.0)
+    try:
+        found = calibrate(Recording(kept, name=draw.recording.name), earth=earth)
+    except NotIdentifiableError:
+        return None
+    errors = heading_errors(draw, torch.tensor(found.center).double(), torch.tensor(found.matrix).double())
+    radians = torch.deg2rad(errors)
+    constant = torch.rad2deg(torch.atan2(radians.sin().mean(), radians.cos().mean()))
+    return (errors - constant + 180.0) % 360.0 - 180.0
+
+
 def by_least_squares(draw: Draw) -> Tensor | None:
     """The same of an ellipsoid by least squares, with no questions asked; None where the quadric is no ellipsoid."""
     points = draw.recording.magnetometer()
@@ -159,15 +175,16 @@ def by_least_squares(draw: Draw) -> Tensor | None:
     return heading_errors(draw, middle + size * ellipsoid.center, symmetric_root(ellipsoid.shape))
 
 
-WAYS = {"calibrate, by the gyroscope": by_calibrate, "ellipsoid by least squares": by_least_squares}
+WAYS = {"gyroscope": by_calibrate, "place": by_place}
 
 
-def judged(draws: range, least: float, most: float) -> dict[str, list[float]]:
+def judged(draws: range, least: float, most: float, by: str = "gyroscope") -> dict[str, list[float]]:
     """Root mean square heading error of each draw, in °; infinite where there is no result."""
-    found: dict[str, list[float]] = {name: [] for name in WAYS}
+    ways = {f"calibrate, by the {by}": WAYS[by], "ellipsoid by least squares": by_least_squares}
+    found: dict[str, list[float]] = {name: [] for name in ways}
     for seed in draws:
         draw = drawn(seed, least, most)
-        for name, way in WAYS.items():
+        for name, way in ways.items():
             errors = way(draw)
             found[name].append(math.inf if errors is None else float(errors.square().mean().sqrt()))
     return found
@@ -200,10 +217,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--tilt", type=float, nargs=2, default=(5.0, 20.0), metavar=("LEAST", "MOST"), help="in °")
+    parser.add_argument("--by", choices=sorted(WAYS), default="gyroscope", help="what is known beside the field")
     parser.add_argument("--picture", type=Path, help="file to draw into")
     arguments = parser.parse_args()
-    found = judged(range(JUDGED_FROM, JUDGED_FROM + arguments.draws), *arguments.tilt)
     least, most = arguments.tilt
+    found = judged(range(JUDGED_FROM, JUDGED_FROM + arguments.draws), least, most, arguments.by)
     table = Table(title=f"{arguments.draws} vehicles that tilt by {least:g} to {most:g}° at the most")
     for heading in ("", "heading error of 2° at the most", "median", "95 %", "no result"):
         table.add_column(heading, justify="right" if heading else "left")
