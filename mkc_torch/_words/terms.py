@@ -236,6 +236,7 @@ TERMS: dict[str, str] = {
     "aided.offset_and_scale": "offset and scale",
     "aided.full_matrix": "offset and full matrix",
     "aided.heading": "Heading ± {change}° as it turned, and a constant ± {constant}°.",
+    "aided.turned": "Heading ± {change}° as it turned, where the axes are the vehicle's; a constant is not known.",
     "aided.bias": "Gyroscope's bias ({bias}) rad/s.",
     "calibration.rest_bias": "bias ({bias}) ± ({errors}) rad/s, from {seconds} s of rest",
     "label.gyroscope": "gyroscope",

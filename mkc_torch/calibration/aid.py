@@ -24,7 +24,8 @@ class Aid:
         undetermined: offsets and entries of the matrix, as "offset_z" or "matrix_zz", that the recording says little or
             nothing of; they are what was likely beforehand, no offset and the unit matrix, and have no standard error.
         heading_error: standard error in ° of how the heading changes as the vehicle turns as it did.
-        constant_error: of a constant of the heading, in °, which only tilting shows.
+        constant_error: of a constant of the heading, in °, which only tilting shows; infinite by place and date, for no
+            length tells how a sensor is turned.
         gyro_bias, gyro_bias_se: of the gyroscope in rad/s; None without one.
     """
 

@@ -288,7 +288,7 @@ def _result(
             evidence=tuple((name, value - best.evidence) for name, value in chosen.tried.items()),
             undetermined=tuple(n for n, u in zip(names, unknown.tolist(), strict=True) if n and u),
             heading_error=errors[0],
-            constant_error=errors[1],
+            constant_error=math.inf if by == "place" else errors[1],
             gyro_bias=None if bias is None else vector_of(bias),
             gyro_bias_se=None if bias is None else vector_of(bias_se),
         ),

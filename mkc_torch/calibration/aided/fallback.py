@@ -122,9 +122,10 @@ def _undetermined(found: Calibration) -> tuple[str, ...]:
         told.append("the matrix" if len(entries) == 9 else f"the matrix at {', '.join(entries)}")
     if not told:
         return ()
+    constant = "" if math.isinf(aid.constant_error) else f", and a constant to {aid.constant_error:.2g}°"
+    advice = ", or give place and date of the recording, beside an attitude or an accelerometer"
     return (
         f"Not determined: {' and '.join(told)}, which {'is' if len(told) == 1 else 'are'} what was likely beforehand. "
-        f"A heading is good while the vehicle tilts as it did: to {aid.heading_error:.2g}°, and a constant to "
-        f"{aid.constant_error:.2g}°. Tilt it more, or give place and date of the recording, beside an "
-        "attitude or an accelerometer.",
+        f"A heading is good while the vehicle tilts as it did: to {aid.heading_error:.2g}°{constant}. "
+        f"Tilt it more{'' if aid.by == 'place' else advice}.",
     )

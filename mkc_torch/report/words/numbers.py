@@ -221,7 +221,10 @@ def aided(calibration: Calibration) -> list[str]:
         if name != aid.response
     ]
     told = [term("aided.by", by=aid.by, response=term(_RESPONSES[aid.response]), rivals="; ".join(rivals))]
-    told.append(term("aided.heading", change=size(aid.heading_error), constant=size(aid.constant_error)))
+    if math.isinf(aid.constant_error):
+        told.append(term("aided.turned", change=size(aid.heading_error)))
+    else:
+        told.append(term("aided.heading", change=size(aid.heading_error), constant=size(aid.constant_error)))
     if aid.gyro_bias is not None and aid.gyro_bias_se is not None:
         told.append(term("aided.bias", bias=listed(aid.gyro_bias, aid.gyro_bias_se)))
     return told

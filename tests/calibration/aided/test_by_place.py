@@ -74,6 +74,7 @@ def test_it_says_by_what_and_what_it_takes_for_true(found):
     assert any("field of the place stands in" in warning for warning in found.warnings)
     assert any("level ground" in warning and "known one" in warning for warning in found.warnings)
     assert "By the place" in " ".join(aided(found))
+    assert "a constant is not known" in " ".join(aided(found))
     matrix = torch.tensor(found.matrix)
     assert torch.allclose(matrix, matrix.mT, atol=1e-6)
     assert Calibration.from_json(found.to_json()) == found
@@ -83,6 +84,7 @@ def test_without_any_tilt_nobody_knows_on_which_side_of_the_circle_the_offset_li
     c = calibrate(level(), earth=EARTH)
     assert "offset_z" in c.aid.undetermined
     assert math.isinf(c.center_se[2])
+    assert any(w.startswith("Not determined: the offset of z") and w.endswith("Tilt it more.") for w in c.warnings)
     assert abs(c.center[0] - 5.0) < 4.0 * c.center_se[0] < 16.0
     assert abs(c.center[1] + 8.0) < 4.0 * c.center_se[1] < 16.0
 
