@@ -46,6 +46,7 @@ def test_a_picture_shows_the_three_curves_of_a_channel():
         ("weight", LOSS.weight, 1.0),
     ):
         x, y = curves[name]
+        assert float(x.min()) == -float(x.max())
         assert float(x.max()) == pytest.approx(24.0)  # three bandwidths of four scales of two
         torch.testing.assert_close(y, factor * of(x.unsqueeze(-1).expand(-1, 2))[:, 1].detach())
     for channel in (2, -1, True):
@@ -166,6 +167,8 @@ def test_the_picture_of_an_error_that_joins_a_batch():
     curves = drawn(ENTROPY.plot(batch))
     x, y = curves["change of value · 51"]
     torch.testing.assert_close(y, 51.0 * (ENTROPY.rho(x, batch) - ENTROPY.rho(torch.zeros(1), batch)))
+    scale = 1.4826 * float(batch.abs().quantile(0.5))
+    assert [float(x.min()), float(x.max())] == pytest.approx([-6.0 * scale, 6.0 * scale], rel=0.05)
     assert all(bool(torch.isfinite(values).all()) for _, values in curves.values())
     assert "201" in next(iter(drawn(ENTROPY.plot())))
 

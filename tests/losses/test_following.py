@@ -422,6 +422,38 @@ def test_what_is_remembered_of_many_channels_stays_small():
     assert Following(10_000).recent.shape == (10_000, 64)
 
 
+def test_a_loss_that_settles_on_its_floor_can_be_learned_on():
+    loss = MKCLoss(1)
+    noise = torch.randn(50, 1, generator=generator())
+    for size in [1.0, *[1e-9] * 50]:
+        loss((size * noise).requires_grad_(), torch.zeros(50, 1))
+    torch.testing.assert_close(loss.d, loss.d_min)
+    loss.settle()
+    torch.testing.assert_close(loss.d, loss.d_min)
+    slopes = torch.autograd.grad(loss(1e-9 * noise, torch.zeros(50, 1)), list(loss.parameters()))
+    assert all(bool(torch.isfinite(one).all()) for one in (*slopes, *loss.parameters()))
+
+
+def test_a_guide_steers_a_loss_of_given_d_in_training_alone():
+    x, y = torch.randn(2, 40, 1, generator=generator())
+    plain, loss, guide = MKCLoss(1, d=1.0), MKCLoss(1, d=1.0), Following(1)
+    loss.follow_guide(guide)
+
+    def looked_at(one):
+        leaf = x.clone().requires_grad_()
+        value = one(leaf, y)
+        return value.detach(), torch.autograd.grad(value, leaf)[0]
+
+    (value, pull), (own_value, own_pull) = looked_at(loss), looked_at(plain)
+    torch.testing.assert_close(value, own_value)
+    assert not torch.allclose(pull, own_pull, rtol=0.1)
+    assert int(guide.seen) == 1
+    torch.testing.assert_close(looked_at(loss.eval()), looked_at(plain.eval()))
+    assert int(guide.seen) == 1
+    loss.train().follow_guide(None)
+    torch.testing.assert_close(looked_at(loss)[1], own_pull)
+
+
 # --- warnings
 
 
