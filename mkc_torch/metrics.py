@@ -15,9 +15,9 @@ except ModuleNotFoundError as error:
     ) from error
 
 from mkc_torch._support.arguments import refuse_bad_batch
+from mkc_torch.density.energy import energy_value
 from mkc_torch.density.normalizer import log_partition
 from mkc_torch.losses._checks import checked_weight
-from mkc_torch.losses._energy_sums import energy_sums
 from mkc_torch.losses.mkc import MKCLoss, checked_loss
 
 if TYPE_CHECKING:
@@ -104,10 +104,11 @@ class MKCNegativeLogLikelihood(Metric):
                 error = torch.where(counts, error, 0.0)
             refuse_bad_batch(input, target, counts, error)
             kappa, d, bound = (t.double() for t in (loss.kappa, loss.d, loss.bound))
+            shape = [-1 if i == axis else 1 for i in range(error.dim())]
             others = [i for i in range(error.dim()) if i != axis]
-            elements = weights.sum(others) if others else weights
-            norm = torch.log(d) + log_partition(kappa, bound / d)
-            total = energy_sums(error, kappa, d, weights, axis) + norm * elements
+            nll = energy_value(error / d.view(shape), kappa.view(shape))
+            nll = nll + (torch.log(d) + log_partition(kappa, bound / d)).view(shape)
+            total, elements = ((one.sum(others) if others else one) for one in (weights * nll, weights))
         self.total += total.to(self.total)
         self.weight += elements.to(self.weight)
 

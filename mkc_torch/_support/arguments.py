@@ -272,25 +272,28 @@ def refuse_not_finite(
 
 
 def refuse_bad_batch(
-    input: Float[Tensor, "*shape"],
+    input: Float[Tensor, "*shape"] | None,
     target: Float[Tensor, "*shape"],
     counts: Bool[Tensor, "*shape"] | None = None,
     error: Float[Tensor, "*shape"] | None = None,
+    advice: str = "",
 ) -> None:
     """Refuse predictions and targets that count and are NaN or infinite, where that can be seen.
 
     Args:
-        input, target: predictions and targets, in float32 at least.
+        input, target: predictions and targets, in float32 at least; None for predictions that are not looked at.
         counts: which elements count; None if all do.
         error: their difference with 0 in place of what does not count, where it is laid out: one look does then.
+        advice: what else to do about predictions that are not finite.
 
     Raises:
         ValueError: a target or a prediction is not finite.
     """
-    if seems_finite(*((input, target) if error is None else (error,))):
+    if seems_finite(*([one for one in (input, target) if one is not None] if error is None else (error,))):
         return
     refuse_not_finite("target", target, "Leave them out: loss(input, target, weight=torch.isfinite(target))", counts)
-    refuse_not_finite("input", input, DIVERGED, counts)
+    if input is not None:
+        refuse_not_finite("input", input, f"{DIVERGED}. {advice}" if advice else DIVERGED, counts)
 
 
 def _float(name: str, value: float) -> float:

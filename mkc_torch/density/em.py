@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.density.fit import DensityState, initial_state
+from mkc_torch.density.likelihood import DensityState, initial_state
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -1,255 +1,36 @@
 """Fit σ and d of the MKC density to residuals by maximum likelihood: the E-step of MKC-EM (Algorithm 2 of the paper).
 
-The mean negative log-likelihood of each channel is a function of two numbers. It is minimised by a safeguarded Newton
-method with analytic derivatives in κ = 1/σ², of which σ = ∞ is a finite value, and log d. A step in log κ would go too
-far: where the tail is already more than there are outliers, the likelihood falls exponentially.
+The mean negative log-likelihood of each channel is a function of two numbers, minimised by the safeguarded Newton
+method of :mod:`mkc_torch.density.likelihood`.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import (
-    as_numbers,
-    checked_number,
-    checked_whole,
-    refuse_not_finite,
-    refuse_not_real,
+from mkc_torch._support.arguments import checked_number, checked_whole
+from mkc_torch._support.arrays import Data
+from mkc_torch.density._residuals import (
+    Domain,
+    Residuals,
+    channel_values,
+    checked_domain,
+    checked_residuals,
+    checked_weight,
 )
-from mkc_torch._support.arrays import Data, as_tensor
-from mkc_torch._support.order_statistic import robust_scale
-from mkc_torch.density._full_weight import full_weight
-from mkc_torch.density.energy import KAPPA_MAX, SIGMA_LEAST, energy_value
-from mkc_torch.density.normalizer import head_rule, integrate, log_partition_value, tail_density
+from mkc_torch.density.energy import SIGMA_LEAST
+from mkc_torch.density.likelihood import initial_state, maximise
+from mkc_torch.density.tails import Tails, assess_tails
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-_KAPPA_OFFSET = 0.02
-"""Steps in κ are measured in shares of κ and this: a thousandth matters near a Gaussian, and nowhere else."""
-
-WIDE = 10.0
-"""Least half-width of the domain in scales."""
-
-_LONGEST, _FURTHEST_DOWN = 2.0, math.exp(-2.0)
-"""Of a step, in log d and in shares of κ; and the share of κ that a step leaves at least."""
-
-
-class Derivatives(NamedTuple):
-    """A function of (κ, log d): value, gradient and Hessian, each of shape (*, m)."""
-
-    value: Tensor
-    kappa: Tensor
-    log_d: Tensor
-    kappa_kappa: Tensor
-    kappa_log_d: Tensor
-    log_d_log_d: Tensor
-
-
-def energy_terms(q: Tensor, kappa: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """exp(-x), E, -∂E/∂κ and ∂²E/∂κ² at q = z²/2, x = κ q."""
-    x = kappa * q
-    w = torch.exp(-x)
-    divisor = torch.where(kappa > 0, kappa, 1.0)
-    qw = q * w
-    e = -torch.expm1(-x) / divisor
-    first = (e - qw) / divisor
-    second = (2.0 * first - q * qw) / divisor
-    # below this x the differences lose more digits than two terms of the series leave out
-    small = x < (1e-5 if q.dtype == torch.float64 else 1e-2)
-    q2 = q * q
-    e = torch.where(small, q - 0.5 * q * x, e)
-    first = torch.where(small, q2 * (0.5 - x / 3.0), first)
-    second = torch.where(small, q * q2 * (1.0 / 3.0 - 0.25 * x), second)
-    return w, e, first, second
-
-
-def _mean(values: Tensor, weight: Tensor | None) -> Tensor:
-    """Mean over samples; ``weight`` sums to one over them."""
-    return values.mean(-2) if weight is None else (weight * values).sum(-2)
-
-
-def energy_derivatives(error: Tensor, weight: Tensor | None, kappa: Tensor, log_d: Tensor) -> Derivatives:
-    q = 0.5 * (error * torch.exp(-log_d).unsqueeze(-2)).square()
-    w, e, first, second = energy_terms(q, kappa.unsqueeze(-2))
-    qw = q * w
-    q2w = q * qw
-    mean_qw, mean_q2w = _mean(qw, weight), _mean(q2w, weight)
-    return Derivatives(
-        value=_mean(e, weight),
-        kappa=-_mean(first, weight),
-        log_d=-2.0 * mean_qw,
-        kappa_kappa=_mean(second, weight),
-        kappa_log_d=2.0 * mean_q2w,
-        log_d_log_d=4.0 * (mean_qw - kappa * mean_q2w),
-    )
-
-
-def normaliser_derivatives(kappa: Tensor, log_d: Tensor, log_bound: Tensor) -> Derivatives:
-    """Derivatives of log(d Z(κ, bound / d))."""
-    length = torch.exp(log_bound - log_d)
-    tail = tail_density(kappa)
-    k = torch.where(tail > 0, kappa, 1.0)
-    tail_1, tail_2 = tail / k.pow(2), tail * (1.0 - 2.0 * k) / k.pow(4)
-    nodes, weights = head_rule(kappa, length)
-    _, e, first, second = energy_terms(0.5 * nodes.square(), kappa.unsqueeze(-1))
-    p = torch.exp(-e)
-
-    z = integrate(p, tail, length, weights)
-    z_k = integrate(first * p, tail_1, length, weights) / z
-    z_kk = integrate((first.square() - second) * p, tail_2, length, weights) / z
-    w_end, e_end, first_end, _ = energy_terms(0.5 * length.square(), kappa)
-    edge = 2.0 * torch.exp(-e_end) / z
-    l_1 = length * edge
-    l_2 = length * l_1 * (-length * w_end - edge) + l_1
-    return Derivatives(
-        value=torch.log(z) + log_d,
-        kappa=z_k,
-        log_d=1.0 - l_1,
-        kappa_kappa=z_kk - z_k.square(),
-        kappa_log_d=-l_1 * (first_end - z_k),
-        log_d_log_d=l_2,
-    )
-
-
-@dataclass(frozen=True)
-class DensityState:
-    """Where a fit stands, every field (*, m); ``value`` is the mean negative log-likelihood at the last step."""
-
-    kappa: Tensor
-    log_d: Tensor
-    log_bound: Tensor
-    log_d_min: Tensor
-    damping: Tensor
-    value: Tensor
-    free_kappa: bool = True
-    free_d: bool = True
-
-    def select(self, index: Tensor) -> DensityState:
-        """The state of the problems at ``index``."""
-        fields = ("kappa", "log_d", "log_bound", "log_d_min", "damping", "value")
-        return replace(self, **{f: getattr(self, f)[index] for f in fields})
-
-
-def negative_log_likelihood(error: Tensor, weight: Tensor | None, state: DensityState) -> Float[Tensor, "*batch m"]:
-    """Mean negative log-density of the residuals of each channel."""
-    z = error * torch.exp(-state.log_d).unsqueeze(-2)
-    return _mean(energy_value(z, state.kappa.unsqueeze(-2)), weight) + state.log_d + _log_z(state)
-
-
-def _log_z(state: DensityState) -> Tensor:
-    return log_partition_value(state.kappa, torch.exp(state.log_bound - state.log_d))
-
-
-def initial_state(
-    error: Float[Tensor, "*batch N m"],
-    weight: Float[Tensor, "*batch N m"] | None,
-    scale: Float[Tensor, "*batch m"],
-    bound: Float[Tensor, "*batch m"],
-    d_min: Float[Tensor, "*batch m"],
-    *,
-    kappa: Float[Tensor, "*batch m"] | None = None,
-    d: Float[Tensor, "*batch m"] | None = None,
-    tails: Sequence[float | Tensor] = (0.1, 0.4, 1.5),
-) -> DensityState:
-    """The likeliest of a Gaussian and of densities with κ from ``tails`` and the given scale.
-
-    ``kappa`` or ``d`` given stays as it is.
-    """
-    rms = torch.sqrt(_mean(error.square(), weight)).clamp(min=d_min)
-    log_bound, log_d_min = torch.log(bound), torch.log(d_min)
-    blank = DensityState(rms, rms, log_bound, log_d_min, torch.full_like(rms, 1e-3), rms, kappa is None, d is None)
-    best: DensityState | None = None
-    for start_kappa, start_d in ((0.0, rms), *((tail, scale) for tail in tails)):
-        state = replace(
-            blank,
-            kappa=torch.as_tensor(start_kappa).to(rms).expand_as(rms) if kappa is None else kappa.expand_as(rms),
-            log_d=torch.log(start_d.clamp(min=d_min)) if d is None else torch.log(d).expand_as(rms),
-        )
-        state = replace(state, value=negative_log_likelihood(error, weight, state))
-        if best is None:
-            best = state
-        else:
-            better = state.value < best.value
-            best = replace(
-                best,
-                kappa=torch.where(better, state.kappa, best.kappa),
-                log_d=torch.where(better, state.log_d, best.log_d),
-                value=torch.where(better, state.value, best.value),
-            )
-    assert best is not None
-    return best
-
-
-def newton_step(error: Tensor, weight: Tensor | None, state: DensityState) -> DensityState:
-    """One damped Newton step in (κ, log d) within κ in [0, 400] and d in [d_min, bound]; never uphill."""
-    total = likelihood_derivatives(energy_derivatives(error, weight, state.kappa, state.log_d), state)
-    proposal = newton_proposal(total, state)
-    value = negative_log_likelihood(error, weight, proposal)
-    better = value <= total.value
-    return replace(
-        state,
-        kappa=torch.where(better, proposal.kappa, state.kappa),
-        log_d=torch.where(better, proposal.log_d, state.log_d),
-        damping=torch.where(better, 0.1 * state.damping, 10.0 * state.damping).clamp(1e-9, 1e6),
-        value=torch.where(better, value, total.value),
-    )
-
-
-def likelihood_derivatives(energy: Derivatives, state: DensityState) -> Derivatives:
-    """Those of the mean negative log-likelihood, from those of the mean energy."""
-    norm = normaliser_derivatives(state.kappa, state.log_d, state.log_bound)
-    return Derivatives(*(a + b for a, b in zip(energy, norm, strict=True)))
-
-
-def newton_proposal(total: Derivatives, state: DensityState) -> DensityState:
-    """Where a damped Newton step from ``state`` leads, its value not yet known."""
-    chain = state.kappa + _KAPPA_OFFSET
-    g_s, g_l = total.kappa * chain, total.log_d
-    h_ss = total.kappa_kappa * chain.square()
-    h_sl, h_ll = total.kappa_log_d * chain, total.log_d_log_d
-    held_s = ((state.kappa <= 0) & (g_s > 0)) | ((state.kappa >= KAPPA_MAX) & (g_s < 0))
-    held_l = ((state.log_d <= state.log_d_min) & (g_l > 0)) | ((state.log_d >= state.log_bound) & (g_l < 0))
-    if not state.free_kappa:
-        held_s = torch.ones_like(held_s)
-    if not state.free_d:
-        held_l = torch.ones_like(held_l)
-    g_s, g_l = torch.where(held_s, 0.0, g_s), torch.where(held_l, 0.0, g_l)
-    h_sl = torch.where(held_s | held_l, 0.0, h_sl)
-    h_ss, h_ll = torch.where(held_s, 1.0, h_ss), torch.where(held_l, 1.0, h_ll)
-    # on scales of their own: near a Gaussian the curvature by κ is a thousandth of that by log d
-    r_s, r_l = (h.abs().clamp(min=1e-8 * (h_ss.abs() + h_ll.abs())).rsqrt() for h in (h_ss, h_ll))
-    a, b, c = h_ss * r_s * r_s, h_sl * r_s * r_l, h_ll * r_l * r_l
-    # Levenberg's shift also lifts the smaller eigenvalue above 0
-    middle, spread = 0.5 * (a + c), torch.hypot(0.5 * (a - c), b)
-    shift = (spread - middle + 1e-3).clamp(min=0.0) + state.damping
-    a, c = a + shift, c + shift
-    determinant = a * c - b * b
-    g_s, g_l = g_s * r_s, g_l * r_l
-    step_s, step_l = r_s * (b * g_l - c * g_s) / determinant, r_l * (b * g_s - a * g_l) / determinant
-    longest = torch.maximum(step_s.abs(), step_l.abs())
-    shorten = (_LONGEST / longest.clamp(min=_LONGEST)).nan_to_num(0.0)
-    grown = (1.0 + shorten * step_s.nan_to_num(0.0)).clamp(min=_FURTHEST_DOWN)
-    kappa = (chain * grown - _KAPPA_OFFSET).clamp(0.0, KAPPA_MAX)
-    log_d = torch.minimum(
-        torch.maximum(state.log_d + shorten * step_l.nan_to_num(0.0), state.log_d_min), state.log_bound
-    )
-    return replace(
-        state,
-        kappa=kappa if state.free_kappa else state.kappa,
-        log_d=log_d if state.free_d else state.log_d,
-    )
-
-
-def conclusive(before: DensityState, after: DensityState) -> Tensor:
-    """Whether a step says something about rest: it was taken, or no shorter one is worth trying. Shape (*, m)."""
-    return (after.damping <= before.damping) | (after.damping >= 1e3)
+__all__ = ["DensityFit", "fit_density"]
 
 
 @dataclass(frozen=True)
@@ -279,47 +60,21 @@ class DensityFit:
     log_likelihood: Float[Tensor, "*batch m"]
     converged: Bool[Tensor, "*batch m"]
     n_iter: int
+    _residuals: Residuals = field(repr=False, compare=False)
+    _domain: Domain = field(repr=False, compare=False)
 
+    @cached_property
+    def tails(self) -> Tails:
+        """Whether the tails of the residuals are heavier than a Gaussian's, :func:`assess_tails` on the same domain.
 
-def domain_rule(
-    error: Float[Tensor, "*batch N m"],
-    scale: Float[Tensor, "*batch m"],
-    used: Tensor | None = None,
-    scales: float = WIDE,
-) -> Float[Tensor, "*batch m"]:
-    """The half-width of the domain: half the range of the residuals of a robust fit, and no less than 10 scales.
+        Computed at the first use, which the residuals are kept for, and by free fits, also where ``sigma`` or ``d`` was
+        fixed.
 
-    The normaliser depends on the length of the domain alone when both its ends lie on the flat tail, so the domain is
-    an interval of that length that covers the residuals, centred on them or not. Ten scales leave Gaussian data at
-    σ = ∞, where a = max|e| over-fits the tail; half the range instead of a multiple of max|e| keeps the tail of
-    one-sided outliers as dense as it is.
-
-    Args:
-        error: residuals.
-        scale: robust scale of each channel.
-        used: boolean mask of the residuals that count.
-        scales: least half-width in scales.
-    """
-    high = error if used is None else torch.where(used, error, -torch.inf)
-    low = error if used is None else torch.where(used, error, torch.inf)
-    return torch.maximum(0.5 * (high.amax(-2) - low.amin(-2)), scales * scale)
-
-
-def refuse_bad_bound(bound: Tensor, scale: Tensor) -> None:
-    """Refuse a domain that the head of the density does not fit in, and one whose square overflows."""
-    most = torch.finfo(scale.dtype).max ** 0.4
-    if not bool((bound <= most).all()):
-        raise ValueError(
-            f"Expected argument `bound` within {most:.1g}, beyond which squares overflow, but got "
-            f"{float(bound.max()):.4g}; it is the half-width of the domain that errors can lie in."
-        )
-    narrow = bound < 2.0 * scale
-    if bool(narrow.any()):
-        first = tuple(narrow.nonzero()[0])
-        raise ValueError(
-            f"Expected argument `bound` to be at least two robust scales of the residuals, "
-            f"{2.0 * scale[first].item():.4g}, but got {bound[first].item():.4g}; it is the domain's half-width."
-        )
+        Raises:
+            ValueError: all residuals of a channel are 0.
+        """
+        error, weight = self._residuals.error, self._residuals.weight
+        return assess_tails(error, weight, bound=self._domain.bound, d_min=self._domain.d_min)
 
 
 def fit_density(
@@ -364,87 +119,32 @@ def fit_density(
         >>> bool(fit.sigma > 8), round(float(fit.d), 1)
         (True, 1.0)
     """
-    error = as_tensor("error", error)
-    refuse_not_real("error", error)
-    if error.dtype in (torch.float16, torch.bfloat16):
-        raise TypeError(f"Expected argument `error` of dtype float32 or float64 but got {error.dtype}; use .float().")
-    if error.dim() < 2 or error.shape[-2] < 2 or error.shape[-1] == 0:
-        mend = "; one channel is error[:, None]" if error.dim() == 1 and len(error) > 1 else ""
-        raise ValueError(
-            f"Expected argument `error` of shape (*, N >= 2, m) with a channel at least but got {tuple(error.shape)}"
-            f"{mend}."
-        )
-    refuse_not_finite("error", error, "Leave those residuals out")
-    most = torch.finfo(error.dtype).max ** 0.4
-    if not bool((error.abs() <= most).all()):
-        raise ValueError(
-            f"Expected argument `error` within {most:.1g}, beyond which squares overflow, but got "
-            f"{float(error.abs().max()):.2g}; divide by a unit near its scale, or leave out what cannot be right."
-        )
+    error = checked_residuals(error)
     checked_whole("max_iter", max_iter, 1, "100 is ample")
     checked_number("tol", tol, ends="[)", advice="1e-12 suits float64")
-    shape = (*error.shape[:-2], error.shape[-1])
-
-    def parameter(name: str, value: float | Tensor | None, least: float = 0.0, infinite: bool = False) -> Tensor | None:
-        if value is None:
-            return None
-        t = as_numbers(name, value, error.dtype, error.device).to(error)
-        if not bool(((t > 0) & (t >= least) & (torch.isfinite(t) | infinite)).all()):
-            wanted = f"in [{least:.4g}, inf]" if infinite else "positive and finite"
-            raise ValueError(f"Expected argument `{name}` to be {wanted} but got {value}.")
-        try:
-            return t.expand(shape)
-        except RuntimeError:
-            raise ValueError(
-                f"Expected argument `{name}` to be a number or of shape (m,) or {shape} but got {tuple(t.shape)}."
-            ) from None
-
-    normalised = None
-    if weight is not None:
-        weight = full_weight(as_tensor("weight", weight), error)
-        normalised = weight / weight.sum(-2, keepdim=True)
-    scale = robust_scale(error, weight)
-    tiny = torch.finfo(error.dtype).tiny ** 0.5
-    scale = torch.where(scale > 0, scale, torch.sqrt(_mean(error.square(), normalised))).clamp(min=tiny)
-    floor = parameter("d_min", d_min)
-    half_width = parameter("bound", bound)
-    if half_width is not None:
-        refuse_bad_bound(half_width, scale)
-    else:
-        half_width = domain_rule(error, scale, None if weight is None else weight > 0)
-    if floor is not None and bool((floor >= half_width).any()):
-        raise ValueError(
-            f"Expected argument `d_min` below the half-width of the domain, {half_width.tolist()}, but got {d_min}; it "
-            "is the precision of the residuals."
-        )
-    fixed_sigma, fixed_d = parameter("sigma", sigma, SIGMA_LEAST, infinite=True), parameter("d", d)
-    if fixed_d is not None and bound is not None and bool((fixed_d >= half_width).any()):
+    residuals = checked_weight(weight, error)
+    domain = checked_domain(residuals, bound, d_min)
+    fixed_sigma = channel_values("sigma", sigma, error, SIGMA_LEAST, infinite=True)
+    fixed_d = channel_values("d", d, error)
+    if fixed_d is not None and bound is not None and bool((fixed_d >= domain.bound).any()):
         raise ValueError(f"Expected argument `d` below `bound` but got {d} and {bound}; widen `bound`.")
-    state = initial_state(
+    start = initial_state(
         error,
-        normalised,
-        scale,
-        half_width,
-        0.1 * scale if floor is None else floor,
+        residuals.share,
+        residuals.scale,
+        *domain,
         kappa=None if fixed_sigma is None else fixed_sigma.pow(-2),
         d=fixed_d,
     )
-    still = torch.zeros(shape, dtype=torch.int64, device=error.device)
-    n_iter = 0
-    while n_iter < max_iter:
-        n_iter += 1
-        before = state
-        state = newton_step(error, normalised, state)
-        rounding = 8 * torch.finfo(error.dtype).eps * state.value.abs().clamp(min=1.0)
-        improved = before.value - state.value > tol + rounding
-        still = torch.where(improved, 0, still + conclusive(before, state).to(still.dtype))
-        if bool((still >= 2).all()):
-            break
+    state, converged, n_iter = maximise(error, residuals.share, start, max_iter=max_iter, tol=tol)
     return DensityFit(
         sigma=state.kappa.rsqrt(),
         d=torch.exp(state.log_d),
         bound=torch.exp(state.log_bound),
         log_likelihood=-state.value,
-        converged=still >= 2,
+        converged=converged,
         n_iter=n_iter,
+        # a copy, since the caller may write over the residuals before the tails are asked for
+        _residuals=Residuals(*(None if t is None else t.detach().clone() for t in residuals)),
+        _domain=domain,
     )

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import as_numbers, refuse_not_real
 from mkc_torch._support.order_statistic import robust_scale
-from mkc_torch.density.fit import refuse_bad_bound
+from mkc_torch.density.domain import refuse_bad_bound
 
 if TYPE_CHECKING:
     from jaxtyping import Float

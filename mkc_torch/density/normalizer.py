@@ -125,6 +125,18 @@ def log_partition(kappa: Float[Tensor, "*batch"], length: Float[Tensor, "*batch"
     return value
 
 
+def log_partition_with_slopes(xp: Any, kappa: Any, length: Any) -> tuple[Any, Any, Any]:
+    """``log Z`` and its derivatives by kappa and by length, none of them differentiable.
+
+    Args:
+        xp: ``numpy`` or ``torch``, whose arrays the others are; NumPy's are float64.
+        kappa, length: as in :func:`log_partition`, of one shape.
+    """
+    if xp is np:
+        return log_partition_and_slopes(kappa, length, _NODES.numpy(), _WEIGHTS.numpy(), _HEAD_TOLERANCE)
+    return _log_partition_and_slopes(kappa, length, energy_value)
+
+
 def _log_partition_and_slopes(
     kappa: Tensor, length: Tensor, energy: Callable[[Tensor, Tensor], Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:

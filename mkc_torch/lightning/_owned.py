@@ -13,7 +13,7 @@ from torch.utils.hooks import RemovableHandle
 
 from mkc_torch.density.energy import KAPPA_MAX
 from mkc_torch.lightning._pace import set_pace
-from mkc_torch.losses._following import Following
+from mkc_torch.losses.bandwidth_schedule import BandwidthSchedule as Following
 from mkc_torch.losses.mkc import MKCLoss
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from lightning.pytorch import Trainer
 
-from mkc_torch.losses._following import BEFORE, Following
+from mkc_torch.losses.bandwidth_schedule import WARMUP_STEPS as BEFORE, BandwidthSchedule as Following
 
 __all__ = ["set_pace"]
 

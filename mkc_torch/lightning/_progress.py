@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mkc_torch.lightning._owned import OwnedLoss
 from mkc_torch.lightning.residual_histogram import ResidualHistogram
-from mkc_torch.losses._following import Following
+from mkc_torch.losses.bandwidth_schedule import BandwidthSchedule as Following
 from mkc_torch.losses.mkc import MKCLoss
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from mkc_torch.functional import mkc_nll
 from mkc_torch.lightning._owned import SIGMA_CAP, OwnedLoss
 from mkc_torch.lightning._progress import MIN_RESIDUALS, Progress
 from mkc_torch.lightning.residual_histogram import ResidualHistogram
-from mkc_torch.losses._following import Following
+from mkc_torch.losses.bandwidth_schedule import BandwidthSchedule as Following
 from mkc_torch.losses.mkc import MKCLoss
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mkc_torch.density.fit import Derivatives, energy_terms
+from mkc_torch.density.likelihood import Derivatives, energy_terms
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float64

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.density.fit import WIDE, DensityState
+from mkc_torch.density.domain import WIDE
+from mkc_torch.density.likelihood import DensityState
 from mkc_torch.density.normalizer import log_partition_value
 from mkc_torch.linear._blocks import Bends, Density, Sums
 from mkc_torch.linear._implicit.at_rest import Rest

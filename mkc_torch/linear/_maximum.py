@@ -8,15 +8,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from mkc_torch.density.domain import domain_rule, refuse_bad_bound
 from mkc_torch.density.em import gaussian_state, normalised, spread, written
-from mkc_torch.density.fit import (
-    DensityState,
-    conclusive,
-    domain_rule,
-    initial_state,
-    newton_step,
-    refuse_bad_bound,
-)
+from mkc_torch.density.likelihood import DensityState, conclusive, initial_state, newton_step
 from mkc_torch.linear._mkc import channel_parameter, fixed_point_step
 from mkc_torch.linear._problem import LinearProblem
 from mkc_torch.linear._robust_start import RobustStart, Start, robust_start

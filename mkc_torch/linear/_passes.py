@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.density.energy import KAPPA_MAX
-from mkc_torch.density.fit import DensityState, Derivatives, likelihood_derivatives, newton_proposal
+from mkc_torch.density.likelihood import DensityState, Derivatives, likelihood_derivatives, newton_proposal
 from mkc_torch.linear._blocks import (
     Bends,
     Block,

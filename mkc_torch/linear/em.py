@@ -12,7 +12,7 @@ from mkc_torch._support.arguments import checked_number, checked_whole, refuse_o
 from mkc_torch._support.arrays import Data
 from mkc_torch.density.em import normalised
 from mkc_torch.density.energy import SIGMA_LEAST
-from mkc_torch.density.fit import negative_log_likelihood
+from mkc_torch.density.likelihood import negative_log_likelihood
 from mkc_torch.linear._implicit.at_rest import Rest
 from mkc_torch.linear._implicit.layer import Given, fit_layer, wanted
 from mkc_torch.linear._inference import Inference

@@ -21,7 +21,7 @@ from mkc_torch.losses._checks import (
     refuse_other_shapes,
 )
 from mkc_torch.losses._curves import SampleCurves
-from mkc_torch.losses._logistic import logistic
+from mkc_torch.losses._parameters import logistic
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.density.em import gaussian_state, normalised, spread, written
-from mkc_torch.density.fit import DensityState, conclusive, newton_step
+from mkc_torch.density.likelihood import DensityState, conclusive, newton_step
 from mkc_torch.nonlinear._constraints import constrained
 from mkc_torch.nonlinear._descent import damped_step
 from mkc_torch.nonlinear._problem import Point, Problem

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import checked_number, checked_whole
 from mkc_torch._support.forward_mode import Residual
+from mkc_torch.density.domain import domain_rule
 from mkc_torch.density.energy import SIGMA_LEAST
-from mkc_torch.density.fit import DensityState, domain_rule, initial_state
+from mkc_torch.density.likelihood import DensityState, initial_state
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
 from mkc_torch.nonlinear._alternate import Maximum, alternated, gaussian_candidate, likelihood_of
 from mkc_torch.nonlinear._arguments import per_channel, prepared, refuse_out_of_reach

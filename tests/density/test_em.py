@@ -3,7 +3,7 @@
 import torch
 
 from mkc_torch.density.em import gaussian_state, normalised, spread, written
-from mkc_torch.density.fit import initial_state, negative_log_likelihood
+from mkc_torch.density.likelihood import initial_state, negative_log_likelihood
 
 E = torch.linspace(-2.0, 3.0, 60, dtype=torch.float64).reshape(3, 10, 2)
 WEIGHT = torch.arange(60, dtype=torch.float64).reshape(3, 10, 2) % 4

@@ -13,15 +13,15 @@ from scipy.stats import norm
 from torch import Tensor
 
 from mkc_torch import fit_density
-from mkc_torch.density.fit import (
+from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.density.domain import domain_rule
+from mkc_torch.density.likelihood import (
     DensityState,
-    domain_rule,
     energy_derivatives,
     initial_state,
     negative_log_likelihood,
     newton_step,
     normaliser_derivatives,
-    robust_scale,
 )
 from mkc_torch.linear import LeastSquares, MKCRegression
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mkc_torch.density.fit import domain_rule
+from mkc_torch.density.domain import domain_rule
 from mkc_torch.linear import MKCRegression, _maximum
 
 PATH = Path(__file__).parents[2] / "examples" / "paper" / "example_2.py"

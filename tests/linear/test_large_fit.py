@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from mkc_torch.density.fit import energy_derivatives
+from mkc_torch.density.likelihood import energy_derivatives
 from mkc_torch.linear import MKCRegression, RankDeficientError, _blocks, _large, _passes, em
 from mkc_torch.linear._blocks import Density, blocks, energy_of, kernel, residual, sums
 from mkc_torch.linear._mkc import coefficient_covariance

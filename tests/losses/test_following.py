@@ -13,7 +13,8 @@ from torch import nn
 
 from mkc_torch import MKCLoss
 from mkc_torch.functional import mkc_nll
-from mkc_torch.losses._following import Following
+from mkc_torch.losses.bandwidth_schedule import BandwidthSchedule
+from mkc_torch.losses.residual_scale import ResidualScale
 
 N = 600
 
@@ -273,8 +274,8 @@ def test_the_network_begins_with_a_loss_sharper_than_the_absolute_value_and_ends
     loss, leaf = MKCLoss(1), error.clone().requires_grad_()
     (early,) = torch.autograd.grad(loss(leaf, torch.zeros(200, 1)), leaf)
     assert float(early[0] / early[1]) == pytest.approx(2.0, rel=1e-3)
-    loss.following.turned.fill_(1.0)
-    loss.following.log_bandwidth.fill_(0.0)
+    loss.schedule.share.fill_(1.0)
+    loss.schedule.log_bandwidth.fill_(0.0)
     (late,) = torch.autograd.grad(loss(leaf, torch.zeros(200, 1)), leaf)
     assert float(late[1].abs()) < 1e-6 * float(early[1].abs())
 
@@ -322,7 +323,7 @@ def test_settled_it_is_a_loss_with_numbers():
     x, y = torch.randn(2, 50, 1, generator=generator())
     loss(x, y)
     d, value = loss.d.item(), loss.eval()(x, y).item()
-    loss.train().settle()
+    loss.train().freeze_scale()
     assert loss.d.item() == pytest.approx(d, rel=1e-5)
     assert loss(x, y).item() == pytest.approx(value, rel=1e-4)
     assert loss(x, 100.0 * y).item() > value
@@ -342,7 +343,7 @@ def test_given_numbers_are_kept():
         loss(size * torch.randn(50, 1, generator=generator()), torch.zeros(50, 1))
         assert (float(loss.bound), float(loss.d_min)) == (50.0, 0.25)
         assert 0.25 <= loss.d.item() <= 25.0
-    assert MKCLoss(1, d=2.0).following is None
+    assert MKCLoss(1, d=2.0).residual_scale is None
     assert MKCLoss(1, d=2.0).bound.item() == 200.0
 
 
@@ -354,7 +355,7 @@ def test_gradients_accumulate_over_batches():
     x, y = torch.randn(64, 2, generator=generator()), torch.randn(64, 1, generator=generator(1))
     sum(loss(model(a), b) for a, b in zip(x.split(16), y.split(16), strict=True)).backward()
     assert model.weight.grad.isfinite().all()
-    assert float(loss.following.seen) == 4.0
+    assert int(loss.schedule.steps) == 4
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
@@ -400,7 +401,7 @@ def _process(rank, port, queue):
     for step in range(3):
         x = torch.randn(50, 1, generator=generator(10 * rank + step))
         loss((1.0 + 3.0 * rank) * x, torch.zeros(50, 1))
-    queue.put([loss.d.item(), float(loss.bound), float(loss.d_min), float(loss.following.log_bandwidth)])
+    queue.put([loss.d.item(), float(loss.bound), float(loss.d_min), float(loss.schedule.log_bandwidth)])
     torch.distributed.barrier()
     torch.distributed.destroy_process_group()
 
@@ -428,7 +429,7 @@ def test_a_loss_that_settles_on_its_floor_can_be_learned_on():
     for size in [1.0, *[1e-9] * 50]:
         loss((size * noise).requires_grad_(), torch.zeros(50, 1))
     torch.testing.assert_close(loss.d, loss.d_min)
-    loss.settle()
+    loss.freeze_scale()
     torch.testing.assert_close(loss.d, loss.d_min)
     slopes = torch.autograd.grad(loss(1e-9 * noise, torch.zeros(50, 1)), list(loss.parameters()))
     assert all(bool(torch.isfinite(one).all()) for one in (*slopes, *loss.parameters()))

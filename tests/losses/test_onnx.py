@@ -108,7 +108,7 @@ def test_a_loss_of_given_numbers(options):
 def test_a_loss_that_follows_its_residuals_before_and_after_it_has_settled(settled):
     module = trained(MKCLoss(2))
     if settled:
-        module.loss.settle()
+        module.loss.freeze_scale()
     refuse_other(module, batch)
 
 

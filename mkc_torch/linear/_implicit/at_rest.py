@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.density.energy import KAPPA_MAX, energy, energy_dkappa, energy_dz
-from mkc_torch.density.fit import energy_derivatives, normaliser_derivatives
+from mkc_torch.density.likelihood import energy_derivatives, normaliser_derivatives
 from mkc_torch.density.normalizer import _log_partition_and_slopes
 from mkc_torch.linear._implicit.refusal import _NO_MINIMUM, _NOT_AT_REST
 from mkc_torch.linear._problem import LinearProblem

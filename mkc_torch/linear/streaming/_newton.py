@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.density.energy import KAPPA_MAX
-from mkc_torch.density.fit import normaliser_derivatives
+from mkc_torch.density.likelihood import normaliser_derivatives
 from mkc_torch.linear.streaming._rough import LEAST_KAPPA_OF_ROUGH
 from mkc_torch.linear.streaming._sums import Slopes
 

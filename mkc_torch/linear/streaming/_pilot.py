@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.density.fit import normaliser_derivatives
+from mkc_torch.density.likelihood import normaliser_derivatives
 from mkc_torch.linear._problem import RankDeficientError
 from mkc_torch.linear.em import MKCRegression
 from mkc_torch.linear.streaming._blocks import Shape

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.files import write_atomically
-from mkc_torch.density.fit import normaliser_derivatives
+from mkc_torch.density.likelihood import normaliser_derivatives
 from mkc_torch.linear._problem import solve_gram
 from mkc_torch.linear._scale_search import relative_precision
 from mkc_torch.linear.streaming._blocks import Shape

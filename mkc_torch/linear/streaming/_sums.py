@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from mkc_torch.density.fit import energy_derivatives
+from mkc_torch.density.likelihood import energy_derivatives
 from mkc_torch.linear.streaming._blocks import Block, Shape, blocks
 from mkc_torch.linear.summary import LIGHT
 

@@ -1,0 +1,112 @@
+"""Selection of the bandwidth by which a network learns: estimated variance and shrinkage of the predictions.
+
+The variance alone does not separate wrong targets from wide noise. A wrong target that is independent of its input
+pulls the prediction toward the middle. Least squares yields, the residuals of right and wrong targets then look alike,
+and a wide bandwidth looks best. The initial loss, which gives far residuals little weight, would stretch such
+predictions again: its influence correlates with the prediction. So each bandwidth is judged by its variance and by the
+square of the shrinkage that it adds to the initial loss's, as far as that exceeds chance.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from mkc_torch.losses._initial_loss import initial_influence
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+__all__ = ["BandwidthSelection", "select_bandwidth"]
+
+BANDWIDTHS = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 16.0, 64.0)
+"""Candidates, in scales."""
+
+TOLERANCE = 1.1
+"""Times the smallest risk up to which a wider bandwidth is taken."""
+
+CHANCE = 9.0
+"""Squared standard errors of shrinkage that are put down to chance: three standard errors. Set on Friedman's second and
+third function and the Carseats and Hitters tables."""
+
+LEAST_SLOPE = 1e-3
+"""Least mean derivative of an influence function."""
+
+TINY = 1e-30
+"""Stands for 0 in a denominator."""
+
+_FAR = 1e4
+"""Square of a residual over its bandwidth at which its kernel is 0 already."""
+
+
+class BandwidthSelection(NamedTuple):
+    """The widest bandwidth of nearly the smallest risk, in scales, and whether it is better than the initial loss."""
+
+    bandwidth: Any
+    better: Any
+
+
+def select_bandwidth(
+    xp: Any, z: Float[Tensor, "m L"], prediction: Float[Tensor, "m L"], weight: Float[Tensor, "m L"]
+) -> BandwidthSelection:
+    """Judge all bandwidths, and the initial loss, on residuals.
+
+    The variance of an M-estimate with influence ψ is E ψ² / (E ψ')² (Huber, "Robust Statistics" (1981), 3.2). Its
+    shrinkage is one step of Newton's method for the slope on the standardised prediction, E ψ q / E ψ'.
+
+    Args:
+        xp: ``numpy`` or ``torch``, whose arrays the others are.
+        z: residuals, prediction less target, over their scale.
+        prediction: the prediction of each residual.
+        weight: the weight of each residual.
+
+    Example:
+        >>> import torch
+        >>> z = torch.linspace(-0.999, 0.999, 999).erfinv().unsqueeze(0) * 2.0**0.5
+        >>> select_bandwidth(torch, z, torch.zeros_like(z), torch.ones_like(z))
+        BandwidthSelection(bandwidth=tensor([64.]), better=tensor([True]))
+    """
+    share = weight / xp.clip(weight.sum(-1), TINY, None)[..., None]
+
+    def mean(values: Any) -> Any:
+        return (values @ share[..., None])[..., 0]
+
+    influence, slope = _influences(xp, z)
+    slope = xp.clip(mean(slope), LEAST_SLOPE, None)
+    risk = mean(influence * influence) / (slope * slope)
+    # contribution of each sample to the slope, less its contribution under the initial loss, which is last
+    step = (influence - mean(influence)[..., None]) * (_standardised(xp, prediction, share)[..., None, :])
+    step = step / slope[..., None]
+    step = step - step[..., -1:, :]
+    shrinkage = mean(step)
+    spread = mean((step - shrinkage[..., None]) ** 2)
+    size = 1.0 / xp.clip((share * share).sum(-1), TINY, None)[..., None]
+    risk = risk + xp.clip(size * xp.clip(shrinkage, 0.0, None) ** 2 - CHANCE * spread, 0.0, None)
+    annealed, initial = risk[..., :-1], risk[..., -1]
+    least = xp.amin(annealed, -1)
+    chosen = xp.where(annealed <= TOLERANCE * least[..., None], _widths(xp, z), 0.0)
+    return BandwidthSelection(xp.amax(chosen, -1), TOLERANCE * least < initial)
+
+
+def _widths(xp: Any, like: Any) -> Any:
+    if xp.__name__ == "numpy":
+        return xp.asarray(BANDWIDTHS, dtype=like.dtype)
+    return like.new_tensor(BANDWIDTHS)
+
+
+def _influences(xp: Any, z: Any) -> tuple[Any, Any]:
+    """Influence and its derivative under each bandwidth and, last, under the initial loss: (m, K + 1, L)."""
+    each = z[..., None, :]
+    ratio = each / _widths(xp, z)[:, None]
+    square = xp.clip(ratio * ratio, None, _FAR)  # beyond, a product of infinity and 0
+    inlier = xp.exp(-0.5 * square)
+    initial, slope = initial_influence(xp, each)
+    return xp.concatenate([each * inlier, initial], -2), xp.concatenate([(1.0 - square) * inlier, slope], -2)
+
+
+def _standardised(xp: Any, values: Any, share: Any) -> Any:
+    """Of mean 0 and variance 1; 0 where all values are equal."""
+    centred = xp.where(share > 0, values - (values * share).sum(-1)[..., None], 0.0)
+    # over their largest, whose square neither overflows nor is 0
+    centred = centred / xp.clip(xp.amax(xp.abs(centred), -1), TINY, None)[..., None]
+    return centred / xp.clip(xp.sqrt((centred * centred * share).sum(-1)), TINY, None)[..., None]

@@ -1,0 +1,45 @@
+"""Which implementation computes a loss: torch's operations, its compiler, or Triton kernels."""
+
+from __future__ import annotations
+
+import functools
+from importlib.util import find_spec
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["Implementation", "checked_implementation", "kernels_are_available", "runs_kernels"]
+
+Implementation = Literal["auto", "eager", "compile", "triton"]
+
+
+def checked_implementation(impl: str) -> Implementation:
+    """``impl`` itself.
+
+    Raises:
+        ValueError: there is no such implementation, or Triton is not installed.
+    """
+    if impl not in get_args(Implementation):
+        known = ", ".join(map(repr, get_args(Implementation)))
+        raise ValueError(f"Expected argument `impl` to be one of {known} but got {impl!r}; 'auto' chooses.")
+    if impl == "triton" and find_spec("triton") is None:
+        raise ValueError(
+            "Expected argument `impl` to be 'auto', 'eager' or 'compile' without Triton but got 'triton'; torch's CUDA "
+            "wheels bring it, and `pip install triton` runs its interpreter on the CPU."
+        )
+    return impl  # type: ignore[return-value]
+
+
+@functools.cache
+def kernels_are_available() -> bool:
+    """Whether Triton can compile for a GPU of this process."""
+    return find_spec("triton") is not None and torch.cuda.is_available()
+
+
+def runs_kernels(loss: nn.Module, input: object) -> bool:
+    """Whether a batch goes through the kernels."""
+    impl = loss.impl
+    if impl == "triton":
+        return True
+    return impl == "auto" and isinstance(input, Tensor) and input.device.type == "cuda" and kernels_are_available()

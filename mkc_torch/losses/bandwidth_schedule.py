@@ -1,0 +1,135 @@
+"""The schedule of the loss by which a network learns: from a sharp initial loss to Welsch's of a selected bandwidth.
+
+The likelihood of σ and d describes the noise. It does not say by which bandwidth a network gets there: with half of the
+targets wrong a wide Gaussian is as likely as a narrow head, and a network that least squares has pulled away stays
+there. So the network begins with a loss sharper than the absolute value, and is annealed to Welsch's of the bandwidth
+that the recent residuals and predictions support, as long as they do.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from mkc_torch.density.energy import energy
+from mkc_torch.losses._bandwidth_selection import select_bandwidth
+from mkc_torch.losses._initial_loss import initial_loss
+from mkc_torch.losses.residual_scale import RATE, SMALL_STATE, ResidualScale, average_over_processes, numpy_may_read
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["BandwidthSchedule"]
+
+WARMUP_STEPS = 100
+"""Batches for which the initial loss is used alone."""
+
+ANNEAL_STEP = 0.005
+"""Change of the share of the annealed loss with each batch after the warm-up."""
+
+SELECTION_INTERVAL = 4
+"""Batches between two selections of the bandwidth: a selection costs more than a small batch."""
+
+UNLIMITED = 32.0
+"""Bandwidth in scales from which it does not limit a likelihood: half the widest candidate."""
+
+
+class BandwidthSchedule(nn.Module):
+    """From the initial loss to Welsch's of the selected bandwidth, for each channel; all state in buffers.
+
+    In the first ``warmup_steps`` batches the initial loss is used alone. At every fourth batch the bandwidth is selected
+    by the estimated risk of the predictions, and the share of the annealed loss grows where it has a smaller risk than
+    the initial loss, and falls where it has not.
+
+    Args:
+        num_channels: m.
+        warmup_steps: batches for which the initial loss is used alone.
+        anneal_step: change of the share with each later batch.
+
+    Attributes:
+        steps: how many batches were seen, ().
+        log_bandwidth: logarithm of the selected bandwidth in scales, a running mean, (m,).
+        share: share of the annealed loss in [0, 1], (m,).
+
+    Example:
+        >>> scale, schedule = ResidualScale(1), BandwidthSchedule(1)
+        >>> scale.update(torch.linspace(-3.0, 3.0, 500).unsqueeze(-1), torch.zeros(500, 1))
+        >>> schedule.update(scale)
+        >>> schedule.bandwidth, schedule.share
+        (tensor([64.0000]), tensor([0.]))
+        >>> schedule.energy(torch.tensor([[0.0], [1.0], [100.0]])).flatten()
+        tensor([0.0000, 0.1006, 1.7089])
+    """
+
+    steps: Tensor
+    log_bandwidth: Tensor
+    share: Tensor
+
+    def __init__(
+        self, num_channels: int, *, warmup_steps: int = WARMUP_STEPS, anneal_step: float = ANNEAL_STEP
+    ) -> None:
+        super().__init__()
+        self.warmup_steps, self.anneal_step = warmup_steps, anneal_step
+        self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("log_bandwidth", torch.zeros(num_channels))
+        self.register_buffer("share", torch.zeros(num_channels))
+
+    @property
+    def bandwidth(self) -> Float[Tensor, " m"]:
+        """The selected bandwidth, in scales."""
+        return self.log_bandwidth.exp()
+
+    def energy(self, z: Float[Tensor, "*batch m"]) -> Float[Tensor, "*batch m"]:
+        """The loss by which a network learns, of residuals over their scale, the channels last."""
+        share = self.share.to(z.dtype)
+        kappa = torch.exp(-2.0 * self.log_bandwidth).to(z.dtype)
+        return share * energy(z, kappa) + (1.0 - share) * initial_loss(torch, z)
+
+    @torch.no_grad()
+    def update(self, residual_scale: ResidualScale) -> None:
+        """Take a batch into the schedule that ``residual_scale`` has been updated with."""
+        state = ScheduleState(self.steps, self.log_bandwidth, self.share)
+        recent, log_scale = residual_scale.recent, residual_scale.log_scale
+        on_cpu = self.share.device.type == "cpu" and not torch.compiler.is_compiling()
+        if on_cpu and self.steps.item() % SELECTION_INTERVAL:  # elsewhere a look would wait
+            self.steps += 1
+            return
+        if len(self.share) <= SMALL_STATE and numpy_may_read(self.share, recent):
+            arrays = ScheduleState(*(value.numpy() for value in state))
+            with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+                new = self._next(np, arrays, recent.numpy(), log_scale.numpy())
+            new = ScheduleState(*(torch.as_tensor(value) for value in new))
+        else:
+            new = self._next(torch, state, recent, log_scale)
+        log_bandwidth, share = average_over_processes([new.log_bandwidth, new.share])
+        for old, value in zip(state, (new.steps, log_bandwidth, share), strict=True):
+            old.copy_(value)
+
+    def _next(self, xp: Any, old: ScheduleState, recent: Any, log_scale: Any) -> ScheduleState:
+        """The state after a batch; ``xp`` is ``numpy`` or ``torch``, whose arrays the others are."""
+        residual, prediction, weight = recent[0], recent[1], recent[2]
+        selected = select_bandwidth(xp, residual / xp.exp(log_scale)[..., None], prediction, weight)
+        steps = old.steps.astype(old.share.dtype) if xp is np else old.steps.to(old.share.dtype)
+        least_rate = 1.0 - (1.0 - RATE) ** SELECTION_INTERVAL
+        rate = xp.clip(SELECTION_INTERVAL / (steps + 1.0), least_rate, 1.0)
+        step = xp.where(selected.better, SELECTION_INTERVAL * self.anneal_step, -SELECTION_INTERVAL * self.anneal_step)
+        annealing = (old.steps >= self.warmup_steps) & ((weight * xp.abs(residual)).sum(-1) > 0)
+        due = old.steps % SELECTION_INTERVAL == 0
+        log_bandwidth = old.log_bandwidth + rate * (xp.log(selected.bandwidth) - old.log_bandwidth)
+        share = xp.where(annealing, xp.clip(old.share + step, 0.0, 1.0), old.share)
+        return ScheduleState(
+            steps=old.steps + 1,
+            log_bandwidth=xp.where(due, log_bandwidth, old.log_bandwidth),
+            share=xp.where(due, share, old.share),
+        )
+
+
+class ScheduleState(NamedTuple):
+    """The buffers of :class:`BandwidthSchedule`."""
+
+    steps: Any
+    log_bandwidth: Any
+    share: Any

@@ -1,0 +1,316 @@
+"""A running robust scale and half range of the residuals of each channel, with the contract of batch normalisation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.distributed
+from torch import Tensor, nn
+
+from mkc_torch._support.torch_internals import is_wrapped
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+__all__ = ["ResidualScale", "average_over_processes", "numpy_may_read"]
+
+QUANTILE = 0.4
+"""Level of the quantile of |residual| that gives the scale: below one half, where half of the targets are wrong."""
+
+NORMAL_QUANTILE = 0.5244005
+"""That quantile of the absolute value of a standard normal variable."""
+
+MOST_RECENT = 512
+"""Residuals of a channel that are kept."""
+
+FEWEST_RECENT = 64
+"""Residuals of a channel that are kept however many channels there are."""
+
+RECENT_IN_ALL = 1 << 16
+"""Residuals that are kept of all channels together, but for ``FEWEST_RECENT``."""
+
+RANGE_ROWS = 1 << 14
+"""Residuals of a batch and channel from which the half range is taken, evenly spaced."""
+
+RATE = 0.1
+"""Share of a new batch in the running scale; the n-th batch has 1 / n while that is more."""
+
+RANGE_DECAY = 0.999
+"""Factor by which the half range shrinks with each batch that does not reach it."""
+
+SCALES_IN_BOUND = 10.0
+"""Least bound, in scales."""
+
+FLOOR_IN_SPREAD = 1e-3
+"""Floor of d, in mean absolute deviations of the first residuals."""
+
+TINY = 1e-30
+"""Stands for 0 in a logarithm and in a denominator."""
+
+SMALL_STATE = 64
+"""Channels up to which NumPy, which costs less a call than torch, computes the state on the CPU."""
+
+
+class ResidualScale(nn.Module):
+    """Running robust scale, half range and most recent residuals of each channel, all in buffers.
+
+    ``update`` is the only method that changes the state, and is called in training. The scale is the 0.4 quantile of
+    the recent absolute residuals over that of a standard normal variable, averaged over the batches in its logarithm.
+    Residuals of weight 0 and residuals that are not finite do not count.
+
+    In distributed training the scales of all processes are averaged and their half ranges joined, so that all
+    processes have the same.
+
+    Args:
+        num_channels: m.
+
+    Attributes:
+        recent: the latest residuals, the predictions that they belong to and their weights, (3, m, L).
+        position: index in the last dimension of ``recent`` that the next residual takes, ().
+        batches: how many batches had a residual that counts, (m,).
+        log_scale: logarithm of the scale in the unit of the target, (m,).
+        half_range: half the range of the residuals, (m,).
+        floor: a thousandth of the spread of the first residuals, (m,).
+
+    Example:
+        >>> scale = ResidualScale(1)
+        >>> scale.update(torch.linspace(-3.0, 3.0, 500).unsqueeze(-1), torch.zeros(500, 1))
+        >>> scale.scale, scale.half_range
+        (tensor([2.2838]), tensor([3.]))
+    """
+
+    recent: Tensor
+    position: Tensor
+    batches: Tensor
+    log_scale: Tensor
+    half_range: Tensor
+    floor: Tensor
+
+    def __init__(self, num_channels: int) -> None:
+        super().__init__()
+        length = min(MOST_RECENT, max(FEWEST_RECENT, RECENT_IN_ALL // num_channels))
+        self.register_buffer("recent", torch.zeros(3, num_channels, length))
+        self.register_buffer("position", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("batches", torch.zeros(num_channels, dtype=torch.int64))
+        self.register_buffer("log_scale", torch.zeros(num_channels))
+        self.register_buffer("half_range", torch.ones(num_channels))
+        self.register_buffer("floor", torch.full((num_channels,), FLOOR_IN_SPREAD))
+
+    @property
+    def scale(self) -> Float[Tensor, " m"]:
+        """Robust standard deviation about 0 of the recent residuals, in the unit of the target."""
+        return self.log_scale.exp()
+
+    @property
+    def bound(self) -> Float[Tensor, " m"]:
+        """Half the range of the residuals, and no less than ten scales."""
+        return torch.maximum(self.half_range, SCALES_IN_BOUND * self.scale)
+
+    @torch.no_grad()
+    def update(
+        self,
+        prediction: Float[Tensor, "*shape"],
+        target: Float[Tensor, "*shape"],
+        weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
+        channel_dim: int = -1,
+    ) -> None:
+        """Take a batch into the state.
+
+        Args:
+            prediction: predictions whose dimension ``channel_dim`` has size m.
+            target: targets of the same shape.
+            weight: non-negative weights or a mask of the same shape; None for 1.
+            channel_dim: the dimension of the channels.
+        """
+        given = [v for v in (prediction, target, weight) if v is not None]
+        rows = [spaced_rows(values.detach(), channel_dim, RANGE_ROWS) for values in given]
+        if len(self.log_scale) <= SMALL_STATE and numpy_may_read(self.log_scale, *rows):
+            recent, state = self.recent.numpy(), ScaleState(*(value.numpy() for value in self._state()))
+            with np.errstate(over="ignore", invalid="ignore"):
+                batch = rows_of_batch(np, recent, *(values.numpy() for values in rows))
+                _insert_in_numpy(recent, self.position, batch.rows)
+                state = updated(np, recent, state, batch.half_range)
+            state = ScaleState(*(torch.from_numpy(value) for value in state))
+        else:
+            batch = rows_of_batch(torch, self.recent, *rows)
+            count, length = batch.rows.shape[-1], self.recent.shape[-1]
+            slots = (self.position + torch.arange(count, device=self.recent.device)) % length
+            self.recent.index_copy_(-1, slots, batch.rows)
+            self.position.copy_((self.position + count) % length)
+            state = updated(torch, self.recent, self._state(), batch.half_range)
+        for old, new in zip(self._state(), _alike_in_all_processes(state), strict=True):
+            old.copy_(new)
+
+    def _state(self) -> ScaleState:
+        return ScaleState(self.batches, self.log_scale, self.half_range, self.floor)
+
+    @torch.no_grad()
+    def with_batch(self, prediction: Tensor, target: Tensor, weight: Tensor | None, channel_dim: int) -> ScaleState:
+        """The state, or of a channel that has had no batch what it would be after this one. Changes nothing."""
+        given = [v for v in (prediction, target, weight) if v is not None]
+        rows = [spaced_rows(values.detach(), channel_dim, RANGE_ROWS) for values in given]
+        batch = rows_of_batch(torch, self.recent, *rows)
+        state, known = self._state(), self.batches > 0
+        new = updated(torch, batch.rows, state, batch.half_range)
+        return ScaleState(*(torch.where(known, old, value) for old, value in zip(state, new, strict=True)))
+
+
+class ScaleState(NamedTuple):
+    """The buffers of :class:`ResidualScale` that have one number a channel, (m,) each."""
+
+    batches: Any
+    log_scale: Any
+    half_range: Any
+    floor: Any
+
+
+class BatchRows(NamedTuple):
+    """Residuals, predictions and weights of some rows of a batch (3, m, k), and its half range (m,)."""
+
+    rows: Any
+    half_range: Any
+
+
+def rows_of_batch(xp: Any, recent: Any, prediction: Any, target: Any, weight: Any = None) -> BatchRows:
+    """As many evenly spaced rows as ``recent`` holds at most, with weight 0 where a residual is not finite.
+
+    Args:
+        xp: ``numpy`` or ``torch``, whose arrays the others are.
+        recent: as the buffer of :class:`ResidualScale`.
+        prediction, target, weight: rows by channels, (n, m).
+    """
+    dtype, length = recent.dtype, recent.shape[-1]
+    prediction, target = _cast(xp, prediction, dtype), _cast(xp, target, dtype)
+    residual = prediction - target
+    counts = xp.isfinite(residual)
+    if weight is None:
+        weight = _cast(xp, counts, dtype)
+    else:
+        weight = xp.where(counts, _cast(xp, weight, dtype), 0.0)
+        counts = weight > 0
+    residual = xp.where(counts, residual, 0.0)
+    prediction = xp.where(counts, prediction, 0.0)
+    half_range = 0.5 * (xp.amax(residual, 0) - xp.amin(residual, 0))
+    rows = [residual, prediction, weight]
+    count = len(residual)
+    if count > length:
+        places = np.arange(length) if xp is np else torch.arange(length, device=residual.device)
+        rows = [values[places * count // length] for values in rows]
+    return BatchRows(xp.stack([values.T for values in rows]), half_range)
+
+
+def _cast(xp: Any, values: Any, dtype: Any) -> Any:
+    return values.astype(dtype, copy=False) if xp is np else values.to(dtype)
+
+
+def _insert_in_numpy(recent: Any, position: Tensor, rows: Any) -> None:
+    """Put new residuals in the place of the oldest ones."""
+    count, length, start = rows.shape[-1], recent.shape[-1], position.item()
+    head = min(count, length - start)
+    recent[..., start : start + head] = rows[..., :head]
+    recent[..., : count - head] = rows[..., head:]
+    position.fill_((start + count) % length)
+
+
+def updated(xp: Any, recent: Any, old: ScaleState, half_range: Any) -> ScaleState:
+    """The state after a batch whose residuals stand in ``recent``.
+
+    Args:
+        xp: ``numpy`` or ``torch``, whose arrays the others are.
+        recent: as the buffer of :class:`ResidualScale`.
+        old: the state before the batch.
+        half_range: half the range of the residuals of this batch, (m,).
+    """
+    residual, weight = recent[0], recent[2]
+    size = xp.abs(residual)
+    share = weight / xp.clip(weight.sum(-1), TINY, None)[..., None]
+    candidate = weighted_quantile(xp, size, weight, QUANTILE) / NORMAL_QUANTILE
+    # where most residuals are exactly 0, their mean size stands for the quantile
+    candidate = xp.where(candidate > 0, candidate, (size * share).sum(-1))
+    known = candidate > 0
+    first = (old.batches == 0) & known
+    new = xp.where(known, xp.log(xp.clip(candidate, TINY, None)), old.log_scale)
+    rate = xp.clip(1.0 / (_cast(xp, old.batches, recent.dtype) + 1.0), RATE, None)
+    log_scale = xp.where(first, new, old.log_scale + rate * (new - old.log_scale))
+    middle = (residual * share).sum(-1)
+    spread = (xp.abs(residual - middle[..., None]) * share).sum(-1)
+    scale = xp.exp(log_scale)
+    # an offset widens the scale, targets that are wrong by far widen the spread
+    floor = FLOOR_IN_SPREAD * xp.where(spread > 0, xp.minimum(spread, scale), scale)
+    wider = xp.maximum(half_range, RANGE_DECAY * old.half_range)
+    return ScaleState(
+        batches=old.batches + known,
+        log_scale=log_scale,
+        half_range=xp.where(first, half_range, xp.where(known, wider, old.half_range)),
+        floor=xp.where(first, floor, old.floor),
+    )
+
+
+def weighted_quantile(xp: Any, values: Any, weight: Any, level: float) -> Any:
+    """The least value, of each channel, up to which a share ``level`` of the weight lies; (m, L), (m, L) -> (m,)."""
+    if xp is np:
+        equal = weight == (weight > 0)
+        if equal.all():  # sorting alone is several times as fast as sorting weights along
+            ordered = np.sort(np.where(weight > 0, values, np.inf), -1)
+            rank = np.ceil(level * weight.sum(-1)).astype(np.int64) - 1
+            found = np.take_along_axis(ordered, rank.clip(0)[:, None], -1)[:, 0]
+            return np.where(np.isfinite(found), found, 0.0).astype(values.dtype)
+        order = np.argsort(values, -1, kind="stable")
+        ordered, cumulated = np.take_along_axis(values, order, -1), np.take_along_axis(weight, order, -1).cumsum(-1)
+        at = (cumulated < level * cumulated[:, -1:]).sum(-1, keepdims=True).clip(max=values.shape[-1] - 1)
+        return np.take_along_axis(ordered, at, -1)[:, 0]
+    ordered, order = values.sort(dim=-1, stable=True)
+    cumulated = weight.gather(-1, order).cumsum(-1)
+    at = (cumulated < level * cumulated[..., -1:]).sum(-1, keepdim=True).clamp(max=values.shape[-1] - 1)
+    return ordered.gather(-1, at).squeeze(-1)
+
+
+def spaced_rows(values: Tensor, axis: int, most: int) -> Float[Tensor, "n m"]:
+    """Evenly spaced samples, their channels last; at most twice as many as asked for."""
+    moved = values.movedim(axis, -1)
+    shape = moved.shape[:-1]
+    count = shape.numel()
+    step = max(1, count // most)
+    if moved.dim() <= 2 or moved.is_contiguous() or step == 1:
+        return moved.reshape(count, moved.shape[-1])[::step]
+    # channels that are not last in memory: a reshape would copy the whole batch
+    index = torch.arange(0, count, step, device=values.device)
+    places = []
+    for size in reversed(shape):
+        places.append(index % size)
+        index = index // size
+    return moved[tuple(reversed(places))]
+
+
+def numpy_may_read(*values: Tensor) -> bool:
+    """Whether NumPy may read and write the memory of tensors: on the CPU, in eager code, under no transform."""
+    return not torch.compiler.is_compiling() and all(
+        type(value) in (Tensor, nn.Parameter) and value.device.type == "cpu" and not is_wrapped(value)
+        for value in values
+    )
+
+
+def average_over_processes(values: Sequence[Float[Tensor, " m"]]) -> Sequence[Float[Tensor, " m"]]:
+    """The means over the processes of a distributed training."""
+    if not _is_distributed():
+        return values
+    means = torch.stack(list(values))
+    torch.distributed.all_reduce(means)
+    return (means / torch.distributed.get_world_size()).unbind(0)
+
+
+def _is_distributed() -> bool:
+    distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
+    return distributed and torch.distributed.get_world_size() > 1
+
+
+def _alike_in_all_processes(state: ScaleState) -> ScaleState:
+    if not _is_distributed():
+        return state
+    log_scale, floor = average_over_processes([state.log_scale, state.floor])
+    widest = torch.stack([state.half_range, state.batches.to(state.half_range)])
+    torch.distributed.all_reduce(widest, torch.distributed.ReduceOp.MAX)
+    return ScaleState(widest[1].to(state.batches), log_scale, widest[0], floor)
