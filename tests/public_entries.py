@@ -119,6 +119,11 @@ def entries() -> Iterator[Entry]:
         density.fit_density,
         {"error": Y, "weight": torch.ones_like(Y), "bound": 40.0, "d_min": 1e-3, "max_iter": 30},
     )
+    yield Entry(
+        ("density.assess_tails", "density.Tails", "density.ChannelTails"),
+        density.assess_tails,
+        {"error": Y, "weight": torch.ones_like(Y), "bound": 40.0, "d_min": 1e-3, "count": 50.0},
+    )
     yield Entry(("density.fit_kernels", "density.KernelsFit"), density.fit_kernels, {"error": Y, "bound": 40.0})
     shares = {"sigma": 2.0, "d": 1.0, "epsilon": 0.3, "zeta": 0.5, "num_samples": 100, "num_inliers": 80}
     yield Entry(("density.error_bound",), density.error_bound, shares)

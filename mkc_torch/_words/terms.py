@@ -206,7 +206,8 @@ TERMS: dict[str, str] = {
     "noise.smooth_alone": "{smooth}; the residual is {residual}",
     "noise.smooth_reaches": "a smooth correction by all recorded columns and by time reaches {residual}",
     "noise.gaussian": "Gaussian",
-    "noise.heavy_tailed": "heavy-tailed, σ = {sigma}",
+    "noise.heavy_tailed": "heavy-tailed: {share} of the errors beyond three times that (0.27 % if Gaussian)",
+    "noise.bandwidth": "σ = {sigma}",
     "noise.along_the_field": "{size} along the field, {kind}",
     # a calibration in sentences
     "calibration.result": "Offset ({center}) {unit}, semi-axes ({axes}) {unit}.",

@@ -25,6 +25,9 @@ from mkc_torch.calibration.places import disturbed_places, numbered
 from mkc_torch.calibration.plain_values import Spread, matrix_of, spread_of, vector_of
 from mkc_torch.calibration.recorded_ellipsoid import recorded_ellipsoid
 from mkc_torch.calibration.result import Calibration
+from mkc_torch.calibration.runs import in_each_run, run_slices
+from mkc_torch.calibration.turning import thin_at_rest
+from mkc_torch.density.tails import ChannelTails, time_series_tails
 from mkc_torch.functional import mkc_weight
 from mkc_torch.linear import MKCRegression
 from mkc_torch.recording.recording import Recording, RecordingError
@@ -215,7 +218,15 @@ def _of_ellipsoid(fit: EllipsoidFit, usable: Recording, field_strength: float | 
             *_warnings(fit, found, length - radius, float(rejected.double().mean())),
         ),
         used=usable,
+        tails=_tails(usable, (length / radius).square() - 1.0),
     )
+
+
+def _tails(usable: Recording, residual: Tensor) -> ChannelTails | None:
+    """The tails of the residual of the samples that the ellipsoid was fitted to; None of an exact fit."""
+    taken = in_each_run(usable.magnetometer(), run_slices(usable), thin_at_rest)
+    assert taken is not None
+    return next(iter(time_series_tails(residual[taken].unsqueeze(-1))), None)
 
 
 def _density(fit: EllipsoidFit) -> tuple[float, float, float]:

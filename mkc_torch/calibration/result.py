@@ -24,6 +24,7 @@ from mkc_torch.calibration.file import (
 )
 from mkc_torch.calibration.plain_values import Spread
 from mkc_torch.calibration.plot import CalibrationPlot
+from mkc_torch.density.tails import ChannelTails
 from mkc_torch.functional import mkc_weight
 from mkc_torch.recording.disturbance import Interval
 from mkc_torch.recording.recording import Recording
@@ -73,6 +74,8 @@ class Calibration:
         coverage: of directions, by the samples in use.
         warnings: sentences about the recording and the fit.
         name: what the sensor is called: the recording's name, unless another was given.
+        tails: of :meth:`algebraic_residual`: whether heavier than a Gaussian's, and the share of the errors expected
+            beyond 3 d; None of an exact fit, and of a file that does not have them.
         used: the samples that it was made from, which the pictures show; None where it was read from a file.
     """
 
@@ -103,6 +106,7 @@ class Calibration:
     aid: Aid | None = None
     sensor: str = "mag"
     rest_bias: RestBias | None = None
+    tails: ChannelTails | None = None
     used: Recording | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -216,6 +220,7 @@ def calibration_to_json(calibration: Calibration) -> str:
             "sigma": "inf" if math.isinf(c.sigma) else c.sigma,
             "d": c.d,
             "bound": c.bound,
+            **({} if c.tails is None else c.tails._asdict()),
         },
         "residual": {"before": c.before._asdict(), "after": c.after._asdict()},
         "rejected": {
@@ -304,5 +309,8 @@ def calibration_from_json(text: str) -> Calibration:
             c.number("gyroscope", "rest_seconds"),
         )
         if c.has("gyroscope")
+        else None,
+        tails=ChannelTails(*(c.number("noise", name) for name in ChannelTails._fields))
+        if c.has("noise", "likelihood_ratio")
         else None,
     )

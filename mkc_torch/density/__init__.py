@@ -1,4 +1,4 @@
-"""The MKC density: its energy and normaliser, the distribution, its fit to residuals, and how robust it is."""
+"""The MKC density: its energy and normaliser, the distribution, its fit to residuals, their tails, its robustness."""
 
 from mkc_torch.density.distribution import MKCDistribution
 from mkc_torch.density.fit import DensityFit, fit_density
@@ -12,11 +12,15 @@ from mkc_torch.density.robustness import (
     gaussian_efficiency,
     least_bandwidth,
 )
+from mkc_torch.density.tails import ChannelTails, Tails, assess_tails
 
 __all__ = [
+    "ChannelTails",
     "DensityFit",
     "KernelsFit",
     "MKCDistribution",
+    "Tails",
+    "assess_tails",
     "bandwidth_for_efficiency",
     "breakdown_point",
     "error_bound",

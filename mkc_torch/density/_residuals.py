@@ -34,6 +34,14 @@ class Residuals(NamedTuple):
     share: Float[Tensor, "*batch N m"] | None
     scale: Float[Tensor, "*batch m"]
 
+    def detached_copy(self) -> Residuals:
+        """The same numbers in memory of their own, without autograd's graph."""
+
+        def copy(values: Tensor | None) -> Tensor | None:
+            return None if values is None else values.detach().clone()
+
+        return Residuals(self.error.detach().clone(), copy(self.weight), copy(self.share), self.scale.detach().clone())
+
 
 class Domain(NamedTuple):
     """Half-width of the domain and floor under d, each (*, m)."""

@@ -145,6 +145,6 @@ def fit_density(
         converged=converged,
         n_iter=n_iter,
         # a copy, since the caller may write over the residuals before the tails are asked for
-        _residuals=Residuals(*(None if t is None else t.detach().clone() for t in residuals)),
+        _residuals=residuals.detached_copy(),
         _domain=domain,
     )

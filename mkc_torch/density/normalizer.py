@@ -33,6 +33,11 @@ def _head_quadrature(count: int) -> tuple[Tensor, Tensor]:
 _NODES, _WEIGHTS = _head_quadrature(32)
 
 
+def head_rule_constants() -> tuple[Float[Tensor, " nodes"], Float[Tensor, " nodes"]]:
+    """Nodes on [0, 1] and weights of the rule on the head, in float64."""
+    return _NODES, _WEIGHTS
+
+
 def tail_density(kappa: Tensor) -> Tensor:
     """``exp(-1 / kappa)``, the unnormalised density of the flat tail, with value and gradient 0 at ``kappa = 0``."""
     positive = kappa > 1e-3  # exp(-1000) is 0 in float64

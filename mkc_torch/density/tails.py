@@ -7,14 +7,15 @@ all samples. Twice the log-likelihood ratio against the Gaussian on the same dom
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from mkc_torch._support.arrays import Data
-from mkc_torch.density._residuals import channel_values, checked_domain, checked_residuals, checked_weight
+from mkc_torch._support.effective_size import effective_size
+from mkc_torch.density._residuals import Residuals, channel_values, checked_domain, checked_residuals, checked_weight
 from mkc_torch.density.energy import KAPPA_MAX, energy_dkappa, energy_dz, energy_value
 from mkc_torch.density.likelihood import DensityState, initial_state, maximise
 from mkc_torch.density.normalizer import head_rule, integrate, tail_density
@@ -22,7 +23,7 @@ from mkc_torch.density.normalizer import head_rule, integrate, tail_density
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["GAUSSIAN_BELOW", "ChannelTails", "Tails", "assess_tails", "percent_with_error"]
+__all__ = ["GAUSSIAN_BELOW", "ChannelTails", "Tails", "assess_tails", "percent_with_error", "time_series_tails"]
 
 GAUSSIAN_BELOW = 2.71
 """5 % point of the equal mixture of χ²₀ and χ²₁, as κ = 0 is on the boundary: Chernoff 1954, Self & Liang 1987."""
@@ -67,6 +68,8 @@ class ChannelTails(NamedTuple):
     def __str__(self) -> str:
         if self.is_gaussian:
             return "Gaussian"
+        if self.share_beyond == 0.0:
+            return "heavy-tailed, on a domain that ends within 3 d"
         share = percent_with_error(self.share_beyond, self.share_error)
         return f"heavy-tailed: {share} of the errors beyond 3 d ({100.0 * GAUSSIAN_SHARE:.2f} % if Gaussian)"
 
@@ -94,8 +97,8 @@ class Tails:
         is_gaussian: whether it is below 2.71, (*, m): the Gaussian is not rejected at 5 %.
         share_beyond: probability of an error beyond 3 d, in [0, 1], (*, m): of the MKC fit, or of the Gaussian fit
             where ``is_gaussian``, 0.0027 on a wide domain.
-        share_error: its standard error, (*, m); where ``is_gaussian``, the standard error in the direction of a heavier
-            tail, so that the share may be ``share_beyond + 2 share_error`` without the test showing it.
+        share_error: its standard error, (*, m). Where ``is_gaussian``, what the test may have missed: ``share_beyond +
+            2 share_error`` is at least two standard errors above the share of the MKC fit.
         share_observed: weighted share of the given residuals beyond 3 d, (*, m). If it differs from ``share_beyond`` by
             several ``share_error``, the tail is not flat and the MKC density does not describe it.
         sigma, d: of the MKC fit, (*, m).
@@ -146,8 +149,9 @@ def assess_tails(
     the boundary of the parameters. Of Gaussian samples 5 % are rejected asymptotically and fewer of small samples
     (3 % of 500 residuals, 1.5 % of 100).
 
-    The test assumes independent residuals of mean zero. Residuals that are autocorrelated tell less than their number:
-    give the number of independent ones as ``count``, or expect more than 5 % false rejections.
+    Tails lighter than a Gaussian's, such as those of uniform errors, pass as Gaussian. The test assumes independent
+    residuals of mean zero. Autocorrelated residuals hold less information than their number: give the effective number
+    of independent residuals as ``count``, or expect more than 5 % false rejections.
 
     The standard error of the share is that of the delta method with the Fisher information of the MKC density. It does
     not contain that the density may not be the right one; ``share_observed`` shows that.
@@ -160,7 +164,8 @@ def assess_tails(
         bound: half-width of the domain, in the unit of ``error``, at least two robust scales of them; default by
             :func:`mkc_torch.density.domain.domain_rule`. The ratio depends on it a little: compare at equal bounds.
         d_min: floor under d of both fits, in the unit of ``error``; default a tenth of the robust scale.
-        count: number of independent residuals; default N, with weights ``(Σw)² / Σw²`` (Kish).
+        count: number of independent residuals, at most N or the sum of the weights; default N, and with weights
+            ``(Σw)² / Σw²`` (Kish).
 
     Raises:
         TypeError: residuals or weights that are no real numbers, or a parameter that is no number.
@@ -186,9 +191,7 @@ def assess_tails(
     error, _, share, scale = residuals
     _refuse_zeros(error if share is None else torch.where(share > 0, error, 0.0))
     domain = checked_domain(residuals, bound, d_min)
-    number = channel_values("count", count, error)
-    if number is None:
-        number = torch.full_like(scale, error.shape[-2]) if share is None else share.square().sum(-2).reciprocal()
+    number = _count(residuals, count)
 
     def fitted(kappa: Tensor | None) -> DensityState:
         start = initial_state(error, share, scale, *domain, kappa=kappa)
@@ -199,7 +202,12 @@ def assess_tails(
     mkc = _where(mkc.value < gaussian.value, mkc, gaussian)
     ratio = (2.0 * number * (gaussian.value - mkc.value)).clamp(min=0.0)
     is_gaussian = ratio < GAUSSIAN_BELOW
-    probability, standard_error = _share_beyond(_where(is_gaussian, gaussian, mkc), number)
+    free_share, free_error = _share_beyond(mkc, number)
+    gaussian_share, gaussian_error = _share_beyond(gaussian, number)
+    # two errors above the Gaussian's share reach at least as far as two errors above that of the free fit
+    undetected = torch.maximum(gaussian_error, 0.5 * (free_share - gaussian_share) + free_error)
+    probability = torch.where(is_gaussian, gaussian_share, free_share)
+    standard_error = torch.where(is_gaussian, undetected, free_error)
     d = torch.exp(mkc.log_d)
     beyond = (error.abs() > REACH_SCALES * d.unsqueeze(-2)).to(error.dtype)
     observed = beyond.mean(-2) if share is None else (share * beyond).sum(-2)
@@ -209,6 +217,46 @@ def assess_tails(
         is_gaussian,
         *(t.to(dtype) for t in (probability, standard_error, observed, sigma, d, half_width, number)),
     )
+
+
+def time_series_tails(error: Float[Tensor, "N m"]) -> tuple[ChannelTails, ...]:
+    """The tails of each channel of a time series, counting as many independent residuals as its autocorrelation leaves.
+
+    The autocorrelation is that of ``|e| / (|e| + scale)``, which outliers do not dominate.
+
+    Args:
+        error: residuals in the order of time.
+
+    Returns:
+        A test a channel; empty where the residuals of a channel are all 0, an exact fit.
+
+    Example:
+        >>> error = torch.randn(500, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> [str(channel) for channel in time_series_tails(error)], time_series_tails(0.0 * error)
+        (['Gaussian'], ())
+    """
+    if bool((error == 0).all(-2).any()):
+        return ()
+    size = error.abs().double()
+    bounded = size / (size + checked_weight(None, size).scale)
+    count = error.new_tensor([effective_size(channel) for channel in bounded.unbind(-1)])
+    return assess_tails(error, count=count).channels
+
+
+def _count(residuals: Residuals, count: float | Tensor | None) -> Float[Tensor, "*batch m"]:
+    """Number of independent residuals: the given one, or Kish's effective sample size."""
+    error, weight, share, scale = residuals
+    number = channel_values("count", count, error)
+    if number is None:
+        return torch.full_like(scale, error.shape[-2]) if share is None else share.square().sum(-2).reciprocal()
+    # weights may be numbers of repetitions
+    most = error.shape[-2] if weight is None else max(error.shape[-2], float(weight.sum(-2).max()))
+    if bool((number > most).any()):
+        raise ValueError(
+            f"Expected argument `count` to be at most the number of residuals, {most:.6g}, but got "
+            f"{float(number.max()):.6g}; it is the number of independent residuals, leave it out if all are."
+        )
+    return number
 
 
 def _refuse_zeros(error: Float[Tensor, "*batch N m"]) -> None:
@@ -225,8 +273,12 @@ def _refuse_zeros(error: Float[Tensor, "*batch N m"]) -> None:
 
 def _where(condition: Bool[Tensor, "*batch m"], yes: DensityState, no: DensityState) -> DensityState:
     """Channel by channel one of two states of the same residuals."""
-    names = ("kappa", "log_d", "log_bound", "log_d_min", "damping", "value")
-    return DensityState(*(torch.where(condition, getattr(yes, n), getattr(no, n)) for n in names))
+    return replace(
+        no,
+        kappa=torch.where(condition, yes.kappa, no.kappa),
+        log_d=torch.where(condition, yes.log_d, no.log_d),
+        value=torch.where(condition, yes.value, no.value),
+    )
 
 
 class _Moments(NamedTuple):

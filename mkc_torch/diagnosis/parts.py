@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from torch import Tensor
 
+from mkc_torch.density.tails import ChannelTails
 from mkc_torch.diagnosis.world import Curve, Grade, Shape
 
 if TYPE_CHECKING:
@@ -290,7 +291,8 @@ class Noise:
 
     ``model`` is one of "white", "ar" and "random_walk"; ``parameters`` names its numbers, ``units`` those that have
     a unit; ``bound`` is the half-width of the density's domain, one for all models compared. ``unit`` is that of d and
-    the bound.
+    the bound. ``tails`` has the test for heavy tails of each channel, on as many residuals as are independent; empty
+    where the fit of a channel is exact.
     """
 
     model: Literal["white", "ar", "random_walk"]
@@ -301,6 +303,7 @@ class Noise:
     description: str
     units: Mapping[str, str] = field(default_factory=dict)
     unit: str = ""
+    tails: tuple[ChannelTails, ...] = ()
 
 
 @dataclass(frozen=True)

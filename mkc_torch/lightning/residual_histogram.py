@@ -84,7 +84,7 @@ class ResidualHistogram:
 
         Before the first batch it is the reach of the bins as well; afterwards they stay as they are.
         """
-        self.bound = bound.detach().to(self.reach)
+        self.bound = bound.detach().to(self.reach, copy=True)
         if not self._begun:
             known = torch.isfinite(self.bound) & (self.bound > 0)
             self.reach.copy_(torch.where(known, _MARGIN * self.bound, 0.0))
@@ -128,7 +128,8 @@ class ResidualHistogram:
         if not self._reach_is_set and error.numel():
             self._set_reach(size if weight is None else size * (weight > 0), others)
         along = [-1 if i == axis else 1 for i in range(error.dim())]
-        unit = self.reach if self._reach_is_set else self.reach.clamp(min=_MIN_REACH)
+        # a channel without a reach got nothing but zeros, and 0 / inf is 0
+        unit = self.reach if self._reach_is_set else torch.threshold(self.reach, 0.0, math.inf)
         # clamped, so that its square stays finite
         ratio = size.div_(unit.to(size.dtype).view(along)).clamp_(max=1e18).float()
         index = _leading_bits(ratio).add_(self._offset.view(along))

@@ -59,8 +59,8 @@ def checked_axis(input: Tensor, channel_dim: int) -> int:
     return channel_dim % input.dim()
 
 
-def checked_weight(weight: Tensor, input: Tensor, axis: int) -> tuple[Tensor, Tensor]:
-    """Weights of the shape of the input, and which of them count.
+def checked_weight(weight: Tensor, input: Tensor, axis: int, *, cast: bool = True) -> tuple[Tensor, Tensor]:
+    """Weights of the shape of the input, in its dtype unless ``cast`` is False, and which of them count.
 
     A weight of each sample has no dimension for the channels; one of each element may have size 1 where it is the same.
     """
@@ -76,6 +76,8 @@ def checked_weight(weight: Tensor, input: Tensor, axis: int) -> tuple[Tensor, Te
             f"{tuple(samples)} but got {tuple(weight.shape)}."
         )
     weight = weight.expand(input.shape)
+    if not cast:
+        return weight, weight
     counts = weight if weight.dtype == torch.bool else weight != 0
     return weight.to(input.dtype), counts
 

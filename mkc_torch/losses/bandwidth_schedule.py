@@ -50,7 +50,7 @@ class BandwidthSchedule(nn.Module):
         anneal_step: change of the share with each later batch.
 
     Attributes:
-        steps: how many batches were seen, ().
+        steps: how many batches were seen; the same for all channels, which a kernel counts one by one, (m,).
         log_bandwidth: logarithm of the selected bandwidth in scales, a running mean, (m,).
         share: share of the annealed loss in [0, 1], (m,).
 
@@ -58,8 +58,8 @@ class BandwidthSchedule(nn.Module):
         >>> scale, schedule = ResidualScale(1), BandwidthSchedule(1)
         >>> scale.update(torch.linspace(-3.0, 3.0, 500).unsqueeze(-1), torch.zeros(500, 1))
         >>> schedule.update(scale)
-        >>> schedule.bandwidth, schedule.share
-        (tensor([64.0000]), tensor([0.]))
+        >>> schedule.bandwidth.round(), schedule.share
+        (tensor([64.]), tensor([0.]))
         >>> schedule.energy(torch.tensor([[0.0], [1.0], [100.0]])).flatten()
         tensor([0.0000, 0.1006, 1.7089])
     """
@@ -73,7 +73,7 @@ class BandwidthSchedule(nn.Module):
     ) -> None:
         super().__init__()
         self.warmup_steps, self.anneal_step = warmup_steps, anneal_step
-        self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("steps", torch.zeros(num_channels, dtype=torch.int64))
         self.register_buffer("log_bandwidth", torch.zeros(num_channels))
         self.register_buffer("share", torch.zeros(num_channels))
 
@@ -94,7 +94,7 @@ class BandwidthSchedule(nn.Module):
         state = ScheduleState(self.steps, self.log_bandwidth, self.share)
         recent, log_scale = residual_scale.recent, residual_scale.log_scale
         on_cpu = self.share.device.type == "cpu" and not torch.compiler.is_compiling()
-        if on_cpu and self.steps.item() % SELECTION_INTERVAL:  # elsewhere a look would wait
+        if on_cpu and self.steps[0].item() % SELECTION_INTERVAL:  # elsewhere a look would wait
             self.steps += 1
             return
         if len(self.share) <= SMALL_STATE and numpy_may_read(self.share, recent):
@@ -115,7 +115,8 @@ class BandwidthSchedule(nn.Module):
         steps = old.steps.astype(old.share.dtype) if xp is np else old.steps.to(old.share.dtype)
         least_rate = 1.0 - (1.0 - RATE) ** SELECTION_INTERVAL
         rate = xp.clip(SELECTION_INTERVAL / (steps + 1.0), least_rate, 1.0)
-        step = xp.where(selected.better, SELECTION_INTERVAL * self.anneal_step, -SELECTION_INTERVAL * self.anneal_step)
+        one = xp.ones_like(old.share)
+        step = SELECTION_INTERVAL * self.anneal_step * xp.where(selected.better, one, -one)
         annealing = (old.steps >= self.warmup_steps) & ((weight * xp.abs(residual)).sum(-1) > 0)
         due = old.steps % SELECTION_INTERVAL == 0
         log_bandwidth = old.log_bandwidth + rate * (xp.log(selected.bandwidth) - old.log_bandwidth)

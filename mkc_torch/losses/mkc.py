@@ -26,6 +26,7 @@ from mkc_torch.losses._curves import ChannelCurves
 from mkc_torch.losses._fused import fused_loss
 from mkc_torch.losses._implementation import Implementation, checked_implementation, runs_kernels
 from mkc_torch.losses._parameters import ChannelState, logistic, to_d
+from mkc_torch.losses._snapshot import snapshot
 from mkc_torch.losses._state_dict import logit_of_kappa, logit_of_scale, translate
 from mkc_torch.losses._terms import Batch, LossTerms, Settings, loss_terms, loss_value
 from mkc_torch.losses.bandwidth_schedule import BandwidthSchedule
@@ -334,9 +335,13 @@ class MKCLoss(ChannelCurves, nn.Module):
             floor = own_floor.clone() if floor is None else floor
         assert bound is not None
         assert floor is not None
-        if schedule is None:
-            return ChannelState(bound, floor, scale)
-        return ChannelState(bound, floor, scale, schedule.log_bandwidth.clone(), schedule.share.clone())
+        state = ChannelState(bound, floor, scale)
+        if schedule is not None:
+            state = ChannelState(bound, floor, scale, schedule.log_bandwidth.clone(), schedule.share.clone())
+        if running is None or not (self.training and torch.compiler.is_compiling()):
+            return state
+        kept = iter(snapshot([one for one in state if one is not None]))
+        return ChannelState(*(None if one is None else next(kept) for one in state))
 
     def _settings(self, batch: Batch, *, robust: bool, updated: bool) -> Settings:
         running = self._running()[0] if robust else self.residual_scale

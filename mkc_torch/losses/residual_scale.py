@@ -15,7 +15,7 @@ from mkc_torch._support.torch_internals import is_wrapped
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["ResidualScale", "average_over_processes", "numpy_may_read"]
+__all__ = ["ResidualScale", "alike_in_all_processes", "average_over_processes", "is_distributed", "numpy_may_read"]
 
 QUANTILE = 0.4
 """Level of the quantile of |residual| that gives the scale: below one half, where half of the targets are wrong."""
@@ -69,7 +69,8 @@ class ResidualScale(nn.Module):
 
     Attributes:
         recent: the latest residuals, the predictions that they belong to and their weights, (3, m, L).
-        position: index in the last dimension of ``recent`` that the next residual takes, ().
+        position: index in the last dimension of ``recent`` that the next residual takes; the same for all channels, which
+            a kernel counts one by one, (m,).
         batches: how many batches had a residual that counts, (m,).
         log_scale: logarithm of the scale in the unit of the target, (m,).
         half_range: half the range of the residuals, (m,).
@@ -79,7 +80,7 @@ class ResidualScale(nn.Module):
         >>> scale = ResidualScale(1)
         >>> scale.update(torch.linspace(-3.0, 3.0, 500).unsqueeze(-1), torch.zeros(500, 1))
         >>> scale.scale, scale.half_range
-        (tensor([2.2838]), tensor([3.]))
+        (tensor([2.2814]), tensor([3.]))
     """
 
     recent: Tensor
@@ -93,7 +94,7 @@ class ResidualScale(nn.Module):
         super().__init__()
         length = min(MOST_RECENT, max(FEWEST_RECENT, RECENT_IN_ALL // num_channels))
         self.register_buffer("recent", torch.zeros(3, num_channels, length))
-        self.register_buffer("position", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("position", torch.zeros(num_channels, dtype=torch.int64))
         self.register_buffer("batches", torch.zeros(num_channels, dtype=torch.int64))
         self.register_buffer("log_scale", torch.zeros(num_channels))
         self.register_buffer("half_range", torch.ones(num_channels))
@@ -132,16 +133,16 @@ class ResidualScale(nn.Module):
             with np.errstate(over="ignore", invalid="ignore"):
                 batch = rows_of_batch(np, recent, *(values.numpy() for values in rows))
                 _insert_in_numpy(recent, self.position, batch.rows)
-                state = updated(np, recent, state, batch.half_range)
+                state = updated(np, recent, state, batch)
             state = ScaleState(*(torch.from_numpy(value) for value in state))
         else:
             batch = rows_of_batch(torch, self.recent, *rows)
             count, length = batch.rows.shape[-1], self.recent.shape[-1]
-            slots = (self.position + torch.arange(count, device=self.recent.device)) % length
+            slots = (self.position[:1] + torch.arange(count, device=self.recent.device)) % length
             self.recent.index_copy_(-1, slots, batch.rows)
             self.position.copy_((self.position + count) % length)
-            state = updated(torch, self.recent, self._state(), batch.half_range)
-        for old, new in zip(self._state(), _alike_in_all_processes(state), strict=True):
+            state = updated(torch, self.recent, self._state(), batch)
+        for old, new in zip(self._state(), alike_in_all_processes(state), strict=True):
             old.copy_(new)
 
     def _state(self) -> ScaleState:
@@ -154,7 +155,7 @@ class ResidualScale(nn.Module):
         rows = [spaced_rows(values.detach(), channel_dim, RANGE_ROWS) for values in given]
         batch = rows_of_batch(torch, self.recent, *rows)
         state, known = self._state(), self.batches > 0
-        new = updated(torch, batch.rows, state, batch.half_range)
+        new = updated(torch, batch.rows, state, batch)
         return ScaleState(*(torch.where(known, old, value) for old, value in zip(state, new, strict=True)))
 
 
@@ -191,9 +192,10 @@ def rows_of_batch(xp: Any, recent: Any, prediction: Any, target: Any, weight: An
     else:
         weight = xp.where(counts, _cast(xp, weight, dtype), 0.0)
         counts = weight > 0
+    least, most = (xp.where(counts, residual, bound) for bound in (np.inf, -np.inf))
+    half_range = xp.clip(0.5 * (xp.amax(most, 0) - xp.amin(least, 0)), 0.0, None)  # 0 where none counts
     residual = xp.where(counts, residual, 0.0)
     prediction = xp.where(counts, prediction, 0.0)
-    half_range = 0.5 * (xp.amax(residual, 0) - xp.amin(residual, 0))
     rows = [residual, prediction, weight]
     count = len(residual)
     if count > length:
@@ -208,21 +210,21 @@ def _cast(xp: Any, values: Any, dtype: Any) -> Any:
 
 def _insert_in_numpy(recent: Any, position: Tensor, rows: Any) -> None:
     """Put new residuals in the place of the oldest ones."""
-    count, length, start = rows.shape[-1], recent.shape[-1], position.item()
+    count, length, start = rows.shape[-1], recent.shape[-1], position[0].item()
     head = min(count, length - start)
     recent[..., start : start + head] = rows[..., :head]
     recent[..., : count - head] = rows[..., head:]
     position.fill_((start + count) % length)
 
 
-def updated(xp: Any, recent: Any, old: ScaleState, half_range: Any) -> ScaleState:
-    """The state after a batch whose residuals stand in ``recent``.
+def updated(xp: Any, recent: Any, old: ScaleState, batch: BatchRows) -> ScaleState:
+    """The state after a batch whose residuals stand in ``recent``; a channel of which none counts keeps its state.
 
     Args:
         xp: ``numpy`` or ``torch``, whose arrays the others are.
         recent: as the buffer of :class:`ResidualScale`.
         old: the state before the batch.
-        half_range: half the range of the residuals of this batch, (m,).
+        batch: rows and half range of this batch.
     """
     residual, weight = recent[0], recent[2]
     size = xp.abs(residual)
@@ -230,7 +232,7 @@ def updated(xp: Any, recent: Any, old: ScaleState, half_range: Any) -> ScaleStat
     candidate = weighted_quantile(xp, size, weight, QUANTILE) / NORMAL_QUANTILE
     # where most residuals are exactly 0, their mean size stands for the quantile
     candidate = xp.where(candidate > 0, candidate, (size * share).sum(-1))
-    known = candidate > 0
+    known = (candidate > 0) & (batch.rows[2].sum(-1) > 0)
     first = (old.batches == 0) & known
     new = xp.where(known, xp.log(xp.clip(candidate, TINY, None)), old.log_scale)
     rate = xp.clip(1.0 / (_cast(xp, old.batches, recent.dtype) + 1.0), RATE, None)
@@ -240,11 +242,11 @@ def updated(xp: Any, recent: Any, old: ScaleState, half_range: Any) -> ScaleStat
     scale = xp.exp(log_scale)
     # an offset widens the scale, targets that are wrong by far widen the spread
     floor = FLOOR_IN_SPREAD * xp.where(spread > 0, xp.minimum(spread, scale), scale)
-    wider = xp.maximum(half_range, RANGE_DECAY * old.half_range)
+    wider = xp.maximum(batch.half_range, RANGE_DECAY * old.half_range)
     return ScaleState(
         batches=old.batches + known,
         log_scale=log_scale,
-        half_range=xp.where(first, half_range, xp.where(known, wider, old.half_range)),
+        half_range=xp.where(first, batch.half_range, xp.where(known, wider, old.half_range)),
         floor=xp.where(first, floor, old.floor),
     )
 
@@ -295,20 +297,22 @@ def numpy_may_read(*values: Tensor) -> bool:
 
 def average_over_processes(values: Sequence[Float[Tensor, " m"]]) -> Sequence[Float[Tensor, " m"]]:
     """The means over the processes of a distributed training."""
-    if not _is_distributed():
+    if not is_distributed():
         return values
     means = torch.stack(list(values))
     torch.distributed.all_reduce(means)
     return (means / torch.distributed.get_world_size()).unbind(0)
 
 
-def _is_distributed() -> bool:
+def is_distributed() -> bool:
+    """Whether several processes train together."""
     distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
     return distributed and torch.distributed.get_world_size() > 1
 
 
-def _alike_in_all_processes(state: ScaleState) -> ScaleState:
-    if not _is_distributed():
+def alike_in_all_processes(state: ScaleState) -> ScaleState:
+    """The state that all processes of a distributed training go on with: mean scales, the widest range."""
+    if not is_distributed():
         return state
     log_scale, floor = average_over_processes([state.log_scale, state.floor])
     widest = torch.stack([state.half_range, state.batches.to(state.half_range)])

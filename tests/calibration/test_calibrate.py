@@ -114,6 +114,25 @@ def test_gaussian_noise_rejects_nothing_and_round_trips_an_infinite_sigma():
     assert Calibration.from_json(c.to_json()) == c
 
 
+def test_gaussian_noise_is_called_heavy_tailed_in_few_recordings_whatever_sigma_is():
+    made = [calibrate(recorded(noisy_ellipsoid(200, seed=seed))) for seed in range(20)]
+    assert sum(math.isfinite(c.sigma) for c in made) > 4
+    assert sum(not c.tails.is_gaussian for c in made) <= 2
+
+
+def test_the_tails_of_a_disturbed_recording_are_heavy_and_round_trip(demo_calibration):
+    tails = demo_calibration.tails
+    assert not tails.is_gaussian
+    assert tails.share_beyond == pytest.approx(demo_calibration.rejected_share, abs=2.0 * tails.share_error)
+    text = demo_calibration.to_json()
+    assert json.loads(text)["noise"]["share_beyond"] == tails.share_beyond
+    assert Calibration.from_json(text).tails == tails
+    older = json.loads(text)
+    for name in tails._fields:
+        del older["noise"][name]
+    assert Calibration.from_json(json.dumps(older)).tails is None
+
+
 def test_json_round_trips_exactly_and_is_strict(demo_calibration):
     text = demo_calibration.to_json()
     assert Calibration.from_json(text) == demo_calibration

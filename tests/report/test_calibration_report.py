@@ -11,6 +11,7 @@ pytest.importorskip("jinja2")
 
 from mkc_torch.calibration.calibrate import calibrate
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.density import ChannelTails
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.recording.recording import Recording
 from mkc_torch.report import Comparison, calibration_report, refusal_report
@@ -202,6 +203,17 @@ def test_numbers_of_any_size_are_written_in_a_power_of_ten(recording):
 def test_the_noise_is_said_in_the_units_of_the_recording(calibration, page):
     assert wording.noise(calibration).startswith("0.47")
     assert f"The noise is {wording.noise(calibration)}." in text_of(page)
+
+
+def test_the_noise_is_gaussian_where_the_test_for_heavy_tails_says_so_whatever_sigma_is(calibration, recording):
+    heavy = dataclasses.replace(calibration, tails=ChannelTails(31.5, 0.041, 0.006))
+    share = "heavy-tailed: 4.1 ± 0.6 % of the errors beyond three times that (0.27 % if Gaussian)"
+    assert wording.noise(heavy).endswith(share)
+    gaussian = dataclasses.replace(calibration, sigma=4.35, tails=ChannelTails(1.3, 0.0027, 0.001))
+    assert wording.noise(gaussian).endswith("along the field, Gaussian")
+    assert "no heavier than chance makes that of Gaussian noise" in text_of(calibration_report(gaussian, recording))
+    # a file of before has no test
+    assert wording.noise(dataclasses.replace(calibration, sigma=4.35, tails=None)).endswith("field, σ = 4.35")
 
 
 def test_backticks_are_set_as_code(calibration, recording):

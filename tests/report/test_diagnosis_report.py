@@ -8,6 +8,7 @@ import torch
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
+from mkc_torch.density import ChannelTails
 from mkc_torch.diagnosis.evidence import density, driver_shift, extrapolation, held_out_gain, onset, remaining, switched
 from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.model.drivers import Driver
@@ -355,6 +356,14 @@ def test_numbers_without_an_error_say_so():
     lag = (Parameter("lag", 1.5, None, "s"),)
     text = text_of(diagnosis_report(first_changed(make_diagnosis(1, samples=240), parameters=lag)))
     assert "lag 1.50 s, standard error not estimated" in text
+
+
+def test_the_noise_has_the_share_of_the_errors_in_its_tail():
+    tails = (ChannelTails(31.5, 0.041, 0.006), ChannelTails(1.3, 0.0027, 0.001))
+    made = make_diagnosis(1, channels=2)
+    texts = [text for _, text in noise.noise_parameters(dataclasses.replace(made.noise, tails=tails), ("x", "y"))]
+    assert texts[-2].endswith("; heavy-tailed: 4.1 ± 0.6 % of the errors beyond 3 d (0.27 % if Gaussian)")
+    assert texts[-1].endswith("; Gaussian")
 
 
 def test_the_noise_has_units_and_its_density_is_compared():

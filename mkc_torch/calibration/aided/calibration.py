@@ -30,6 +30,7 @@ from mkc_torch.calibration.result import Calibration
 from mkc_torch.calibration.runs import in_each_run, run_slices
 from mkc_torch.calibration.turning import thin_at_rest
 from mkc_torch.density import fit_density
+from mkc_torch.density.tails import time_series_tails
 from mkc_torch.recording.recording import Recording
 
 if TYPE_CHECKING:
@@ -253,7 +254,8 @@ def _result(
     rejected = weight < _REJECTED_BELOW
     length = torch.linalg.vector_norm(field, dim=-1)
     norm = torch.linalg.vector_norm(points, dim=-1)
-    density = fit_density((length.square() - 1.0).unsqueeze(-1))
+    algebraic = (length.square() - 1.0).unsqueeze(-1)
+    density = fit_density(algebraic)
     found = coverage(field[~rejected] if bool((~rejected).any()) else field)
     unit = usable.units["mag_x"]
     bias = chosen.errors[:3] if best.model.biased else None
@@ -292,6 +294,7 @@ def _result(
             gyro_bias=None if bias is None else vector_of(bias),
             gyro_bias_se=None if bias is None else vector_of(bias_se),
         ),
+        tails=next(iter(time_series_tails(algebraic)), None),
     )
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.effective_size import effective_size
 from mkc_torch.density.distribution import MKCDistribution
 from mkc_torch.diagnosis.evidence.base import Case, Table, Told
 from mkc_torch.diagnosis.result import DensityCheck
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 __all__ = [
     "density_checks",
     "density_warnings",
-    "effective_size",
     "kolmogorov",
     "said",
     "student_cdf",
@@ -170,30 +170,6 @@ def kolmogorov(uniform: Float[Tensor, " N"]) -> float:
     N = len(ordered)
     below = torch.arange(N, dtype=ordered.dtype) / N
     return float(torch.maximum(ordered - below, below + 1.0 / N - ordered).max())
-
-
-def effective_size(values: Float[Tensor, " N"]) -> float:
-    """How many independent samples tell as much of the mean: N over the integrated autocorrelation time.
-
-    Summed over pairs of lags as long as they are positive. Geyer, "Practical Markov chain Monte Carlo", Statistical
-    Science 7 (1992), 3.3.
-
-    Example:
-        >>> generator = torch.Generator().manual_seed(0)
-        >>> white = torch.randn(4000, generator=generator, dtype=torch.float64)
-        >>> effective_size(white) > 3000, effective_size(white.repeat_interleave(10)) < 6000
-        (True, True)
-    """
-    N = len(values)
-    centred = values - values.mean()
-    spectrum = torch.fft.rfft(centred, n=2 * N)
-    covariance = torch.fft.irfft(spectrum.abs().square(), n=2 * N)[: N - N % 2]
-    if float(covariance[0]) <= 0.0:
-        return float(N)
-    pairs = covariance.unflatten(0, (-1, 2)).sum(-1) / covariance[0]
-    positive = (pairs > 0.0).to(pairs.dtype).cumprod(0)
-    time = 2.0 * float((pairs * positive).sum()) - 1.0
-    return N / max(time, 1.0)
 
 
 def student_fit(error: Float[Tensor, " N"]) -> tuple[float, float, float]:

@@ -140,6 +140,7 @@ def _noise(noise: Noise) -> dict[str, Any]:
         "description": noise.description,
         **({"units": dict(noise.units)} if noise.units else {}),
         **({"unit": noise.unit} if noise.unit else {}),
+        **({"tails": [channel._asdict() for channel in noise.tails]} if noise.tails else {}),
     }
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import torch
-
+from mkc_torch.density.tails import time_series_tails
 from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.result import Noise, Number
 from mkc_torch.diagnosis.settings import NoiseSettings
@@ -37,7 +36,8 @@ def noise_summary(final: Estimate, settings: NoiseSettings) -> Noise:
         model, told = "ar", "coloured noise" + (", with a slow part that enters with the offset" if clear else "")
     else:
         model, told = "white", "white noise"
-    tail = "Gaussian" if bool(torch.isinf(fit.sigma).all()) else "heavy-tailed"
+    tails = time_series_tails(fit.residual)
+    tail = "Gaussian" if all(channel.is_gaussian for channel in tails) else "heavy-tailed"
     return Noise(
         model,  # type: ignore[arg-type]
         parameters,
@@ -47,4 +47,5 @@ def noise_summary(final: Estimate, settings: NoiseSettings) -> Noise:
         f"{tail} {told}",
         units,
         prepared.unit,
+        tails,
     )

@@ -61,7 +61,8 @@ def noise_parameters(noise: Noise, channels: Sequence[str]) -> list[tuple[str, s
         if len(noise.sigma) > 1 and i < len(channels):
             name = term("noise.of_channel", name=name, channel=plain(channels[i]))
         within = term("where.near_zero", bound=f"{size(bound)}{unit}")
-        rows.append((name, f"σ = {bandwidth(sigma)}, d = {size(d)}{unit}, {within}"))
+        tail = f"; {noise.tails[i]}" if i < len(noise.tails) else ""
+        rows.append((name, f"σ = {bandwidth(sigma)}, d = {size(d)}{unit}, {within}{tail}"))
     return rows
 
 

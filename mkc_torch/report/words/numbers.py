@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from mkc_torch._words.terms import term
 from mkc_torch.calibration.result import Calibration, RestBias, Spread
+from mkc_torch.density.tails import percent_with_error
 from mkc_torch.recording.disturbance import Interval
 
 _MOST_DECIMALS = 9
@@ -144,13 +145,18 @@ def bandwidth(sigma: float) -> str:
 
 
 def noise(calibration: Calibration) -> str:
-    """The noise along the field in the recording's unit, and whether outliers stand beside it.
+    """The noise along the field in the recording's unit, Gaussian or with the share of the errors in a heavy tail.
 
     The algebraic residual is twice the relative error of the length, to first order.
     """
     c = calibration
-    tailed = not math.isinf(c.sigma)
-    kind = term("noise.heavy_tailed", sigma=bandwidth(c.sigma)) if tailed else term("noise.gaussian")
+    if c.tails is None:
+        kind = term("noise.bandwidth", sigma=bandwidth(c.sigma))
+    elif c.tails.is_gaussian:
+        kind = term("noise.gaussian")
+    else:
+        share = percent_with_error(c.tails.share_beyond, c.tails.share_error)
+        kind = term("noise.heavy_tailed", share=share)
     return term("noise.along_the_field", size=f"{size(0.5 * c.radius * c.d)} {c.unit}", kind=kind)
 
 

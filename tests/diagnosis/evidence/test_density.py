@@ -6,11 +6,11 @@ import torch
 from scipy import stats
 
 from mkc_torch import MKCDistribution, diagnose
+from mkc_torch._support.effective_size import effective_size
 from mkc_torch.density.fit import fit_density
 from mkc_torch.diagnosis.evidence.density import (
     density_checks,
     density_warnings,
-    effective_size,
     kolmogorov,
     student_cdf,
     student_fit,

@@ -8,6 +8,7 @@ import torch
 
 pytest.importorskip("jsonschema")
 
+from mkc_torch.density import ChannelTails
 from mkc_torch.diagnosis.evidence import density, driver_shift, extrapolation, held_out_gain, onset, switched
 from mkc_torch.diagnosis.files.diagnosis_json import DiagnosisFileError, diagnosis_to_json, json_schema, validate
 from mkc_torch.diagnosis.model.drivers import Driver
@@ -122,11 +123,13 @@ def test_what_an_equation_needs_is_written():
 def test_the_noise_s_units_and_its_density_s_distances_are_written():
     made = make_diagnosis(1)
     check = DensityCheck("norm", 0.02, 0.03, 4.0, 0.05, False)
-    noise = dataclasses.replace(made.noise, units={"wander": "µT"}, unit="µT")
+    tails = (ChannelTails(31.5, 0.041, 0.006),)
+    noise = dataclasses.replace(made.noise, units={"wander": "µT"}, unit="µT", tails=tails)
     told = written(with_evidence(dataclasses.replace(made, noise=noise), density.said([check], EvidenceSettings())))[
         "noise"
     ]
     assert (told["unit"], told["units"]) == ("µT", {"wander": "µT"})
+    assert told["tails"] == [{"likelihood_ratio": 31.5, "share_beyond": 0.041, "share_error": 0.006}]
     assert told["density_check"] == [
         {
             "channel": "norm", "distance": 0.02, "student_t_distance": 0.03, "degrees_of_freedom": 4.0,

@@ -36,5 +36,7 @@ def test_an_offset_that_wanders_is_told_with_its_unit():
 def test_noise_with_a_memory_is_coloured_and_without_one_white():
     coloured, white = told(0.0, 0.7), told(0.0, 0.0)
     assert (coloured.model, white.model) == ("ar", "white")
-    assert "coloured noise" in coloured.description
-    assert white.description.endswith("white noise")
+    # the noise is Gaussian, though the fitted σ need not be infinite
+    assert (coloured.description, white.description) == ("Gaussian coloured noise", "Gaussian white noise")
+    assert all(channel.is_gaussian for noise in (coloured, white) for channel in noise.tails)
+    assert len(white.tails) == len(white.sigma)

@@ -1,0 +1,264 @@
+"""What :class:`mkc_torch.MKCLoss` computes by kernels: two launches forward where the scale is followed, one backward."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.torch_internals import in_backward, is_transformed
+from mkc_torch.losses._checks import checked_weight
+from mkc_torch.losses._parameters import ChannelState
+from mkc_torch.losses._terms import Batch, Settings, loss_value
+from mkc_torch.losses.kernels.channels import TABLE
+from mkc_torch.losses.kernels.launch import (
+    Arranged,
+    Options,
+    Running,
+    arranged,
+    make_table,
+    pass_over,
+    reduce_batch,
+    rescale,
+    view_as_arranged,
+    weight_sums,
+)
+from mkc_torch.losses.residual_scale import ScaleState, alike_in_all_processes, average_over_processes, is_distributed
+
+if TYPE_CHECKING:
+    from mkc_torch.losses.mkc import MKCLoss
+
+__all__ = ["kernel_loss"]
+
+
+class Work(NamedTuple):
+    """One forward pass: the batch as it was given and as it is viewed, the numbers of each channel, and the loss's own."""
+
+    input: Tensor
+    target: Tensor
+    weight: Tensor | None
+    axis: int
+    batch: Arranged
+    table: Tensor
+    options: Options
+    fixed_kappa: Tensor | None
+    fixed_d: Tensor | None
+    reduction: str
+
+    def settings(self) -> Settings:
+        """What the differentiable formulas need, from the table."""
+        rows = dict(zip(TABLE, self.table, strict=True))
+        robust, has_scale = self.options.robust, self.options.has_scale
+        state = ChannelState(
+            rows["bound"],
+            rows["floor"],
+            rows["scale"] if has_scale else None,
+            rows["log_bandwidth"] if robust else None,
+            rows["share"] if robust else None,
+        )
+        reduction: Any = self.reduction
+        return Settings(
+            self.fixed_kappa, self.fixed_d, state, self.options.follows, self.options.normalize, reduction
+        )
+
+    def value_by_formulas(self, input: Tensor, target: Tensor, raw_kappa: Tensor | None, raw_d: Tensor | None) -> Tensor:
+        """The loss as a differentiable function of its inputs, at the state of this forward pass."""
+        dtype = self.table.dtype
+        counts = None if self.weight is None else self.weight != 0
+        weight = None if self.weight is None else self.weight.to(dtype)
+        return loss_value(
+            Batch(input.to(dtype), target.to(dtype), weight, counts, self.axis), raw_kappa, raw_d, self.settings()
+        )
+
+
+def kernel_loss(loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None) -> Tensor:
+    """The forward pass of a loss by kernels; what they do not do, transforms say, by formulas."""
+    axis = loss._checked_axis(input, target)
+    parameters = [one for one in (loss.raw_kappa, loss.raw_d) if one is not None]
+    compiling = torch.compiler.is_compiling()
+    given = [one for one in (input, target, weight) if isinstance(one, Tensor)]
+    if not compiling and any(is_transformed(one) for one in (*given, *parameters)):
+        return loss._computed(input, target, weight)
+    if weight is not None:
+        if weight.requires_grad:
+            return loss._computed(input, target, weight)
+        weight = checked_weight(weight, input, axis, cast=False)[0]
+    if compiling or any(type(one) not in (Tensor, torch.nn.Parameter) for one in (*given, *parameters)):
+        from mkc_torch.losses.kernels.operators import operator_loss
+
+        return operator_loss(loss, input, target, weight, axis)
+    work = prepared(loss, input, target, weight, axis)
+    function: Any = _Each if loss.reduction == "none" else _Reduced
+    value: Tensor = function.apply(input, target, loss.raw_kappa, loss.raw_d, work)
+    return value
+
+
+def options_of(loss: MKCLoss) -> Options:
+    """What a loss computes in its present mode."""
+    scale, schedule = loss._running()
+    robust = loss.training and schedule is not None
+    return Options(
+        follows=loss._follows,
+        robust=robust,
+        has_scale=scale is not None and (loss._follows or robust),
+        learn_kappa=loss.raw_kappa is not None,
+        learn_d=loss.raw_d is not None,
+        own_bound=loss.fixed_bound is not None,
+        own_floor=loss.fixed_d_min is not None,
+        normalize=loss.normalize,
+        mean=loss.reduction == "mean",
+    )
+
+
+@torch.no_grad()
+def prepared(loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None, axis: int) -> Work:
+    """Update the running state in training, and make the table."""
+    options, batch = options_of(loss), arranged(input.detach(), target.detach(), weight, axis)
+    request = request_of(loss, input.device)
+    table = updated_table(batch, request, options, updates=request.updates and not in_backward())
+    fixed = (loss.fixed_kappa, loss.fixed_d)
+    return Work(input, target, weight, axis, batch, table, options, *fixed, loss.reduction)
+
+
+class Request(NamedTuple):
+    """What a loss asks the channel kernel for."""
+
+    kappa: Tensor
+    d: Tensor | None
+    bound: Tensor | None
+    floor: Tensor | None
+    running: Running
+    updates: bool
+    warmup_steps: int
+    anneal_step: float
+
+
+def request_of(loss: MKCLoss, device: torch.device) -> Request:
+    """The parameters and buffers of a loss."""
+    scale, schedule = loss._running()
+    if scale is not None and scale.log_scale.device != device:
+        scale.to(device)  # a guide is no part of the loss, and is not moved with it
+        if schedule is not None:
+            schedule.to(device)
+    kappa = loss.fixed_kappa if loss.raw_kappa is None else loss.raw_kappa
+    d = loss.fixed_d if loss.raw_d is None else loss.raw_d
+    assert kappa is not None
+    pace = (0, 0.0) if schedule is None else (schedule.warmup_steps, schedule.anneal_step)
+    updates = scale is not None and loss.training
+    return Request(kappa, d, loss.fixed_bound, loss.fixed_d_min, running_of(loss), updates, *pace)
+
+
+def updated_table(batch: Arranged, request: Request, options: Options, *, updates: bool) -> Tensor:
+    """The table of the numbers of each channel, after an update of the running state where that is asked for."""
+    running, numbers, pace = request.running, request[:4], request[-2:]
+    scheduled = updates and running.share is not None
+    if not (updates and is_distributed()):
+        peek = options.has_scale and not updates
+        return make_table(
+            batch, running, *numbers, options, scale=updates, peek=peek, schedule=scheduled, table=True, pace=pace
+        )
+    make_table(batch, running, *numbers, options, scale=True, table=False, pace=pace)
+    state = ScaleState(running.batches, running.log_scale, running.half_range, running.floor)
+    for own, joined in zip(state, alike_in_all_processes(state), strict=True):
+        own.copy_(joined)
+    if scheduled:
+        make_table(batch, running, *numbers, options, schedule=True, table=False, pace=pace)
+        own_schedule = [running.log_bandwidth, running.share]
+        for own, mean in zip(own_schedule, average_over_processes(own_schedule), strict=True):  # type: ignore[arg-type]
+            own.copy_(mean)  # type: ignore[union-attr]
+    return make_table(batch, running, *numbers, options, pace=pace)
+
+
+def running_of(loss: MKCLoss) -> Running:
+    """The buffers of the modules that are updated in training."""
+    scale, schedule = loss._running()
+    if scale is None:
+        return Running()
+    own = (scale.recent, scale.position, scale.batches, scale.log_scale, scale.half_range, scale.floor)
+    return Running(*own) if schedule is None else Running(*own, schedule.steps, schedule.log_bandwidth, schedule.share)
+
+
+class _Reduced(torch.autograd.Function):
+    """A sum or mean. float32 and bfloat16 make the gradient by the input in the forward pass; float16, which a mean over
+    many elements underflows before a gradient scaler multiplies, makes it in the backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, input: Tensor, target: Tensor, raw_kappa: Any, raw_d: Any, work: Work) -> Tensor:
+        wants = ctx.needs_input_grad
+        ctx.stores = (wants[0] or wants[1]) and input.dtype != torch.float16
+        value, *ctx.found = reduce_batch(work.batch, work.table, work.options, wants_input=ctx.stores)
+        ctx.save_for_backward(input, target, raw_kappa, raw_d)
+        ctx.work = work._replace(input=None, target=None)
+        return value
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():
+            return (*_by_formulas(ctx, grad), None)
+        found, ctx.found = ctx.found, None
+        work: Work = ctx.work
+        if found is None:  # a second backward pass of one graph
+            found = reduce_batch(work.batch, work.table, work.options, wants_input=ctx.stores)[1:]
+        slopes, by_kappa, by_d = found
+        rescale(slopes, by_kappa, by_d, grad)
+        wants = ctx.needs_input_grad
+        if slopes is None and (wants[0] or wants[1]):
+            slopes = torch.empty_like(work.batch.like)
+            weights, total = weight_sums(work.batch, work.table.dtype)
+            pass_over(
+                work.batch, work.table, work.options, weights=weights, total_weight=total, upstream=grad,
+                slopes=view_as_arranged(slopes, work.batch),
+            )  # fmt: skip
+        return (*_handed_out(ctx, slopes), by_kappa, by_d, None)
+
+
+class _Each(torch.autograd.Function):
+    """Each element's loss. The gradients are made in the backward pass, which has to read the upstream gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, input: Tensor, target: Tensor, raw_kappa: Any, raw_d: Any, work: Work) -> Tensor:
+        ctx.save_for_backward(input, target, raw_kappa, raw_d)
+        ctx.work = work._replace(input=None, target=None)
+        values = torch.empty_like(work.batch.like, dtype=work.table.dtype)
+        pass_over(work.batch, work.table, work.options, values=view_as_arranged(values, work.batch))
+        return values
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        if torch.is_grad_enabled():
+            return (*_by_formulas(ctx, grad), None)
+        work: Work = ctx.work
+        slopes, by_kappa, by_d = gradients_of_each(work.batch, work.table, work.options, grad)
+        return (*_handed_out(ctx, slopes), by_kappa, by_d, None)
+
+
+def gradients_of_each(
+    batch: Arranged, table: Tensor, options: Options, grad: Tensor
+) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """Gradients by the input and the raw parameters, of elements each of which has its own upstream gradient."""
+    slopes = torch.empty_like(batch.like)
+    by_kappa = table.new_empty(batch.channels) if options.learn_kappa else None
+    by_d = table.new_empty(batch.channels) if options.learn_d else None
+    pass_over(
+        batch, table, options, upstream=grad, slopes=view_as_arranged(slopes, batch), by_kappa=by_kappa, by_d=by_d,
+        sums=options.learn_kappa or options.learn_d,
+    )  # fmt: skip
+    return slopes, by_kappa, by_d
+
+
+def _handed_out(ctx: Any, slopes: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+    """The gradients by input and target, in their dtypes."""
+    input, target, *_ = ctx.saved_tensors
+    wants = ctx.needs_input_grad
+    by_target = -slopes.to(target.dtype) if wants[1] and slopes is not None else None
+    return slopes if wants[0] else None, by_target
+
+
+def _by_formulas(ctx: Any, grad: Tensor) -> list[Tensor | None]:
+    """Gradients that are functions of the inputs, for a second derivative."""
+    given = ctx.saved_tensors
+    value = ctx.work.value_by_formulas(*given)
+    wanted = [one for one, wants in zip(given, ctx.needs_input_grad, strict=False) if wants]
+    found = iter(torch.autograd.grad(value, wanted, grad.to(value.dtype), create_graph=True))
+    return [next(found) if wants else None for wants in ctx.needs_input_grad[:4]]

@@ -1,0 +1,170 @@
+"""Time, memory, kernels and host synchronisations of a step, beside peers and the floor of memory traffic."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mkc_torch import MKCLoss
+from tests.device.modes import FIXED, MODES, LearnedGaussianNLL, LearnedStudentT, Step, batch, copy_rate, made, seconds
+
+CHANNELS = 4
+
+
+def step_of(loss: Any, input: Tensor, target: Tensor, **rest: Any) -> Step:
+    """A step of a loss, or of a compiled one."""
+    return Step(loss, list(loss.parameters()), input, target, **rest)
+
+
+def makers(device: torch.device) -> dict[str, Callable[[], nn.Module]]:
+    """The losses of the table."""
+    found: dict[str, Callable[[], nn.Module]] = {
+        "HuberLoss": nn.HuberLoss,
+        "GaussianNLLLoss, learned": lambda: LearnedGaussianNLL(CHANNELS).to(device),
+    }
+    for name in MODES:
+        found[f"MKCLoss, {name}"] = lambda name=name: made(name, CHANNELS, device)
+    return found
+
+
+def kernels_and_syncs(step: Callable[[], object], device: torch.device) -> tuple[str, str]:
+    """How many kernels a step launches, and whether it waits for the device."""
+    if device.type != "cuda":
+        return "-", "-"
+    step()
+    torch.cuda.synchronize()
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        step()
+        torch.cuda.synchronize()
+    count = sum(1 for event in profile.events() if event.device_type == torch.autograd.DeviceType.CUDA)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        step()
+        waits = "0"
+    except RuntimeError:
+        waits = "waits"
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    return str(count), waits
+
+
+def print_steps(device: torch.device, sizes: tuple[int, ...], *, compiled: bool) -> None:
+    """The table of steps."""
+    rate = copy_rate(device, sizes[-1])
+    print(f"  copy rate {rate / 1e12:.2f} TB/s; floor: 12 bytes an element")
+    print(f"  {'loss':34}{'elements':>12}{'ms':>10}{'over floor':>12}{'memory':>8}{'kernels':>9}{'syncs':>7}")
+    rows = dict(makers(device))
+    if compiled:
+        rows["Student t, learned, compiled"] = lambda: torch.compile(LearnedStudentT(CHANNELS).to(device))
+        for name in MODES:
+            rows[f"MKCLoss, {name}, compiled"] = lambda name=name: torch.compile(
+                made(name, CHANNELS, device), fullgraph=True
+            )
+    for size in sizes:
+        for name, make in rows.items():
+            input, target = batch(size // CHANNELS, CHANNELS, device)
+            step = step_of(make(), input, target)
+            try:
+                time = seconds(step, device)
+            except Exception as error:  # noqa: BLE001  a compiler's failure is a row of the table
+                print(f"  {name:34}{size:12}  {type(error).__name__}: {str(error).splitlines()[0][:80]}")
+                continue
+            memory = "-"
+            if device.type == "cuda":
+                torch.cuda.reset_peak_memory_stats()
+                before = torch.cuda.memory_allocated()
+                input.grad = None
+                before = torch.cuda.memory_allocated()
+                step()
+                memory = f"{(torch.cuda.max_memory_allocated() - before) / (4 * size):.2f}"
+            kernels, waits = kernels_and_syncs(step, device)
+            over = time * rate / (12.0 * size)
+            print(f"  {name:34}{size:12}{1e3 * time:10.4f}{over:12.2f}{memory:>8}{kernels:>9}{waits:>7}", flush=True)
+            del step, input, target
+
+
+def print_variants(device: torch.device, size: int) -> None:
+    """Other dtypes, upstream gradients, weights and reductions at the largest size, over floors of their own."""
+    rate = copy_rate(device, size)
+    weight = torch.rand(size // CHANNELS, CHANNELS, device=device)
+    upstream = torch.tensor(3.0, device=device)
+    for name in MODES:
+        rows: list[tuple[str, torch.dtype, float, dict[str, Any], dict[str, Any]]] = [
+            ("bfloat16", torch.bfloat16, 6.0, {}, {}),
+            ("float16", torch.float16, 6.0, {}, {}),
+            ("upstream gradient 3", torch.float32, 12.0, {}, {"upstream": upstream}),
+            ("weighted mean", torch.float32, 16.0, {}, {"weight": weight}),
+            ("masked mean", torch.float32, 13.0, {}, {"weight": weight > 0.3}),
+            ("reduction none", torch.float32, 28.0, {"reduction": "none"}, {"upstream": weight}),
+        ]
+        for what, dtype, floor, options, rest in rows:
+            input, target = batch(size // CHANNELS, CHANNELS, device, dtype)
+            time = seconds(step_of(made(name, CHANNELS, device, **options), input, target, **rest), device, budget=0.2)
+            print(f"  {name:12} {what:22} {1e3 * time:9.3f} ms {time * rate / (floor * size):6.2f} x its floor", flush=True)
+    layouts = (("channels second", (size // 2**16, CHANNELS, 2**8, 2**6), 1), ("one channel", (size, 1), -1))
+    for name in MODES:
+        for what, shape, axis in (*layouts, ("seven channels", (size // 7, 7), -1), ("1000 channels", (size // 1000, 1000), -1)):
+            x = torch.randn(shape, device=device).requires_grad_()
+            y = torch.randn(shape, device=device)
+            loss = MKCLoss(shape[axis], channel_dim=axis, **MODES[name]).to(device)
+            time = seconds(step_of(loss, x, y), device, budget=0.2)
+            print(f"  {name:12} {what:22} {1e3 * time:9.3f} ms {time * rate / (12.0 * x.numel()):6.2f} x its floor", flush=True)
+
+
+def print_training(device: torch.device) -> None:
+    """A training step of a small perceptron under each loss, over Huber's."""
+    reference = 0.0
+    for name, make in makers(device).items():
+        torch.manual_seed(0)
+        net = nn.Sequential(nn.Linear(16, 64), nn.SiLU(), nn.Linear(64, 64), nn.SiLU(), nn.Linear(64, CHANNELS)).to(device)
+        loss = make()
+        groups = [{"params": list(net.parameters())}]
+        if list(loss.parameters()):
+            groups.append({"params": list(loss.parameters()), "weight_decay": 0.0})
+        optimiser = torch.optim.AdamW(groups, lr=1e-3)
+        x, y = torch.randn(256, 16, device=device), torch.randn(256, CHANNELS, device=device)
+
+        def step() -> None:
+            optimiser.zero_grad()
+            loss(net(x), y).backward()
+            optimiser.step()
+
+        time = seconds(step, device, budget=1.5)
+        reference = reference or time
+        print(f"  {name:34}{1e3 * time:9.3f} ms {time / reference:6.2f} x Huber's", flush=True)
+
+
+def print_capture(device: torch.device) -> None:
+    """Every mode in a CUDA graph, replayed and compared with eager training."""
+    if device.type != "cuda":
+        print("  no CUDA graphs on this device")
+        return
+    for name, options in {**MODES, "fixed, likelihood": FIXED | {"objective": "likelihood"}}.items():
+        loss, twin = (MKCLoss(CHANNELS, **options).to(device) for _ in range(2))
+        twin.load_state_dict(loss.state_dict())
+        input, target = batch(256, CHANNELS, device)
+        step = step_of(loss, input, target)
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            for _ in range(3):
+                step()
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        input.grad = None
+        with torch.cuda.graph(graph):
+            step()
+        for _ in range(47):
+            graph.replay()
+        other, same = batch(256, CHANNELS, device)
+        for _ in range(3 + 47):
+            step_of(twin, other, same)()
+        torch.cuda.synchronize()
+        off = max(
+            [0.0, *(float((a.double() - b.double()).abs().max()) for a, b in zip(loss.state_dict().values(), twin.state_dict().values(), strict=True))]
+        )
+        time = seconds(graph.replay, device, budget=0.2)
+        print(f"  {name:20} captured; state differs by {off:.1e} after 50 batches; a replay {1e3 * time:.4f} ms", flush=True)
