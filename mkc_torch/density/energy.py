@@ -137,7 +137,8 @@ def _near(x: Tensor) -> Tensor:
         (0.8306046932331322, 0.14982512785597574),
         (0.9662347571015759, 0.0827698396397692),
     )
-    if x.numel() <= _FEW and not torch.compiler.is_compiling():
+    # a list of numbers is copied to a GPU while it waits
+    if x.numel() <= _FEW and x.device.type == "cpu" and not torch.compiler.is_compiling():
         nodes, weights = x.new_tensor(rule).unbind(-1)
         return (weights * torch.exp(-x.unsqueeze(-1) * nodes)).sum(-1)
     near = torch.zeros_like(x)

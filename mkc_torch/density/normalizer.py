@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import refuse_no_tensor, refuse_out_of_range
+from mkc_torch._support.torch_internals import functorch_is_active
 from mkc_torch.density._normalizer_of_few import few, log_partition_and_slopes
 from mkc_torch.density.energy import energy, energy_dkappa, energy_value
 
@@ -38,6 +39,21 @@ def head_rule_constants() -> tuple[Float[Tensor, " nodes"], Float[Tensor, " node
     return _NODES, _WEIGHTS
 
 
+_COPIES: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = {}
+"""The rule on other devices and in other dtypes: a copy to a GPU waits, and is made once."""
+
+
+def _rule_like(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Nodes and weights in the dtype and on the device of a tensor."""
+    key = (values.device, values.dtype)
+    if torch.compiler.is_compiling() or type(values) is not Tensor or functorch_is_active():
+        return _NODES.to(values), _WEIGHTS.to(values)
+    if key not in _COPIES:
+        with torch.inference_mode(False), torch.no_grad():
+            _COPIES[key] = _NODES.to(values), _WEIGHTS.to(values)
+    return _COPIES[key]
+
+
 def tail_density(kappa: Tensor) -> Tensor:
     """``exp(-1 / kappa)``, the unnormalised density of the flat tail, with value and gradient 0 at ``kappa = 0``."""
     positive = kappa > 1e-3  # exp(-1000) is 0 in float64
@@ -58,7 +74,8 @@ def head_rule(kappa: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
     """
     reach = head_reach(kappa)
     end = torch.maximum(torch.minimum(length, reach), -reach).unsqueeze(-1)
-    return end * _NODES.to(end), end * _WEIGHTS.to(end)
+    nodes, weights = _rule_like(end)
+    return end * nodes, end * weights
 
 
 def integrate(

@@ -91,7 +91,7 @@ def select_bandwidth(
 def _widths(xp: Any, like: Any) -> Any:
     if xp.__name__ == "numpy":
         return xp.asarray(BANDWIDTHS, dtype=like.dtype)
-    return like.new_tensor(BANDWIDTHS)
+    return xp.stack([like.new_full((), width) for width in BANDWIDTHS])  # a list would be copied to a GPU, which waits
 
 
 def _influences(xp: Any, z: Any) -> tuple[Any, Any]:

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from mkc_torch.density.energy import KAPPA_MAX
 from mkc_torch.losses._parameters import ChannelState, to_d
-from mkc_torch.losses.bandwidth_schedule import BandwidthSchedule
 from mkc_torch.losses.residual_scale import ResidualScale
 
 __all__ = ["logit_of_kappa", "logit_of_scale", "translate"]
@@ -26,9 +25,16 @@ def logit_of_scale(d: Tensor, low: Tensor, high: Tensor) -> Tensor:
 
 
 def translate(
-    state: MutableMapping[str, Any], prefix: str, *, learns_kappa: bool, learns_d: bool, follows: bool
+    state: MutableMapping[str, Any], prefix: str, *, learns_kappa: bool, learns_d: bool, follows: bool, robust: bool
 ) -> None:
-    """Change what is stored into what a loss has: σ and d as they are, learned or fixed, in place."""
+    """Change what is stored into what a loss has: σ and d as they are, learned or fixed, in place.
+
+    Args:
+        state: what is loaded.
+        prefix: of the names of the loss.
+        learns_kappa, learns_d, follows: as the loss does that it is loaded into.
+        robust: whether that loss has a running scale and a schedule.
+    """
 
     def stored(name: str) -> Tensor | None:
         value = state.get(prefix + name)
@@ -41,8 +47,14 @@ def translate(
         state[prefix + "fixed_kappa"] = KAPPA_MAX * torch.sigmoid(state.pop(prefix + "raw_kappa"))
     if follows:
         return
-    if stored("residual_scale.log_scale") is not None and stored("fixed_d") is None:
-        _freeze(state, prefix)
+    if stored("residual_scale.log_scale") is not None:
+        # a loss of a given d has both, and the numbers of a loss that follows are those of its scale
+        given = stored("fixed_bound") is not None and stored("fixed_d_min") is not None
+        if stored("fixed_d") is None and not given:
+            _freeze(state, prefix)
+        if not robust:
+            for name in [one for one in state if one.startswith((f"{prefix}residual_scale.", f"{prefix}schedule."))]:
+                del state[name]
     raw, fixed, bound, floor = (stored(name) for name in ("raw_d", "fixed_d", "fixed_bound", "fixed_d_min"))
     if bound is None or floor is None:
         return
@@ -53,11 +65,10 @@ def translate(
 
 
 def _freeze(state: MutableMapping[str, Any], prefix: str) -> None:
-    """Replace a running scale and its schedule by the numbers that they stand for, in place."""
-    scale = ResidualScale(len(state[prefix + "residual_scale.log_scale"]))
-    scale.load_state_dict({name: state.pop(f"{prefix}residual_scale.{name}") for name in scale.state_dict()})
-    for name in BandwidthSchedule(1).state_dict():
-        state.pop(f"{prefix}schedule.{name}", None)
+    """Add the numbers that a running scale stands for, in place."""
+    like = state[prefix + "residual_scale.log_scale"]
+    scale = ResidualScale(len(like)).to(like)
+    scale.load_state_dict({name: state[f"{prefix}residual_scale.{name}"] for name in scale.state_dict()})
     bound = state.setdefault(prefix + "fixed_bound", scale.bound)
     floor = state.setdefault(prefix + "fixed_d_min", scale.floor)
     d = to_d(state.pop(prefix + "raw_d", None), ChannelState(bound, floor, scale.scale), follows=True)

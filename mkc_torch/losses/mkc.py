@@ -316,7 +316,11 @@ class MKCLoss(ChannelCurves, nn.Module):
 
     def _running(self) -> tuple[ResidualScale | None, BandwidthSchedule | None]:
         """The modules that are updated in training."""
-        return (self.residual_scale, self.schedule) if self._guide is None else self._guide
+        guide = self.__dict__["_guide"]
+        if guide is not None:
+            return guide
+        modules: Any = self._modules  # attributes of modules take a microsecond each
+        return modules.get("residual_scale"), modules.get("schedule")
 
     def _state(self, batch: Batch | None = None, *, robust: bool = False) -> ChannelState:
         """The buffers as one forward pass takes them: copies, for the next batch changes the buffers.
@@ -370,6 +374,7 @@ class MKCLoss(ChannelCurves, nn.Module):
             learns_kappa=self.raw_kappa is not None,
             learns_d=self.raw_d is not None,
             follows=self._follows,
+            robust=self.residual_scale is not None,
         )
         super()._load_from_state_dict(state_dict, prefix, *rest)
 

@@ -32,7 +32,10 @@ def numbers(mode, m=4, dtype=torch.float64, reduction="mean"):
         state = state._replace(scale=0.7 + ramp)
     if mode.startswith("robust"):
         state = state._replace(log_bandwidth=4.0 * ramp, share=(1.5 * ramp.flip(0)).clamp(max=1.0))
-    learns_kappa, learns_d = mode not in ("fixed", "normalised", "d"), mode not in ("fixed", "normalised", "sigma", "scale")
+    learns_kappa, learns_d = (
+        mode not in ("fixed", "normalised", "d"),
+        mode not in ("fixed", "normalised", "sigma", "scale"),
+    )
     settings = Settings(
         fixed_kappa=None if learns_kappa else kappa,
         fixed_d=None if learns_d or follows else d,
@@ -172,7 +175,9 @@ def test_single_precision_keeps_the_gradient_of_large_bandwidths(sigma):
     raw = torch.logit(torch.tensor([sigma**-2.0 / 400.0], dtype=torch.float64)).float()
     state = ChannelState(bound=torch.tensor([100.0]), floor=torch.tensor([0.001]))
     error, settings = 1.5 * randn(rows, 1).float(), Settings(None, torch.ones(1), state, False, False, "mean")
-    double = Settings(None, torch.ones(1).double(), ChannelState(*(s and s.double() for s in state)), False, False, "mean")
+    double = Settings(
+        None, torch.ones(1).double(), ChannelState(*(s and s.double() for s in state)), False, False, "mean"
+    )
     zeros = torch.zeros_like(error)
     found = differentiated(fused_loss, error, zeros, raw, None, settings)
     expected = differentiated(loss_value, error.double(), zeros.double(), raw.double(), None, double)

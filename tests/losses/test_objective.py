@@ -285,7 +285,9 @@ def test_backward_passes_of_one_graph_agree_to_the_bit_and_scale_with_the_upstre
 
 def loss_at(loss, value, x, y):
     """The terms at the state that gave a value, by going back one batch."""
-    before = annealing(**({} if loss._follows else ROBUST["given d"]), **({} if loss.raw_d is not None else NOT_LEARNED))
+    before = annealing(
+        **({} if loss._follows else ROBUST["given d"]), **({} if loss.raw_d is not None else NOT_LEARNED)
+    )
     found = before(x, y)
     torch.testing.assert_close(found, value, rtol=0.0, atol=0.0)
     return before.terms(x, y)

@@ -35,8 +35,8 @@ def finish(sum_network, sum_energy, sum_kappa, sum_d, weight, table, channel, ma
 def elements_kernel(
     x, t, w, upstream, table, weights, total_weight,
     values, slopes, partial, value, by_kappa, by_d,
-    outer, m, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs, count,
-    SO: tl.constexpr, BLOCK_ROW: tl.constexpr, BLOCK_COL: tl.constexpr, CHANNELS_LAST: tl.constexpr,
+    outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs, count, elements,
+    CHANNELS: tl.constexpr, BLOCK_ROW: tl.constexpr, BLOCK_COL: tl.constexpr, LAYOUT: tl.constexpr,
     HAS_WEIGHT: tl.constexpr, MEAN: tl.constexpr, UPSTREAM: tl.constexpr,
     ROBUST: tl.constexpr, LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr,
     WRITE_VALUES: tl.constexpr, WRITE_SLOPES: tl.constexpr, SUMS: tl.constexpr, FINISH: tl.constexpr,
@@ -45,27 +45,52 @@ def elements_kernel(
     """Values of elements (WRITE_VALUES), gradients by the input (WRITE_SLOPES) and sums of each channel (SUMS).
 
     UPSTREAM is 0 where the upstream gradient is 1, 1 where it is one number and 2 where each element has its own. The
-    tile is rows by channels (CHANNELS_LAST) or rows by places within a channel. With FINISH the one program that there
-    is makes the value and the gradients by the raw parameters itself.
+    columns of a tile are, by LAYOUT, 0: places within the one channel of a program; 1: channels; 2: channels of several
+    rows one after the other, all memory in one line. With FINISH the one program that there is makes the value and the
+    gradients by the raw parameters itself.
     """
     like = tl.float64 if WIDE else tl.float32
+    m = CHANNELS
     lane = tl.arange(0, BLOCK_COL)
-    if CHANNELS_LAST:
-        channel = tl.program_id(1) * BLOCK_COL + lane
-        known = channel < m
-        blocks_col = 1
-    else:
+    rows = tl.arange(0, BLOCK_ROW)
+    if LAYOUT == 0:
         channel = tl.program_id(1) + 0 * lane
-        known = lane >= 0
         blocks_col = tl.cdiv(inner, BLOCK_COL)
+        tile = rows.to(tl.int64)[:, None] * so + (lane * sk)[None, :]
+        tile_w = rows.to(tl.int64)[:, None] * wo + (lane * wk)[None, :]
+        tile_u = rows.to(tl.int64)[:, None] * uo + (lane * uk)[None, :]
+        channel_place = tl.full((), 1, tl.int64) * tl.program_id(1)
+        known = lane >= 0
+    elif LAYOUT == 1:
+        channel = tl.program_id(1) * BLOCK_COL + lane
+        blocks_col = 1
+        tile = rows[:, None] * CHANNELS + channel[None, :]
+        tile_w = rows[:, None] * wo + (channel * wc)[None, :]
+        tile_u = rows[:, None] * uo + (channel * uc)[None, :]
+        known = channel < CHANNELS
+    else:
+        channel = lane % CHANNELS
+        blocks_col = 1
+        together: tl.constexpr = BLOCK_COL // CHANNELS
+        tile = rows[:, None] * BLOCK_COL + lane[None, :]
+        row_of = rows[:, None] * together + (lane // CHANNELS)[None, :]
+        tile_w = row_of * wo + (channel * wc)[None, :]
+        tile_u = row_of * uo + (channel * uc)[None, :]
+        known = lane >= 0
     kappa = tl.load(table + channel, mask=known, other=1.0)[None, :]
-    d = tl.load(table + m + channel, mask=known, other=1.0)[None, :]
+    inverse_d = 1.0 / tl.load(table + m + channel, mask=known, other=1.0)[None, :]
+    inverse_kappa = 1.0 / tl.where(kappa > 0, kappa, 1.0)
+    has_annealed, has_initial = True, True
     if ROBUST:
         annealed_kappa = tl.load(table + 7 * m + channel, mask=known, other=1.0)[None, :]
-        annealed_d = tl.load(table + 8 * m + channel, mask=known, other=1.0)[None, :]
-        scale = tl.load(table + 9 * m + channel, mask=known, other=1.0)[None, :]
-        share = tl.load(table + 10 * m + channel, mask=known, other=1.0)[None, :]
-        of_annealed, of_initial = share / annealed_d, (1.0 - share) / scale
+        inverse_annealed = 1.0 / tl.where(annealed_kappa > 0, annealed_kappa, 1.0)
+        inverse_annealed_d = 1.0 / tl.load(table + 8 * m + channel, mask=known, other=1.0)[None, :]
+        inverse_scale = 1.0 / tl.load(table + 9 * m + channel, mask=known, other=1.0)[None, :]
+        given_share = tl.load(table + 10 * m + channel, mask=known, other=0.0)
+        has_annealed = tl.max(given_share, 0) > 0.0
+        has_initial = tl.min(tl.where(known, given_share, 1.0), 0) < 1.0
+        share = given_share[None, :]
+        of_annealed, of_initial = share * inverse_annealed_d, (1.0 - share) * inverse_scale
     if NORMALIZE and WRITE_VALUES:
         norm = tl.load(table + 4 * m + channel, mask=known, other=0.0)[None, :]
     divisor = tl.full((), 1.0, like) * count
@@ -75,6 +100,9 @@ def elements_kernel(
     factor = 1.0 / divisor
     if UPSTREAM == 1:
         factor = factor * tl.load(upstream).to(like)
+    if ROBUST:
+        of_annealed, of_initial = of_annealed * factor, of_initial * factor
+    of_density = inverse_d * factor
     sum_energy = tl.zeros((BLOCK_ROW, BLOCK_COL), like)
     sum_network = tl.zeros((BLOCK_ROW, BLOCK_COL), like)
     sum_kappa = tl.zeros((BLOCK_ROW, BLOCK_COL), like)
@@ -83,74 +111,90 @@ def elements_kernel(
     blocks = tl.cdiv(outer, BLOCK_ROW) * blocks_col
     for block in range(tl.program_id(0), blocks, programs):
         block_row = block // blocks_col
-        row = (tl.full((), BLOCK_ROW, tl.int64) * block_row + tl.arange(0, BLOCK_ROW))[:, None]
-        if CHANNELS_LAST:
-            mask = (row < outer) & known[None, :]
-            place = row * SO + (channel * sc)[None, :]
+        first_row = tl.full((), BLOCK_ROW, tl.int64) * block_row
+        if LAYOUT == 0:
+            first_k = tl.full((), BLOCK_COL, tl.int64) * (block - block_row * blocks_col)
+            mask = (rows[:, None] < outer - first_row) & (lane[None, :] < inner - first_k)
+            place = first_row * so + channel_place * sc + first_k * sk + tile
+            place_w = first_row * wo + channel_place * wc + first_k * wk + tile_w
+            place_u = first_row * uo + channel_place * uc + first_k * uk + tile_u
+        elif LAYOUT == 1:
+            mask = (rows[:, None] < outer - first_row) & known[None, :]
+            place = first_row * CHANNELS + tile
+            place_w, place_u = first_row * wo + tile_w, first_row * uo + tile_u
         else:
-            k = (tl.full((), BLOCK_COL, tl.int64) * (block - block_row * blocks_col) + lane)[None, :]
-            mask = (row < outer) & (k < inner)
-            place = row * so + (channel.to(tl.int64) * sc)[None, :] + k * sk
+            place = first_row * BLOCK_COL + tile
+            mask = place < elements
+            place_w, place_u = first_row * together * wo + tile_w, first_row * together * uo + tile_u
         error = tl.load(x + place, mask=mask, other=0.0).to(like) - tl.load(t + place, mask=mask, other=0.0).to(like)
-        factors = factor
         if HAS_WEIGHT:
-            if CHANNELS_LAST:
-                weight = tl.load(w + row * wo + (channel * wc)[None, :], mask=mask, other=0).to(like)
-            else:
-                weight = tl.load(w + row * wo + (channel * wc)[None, :] + k * wk, mask=mask, other=0).to(like)
+            weight = tl.load(w + place_w, mask=mask, other=0).to(like)
             error = tl.where(weight != 0, error, 0.0)
-            factors = factors * weight
         if UPSTREAM == 2:
-            if CHANNELS_LAST:
-                given = tl.load(upstream + row * uo + (channel * uc)[None, :], mask=mask, other=0.0).to(like)
-            else:
-                given = tl.load(upstream + row * uo + (channel * uc)[None, :] + k * uk, mask=mask, other=0.0).to(like)
-            factors = factors * given
-        z = error / d
-        density, slope = energy(z, kappa)
-        network = 0.0
+            given = tl.load(upstream + place_u, mask=mask, other=0.0).to(like)
+        z = error * inverse_d
+        density, slope, minus_x, inlier, half = energy(z, kappa, inverse_kappa, WIDE)
         if ROBUST:
-            own, own_slope = energy(error / annealed_d, annealed_kappa)
-            first, first_slope = initial(error / scale)
-            network = share * own + (1.0 - share) * first
-            by_input = own_slope * of_annealed + first_slope * of_initial
-        else:
-            by_input = slope / d
-        if WRITE_SLOPES:
-            tl.store(slopes + place, (by_input * factors).to(slopes.dtype.element_ty), mask=mask)
-        if WRITE_VALUES:
+            network, by_input = tl.zeros_like(error), tl.zeros_like(error)
+            if has_annealed:
+                own, own_slope, _, _, _ = energy(error * inverse_annealed_d, annealed_kappa, inverse_annealed, WIDE)
+                network, by_input = share * own, of_annealed * own_slope
+            if has_initial:
+                first, first_slope = initial(error * inverse_scale, WIDE)
+                network += (1.0 - share) * first
+                by_input += of_initial * first_slope
             written = network + density
+        else:
+            by_input = slope * of_density
+            written = density
+        if WRITE_SLOPES:
+            if HAS_WEIGHT:
+                by_input = by_input * weight
+            if UPSTREAM == 2:
+                by_input = by_input * given
+            tl.store(slopes + place, by_input.to(slopes.dtype.element_ty), mask=mask)
+        if WRITE_VALUES:
             if NORMALIZE:
                 written += norm
             if HAS_WEIGHT:
                 written = written * weight
             tl.store(values + place, written.to(values.dtype.element_ty), mask=mask)
         if SUMS:
-            # weights of the sums: upstream gradients without the divisor, which finish() has
-            if HAS_WEIGHT:
+            # the upstream gradient of each element, less the divisor, which finish() has
+            if HAS_WEIGHT and UPSTREAM == 2:
+                part = weight * given
+            elif HAS_WEIGHT:
                 part = weight
-                if UPSTREAM == 2:
-                    part = part * given
-                density, network, slope = density * part, network * part, slope * part
             elif UPSTREAM == 2:
                 part = given
-                density, network, slope = density * part, network * part, slope * part
+            if LEARN_KAPPA:
+                curve = energy_by_kappa(minus_x, inlier, half, inverse_kappa, WIDE)
+            if HAS_WEIGHT or UPSTREAM == 2:
+                density, slope = density * part, slope * part
+                if ROBUST:
+                    network = network * part
+                if LEARN_KAPPA:
+                    curve = curve * part
             sum_energy += density
             if ROBUST:
                 sum_network += network
             if LEARN_D:
-                sum_d += tl.where(mask, z * slope, 0.0)
+                sum_d += z * slope
             if LEARN_KAPPA:
-                curve = energy_by_kappa(z, kappa)
-                if HAS_WEIGHT or UPSTREAM == 2:
-                    curve = curve * part
                 sum_kappa += curve
             if UPSTREAM == 2:
                 sum_weight += part
     if SUMS:
         total_energy, total_network = tl.sum(sum_energy, 0), tl.sum(sum_network, 0)
         total_kappa, total_d, total_given = tl.sum(sum_kappa, 0), tl.sum(sum_d, 0), tl.sum(sum_weight, 0)
-        if not CHANNELS_LAST:  # the one channel of this program, in the first lane
+        if LAYOUT == 2:
+            channel, known = tl.arange(0, CHANNELS), tl.arange(0, CHANNELS) >= 0
+            total_energy = tl.sum(tl.reshape(total_energy, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
+            total_network = tl.sum(tl.reshape(total_network, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
+            total_kappa = tl.sum(tl.reshape(total_kappa, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
+            total_d = tl.sum(tl.reshape(total_d, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
+            total_given = tl.sum(tl.reshape(total_given, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
+        elif LAYOUT == 0:  # the one channel of this program, in the first lane
             total_energy = tl.where(lane == 0, tl.sum(total_energy, 0), 0.0)
             total_network = tl.where(lane == 0, tl.sum(total_network, 0), 0.0)
             total_kappa = tl.where(lane == 0, tl.sum(total_kappa, 0), 0.0)
@@ -158,7 +202,7 @@ def elements_kernel(
             total_given = tl.where(lane == 0, tl.sum(total_given, 0), 0.0)
             known = lane == 0
         if FINISH:
-            each = tl.full((), 1.0, like) * outer * inner
+            each = tl.full((), 1.0, like) * elements / CHANNELS
             if UPSTREAM == 2:
                 each = total_given
             elif HAS_WEIGHT:

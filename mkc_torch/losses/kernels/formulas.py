@@ -9,63 +9,80 @@ __all__ = ["energy", "energy_by_kappa", "initial", "log_partition"]
 
 
 @triton.jit
-def series(x, KIND: tl.constexpr):
-    """``(1 - exp(-x)) / x`` (KIND 0) or ``(1 - exp(-x) (1 + x)) / x²`` (KIND 1), for 0 <= x <= 0.5."""
-    if KIND == 0:
-        value = 1.0 - x * (1.0 / 12)
-        value = 1.0 - x * (1.0 / 11) * value
-        value = 1.0 - x * (1.0 / 10) * value
-        value = 1.0 - x * (1.0 / 9) * value
-        value = 1.0 - x * (1.0 / 8) * value
-        value = 1.0 - x * (1.0 / 7) * value
-        value = 1.0 - x * (1.0 / 6) * value
-        value = 1.0 - x * (1.0 / 5) * value
-        value = 1.0 - x * (1.0 / 4) * value
-        value = 1.0 - x * (1.0 / 3) * value
-        return 1.0 - x * (1.0 / 2) * value
-    # coefficients (-1)^n / (n! (n + 2))
-    value = 1.0 / (3628800.0 * 12.0)
-    value = -1.0 / (362880.0 * 11.0) + x * value
-    value = 1.0 / (40320.0 * 10.0) + x * value
-    value = -1.0 / (5040.0 * 9.0) + x * value
-    value = 1.0 / (720.0 * 8.0) + x * value
-    value = -1.0 / (120.0 * 7.0) + x * value
-    value = 1.0 / (24.0 * 6.0) + x * value
-    value = -1.0 / (6.0 * 5.0) + x * value
-    value = 1.0 / (2.0 * 4.0) + x * value
-    value = -1.0 / 3.0 + x * value
-    return 0.5 + x * value
+def series(minus_x, WIDE: tl.constexpr):
+    """``(1 - exp(-x)) / x`` for 0 <= x <= 0.25, to the digits of float32 or, WIDE, of float64."""
+    if WIDE:
+        value = 1.0 / 39916800 + minus_x * (1.0 / 479001600)
+        value = 1.0 / 3628800 + minus_x * value
+        value = 1.0 / 362880 + minus_x * value
+        value = 1.0 / 40320 + minus_x * value
+        value = 1.0 / 5040 + minus_x * value
+        value = 1.0 / 720 + minus_x * value
+    else:
+        value = 1.0 / 720
+    value = 1.0 / 120 + minus_x * value
+    value = 1.0 / 24 + minus_x * value
+    value = 1.0 / 6 + minus_x * value
+    value = 0.5 + minus_x * value
+    return 1.0 + minus_x * value
 
 
 @triton.jit
-def energy(z, kappa):
-    """Energy of a standardised error, and its derivative by it."""
-    minus_x = tl.maximum((z * (-0.5 * kappa)) * z, -1e4)  # in this order 0 times a square that overflows is 0
+def curve_series(minus_x, WIDE: tl.constexpr):
+    """``(1 - exp(-x) (1 + x)) / x²``, the sum of ``(-x)^n / (n! (n + 2))``, for 0 <= x <= 0.5."""
+    if WIDE:
+        value = 1.0 / (362880.0 * 11.0) + minus_x * (1.0 / (3628800.0 * 12.0))
+        value = 1.0 / (40320.0 * 10.0) + minus_x * value
+        value = 1.0 / (5040.0 * 9.0) + minus_x * value
+        value = 1.0 / (720.0 * 8.0) + minus_x * value
+    else:
+        value = 1.0 / (720.0 * 8.0)
+    value = 1.0 / (120.0 * 7.0) + minus_x * value
+    value = 1.0 / (24.0 * 6.0) + minus_x * value
+    value = 1.0 / (6.0 * 5.0) + minus_x * value
+    value = 1.0 / (2.0 * 4.0) + minus_x * value
+    value = 1.0 / 3.0 + minus_x * value
+    return 0.5 + minus_x * value
+
+
+@triton.jit
+def energy(z, kappa, inverse_kappa, WIDE: tl.constexpr):
+    """Energy of a standardised error, its derivative by it, -x = -kappa z² / 2, exp(-x) and z² / 2.
+
+    ``inverse_kappa`` is anything finite where kappa is 0.
+    """
+    minus_x = (z * (-0.5 * kappa)) * z  # in this order 0 times a square that overflows is 0
     inlier = tl.exp(minus_x)
-    near = 0.5 * z * z * series(tl.minimum(-minus_x, 0.5), 0)
-    far = (1.0 - inlier) / tl.where(kappa > 0, kappa, 1.0)
-    value = tl.where(minus_x > -0.5, near, far)
-    return tl.where(z == z, value, z), z * inlier  # the maximum of NaN and a number is the number
+    half = (0.5 * z) * z
+    near = half * series(tl.maximum(minus_x, -0.25), WIDE)
+    value = tl.where(minus_x > -0.25, near, inverse_kappa - inverse_kappa * inlier)
+    return value, z * inlier, minus_x, inlier, half
 
 
 @triton.jit
-def energy_by_kappa(z, kappa):
-    """Derivative of the energy by kappa."""
-    minus_x = tl.maximum((z * (-0.5 * kappa)) * z, -1e4)
-    half = 0.5 * z * z
-    near = -half * half * series(tl.minimum(-minus_x, 0.5), 1)
-    positive = tl.where(kappa > 0, kappa, 1.0)
-    far = (tl.exp(minus_x) * (1.0 - minus_x) - 1.0) / (positive * positive)
+def energy_by_kappa(minus_x, inlier, half, inverse_kappa, WIDE: tl.constexpr):
+    """Derivative of the energy by kappa, from what :func:`energy` returns."""
+    near = -half * half * curve_series(tl.maximum(minus_x, -0.5), WIDE)
+    far = (inlier * (1.0 - tl.maximum(minus_x, -1e4)) - 1.0) * (inverse_kappa * inverse_kappa)
     return tl.where(minus_x > -0.5, near, far)
 
 
 @triton.jit
-def initial(z):
+def initial(z, WIDE: tl.constexpr):
     """The initial loss, which bends at 0.2 scales, and its derivative."""
     ratio = z * 5.0
-    root = tl.sqrt(1.0 + ratio * ratio)
-    fourth = tl.sqrt(root)
-    return 0.08 * (fourth - 1.0), z / (root * fourth)
+    if WIDE:
+        root = tl.sqrt(1.0 + ratio * ratio)
+        fourth = tl.sqrt(root)
+        slope = z / (root * fourth)
+    else:
+        square = tl.minimum(1.0 + ratio * ratio, 1e37)
+        inverse = tl.rsqrt(square)
+        root = square * inverse
+        inverse_fourth = tl.rsqrt(root)
+        fourth = root * inverse_fourth
+        slope = z * (inverse * inverse_fourth)
+    return 0.08 * (fourth - 1.0), slope
 
 
 @triton.jit
@@ -85,11 +102,12 @@ def log_partition(kappa, length, rule, NODES: tl.constexpr):
     reach = tl.sqrt(-2.0 * tl.log(least * softplus) / least)
     end = tl.minimum(length, reach)
     u = end * nodes
-    value, _ = energy(u, kappa)
+    inverse = 1.0 / tl.where(kappa > 0, kappa, 1.0)
+    value, _, minus_x, inlier, half = energy(u, kappa, inverse, True)
     density = tl.exp(-value)
     share = end * weights
     tail_slope = tail / (safe * safe)
     z = 2.0 * length * tail + tl.sum(share * (density - tail), 0)
-    by_kappa = 2.0 * length * tail_slope + tl.sum(share * (-energy_by_kappa(u, kappa) * density - tail_slope), 0)
-    at_end, _ = energy(length, kappa)
+    by_kappa = 2.0 * length * tail_slope + tl.sum(share * (-energy_by_kappa(minus_x, inlier, half, inverse, True) * density - tail_slope), 0)
+    at_end, _, _, _, _ = energy(length, kappa, inverse, True)
     return tl.log(z), by_kappa / z, 2.0 * tl.exp(-at_end) / z

@@ -6,11 +6,11 @@ import functools
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-import triton
 from torch import Tensor
 
 from mkc_torch.density.normalizer import head_rule_constants
 from mkc_torch.losses._bandwidth_selection import BANDWIDTHS
+from mkc_torch.losses.kernels.cached import CachedKernel
 from mkc_torch.losses.kernels.channels import TABLE, channel_kernel
 from mkc_torch.losses.kernels.elements import elements_kernel, finish_kernel, rescale_kernel
 from mkc_torch.losses.residual_scale import RANGE_ROWS
@@ -28,7 +28,6 @@ __all__ = [
     "pass_over",
     "reduce_batch",
     "rescale",
-    "view_as_arranged",
     "weight_sums",
 ]
 
@@ -37,6 +36,9 @@ TILE = 1024
 
 MOST_COLUMNS = 64
 """Channels of a tile, where they are last in memory."""
+
+LINE_COLUMNS = 128
+"""Elements of a row of a tile where memory is one line."""
 
 ALONE = 1 << 14
 """Elements up to which one program finishes a batch alone."""
@@ -52,6 +54,9 @@ RESCALED = 4096
 
 WARPS = 4
 """Warps of a program."""
+
+_CHANNELS, _ELEMENTS = CachedKernel(channel_kernel), CachedKernel(elements_kernel)
+_FINISH, _RESCALE = CachedKernel(finish_kernel), CachedKernel(rescale_kernel)
 
 
 class Options(NamedTuple):
@@ -83,18 +88,20 @@ class Running(NamedTuple):
 
 
 class Arranged(NamedTuple):
-    """A batch as (outer, m, inner) views whose strides input and target share; the weight has its own."""
+    """A batch seen as (outer, m, inner): its tensors, these sizes, and the strides of input and target, which agree."""
 
     input: Tensor
+    """The input, or a copy whose memory has no gaps: gradients have its layout."""
     target: Tensor
     weight: Tensor | None
-    like: Tensor
-    """The input itself, or a copy whose memory has no gaps: gradients have its layout."""
     axis: int
+    size: tuple[int, int, int]
+    strides: tuple[int, int, int]
+    weight_strides: tuple[int, int, int]
 
     @property
     def channels(self) -> int:
-        return self.input.shape[1]
+        return self.size[1]
 
     @property
     def wide(self) -> bool:
@@ -102,29 +109,29 @@ class Arranged(NamedTuple):
 
 
 def arranged(input: Tensor, target: Tensor, weight: Tensor | None, axis: int) -> Arranged:
-    """Views of a batch that the kernels walk through; copies where its memory has gaps."""
-    if not (input.is_contiguous() or input.movedim(axis, -1).is_contiguous()):
-        input = input.contiguous()
-    if target.stride() != input.stride():
+    """A batch as the kernels walk through it; with copies where its memory has gaps."""
+    shape = input.shape
+    m = shape[axis]
+    contiguous = input.is_contiguous()
+    if not (contiguous or input.movedim(axis, -1).is_contiguous()):
+        input, contiguous = input.contiguous(), True
+    if not (contiguous and target.is_contiguous()) and target.stride() != input.stride():
         target = torch.empty_like(input, dtype=target.dtype).copy_(target)
-    given = [input, target] if weight is None else [input, target, weight.expand(input.shape)]
-    views = [_view(one, axis, channels_last=not input.is_contiguous()) for one in given]
-    return Arranged(views[0], views[1], None if weight is None else views[2], input, axis)
-
-
-def view_as_arranged(values: Tensor, batch: Arranged) -> Tensor:
-    """A tensor of the shape of the batch as the batch is viewed."""
-    return _view(values, batch.axis, channels_last=not batch.like.is_contiguous())
-
-
-def _view(values: Tensor, axis: int, *, channels_last: bool) -> Tensor:
-    shape = values.shape
-    if channels_last:
-        return values.movedim(axis, -1).reshape(-1, shape[axis], 1)
     outer, inner = shape[:axis].numel(), shape[axis + 1 :].numel()
-    if shape[axis] == 1:  # one channel: all of it is one row
-        return values.reshape(1, 1, -1)
-    return values.reshape(outer, shape[axis], inner)
+    if not contiguous or m == 1:  # channels are last in memory; one channel is a line
+        outer, inner = outer * inner, 1
+    strides_of_weight = (0, 0, 0)
+    if weight is not None:
+        weight = _view(weight.expand(shape), axis, (outer, m, inner))
+        strides_of_weight = weight.stride()  # type: ignore[assignment]
+    return Arranged(
+        input, target, weight, axis, (outer, m, inner), (m * inner, inner, 1), strides_of_weight
+    )
+
+
+def _view(values: Tensor, axis: int, size: tuple[int, int, int]) -> Tensor:
+    """A tensor of the shape of the batch as (outer, m, inner)."""
+    return (values.movedim(axis, -1) if size[2] == 1 else values).reshape(size)
 
 
 @functools.cache
@@ -135,7 +142,7 @@ def _constants(device: torch.device) -> tuple[Tensor, Tensor]:
 
 
 @functools.cache
-def _multiprocessors(device: torch.device) -> int:
+def multiprocessors(device: torch.device) -> int:
     return torch.cuda.get_device_properties(device).multi_processor_count if device.type == "cuda" else 2
 
 
@@ -170,57 +177,69 @@ def make_table(
         peek: whether channels without a batch so far take their scale from this one, for the table alone.
         pace: ``warmup_steps`` and ``anneal_step`` of the schedule.
     """
-    x, t, w = batch.input, batch.target, batch.weight
-    outer, m, inner = x.shape
+    outer, m, inner = batch.size
+    device = batch.input.device
     dtype = torch.float64 if batch.wide else kappa.dtype
-    numbers = torch.empty((len(TABLE), m), dtype=dtype, device=x.device)
+    numbers = torch.empty((len(TABLE), m), dtype=dtype, device=device)
     rows = outer * inner
     step = max(1, rows // RANGE_ROWS)
-    rule, widths = _constants(x.device)
-    dummy = numbers
-    recent = dummy if running.recent is None else running.recent
+    rule, widths = _constants(device)
     length = 1 if running.recent is None else running.recent.shape[-1]
-    buffers = [dummy if one is None else one for one in running[1:]]
-    given = [dummy if one is None else one for one in (d, bound, floor)]
-    channel_kernel[(m,)](
-        x, t, dummy if w is None else w, recent, *buffers, kappa, *given, numbers, rule, widths,
-        rows, m, inner, *x.stride(), *((0, 0, 0) if w is None else w.stride()),
-        -(-rows // step), step, *pace,
-        LENGTH=length, LENGTH_PAD=max(_power(length), 16), RANGE_BLOCK=min(max(_power(-(-rows // step)), 16), 1024),
-        SCALE=scale, PEEK=peek, SCHEDULE=schedule, MAKE_TABLE=table, HAS_WEIGHT=w is not None,
-        HAS_SCALE=options.has_scale, ROBUST=options.robust, FOLLOWS=options.follows,
-        LEARN_KAPPA=options.learn_kappa, LEARN_D=options.learn_d,
-        OWN_BOUND=options.own_bound, OWN_FLOOR=options.own_floor, NORMALIZE=options.normalize,
-        WIDTHS=len(BANDWIDTHS), WIDTHS_PAD=16, NODES=32, WIDE=dtype == torch.float64,
-        num_warps=WARPS,
+    tensors = (batch.input, batch.target, batch.weight, *running, kappa, d, bound, floor, numbers, rule, widths)
+    range_rows = -(-rows // step)
+    _CHANNELS.launch(
+        (m, 1, 1),
+        [numbers if one is None else one for one in tensors],
+        (rows, m, inner, *batch.strides, *batch.weight_strides, range_rows, step, *pace),
+        (
+            length, max(_power(length), 16), min(max(_power(range_rows), 16), 1024),
+            scale, peek, schedule, table, batch.weight is not None,
+            options.has_scale, options.robust, options.follows, options.learn_kappa, options.learn_d,
+            options.own_bound, options.own_floor, options.normalize,
+            len(BANDWIDTHS), 16, 32, dtype == torch.float64,
+        ),
+        WARPS,
     )  # fmt: skip
     return numbers
 
 
 class Tiles(NamedTuple):
-    """How a pass over a batch is cut: block sizes, programs along the batch and along the channels."""
+    """How a pass over a batch is cut: block sizes, the layout of columns, programs along the batch and the channels."""
 
     block_row: int
     block_col: int
-    channels_last: bool
+    layout: int
     programs: int
     columns: int
+    outer: int
+
+
+PLACES, CHANNELS, LINE = 0, 1, 2
+"""Columns of a tile: places within a channel, channels, or channels of several rows in one line of memory."""
 
 
 def _tiles(batch: Arranged) -> Tiles:
-    outer, m, inner = batch.input.shape
-    channels_last = inner == 1 and m > 1
-    alone = outer * m * inner <= ALONE
-    if channels_last:
+    outer, m, inner = batch.size
+    elements = outer * m * inner
+    if inner == 1 and _power(m) == m and m <= LINE_COLUMNS:
+        layout, columns = LINE, 1
+        block_col = LINE_COLUMNS if elements >= LINE_COLUMNS else max(_power(elements), m)
+        outer = -(-elements // block_col)
+        block_row = min(max(TILE // block_col, 1), _power(outer))
+        blocks = -(-outer // block_row)
+    elif inner == 1:
+        layout = CHANNELS
         block_col = min(_power(m), MOST_COLUMNS)
         block_row = min(max(TILE // block_col, 1), _power(outer))
         blocks, columns = -(-outer // block_row), -(-m // block_col)
     else:
+        layout = PLACES
         block_col = min(_power(inner), TILE)
         block_row = min(max(TILE // block_col, 1), _power(outer))
         blocks, columns = -(-outer // block_row) * -(-inner // block_col), m
-    most = max(1, min(PROGRAMS_EACH * _multiprocessors(batch.input.device) // min(columns, 8), PARTIAL_SUMS // m))
-    return Tiles(block_row, block_col, channels_last, 1 if alone and columns == 1 else min(blocks, most), columns)
+    most = max(1, min(PROGRAMS_EACH * multiprocessors(batch.input.device) // min(columns, 8), PARTIAL_SUMS // m))
+    programs = 1 if elements <= ALONE and columns == 1 else min(blocks, most)
+    return Tiles(block_row, block_col, layout, programs, columns, outer)
 
 
 def pass_over(
@@ -244,71 +263,72 @@ def pass_over(
         table: of :func:`make_table`.
         options: what the loss computes.
         weights, total_weight: sums of the weights of each channel, (m,), and of all; where there are weights.
-        upstream: gradient by the value, one number or one a element, of any strides; None for 1.
-        values: takes the value of each element.
+        upstream: gradient by the value, one number or one of each element, of any strides; None for 1.
+        values: takes the value of each element; laid out as the input, as ``slopes`` is.
         slopes: takes the gradient by the input.
         by_kappa, by_d: take the gradients by the raw parameters, (m,); with ``sums``.
         sums: whether the sums of each channel are wanted.
     """
-    x, t, w = batch.input, batch.target, batch.weight
-    outer, m, inner = x.shape
+    outer, m, inner = batch.size
+    device, dtype = table.device, table.dtype
     tiles = _tiles(batch)
     each = upstream is not None and upstream.dim() > 0
     finish = sums and tiles.programs == 1 and tiles.columns == 1
-    value = torch.empty(1 if finish else tiles.columns, dtype=table.dtype, device=x.device) if sums else None
-    partial = None
-    if sums and not finish:
-        partial = torch.empty((5, tiles.programs, m), dtype=table.dtype, device=x.device)
-    given = view_as_arranged(upstream, batch) if each and upstream is not None else upstream
-    count = outer * m * inner if options.mean else 1
-    learn_kappa, learn_d = options.learn_kappa and by_kappa is not None, options.learn_d and by_d is not None
-    dummy = table
-
-    def pointer(one: Tensor | None) -> Tensor:
-        return dummy if one is None else one
-
-    elements_kernel[(tiles.programs, tiles.columns)](
-        x, t, pointer(w), pointer(given), table, pointer(weights), pointer(total_weight),
-        pointer(values), pointer(slopes), pointer(partial), pointer(value), pointer(by_kappa), pointer(by_d),
-        outer, m, inner, *x.stride(), *((0, 0, 0) if w is None else w.stride()),
-        *(given.stride() if each and given is not None else (0, 0, 0)), tiles.programs, count,
-        SO=x.stride(0) if tiles.channels_last else 1,
-        BLOCK_ROW=tiles.block_row, BLOCK_COL=tiles.block_col, CHANNELS_LAST=tiles.channels_last,
-        HAS_WEIGHT=w is not None, MEAN=options.mean, UPSTREAM=0 if given is None else 2 if each else 1,
-        ROBUST=options.robust, LEARN_KAPPA=learn_kappa, LEARN_D=learn_d, NORMALIZE=options.normalize,
-        WRITE_VALUES=values is not None, WRITE_SLOPES=slopes is not None, SUMS=sums, FINISH=finish,
-        WIDE=table.dtype == torch.float64,
-        num_warps=WARPS,
+    value = torch.empty(1 if finish else -(-m // MOST_COLUMNS), dtype=dtype, device=device) if sums else None
+    partial = torch.empty((5, tiles.programs, m), dtype=dtype, device=device) if sums and not finish else None
+    strides = (0, 0, 0)
+    if each and upstream is not None:
+        upstream = _view(upstream, batch.axis, batch.size)
+        strides = upstream.stride()  # type: ignore[assignment]
+    elements = outer * m * inner
+    count = elements if options.mean else 1
+    learns = (options.learn_kappa and by_kappa is not None, options.learn_d and by_d is not None)
+    tensors = (
+        batch.input, batch.target, batch.weight, upstream, table, weights, total_weight,
+        values, slopes, partial, value, by_kappa, by_d,
+    )  # fmt: skip
+    _ELEMENTS.launch(
+        (tiles.programs, tiles.columns, 1),
+        [table if one is None else one for one in tensors],
+        (tiles.outer, inner, *batch.strides, *batch.weight_strides, *strides, tiles.programs, count, elements),
+        (
+            m, tiles.block_row, tiles.block_col, tiles.layout,
+            batch.weight is not None, options.mean, 0 if upstream is None else 2 if each else 1,
+            options.robust, *learns, options.normalize,
+            values is not None, slopes is not None, sums, finish, dtype == torch.float64,
+        ),
+        WARPS,
     )  # fmt: skip
     if partial is None or value is None:
         return value
-    block_col = min(tiles.block_col, 64) if tiles.channels_last else min(_power(m), 64)
-    columns = -(-m // block_col)
-    if columns != len(value):
-        value = torch.empty(columns, dtype=table.dtype, device=x.device)
-    finish_kernel[(columns,)](
-        partial, table, pointer(weights), pointer(total_weight), value, pointer(by_kappa), pointer(by_d),
-        m, tiles.programs, outer * inner, count,
-        BLOCK_ROW=min(_power(tiles.programs), max(1024 // block_col, 1)), BLOCK_COL=block_col,
-        HAS_WEIGHT=w is not None, MEAN=options.mean, ROBUST=options.robust, LEARN_KAPPA=learn_kappa, LEARN_D=learn_d,
-        NORMALIZE=options.normalize, GIVEN=each, WIDE=table.dtype == torch.float64,
-        num_warps=WARPS,
+    block_col = min(_power(m), MOST_COLUMNS)
+    tensors = (partial, table, weights, total_weight, value, by_kappa, by_d)
+    _FINISH.launch(
+        (len(value), 1, 1),
+        [table if one is None else one for one in tensors],
+        (m, tiles.programs, outer * inner, count),
+        (
+            min(_power(tiles.programs), max(1024 // block_col, 1)), block_col, batch.weight is not None, options.mean,
+            options.robust, *learns, options.normalize, each, dtype == torch.float64,
+        ),
+        WARPS,
     )  # fmt: skip
-    return value if columns == 1 else value.sum(0, keepdim=True)
+    return value if len(value) == 1 else value.sum(0, keepdim=True)
 
 
 def rescale(slopes: Tensor | None, by_kappa: Tensor | None, by_d: Tensor | None, upstream: Tensor) -> None:
     """Multiply gradients by the upstream gradient, in place; where that is 1 nothing is read."""
     count = 0 if slopes is None else slopes.numel()
     m = max(0 if one is None else len(one) for one in (by_kappa, by_d))
-    programs = max(1, min(-(-count // RESCALED), PROGRAMS_EACH * _multiprocessors(upstream.device)))
-    dummy = upstream
-    rescale_kernel[(programs,)](
-        dummy if slopes is None else slopes, dummy if by_kappa is None else by_kappa, dummy if by_d is None else by_d,
-        upstream, count, m, programs,
-        BLOCK=RESCALED, HAS_SLOPES=slopes is not None, LEARN_KAPPA=by_kappa is not None, LEARN_D=by_d is not None,
-        num_warps=WARPS,
-    )  # fmt: skip
+    programs = max(1, min(-(-count // RESCALED), PROGRAMS_EACH * multiprocessors(upstream.device)))
+    given = (slopes, by_kappa, by_d, upstream)
+    _RESCALE.launch(
+        (programs, 1, 1),
+        [upstream if one is None else one for one in given],
+        (count, m, programs),
+        (RESCALED, *(one is not None for one in given[:3])),
+        WARPS,
+    )
 
 
 def reduce_batch(
@@ -317,12 +337,11 @@ def reduce_batch(
     """Value () of a reduced loss, and its gradients by the input and by the raw parameters."""
     weights, total = weight_sums(batch, table.dtype)
     m = batch.channels
-    slopes = torch.empty_like(batch.like) if wants_input else None
+    slopes = torch.empty_like(batch.input) if wants_input else None
     by_kappa = table.new_empty(m) if options.learn_kappa else None
     by_d = table.new_empty(m) if options.learn_d else None
-    written = None if slopes is None else view_as_arranged(slopes, batch)
     value = pass_over(
-        batch, table, options, weights=weights, total_weight=total, slopes=written, by_kappa=by_kappa, by_d=by_d, sums=True
+        batch, table, options, weights=weights, total_weight=total, slopes=slopes, by_kappa=by_kappa, by_d=by_d, sums=True
     )
     assert value is not None
     return value.view(()), slopes, by_kappa, by_d
@@ -338,5 +357,5 @@ def weight_sums(batch: Arranged, dtype: torch.dtype) -> tuple[Tensor | None, Ten
 
 def kernels_are_interpreted() -> bool:
     """Whether Triton's interpreter runs the kernels, as on a machine without a GPU."""
-    return not isinstance(elements_kernel, triton.JITFunction)
+    return _ELEMENTS.is_interpreted
 

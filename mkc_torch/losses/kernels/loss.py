@@ -21,7 +21,6 @@ from mkc_torch.losses.kernels.launch import (
     pass_over,
     reduce_batch,
     rescale,
-    view_as_arranged,
     weight_sums,
 )
 from mkc_torch.losses.residual_scale import ScaleState, alike_in_all_processes, average_over_processes, is_distributed
@@ -73,24 +72,25 @@ class Work(NamedTuple):
 
 
 def kernel_loss(loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None) -> Tensor:
-    """The forward pass of a loss by kernels; what they do not do, transforms say, by formulas."""
+    """The forward pass of a loss by kernels; by formulas under transforms, and where a weight wants a gradient."""
     axis = loss._checked_axis(input, target)
-    parameters = [one for one in (loss.raw_kappa, loss.raw_d) if one is not None]
+    own = loss._parameters  # attributes of modules take a microsecond each
+    raw_kappa, raw_d = own.get("raw_kappa"), own.get("raw_d")
+    given = [one for one in (input, target, weight, raw_kappa, raw_d) if one is not None]
     compiling = torch.compiler.is_compiling()
-    given = [one for one in (input, target, weight) if isinstance(one, Tensor)]
-    if not compiling and any(is_transformed(one) for one in (*given, *parameters)):
+    if not compiling and any(is_transformed(one) for one in given):
         return loss._computed(input, target, weight)
     if weight is not None:
         if weight.requires_grad:
             return loss._computed(input, target, weight)
         weight = checked_weight(weight, input, axis, cast=False)[0]
-    if compiling or any(type(one) not in (Tensor, torch.nn.Parameter) for one in (*given, *parameters)):
+    if compiling or any(type(one) is not Tensor and type(one) is not torch.nn.Parameter for one in given):
         from mkc_torch.losses.kernels.operators import operator_loss
 
         return operator_loss(loss, input, target, weight, axis)
     work = prepared(loss, input, target, weight, axis)
     function: Any = _Each if loss.reduction == "none" else _Reduced
-    value: Tensor = function.apply(input, target, loss.raw_kappa, loss.raw_d, work)
+    value: Tensor = function.apply(input, target, raw_kappa, raw_d, work)
     return value
 
 
@@ -98,14 +98,15 @@ def options_of(loss: MKCLoss) -> Options:
     """What a loss computes in its present mode."""
     scale, schedule = loss._running()
     robust = loss.training and schedule is not None
+    buffers, parameters = loss._buffers, loss._parameters
     return Options(
         follows=loss._follows,
         robust=robust,
         has_scale=scale is not None and (loss._follows or robust),
-        learn_kappa=loss.raw_kappa is not None,
-        learn_d=loss.raw_d is not None,
-        own_bound=loss.fixed_bound is not None,
-        own_floor=loss.fixed_d_min is not None,
+        learn_kappa=parameters.get("raw_kappa") is not None,
+        learn_d=parameters.get("raw_d") is not None,
+        own_bound=buffers.get("fixed_bound") is not None,
+        own_floor=buffers.get("fixed_d_min") is not None,
         normalize=loss.normalize,
         mean=loss.reduction == "mean",
     )
@@ -117,7 +118,8 @@ def prepared(loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None
     options, batch = options_of(loss), arranged(input.detach(), target.detach(), weight, axis)
     request = request_of(loss, input.device)
     table = updated_table(batch, request, options, updates=request.updates and not in_backward())
-    fixed = (loss.fixed_kappa, loss.fixed_d)
+    buffers = loss._buffers
+    fixed = (buffers.get("fixed_kappa"), buffers.get("fixed_d"))
     return Work(input, target, weight, axis, batch, table, options, *fixed, loss.reduction)
 
 
@@ -137,16 +139,25 @@ class Request(NamedTuple):
 def request_of(loss: MKCLoss, device: torch.device) -> Request:
     """The parameters and buffers of a loss."""
     scale, schedule = loss._running()
-    if scale is not None and scale.log_scale.device != device:
-        scale.to(device)  # a guide is no part of the loss, and is not moved with it
-        if schedule is not None:
-            schedule.to(device)
-    kappa = loss.fixed_kappa if loss.raw_kappa is None else loss.raw_kappa
-    d = loss.fixed_d if loss.raw_d is None else loss.raw_d
+    parameters, buffers = loss._parameters, loss._buffers
+    kappa, d = parameters.get("raw_kappa"), parameters.get("raw_d")
+    kappa = buffers.get("fixed_kappa") if kappa is None else kappa
+    d = buffers.get("fixed_d") if d is None else d
     assert kappa is not None
-    pace = (0, 0.0) if schedule is None else (schedule.warmup_steps, schedule.anneal_step)
-    updates = scale is not None and loss.training
-    return Request(kappa, d, loss.fixed_bound, loss.fixed_d_min, running_of(loss), updates, *pace)
+    running, pace = Running(), (0, 0.0)
+    if scale is not None:
+        own = scale._buffers
+        if own["log_scale"].device != device:  # type: ignore[union-attr]
+            scale.to(device)  # a guide is no part of the loss, and is not moved with it
+        running = Running(*(own[name] for name in Running._fields[:6]))
+        if schedule is not None:
+            others = schedule._buffers
+            if others["share"].device != device:  # type: ignore[union-attr]
+                schedule.to(device)
+            running = Running(*running[:6], *(others[name] for name in Running._fields[6:]))
+            pace = (schedule.warmup_steps, schedule.anneal_step)
+    given = (kappa, d, buffers.get("fixed_bound"), buffers.get("fixed_d_min"))
+    return Request(*given, running, scale is not None and loss.training, *pace)
 
 
 def updated_table(batch: Arranged, request: Request, options: Options, *, updates: bool) -> Tensor:
@@ -168,15 +179,6 @@ def updated_table(batch: Arranged, request: Request, options: Options, *, update
         for own, mean in zip(own_schedule, average_over_processes(own_schedule), strict=True):  # type: ignore[arg-type]
             own.copy_(mean)  # type: ignore[union-attr]
     return make_table(batch, running, *numbers, options, pace=pace)
-
-
-def running_of(loss: MKCLoss) -> Running:
-    """The buffers of the modules that are updated in training."""
-    scale, schedule = loss._running()
-    if scale is None:
-        return Running()
-    own = (scale.recent, scale.position, scale.batches, scale.log_scale, scale.half_range, scale.floor)
-    return Running(*own) if schedule is None else Running(*own, schedule.steps, schedule.log_bandwidth, schedule.share)
 
 
 class _Reduced(torch.autograd.Function):
@@ -204,11 +206,11 @@ class _Reduced(torch.autograd.Function):
         rescale(slopes, by_kappa, by_d, grad)
         wants = ctx.needs_input_grad
         if slopes is None and (wants[0] or wants[1]):
-            slopes = torch.empty_like(work.batch.like)
+            slopes = torch.empty_like(work.batch.input)
             weights, total = weight_sums(work.batch, work.table.dtype)
             pass_over(
                 work.batch, work.table, work.options, weights=weights, total_weight=total, upstream=grad,
-                slopes=view_as_arranged(slopes, work.batch),
+                slopes=slopes,
             )  # fmt: skip
         return (*_handed_out(ctx, slopes), by_kappa, by_d, None)
 
@@ -220,8 +222,8 @@ class _Each(torch.autograd.Function):
     def forward(ctx: Any, input: Tensor, target: Tensor, raw_kappa: Any, raw_d: Any, work: Work) -> Tensor:
         ctx.save_for_backward(input, target, raw_kappa, raw_d)
         ctx.work = work._replace(input=None, target=None)
-        values = torch.empty_like(work.batch.like, dtype=work.table.dtype)
-        pass_over(work.batch, work.table, work.options, values=view_as_arranged(values, work.batch))
+        values = torch.empty_like(work.batch.input, dtype=work.table.dtype)
+        pass_over(work.batch, work.table, work.options, values=values)
         return values
 
     @staticmethod
@@ -237,11 +239,11 @@ def gradients_of_each(
     batch: Arranged, table: Tensor, options: Options, grad: Tensor
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
     """Gradients by the input and the raw parameters, of elements each of which has its own upstream gradient."""
-    slopes = torch.empty_like(batch.like)
+    slopes = torch.empty_like(batch.input)
     by_kappa = table.new_empty(batch.channels) if options.learn_kappa else None
     by_d = table.new_empty(batch.channels) if options.learn_d else None
     pass_over(
-        batch, table, options, upstream=grad, slopes=view_as_arranged(slopes, batch), by_kappa=by_kappa, by_d=by_d,
+        batch, table, options, upstream=grad, slopes=slopes, by_kappa=by_kappa, by_d=by_d,
         sums=options.learn_kappa or options.learn_d,
     )  # fmt: skip
     return slopes, by_kappa, by_d

@@ -20,7 +20,6 @@ from mkc_torch.losses.kernels.launch import (
     arranged,
     pass_over,
     reduce_batch,
-    view_as_arranged,
     weight_sums,
 )
 from mkc_torch.losses.kernels.loss import Request, gradients_of_each, options_of, request_of, updated_table
@@ -127,11 +126,11 @@ def slopes(
 ) -> Tensor:
     """The gradient by the input of a reduced loss, times the upstream gradient before it is rounded."""
     batch = arranged(input, target, weight, axis)
-    found = torch.empty_like(batch.like)
+    found = torch.empty_like(batch.input)
     weights, total = weight_sums(batch, table.dtype)
     pass_over(
         batch, table, Options(*options), weights=weights, total_weight=total, upstream=grad,
-        slopes=view_as_arranged(found, batch),
+        slopes=found,
     )  # fmt: skip
     return found
 
@@ -154,8 +153,8 @@ def each_loss(
 ) -> Tensor:
     """The loss of each element."""
     batch = arranged(input, target, weight, axis)
-    values = torch.empty_like(batch.like, dtype=table.dtype)
-    pass_over(batch, table, Options(*options), values=view_as_arranged(values, batch))
+    values = torch.empty_like(batch.input, dtype=table.dtype)
+    pass_over(batch, table, Options(*options), values=values)
     return values
 
 

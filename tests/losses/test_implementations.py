@@ -1,0 +1,274 @@
+"""One algorithm, whatever computes it: NumPy, torch, torch's compiler, and tensors that have no values to look at."""
+
+import copy
+import math
+
+import pytest
+import torch
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from mkc_torch import MKCLoss
+from mkc_torch.losses import _fused, bandwidth_schedule, mkc, residual_scale
+
+FIXED = {"learn_sigma": False, "learn_d": False}
+MODES = {
+    "as it comes": {},
+    "given d, robust": {"d": 1.0, "objective": "robust"},
+    "likelihood, d follows": {"objective": "likelihood"},
+    "learned": {"d": 1.0},
+    "fixed": {"d": 1.0, **FIXED},
+    "fixed, normalised": {"d": 1.0, "normalize": True, **FIXED},
+    "follows, nothing learned": FIXED,
+}
+each_mode = pytest.mark.parametrize("options", MODES.values(), ids=MODES)
+compiler = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
+
+
+def batch(step, *shape):
+    """Predictions and targets without ties, whose noise changes, and of which up to half are wrong for a while."""
+    g = torch.Generator().manual_seed(step)
+    x, y = torch.randn(2, *shape, generator=g, dtype=torch.float64)
+    y *= 1.0 + 0.5 * math.sin(0.1 * step)
+    if step % 100 < 50:
+        y[::2] += 0.1 * step * torch.rand(y[::2].shape, generator=g, dtype=torch.float64)
+    return x, y
+
+
+def made(options, warmup_steps=20):
+    loss = MKCLoss(2, **options).double()
+    if loss.schedule is not None:
+        loss.schedule.warmup_steps = warmup_steps
+    return loss
+
+
+def stepped(loss, call, x, y, *weight):
+    """Value and gradients of one batch."""
+    x = x.clone().requires_grad_()
+    value = call(x, y, *weight)
+    return [value.detach(), *torch.autograd.grad(value.sum(), [x, *loss.parameters()])]
+
+
+def assert_same_steps(one, other, call, steps, *, rtol, shape=(64, 2), prepare=lambda _: None):
+    """Values, gradients and states of two losses agree batch after batch; counters and shares to the bit."""
+    shares = []
+    for step in range(steps):
+        x, y = batch(step, *shape)
+        prepare(0)
+        expected = stepped(one, one, x, y)
+        prepare(1)
+        found = stepped(other, call, x, y)
+        for a, b in zip(found, expected, strict=True):
+            torch.testing.assert_close(a, b, rtol=rtol, atol=rtol * float(b.abs().max()))
+        for name, value in one.state_dict().items():
+            exact = name.endswith(("share", "steps", "batches", "position"))
+            tolerance = 0.0 if exact else rtol
+            torch.testing.assert_close(other.state_dict()[name], value, rtol=tolerance, atol=tolerance)
+        if one.schedule is not None:
+            shares.append(one.schedule.share.clone())
+    if shares and steps >= 300:  # up and down, in between and at the end
+        change = torch.stack(shares).diff(dim=0)
+        assert bool((change > 0).any())
+        assert bool((change < 0).any())
+        assert bool((shares[-1] == 1.0).any())
+
+
+# --- the compiler
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    """A loss as it comes, compiled once for all tests: a loss, its copy, and the copy compiled."""
+    torch.compiler.reset()
+    loss = made({})
+    own = copy.deepcopy(loss)
+    return loss, own, torch.compile(own, fullgraph=True)
+
+
+@compiler
+def test_a_compiled_loss_is_the_same_algorithm_over_300_batches(compiled):
+    assert_same_steps(*compiled, 300, rtol=1e-10)
+
+
+@compiler
+def test_gradients_of_a_compiled_loss_are_those_of_the_state_of_their_forward_pass(compiled):
+    """Eight forward passes, each of which changes the state, before a backward pass."""
+    loss, own, call = compiled
+    for one in (loss, own):
+        one.load_state_dict(made({}).state_dict())
+    for start in range(0, 48, 8):
+        batches = [batch(start + step, 64, 2) for step in range(8)]
+        found = []
+        for one in (loss, call):
+            inputs = [x.clone().requires_grad_() for x, _ in batches]
+            values = [one(x, y) for x, (_, y) in zip(inputs, batches, strict=True)]
+            found.append([torch.autograd.grad(value, x)[0] for value, x in zip(values, inputs, strict=True)])
+        torch.testing.assert_close(*found, rtol=1e-10, atol=1e-12)
+    assert bool((loss.schedule.share > 0).any())
+
+
+@compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("options", list(MODES.values())[1:], ids=list(MODES)[1:])
+def test_every_mode_compiled_is_the_same_algorithm(options):
+    torch.compiler.reset()
+    loss = made(options)
+    own = copy.deepcopy(loss)
+    assert_same_steps(loss, own, torch.compile(own, fullgraph=True), 300, rtol=1e-10)
+
+
+@compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"channel_dim": 1}, {"reduction": "none"}], ids=str)
+@pytest.mark.parametrize("weighted", [False, True])
+def test_a_compiled_loss_takes_weights_and_batches_of_any_size(options, weighted):
+    torch.compiler.reset()
+    loss = made(options, warmup_steps=0)
+    own = copy.deepcopy(loss)
+    compiled = torch.compile(own, fullgraph=True)
+    for step, rows in enumerate([64, 64, 40, 700, 3, 1, 20_000, 64]):
+        x, y = batch(step, rows, *((2, 5) if options.get("channel_dim") else (2,)))
+        weight = [torch.rand(x.shape, generator=torch.Generator().manual_seed(step)).double()] if weighted else []
+        torch.testing.assert_close(
+            stepped(own, compiled, x, y, *weight), stepped(loss, loss, x, y, *weight), rtol=1e-9, atol=1e-11
+        )
+    torch.testing.assert_close(own.state_dict(), loss.state_dict(), rtol=1e-10, atol=1e-10)
+
+
+@compiler
+def test_impl_compile_is_impl_eager(monkeypatch):
+    torch.compiler.reset()
+    compiled = torch.compile(mkc.MKCLoss._computed, backend="aot_eager")
+    calls = []
+    monkeypatch.setattr(mkc, "_compiled", lambda: lambda *args: calls.append(1) or compiled(*args))
+    one, other = made({"impl": "eager"}, 0), made({"impl": "compile"}, 0)
+    assert_same_steps(one, other, other, 12, rtol=1e-10)
+    assert len(calls) == 12
+
+
+def test_an_unknown_implementation_is_refused():
+    with pytest.raises(ValueError, match="`impl` to be one of 'auto', 'eager', 'compile', 'triton' but got 'cuda'"):
+        MKCLoss(1, impl="cuda")
+
+
+# --- NumPy and torch
+
+
+@each_mode
+def test_torch_is_the_same_algorithm_as_numpy_over_300_batches(options, monkeypatch):
+    def choose(which):
+        for module in (residual_scale, bandwidth_schedule, _fused):
+            monkeypatch.setattr(module, "SMALL_STATE", 0 if which else 64)
+
+    loss = made(options)
+    other = copy.deepcopy(loss)
+    assert_same_steps(loss, other, other, 300, rtol=1e-10, prepare=choose)
+
+
+def test_single_precision_is_the_same_algorithm_in_numpy_and_torch(monkeypatch):
+    loss = made({}).float()
+    other = copy.deepcopy(loss)
+    for step in range(120):
+        x, y = (values.float() for values in batch(step, 64, 2))
+        found = []
+        for which, own in enumerate((loss, other)):
+            for module in (residual_scale, bandwidth_schedule, _fused):
+                monkeypatch.setattr(module, "SMALL_STATE", 0 if which else 64)
+            found.append(stepped(own, own, x, y))
+        torch.testing.assert_close(*found, rtol=1e-4, atol=1e-6)
+        assert torch.equal(loss.schedule.share, other.schedule.share)
+        torch.testing.assert_close(loss.residual_scale.scale, other.residual_scale.scale, rtol=1e-5, atol=0.0)
+        torch.testing.assert_close(loss.schedule.bandwidth, other.schedule.bandwidth, rtol=1e-5, atol=0.0)
+
+
+# --- no values
+
+
+class OneDevice(TorchDispatchMode):
+    """Fails where an operation looks at a value, or has a tensor of the CPU among its arguments or results."""
+
+    looks = frozenset(
+        getattr(torch.ops.aten, name)
+        for name in ("_local_scalar_dense", "nonzero", "equal", "is_nonzero", "masked_select")
+    )
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):  # noqa: ARG002
+        assert func.overloadpacket not in self.looks, f"{func} looks at a value"
+        result = func(*args, **(kwargs or {}))
+        tensors = [one for one in tree_leaves((args, kwargs, result)) if isinstance(one, torch.Tensor)]
+        assert {one.device.type for one in tensors} <= {"meta"}, f"{func} mixes devices"
+        return result
+
+
+class NoHostCopy(TorchFunctionMode):
+    """Fails where a tensor is made of Python's or NumPy's numbers, or read into them: torch copies out of our sight."""
+
+    made = (torch.tensor, torch.as_tensor, torch.asarray, torch.from_numpy, torch.Tensor.new_tensor)
+    read = (torch.Tensor.item, torch.Tensor.tolist, torch.Tensor.numpy, torch.Tensor.cpu, torch.Tensor.__bool__)
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):  # noqa: ARG002
+        assert func not in self.read, f"{func} reads a value"
+        source = args[0] if func is not torch.Tensor.new_tensor else args[1]
+        assert func not in self.made or isinstance(source, torch.Tensor), f"{func} copies from the host"
+        return func(*args, **(kwargs or {}))
+
+
+def meta_step(loss, shape, dtype, weight):
+    x = torch.empty(shape, device="meta", dtype=dtype, requires_grad=True)
+    y = torch.empty(shape, device="meta", dtype=dtype)
+    value = loss(x, y, weight)
+    (value if value.dim() == 0 else value.sum()).backward()
+    return x, value
+
+
+@each_mode
+@pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
+@pytest.mark.parametrize("weighted", [None, torch.float32, torch.bool], ids=["plain", "weighted", "masked"])
+@pytest.mark.parametrize("channel_dim", [None, 1])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.float64])
+def test_a_training_step_looks_at_no_value_and_copies_nothing_from_the_host(
+    options, reduction, weighted, channel_dim, dtype
+):
+    loss = MKCLoss(3, reduction=reduction, channel_dim=channel_dim, **options).to("meta")
+    shape = (5, 3) if channel_dim is None else (5, 3, 7)
+    weight = None if weighted is None else torch.ones(shape, device="meta", dtype=weighted)
+    meta_step(loss, shape, dtype, weight)  # constants are copied to a device once
+    with NoHostCopy(), OneDevice():
+        x, value = meta_step(loss, shape, dtype, weight)
+    assert x.grad.shape == shape
+    assert x.grad.dtype == dtype
+    assert value.shape == (shape if reduction == "none" else ())
+    assert value.device.type == "meta"
+    assert all(parameter.grad.device.type == "meta" for parameter in loss.parameters())
+
+
+@each_mode
+def test_evaluation_and_a_second_derivative_look_at_no_value(options):
+    loss = MKCLoss(3, **options).to("meta")
+
+    def steps():
+        x, y = (torch.empty(5, 3, device="meta", requires_grad=True) for _ in range(2))
+        value = loss.train()(x, y)
+        wanted = [x, y, *loss.parameters()]
+        slopes = torch.autograd.grad(value, wanted, create_graph=True)
+        torch.autograd.grad(sum(slope.sum() for slope in slopes), wanted, allow_unused=True)
+        loss.eval()(x, y).backward()
+        loss.terms(x, y)
+
+    steps()
+    with NoHostCopy(), OneDevice():
+        steps()
+
+
+def test_these_modes_see_what_they_should():
+    one = torch.ones(3, device="meta")
+    for bad in (
+        lambda: one.new_tensor([1.0, 2.0]),
+        lambda: torch.tensor([1.0], device="meta"),
+        lambda: torch.ones(3).to("meta"),
+        lambda: one + torch.ones(()),
+        lambda: torch.ones(3).sum().item(),
+    ):
+        with pytest.raises(AssertionError), NoHostCopy(), OneDevice():
+            bad()
