@@ -32,7 +32,7 @@ FEWEST_RECENT = 64
 RECENT_IN_ALL = 1 << 16
 """Residuals that are kept of all channels together, but for ``FEWEST_RECENT``."""
 
-RANGE_ROWS = 1 << 14
+RANGE_ROWS = 1 << 12
 """Residuals of a batch and channel from which the half range is taken, evenly spaced."""
 
 RATE = 0.1
@@ -126,17 +126,16 @@ class ResidualScale(nn.Module):
             weight: non-negative weights or a mask of the same shape; None for 1.
             channel_dim: the dimension of the channels.
         """
-        given = [v for v in (prediction, target, weight) if v is not None]
-        rows = [spaced_rows(values.detach(), channel_dim, RANGE_ROWS) for values in given]
+        rows, spread = self._sampled(prediction, target, weight, channel_dim)
         if len(self.log_scale) <= SMALL_STATE and numpy_may_read(self.log_scale, *rows):
             recent, state = self.recent.numpy(), ScaleState(*(value.numpy() for value in self._state()))
             with np.errstate(over="ignore", invalid="ignore"):
-                batch = rows_of_batch(np, recent, *(values.numpy() for values in rows))
+                batch = rows_of_batch(np, recent.dtype, _arrays(rows), _arrays(spread))
                 _insert_in_numpy(recent, self.position, batch.rows)
                 state = updated(np, recent, state, batch)
             state = ScaleState(*(torch.from_numpy(value) for value in state))
         else:
-            batch = rows_of_batch(torch, self.recent, *rows)
+            batch = rows_of_batch(torch, self.recent.dtype, rows, spread)
             count, length = batch.rows.shape[-1], self.recent.shape[-1]
             slots = (self.position[:1] + torch.arange(count, device=self.recent.device)) % length
             self.recent.index_copy_(-1, slots, batch.rows)
@@ -145,15 +144,26 @@ class ResidualScale(nn.Module):
         for old, new in zip(self._state(), alike_in_all_processes(state), strict=True):
             old.copy_(new)
 
+    def _sampled(
+        self, prediction: Tensor, target: Tensor, weight: Tensor | None, axis: int
+    ) -> tuple[list[Tensor], list[Tensor] | None]:
+        """Evenly spaced rows of the batch to keep and, of a larger batch, more of them for the half range."""
+        given = [v.detach() for v in (prediction, target, weight) if v is not None]
+        length = self.recent.shape[-1]
+        rows = [spaced_rows(values, axis, length) for values in given]
+        if given[0].numel() <= length * given[0].shape[axis]:
+            return rows, None
+        return rows, [spaced_rows(values, axis, RANGE_ROWS) for values in given]
+
     def _state(self) -> ScaleState:
         return ScaleState(self.batches, self.log_scale, self.half_range, self.floor)
 
     @torch.no_grad()
     def with_batch(self, prediction: Tensor, target: Tensor, weight: Tensor | None, channel_dim: int) -> ScaleState:
         """The state, or of a channel that has had no batch what it would be after this one. Changes nothing."""
-        given = [v for v in (prediction, target, weight) if v is not None]
-        rows = [spaced_rows(values.detach(), channel_dim, RANGE_ROWS) for values in given]
-        batch = rows_of_batch(torch, self.recent, *rows)
+        batch = rows_of_batch(
+            torch, self.recent.dtype, *self._sampled(prediction, target, weight, channel_dim)
+        )
         state, known = self._state(), self.batches > 0
         new = updated(torch, batch.rows, state, batch)
         return ScaleState(*(torch.where(known, old, value) for old, value in zip(state, new, strict=True)))
@@ -175,15 +185,22 @@ class BatchRows(NamedTuple):
     half_range: Any
 
 
-def rows_of_batch(xp: Any, recent: Any, prediction: Any, target: Any, weight: Any = None) -> BatchRows:
-    """As many evenly spaced rows as ``recent`` holds at most, with weight 0 where a residual is not finite.
+def rows_of_batch(xp: Any, dtype: Any, rows: Sequence[Any], more: Sequence[Any] | None) -> BatchRows:
+    """Residuals of rows, with weight 0 where a residual is not finite, and the half range of these or of more rows.
 
     Args:
         xp: ``numpy`` or ``torch``, whose arrays the others are.
-        recent: as the buffer of :class:`ResidualScale`.
-        prediction, target, weight: rows by channels, (n, m).
+        dtype: of the result.
+        rows, more: predictions, targets and, if any, weights, (k, m) each.
     """
-    dtype, length = recent.dtype, recent.shape[-1]
+    residual, prediction, weight = _residuals(xp, dtype, *rows)
+    wide, _, counts = (residual, prediction, weight) if more is None else _residuals(xp, dtype, *more)
+    least, most = (xp.where(counts > 0, wide, bound) for bound in (np.inf, -np.inf))
+    half_range = xp.clip(0.5 * (xp.amax(most, 0) - xp.amin(least, 0)), 0.0, None)  # 0 where none counts
+    return BatchRows(xp.stack([residual.T, prediction.T, weight.T]), half_range)
+
+
+def _residuals(xp: Any, dtype: Any, prediction: Any, target: Any, weight: Any = None) -> tuple[Any, Any, Any]:
     prediction, target = _cast(xp, prediction, dtype), _cast(xp, target, dtype)
     residual = prediction - target
     counts = xp.isfinite(residual)
@@ -192,16 +209,11 @@ def rows_of_batch(xp: Any, recent: Any, prediction: Any, target: Any, weight: An
     else:
         weight = xp.where(counts, _cast(xp, weight, dtype), 0.0)
         counts = weight > 0
-    least, most = (xp.where(counts, residual, bound) for bound in (np.inf, -np.inf))
-    half_range = xp.clip(0.5 * (xp.amax(most, 0) - xp.amin(least, 0)), 0.0, None)  # 0 where none counts
-    residual = xp.where(counts, residual, 0.0)
-    prediction = xp.where(counts, prediction, 0.0)
-    rows = [residual, prediction, weight]
-    count = len(residual)
-    if count > length:
-        places = np.arange(length) if xp is np else torch.arange(length, device=residual.device)
-        rows = [values[places * count // length] for values in rows]
-    return BatchRows(xp.stack([values.T for values in rows]), half_range)
+    return xp.where(counts, residual, 0.0), xp.where(counts, prediction, 0.0), weight
+
+
+def _arrays(values: Sequence[Tensor] | None) -> list[Any] | None:
+    return None if values is None else [one.numpy() for one in values]
 
 
 def _cast(xp: Any, values: Any, dtype: Any) -> Any:
@@ -271,15 +283,16 @@ def weighted_quantile(xp: Any, values: Any, weight: Any, level: float) -> Any:
 
 
 def spaced_rows(values: Tensor, axis: int, most: int) -> Float[Tensor, "n m"]:
-    """Evenly spaced samples, their channels last; at most twice as many as asked for."""
+    """As many evenly spaced samples as asked for, or all if they are fewer, with their channels last."""
     moved = values.movedim(axis, -1)
     shape = moved.shape[:-1]
     count = shape.numel()
-    step = max(1, count // most)
-    if moved.dim() <= 2 or moved.is_contiguous() or step == 1:
-        return moved.reshape(count, moved.shape[-1])[::step]
+    if count <= most:
+        return moved.reshape(count, moved.shape[-1])
+    index = torch.arange(most, device=values.device) * count // most
+    if moved.dim() == 2 or moved.is_contiguous():
+        return moved.reshape(count, moved.shape[-1])[index]
     # channels that are not last in memory: a reshape would copy the whole batch
-    index = torch.arange(0, count, step, device=values.device)
     places = []
     for size in reversed(shape):
         places.append(index % size)
@@ -311,10 +324,19 @@ def is_distributed() -> bool:
 
 
 def alike_in_all_processes(state: ScaleState) -> ScaleState:
-    """The state that all processes of a distributed training go on with: mean scales, the widest range."""
+    """The state that all processes of a distributed training go on with: mean scales, the widest range.
+
+    Of a channel that has had no batch in a process, the others' scale and range are taken.
+    """
     if not is_distributed():
         return state
-    log_scale, floor = average_over_processes([state.log_scale, state.floor])
-    widest = torch.stack([state.half_range, state.batches.to(state.half_range)])
+    known = (state.batches > 0).to(state.log_scale)
+    share, *shares = average_over_processes([known, known * state.log_scale, known * state.floor])
+    log_scale, floor = (
+        torch.where(share > 0, mean / share.clamp(min=TINY), old)
+        for mean, old in zip(shares, (state.log_scale, state.floor), strict=True)
+    )
+    widest = torch.stack([known * state.half_range, state.batches.to(state.half_range)])
     torch.distributed.all_reduce(widest, torch.distributed.ReduceOp.MAX)
-    return ScaleState(widest[1].to(state.batches), log_scale, widest[0], floor)
+    half_range = torch.where(share > 0, widest[0], state.half_range)
+    return ScaleState(widest[1].to(state.batches), log_scale, half_range, floor)

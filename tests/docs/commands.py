@@ -50,6 +50,7 @@ EXAMPLES = {
     "examples/calibration/least_squares_beside.py": "RECORDING.csv ANOTHER.csv",
     "examples/calibration/hardly_tilting.py": "--draws 1 --tilt 8 15",
     "examples/lightning/any_unit.py": "--help",
+    "examples/loss_pictures.py": "--output pictures",
     "examples/gallery.py": "--help",  # minutes, on recordings that are not part of the project
     # minutes each, on recordings that are not part of the project
     "examples/concealed_physics/dynamics/heaters.py": "--help",

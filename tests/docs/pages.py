@@ -24,6 +24,12 @@ class Block:
     language: str
     text: str
 
+    @property
+    def needs(self) -> str | None:
+        """The package that the first line of the block names, ``# needs NAME``; the project does not depend on it."""
+        found = re.match(r"# needs (\w+)\n", self.text)
+        return None if found is None else found[1]
+
     def __str__(self) -> str:
         return f"{self.page.name}, line {self.line}"
 

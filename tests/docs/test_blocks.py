@@ -1,5 +1,7 @@
 """Every fenced block of the README and of the manual runs, in the order in which a reader meets it."""
 
+from importlib.util import find_spec
+
 import pytest
 
 pytest.importorskip("lightning")
@@ -29,6 +31,10 @@ FOUND = {
 
 NEEDS = {"large_data": "pyarrow", "own_simulation": "fmpy"}
 """Packages that a page needs beside those of all."""
+
+
+OPTIONAL = [block for page in PAGES for block in blocks(page) if block.needs is not None]
+"""Blocks of packages that this project does not depend on."""
 
 
 @pytest.fixture(scope="module")
@@ -72,12 +78,20 @@ def test_every_block_of_a_page_runs(page, folder):
     names = {"__name__": page.stem}
     for block in blocks(page):
         print(f"{block}:")  # shown where it fails
+        if block.needs is not None and find_spec(block.needs) is None:
+            continue  # the next test says so
         if block.language == "python":
             run_python(block, names, folder)
         elif block.language == "sh":
             run_shell(block, folder)
     found = {name: names[name].findings[0].effect for name in FOUND.get(page.stem, {})}
     assert found == FOUND.get(page.stem, {})
+
+
+@pytest.mark.parametrize("block", OPTIONAL, ids=str)
+def test_the_package_of_an_optional_block_is_installed(block):
+    """If so, the test before has run the block; if not, the skip names the package."""
+    pytest.importorskip(block.needs)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)

@@ -27,6 +27,7 @@ MANUAL = {
     "index.md",
     "large_data.md",
     "loss.md",
+    "losses.md",
     "measured.md",
     "own_simulation.md",
     "promises.md",

@@ -106,7 +106,7 @@ def test_residuals_of_weight_0_have_no_part():
 
 
 def test_a_weight_counts_as_that_many_residuals_but_for_chance():
-    z, prediction, weight = (values.double() for values in fitted(0.5, 1.0))
+    z, _, weight = (values.double() for values in fitted(0.5, 1.0))
     times = torch.randint(1, 4, (N,), generator=generator(2))
     repeated = [values.repeat_interleave(times, 1) for values in (z, torch.zeros_like(z), weight)]
     found, expected = selection(z, torch.zeros_like(z), weight * times), selection(*repeated)

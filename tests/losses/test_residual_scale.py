@@ -1,4 +1,4 @@
-"""The running scale of residuals: robust, in the unit of the target, of each channel alone, the same in NumPy and torch."""
+"""The running scale of residuals: robust, in the unit of the target, each channel alone, equal in NumPy and torch."""
 
 import copy
 import math
@@ -149,6 +149,9 @@ def test_residuals_of_weight_0_and_residuals_that_are_not_finite_do_not_count():
     expected = updated(residual[1::2])
     for weight in (mask, mask.double(), None):
         assert_same_numbers(updated((spoilt, weight)), expected, rtol=1e-12, atol=0.0)
+        scale = ResidualScale(1).double()
+        scale.update(torch.zeros_like(residual), spoilt, weight)
+        assert_same_numbers(scale, expected, rtol=1e-12, atol=0.0)
 
 
 @given(
@@ -269,7 +272,7 @@ def test_what_is_kept_of_many_channels_stays_small(channels):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_most_extreme_of_evenly_spaced_residuals_give_the_half_range_of_a_large_batch(dtype):
     residual = torch.linspace(-3.0, 5.0, 5 * RANGE_ROWS + 7, dtype=dtype).unsqueeze(-1)
-    assert float(updated(residual, dtype=dtype).half_range) == pytest.approx(4.0, rel=1e-4)
+    assert float(updated(residual, dtype=dtype).half_range) == pytest.approx(4.0, rel=2.0 / RANGE_ROWS)
 
 
 @given(
@@ -286,9 +289,9 @@ def test_spaced_rows_are_rows_of_the_batch_whatever_its_layout(shape, axis, most
     strided = values.permute(places).contiguous().permute([places.index(i) for i in range(len(shape))])
     assert torch.equal(strided, values)
     rows = values.movedim(axis, -1).reshape(-1, shape[axis])
-    expected = rows[:: max(1, len(rows) // most)]
+    kept = min(len(rows), most)
+    expected = rows[[place * len(rows) // kept for place in range(kept)]]
     assert torch.equal(spaced_rows(strided, axis, most), expected)
-    assert len(expected) <= 2 * most
 
 
 @pytest.mark.parametrize("shape", [(40, 3, 5), (40, 3, 30, 20), (40, 3)])
@@ -307,7 +310,7 @@ def test_channels_in_the_second_dimension_give_what_channels_last_give(shape):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("weighted", [None, "weights", "mask"])
 def test_numpy_and_torch_compute_the_same_state(dtype, weighted, monkeypatch):
-    """Batches of one row, of fewer and of more than are kept, with residuals that are not finite and some that are 0."""
+    """Batches of one row, of fewer and of more than are kept, with residuals that are not finite and residuals of 0."""
     scales = [ResidualScale(3).to(dtype), ResidualScale(3).to(dtype)]
     for n, rows in enumerate([1, 7, 200, 511, 512, 513, 3000, 40, 40, 40, 700, 1]):
         prediction, target = randn(rows, 3, seed=n).to(dtype), randn(rows, 3, seed=100 + n).to(dtype)

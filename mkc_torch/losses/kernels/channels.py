@@ -41,16 +41,18 @@ def quantile(size, weight, LEVEL: tl.constexpr, WIDE: tl.constexpr):
             reached = tl.sum(tl.where(bits <= middle, weight, 0.0), 0) >= wanted
             high = tl.where(reached, middle, high)
             low = tl.where(reached, low, middle + 1)
-        return high.to(tl.float64, bitcast=True)
-    bits = size.to(tl.int32, bitcast=True)
-    low = tl.sum(tl.zeros_like(bits), 0)
-    high = low + 0x7F800000
-    for _ in range(31):
-        middle = low + (high - low) // 2
-        reached = tl.sum(tl.where(bits <= middle, weight, 0.0), 0) >= wanted
-        high = tl.where(reached, middle, high)
-        low = tl.where(reached, low, middle + 1)
-    return high.to(tl.float32, bitcast=True)
+        found = high.to(tl.float64, bitcast=True)
+    else:
+        bits = size.to(tl.int32, bitcast=True)
+        low = tl.sum(tl.zeros_like(bits), 0)
+        high = low + 0x7F800000
+        for _ in range(31):
+            middle = low + (high - low) // 2
+            reached = tl.sum(tl.where(bits <= middle, weight, 0.0), 0) >= wanted
+            high = tl.where(reached, middle, high)
+            low = tl.where(reached, low, middle + 1)
+        found = high.to(tl.float32, bitcast=True)
+    return found
 
 
 @triton.jit
@@ -91,7 +93,7 @@ def channel_kernel(
     kappa_given, d_given, bound_given, floor_given,
     table, rule, widths,
     rows, m, inner, so, sc, sk, wo, wc, wk,
-    range_rows, range_step, warmup, anneal_step,
+    range_rows, warmup, anneal_step,
     LENGTH: tl.constexpr, LENGTH_PAD: tl.constexpr, RANGE_BLOCK: tl.constexpr,
     SCALE: tl.constexpr, PEEK: tl.constexpr, SCHEDULE: tl.constexpr, MAKE_TABLE: tl.constexpr, HAS_WEIGHT: tl.constexpr,
     HAS_SCALE: tl.constexpr, ROBUST: tl.constexpr, FOLLOWS: tl.constexpr,
@@ -118,6 +120,7 @@ def channel_kernel(
         residual, prediction, weight = load_rows(
             x, t, w, row, new, channel, inner, so, sc, sk, wo, wc, wk, HAS_WEIGHT, like
         )
+        given = tl.sum(weight, 0)
         if SCALE:
             plane = m * LENGTH
             residual = tl.where(new, residual, tl.load(recent + at, mask=inside, other=0.0).to(like))
@@ -131,17 +134,17 @@ def channel_kernel(
         for first in range(0, range_rows, RANGE_BLOCK):
             index = first + tl.arange(0, RANGE_BLOCK)
             mask = index < range_rows
-            value, _, _ = load_rows(
-                x, t, w, index.to(tl.int64) * range_step, mask, channel, inner, so, sc, sk, wo, wc, wk, HAS_WEIGHT, like
+            value, _, counted = load_rows(
+                x, t, w, (index.to(tl.int64) * rows) // range_rows, mask, channel, inner, so, sc, sk, wo, wc, wk, HAS_WEIGHT, like
             )
-            low = tl.where(mask, tl.minimum(low, value), low)
-            high = tl.where(mask, tl.maximum(high, value), high)
-        span = 0.5 * (tl.max(high, 0) - tl.min(low, 0))
+            low = tl.where(counted > 0, tl.minimum(low, value), low)
+            high = tl.where(counted > 0, tl.maximum(high, value), high)
+        span = tl.maximum(0.5 * (tl.max(high, 0) - tl.min(low, 0)), 0.0)
         size = tl.abs(residual)
         part = weight / tl.maximum(tl.sum(weight, 0), 1e-30)
         candidate = quantile(size, weight, 0.4, WIDE) / 0.5244005
         candidate = tl.where(candidate > 0, candidate, tl.sum(size * part, 0))
-        known = candidate > 0
+        known = (candidate > 0) & (given > 0)
         seen, old = tl.load(batches + channel), tl.load(log_scale + channel).to(like)
         begins = known & (seen == 0)
         found = tl.where(known, tl.log(tl.maximum(candidate, 1e-30)), old)

@@ -32,25 +32,21 @@ def finish(sum_network, sum_energy, sum_kappa, sum_d, weight, table, channel, ma
 
 
 @triton.jit
-def elements_kernel(
-    x, t, w, upstream, table, weights, total_weight,
-    values, slopes, partial, value, by_kappa, by_d,
-    outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs, count, elements,
+def walk(
+    x, t, w, upstream, values, slopes, table,
+    outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs, elements, factor,
     CHANNELS: tl.constexpr, BLOCK_ROW: tl.constexpr, BLOCK_COL: tl.constexpr, LAYOUT: tl.constexpr,
-    HAS_WEIGHT: tl.constexpr, MEAN: tl.constexpr, UPSTREAM: tl.constexpr,
-    ROBUST: tl.constexpr, LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr,
-    WRITE_VALUES: tl.constexpr, WRITE_SLOPES: tl.constexpr, SUMS: tl.constexpr, FINISH: tl.constexpr,
-    WIDE: tl.constexpr,
+    HAS_WEIGHT: tl.constexpr, EACH: tl.constexpr, ANNEALED: tl.constexpr, INITIAL: tl.constexpr,
+    LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr,
+    WRITE_VALUES: tl.constexpr, WRITE_SLOPES: tl.constexpr, SUMS: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """Values of elements (WRITE_VALUES), gradients by the input (WRITE_SLOPES) and sums of each channel (SUMS).
+    """The pass of one program, in the phase of the schedule that ANNEALED and INITIAL name; the likelihood has neither.
 
-    UPSTREAM is 0 where the upstream gradient is 1, 1 where it is one number and 2 where each element has its own. The
-    columns of a tile are, by LAYOUT, 0: places within the one channel of a program; 1: channels; 2: channels of several
-    rows one after the other, all memory in one line. With FINISH the one program that there is makes the value and the
-    gradients by the raw parameters itself.
+    Returns sums of each place of the tile: of the network's term, of the energy, of its derivatives by kappa and, times
+    -d, by d, and of the upstream gradients.
     """
     like = tl.float64 if WIDE else tl.float32
-    m = CHANNELS
+    m: tl.constexpr = CHANNELS
     lane = tl.arange(0, BLOCK_COL)
     rows = tl.arange(0, BLOCK_ROW)
     if LAYOUT == 0:
@@ -80,31 +76,22 @@ def elements_kernel(
     kappa = tl.load(table + channel, mask=known, other=1.0)[None, :]
     inverse_d = 1.0 / tl.load(table + m + channel, mask=known, other=1.0)[None, :]
     inverse_kappa = 1.0 / tl.where(kappa > 0, kappa, 1.0)
-    has_annealed, has_initial = True, True
-    if ROBUST:
+    if ANNEALED:
         annealed_kappa = tl.load(table + 7 * m + channel, mask=known, other=1.0)[None, :]
         inverse_annealed = 1.0 / tl.where(annealed_kappa > 0, annealed_kappa, 1.0)
         inverse_annealed_d = 1.0 / tl.load(table + 8 * m + channel, mask=known, other=1.0)[None, :]
+        of_annealed = inverse_annealed_d * factor
+    if INITIAL:
         inverse_scale = 1.0 / tl.load(table + 9 * m + channel, mask=known, other=1.0)[None, :]
-        given_share = tl.load(table + 10 * m + channel, mask=known, other=0.0)
-        has_annealed = tl.max(given_share, 0) > 0.0
-        has_initial = tl.min(tl.where(known, given_share, 1.0), 0) < 1.0
-        share = given_share[None, :]
-        of_annealed, of_initial = share * inverse_annealed_d, (1.0 - share) * inverse_scale
+        of_initial = inverse_scale * factor
+    if ANNEALED and INITIAL:
+        share = tl.load(table + 10 * m + channel, mask=known, other=0.0)[None, :]
+        of_annealed, of_initial = of_annealed * share, of_initial * (1.0 - share)
+    of_density = inverse_d * factor
     if NORMALIZE and WRITE_VALUES:
         norm = tl.load(table + 4 * m + channel, mask=known, other=0.0)[None, :]
-    divisor = tl.full((), 1.0, like) * count
-    if HAS_WEIGHT and MEAN:
-        divisor = tl.load(total_weight).to(like)
-        divisor = tl.where(divisor > 0, divisor, 1.0)
-    factor = 1.0 / divisor
-    if UPSTREAM == 1:
-        factor = factor * tl.load(upstream).to(like)
-    if ROBUST:
-        of_annealed, of_initial = of_annealed * factor, of_initial * factor
-    of_density = inverse_d * factor
-    sum_energy = tl.zeros((BLOCK_ROW, BLOCK_COL), like)
     sum_network = tl.zeros((BLOCK_ROW, BLOCK_COL), like)
+    sum_energy = tl.zeros((BLOCK_ROW, BLOCK_COL), like)
     sum_kappa = tl.zeros((BLOCK_ROW, BLOCK_COL), like)
     sum_d = tl.zeros((BLOCK_ROW, BLOCK_COL), like)
     sum_weight = tl.zeros((BLOCK_ROW, BLOCK_COL), like)
@@ -130,27 +117,29 @@ def elements_kernel(
         if HAS_WEIGHT:
             weight = tl.load(w + place_w, mask=mask, other=0).to(like)
             error = tl.where(weight != 0, error, 0.0)
-        if UPSTREAM == 2:
+        if EACH:
             given = tl.load(upstream + place_u, mask=mask, other=0.0).to(like)
         z = error * inverse_d
         density, slope, minus_x, inlier, half = energy(z, kappa, inverse_kappa, WIDE)
-        if ROBUST:
-            network, by_input = tl.zeros_like(error), tl.zeros_like(error)
-            if has_annealed:
-                own, own_slope, _, _, _ = energy(error * inverse_annealed_d, annealed_kappa, inverse_annealed, WIDE)
-                network, by_input = share * own, of_annealed * own_slope
-            if has_initial:
-                first, first_slope = initial(error * inverse_scale, WIDE)
-                network += (1.0 - share) * first
+        written = density
+        if ANNEALED:
+            network, own_slope, _, _, _ = energy(error * inverse_annealed_d, annealed_kappa, inverse_annealed, WIDE)
+            by_input = of_annealed * own_slope
+        if INITIAL:
+            first, first_slope = initial(error * inverse_scale, WIDE)
+            if ANNEALED:
+                network = first + share * (network - first)
                 by_input += of_initial * first_slope
-            written = network + density
+            else:
+                network, by_input = first, of_initial * first_slope
+        if ANNEALED or INITIAL:
+            written += network
         else:
             by_input = slope * of_density
-            written = density
         if WRITE_SLOPES:
             if HAS_WEIGHT:
                 by_input = by_input * weight
-            if UPSTREAM == 2:
+            if EACH:
                 by_input = by_input * given
             tl.store(slopes + place, by_input.to(slopes.dtype.element_ty), mask=mask)
         if WRITE_VALUES:
@@ -160,70 +149,142 @@ def elements_kernel(
                 written = written * weight
             tl.store(values + place, written.to(values.dtype.element_ty), mask=mask)
         if SUMS:
+            if LEARN_KAPPA:
+                curve = energy_by_kappa(minus_x, inlier, half, inverse_kappa, WIDE)
             # the upstream gradient of each element, less the divisor, which finish() has
-            if HAS_WEIGHT and UPSTREAM == 2:
+            if HAS_WEIGHT and EACH:
                 part = weight * given
             elif HAS_WEIGHT:
                 part = weight
-            elif UPSTREAM == 2:
+            elif EACH:
                 part = given
-            if LEARN_KAPPA:
-                curve = energy_by_kappa(minus_x, inlier, half, inverse_kappa, WIDE)
-            if HAS_WEIGHT or UPSTREAM == 2:
+            if HAS_WEIGHT or EACH:
                 density, slope = density * part, slope * part
-                if ROBUST:
+                if ANNEALED or INITIAL:
                     network = network * part
                 if LEARN_KAPPA:
                     curve = curve * part
             sum_energy += density
-            if ROBUST:
+            if ANNEALED or INITIAL:
                 sum_network += network
             if LEARN_D:
                 sum_d += z * slope
             if LEARN_KAPPA:
                 sum_kappa += curve
-            if UPSTREAM == 2:
+            if EACH:
                 sum_weight += part
+    return sum_network, sum_energy, sum_kappa, sum_d, sum_weight
+
+
+@triton.jit
+def elements_kernel(
+    x, t, w, upstream, table, weights, total_weight,
+    values, slopes, partial, value, by_kappa, by_d,
+    outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs, count, elements,
+    CHANNELS: tl.constexpr, BLOCK_ROW: tl.constexpr, BLOCK_COL: tl.constexpr, LAYOUT: tl.constexpr,
+    HAS_WEIGHT: tl.constexpr, MEAN: tl.constexpr, UPSTREAM: tl.constexpr,
+    ROBUST: tl.constexpr, LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr,
+    WRITE_VALUES: tl.constexpr, WRITE_SLOPES: tl.constexpr, SUMS: tl.constexpr, FINISH: tl.constexpr,
+    WIDE: tl.constexpr,
+):  # fmt: skip
+    """Values of elements (WRITE_VALUES), gradients by the input (WRITE_SLOPES) and sums of each channel (SUMS).
+
+    UPSTREAM is 0 where the upstream gradient is 1, 1 where it is one number and 2 where each element has its own. The
+    columns of a tile are, by LAYOUT, 0: places within the one channel of a program; 1: channels; 2: channels of several
+    rows one after the other, all memory in one line. With FINISH the one program that there is makes the value and the
+    gradients by the raw parameters itself.
+    """
+    like = tl.float64 if WIDE else tl.float32
+    m: tl.constexpr = CHANNELS
+    each: tl.constexpr = UPSTREAM == 2
+    lane = tl.arange(0, BLOCK_COL)
+    divisor = tl.full((), 1.0, like) * count
+    if HAS_WEIGHT and MEAN:
+        divisor = tl.load(total_weight).to(like)
+        divisor = tl.where(divisor > 0, divisor, 1.0)
+    factor = 1.0 / divisor
+    if UPSTREAM == 1:
+        factor = factor * tl.load(upstream).to(like)
+    if ROBUST:
+        if LAYOUT == 0:
+            share = tl.load(table + 10 * m + tl.program_id(1) + 0 * lane)
+            low, high = tl.min(share, 0), tl.max(share, 0)
+        elif LAYOUT == 1:
+            channel = tl.program_id(1) * BLOCK_COL + lane
+            low = tl.min(tl.load(table + 10 * m + channel, mask=channel < m, other=1.0), 0)
+            high = tl.max(tl.load(table + 10 * m + channel, mask=channel < m, other=0.0), 0)
+        else:
+            share = tl.load(table + 10 * m + lane % m)
+            low, high = tl.min(share, 0), tl.max(share, 0)
+        # most batches lie before or after the change from one loss to the other
+        if high <= 0.0:
+            sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(
+                x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs,
+                elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, each, False, True, LEARN_KAPPA,
+                LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
+            )  # fmt: skip
+        elif low >= 1.0:
+            sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(
+                x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs,
+                elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, each, True, False, LEARN_KAPPA,
+                LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
+            )  # fmt: skip
+        else:
+            sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(
+                x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs,
+                elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, each, True, True, LEARN_KAPPA,
+                LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
+            )  # fmt: skip
+    else:
+        sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(
+            x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs,
+            elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, each, False, False, LEARN_KAPPA,
+            LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
+        )  # fmt: skip
     if SUMS:
         total_energy, total_network = tl.sum(sum_energy, 0), tl.sum(sum_network, 0)
         total_kappa, total_d, total_given = tl.sum(sum_kappa, 0), tl.sum(sum_d, 0), tl.sum(sum_weight, 0)
-        if LAYOUT == 2:
-            channel, known = tl.arange(0, CHANNELS), tl.arange(0, CHANNELS) >= 0
-            total_energy = tl.sum(tl.reshape(total_energy, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
-            total_network = tl.sum(tl.reshape(total_network, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
-            total_kappa = tl.sum(tl.reshape(total_kappa, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
-            total_d = tl.sum(tl.reshape(total_d, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
-            total_given = tl.sum(tl.reshape(total_given, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
-        elif LAYOUT == 0:  # the one channel of this program, in the first lane
+        if LAYOUT == 0:  # the one channel of this program, in the first lane
             total_energy = tl.where(lane == 0, tl.sum(total_energy, 0), 0.0)
             total_network = tl.where(lane == 0, tl.sum(total_network, 0), 0.0)
             total_kappa = tl.where(lane == 0, tl.sum(total_kappa, 0), 0.0)
             total_d = tl.where(lane == 0, tl.sum(total_d, 0), 0.0)
             total_given = tl.where(lane == 0, tl.sum(total_given, 0), 0.0)
-            known = lane == 0
+            channel_out, known_out = tl.program_id(1) + 0 * lane, lane == 0
+        elif LAYOUT == 1:
+            channel_out = tl.program_id(1) * BLOCK_COL + lane
+            known_out = channel_out < m
+        else:
+            channel_out = tl.arange(0, CHANNELS)
+            known_out = channel_out >= 0
+            total_energy = tl.sum(tl.reshape(total_energy, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
+            total_network = tl.sum(tl.reshape(total_network, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
+            total_kappa = tl.sum(tl.reshape(total_kappa, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
+            total_d = tl.sum(tl.reshape(total_d, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
+            total_given = tl.sum(tl.reshape(total_given, (BLOCK_COL // CHANNELS, CHANNELS)), 0)
         if FINISH:
-            each = tl.full((), 1.0, like) * elements / CHANNELS
+            each_weight = tl.full((), 1.0, like) * elements / CHANNELS
             if UPSTREAM == 2:
-                each = total_given
+                each_weight = total_given
             elif HAS_WEIGHT:
-                each = tl.load(weights + channel, mask=known, other=0.0).to(like)
+                each_weight = tl.load(weights + channel_out, mask=known_out, other=0.0).to(like)
             part_of_value = finish(
-                total_network, total_energy, total_kappa, total_d, each, table, channel, known, m, divisor,
+                total_network, total_energy, total_kappa, total_d, each_weight, table, channel_out, known_out, m, divisor,
                 LEARN_KAPPA, LEARN_D, NORMALIZE, by_kappa, by_d,
             )  # fmt: skip
-            tl.store(value, tl.sum(tl.where(known, part_of_value, 0.0), 0))
+            tl.store(value, tl.sum(tl.where(known_out, part_of_value, 0.0), 0))
         else:
-            at = partial + tl.program_id(0) * m + channel
+            at = partial + tl.program_id(0) * m + channel_out
             step = programs * m
-            tl.store(at, total_energy, mask=known)
+            tl.store(at, total_energy, mask=known_out)
             if ROBUST:
-                tl.store(at + step, total_network, mask=known)
+                tl.store(at + step, total_network, mask=known_out)
             if LEARN_KAPPA:
-                tl.store(at + 2 * step, total_kappa, mask=known)
+                tl.store(at + 2 * step, total_kappa, mask=known_out)
             if LEARN_D:
-                tl.store(at + 3 * step, total_d, mask=known)
+                tl.store(at + 3 * step, total_d, mask=known_out)
             if UPSTREAM == 2:
-                tl.store(at + 4 * step, total_given, mask=known)
+                tl.store(at + 4 * step, total_given, mask=known_out)
 
 
 @triton.jit

@@ -49,6 +49,9 @@ PROGRAMS_EACH = 8
 PARTIAL_SUMS = 1 << 20
 """Sums of programs and channels that are kept at most."""
 
+FINISHED = 4096
+"""Sums of a block that are added up at once."""
+
 RESCALED = 4096
 """Gradients of a block that are rescaled."""
 
@@ -182,15 +185,14 @@ def make_table(
     dtype = torch.float64 if batch.wide else kappa.dtype
     numbers = torch.empty((len(TABLE), m), dtype=dtype, device=device)
     rows = outer * inner
-    step = max(1, rows // RANGE_ROWS)
     rule, widths = _constants(device)
     length = 1 if running.recent is None else running.recent.shape[-1]
     tensors = (batch.input, batch.target, batch.weight, *running, kappa, d, bound, floor, numbers, rule, widths)
-    range_rows = -(-rows // step)
+    range_rows = min(rows, RANGE_ROWS)
     _CHANNELS.launch(
         (m, 1, 1),
         [numbers if one is None else one for one in tensors],
-        (rows, m, inner, *batch.strides, *batch.weight_strides, range_rows, step, *pace),
+        (rows, m, inner, *batch.strides, *batch.weight_strides, range_rows, *pace),
         (
             length, max(_power(length), 16), min(max(_power(range_rows), 16), 1024),
             scale, peek, schedule, table, batch.weight is not None,
@@ -308,7 +310,7 @@ def pass_over(
         [table if one is None else one for one in tensors],
         (m, tiles.programs, outer * inner, count),
         (
-            min(_power(tiles.programs), max(1024 // block_col, 1)), block_col, batch.weight is not None, options.mean,
+            min(_power(tiles.programs), max(FINISHED // block_col, 1)), block_col, batch.weight is not None, options.mean,
             options.robust, *learns, options.normalize, each, dtype == torch.float64,
         ),
         WARPS,
