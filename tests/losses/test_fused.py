@@ -26,7 +26,9 @@ def numbers(mode, m=4, dtype=torch.float64, reduction="mean"):
     """Raw parameters, and what a loss of that mode computes with beside them."""
     kappa, raw_kappa, d, raw_d = (one.to(dtype).repeat(-(-m // 4))[:m] for one in (KAPPA, RAW_KAPPA, D, RAW_D))
     ramp = torch.linspace(0.0, 1.0, m, dtype=dtype)
-    state = ChannelState(bound=30.0 + 10.0 * ramp, floor=0.01 + 0.01 * ramp)
+    state = ChannelState(
+        bound=30.0 - 20.0 * ramp, floor=0.6 - 0.59 * ramp
+    )  # of the first and the last d where it follows
     follows = mode in ("follows", "scale", "robust")
     if follows or mode.startswith("robust"):
         state = state._replace(scale=0.7 + ramp)

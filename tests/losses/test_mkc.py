@@ -728,7 +728,7 @@ def test_half_keeps_the_parameters_and_bounds_in_float32():
 
 def test_a_bandwidth_at_the_end_of_its_range_can_still_move():
     loss = MKCLoss(1, sigma=0.05)
-    assert float(torch.autograd.grad(loss.kappa.sum(), loss.raw_kappa)[0]) > 1e-5
+    assert float(torch.autograd.grad(loss.kappa.sum(), loss.raw_kappa)[0]) > 1e-4
 
 
 @pytest.mark.parametrize("reduction", ["none", "mean", "sum"])

@@ -164,6 +164,17 @@ def test_of_a_given_d_the_annealed_term_is_the_energy_at_a_bandwidth_no_wider_th
     torch.testing.assert_close(loss.terms(x, y).network, unlimited, rtol=1e-10, atol=0.0)
 
 
+def test_a_bandwidth_near_the_widest_limits_no_gaussian():
+    loss, (x, y) = MKCLoss(2, sigma=math.inf, d=1.5, objective="robust", **NOT_LEARNED).double(), data(30, 2, seed=7)
+    loss(x, y)
+    loss.schedule.share.fill_(1.0)
+    loss.schedule.log_bandwidth.fill_(math.log(33.0))
+    torch.testing.assert_close(loss.terms(x, y).network, 0.5 * ((x - y) / 1.5).square().mean(), rtol=1e-12, atol=0.0)
+    loss.schedule.log_bandwidth.fill_(math.log(31.0))
+    limited = mkc_energy(x - y, 31.0 * loss.residual_scale.scale / 1.5, 1.5).mean()
+    torch.testing.assert_close(loss.terms(x, y).network, limited, rtol=1e-10, atol=0.0)
+
+
 @pytest.mark.parametrize("options", LIKELIHOOD.values(), ids=LIKELIHOOD)
 def test_under_the_likelihood_the_network_term_is_0_and_the_density_term_has_all_gradients(options):
     loss, (x, y) = annealing(**options), (leaf(one) for one in data(30, 2, seed=7))

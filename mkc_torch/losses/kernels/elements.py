@@ -37,13 +37,14 @@ def walk(
     outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs, elements, factor,
     CHANNELS: tl.constexpr, BLOCK_ROW: tl.constexpr, BLOCK_COL: tl.constexpr, LAYOUT: tl.constexpr,
     HAS_WEIGHT: tl.constexpr, EACH: tl.constexpr, ANNEALED: tl.constexpr, INITIAL: tl.constexpr,
-    LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr,
+    CURVE: tl.constexpr, LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr,
     WRITE_VALUES: tl.constexpr, WRITE_SLOPES: tl.constexpr, SUMS: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
     """The pass of one program, in the phase of the schedule that ANNEALED and INITIAL name; the likelihood has neither.
 
     Returns sums of each place of the tile: of the network's term, of the energy, of its derivatives by kappa and, times
-    -d, by d, and of the upstream gradients.
+    -d, by d, and of the upstream gradients. The derivative by kappa is that of each element with CURVE; else a
+    difference of the other sums, which keeps its digits where no kappa is small.
     """
     like = tl.float64 if WIDE else tl.float32
     m: tl.constexpr = CHANNELS
@@ -149,7 +150,7 @@ def walk(
                 written = written * weight
             tl.store(values + place, written.to(values.dtype.element_ty), mask=mask)
         if SUMS:
-            if LEARN_KAPPA:
+            if LEARN_KAPPA and CURVE:
                 curve = energy_by_kappa(minus_x, inlier, half, inverse_kappa, WIDE)
             # the upstream gradient of each element, less the divisor, which finish() has
             if HAS_WEIGHT and EACH:
@@ -162,17 +163,51 @@ def walk(
                 density, slope = density * part, slope * part
                 if ANNEALED or INITIAL:
                     network = network * part
-                if LEARN_KAPPA:
+                if LEARN_KAPPA and CURVE:
                     curve = curve * part
             sum_energy += density
             if ANNEALED or INITIAL:
                 sum_network += network
-            if LEARN_D:
+            if LEARN_D or (LEARN_KAPPA and not CURVE):
                 sum_d += z * slope
-            if LEARN_KAPPA:
+            if LEARN_KAPPA and CURVE:
                 sum_kappa += curve
             if EACH:
                 sum_weight += part
+    if SUMS and LEARN_KAPPA and not CURVE:
+        sum_kappa = (0.5 * sum_d - sum_energy) * inverse_kappa
+    return sum_network, sum_energy, sum_kappa, sum_d, sum_weight
+
+
+@triton.jit
+def walk_by_kappa(
+    least_kappa, x, t, w, upstream, values, slopes, table,
+    outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs, elements, factor,
+    CHANNELS: tl.constexpr, BLOCK_ROW: tl.constexpr, BLOCK_COL: tl.constexpr, LAYOUT: tl.constexpr,
+    HAS_WEIGHT: tl.constexpr, EACH: tl.constexpr, ANNEALED: tl.constexpr, INITIAL: tl.constexpr,
+    LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr,
+    WRITE_VALUES: tl.constexpr, WRITE_SLOPES: tl.constexpr, SUMS: tl.constexpr, WIDE: tl.constexpr,
+):  # fmt: skip
+    """:func:`walk` with the derivative by kappa in the way that keeps its digits: a third of the arithmetic is its own."""
+    if LEARN_KAPPA and SUMS and not WIDE:
+        if least_kappa >= 0.1:
+            sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(
+                x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs,
+                elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, EACH, ANNEALED, INITIAL, False,
+                LEARN_KAPPA, LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
+            )  # fmt: skip
+        else:
+            sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(
+                x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs,
+                elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, EACH, ANNEALED, INITIAL, True,
+                LEARN_KAPPA, LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
+            )  # fmt: skip
+    else:
+        sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(
+            x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs,
+            elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, EACH, ANNEALED, INITIAL, True,
+            LEARN_KAPPA, LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
+        )  # fmt: skip
     return sum_network, sum_energy, sum_kappa, sum_d, sum_weight
 
 
@@ -205,41 +240,40 @@ def elements_kernel(
     factor = 1.0 / divisor
     if UPSTREAM == 1:
         factor = factor * tl.load(upstream).to(like)
+    if LAYOUT == 0:
+        channel = tl.program_id(1) + 0 * lane
+    elif LAYOUT == 1:
+        channel = tl.program_id(1) * BLOCK_COL + lane
+    else:
+        channel = lane % m
+    least_kappa = tl.min(tl.load(table + channel, mask=channel < m, other=400.0), 0)
     if ROBUST:
-        if LAYOUT == 0:
-            share = tl.load(table + 10 * m + tl.program_id(1) + 0 * lane)
-            low, high = tl.min(share, 0), tl.max(share, 0)
-        elif LAYOUT == 1:
-            channel = tl.program_id(1) * BLOCK_COL + lane
-            low = tl.min(tl.load(table + 10 * m + channel, mask=channel < m, other=1.0), 0)
-            high = tl.max(tl.load(table + 10 * m + channel, mask=channel < m, other=0.0), 0)
-        else:
-            share = tl.load(table + 10 * m + lane % m)
-            low, high = tl.min(share, 0), tl.max(share, 0)
+        low = tl.min(tl.load(table + 10 * m + channel, mask=channel < m, other=1.0), 0)
+        high = tl.max(tl.load(table + 10 * m + channel, mask=channel < m, other=0.0), 0)
         # most batches lie before or after the change from one loss to the other
         if high <= 0.0:
-            sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(
-                x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs,
-                elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, each, False, True, LEARN_KAPPA,
-                LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
+            sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk_by_kappa(
+                least_kappa, x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk,
+                programs, elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, each, False, True,
+                LEARN_KAPPA, LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
             )  # fmt: skip
         elif low >= 1.0:
-            sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(
-                x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs,
-                elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, each, True, False, LEARN_KAPPA,
-                LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
+            sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk_by_kappa(
+                least_kappa, x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk,
+                programs, elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, each, True, False,
+                LEARN_KAPPA, LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
             )  # fmt: skip
         else:
-            sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(
-                x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs,
-                elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, each, True, True, LEARN_KAPPA,
-                LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
+            sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk_by_kappa(
+                least_kappa, x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk,
+                programs, elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, each, True, True,
+                LEARN_KAPPA, LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
             )  # fmt: skip
     else:
-        sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(
-            x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk, programs,
-            elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, each, False, False, LEARN_KAPPA,
-            LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
+        sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk_by_kappa(
+            least_kappa, x, t, w, upstream, values, slopes, table, outer, inner, so, sc, sk, wo, wc, wk, uo, uc, uk,
+            programs, elements, factor, CHANNELS, BLOCK_ROW, BLOCK_COL, LAYOUT, HAS_WEIGHT, each, False, False,
+            LEARN_KAPPA, LEARN_D, NORMALIZE, WRITE_VALUES, WRITE_SLOPES, SUMS, WIDE,
         )  # fmt: skip
     if SUMS:
         total_energy, total_network = tl.sum(sum_energy, 0), tl.sum(sum_network, 0)

@@ -31,8 +31,8 @@ __all__ = [
     "weight_sums",
 ]
 
-TILE = 1024
-"""Elements of a tile of a large batch."""
+TILE = 512
+"""Elements of a tile of a large batch; of half precision where registers are few, twice as many."""
 
 MOST_COLUMNS = 64
 """Channels of a tile, where they are last in memory."""
@@ -220,24 +220,25 @@ PLACES, CHANNELS, LINE = 0, 1, 2
 """Columns of a tile: places within a channel, channels, or channels of several rows in one line of memory."""
 
 
-def _tiles(batch: Arranged) -> Tiles:
+def _tiles(batch: Arranged, *, robust: bool) -> Tiles:
     outer, m, inner = batch.size
     elements = outer * m * inner
+    tile = TILE if robust or batch.input.element_size() > 2 else 2 * TILE
     if inner == 1 and _power(m) == m and m <= LINE_COLUMNS:
         layout, columns = LINE, 1
         block_col = LINE_COLUMNS if elements >= LINE_COLUMNS else max(_power(elements), m)
         outer = -(-elements // block_col)
-        block_row = min(max(TILE // block_col, 1), _power(outer))
+        block_row = min(max(tile // block_col, 1), _power(outer))
         blocks = -(-outer // block_row)
     elif inner == 1:
         layout = CHANNELS
         block_col = min(_power(m), MOST_COLUMNS)
-        block_row = min(max(TILE // block_col, 1), _power(outer))
+        block_row = min(max(tile // block_col, 1), _power(outer))
         blocks, columns = -(-outer // block_row), -(-m // block_col)
     else:
         layout = PLACES
-        block_col = min(_power(inner), TILE)
-        block_row = min(max(TILE // block_col, 1), _power(outer))
+        block_col = min(_power(inner), tile)
+        block_row = min(max(tile // block_col, 1), _power(outer))
         blocks, columns = -(-outer // block_row) * -(-inner // block_col), m
     most = max(1, min(PROGRAMS_EACH * multiprocessors(batch.input.device) // min(columns, 8), PARTIAL_SUMS // m))
     programs = 1 if elements <= ALONE and columns == 1 else min(blocks, most)
@@ -273,7 +274,7 @@ def pass_over(
     """
     outer, m, inner = batch.size
     device, dtype = table.device, table.dtype
-    tiles = _tiles(batch)
+    tiles = _tiles(batch, robust=options.robust)
     each = upstream is not None and upstream.dim() > 0
     finish = sums and tiles.programs == 1 and tiles.columns == 1
     value = torch.empty(1 if finish else -(-m // MOST_COLUMNS), dtype=dtype, device=device) if sums else None
