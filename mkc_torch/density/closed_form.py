@@ -1,8 +1,8 @@
 """The energy and its first derivatives of every element, in formulas that NumPy and torch share.
 
 Autograd on a formula of a dozen operations keeps and reads a dozen arrays of the size of the batch, and calls torch
-twice as often. Here the derivatives are made with the value. They are not differentiable; :mod:`mkc_torch.density.energy`
-has the functions that are.
+twice as often. Here the derivatives are made with the value. They are not differentiable;
+:mod:`mkc_torch.density.energy` has the functions that are.
 """
 
 from __future__ import annotations

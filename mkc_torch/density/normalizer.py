@@ -24,7 +24,7 @@ __all__ = ["log_partition"]
 _HEAD_TOLERANCE = 1e-13
 
 
-def _head_quadrature(count: int) -> tuple[Tensor, Tensor]:
+def head_quadrature(count: int) -> tuple[Tensor, Tensor]:
     """Nodes on [0, 1] and weights of an even integrand on [-1, 1]: Gauss-Legendre under sinh(2t), denser near 0."""
     x, w = np.polynomial.legendre.leggauss(count)
     t = 0.5 * (x + 1.0)
@@ -32,7 +32,7 @@ def _head_quadrature(count: int) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(nodes), torch.from_numpy(weights)
 
 
-_NODES, _WEIGHTS = _head_quadrature(32)
+_NODES, _WEIGHTS = head_quadrature(32)
 
 
 def head_rule_constants() -> tuple[Float[Tensor, " nodes"], Float[Tensor, " nodes"]]:

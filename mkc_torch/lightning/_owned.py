@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
 
 from mkc_torch.density.energy import KAPPA_MAX
-from mkc_torch.lightning._pace import set_pace
-from mkc_torch.losses.bandwidth_schedule import BandwidthSchedule as Following
+from mkc_torch.lightning._pace import Guide, set_pace
 from mkc_torch.losses.mkc import MKCLoss
 
 if TYPE_CHECKING:
@@ -45,15 +44,27 @@ class OwnedLoss:
             parameter.requires_grad_(False)
         return cls(name, loss, loss.register_forward_hook(hook, with_kwargs=True), learned)
 
-    def guide(self, guide: Following | None, trainer: Trainer) -> None:
-        """Lets the loss follow a guide at the pace of this training."""
-        if guide is not None:
-            set_pace(guide, trainer)
-        self.loss.follow_guide(guide)
+    def guide(self, guide: Guide | None, trainer: Trainer) -> None:
+        """Let the network learn by a schedule, at the pace of this training: a guide's, or the loss's own."""
+        own = self.loss.schedule
+        if own is not None:
+            set_pace(own, trainer)
+        if guide is None:
+            self.loss.guide(None, None)
+        else:
+            set_pace(guide.schedule, trainer)
+            self.loss.guide(guide.residual_scale, guide.schedule)
+
+    def freeze(self) -> Guide | None:
+        """Freeze a scale that follows the residuals before the first E-step; return what has guided the network."""
+        scale, schedule = self.loss.residual_scale, self.loss.schedule
+        self.loss.freeze_scale()
+        return None if scale is None or schedule is None else Guide(scale, schedule)
 
     def release(self) -> None:
+        """Give the loss back: no hook, no guide, its parameters learned again."""
         self.handle.remove()
-        self.loss.follow_guide(None)
+        self.loss.guide(None, None)
         for parameter in self.learned:
             parameter.requires_grad_(True)
 

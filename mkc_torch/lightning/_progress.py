@@ -10,8 +10,8 @@ from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
 from mkc_torch.lightning._owned import OwnedLoss
+from mkc_torch.lightning._pace import Guide
 from mkc_torch.lightning.residual_histogram import ResidualHistogram
-from mkc_torch.losses.bandwidth_schedule import BandwidthSchedule as Following
 from mkc_torch.losses.mkc import MKCLoss
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class Progress:
     share_beyond: Float[Tensor, " m"] = field(init=False)
     last_epoch: int = -1
     warned: set[tuple[str, int]] = field(default_factory=set)
-    guide: Following | None = None
+    guide: Guide | None = None
 
     def __post_init__(self) -> None:
         unknown = torch.full(self.histogram.bound.shape, torch.nan, dtype=torch.float64)
@@ -91,7 +91,8 @@ class Progress:
         collapsed = (d <= d_min * (1.0 + 1e-3)) | ((d < 0.01 * self.start_d) & likelier)
         self.warn_once("few", owned.name, ~usable)
         self.warn_once("narrow", owned.name, narrow)
-        self.warn_once("beyond", owned.name, usable & ~narrow & (self.share_beyond > 0.01))
+        if owned.loss._bound_was_given:
+            self.warn_once("beyond", owned.name, usable & ~narrow & (self.share_beyond > 0.01))
         self.warn_once("collapsed", owned.name, usable & collapsed)
 
     def warn_once(self, kind: str, name: str, channels: Bool[Tensor, " m"]) -> None:
@@ -123,6 +124,6 @@ class Progress:
         self.share_beyond = state["share_beyond"]
         self.last_epoch = state["last_epoch"]
         if state.get("guide") is not None:
-            self.guide = Following(len(self.start_d))
+            self.guide = Guide.of_channels(len(self.start_d))
             self.guide.load_state_dict(state["guide"])
         self.warned = {(kind, channel) for kind, channel in state["warned"]}

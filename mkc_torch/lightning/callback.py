@@ -16,9 +16,9 @@ from mkc_torch._support.arguments import checked_number, refuse_other_type, told
 from mkc_torch.density.expectation_step import damped, damped_kappa, expectation_step
 from mkc_torch.functional import mkc_nll
 from mkc_torch.lightning._owned import SIGMA_CAP, OwnedLoss
+from mkc_torch.lightning._pace import Guide
 from mkc_torch.lightning._progress import MIN_RESIDUALS, Progress
 from mkc_torch.lightning.residual_histogram import ResidualHistogram
-from mkc_torch.losses.bandwidth_schedule import BandwidthSchedule as Following
 from mkc_torch.losses.mkc import MKCLoss
 
 if TYPE_CHECKING:
@@ -41,8 +41,9 @@ class MKCExpectationMaximization(Callback):
     Residuals of an epoch come from weights that were changing, and from a network in training mode (dropout); with
     ``residuals`` they come from a pass of their own.
 
-    Best is a loss ``MKCLoss(m, bound=..., learn_sigma=False, learn_d=False, normalize=True)``: it has no parameters,
-    reaches σ = ∞ exactly, and with the normaliser its values, those of a validation say, compare between epochs. The σ
+    Best is a loss ``MKCLoss(m, learn_sigma=False, learn_d=False, normalize=True)``: it has no parameters, reaches σ = ∞
+    exactly, and with the normaliser its values, those of a validation say, compare between epochs. Without a ``d`` and
+    a ``bound`` they follow the residuals until the first E-step and are then frozen; a physical bound is better. The σ
     and d of a loss that learns them are taken out of its hands while the fit lasts: they must be in no optimiser, and
     their σ ends at ``SIGMA_CAP`` at most.
 
@@ -166,23 +167,22 @@ class MKCExpectationMaximization(Callback):
             self._take(trainer, pl_module)
         owned, progress = self._running()
         owned.refuse_optimised(trainer)
-        if self.graduated and progress.guide is None:
-            progress.guide = Following(owned.loss.num_channels)
         if self._restored is not None:
             progress.load_state_dict(self._restored)
             self._restored = None
             if not trainer.is_global_zero:  # what was saved are the residuals of the first process
                 progress.histogram.clear()
-        # a checkpoint brings the module's bound
-        progress.histogram.bound = owned.loss.bound.detach().to(progress.histogram.bound)
+        if owned.loss.fixed_bound is not None:  # that of the checkpoint
+            progress.histogram.set_bound(owned.loss.bound)
+        progress.histogram.to(pl_module.device)
 
     @override
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step == 0:
-            loss = self._running()[0].loss
-            guide = Following(loss.num_channels) if self.graduated else None
-            self._progress = Progress(ResidualHistogram(loss.bound), guide=guide)
+            self._progress = Progress(_histogram(self._running()[0].loss))
         owned, progress = self._running()
+        if self.graduated and progress.guide is None and owned.loss.schedule is None:
+            progress.guide = Guide.of_channels(owned.loss.num_channels)
         owned.guide(progress.guide if self.graduated else None, trainer)
         self._step = trainer.global_step
         if self.residuals is not None and self.every_n_steps is not None:
@@ -243,10 +243,9 @@ class MKCExpectationMaximization(Callback):
                     f"Expected one MKCExpectationMaximization for the loss `{name}` but got two; "
                     "give each callback the name of another loss, or remove one."
                 )
-        loss.settle()  # the E-step finds d, in the bound that there is
         self._owned = OwnedLoss.of(name, loss, self._collect)
-        if self._progress is None or self._progress.histogram.bound.shape != loss.bound.shape:
-            self._progress = Progress(ResidualHistogram(loss.bound))
+        if self._progress is None or len(self._progress.histogram.bound) != loss.num_channels:
+            self._progress = Progress(_histogram(loss))
 
     def _release(self) -> None:
         self._collecting = False
@@ -275,6 +274,10 @@ class MKCExpectationMaximization(Callback):
             _collect_by_pass(progress.histogram, owned.loss, self.residuals, trainer, pl_module)
         if trainer.world_size > 1:
             progress.histogram.all_reduce()
+        try:
+            progress.histogram.check()
+        except ValueError as error:
+            raise ValueError(f"Since the last E-step of the loss `{owned.name}`: {error}") from None
         if bool(progress.histogram.batches == 0):
             progress.warn_once("silent", owned.name, torch.ones_like(progress.start_d, dtype=torch.bool))
         else:
@@ -286,6 +289,12 @@ class MKCExpectationMaximization(Callback):
     def _update(self, trainer: Trainer) -> None:
         owned, progress = self._running()
         loss, histogram = owned.loss, progress.histogram
+        if loss.residual_scale is not None:  # d and bound were the residuals'; from here on they are the E-step's
+            guide = owned.freeze()
+            if self.graduated:
+                progress.guide = guide
+            owned.guide(progress.guide, trainer)
+            histogram.set_bound(loss.bound)
         error, weight = histogram.residuals()
         own = (loss.kappa, loss.d, loss.bound, loss.d_min)
         kappa, d, bound, d_min = (t.detach().to(histogram.bound, copy=True) for t in own)
@@ -364,16 +373,26 @@ def _find_loss(module: nn.Module, name: str | None) -> tuple[str, MKCLoss]:
     return next(iter(losses.items()))
 
 
+def _histogram(loss: MKCLoss) -> ResidualHistogram:
+    """An empty histogram up to the loss's bound, or as far as the residuals reach where the bound is theirs."""
+    bound = None if loss.fixed_bound is None else loss.bound
+    return ResidualHistogram(bound, num_channels=loss.num_channels)
+
+
 def _add_residuals(
     histogram: ResidualHistogram, loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None = None
 ) -> None:
     """Adds what the loss was called with; it has checked the shapes."""
+    half = input.dtype in (torch.float16, torch.bfloat16)
+    finite = torch.isfinite(input.detach())
     input, target = (t.detach().to(torch.promote_types(t.dtype, torch.float32)) for t in (input, target))
     error = input - target
     if weight is not None:
         if weight.dim() < error.dim():
             weight = weight.unsqueeze(loss.channel_dim % error.dim())
         weight = weight.detach().expand(error.shape)
+    if half:  # an overflow is the gradient scaler's, and no residual
+        weight = finite if weight is None else weight * finite
     histogram.add(error, weight, loss.channel_dim)
 
 

@@ -1,8 +1,8 @@
 """The reduced loss with its gradients made in the forward pass, in NumPy, torch or a kernel.
 
-A step by autograd on the formulas of :mod:`mkc_torch.losses._terms` keeps a dozen arrays of the size of the batch. Here
-the forward pass keeps one, the gradient by the input, and hands it out in the first backward pass. A second backward pass
-of one graph makes it anew; a second derivative goes through the formulas.
+A step by autograd on the formulas of :mod:`mkc_torch.losses._terms` keeps a dozen arrays of the size of the batch.
+Here the forward pass keeps one, the gradient by the input, and hands it out in the first backward pass. A second
+backward pass of one graph makes it anew; a second derivative goes through the formulas.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mkc_torch.losses._terms import Batch, Settings, loss_value
 from mkc_torch.losses.residual_scale import SMALL_STATE, numpy_may_read
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    pass
 
 __all__ = ["fused_loss"]
 
@@ -76,7 +76,8 @@ class _Fused(torch.autograd.Function):
     ) -> Tensor:
         wants = ctx.needs_input_grad
         found = reduced_loss(batch, raw_kappa, raw_d, settings, wants_input=wants[0] or wants[1])
-        ctx.found, ctx.batch, ctx.settings = found, batch._replace(input=None, target=None), settings
+        ctx.found, ctx.settings = found, settings
+        ctx.rest = batch[2:]  # input and target are saved, and freed with the graph
         ctx.save_for_backward(input, target, raw_kappa, raw_d)
         return found.value
 
@@ -87,7 +88,7 @@ class _Fused(torch.autograd.Function):
         found, ctx.found = ctx.found, None
         if found is None:
             input, target, raw_kappa, raw_d = ctx.saved_tensors
-            batch = ctx.batch._replace(input=input, target=target)
+            batch = Batch(input, target, *ctx.rest)
             wants = ctx.needs_input_grad
             found = reduced_loss(batch, raw_kappa, raw_d, ctx.settings, wants_input=wants[0] or wants[1])
         of_input, of_target, of_kappa, of_d, *_ = ctx.needs_input_grad
@@ -112,7 +113,7 @@ def _is_one(grad: Tensor) -> bool:
 def _by_formulas(ctx: Any, grad: Tensor) -> list[Tensor | None]:
     """Gradients that are functions of the inputs, for a second derivative."""
     input, target, raw_kappa, raw_d = ctx.saved_tensors
-    value = loss_value(ctx.batch._replace(input=input, target=target), raw_kappa, raw_d, ctx.settings)
+    value = loss_value(Batch(input, target, *ctx.rest), raw_kappa, raw_d, ctx.settings)
     given = (input, target, raw_kappa, raw_d)
     wanted = [one for one, wants in zip(given, ctx.needs_input_grad, strict=False) if wants]
     slopes = iter(torch.autograd.grad(value, wanted, grad.to(value.dtype), create_graph=True))
@@ -130,15 +131,24 @@ def reduced_loss(
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         table = channel_table(
             xp,
-            *(_array(xp, one) for one in raw),
+            _array(xp, raw_kappa),
+            _array(xp, settings.fixed_kappa),
+            _array(xp, raw_d),
+            _array(xp, settings.fixed_d),
             ChannelState(*(_array(xp, one) for one in settings.state)),
             follows=settings.follows,
             normalize=settings.normalize,
         )
         if xp is np and not (batch.input.numel() <= SMALL_BATCH and numpy_may_read(batch.input, batch.target)):
             xp, table = torch, ChannelTable(*(None if one is None else torch.from_numpy(one) for one in table))
-        elements = [_array(xp, one) for one in batch[:4]]
-        work = Elements(*elements, batch.axis, looks=batch.input.device.type == "cpu")
+        work = Elements(
+            _array(xp, batch.input),
+            _array(xp, batch.target),
+            _array(xp, batch.weight),
+            _array(xp, batch.counts),
+            batch.axis,
+            looks=batch.input.device.type == "cpu",
+        )
         divisor = _divisor(xp, work, settings)
         if xp is torch and _is_large(batch):
             sums, by_input = _in_pieces(work, table, divisor, wants_input=wants_input)
@@ -266,7 +276,7 @@ def _in_pieces(
 ) -> tuple[ChannelSums, Tensor | None]:
     """The sums and the gradient, piece by piece; the gradient is the only array of the size of the batch."""
     m = batch.input.shape[-1]
-    flat = [None if one is None else one.reshape(-1, m) for one in batch[:4]]
+    flat: list[Any] = [None if one is None else one.reshape(-1, m) for one in batch[:4]]
     rows, dtype = len(flat[0]), batch.input.dtype
     repeats = max(ROW // m, 1)
     by_input = torch.empty_like(flat[0]) if wants_input else None
@@ -277,7 +287,7 @@ def _in_pieces(
         size = max(PIECE // (r * m), 1) * r
         for first in range(start, end, size):
             last = min(first + size, end)
-            given = [None if one is None else one[first:last].view(-1, r * m) for one in flat]
+            given: list[Any] = [None if one is None else one[first:last].view(-1, r * m) for one in flat]
             error = given[0] - given[1]
             if given[3] is not None:
                 error = torch.where(given[3], error, 0.0)

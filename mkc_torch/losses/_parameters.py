@@ -76,7 +76,7 @@ def scale_ratio(xp: Any, raw: Any) -> Any:
 
 
 def to_d(raw: Tensor | None, state: ChannelState, *, follows: bool) -> Float[Tensor, " m"]:
-    """d of a raw parameter, differentiable; where it follows the residuals, ``raw`` may be None for the scale itself."""
+    """d of a raw parameter, differentiable; where d follows the residuals, None stands for the scale itself."""
     if not follows:
         assert raw is not None
         return state.floor + (state.bound - state.floor) * logistic(raw)
@@ -121,7 +121,9 @@ def channel_table(
         wide = [None if one is None else one.astype(np.float64) for one in (raw_kappa, fixed_kappa, raw_d, fixed_d)]
         state = ChannelState(*(None if one is None else one.astype(np.float64) for one in state))
     else:
-        dtype = as_computed(*(one for one in (raw_kappa, fixed_kappa, raw_d, fixed_d, *state) if one is not None))[0].dtype
+        dtype = as_computed(*(one for one in (raw_kappa, fixed_kappa, raw_d, fixed_d, *state) if one is not None))[
+            0
+        ].dtype
         wide = [None if one is None else one.to(dtype) for one in (raw_kappa, fixed_kappa, raw_d, fixed_d)]
         state = ChannelState(*(None if one is None else one.to(dtype) for one in state))
     raw_kappa, fixed_kappa, raw_d, fixed_d = wide

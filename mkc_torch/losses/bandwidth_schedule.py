@@ -40,9 +40,9 @@ UNLIMITED = 32.0
 class BandwidthSchedule(nn.Module):
     """From the initial loss to Welsch's of the selected bandwidth, for each channel; all state in buffers.
 
-    In the first ``warmup_steps`` batches the initial loss is used alone. At every fourth batch the bandwidth is selected
-    by the estimated risk of the predictions, and the share of the annealed loss grows where it has a smaller risk than
-    the initial loss, and falls where it has not.
+    In the first ``warmup_steps`` batches the initial loss is used alone. At every fourth batch the bandwidth is
+    selected by the estimated risk of the predictions; the share of the annealed loss grows where its risk is smaller
+    than that of the initial loss, and falls where it is larger.
 
     Args:
         num_channels: m.
@@ -50,7 +50,7 @@ class BandwidthSchedule(nn.Module):
         anneal_step: change of the share with each later batch.
 
     Attributes:
-        steps: how many batches were seen; the same for all channels, which a kernel counts one by one, (m,).
+        steps: how many batches were seen; equal for all channels, (m,), because a kernel has one program a channel.
         log_bandwidth: logarithm of the selected bandwidth in scales, a running mean, (m,).
         share: share of the annealed loss in [0, 1], (m,).
 

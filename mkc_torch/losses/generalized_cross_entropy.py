@@ -11,7 +11,9 @@ disbelieves fades as ``p^(1/σ²)``.
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import torch
@@ -19,6 +21,7 @@ from torch import Tensor
 
 from mkc_torch._support.arguments import as_numbers, checked_number, checked_whole, refuse_no_tensor, refuse_not_real
 from mkc_torch.losses._checks import Reduction, at_least_float32, refuse_other_reduction
+from mkc_torch.losses._implementation import Implementation, checked_implementation, runs_kernels
 from mkc_torch.losses._label_curves import LabelCurves
 from mkc_torch.losses.heteroscedastic import _WideBuffers
 
@@ -52,6 +55,8 @@ class GeneralizedCrossEntropyLoss(LabelCurves, _WideBuffers):
         ignore_index: the integer label that does not count; what its logits hold, NaN included, reaches nothing.
         reduction: "none", "mean" or "sum"; as in torch, the mean is over the weights of the labels, or over samples
             where the targets are probabilities.
+        impl: "auto" runs Triton kernels for labels of logits (N, C) on a GPU that has them, and torch elsewhere;
+            "eager", "compile" and "triton" name one. All compute the same.
 
     Attributes:
         sigma: current value (); assign to set it, also under torch.compile.
@@ -83,9 +88,11 @@ class GeneralizedCrossEntropyLoss(LabelCurves, _WideBuffers):
         weight: Float[Tensor, " C"] | None = None,
         ignore_index: int = -100,
         reduction: Reduction = "mean",
+        impl: Implementation = "auto",
     ) -> None:
         super().__init__()
         refuse_other_reduction(reduction)
+        self.impl = checked_implementation(impl)
         self.ignore_index = checked_whole("ignore_index", ignore_index, advice="-100 is torch's")
         self.reduction = reduction
         self.register_buffer("kappa", _inverse_square(sigma))
@@ -121,6 +128,16 @@ class GeneralizedCrossEntropyLoss(LabelCurves, _WideBuffers):
                 range, logits that are NaN or +inf where they count, probabilities that are none. On an accelerator the
                 loss does not wait for the last three: there NaN comes out as NaN.
         """
+        if runs_kernels(self, input):
+            from mkc_torch.losses.kernels.label_loss import label_loss, takes_labels
+
+            if takes_labels(self, input, target):
+                return label_loss(self, input, target)
+        if self.impl == "compile" and not torch.compiler.is_compiling():
+            return _compiled()(self, input, target)
+        return self._computed(input, target)
+
+    def _computed(self, input: Tensor, target: Tensor) -> Tensor:
         return _loss(input, target, self.kappa, self.weight, self.ignore_index, self.reduction)
 
     @torch.no_grad()
@@ -155,6 +172,11 @@ class GeneralizedCrossEntropyLoss(LabelCurves, _WideBuffers):
     def extra_repr(self) -> str:
         weighted = "" if self.weight is None else f", weight={self.weight.tolist()}"
         return f"sigma={self.sigma.item():g}, reduction={self.reduction!r}, ignore_index={self.ignore_index}{weighted}"
+
+
+@functools.cache
+def _compiled() -> Callable[..., Tensor]:
+    return torch.compile(GeneralizedCrossEntropyLoss._computed)
 
 
 def generalized_cross_entropy(

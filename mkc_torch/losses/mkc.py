@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor, nn
 
-from mkc_torch._support.arguments import as_numbers, refuse_bad_batch, told
+from mkc_torch._support.arguments import refuse_bad_batch, told
 from mkc_torch._support.torch_internals import in_backward, is_transformed
-from mkc_torch.density.energy import KAPPA_MAX, as_computed, inverse_square
-from mkc_torch.density.normalizer import log_partition
+from mkc_torch.losses._channel_density import ChannelDensity, Objective, is_auto
 from mkc_torch.losses._checks import (
     Reduction,
     checked_axis,
@@ -25,31 +24,18 @@ from mkc_torch.losses._checks import (
 from mkc_torch.losses._curves import ChannelCurves
 from mkc_torch.losses._fused import fused_loss
 from mkc_torch.losses._implementation import Implementation, checked_implementation, runs_kernels
-from mkc_torch.losses._parameters import ChannelState, logistic, to_d
-from mkc_torch.losses._snapshot import snapshot
-from mkc_torch.losses._state_dict import logit_of_kappa, logit_of_scale, translate
+from mkc_torch.losses._inspection import tails_of, what_goes_wrong
 from mkc_torch.losses._terms import Batch, LossTerms, Settings, loss_terms, loss_value
-from mkc_torch.losses.bandwidth_schedule import BandwidthSchedule
-from mkc_torch.losses.residual_scale import SCALES_IN_BOUND, ResidualScale
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["DEFAULT_BOUND_IN_D", "DEFAULT_D_MIN_IN_D", "MKCLoss", "Objective", "checked_loss"]
+    from mkc_torch.density.tails import Tails
 
-Objective = Literal["robust", "likelihood"]
-
-DEFAULT_BOUND_IN_D = 100.0
-"""Half-width of the domain, in units of the initial d, where no bound is given."""
-
-DEFAULT_D_MIN_IN_D = 1e-3
-"""Floor under d, in units of the initial d, where none is given."""
-
-DEFAULT_LEARNING_RATE = 1e-2
-"""Learning rate of σ and d in :meth:`MKCLoss.param_groups`."""
+__all__ = ["MKCLoss", "checked_loss"]
 
 
-class MKCLoss(ChannelCurves, nn.Module):
+class MKCLoss(ChannelCurves, ChannelDensity):
     """Multi-kernel correntropy loss with a bandwidth σ and a scale d for each channel.
 
     The likelihood is (17) of Li et al. (2023): ``energy + log_normalizer`` where anything is learned, and with σ and d
@@ -112,13 +98,6 @@ class MKCLoss(ChannelCurves, nn.Module):
         True
     """
 
-    fixed_bound: Tensor | None
-    fixed_d_min: Tensor | None
-    fixed_kappa: Tensor | None
-    fixed_d: Tensor | None
-    residual_scale: ResidualScale | None
-    schedule: BandwidthSchedule | None
-
     def __init__(
         self,
         num_channels: int,
@@ -135,7 +114,6 @@ class MKCLoss(ChannelCurves, nn.Module):
         d_min: float | Float[Tensor, " m"] | None = None,
         impl: Implementation = "auto",
     ) -> None:
-        super().__init__()
         if isinstance(num_channels, bool) or not isinstance(num_channels, int) or num_channels < 1:
             raise ValueError(f"Expected argument `num_channels` to be a positive integer but got {num_channels!r}.")
         refuse_other_reduction(reduction)
@@ -148,262 +126,37 @@ class MKCLoss(ChannelCurves, nn.Module):
                 "Expected `learn_sigma=False, learn_d=False` with `normalize=False`: without the normaliser the loss "
                 "is smallest at sigma -> 0 or d -> inf, whatever the data. Drop `normalize=False` to learn them."
             )
-        follows = _is_auto(d)
         if objective not in (None, "robust", "likelihood"):
-            raise ValueError(f"Expected argument `objective` to be 'robust', 'likelihood' or None but got {objective!r}.")
-        robust = objective == "robust" or (objective is None and follows)
-        self.num_channels = num_channels
+            raise ValueError(
+                f"Expected argument `objective` to be 'robust', 'likelihood' or None but got {objective!r}."
+            )
+        super().__init__(
+            num_channels,
+            sigma=sigma,
+            d=d,
+            bound=bound,
+            d_min=d_min,
+            learn_sigma=learn_sigma,
+            learn_d=learn_d,
+            robust=objective == "robust" or (objective is None and is_auto(d)),
+        )
         self.normalize = normalize
         self.channel_dim, self._named_dim = -1 if channel_dim is None else channel_dim, channel_dim is not None
         self.reduction = reduction
         self.impl = checked_implementation(impl)
-        self._follows = follows
-        self.residual_scale = ResidualScale(num_channels) if follows or robust else None
-        self.schedule = BandwidthSchedule(num_channels) if robust else None
-        self.__dict__["_guide"] = None  # no part of the state_dict
-        kappa = inverse_square(self._sigma_in_range(sigma))
-        own_bound = not (bound is None or _is_auto(bound))
-        d = torch.ones(num_channels) if _is_auto(d) else self._per_channel("d", d, low=0.0)
-        half_width = self._per_channel("bound", bound, low=0.0) if own_bound else DEFAULT_BOUND_IN_D * d
-        floor = DEFAULT_D_MIN_IN_D * d if d_min is None else self._per_channel("d_min", d_min, low=0.0)
-        if not follows and not bool((half_width > d).all()):
-            raise ValueError(f"Expected argument `bound` to exceed `d` but got {half_width.tolist()} and {d.tolist()}.")
-        if not follows and learn_d and not bool((floor < d).all()):
-            raise ValueError(f"Expected argument `d_min` below `d` but got {floor.tolist()} and {d.tolist()}.")
-        self.register_buffer("fixed_bound", half_width if own_bound or not follows else None)
-        self.register_buffer("fixed_d_min", floor if d_min is not None or not follows else None)
-        self.register_buffer("fixed_kappa", None if learn_sigma else kappa)
-        self.register_buffer("fixed_d", None if learn_d or follows else d)
-        self.raw_kappa = nn.Parameter(torch.empty_like(kappa)) if learn_sigma else None
-        self.raw_d = nn.Parameter(torch.zeros_like(d)) if learn_d else None
-        self._set_kappa(kappa)
-        if not follows:
-            self._set_d(d)
-
-    def _per_channel(self, name: str, value: object, *, low: float) -> Tensor:
-        (t,) = as_computed(as_numbers(name, value).detach())
-        if t.dim() > 1 or (t.dim() == 1 and t.shape[0] not in (1, self.num_channels)):
-            raise ValueError(
-                f"Expected argument `{name}` to be a number or of shape ({self.num_channels},) but got {tuple(t.shape)}"
-            )
-        if not bool(((t > low) & torch.isfinite(t)).all()):
-            raise ValueError(f"Expected argument `{name}` to be positive and finite but got {value}.")
-        return t.expand(self.num_channels).clone()
-
-    def _sigma_in_range(self, value: float | Tensor) -> Tensor:
-        (t,) = as_computed(as_numbers("sigma", value).detach())
-        least = KAPPA_MAX**-0.5
-        if not bool((t >= least).all()):
-            raise ValueError(f"Expected argument `sigma` in [{least:g}, inf] but got {value}; 3 is a usual start.")
-        finite = self._per_channel("sigma", torch.where(torch.isinf(t), 1.0, t), low=0.0)
-        return torch.where(torch.isinf(t).expand_as(finite), torch.inf, finite)
-
-    @property
-    def kappa(self) -> Float[Tensor, " m"]:
-        """``1 / sigma²`` in [0, 400]."""
-        if self.raw_kappa is None:
-            assert self.fixed_kappa is not None
-            return self.fixed_kappa
-        return KAPPA_MAX * logistic(self.raw_kappa)
-
-    @torch.no_grad()
-    def _set_kappa(self, kappa: Tensor) -> None:
-        if self.raw_kappa is not None:
-            if bool((kappa == 0).any()):
-                raise ValueError(
-                    "Expected a finite `sigma` with `learn_sigma=True` but got inf, where its gradient is 0; "
-                    "start large, at 10 say, or pass `learn_sigma=False`."
-                )
-            self.raw_kappa.copy_(logit_of_kappa(kappa))
-        elif self.fixed_kappa is not None:
-            self.fixed_kappa.copy_(kappa)
-
-    @property
-    def sigma(self) -> Float[Tensor, " m"]:
-        """Bandwidths; assign a number or (m,) in [0.05, inf] to set them."""
-        return self.kappa.rsqrt()
-
-    @sigma.setter
-    def sigma(self, value: float | Tensor) -> None:
-        self._set_kappa(inverse_square(self._sigma_in_range(as_numbers("sigma", value, self._dtype))))
-
-    @property
-    def objective(self) -> Objective:
-        """By what the network learns: "robust" or "likelihood"."""
-        return "likelihood" if self.schedule is None else "robust"
-
-    @property
-    def bound(self) -> Float[Tensor, " m"]:
-        """Half-width of the domain of the errors, in the unit of the target."""
-        return self._state().bound
-
-    @property
-    def d_min(self) -> Float[Tensor, " m"]:
-        """Floor under d, in the unit of the target."""
-        return self._state().floor
-
-    @property
-    def d(self) -> Float[Tensor, " m"]:
-        """Scales in the unit of the target; assign a number or (m,) in (d_min, bound) to set them, where given."""
-        if not self._follows and self.raw_d is None:
-            assert self.fixed_d is not None
-            return self.fixed_d
-        return to_d(self.raw_d, self._state(), follows=self._follows)
-
-    @d.setter
-    def d(self, value: float | Tensor) -> None:
-        if self._follows:
-            raise ValueError(
-                f"Expected a loss with a given `d` to set it but got one that takes d from the residuals, d={value}; "
-                "call freeze_scale() first, or make the loss with `d=` and `bound=`."
-            )
-        bound, d_min = self.bound, self.d_min
-        d = self._per_channel("d", as_numbers("d", value, self._dtype), low=0.0).to(bound)
-        if self.raw_d is not None and not bool(((d > d_min) & (d < bound)).all()):
-            raise ValueError(
-                f"Expected `d` between `d_min` {d_min.tolist()} and `bound` {bound.tolist()} but got {value}."
-            )
-        self._set_d(d)
-
-    @torch.no_grad()
-    def _set_d(self, d: Tensor) -> None:
-        if self.raw_d is not None:
-            self.raw_d.copy_(logit_of_scale(d, self.d_min, self.bound))
-        elif self.fixed_d is not None:
-            self.fixed_d.copy_(d)
-
-    @property
-    def _dtype(self) -> torch.dtype:
-        given = (self.raw_kappa, self.fixed_kappa, self.raw_d, self.fixed_d, self.fixed_bound)
-        dtype = torch.float32
-        for one in given:
-            if one is not None:
-                dtype = torch.promote_types(dtype, one.dtype)
-        return dtype
-
-    @torch.no_grad()
-    def freeze_scale(self) -> None:
-        """Stop following the residuals: d and bound stay as they are and the objective becomes the likelihood.
-
-        For an optimiser that needs the same function at every call, L-BFGS say, and to compare likelihoods.
-
-        Example:
-            >>> loss = MKCLoss(1)
-            >>> _ = loss(torch.tensor([[-1.0], [1.0], [3.0]]), torch.zeros(3, 1))
-            >>> loss.freeze_scale()
-            >>> loss.objective, bool(loss.bound > 5.0 * loss.d)
-            ('likelihood', True)
-        """
-        if self._follows:
-            state = self._state()
-            d = to_d(self.raw_d, state, follows=True)
-            d = torch.minimum(torch.maximum(d, state.floor * (1.0 + 1e-6)), 0.5 * state.bound)
-            self.fixed_bound, self.fixed_d_min, self._follows = state.bound.clone(), state.floor.clone(), False
-            if self.raw_d is None:
-                self.fixed_d = d
-            else:
-                self.raw_d.copy_(logit_of_scale(d, state.floor, state.bound))
-        self.residual_scale, self.schedule = None, None
-
-    def guide(self, residual_scale: ResidualScale | None, schedule: BandwidthSchedule | None) -> None:
-        """Let the network learn by a schedule, as under ``objective="robust"``, that is no part of the loss.
-
-        For trainers that own σ and d: the loss stays the likelihood of given numbers, its ``state_dict`` has nothing of
-        the schedule, and in training the network learns by the likelihood's energy at a bandwidth no wider than the
-        selected bandwidth. None and None end it.
-        """
-        self.__dict__["_guide"] = None if residual_scale is None or schedule is None else (residual_scale, schedule)
-
-    def _running(self) -> tuple[ResidualScale | None, BandwidthSchedule | None]:
-        """The modules that are updated in training."""
-        guide = self.__dict__["_guide"]
-        if guide is not None:
-            return guide
-        modules: Any = self._modules  # attributes of modules take a microsecond each
-        return modules.get("residual_scale"), modules.get("schedule")
-
-    def _state(self, batch: Batch | None = None, *, robust: bool = False) -> ChannelState:
-        """The buffers as one forward pass takes them: copies, for the next batch changes the buffers.
-
-        With a batch, channels that have had none take their scale from it.
-        """
-        running, schedule = self._running() if robust else (self.residual_scale, None)
-        bound, floor, scale = self.fixed_bound, self.fixed_d_min, None
-        if running is not None:
-            log_scale, half_range, own_floor = running.log_scale, running.half_range, running.floor
-            if batch is not None:
-                weight = batch.weight
-                _, log_scale, half_range, own_floor = running.with_batch(batch.input, batch.target, weight, batch.axis)
-            scale = log_scale.exp()
-            bound = torch.maximum(half_range, SCALES_IN_BOUND * scale) if bound is None else bound
-            floor = own_floor.clone() if floor is None else floor
-        assert bound is not None
-        assert floor is not None
-        state = ChannelState(bound, floor, scale)
-        if schedule is not None:
-            state = ChannelState(bound, floor, scale, schedule.log_bandwidth.clone(), schedule.share.clone())
-        if running is None or not (self.training and torch.compiler.is_compiling()):
-            return state
-        kept = iter(snapshot([one for one in state if one is not None]))
-        return ChannelState(*(None if one is None else next(kept) for one in state))
 
     def _settings(self, batch: Batch, *, robust: bool, updated: bool) -> Settings:
         running = self._running()[0] if robust else self.residual_scale
         fresh = not (updated or running is None or torch.compiler.is_compiling())
-        if fresh and running is not None and running.batches.device.type == "cpu" and not is_transformed(running.batches):
+        if (
+            fresh
+            and running is not None
+            and running.batches.device.type == "cpu"
+            and not is_transformed(running.batches)
+        ):
             fresh = bool((running.batches == 0).any())
         state = self._state(batch if fresh else None, robust=robust)
         return Settings(self.fixed_kappa, self.fixed_d, state, self._follows, self.normalize, self.reduction)
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> MKCLoss:
-        """Parameters and buffers stay in float32 at least: half would round them, or overflow."""
-
-        def keep(t: Tensor) -> Tensor:
-            out = fn(t)
-            return t.to(out.device) if out.dtype in (torch.float16, torch.bfloat16) else out
-
-        super()._apply(keep, recurse)  # type: ignore[no-untyped-call]
-        return self
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        if self._follows and prefix + "fixed_bound" in state_dict and prefix + "residual_scale.recent" not in state_dict:
-            self._freeze_as(state_dict, prefix)
-        translate(
-            state_dict,
-            prefix,
-            learns_kappa=self.raw_kappa is not None,
-            learns_d=self.raw_d is not None,
-            follows=self._follows,
-            robust=self.residual_scale is not None,
-        )
-        super()._load_from_state_dict(state_dict, prefix, *rest)
-
-    def _freeze_as(self, state_dict: dict[str, Any], prefix: str) -> None:
-        """Become a loss of given numbers, which a state_dict of a frozen loss is loaded into."""
-        like = self.residual_scale.log_scale if self.residual_scale is not None else torch.zeros(self.num_channels)
-        self._follows, self.residual_scale, self.schedule = False, None, None
-        self.fixed_bound, self.fixed_d_min = torch.ones_like(like), torch.full_like(like, DEFAULT_D_MIN_IN_D)
-        self.fixed_d = torch.full_like(like, 0.1) if self.raw_d is None else None
-
-    def log_normalizer(self) -> Float[Tensor, " m"]:
-        """``log(d Z)`` of each channel: what the negative log-likelihood adds to the energy."""
-        d, bound = self.d, self.bound
-        return torch.log(d) + log_partition(self.kappa, bound / d)
-
-    def param_groups(self, *, lr: float = DEFAULT_LEARNING_RATE, **options: Any) -> list[dict[str, Any]]:
-        """Optimiser groups of the learned σ and d, without weight decay, which would pull them to arbitrary values.
-
-        Args:
-            lr: their learning rate, for Adam and its like; the rate of the network, which may be anything, is not theirs.
-            options: further options of the group.
-
-        Example:
-            >>> model, loss = torch.nn.Linear(3, 2), MKCLoss(2)
-            >>> groups = [{"params": model.parameters()}, *loss.param_groups()]
-            >>> optimiser = torch.optim.AdamW(groups, weight_decay=0.1)
-        """
-        parameters = [p for p in (self.raw_kappa, self.raw_d) if p is not None]
-        return [{"params": parameters, "weight_decay": 0.0, "lr": lr, **options}] if parameters else []
 
     def forward(
         self,
@@ -445,7 +198,7 @@ class MKCLoss(ChannelCurves, nn.Module):
         updated = self._update(batch)
         settings = self._settings(batch, robust=self.training and self._running()[1] is not None, updated=updated)
         compiling = torch.compiler.is_compiling()
-        plain = not compiling and not any(is_transformed(one) for one in self._differentiated(batch))
+        plain = not compiling and not any(map(is_transformed, self._tensors(batch)))
         if not plain or self.reduction == "none" or (batch.weight is not None and batch.weight.requires_grad):
             return loss_value(batch, self.raw_kappa, self.raw_d, settings)
         return fused_loss(batch, self.raw_kappa, self.raw_d, settings)
@@ -477,7 +230,58 @@ class MKCLoss(ChannelCurves, nn.Module):
         settings = self._settings(batch, robust=self._running()[1] is not None, updated=False)
         return loss_terms(batch, self.raw_kappa, self.raw_d, settings)
 
-    def _differentiated(self, batch: Batch) -> list[Tensor]:
+    def check(
+        self,
+        input: Float[Tensor, "*shape"] | None = None,
+        target: Float[Tensor, "*shape"] | None = None,
+        weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
+        *,
+        optimizer: torch.optim.Optimizer | None = None,
+    ) -> tuple[str, ...]:
+        """What goes wrong in a training, a sentence each: empty where nothing does. It reads values; forward does not.
+
+        A d next to its floor; more than 1 % of the errors beyond a given bound; σ or d that no optimizer has.
+
+        Args:
+            input, target, weight: as in :meth:`forward`; None for the most recent residuals, where the loss has them.
+            optimizer: the optimizer of the training; None leaves this check out.
+
+        Example:
+            >>> loss, net = MKCLoss(1), torch.nn.Linear(3, 1)
+            >>> [text[:44] for text in loss.check(optimizer=torch.optim.Adam(net.parameters()))]
+            ['The optimizer does not have sigma and d of t']
+        """
+        return what_goes_wrong(self, input, target, weight, optimizer)
+
+    def tails(
+        self,
+        input: Float[Tensor, "*shape"] | None = None,
+        target: Float[Tensor, "*shape"] | None = None,
+        weight: Float[Tensor, "*shape"] | Bool[Tensor, "*shape"] | None = None,
+    ) -> Tails:
+        """Whether the errors have heavier tails than a Gaussian, and how many of them are expected beyond three d.
+
+        σ alone does not say it: it is finite for about half of all Gaussian samples.
+
+        Args:
+            input, target, weight: as in :meth:`forward`; None for the most recent residuals, where the loss has them.
+
+        Returns:
+            A :class:`mkc_torch.density.Tails`, at the loss's bound; ``print`` shows a line for each channel.
+
+        Raises:
+            ValueError: no residuals: nothing was given and the loss keeps none, or has seen none.
+
+        Example:
+            >>> loss = MKCLoss(1)
+            >>> x = torch.randn(400, 1, generator=torch.Generator().manual_seed(1))
+            >>> _ = loss(x, torch.zeros(400, 1))
+            >>> print(loss.tails())
+            Gaussian
+        """
+        return tails_of(self, input, target, weight)
+
+    def _tensors(self, batch: Batch) -> list[Tensor]:
         given = (batch.input, batch.target, batch.weight, self.raw_kappa, self.raw_d)
         return [one for one in given if one is not None]
 
@@ -501,10 +305,9 @@ class MKCLoss(ChannelCurves, nn.Module):
         scale, schedule = self._running()
         if scale is None or not self.training:
             return False
-        if not torch.compiler.is_compiling():
-            # transforms of functions have no state; activation checkpointing calls a second time, in the backward pass
-            if any(is_transformed(one) for one in batch[:3] if isinstance(one, Tensor)) or in_backward():
-                return False
+        # transforms of functions have no state; activation checkpointing calls a second time, in the backward pass
+        if not torch.compiler.is_compiling() and (in_backward() or any(map(is_transformed, self._tensors(batch)))):
+            return False
         scale.update(batch.input, batch.target, batch.weight, batch.axis)
         if schedule is not None:
             schedule.update(scale)
@@ -535,21 +338,20 @@ class MKCLoss(ChannelCurves, nn.Module):
         if self._follows:
             d, bound = f"auto: {d}", bound if self.fixed_bound is not None else f"auto: {bound}"
         return (
-            f"MKCLoss({self.num_channels}, sigma={sigma}, d={d}, bound={bound}, objective={self.objective!r}, learns={learned}, "
-            f"normalize={self.normalize}, channel_dim={self.channel_dim}, reduction={self.reduction!r})"
+            f"MKCLoss({self.num_channels}, sigma={sigma}, d={d}, bound={bound}, objective={self.objective!r}, "
+            f"learns={learned}, normalize={self.normalize}, channel_dim={self.channel_dim}, "
+            f"reduction={self.reduction!r})"
         )
 
 
-_SEVERAL_CALLS = "An optimiser that calls the loss several times a step, such as L-BFGS, needs loss.freeze_scale() first"
+_SEVERAL_CALLS = (
+    "An optimiser that calls the loss several times a step, such as L-BFGS, needs loss.freeze_scale() first"
+)
 
 
 @functools.cache
 def _compiled() -> Callable[..., Tensor]:
     return torch.compile(MKCLoss._computed)
-
-
-def _is_auto(value: object) -> bool:
-    return isinstance(value, str) and value == "auto"
 
 
 def checked_loss(loss: nn.Module) -> MKCLoss:

@@ -69,8 +69,8 @@ class ResidualScale(nn.Module):
 
     Attributes:
         recent: the latest residuals, the predictions that they belong to and their weights, (3, m, L).
-        position: index in the last dimension of ``recent`` that the next residual takes; the same for all channels, which
-            a kernel counts one by one, (m,).
+        position: index in the last dimension of ``recent`` that the next residual takes; equal for all channels, (m,),
+            because a kernel has one program a channel.
         batches: how many batches had a residual that counts, (m,).
         log_scale: logarithm of the scale in the unit of the target, (m,).
         half_range: half the range of the residuals, (m,).
@@ -130,7 +130,7 @@ class ResidualScale(nn.Module):
         if len(self.log_scale) <= SMALL_STATE and numpy_may_read(self.log_scale, *rows):
             recent, state = self.recent.numpy(), ScaleState(*(value.numpy() for value in self._state()))
             with np.errstate(over="ignore", invalid="ignore"):
-                batch = rows_of_batch(np, recent.dtype, _arrays(rows), _arrays(spread))
+                batch = rows_of_batch(np, recent.dtype, _arrays(rows), None if spread is None else _arrays(spread))
                 _insert_in_numpy(recent, self.position, batch.rows)
                 state = updated(np, recent, state, batch)
             state = ScaleState(*(torch.from_numpy(value) for value in state))
@@ -161,9 +161,7 @@ class ResidualScale(nn.Module):
     @torch.no_grad()
     def with_batch(self, prediction: Tensor, target: Tensor, weight: Tensor | None, channel_dim: int) -> ScaleState:
         """The state, or of a channel that has had no batch what it would be after this one. Changes nothing."""
-        batch = rows_of_batch(
-            torch, self.recent.dtype, *self._sampled(prediction, target, weight, channel_dim)
-        )
+        batch = rows_of_batch(torch, self.recent.dtype, *self._sampled(prediction, target, weight, channel_dim))
         state, known = self._state(), self.batches > 0
         new = updated(torch, batch.rows, state, batch)
         return ScaleState(*(torch.where(known, old, value) for old, value in zip(state, new, strict=True)))
@@ -212,8 +210,8 @@ def _residuals(xp: Any, dtype: Any, prediction: Any, target: Any, weight: Any = 
     return xp.where(counts, residual, 0.0), xp.where(counts, prediction, 0.0), weight
 
 
-def _arrays(values: Sequence[Tensor] | None) -> list[Any] | None:
-    return None if values is None else [one.numpy() for one in values]
+def _arrays(values: Sequence[Tensor]) -> list[Any]:
+    return [one.numpy() for one in values]
 
 
 def _cast(xp: Any, values: Any, dtype: Any) -> Any:

@@ -1,6 +1,6 @@
 """One command for whoever has a device: agreement, time, memory, capture.
 
-    python -m tests.device [--device cuda] [--only agreement steps ...]
+python -m tests.device [--device cuda] [--only agreement steps ...]
 """
 
 from __future__ import annotations

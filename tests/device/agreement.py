@@ -89,7 +89,7 @@ def print_agreement(device: torch.device) -> bool:
     for dtype, tolerance in TOLERANCE.items():
         rows = [row for case, rows in zip(todo, answers, strict=True) if case[-1] == dtype for row in rows]
         text, off = max(rows, key=lambda row: row[1] if row[1] == row[1] else float("inf"))
-        print(f"  {str(dtype):16} greatest difference {off:.1e} of {tolerance:.0e} ({text})")
+        print(f"  {dtype!s:16} greatest difference {off:.1e} of {tolerance:.0e} ({text})")
         for text, off in rows:
             if not off <= tolerance:
                 print(f"    differs: {text}: {off:.2e}")

@@ -1,4 +1,4 @@
-"""Launching a Triton kernel without the search for its compiled form: on a small batch that search is most of the time."""
+"""Launching a Triton kernel without the search for its compiled form, which takes most of the time of a small batch."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ class CachedKernel:
     """A Triton kernel whose compiled forms are kept by all that they are compiled for.
 
     Triton compiles for the dtypes and the alignment of pointers, for numbers that are 1, multiples of 16 or beyond 32
-    bits, and for constants. All of them are in the key here. Pointers are handed over as numbers, which the launcher does
-    not look up.
+    bits, and for constants. All of them are in the key here. Pointers are passed as numbers, which need no look-up.
 
     Args:
         kernel: a function under ``triton.jit`` whose parameters are tensors, then numbers, then constants.

@@ -25,12 +25,12 @@ TABLE = (
     "floor",
     "log_bandwidth",
 )
-"""Rows of the table of numbers that a pass over a batch needs, (14, m): ChannelTable, then what ChannelState has more."""
+"""Rows of the table that a pass over a batch needs, (14, m): those of ChannelTable, then the rest of ChannelState."""
 
 
 @triton.jit
 def quantile(size, weight, LEVEL: tl.constexpr, WIDE: tl.constexpr):
-    """The least size up to which a share LEVEL of the weight lies, by bisection on the bits, which grow with the number."""
+    """The least size up to which a share LEVEL of the weight lies, by bisection on the bits of the number."""
     wanted = LEVEL * tl.sum(weight, 0)
     if WIDE:
         bits = size.to(tl.int64, bitcast=True)
@@ -135,7 +135,21 @@ def channel_kernel(
             index = first + tl.arange(0, RANGE_BLOCK)
             mask = index < range_rows
             value, _, counted = load_rows(
-                x, t, w, (index.to(tl.int64) * rows) // range_rows, mask, channel, inner, so, sc, sk, wo, wc, wk, HAS_WEIGHT, like
+                x,
+                t,
+                w,
+                (index.to(tl.int64) * rows) // range_rows,
+                mask,
+                channel,
+                inner,
+                so,
+                sc,
+                sk,
+                wo,
+                wc,
+                wk,
+                HAS_WEIGHT,
+                like,
             )
             low = tl.where(counted > 0, tl.minimum(low, value), low)
             high = tl.where(counted > 0, tl.maximum(high, value), high)

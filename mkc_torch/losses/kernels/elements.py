@@ -188,7 +188,7 @@ def walk_by_kappa(
     LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr,
     WRITE_VALUES: tl.constexpr, WRITE_SLOPES: tl.constexpr, SUMS: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """:func:`walk` with the derivative by kappa in the way that keeps its digits: a third of the arithmetic is its own."""
+    """:func:`walk` with the derivative by kappa of each element, a third of the arithmetic, only where kappa is small."""
     if LEARN_KAPPA and SUMS and not WIDE:
         if least_kappa >= 0.1:
             sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(
@@ -303,8 +303,8 @@ def elements_kernel(
             elif HAS_WEIGHT:
                 each_weight = tl.load(weights + channel_out, mask=known_out, other=0.0).to(like)
             part_of_value = finish(
-                total_network, total_energy, total_kappa, total_d, each_weight, table, channel_out, known_out, m, divisor,
-                LEARN_KAPPA, LEARN_D, NORMALIZE, by_kappa, by_d,
+                total_network, total_energy, total_kappa, total_d, each_weight, table, channel_out, known_out, m,
+                divisor, LEARN_KAPPA, LEARN_D, NORMALIZE, by_kappa, by_d,
             )  # fmt: skip
             tl.store(value, tl.sum(tl.where(known_out, part_of_value, 0.0), 0))
         else:

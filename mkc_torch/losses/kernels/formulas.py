@@ -108,6 +108,8 @@ def log_partition(kappa, length, rule, NODES: tl.constexpr):
     share = end * weights
     tail_slope = tail / (safe * safe)
     z = 2.0 * length * tail + tl.sum(share * (density - tail), 0)
-    by_kappa = 2.0 * length * tail_slope + tl.sum(share * (-energy_by_kappa(minus_x, inlier, half, inverse, True) * density - tail_slope), 0)
+    by_kappa = 2.0 * length * tail_slope + tl.sum(
+        share * (-energy_by_kappa(minus_x, inlier, half, inverse, True) * density - tail_slope), 0
+    )
     at_end, _, _, _, _ = energy(length, kappa, inverse, True)
     return tl.log(z), by_kappa / z, 2.0 * tl.exp(-at_end) / z

@@ -127,9 +127,7 @@ def arranged(input: Tensor, target: Tensor, weight: Tensor | None, axis: int) ->
     if weight is not None:
         weight = _view(weight.expand(shape), axis, (outer, m, inner))
         strides_of_weight = weight.stride()  # type: ignore[assignment]
-    return Arranged(
-        input, target, weight, axis, (outer, m, inner), (m * inner, inner, 1), strides_of_weight
-    )
+    return Arranged(input, target, weight, axis, (outer, m, inner), (m * inner, inner, 1), strides_of_weight)
 
 
 def _view(values: Tensor, axis: int, size: tuple[int, int, int]) -> Tensor:
@@ -305,14 +303,14 @@ def pass_over(
     if partial is None or value is None:
         return value
     block_col = min(_power(m), MOST_COLUMNS)
-    tensors = (partial, table, weights, total_weight, value, by_kappa, by_d)
+    sums_of = (partial, table, weights, total_weight, value, by_kappa, by_d)
     _FINISH.launch(
         (len(value), 1, 1),
-        [table if one is None else one for one in tensors],
+        [table if one is None else one for one in sums_of],
         (m, tiles.programs, outer * inner, count),
         (
-            min(_power(tiles.programs), max(FINISHED // block_col, 1)), block_col, batch.weight is not None, options.mean,
-            options.robust, *learns, options.normalize, each, dtype == torch.float64,
+            min(_power(tiles.programs), max(FINISHED // block_col, 1)), block_col, batch.weight is not None,
+            options.mean, options.robust, *learns, options.normalize, each, dtype == torch.float64,
         ),
         WARPS,
     )  # fmt: skip
@@ -344,7 +342,15 @@ def reduce_batch(
     by_kappa = table.new_empty(m) if options.learn_kappa else None
     by_d = table.new_empty(m) if options.learn_d else None
     value = pass_over(
-        batch, table, options, weights=weights, total_weight=total, slopes=slopes, by_kappa=by_kappa, by_d=by_d, sums=True
+        batch,
+        table,
+        options,
+        weights=weights,
+        total_weight=total,
+        slopes=slopes,
+        by_kappa=by_kappa,
+        by_d=by_d,
+        sums=True,
     )
     assert value is not None
     return value.view(()), slopes, by_kappa, by_d
@@ -361,4 +367,3 @@ def weight_sums(batch: Arranged, dtype: torch.dtype) -> tuple[Tensor | None, Ten
 def kernels_are_interpreted() -> bool:
     """Whether Triton's interpreter runs the kernels, as on a machine without a GPU."""
     return _ELEMENTS.is_interpreted
-

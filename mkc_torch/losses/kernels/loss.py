@@ -1,8 +1,8 @@
-"""What :class:`mkc_torch.MKCLoss` computes by kernels: two launches forward where the scale is followed, one backward."""
+"""What :class:`mkc_torch.MKCLoss` computes by kernels: two or three launches forward, one backward."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,20 +25,14 @@ from mkc_torch.losses.kernels.launch import (
 )
 from mkc_torch.losses.residual_scale import ScaleState, alike_in_all_processes, average_over_processes, is_distributed
 
-if TYPE_CHECKING:
-    from mkc_torch.losses.mkc import MKCLoss
-
 __all__ = ["kernel_loss"]
 
 
 class Work(NamedTuple):
-    """One forward pass: the batch as it was given and as it is viewed, the numbers of each channel, and the loss's own."""
+    """What one forward pass leaves for the backward pass beside the saved tensors."""
 
-    input: Tensor
-    target: Tensor
     weight: Tensor | None
     axis: int
-    batch: Arranged
     table: Tensor
     options: Options
     fixed_kappa: Tensor | None
@@ -57,11 +51,11 @@ class Work(NamedTuple):
             rows["share"] if robust else None,
         )
         reduction: Any = self.reduction
-        return Settings(
-            self.fixed_kappa, self.fixed_d, state, self.options.follows, self.options.normalize, reduction
-        )
+        return Settings(self.fixed_kappa, self.fixed_d, state, self.options.follows, self.options.normalize, reduction)
 
-    def value_by_formulas(self, input: Tensor, target: Tensor, raw_kappa: Tensor | None, raw_d: Tensor | None) -> Tensor:
+    def value_by_formulas(
+        self, input: Tensor, target: Tensor, raw_kappa: Tensor | None, raw_d: Tensor | None
+    ) -> Tensor:
         """The loss as a differentiable function of its inputs, at the state of this forward pass."""
         dtype = self.table.dtype
         counts = None if self.weight is None else self.weight != 0
@@ -71,7 +65,7 @@ class Work(NamedTuple):
         )
 
 
-def kernel_loss(loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None) -> Tensor:
+def kernel_loss(loss: Any, input: Tensor, target: Tensor, weight: Tensor | None) -> Tensor:
     """The forward pass of a loss by kernels; by formulas under transforms, and where a weight wants a gradient."""
     axis = loss._checked_axis(input, target)
     own = loss._parameters  # attributes of modules take a microsecond each
@@ -88,13 +82,13 @@ def kernel_loss(loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | N
         from mkc_torch.losses.kernels.operators import operator_loss
 
         return operator_loss(loss, input, target, weight, axis)
-    work = prepared(loss, input, target, weight, axis)
+    batch, work = prepared(loss, input, target, weight, axis)
     function: Any = _Each if loss.reduction == "none" else _Reduced
-    value: Tensor = function.apply(input, target, raw_kappa, raw_d, work)
+    value: Tensor = function.apply(input, target, raw_kappa, raw_d, batch, work)
     return value
 
 
-def options_of(loss: MKCLoss) -> Options:
+def options_of(loss: Any) -> Options:
     """What a loss computes in its present mode."""
     scale, schedule = loss._running()
     robust = loss.training and schedule is not None
@@ -113,14 +107,14 @@ def options_of(loss: MKCLoss) -> Options:
 
 
 @torch.no_grad()
-def prepared(loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None, axis: int) -> Work:
+def prepared(loss: Any, input: Tensor, target: Tensor, weight: Tensor | None, axis: int) -> tuple[Arranged, Work]:
     """Update the running state in training, and make the table."""
     options, batch = options_of(loss), arranged(input.detach(), target.detach(), weight, axis)
     request = request_of(loss, input.device)
     table = updated_table(batch, request, options, updates=request.updates and not in_backward())
     buffers = loss._buffers
     fixed = (buffers.get("fixed_kappa"), buffers.get("fixed_d"))
-    return Work(input, target, weight, axis, batch, table, options, *fixed, loss.reduction)
+    return batch, Work(weight, axis, table, options, *fixed, loss.reduction)
 
 
 class Request(NamedTuple):
@@ -136,7 +130,7 @@ class Request(NamedTuple):
     anneal_step: float
 
 
-def request_of(loss: MKCLoss, device: torch.device) -> Request:
+def request_of(loss: Any, device: torch.device) -> Request:
     """The parameters and buffers of a loss."""
     scale, schedule = loss._running()
     parameters, buffers = loss._parameters, loss._buffers
@@ -147,12 +141,12 @@ def request_of(loss: MKCLoss, device: torch.device) -> Request:
     running, pace = Running(), (0, 0.0)
     if scale is not None:
         own = scale._buffers
-        if own["log_scale"].device != device:  # type: ignore[union-attr]
+        if own["log_scale"].device != device:
             scale.to(device)  # a guide is no part of the loss, and is not moved with it
         running = Running(*(own[name] for name in Running._fields[:6]))
         if schedule is not None:
             others = schedule._buffers
-            if others["share"].device != device:  # type: ignore[union-attr]
+            if others["share"].device != device:
                 schedule.to(device)
             running = Running(*running[:6], *(others[name] for name in Running._fields[6:]))
             pace = (schedule.warmup_steps, schedule.anneal_step)
@@ -175,64 +169,76 @@ def updated_table(batch: Arranged, request: Request, options: Options, *, update
         own.copy_(joined)
     if scheduled:
         make_table(batch, running, *numbers, options, schedule=True, table=False, pace=pace)
-        own_schedule = [running.log_bandwidth, running.share]
-        for own, mean in zip(own_schedule, average_over_processes(own_schedule), strict=True):  # type: ignore[arg-type]
-            own.copy_(mean)  # type: ignore[union-attr]
+        own_schedule = [one for one in (running.log_bandwidth, running.share) if one is not None]
+        for own, mean in zip(own_schedule, average_over_processes(own_schedule), strict=True):
+            own.copy_(mean)
     return make_table(batch, running, *numbers, options, pace=pace)
 
 
 class _Reduced(torch.autograd.Function):
-    """A sum or mean. float32 and bfloat16 make the gradient by the input in the forward pass; float16, which a mean over
-    many elements underflows before a gradient scaler multiplies, makes it in the backward pass."""
+    """A sum or mean.
+
+    The forward pass makes the gradient by the input, but not of float16: there 1 over the number of elements underflows
+    before a gradient scaler multiplies, so the backward pass makes it.
+    """
 
     @staticmethod
-    def forward(ctx: Any, input: Tensor, target: Tensor, raw_kappa: Any, raw_d: Any, work: Work) -> Tensor:
+    def forward(
+        ctx: Any, input: Tensor, target: Tensor, raw_kappa: Any, raw_d: Any, batch: Arranged, work: Work
+    ) -> Tensor:
         wants = ctx.needs_input_grad
         ctx.stores = (wants[0] or wants[1]) and input.dtype != torch.float16
-        value, *ctx.found = reduce_batch(work.batch, work.table, work.options, wants_input=ctx.stores)
+        value, *ctx.found = reduce_batch(batch, work.table, work.options, wants_input=ctx.stores)
         ctx.save_for_backward(input, target, raw_kappa, raw_d)
-        ctx.work = work._replace(input=None, target=None)
+        ctx.work = work
         return value
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
-            return (*_by_formulas(ctx, grad), None)
+            return (*_by_formulas(ctx, grad), None, None)
         found, ctx.found = ctx.found, None
-        work: Work = ctx.work
+        work, wants = ctx.work, ctx.needs_input_grad
         if found is None:  # a second backward pass of one graph
-            found = reduce_batch(work.batch, work.table, work.options, wants_input=ctx.stores)[1:]
+            found = reduce_batch(_again(ctx), work.table, work.options, wants_input=ctx.stores)[1:]
         slopes, by_kappa, by_d = found
         rescale(slopes, by_kappa, by_d, grad)
-        wants = ctx.needs_input_grad
         if slopes is None and (wants[0] or wants[1]):
-            slopes = torch.empty_like(work.batch.input)
-            weights, total = weight_sums(work.batch, work.table.dtype)
+            batch = _again(ctx)
+            slopes = torch.empty_like(batch.input)
+            weights, total = weight_sums(batch, work.table.dtype)
             pass_over(
-                work.batch, work.table, work.options, weights=weights, total_weight=total, upstream=grad,
-                slopes=slopes,
-            )  # fmt: skip
-        return (*_handed_out(ctx, slopes), by_kappa, by_d, None)
+                batch, work.table, work.options, weights=weights, total_weight=total, upstream=grad, slopes=slopes
+            )
+        return (*_handed_out(ctx, slopes), by_kappa, by_d, None, None)
 
 
 class _Each(torch.autograd.Function):
     """Each element's loss. The gradients are made in the backward pass, which has to read the upstream gradient."""
 
     @staticmethod
-    def forward(ctx: Any, input: Tensor, target: Tensor, raw_kappa: Any, raw_d: Any, work: Work) -> Tensor:
+    def forward(
+        ctx: Any, input: Tensor, target: Tensor, raw_kappa: Any, raw_d: Any, batch: Arranged, work: Work
+    ) -> Tensor:
         ctx.save_for_backward(input, target, raw_kappa, raw_d)
-        ctx.work = work._replace(input=None, target=None)
-        values = torch.empty_like(work.batch.input, dtype=work.table.dtype)
-        pass_over(work.batch, work.table, work.options, values=values)
+        ctx.work = work
+        values = torch.empty_like(batch.input, dtype=work.table.dtype)
+        pass_over(batch, work.table, work.options, values=values)
         return values
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
-            return (*_by_formulas(ctx, grad), None)
+            return (*_by_formulas(ctx, grad), None, None)
         work: Work = ctx.work
-        slopes, by_kappa, by_d = gradients_of_each(work.batch, work.table, work.options, grad)
-        return (*_handed_out(ctx, slopes), by_kappa, by_d, None)
+        slopes, by_kappa, by_d = gradients_of_each(_again(ctx), work.table, work.options, grad)
+        return (*_handed_out(ctx, slopes), by_kappa, by_d, None, None)
+
+
+def _again(ctx: Any) -> Arranged:
+    """The batch from what was saved: tensors that are not saved would not be freed with the graph."""
+    input, target, *_ = ctx.saved_tensors
+    return arranged(input.detach(), target.detach(), ctx.work.weight, ctx.work.axis)
 
 
 def gradients_of_each(
@@ -251,7 +257,7 @@ def gradients_of_each(
 
 def _handed_out(ctx: Any, slopes: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
     """The gradients by input and target, in their dtypes."""
-    input, target, *_ = ctx.saved_tensors
+    target = ctx.saved_tensors[1]
     wants = ctx.needs_input_grad
     by_target = -slopes.to(target.dtype) if wants[1] and slopes is not None else None
     return slopes if wants[0] else None, by_target

@@ -8,7 +8,7 @@ what is differentiated is another one, which changes nothing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,9 +23,6 @@ from mkc_torch.losses.kernels.launch import (
     weight_sums,
 )
 from mkc_torch.losses.kernels.loss import Request, gradients_of_each, options_of, request_of, updated_table
-
-if TYPE_CHECKING:
-    from mkc_torch.losses.mkc import MKCLoss
 
 __all__ = ["operator_loss"]
 
@@ -82,7 +79,8 @@ def reduced_loss(
     """Value, and gradients by the input, raw_kappa and raw_d; those that are not made are empty."""
     batch, stores = arranged(input, target, weight, axis), input.dtype != torch.float16
     value, *slopes = reduce_batch(batch, table, Options(*options), wants_input=stores)
-    return value, *(table.new_empty(0) if one is None else one for one in slopes)
+    by_input, by_kappa, by_d = (table.new_empty(0) if one is None else one for one in slopes)
+    return value, by_input, by_kappa, by_d
 
 
 @reduced_loss.register_fake
@@ -90,7 +88,9 @@ def _(
     input: Tensor, target: Tensor, weight: Any, axis: int, raw_kappa: Any, raw_d: Any, table: Tensor, options: Any
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     slopes = table.new_empty(0) if input.dtype == torch.float16 else _like(input, axis)
-    return table.new_empty(()), slopes, *(table.new_empty(0) if one is None else torch.empty_like(table[0]) for one in (raw_kappa, raw_d))
+    empty = table.new_empty
+    by_kappa, by_d = (empty(0) if one is None else torch.empty_like(table[0]) for one in (raw_kappa, raw_d))
+    return empty(()), slopes, by_kappa, by_d
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
@@ -100,7 +100,9 @@ def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> Non
     ctx.wanted = (raw_kappa is not None, raw_d is not None)
     half = input.dtype == torch.float16
     ctx.target_dtype = target.dtype
-    ctx.save_for_backward(*((input, target, weight, table) if half else (None, None, None, None)), slopes, by_kappa, by_d)
+    ctx.save_for_backward(
+        *((input, target, weight, table) if half else (None, None, None, None)), slopes, by_kappa, by_d
+    )
     ctx.set_materialize_grads(False)
 
 
@@ -122,7 +124,13 @@ reduced_loss.register_autograd(_backward, setup_context=_setup)
 
 @torch.library.custom_op("mkc_torch::slopes", mutates_args=())
 def slopes(
-    input: Tensor, target: Tensor, weight: Tensor | None, axis: int, table: Tensor, grad: Tensor, options: Sequence[bool]
+    input: Tensor,
+    target: Tensor,
+    weight: Tensor | None,
+    axis: int,
+    table: Tensor,
+    grad: Tensor,
+    options: Sequence[bool],
 ) -> Tensor:
     """The gradient by the input of a reduced loss, times the upstream gradient before it is rounded."""
     batch = arranged(input, target, weight, axis)
@@ -167,12 +175,18 @@ def _(
 
 @torch.library.custom_op("mkc_torch::each_gradients", mutates_args=())
 def each_gradients(
-    input: Tensor, target: Tensor, weight: Tensor | None, axis: int, table: Tensor, grad: Tensor, options: Sequence[bool]
+    input: Tensor,
+    target: Tensor,
+    weight: Tensor | None,
+    axis: int,
+    table: Tensor,
+    grad: Tensor,
+    options: Sequence[bool],
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gradients by the input, raw_kappa and raw_d of elements each with its own upstream gradient."""
     found = gradients_of_each(arranged(input, target, weight, axis), table, Options(*options), grad)
-    first, *others = (table.new_empty(0) if one is None else one for one in found)
-    return first, *others
+    by_input, by_kappa, by_d = (table.new_empty(0) if one is None else one for one in found)
+    return by_input, by_kappa, by_d
 
 
 @each_gradients.register_fake
@@ -180,11 +194,13 @@ def _(
     input: Tensor, target: Tensor, weight: Any, axis: int, table: Tensor, grad: Tensor, options: Sequence[bool]
 ) -> tuple[Tensor, Tensor, Tensor]:
     own = Options(*options)
-    by_raw = (torch.empty_like(table[0]) if learned else table.new_empty(0) for learned in (own.learn_kappa, own.learn_d))
-    return _like(input, axis), *by_raw
+    by_kappa, by_d = (
+        torch.empty_like(table[0]) if learned else table.new_empty(0) for learned in (own.learn_kappa, own.learn_d)
+    )
+    return _like(input, axis), by_kappa, by_d
 
 
-def _each_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:  # noqa: ARG001
+def _each_setup(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
     input, target, weight, ctx.axis, raw_kappa, raw_d, table, ctx.options = inputs
     ctx.wanted, ctx.target_dtype = (raw_kappa is not None, raw_d is not None), target.dtype
     ctx.save_for_backward(input, target, weight, table)
@@ -211,7 +227,7 @@ def _like(input: Tensor, axis: int, dtype: torch.dtype | None = None) -> Tensor:
     return torch.empty_like(input if dense else input.contiguous(), dtype=dtype)
 
 
-def operator_loss(loss: MKCLoss, input: Tensor, target: Tensor, weight: Tensor | None, axis: int) -> Tensor:
+def operator_loss(loss: Any, input: Tensor, target: Tensor, weight: Tensor | None, axis: int) -> Tensor:
     """The forward pass of a loss through the operators."""
     request, options = request_of(loss, input.device), list(options_of(loss))
     given = (input.detach(), target.detach(), weight, axis)

@@ -10,35 +10,38 @@ from mkc_torch.losses.kernels.formulas import energy, energy_by_kappa
 
 __all__ = ["rescale_samples_kernel", "samples_kernel"]
 
-_DEGREE, _INTERVALS, _RATE = tl.constexpr(DEGREE), tl.constexpr(INTERVALS), tl.constexpr(RATE)
-
 
 @triton.jit
-def head_by_table(kappa, table):
+def head_by_table(
+    kappa, table, DEGREE: tl.constexpr = DEGREE, INTERVALS: tl.constexpr = INTERVALS, RATE: tl.constexpr = RATE
+):  # fmt: skip
     """Integral over the head and its derivative by kappa, in float32: mkc_torch.density.head_table has the table."""
-    place = tl.rsqrt(1.0 + _RATE * kappa)
-    position = place * _INTERVALS
-    index = tl.minimum(tl.maximum(position, 0.0), _INTERVALS - 1.0).to(tl.int32)
+    place = tl.rsqrt(1.0 + RATE * kappa)
+    position = place * INTERVALS
+    index = tl.minimum(tl.maximum(position, 0.0), INTERVALS - 1.0).to(tl.int32)
     t = position - index.to(tl.float32) - 0.5
-    value = tl.load(table + _DEGREE * _INTERVALS + index)
+    value = tl.load(table + DEGREE * INTERVALS + index)
     slope = tl.zeros_like(value)
-    for power in tl.static_range(_DEGREE - 1, -1, -1):
+    for power in tl.static_range(DEGREE - 1, -1, -1):
         slope = slope * t + value
-        value = value * t + tl.load(table + power * _INTERVALS + index)
-    return value, slope * (place * place * place) * (-0.5 * _RATE * _INTERVALS)
+        value = value * t + tl.load(table + power * INTERVALS + index)
+    return value, slope * (place * place * place) * (-0.5 * RATE * INTERVALS)
 
 
 @triton.jit
-def head_by_quadrature(kappa, inverse_kappa, tail, tail_slope, length, reach, rule, NODES: tl.constexpr, WIDE: tl.constexpr):  # fmt: skip
-    """Integral over the head, its derivative by kappa, and what is left of it less ``length`` times that by the length."""
+def head_by_quadrature(
+    kappa, inverse_kappa, tail, tail_slope, length, reach, rule, NODES: tl.constexpr, WIDE: tl.constexpr
+):  # fmt: skip
+    """Integral over the head, its derivative by kappa, and it less ``length`` times its derivative by that."""
     end = tl.minimum(length, reach)
     integral, by_kappa = tl.zeros_like(kappa), tl.zeros_like(kappa)
     for node in range(NODES):
         u, share = end * tl.load(rule + node), end * tl.load(rule + NODES + node)
         value, _, minus_x, inlier, half = energy(u, kappa, inverse_kappa, WIDE)
         density = tl.exp(-value)
-        integral += share * (density - tail)
-        by_kappa -= share * (energy_by_kappa(minus_x, inlier, half, inverse_kappa, WIDE) * density + tail_slope)
+        integral += share * density
+        by_kappa -= share * (energy_by_kappa(minus_x, inlier, half, inverse_kappa, WIDE) * density)
+    integral, by_kappa = integral - 2.0 * end * tail, by_kappa - 2.0 * end * tail_slope
     at_end, _, _, _, _ = energy(length, kappa, inverse_kappa, WIDE)
     return integral, by_kappa, integral - 2.0 * length * (tl.exp(-at_end) - tail)
 

@@ -1,0 +1,90 @@
+"""What a trained loss says of its training and of the noise: a check of what goes wrong, and the test of its tails."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from mkc_torch.density.tails import Tails, assess_tails
+from mkc_torch.losses._checks import checked_weight, shortly
+
+__all__ = ["tails_of", "what_goes_wrong"]
+
+NEAR_FLOOR = 2.0
+"""Times the floor below which a scale counts as collapsed."""
+
+MOST_BEYOND = 0.01
+"""Share of the errors beyond a given bound that is mentioned."""
+
+
+@torch.no_grad()
+def what_goes_wrong(
+    loss: Any, input: Tensor | None, target: Tensor | None, weight: Tensor | None, optimizer: Optimizer | None
+) -> tuple[str, ...]:
+    """Sentences for :meth:`mkc_torch.MKCLoss.check`."""
+    found = []
+    d, d_min, bound = loss.d.detach(), loss.d_min, loss.bound
+    low = [int(k) for k in (d < NEAR_FLOOR * d_min).nonzero().flatten()] if loss.raw_d is not None else []
+    if low:
+        found.append(
+            f"The scale d of channel {_listed(low)} is {shortly(d[low])}, next to its floor {shortly(d_min[low])}. The "
+            "network may fit every point, noise included, and the likelihood grows without limit as d -> 0: watch a "
+            "validation set, regularise, or raise `d_min` to the precision of the targets."
+        )
+    if loss._bound_was_given and (input is not None or loss.residual_scale is not None):
+        residual, share = _residuals(loss, input, target, weight)
+        beyond = (share * (residual.abs() > bound)).sum(0) / share.sum(0).clamp(min=torch.finfo(share.dtype).tiny)
+        far = [int(k) for k in (beyond > MOST_BEYOND).nonzero().flatten()]
+        if far:
+            shares = ", ".join(f"{100.0 * float(beyond[k]):.2g} %" for k in far)
+            found.append(
+                f"{shares} of the errors of channel {_listed(far)} lie beyond the bound {shortly(bound[far])}: the "
+                "likelihood does not allow them. Give the largest possible error as `bound`, in the unit of the "
+                "targets, or leave `d` and `bound` out: they are then taken from the residuals."
+            )
+    learned = [name for name in ("raw_kappa", "raw_d") if getattr(loss, name) is not None]
+    if optimizer is not None and learned:
+        optimised = {id(p) for group in optimizer.param_groups for p in group["params"]}
+        missing = [name for name in learned if id(getattr(loss, name)) not in optimised]
+        if missing:
+            names = " and ".join({"raw_kappa": "sigma", "raw_d": "d"}[name] for name in missing)
+            found.append(
+                f"The optimizer does not have {names} of the loss. Add `*loss.param_groups()` to its parameter groups, "
+                "or make the loss with `learn_sigma=False, learn_d=False`."
+            )
+    return tuple(found)
+
+
+def tails_of(loss: Any, input: Tensor | None, target: Tensor | None, weight: Tensor | None) -> Tails:
+    """The test for :meth:`mkc_torch.MKCLoss.tails`."""
+    residual, share = _residuals(loss, input, target, weight)
+    if not bool((share.sum(0) > 0).all()):
+        raise ValueError(
+            "Expected residuals of every channel but got none; call the loss in training first, or pass `input` and "
+            "`target`."
+        )
+    return assess_tails(residual, share, bound=loss.bound.to(residual))
+
+
+def _residuals(loss: Any, input: Tensor | None, target: Tensor | None, weight: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Residuals and weights (N, m), of what was given or of the most recent batches."""
+    if input is None or target is None:
+        if loss.residual_scale is None:
+            raise ValueError(
+                "Expected arguments `input` and `target` but got None: a loss with a given `d` keeps no residuals; "
+                "pass predictions and targets, of a validation set say."
+            )
+        recent = loss.residual_scale.recent
+        return recent[0].T, recent[2].T
+    batch = loss._batch(input.detach(), target.detach(), weight)
+    shares = torch.ones_like(batch.input) if weight is None else checked_weight(weight, batch.input, batch.axis)[0]
+    rows = (one.movedim(batch.axis, -1).reshape(-1, loss.num_channels) for one in (batch.error(), shares))
+    residual, share = rows
+    return residual, share
+
+
+def _listed(channels: list[int]) -> str:
+    return ", ".join(map(str, channels))

@@ -1,0 +1,22 @@
+"""The kernels on a GPU where there is one, and under Triton's interpreter elsewhere."""
+
+import os
+
+import pytest
+import torch
+
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # read where a kernel is defined
+
+
+@pytest.fixture(scope="session")
+def device():
+    """A device that runs the kernels."""
+    pytest.importorskip("triton")
+    if torch.cuda.is_available():
+        return torch.device("cuda")
+    from mkc_torch.losses.kernels.launch import kernels_are_interpreted
+
+    if not kernels_are_interpreted():
+        pytest.skip("the kernels were imported before TRITON_INTERPRET=1 was set")
+    return torch.device("cpu")

@@ -1,0 +1,297 @@
+"""The kernel of the heteroscedastic loss against the formulas in float64."""
+
+import math
+
+import pytest
+import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from mkc_torch import HeteroscedasticMKCLoss
+from mkc_torch.density.head_table import look_up, reaches_beyond_head
+from mkc_torch.density.normalizer import log_partition
+
+INF, NAN = math.inf, math.nan
+TOLERANCE = {torch.float64: 1e-11, torch.float32: 1e-6, torch.bfloat16: 2e-2, torch.float16: 2e-3}
+"""Difference over the greatest number; half precision rounds the gradients twice, and the interpreter cuts them off."""
+compiler = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
+
+
+def uniform(low, high, *shape, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return low + (high - low) * torch.rand(*shape, dtype=torch.float64, generator=generator)
+
+
+def data(*shape, dtype=torch.float64, most_d=4.0):
+    """Input, target, sigma and d."""
+    ranges = ((-6, 6), (-6, 6), (0.06, 6), (0.2, most_d))
+    return [uniform(a, b, *shape, seed=i).to(dtype) for i, (a, b) in enumerate(ranges)]
+
+
+def weights(kind, *shape):
+    found = uniform(-0.5, 1.0, *shape, seed=9).clamp(min=0)
+    return {"none": None, "weighted": found, "masked": found > 0.2}[kind]
+
+
+def differentiated(loss, tensors, weight, upstream=1.0):
+    """Value, and gradients by input, target, sigma and d."""
+    leaves = [one.clone().requires_grad_() for one in tensors]
+    value = loss(*leaves, weight)
+    grad = torch.full_like(value, upstream) if isinstance(upstream, float) else upstream.to(value)
+    return [one.detach().cpu().double() for one in (value, *torch.autograd.grad(value, leaves, grad))]
+
+
+def assert_agrees(device, tensors, weight=None, bound=30.0, upstream=1.0, **options):
+    """The kernel on tensors as they are against the formulas on them in float64."""
+    dtype = torch.promote_types(tensors[0].dtype, torch.float32)
+    found = differentiated(
+        HeteroscedasticMKCLoss(torch.as_tensor(bound, dtype=dtype), impl="triton", **options).to(device),
+        [one.to(device) for one in tensors],
+        None if weight is None else weight.to(device),
+        upstream,
+    )
+    expected = differentiated(
+        HeteroscedasticMKCLoss(torch.as_tensor(bound, dtype=torch.float64), impl="eager", **options),
+        [one.double() for one in tensors],
+        weight,
+        upstream,
+    )
+    tolerance = TOLERANCE[tensors[0].dtype]
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=0.0, atol=tolerance * float(other.abs().max()))
+
+
+@pytest.mark.parametrize("dtype", TOLERANCE)
+@pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
+@pytest.mark.parametrize("weighted", ["none", "weighted", "masked"])
+def test_value_and_gradients_are_those_of_the_formulas(device, dtype, reduction, weighted):
+    shape, upstream = (50, 3), 1700.0 if dtype == torch.float16 else 1.7
+    assert_agrees(device, data(*shape, dtype=dtype), weights(weighted, *shape), reduction=reduction, upstream=upstream)
+
+
+@pytest.mark.parametrize(("bound", "most_d"), [(100.0, 4.0), (4.5, 4.0), (1e6, 0.3)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_domain_may_end_on_the_head_or_far_beyond(device, bound, most_d, dtype):
+    tensors = data(1500, 1, dtype=dtype, most_d=most_d)
+    tensors[2] = torch.exp(uniform(math.log(0.05), math.log(1000.0), 1500, 1, seed=2)).to(dtype)
+    assert_agrees(device, tensors, bound=bound)
+
+
+@pytest.mark.parametrize(("shape", "channel_dim"), [((7, 3), -1), ((2, 3, 4, 5), 1), ((3, 400), 0)])
+@pytest.mark.parametrize("reduction", ["none", "mean"])
+def test_bounds_of_channels(device, shape, channel_dim, reduction):
+    bound = torch.tensor([9.0, 40.0, 90.0])
+    tensors = data(*shape, dtype=torch.float32)
+    assert_agrees(device, tensors, bound=bound, channel_dim=channel_dim, reduction=reduction)
+    last = [one.movedim(channel_dim, -1).contiguous().movedim(-1, channel_dim) for one in tensors]
+    mixed = [last[0], tensors[1], last[2], tensors[3]]
+    weight = weights("weighted", *shape).select(channel_dim, 0)
+    assert_agrees(device, mixed, weight, bound=bound, channel_dim=channel_dim, reduction=reduction)
+
+
+def test_each_element_may_have_its_own_upstream_gradient_and_dtype(device):
+    x, y, sigma, d = data(40, 3, dtype=torch.bfloat16)
+    tensors = [x, y.float(), sigma.float(), d.float()]
+    upstream = uniform(-1.0, 1.0, 40, 3, seed=7)
+    for grad in (upstream, upstream[:, :1].expand(40, 3), upstream.T.contiguous().T):
+        assert_agrees(device, tensors, reduction="none", upstream=grad)
+
+
+def test_infinite_sigma_is_the_gaussian(device):
+    x, y, _, d = data(6, 3, dtype=torch.float32)
+    sigma = torch.full_like(x, INF)
+    assert_agrees(device, [x, y, sigma, d], bound=100.0)
+    assert_agrees(device, [x, y, sigma, d], bound=5.0)
+    found = differentiated(
+        HeteroscedasticMKCLoss(1e3, impl="triton").to(device), [t.to(device) for t in (x, y, sigma, d)], None
+    )
+    assert (found[3] == 0).all()
+
+
+@pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
+@pytest.mark.parametrize("poison", [NAN, -1.0])
+def test_what_is_masked_reaches_neither_value_nor_gradient(device, reduction, poison):
+    loss = HeteroscedasticMKCLoss(30.0, reduction=reduction, impl="triton").to(device)
+    mask = torch.ones(5, 3, dtype=torch.bool, device=device)
+    mask[1, 2] = mask[4, 0] = False
+    tensors = [one.to(device) for one in data(5, 3, dtype=torch.float32)]
+    expected = differentiated(loss, tensors, mask)
+    for one in tensors:
+        one[~mask] = poison
+    found = differentiated(loss, tensors, mask)
+    assert all(map(torch.equal, found, expected))
+    assert all((one[~mask.cpu()] == 0).all() for one in found[1:])
+    nothing = differentiated(loss, tensors, torch.zeros(5, device=device))
+    assert all((one == 0).all() for one in nothing)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # NumPy's, in the interpreter
+@pytest.mark.parametrize("which", range(4))
+def test_nan_comes_out_as_nan(device, which):
+    tensors = [one.to(device) for one in data(5, 3, dtype=torch.float32)]
+    tensors[which][2, 1] = NAN
+    value, *slopes = differentiated(
+        HeteroscedasticMKCLoss(100.0, reduction="none", impl="triton").to(device), tensors, None
+    )
+    for one in (value, *slopes):
+        assert one[2, 1].isnan()
+        assert one.isnan().sum() == 1
+
+
+@pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")  # NumPy's, in the interpreter
+@pytest.mark.parametrize("size", [60.0, 1e10, 1e30])
+@pytest.mark.parametrize("sigma", [0.05, 2.0, 1000.0, INF])
+def test_an_extreme_outlier_leaves_finite_gradients(device, size, sigma):
+    tensors = [torch.full((4, 2), v, device=device) for v in (0.0, 0.0, sigma, 0.1)]
+    tensors[1][1, 1] = size
+    value, *slopes = differentiated(HeteroscedasticMKCLoss(50.0, impl="triton").to(device), tensors, None)
+    if sigma < INF:
+        assert value.isfinite()
+        assert all(one.isfinite().all() for one in slopes)
+    assert slopes[2].isfinite().all()
+
+
+def test_two_backward_passes_of_one_graph_and_second_derivatives(device):
+    tensors = data(6, 2, dtype=torch.float64)
+    for reduction in ("mean", "none"):
+        results = []
+        for impl, where in (("triton", device), ("eager", torch.device("cpu"))):
+            loss = HeteroscedasticMKCLoss(30.0, reduction=reduction, impl=impl).double().to(where)
+            leaves = [one.to(where).requires_grad_() for one in tensors]
+            value = loss(*leaves)
+            first = torch.autograd.grad(3.0 * value.sum(), leaves, retain_graph=True)
+            kept = [one.clone() for one in first]
+            second = torch.autograd.grad(2.0 * value.sum(), leaves, retain_graph=True)
+            assert all(map(torch.equal, first, kept))
+            slopes = torch.autograd.grad(value.sum(), leaves, create_graph=True)
+            bends = torch.autograd.grad(sum((one**2).sum() for one in slopes), leaves)
+            results.append([one.cpu() for one in (*first, *second, *slopes, *bends)])
+        torch.testing.assert_close(*results, rtol=1e-9, atol=1e-11)
+
+
+def test_gradients_that_are_not_wanted_are_not_made(device):
+    loss = HeteroscedasticMKCLoss(30.0, impl="triton").to(device)
+    x, y, sigma, d = (one.to(device) for one in data(5, 3, dtype=torch.float32))
+    expected = differentiated(loss, [x, y, sigma, d], None)
+    d.requires_grad_()
+    (found,) = torch.autograd.grad(loss(x, y, sigma, d), d)
+    assert torch.equal(found.cpu().double(), expected[4])
+    y.requires_grad_()
+    (found,) = torch.autograd.grad(loss(x, y, sigma, d), y)
+    assert torch.equal(found.cpu().double(), expected[2])
+    with torch.no_grad():
+        assert loss(x, y, sigma, d).cpu().double() == expected[0]
+
+
+def test_shared_scales_transforms_and_differentiable_weights_take_the_formulas(device):
+    own, other = (HeteroscedasticMKCLoss(30.0, impl=impl).double().to(device) for impl in ("triton", "eager"))
+    x, y, sigma, d = (one.to(device) for one in data(5, 3))
+    assert torch.equal(own(x, y, sigma[:, :1], d), other(x, y, sigma[:, :1], d))
+    weight = torch.ones_like(x).requires_grad_()
+    found, expected = (torch.autograd.grad(loss(x, y, sigma, d, weight), weight) for loss in (own, other))
+    assert torch.equal(*found, *expected)
+    found, expected = (torch.func.grad(loss)(x, y, sigma, d) for loss in (own, other))
+    assert torch.equal(found, expected)
+
+
+# --- behind torch.library
+
+
+def operands(dtype, weighted, device):
+    tensors = [one.to(device).requires_grad_() for one in data(4, 3, dtype=dtype)]
+    weight = weights(weighted, 4, 3)
+    bound = torch.tensor([9.0, 40.0, 90.0], device=device)
+    return (*tensors, None if weight is None else weight.to(device), bound, 1)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
+@pytest.mark.parametrize("weighted", ["none", "weighted"])
+def test_operators_are_well_formed(device, dtype, weighted):
+    from mkc_torch.losses.kernels import sample_operators as operators
+
+    given = operands(dtype, weighted, device)
+    torch.library.opcheck(operators.sample_values, given)
+    torch.library.opcheck(operators.reduced_sample_loss, (*given, True, [True, True, True]))
+    grad = torch.tensor(2.0, device=device)
+    detached = [one.detach() if isinstance(one, torch.Tensor) else one for one in given]
+    torch.library.opcheck(operators.sample_slopes, (*detached, True, [True, False, True], grad))
+
+
+@compiler
+@pytest.mark.parametrize("reduction", ["mean", "none"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
+def test_compiled_is_eager(device, reduction, dtype):
+    torch.compiler.reset()
+    loss = HeteroscedasticMKCLoss(30.0, reduction=reduction, impl="triton").to(device)
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    tensors = [one.to(device) for one in data(20, 3, dtype=dtype)]
+    weight = weights("weighted", 20, 3).to(device)
+    upstream = 100.0 if dtype == torch.float16 else 1.7
+    for given in (None, weight):
+        found, expected = (differentiated(one, tensors, given, upstream) for one in (compiled, loss))
+        torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-7)
+
+
+@compiler
+def test_impl_compile_is_impl_eager(monkeypatch):
+    from mkc_torch.losses import heteroscedastic
+
+    torch.compiler.reset()
+    compiled = torch.compile(HeteroscedasticMKCLoss._computed, backend="aot_eager")
+    monkeypatch.setattr(heteroscedastic, "_compiled", lambda: compiled)
+    tensors = data(5, 3)
+    found, expected = (
+        differentiated(HeteroscedasticMKCLoss(30.0, impl=impl), tensors, None) for impl in ("compile", "eager")
+    )
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-12)
+
+
+def test_fake_cuda_tensors_go_through_the_operators():
+    pytest.importorskip("triton")
+    with FakeTensorMode():
+        loss = HeteroscedasticMKCLoss(30.0, impl="triton")
+        loss.bound = torch.ones((), device="cuda")
+        x, y, sigma, d = (torch.ones(4, 3, device="cuda") for _ in range(4))
+        assert loss(x, y, sigma, d).device.type == "cuda"
+        loss.reduction = "none"
+        assert loss(x, y, sigma.double(), d).dtype == torch.float64
+
+
+def test_an_unknown_implementation_is_refused():
+    with pytest.raises(ValueError, match="`impl` to be one of 'auto', 'eager', 'compile', 'triton' but got 'cuda'"):
+        HeteroscedasticMKCLoss(30.0, impl="cuda")
+
+
+# --- the table of the head, which the CPU has as well
+
+
+@pytest.mark.parametrize(("shortest", "longest", "rounding"), [(1.0, 15.0, 5e-6), (15.0, 1e7, 5e-7)])
+def test_many_normalisers_in_single_precision_are_those_of_double_precision(shortest, longest, rounding):
+    """Mostly by quadrature, where the tail cancels from the slope, and by the table alone."""
+    n = 5000
+    kappa = torch.cat(
+        [uniform(0.0, 1.0, n), uniform(0.0, 400.0, n), torch.exp(uniform(-14.0, 5.99, n)), torch.zeros(9)]
+    )
+    kappa = kappa.float()
+    length = torch.exp(uniform(math.log(shortest), math.log(longest), len(kappa), seed=1)).float()
+    found, expected = [], []
+    for results, dtype in ((found, torch.float32), (expected, torch.float64)):
+        k, reach = (one.to(dtype).requires_grad_() for one in (kappa, length))
+        value = log_partition(k, reach)
+        by_kappa, by_length = torch.autograd.grad(value.sum(), (k, reach))
+        results += [value.detach().double(), by_kappa.double(), (by_length * length).double()]
+    torch.testing.assert_close(found[0], expected[0], rtol=1e-7, atol=3e-7)
+    # exp(-1 / kappa) has the rounding error of kappa, times 1 / kappa
+    amplified = rounding + 2e-7 / kappa.double().clamp(min=0.03)
+    assert ((found[1] - expected[1]).abs() <= amplified * expected[1].abs()).all()
+    torch.testing.assert_close(found[2], expected[2], rtol=1e-6, atol=1e-6)
+
+
+def test_the_table_itself_has_more_digits_than_single_precision_rounds_away():
+    kappa = torch.cat([uniform(0.0, 0.5, 500), uniform(0.0, 400.0, 500)]).requires_grad_()
+    length = torch.full_like(kappa, 24.0)
+    assert reaches_beyond_head(kappa, length).all()
+    value = log_partition(kappa, length)
+    (by_kappa,) = torch.autograd.grad(value.sum(), kappa)
+    found, slope, _ = look_up(kappa.detach(), length)
+    torch.testing.assert_close(found, value.detach(), rtol=0.0, atol=5e-8)
+    torch.testing.assert_close(slope, by_kappa, rtol=1e-6, atol=0.0)
