@@ -13,6 +13,7 @@ from torch.utils.hooks import RemovableHandle
 
 from mkc_torch.density.energy import KAPPA_MAX
 from mkc_torch.lightning._pace import Guide, set_pace
+from mkc_torch.lightning.residual_histogram import ResidualHistogram
 from mkc_torch.losses.mkc import MKCLoss
 
 if TYPE_CHECKING:
@@ -43,6 +44,11 @@ class OwnedLoss:
         for parameter in learned:
             parameter.requires_grad_(False)
         return cls(name, loss, loss.register_forward_hook(hook, with_kwargs=True), learned)
+
+    def histogram(self) -> ResidualHistogram:
+        """An empty histogram up to the loss's bound, or as far as the residuals reach where the bound follows them."""
+        bound = None if self.loss.fixed_bound is None else self.loss.bound
+        return ResidualHistogram(bound, num_channels=self.loss.num_channels)
 
     def guide(self, guide: Guide | None, trainer: Trainer) -> None:
         """Let the network learn by a schedule, at the pace of this training: a guide's, or the loss's own."""

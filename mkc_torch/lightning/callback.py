@@ -179,7 +179,7 @@ class MKCExpectationMaximization(Callback):
     @override
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step == 0:
-            self._progress = Progress(_histogram(self._running()[0].loss))
+            self._progress = Progress(self._running()[0].histogram())
         owned, progress = self._running()
         if self.graduated and progress.guide is None and owned.loss.schedule is None:
             progress.guide = Guide.of_channels(owned.loss.num_channels)
@@ -245,7 +245,7 @@ class MKCExpectationMaximization(Callback):
                 )
         self._owned = OwnedLoss.of(name, loss, self._collect)
         if self._progress is None or len(self._progress.histogram.bound) != loss.num_channels:
-            self._progress = Progress(_histogram(loss))
+            self._progress = Progress(self._owned.histogram())
 
     def _release(self) -> None:
         self._collecting = False
@@ -371,12 +371,6 @@ def _find_loss(module: nn.Module, name: str | None) -> tuple[str, MKCLoss]:
             "each loss takes a callback of its own, MKCExpectationMaximization(loss=...)."
         )
     return next(iter(losses.items()))
-
-
-def _histogram(loss: MKCLoss) -> ResidualHistogram:
-    """An empty histogram up to the loss's bound, or as far as the residuals reach where the bound is theirs."""
-    bound = None if loss.fixed_bound is None else loss.bound
-    return ResidualHistogram(bound, num_channels=loss.num_channels)
 
 
 def _add_residuals(

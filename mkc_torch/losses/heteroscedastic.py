@@ -62,9 +62,9 @@ class HeteroscedasticMKCLoss(SampleCurves, _WideBuffers):
     told from outliers. With constant σ and d it is :class:`mkc_torch.MKCLoss`. A network that can single out samples
     drives their d to its floor: give the head a physical ``d_min`` and watch a validation set.
 
-    The normaliser of every σ and d is a quadrature of 32 nodes, computed in chunks of bounded memory: some microseconds
-    an element on one core, thirty times the rest of the loss. In float32, on the CPU and in the kernels of a GPU, a
-    table takes its place where the domain reaches beyond the head of the density; it is then twenty times as fast.
+    The normaliser of every σ and d is a quadrature of 32 nodes, computed in chunks of bounded memory: a microsecond or
+    more an element on one core, thirty times the rest of the loss. In float32, on the CPU and in the kernels of a GPU,
+    a table takes its place where the domain reaches beyond the head of the density; the loss is then ten times as fast.
     Where σ and d have a dimension 1 that the input has not, one value a sample for many channels say, the normaliser is
     computed once and shared, by torch's operations.
 

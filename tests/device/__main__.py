@@ -1,4 +1,4 @@
-"""One command for whoever has a device: agreement, time, memory, capture.
+"""One command for whoever has a device: agreement, time, memory, capture, fits.
 
 python -m tests.device [--device cuda] [--only agreement steps ...]
 """
@@ -7,13 +7,17 @@ from __future__ import annotations
 
 import argparse
 import time
+import traceback
+from collections.abc import Callable
 
 import torch
 
 from tests.device.agreement import print_agreement
+from tests.device.fits import print_fits
+from tests.device.other_losses import print_other_losses
 from tests.device.speed import print_capture, print_steps, print_training, print_variants
 
-SECTIONS = ("agreement", "steps", "variants", "training", "capture")
+SECTIONS = ("agreement", "steps", "training", "capture", "compiled", "variants", "other", "fits")
 
 
 def main() -> None:
@@ -21,27 +25,31 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, default=SECTIONS)
-    parser.add_argument("--not-compiled", action="store_true", help="leave torch.compile out, which takes longest")
     chosen = parser.parse_args()
     device = torch.device(chosen.device)
     gpu = device.type == "cuda"
     card = torch.cuda.get_device_name(device) if gpu else "CPU"
     print(f"{card}, torch {torch.__version__}", flush=True)
     sizes = (1024, 1 << 22, 1 << 27) if gpu else (1024, 1 << 20)
+    sections: dict[str, Callable[[], bool | None]] = {
+        "agreement": lambda: print_agreement(device),
+        "steps": lambda: print_steps(device, sizes, compiled=False),
+        "training": lambda: print_training(device),
+        "capture": lambda: print_capture(device),
+        "compiled": lambda: print_steps(device, sizes, compiled=True),
+        "variants": lambda: print_variants(device, sizes[-1]),
+        "other": lambda: print_other_losses(device),
+        "fits": lambda: print_fits(device, large=1_000_000 if gpu else 20_000, many=10_000 if gpu else 50),
+    }
     right = True
     for name in chosen.only:
         start = time.perf_counter()
         print(f"\n{name}", flush=True)
-        if name == "agreement":
-            right = print_agreement(device)
-        elif name == "steps":
-            print_steps(device, sizes, compiled=not chosen.not_compiled)
-        elif name == "variants":
-            print_variants(device, sizes[-1])
-        elif name == "training":
-            print_training(device)
-        else:
-            print_capture(device)
+        try:
+            right = sections[name]() is not False and right
+        except Exception:  # the other sections are worth having
+            traceback.print_exc()
+            right = False
         print(f"  ({time.perf_counter() - start:.0f} s)", flush=True)
     if not right:
         raise SystemExit("Values on the device differ from the CPU's; see above.")

@@ -52,77 +52,99 @@ def kernels_and_syncs(step: Callable[[], object], device: torch.device) -> tuple
     return str(count), waits
 
 
+def captured_time(step: Step, device: torch.device) -> float | None:
+    """Time of a step replayed from a CUDA graph: the card's own, without that of Python; None where there are none."""
+    if device.type != "cuda":
+        return None
+    stream = torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        for _ in range(2):
+            step()
+    torch.cuda.current_stream().wait_stream(stream)
+    graph = torch.cuda.CUDAGraph()
+    step.input.grad = None
+    with torch.cuda.graph(graph):
+        step()
+    return seconds(graph.replay, device, budget=0.1)
+
+
+def measured(step: Step, size: int, rate: float, device: torch.device) -> str:
+    """One row: time, time of the card alone over the floor, memory over the input, kernels, host synchronisations."""
+    time = seconds(step, device, budget=0.2)
+    try:
+        alone = captured_time(step, device)
+    except RuntimeError:  # a loss that reads values
+        alone, step.input.grad = None, None
+    memory = "-"
+    if device.type == "cuda":
+        step.input.grad = None
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        step()
+        memory = f"{(torch.cuda.max_memory_allocated() - before) / (4 * size):.2f}"
+    kernels, waits = kernels_and_syncs(step, device)
+    text = "-" if alone is None else f"{1e3 * alone:.4f}"
+    over = (time if alone is None else alone) * rate / (12.0 * size)
+    return f"{size:12}{1e3 * time:10.4f}{text:>10}{over:12.2f}{memory:>8}{kernels:>9}{waits:>7}"
+
+
 def print_steps(device: torch.device, sizes: tuple[int, ...], *, compiled: bool) -> None:
-    """The table of steps."""
+    """The table of steps, eager or compiled."""
     rate = copy_rate(device, sizes[-1])
-    print(f"  copy rate {rate / 1e12:.2f} TB/s; floor: 12 bytes an element")
-    print(f"  {'loss':34}{'elements':>12}{'ms':>10}{'over floor':>12}{'memory':>8}{'kernels':>9}{'syncs':>7}")
-    rows = dict(makers(device))
+    print(f"  copy rate {rate / 1e12:.2f} TB/s; floor: 12 bytes an element; ms: eager, and replayed from a CUDA graph")
+    print(
+        f"  {'loss':34}{'elements':>12}{'ms':>10}{'graph':>10}{'over floor':>12}{'memory':>8}{'kernels':>9}{'syncs':>7}"
+    )
+    rows: dict[str, Any] = {name: make() for name, make in makers(device).items()}
     if compiled:
-        rows["Student t, learned, compiled"] = lambda: torch.compile(LearnedStudentT(CHANNELS).to(device))
-        for name in MODES:
-            rows[f"MKCLoss, {name}, compiled"] = lambda name=name: torch.compile(
-                made(name, CHANNELS, device), fullgraph=True
-            )
-    for size in sizes:
-        for name, make in rows.items():
-            input, target = batch(size // CHANNELS, CHANNELS, device)
-            step = step_of(make(), input, target)
+        rows = {"Student t, learned": LearnedStudentT(CHANNELS).to(device)}
+        rows |= {f"MKCLoss, {name}": made(name, CHANNELS, device) for name in MODES}
+        rows = {f"{name}, compiled": torch.compile(loss, fullgraph=True) for name, loss in rows.items()}
+    for name, loss in rows.items():
+        for size in sizes:
+            step = step_of(loss, *batch(size // CHANNELS, CHANNELS, device))
             try:
-                time = seconds(step, device)
+                row = measured(step, size, rate, device)
             except Exception as error:
-                print(f"  {name:34}{size:12}  {type(error).__name__}: {str(error).splitlines()[0][:80]}")
-                continue
-            memory = "-"
-            if device.type == "cuda":
-                torch.cuda.reset_peak_memory_stats()
-                before = torch.cuda.memory_allocated()
-                input.grad = None
-                before = torch.cuda.memory_allocated()
-                step()
-                memory = f"{(torch.cuda.max_memory_allocated() - before) / (4 * size):.2f}"
-            kernels, waits = kernels_and_syncs(step, device)
-            over = time * rate / (12.0 * size)
-            print(f"  {name:34}{size:12}{1e3 * time:10.4f}{over:12.2f}{memory:>8}{kernels:>9}{waits:>7}", flush=True)
-            del step, input, target
+                row = f"{size:12}  {type(error).__name__}: {str(error).splitlines()[0][:80]}"
+            print(f"  {name:34}{row}", flush=True)
 
 
 def print_variants(device: torch.device, size: int) -> None:
-    """Other dtypes, upstream gradients, weights and reductions at the largest size, over floors of their own."""
+    """Other dtypes, upstream gradients, weights, reductions and layouts at the largest size, over floors of their own."""
     rate = copy_rate(device, size)
     weight = torch.rand(size // CHANNELS, CHANNELS, device=device)
     upstream = torch.tensor(3.0, device=device)
-    for name in MODES:
-        rows: list[tuple[str, torch.dtype, float, dict[str, Any], dict[str, Any]]] = [
-            ("bfloat16", torch.bfloat16, 6.0, {}, {}),
-            ("float16", torch.float16, 6.0, {}, {}),
-            ("upstream gradient 3", torch.float32, 12.0, {}, {"upstream": upstream}),
-            ("weighted mean", torch.float32, 16.0, {}, {"weight": weight}),
-            ("masked mean", torch.float32, 13.0, {}, {"weight": weight > 0.3}),
-            ("reduction none", torch.float32, 28.0, {"reduction": "none"}, {"upstream": weight}),
-        ]
-        for what, dtype, floor, options, rest in rows:
-            input, target = batch(size // CHANNELS, CHANNELS, device, dtype)
-            time = seconds(step_of(made(name, CHANNELS, device, **options), input, target, **rest), device, budget=0.2)
-            print(
-                f"  {name:12} {what:22} {1e3 * time:9.3f} ms {time * rate / (floor * size):6.2f} x its floor",
-                flush=True,
-            )
-    layouts = (("channels second", (size // 2**16, CHANNELS, 2**8, 2**6), 1), ("one channel", (size, 1), -1))
-    for name in MODES:
-        for what, shape, axis in (
-            *layouts,
-            ("seven channels", (size // 7, 7), -1),
-            ("1000 channels", (size // 1000, 1000), -1),
-        ):
-            x = torch.randn(shape, device=device).requires_grad_()
-            y = torch.randn(shape, device=device)
-            loss = MKCLoss(shape[axis], channel_dim=axis, **MODES[name]).to(device)
-            time = seconds(step_of(loss, x, y), device, budget=0.2)
-            print(
-                f"  {name:12} {what:22} {1e3 * time:9.3f} ms {time * rate / (12.0 * x.numel()):6.2f} x its floor",
-                flush=True,
-            )
+    rows: list[tuple[str, torch.dtype, float, dict[str, Any], dict[str, Any]]] = [
+        ("bfloat16", torch.bfloat16, 6.0, {}, {}),
+        ("float16", torch.float16, 6.0, {}, {}),
+        ("upstream gradient 3", torch.float32, 12.0, {}, {"upstream": upstream}),
+        ("weighted mean", torch.float32, 16.0, {}, {"weight": weight}),
+        ("masked mean", torch.float32, 13.0, {}, {"weight": weight > 0.3}),
+        ("reduction none", torch.float32, 28.0, {"reduction": "none"}, {"upstream": weight}),
+    ]
+    layouts = (
+        ("channels second", (size // 2**16, CHANNELS, 2**8, 2**6), 1),
+        ("one channel", (size, 1), -1),
+        ("seven channels", (size // 7, 7), -1),
+        ("1000 channels", (size // 1000, 1000), -1),
+    )
+
+    def line(name: str, what: str, step: Step, bytes_each: float) -> None:
+        eager, alone = seconds(step, device, budget=0.1, least=3), captured_time(step, device)
+        over = (eager if alone is None else alone) * rate / (bytes_each * step.input.numel())
+        text = "-" if alone is None else f"{1e3 * alone:.3f}"
+        print(f"  {name:12} {what:22} {1e3 * eager:9.3f} ms, graph {text:>7} ms {over:6.2f} x its floor", flush=True)
+
+    for name, options in MODES.items():
+        for what, dtype, floor, extra, rest in rows:
+            given = batch(size // CHANNELS, CHANNELS, device, dtype)
+            line(name, what, step_of(made(name, CHANNELS, device, **extra), *given, **rest), floor)
+        for what, shape, axis in layouts:
+            x, y = torch.randn(shape, device=device).requires_grad_(), torch.randn(shape, device=device)
+            line(name, what, step_of(MKCLoss(shape[axis], channel_dim=axis, **options).to(device), x, y), 12.0)
 
 
 class Training:

@@ -188,7 +188,7 @@ def walk_by_kappa(
     LEARN_KAPPA: tl.constexpr, LEARN_D: tl.constexpr, NORMALIZE: tl.constexpr,
     WRITE_VALUES: tl.constexpr, WRITE_SLOPES: tl.constexpr, SUMS: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """:func:`walk` with the derivative by kappa of each element, a third of the arithmetic, only where kappa is small."""
+    """:func:`walk` with the derivative by kappa of each element, a third of the work, only where kappa is small."""
     if LEARN_KAPPA and SUMS and not WIDE:
         if least_kappa >= 0.1:
             sum_network, sum_energy, sum_kappa, sum_d, sum_weight = walk(

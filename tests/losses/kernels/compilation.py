@@ -1,0 +1,98 @@
+"""Compile for a GPU what losses launch, on a machine that need not have one.
+
+    python -m tests.losses.kernels.compilation
+
+The interpreter runs what the compiler refuses: variables that change their type in a branch or a loop, numbers that are
+1 and so become constants. Losses run here on the CPU with launches recorded in place of being run, so that each is
+compiled with the dtypes, alignments and flags that it has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+import triton
+from torch import Tensor
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+
+from mkc_torch import GeneralizedCrossEntropyLoss, HeteroscedasticMKCLoss
+from mkc_torch.losses.kernels.cached import CachedKernel
+
+TARGET = GPUTarget("cuda", 90, 32)
+"""An H100."""
+
+_TYPES = {
+    torch.float16: "*fp16", torch.bfloat16: "*bf16", torch.float32: "*fp32", torch.float64: "*fp64",
+    torch.bool: "*i1", torch.uint8: "*u8", torch.int32: "*i32", torch.int64: "*i64",
+}  # fmt: skip
+
+
+def compiled(kernel: Any, tensors: Any, numbers: Any, constants: Any, warps: int) -> Any:
+    """A kernel as Triton compiles it for such a launch."""
+    given = (*tensors, *numbers, *constants)
+    signature, constant, attributes = {}, {}, {}
+    for place, (name, value) in enumerate(zip(kernel.arg_names, given, strict=True)):
+        if place >= len(tensors) + len(numbers) or (not isinstance(value, Tensor) and value == 1):
+            signature[name], constant[(place,)] = "constexpr", value
+            continue
+        if isinstance(value, Tensor):
+            signature[name], aligned = _TYPES[value.dtype], True
+        else:
+            signature[name] = "fp32" if isinstance(value, float) else "i64" if abs(value) >= 2**31 else "i32"
+            aligned = isinstance(value, int) and value % 16 == 0
+        if aligned:
+            attributes[(place,)] = [["tt.divisibility", 16]]
+    source = ASTSource(kernel, signature, constant, attributes)
+    return triton.compile(source, target=TARGET, options={"num_warps": warps})
+
+
+def training_steps() -> Iterator[str]:
+    """Forward and backward passes of losses, by name."""
+
+    def samples(name: str, dtype: torch.dtype, *, weighted: bool = False, each: bool = False, **options: Any) -> str:
+        leaves = [torch.ones(64, 16, 3, dtype=dtype, requires_grad=True) for _ in range(4)]
+        weight = torch.ones(64, 16, 3, dtype=torch.bool) if weighted else None
+        bound = torch.full((16 if each else 1,), 9.0, dtype=torch.float64 if dtype == torch.float64 else torch.float32)
+        loss = HeteroscedasticMKCLoss(bound if each else bound[0], channel_dim=1, impl="triton", **options)
+        loss(*leaves, weight).sum().backward()
+        return f"samples, {name}"
+
+    yield samples("float32", torch.float32)
+    yield samples("bfloat16, weighted, bounds of channels", torch.bfloat16, weighted=True, each=True)
+    yield samples("float16", torch.float16, reduction="sum")
+    yield samples("float64, each", torch.float64, reduction="none")
+
+    def labels(name: str, shape: tuple[int, int], dtype: torch.dtype, *, weighted: bool = False, **options: Any) -> str:
+        logits = torch.zeros(shape, dtype=dtype, requires_grad=True)
+        weight = torch.ones(shape[1]) if weighted else None
+        target = torch.zeros(shape[0], dtype=torch.uint8 if shape[1] < 256 else torch.int64)
+        GeneralizedCrossEntropyLoss(impl="triton", weight=weight, **options)(logits, target).sum().backward()
+        return f"labels, {name}"
+
+    yield labels("float32", (256, 1000), torch.float32)
+    yield labels("bfloat16, weighted, many rows", (3000, 10), torch.bfloat16, weighted=True)
+    yield labels("float16, many classes", (2, 5000), torch.float16)
+    yield labels("float64, each", (16, 3), torch.float64, reduction="none")
+
+
+def main() -> None:
+    """Compile every launch; a word on each that reads four numbers at once."""
+    launches: list[tuple[Any, ...]] = []
+
+    def launch(self: CachedKernel, grid: Any, *arguments: Any) -> None:  # noqa: ARG001
+        launches.append((self.kernel, *arguments))
+
+    CachedKernel.launch = launch  # type: ignore[method-assign]
+    for name in training_steps():
+        for kernel, *arguments in launches:
+            found = compiled(kernel, *arguments)
+            loads = "ld.global.v4" if ".v4.b32" in found.asm["ptx"] else "narrow loads"
+            print(f"{name}: {kernel.__name__}, {loads}", flush=True)
+        launches.clear()
+
+
+if __name__ == "__main__":
+    main()

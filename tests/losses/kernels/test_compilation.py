@@ -1,0 +1,24 @@
+"""The compiler of a GPU takes what the interpreter runs."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def test_kernels_compile_for_a_gpu_and_read_four_numbers_at_once():
+    triton = pytest.importorskip("triton")
+    if not (Path(triton.__file__).parent / "backends/nvidia/bin/ptxas").exists():
+        pytest.skip("this Triton has no ptxas")
+    # the interpreter is chosen where a kernel is defined
+    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    command = [sys.executable, "-W", "ignore", "-m", "tests.losses.kernels.compilation"]
+    root = Path(__file__).parents[3]
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-4000:]
+    lines = done.stdout.splitlines()
+    assert len(lines) >= 15
+    for start in ("samples, float32", "labels, float32"):
+        assert any(line.startswith(start) and line.endswith("ld.global.v4") for line in lines)
