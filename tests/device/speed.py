@@ -113,7 +113,7 @@ def print_steps(device: torch.device, sizes: tuple[int, ...], *, compiled: bool)
 
 
 def print_variants(device: torch.device, size: int) -> None:
-    """Other dtypes, upstream gradients, weights, reductions and layouts at the largest size, over floors of their own."""
+    """Other dtypes, upstream gradients, weights, reductions and layouts at the largest size, over their own floors."""
     rate = copy_rate(device, size)
     weight = torch.rand(size // CHANNELS, CHANNELS, device=device)
     upstream = torch.tensor(3.0, device=device)
