@@ -415,9 +415,7 @@ def test_order_of_the_batches_does_not_matter(values, bound, on_accelerator, ord
 @given(
     # sizes within 1e18 of each other: a square of a larger ratio would overflow, and is cut off there
     values=st.lists(
-        st.lists(
-            st.floats(-1e3, 1e3, width=32).filter(lambda v: v == 0.0 or abs(v) > 1e-12), min_size=1, max_size=10
-        ),
+        st.lists(st.floats(-1e3, 1e3, width=32).filter(lambda v: v == 0.0 or abs(v) > 1e-12), min_size=1, max_size=10),
         min_size=1,
         max_size=5,
     ),

@@ -89,7 +89,7 @@ def _(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     slopes = table.new_empty(0) if input.dtype == torch.float16 else _like(input, axis)
     empty = table.new_empty
-    by_kappa, by_d = (empty(0) if one is None else torch.empty_like(table[0]) for one in (raw_kappa, raw_d))
+    by_kappa, by_d = (empty(0) if one is None else table.new_empty(table.shape[1]) for one in (raw_kappa, raw_d))
     return empty(()), slopes, by_kappa, by_d
 
 
@@ -195,7 +195,7 @@ def _(
 ) -> tuple[Tensor, Tensor, Tensor]:
     own = Options(*options)
     by_kappa, by_d = (
-        torch.empty_like(table[0]) if learned else table.new_empty(0) for learned in (own.learn_kappa, own.learn_d)
+        table.new_empty(table.shape[1]) if learned else table.new_empty(0) for learned in (own.learn_kappa, own.learn_d)
     )
     return _like(input, axis), by_kappa, by_d
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from mkc_torch import GeneralizedCrossEntropyLoss, HeteroscedasticMKCLoss
+from mkc_torch import GeneralizedCrossEntropyLoss, HeteroscedasticMKCLoss, MKCLoss
 from mkc_torch.losses.kernels.cached import CachedKernel
 
 TARGET = GPUTarget("cuda", 90, 32)
@@ -72,6 +72,20 @@ def training_steps() -> Iterator[str]:
         GeneralizedCrossEntropyLoss(impl="triton", weight=weight, **options)(logits, target).sum().backward()
         return f"labels, {name}"
 
+    def channels(
+        name: str, shape: tuple[int, ...], dtype: torch.dtype, *, axis: int = -1, weighted: bool = False, **options: Any
+    ) -> str:
+        x, y = torch.zeros(shape, dtype=dtype, requires_grad=True), torch.ones(shape, dtype=dtype)
+        loss = MKCLoss(shape[axis], channel_dim=axis, impl="triton", **options)
+        loss = loss.double() if dtype == torch.float64 else loss
+        loss(x, y, torch.ones(shape, dtype=torch.bool) if weighted else None).sum().backward()
+        return f"channels, {name}"
+
+    yield channels("float32", (1 << 15, 4), torch.float32)
+    yield channels("given d, one small batch", (64, 1), torch.float32, d=1.0)
+    yield channels("float64, seven channels, weighted", (5000, 7), torch.float64, weighted=True)
+    yield channels("images", (2, 3, 64, 64), torch.bfloat16, axis=1, d=1.0, reduction="none")
+    yield channels("float16", (1 << 15, 4), torch.float16, d=1.0, learn_sigma=False, learn_d=False)
     yield labels("float32", (256, 1000), torch.float32)
     yield labels("bfloat16, weighted, many rows", (3000, 10), torch.bfloat16, weighted=True)
     yield labels("float16, many classes", (2, 5000), torch.float16)

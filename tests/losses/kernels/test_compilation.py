@@ -20,5 +20,5 @@ def test_kernels_compile_for_a_gpu_and_read_four_numbers_at_once():
     assert done.returncode == 0, done.stderr[-4000:]
     lines = done.stdout.splitlines()
     assert len(lines) >= 15
-    for start in ("samples, float32", "labels, float32"):
+    for start in ("channels, float32", "samples, float32", "labels, float32"):
         assert any(line.startswith(start) and line.endswith("ld.global.v4") for line in lines)
