@@ -18,7 +18,8 @@ from mkc_torch._support.arguments import (
     told,
 )
 from mkc_torch.density.energy import as_computed, energy, inverse_square
-from mkc_torch.density.normalizer import head_rule, log_partition, partition, refuse_bad_ratio, tail_density
+from mkc_torch.density.head import head_rule, tail_density
+from mkc_torch.density.normalizer import log_partition, partition, refuse_bad_ratio
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.density.head import head_integral
+
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
@@ -35,8 +37,6 @@ def head_table(device: torch.device) -> Float[Tensor, "8 16"]:
 
     The variable runs from -1/2 to 1/2 over an interval.
     """
-    from mkc_torch.density.normalizer import head_integral  # which looks up in the table
-
     with torch.inference_mode(False), torch.no_grad():
         count = DEGREE + 1
         angle = torch.pi * (torch.arange(count, dtype=torch.float64) + 0.5) / count

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from mkc_torch.density.energy import KAPPA_MAX, energy_value
-from mkc_torch.density.normalizer import head_rule, integrate, log_partition_value, tail_density
+from mkc_torch.density.head import head_rule, integrate, tail_density
+from mkc_torch.density.normalizer import log_partition_value
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -17,8 +17,8 @@ from mkc_torch._support.arrays import Data
 from mkc_torch._support.effective_size import effective_size
 from mkc_torch.density._residuals import Residuals, channel_values, checked_domain, checked_residuals, checked_weight
 from mkc_torch.density.energy import KAPPA_MAX, energy_dkappa, energy_dz, energy_value
+from mkc_torch.density.head import head_rule, integrate, tail_density
 from mkc_torch.density.likelihood import DensityState, initial_state, maximise
-from mkc_torch.density.normalizer import head_rule, integrate, tail_density
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

@@ -129,7 +129,7 @@ class GeneralizedCrossEntropyLoss(LabelCurves, _WideBuffers):
                 loss does not wait for the last three: there NaN comes out as NaN.
         """
         if runs_kernels(self, input):
-            from mkc_torch.losses.kernels.label_loss import label_loss, takes_labels
+            from mkc_torch.losses.kernels.entry import label_loss, takes_labels
 
             if takes_labels(self, input, target):
                 return label_loss(self, input, target)

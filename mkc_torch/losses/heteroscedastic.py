@@ -141,7 +141,7 @@ class HeteroscedasticMKCLoss(SampleCurves, _WideBuffers):
                 a NaN comes out as NaN.
         """
         if runs_kernels(self, input):
-            from mkc_torch.losses.kernels.sample_loss import sample_loss
+            from mkc_torch.losses.kernels.entry import sample_loss
 
             return sample_loss(self, input, target, sigma, d, weight)
         if self.impl == "compile" and not torch.compiler.is_compiling():

@@ -186,7 +186,7 @@ class MKCLoss(ChannelCurves, ChannelDensity):
                 what is not finite.
         """
         if runs_kernels(self, input):
-            from mkc_torch.losses.kernels.loss import kernel_loss
+            from mkc_torch.losses.kernels.entry import kernel_loss
 
             return kernel_loss(self, input, target, weight)
         if self.impl == "compile" and not torch.compiler.is_compiling():

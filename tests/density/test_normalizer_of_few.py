@@ -8,11 +8,12 @@ from hypothesis import strategies as st
 
 from mkc_torch.density._normalizer_of_few import few, log_partition_and_slopes
 from mkc_torch.density.energy import energy
-from mkc_torch.density.normalizer import _HEAD_TOLERANCE, _NODES, _WEIGHTS, _log_partition_and_slopes, log_partition
+from mkc_torch.density.head import HEAD_TOLERANCE, head_rule_constants
+from mkc_torch.density.normalizer import _log_partition_and_slopes, log_partition
 
 
 def of_few(kappa, length):
-    return log_partition_and_slopes(kappa, length, _NODES.numpy(), _WEIGHTS.numpy(), _HEAD_TOLERANCE)
+    return log_partition_and_slopes(kappa, length, *(one.numpy() for one in head_rule_constants()), HEAD_TOLERANCE)
 
 
 @given(

@@ -5,21 +5,17 @@ A few labels take one launch forward, many three; backward there is one.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from mkc_torch._support.torch_internals import is_transformed
 from mkc_torch.losses._checks import at_least_float32
 from mkc_torch.losses.kernels.cached import CachedKernel
 from mkc_torch.losses.kernels.labels import count_kernel, labels_kernel
 from mkc_torch.losses.kernels.launch import WARPS, multiprocessors, rescale
 
-if TYPE_CHECKING:
-    from mkc_torch.losses.generalized_cross_entropy import GeneralizedCrossEntropyLoss
-
-__all__ = ["label_loss", "takes_labels"]
+__all__ = ["EachLabel", "ReducedLabels", "Work", "arranged_labels", "label_slopes", "label_values", "reduce_labels"]
 
 TILE = 1024
 """Logits of a tile of several rows."""
@@ -162,11 +158,11 @@ def label_slopes(batch: Labels, mean: bool, upstream: Tensor) -> Tensor:
 class Work(NamedTuple):
     """One forward pass: the loss, and the batch."""
 
-    loss: GeneralizedCrossEntropyLoss
+    loss: Any
     batch: Labels
 
 
-class _Reduced(torch.autograd.Function):
+class ReducedLabels(torch.autograd.Function):
     """A sum or mean, whose gradient is made in the forward pass. That of float16, which a mean over many rows
     underflows before a gradient scaler multiplies, is made in the backward pass."""
 
@@ -189,7 +185,7 @@ class _Reduced(torch.autograd.Function):
         return found, None, None
 
 
-class _Each(torch.autograd.Function):
+class EachLabel(torch.autograd.Function):
     """The loss of each row. The gradient is made in the backward pass, which has to read the upstream gradient."""
 
     @staticmethod
@@ -216,32 +212,3 @@ def _by_formulas(ctx: Any, grad: Tensor) -> Tensor:
     value = ctx.work.loss._computed(input, target)
     (found,) = torch.autograd.grad(value, input, grad.to(value.dtype), create_graph=True)
     return found
-
-
-def takes_labels(loss: GeneralizedCrossEntropyLoss, input: object, target: object) -> bool:
-    """Whether the kernels compute such a batch: labels of rows (N, C). Others, and wrong ones, go to the formulas."""
-    if not (isinstance(input, Tensor) and isinstance(target, Tensor)) or not input.is_floating_point():
-        return False
-    if input.dim() != 2 or input.numel() == 0 or target.shape != input.shape[:1]:
-        return False
-    if target.is_floating_point() or target.is_complex() or target.dtype == torch.bool:
-        return False
-    if loss.weight is not None and loss.weight.shape != input.shape[1:]:
-        return False
-    if not -_INT32 <= loss.ignore_index < _INT32:
-        return False
-    return torch.compiler.is_compiling() or not (is_transformed(input) or is_transformed(target))
-
-
-def label_loss(loss: GeneralizedCrossEntropyLoss, input: Tensor, target: Tensor) -> Tensor:
-    """The forward pass of a loss by kernels, of a batch that :func:`takes_labels`."""
-    plain = type(target) is Tensor and type(input) in (Tensor, torch.nn.Parameter)
-    if torch.compiler.is_compiling() or not plain:
-        from mkc_torch.losses.kernels.label_operators import operator_label_loss
-
-        return operator_label_loss(loss, input, target)
-    with torch.no_grad():
-        batch = arranged_labels(input.detach(), target, loss.kappa, loss.weight, loss.ignore_index)
-    function: Any = _Each if loss.reduction == "none" else _Reduced
-    value: Tensor = function.apply(input, target, Work(loss, batch))
-    return value

@@ -3,16 +3,13 @@ tensors without memory."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from mkc_torch.losses._checks import at_least_float32
 from mkc_torch.losses.kernels.label_loss import arranged_labels, label_slopes, label_values, reduce_labels
-
-if TYPE_CHECKING:
-    from mkc_torch.losses.generalized_cross_entropy import GeneralizedCrossEntropyLoss
 
 __all__ = ["operator_label_loss"]
 
@@ -88,7 +85,7 @@ reduced_label_loss.register_autograd(_backward, setup_context=_save)
 values_of_labels.register_autograd(_backward, setup_context=_save)
 
 
-def operator_label_loss(loss: GeneralizedCrossEntropyLoss, input: Tensor, target: Tensor) -> Tensor:
+def operator_label_loss(loss: Any, input: Tensor, target: Tensor) -> Tensor:
     """The forward pass of a loss through the operators."""
     given = (input, target, loss.kappa, loss.weight, loss.ignore_index)
     if loss.reduction == "none":

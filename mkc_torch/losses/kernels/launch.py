@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from mkc_torch.density.normalizer import head_rule_constants
+from mkc_torch.density.head import head_rule_constants
 from mkc_torch.losses._bandwidth_selection import BANDWIDTHS
 from mkc_torch.losses.kernels.cached import CachedKernel
 from mkc_torch.losses.kernels.channels import TABLE, channel_kernel

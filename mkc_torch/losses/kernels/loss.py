@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from mkc_torch._support.torch_internals import in_backward, is_transformed
-from mkc_torch.losses._checks import checked_weight
+from mkc_torch._support.torch_internals import in_backward
 from mkc_torch.losses._parameters import ChannelState
 from mkc_torch.losses._terms import Batch, Settings, loss_value
 from mkc_torch.losses.kernels.channels import TABLE
@@ -25,7 +24,7 @@ from mkc_torch.losses.kernels.launch import (
 )
 from mkc_torch.losses.residual_scale import ScaleState, alike_in_all_processes, average_over_processes, is_distributed
 
-__all__ = ["kernel_loss"]
+__all__ = ["gradients_of_each", "options_of", "prepared", "request_of", "updated_table"]
 
 
 class Work(NamedTuple):
@@ -63,29 +62,6 @@ class Work(NamedTuple):
         return loss_value(
             Batch(input.to(dtype), target.to(dtype), weight, counts, self.axis), raw_kappa, raw_d, self.settings()
         )
-
-
-def kernel_loss(loss: Any, input: Tensor, target: Tensor, weight: Tensor | None) -> Tensor:
-    """The forward pass of a loss by kernels; by formulas under transforms, and where a weight wants a gradient."""
-    axis = loss._checked_axis(input, target)
-    own = loss._parameters  # attributes of modules take a microsecond each
-    raw_kappa, raw_d = own.get("raw_kappa"), own.get("raw_d")
-    given = [one for one in (input, target, weight, raw_kappa, raw_d) if one is not None]
-    compiling = torch.compiler.is_compiling()
-    if not compiling and any(is_transformed(one) for one in given):
-        return loss._computed(input, target, weight)
-    if weight is not None:
-        if weight.requires_grad:
-            return loss._computed(input, target, weight)
-        weight = checked_weight(weight, input, axis, cast=False)[0]
-    if compiling or any(type(one) is not Tensor and type(one) is not torch.nn.Parameter for one in given):
-        from mkc_torch.losses.kernels.operators import operator_loss
-
-        return operator_loss(loss, input, target, weight, axis)
-    batch, work = prepared(loss, input, target, weight, axis)
-    function: Any = _Each if loss.reduction == "none" else _Reduced
-    value: Tensor = function.apply(input, target, raw_kappa, raw_d, batch, work)
-    return value
 
 
 def options_of(loss: Any) -> Options:
@@ -175,7 +151,7 @@ def updated_table(batch: Arranged, request: Request, options: Options, *, update
     return make_table(batch, running, *numbers, options, pace=pace)
 
 
-class _Reduced(torch.autograd.Function):
+class ReducedFunction(torch.autograd.Function):
     """A sum or mean.
 
     The forward pass makes the gradient by the input, but not of float16: there 1 over the number of elements underflows
@@ -213,7 +189,7 @@ class _Reduced(torch.autograd.Function):
         return (*_handed_out(ctx, slopes), by_kappa, by_d, None, None)
 
 
-class _Each(torch.autograd.Function):
+class EachFunction(torch.autograd.Function):
     """Each element's loss. The gradients are made in the backward pass, which has to read the upstream gradient."""
 
     @staticmethod

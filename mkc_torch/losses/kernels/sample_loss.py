@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from mkc_torch._support.torch_internals import is_transformed
+from mkc_torch.density.head import head_quadrature, head_rule_constants
 from mkc_torch.density.head_table import head_table
-from mkc_torch.density.normalizer import head_quadrature, head_rule_constants
-from mkc_torch.losses._checks import checked_weight
 from mkc_torch.losses.kernels.cached import CachedKernel
 from mkc_torch.losses.kernels.launch import RESCALED, WARPS, multiprocessors
 from mkc_torch.losses.kernels.samples import rescale_samples_kernel, samples_kernel
 
-if TYPE_CHECKING:
-    from mkc_torch.losses.heteroscedastic import HeteroscedasticMKCLoss
-
-__all__ = ["sample_loss"]
+__all__ = ["EachSample", "ReducedSamples", "Work", "arranged_samples"]
 
 BLOCK = 512
 """Elements of a block; a thread holds four, which are one load."""
@@ -200,12 +195,12 @@ def has_float16(*given: Tensor) -> bool:
 class Work(NamedTuple):
     """One forward pass: the loss, the batch, and the weights as they were given."""
 
-    loss: HeteroscedasticMKCLoss
+    loss: Any
     batch: Samples
     weight: Tensor | None
 
 
-class _Reduced(torch.autograd.Function):
+class ReducedSamples(torch.autograd.Function):
     """A sum or mean, whose gradients are made in the forward pass; those of float16 in the backward pass."""
 
     @staticmethod
@@ -232,7 +227,7 @@ class _Reduced(torch.autograd.Function):
         return _handed_out(ctx, found)
 
 
-class _Each(torch.autograd.Function):
+class EachSample(torch.autograd.Function):
     """Each element's loss. The gradients are made in the backward pass, which has to read the upstream gradient."""
 
     @staticmethod
@@ -265,35 +260,3 @@ def _by_formulas(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
     wanted = [one for one, wants in zip(given, ctx.needs_input_grad, strict=False) if wants]
     found = iter(torch.autograd.grad(value, wanted, grad.to(value.dtype), create_graph=True))
     return *(next(found) if wants else None for wants in ctx.needs_input_grad[:4]), None
-
-
-def sample_loss(
-    loss: HeteroscedasticMKCLoss, input: Tensor, target: Tensor, sigma: Tensor, d: Tensor, weight: Tensor | None
-) -> Tensor:
-    """The forward pass of a loss by kernels.
-
-    It takes the formulas under transforms, where a weight wants a gradient, and for a sigma or a d of another shape
-    than the input, one for many channels say.
-    """
-    axis = loss._checked_axis(input, target)
-    loss._check_scales(input, sigma, d)
-    given = [one for one in (input, target, sigma, d, weight) if one is not None]
-    compiling = torch.compiler.is_compiling()
-    same = sigma.shape == input.shape and d.shape == input.shape
-    # 32 bits count within one round of the channels
-    short = loss.bound.numel() == 1 or input.shape[axis:].numel() < 2**30
-    transformed = not compiling and any(is_transformed(one) for one in given)
-    if transformed or not (same and short) or (weight is not None and weight.requires_grad):
-        return loss._computed(input, target, sigma, d, weight)
-    own_weight = None if weight is None else checked_weight(weight, input, axis, cast=False)[0]
-    if compiling or any(type(one) is not Tensor and type(one) is not torch.nn.Parameter for one in given):
-        from mkc_torch.losses.kernels.sample_operators import operator_sample_loss
-
-        return operator_sample_loss(loss, input, target, sigma, d, own_weight, axis)
-    with torch.no_grad():
-        batch = arranged_samples(
-            input.detach(), target.detach(), sigma.detach(), d.detach(), own_weight, loss.bound, axis
-        )
-    function: Any = _Each if loss.reduction == "none" else _Reduced
-    value: Tensor = function.apply(input, target, sigma, d, Work(loss, batch, weight))
-    return value

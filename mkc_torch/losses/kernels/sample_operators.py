@@ -4,7 +4,7 @@ without memory."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,9 +19,6 @@ from mkc_torch.losses.kernels.sample_loss import (
     samples_values,
     without_gaps,
 )
-
-if TYPE_CHECKING:
-    from mkc_torch.losses.heteroscedastic import HeteroscedasticMKCLoss
 
 __all__ = ["operator_sample_loss"]
 
@@ -146,7 +143,7 @@ sample_values.register_autograd(_backward, setup_context=_save)
 
 
 def operator_sample_loss(
-    loss: HeteroscedasticMKCLoss,
+    loss: Any,
     input: Tensor,
     target: Tensor,
     sigma: Tensor,
