@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+from mkc_torch._support.numpy_or_torch import at_least, at_most
+
 __all__ = ["ElementEnergy", "element_energy"]
 
 _SERIES_BELOW = 0.3
@@ -49,8 +51,8 @@ def element_energy(xp: Any, z: Any, kappa: Any, *, wants_kappa: bool, has_gaussi
     by_z = z * inlier
     if not wants_kappa:
         return ElementEnergy(value, by_z, None)
-    minus_x = xp.clip(minus_x, _LEAST_EXPONENT, None)
-    near_x = xp.clip(-minus_x, None, _SERIES_BELOW)
+    minus_x = at_least(xp, minus_x, _LEAST_EXPONENT)
+    near_x = at_most(xp, -minus_x, _SERIES_BELOW)
     series = _SERIES[-1]
     for coefficient in _SERIES[-2::-1]:
         series = coefficient + near_x * series

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from mkc_torch._support.numpy_or_torch import at_least, at_most
 from mkc_torch.losses._initial_loss import initial_influence
 
 if TYPE_CHECKING:
@@ -66,13 +67,13 @@ def select_bandwidth(
         >>> select_bandwidth(torch, z, torch.zeros_like(z), torch.ones_like(z))
         BandwidthSelection(bandwidth=tensor([64.]), better=tensor([True]))
     """
-    share = weight / xp.clip(weight.sum(-1), TINY, None)[..., None]
+    share = weight / at_least(xp, weight.sum(-1), TINY)[..., None]
 
     def mean(values: Any) -> Any:
         return (values @ share[..., None])[..., 0]
 
     influence, slope = _influences(xp, z)
-    slope = xp.clip(mean(slope), LEAST_SLOPE, None)
+    slope = at_least(xp, mean(slope), LEAST_SLOPE)
     risk = mean(influence * influence) / (slope * slope)
     # contribution of each sample to the slope, less its contribution under the initial loss, which is last
     step = (influence - mean(influence)[..., None]) * (_standardised(xp, prediction, share)[..., None, :])
@@ -80,8 +81,8 @@ def select_bandwidth(
     step = step - step[..., -1:, :]
     shrinkage = mean(step)
     spread = mean((step - shrinkage[..., None]) ** 2)
-    size = 1.0 / xp.clip((share * share).sum(-1), TINY, None)[..., None]
-    risk = risk + xp.clip(size * xp.clip(shrinkage, 0.0, None) ** 2 - CHANCE * spread, 0.0, None)
+    size = 1.0 / at_least(xp, (share * share).sum(-1), TINY)[..., None]
+    risk = risk + at_least(xp, size * at_least(xp, shrinkage, 0.0) ** 2 - CHANCE * spread, 0.0)
     annealed, initial = risk[..., :-1], risk[..., -1]
     least = xp.amin(annealed, -1)
     chosen = xp.where(annealed <= TOLERANCE * least[..., None], _widths(xp, z), 0.0)
@@ -98,7 +99,7 @@ def _influences(xp: Any, z: Any) -> tuple[Any, Any]:
     """Influence and its derivative under each bandwidth and, last, under the initial loss: (m, K + 1, L)."""
     each = z[..., None, :]
     ratio = each / _widths(xp, z)[:, None]
-    square = xp.clip(ratio * ratio, None, _FAR)  # beyond, a product of infinity and 0
+    square = at_most(xp, ratio * ratio, _FAR)  # beyond, a product of infinity and 0
     inlier = xp.exp(-0.5 * square)
     initial, slope = initial_influence(xp, each)
     return xp.concatenate([each * inlier, initial], -2), xp.concatenate([(1.0 - square) * inlier, slope], -2)
@@ -108,5 +109,5 @@ def _standardised(xp: Any, values: Any, share: Any) -> Any:
     """Of mean 0 and variance 1; 0 where all values are equal."""
     centred = xp.where(share > 0, values - (values * share).sum(-1)[..., None], 0.0)
     # over their largest, whose square neither overflows nor is 0
-    centred = centred / xp.clip(xp.amax(xp.abs(centred), -1), TINY, None)[..., None]
-    return centred / xp.clip(xp.sqrt((centred * centred * share).sum(-1)), TINY, None)[..., None]
+    centred = centred / at_least(xp, xp.amax(xp.abs(centred), -1), TINY)[..., None]
+    return centred / at_least(xp, xp.sqrt((centred * centred * share).sum(-1)), TINY)[..., None]

@@ -185,12 +185,9 @@ class ChannelDensity(nn.Module):
 
     @property
     def _dtype(self) -> torch.dtype:
-        given = (self.raw_kappa, self.fixed_kappa, self.raw_d, self.fixed_d, self.fixed_bound)
-        dtype = torch.float32
-        for one in given:
-            if one is not None:
-                dtype = torch.promote_types(dtype, one.dtype)
-        return dtype
+        given = (*self._parameters.values(), *self._buffers.values())
+        wide = any(one is not None and one.dtype == torch.float64 for one in given)
+        return torch.float64 if wide else torch.float32
 
     @torch.no_grad()
     def freeze_scale(self) -> None:

@@ -156,11 +156,15 @@ def reduced_loss(
             sums, by_input = _at_once(xp, work, table, divisor, wants_input=wants_input)
         value, by_raw_kappa, by_raw_d = _assembled(xp, work, sums, table, divisor)
     return ReducedLoss(
-        torch.as_tensor(value, dtype=dtype),
+        torch.scalar_tensor(value, dtype=dtype) if xp is np else value.to(dtype),
         by_input,
-        None if raw_kappa is None else torch.as_tensor(by_raw_kappa, dtype=raw_kappa.dtype),
-        None if raw_d is None else torch.as_tensor(by_raw_d, dtype=raw_d.dtype),
+        None if raw_kappa is None else _tensor(xp, by_raw_kappa, raw_kappa.dtype),
+        None if raw_d is None else _tensor(xp, by_raw_d, raw_d.dtype),
     )
+
+
+def _tensor(xp: Any, values: Any, dtype: torch.dtype) -> Tensor:
+    return (torch.from_numpy(values) if xp is np else values).to(dtype)
 
 
 class Elements(NamedTuple):

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mkc_torch._support.numpy_or_torch import at_least, at_most
 from mkc_torch.density.energy import energy
 from mkc_torch.losses._bandwidth_selection import select_bandwidth
 from mkc_torch.losses._initial_loss import initial_loss
@@ -114,13 +115,13 @@ class BandwidthSchedule(nn.Module):
         selected = select_bandwidth(xp, residual / xp.exp(log_scale)[..., None], prediction, weight)
         steps = old.steps.astype(old.share.dtype) if xp is np else old.steps.to(old.share.dtype)
         least_rate = 1.0 - (1.0 - RATE) ** SELECTION_INTERVAL
-        rate = xp.clip(SELECTION_INTERVAL / (steps + 1.0), least_rate, 1.0)
+        rate = at_most(xp, at_least(xp, SELECTION_INTERVAL / (steps + 1.0), least_rate), 1.0)
         one = xp.ones_like(old.share)
         step = SELECTION_INTERVAL * self.anneal_step * xp.where(selected.better, one, -one)
         annealing = (old.steps >= self.warmup_steps) & ((weight * xp.abs(residual)).sum(-1) > 0)
         due = old.steps % SELECTION_INTERVAL == 0
         log_bandwidth = old.log_bandwidth + rate * (xp.log(selected.bandwidth) - old.log_bandwidth)
-        share = xp.where(annealing, xp.clip(old.share + step, 0.0, 1.0), old.share)
+        share = xp.where(annealing, at_most(xp, at_least(xp, old.share + step, 0.0), 1.0), old.share)
         return ScheduleState(
             steps=old.steps + 1,
             log_bandwidth=xp.where(due, log_bandwidth, old.log_bandwidth),

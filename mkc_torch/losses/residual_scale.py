@@ -10,6 +10,7 @@ import torch
 import torch.distributed
 from torch import Tensor, nn
 
+from mkc_torch._support.numpy_or_torch import at_least
 from mkc_torch._support.torch_internals import is_wrapped
 
 if TYPE_CHECKING:
@@ -194,7 +195,7 @@ def rows_of_batch(xp: Any, dtype: Any, rows: Sequence[Any], more: Sequence[Any] 
     residual, prediction, weight = _residuals(xp, dtype, *rows)
     wide, _, counts = (residual, prediction, weight) if more is None else _residuals(xp, dtype, *more)
     least, most = (xp.where(counts > 0, wide, bound) for bound in (np.inf, -np.inf))
-    half_range = xp.clip(0.5 * (xp.amax(most, 0) - xp.amin(least, 0)), 0.0, None)  # 0 where none counts
+    half_range = at_least(xp, 0.5 * (xp.amax(most, 0) - xp.amin(least, 0)), 0.0)  # 0 where none counts
     return BatchRows(xp.stack([residual.T, prediction.T, weight.T]), half_range)
 
 
@@ -238,14 +239,14 @@ def updated(xp: Any, recent: Any, old: ScaleState, batch: BatchRows) -> ScaleSta
     """
     residual, weight = recent[0], recent[2]
     size = xp.abs(residual)
-    share = weight / xp.clip(weight.sum(-1), TINY, None)[..., None]
+    share = weight / at_least(xp, weight.sum(-1), TINY)[..., None]
     candidate = weighted_quantile(xp, size, weight, QUANTILE) / NORMAL_QUANTILE
     # where most residuals are exactly 0, their mean size stands for the quantile
     candidate = xp.where(candidate > 0, candidate, (size * share).sum(-1))
     known = (candidate > 0) & (batch.rows[2].sum(-1) > 0)
     first = (old.batches == 0) & known
-    new = xp.where(known, xp.log(xp.clip(candidate, TINY, None)), old.log_scale)
-    rate = xp.clip(1.0 / (_cast(xp, old.batches, recent.dtype) + 1.0), RATE, None)
+    new = xp.where(known, xp.log(at_least(xp, candidate, TINY)), old.log_scale)
+    rate = at_least(xp, 1.0 / (_cast(xp, old.batches, recent.dtype) + 1.0), RATE)
     log_scale = xp.where(first, new, old.log_scale + rate * (new - old.log_scale))
     middle = (residual * share).sum(-1)
     spread = (xp.abs(residual - middle[..., None]) * share).sum(-1)
