@@ -47,14 +47,15 @@ def inlier_weight(
     Args:
         loss: the loss with its current σ and d.
         input: predictions, as for the loss.
-        target: targets of the same shape. Where either is NaN, so is the weight.
+        target: targets of the same shape.
 
     Returns:
         Weights in [0, 1] of the shape of ``input``, float32 at least, without a gradient.
 
     Raises:
         TypeError: a loss of another kind; integer or complex input or target, or what is no tensor.
-        ValueError: shapes differ, are empty, or have another number of channels than the loss.
+        ValueError: shapes differ, are empty, or have another number of channels than the loss; an error is NaN. An
+            infinite error has the weight 0.
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (15).
@@ -66,7 +67,9 @@ def inlier_weight(
     """
     loss = checked_loss(loss)
     axis = loss._checked_axis(input, target)
-    return mkc_weight(_error(input, target), _along(loss.sigma, input, axis), _along(loss.d, input, axis))
+    error = _error(input, target)
+    _refuse_missing(error)
+    return mkc_weight(error, _along(loss.sigma, input, axis), _along(loss.d, input, axis))
 
 
 def outliers(
@@ -85,7 +88,7 @@ def outliers(
 
     Raises:
         TypeError: as in :func:`inlier_weight`.
-        ValueError: as in :func:`inlier_weight`; a limit outside (0, 1); an error that is NaN.
+        ValueError: as in :func:`inlier_weight`; a limit outside (0, 1).
 
     References:
         Li et al., "Multi-kernel Correntropy Regression" (2023), (15).
@@ -96,15 +99,7 @@ def outliers(
         tensor([False, False,  True])
     """
     checked_number("weight_below", weight_below, 0.0, 1.0, advice="0.1 is usual")
-    weight = inlier_weight(loss, input, target)
-    unknown = weight.isnan()
-    if bool(unknown.any()):
-        raise ValueError(
-            f"Expected `input - target` without NaN but got {int(unknown.sum())}, the first at index "
-            f"{tuple(unknown.nonzero()[0].tolist())}: neither inlier nor outlier. Where a target is missing put the "
-            "prediction, torch.where(torch.isfinite(target), target, input), which is never flagged."
-        )
-    return weight < weight_below
+    return inlier_weight(loss, input, target) < weight_below
 
 
 @torch.no_grad()
@@ -197,6 +192,17 @@ def predictive_interval(loss: MKCLoss, input: Float[Tensor, "*shape"], level: fl
     centre = input.to(at_least_float32(input))
     half = _along(half.to(centre), input, axis)
     return Interval(centre - half, centre + half)
+
+
+def _refuse_missing(error: Tensor) -> None:
+    """Refuse an error that is NaN: it is neither inlier nor outlier. An infinite error is an outlier."""
+    unknown = error.isnan()
+    if bool(unknown.any()):
+        raise ValueError(
+            f"Expected `input - target` without NaN but got {int(unknown.sum())}, the first at index "
+            f"{tuple(unknown.nonzero()[0].tolist())}: neither inlier nor outlier. Where a target is missing put the "
+            "prediction, torch.where(torch.isfinite(target), target, input), which is never flagged."
+        )
 
 
 def _error(input: Tensor, target: Tensor) -> Tensor:
