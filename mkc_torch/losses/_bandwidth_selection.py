@@ -80,7 +80,7 @@ def select_bandwidth(
     step = step / slope[..., None]
     step = step - step[..., -1:, :]
     shrinkage = mean(step)
-    spread = mean((step - shrinkage[..., None]) ** 2)
+    spread = mean(step * step) - shrinkage * shrinkage
     size = 1.0 / at_least(xp, (share * share).sum(-1), TINY)[..., None]
     risk = risk + at_least(xp, size * at_least(xp, shrinkage, 0.0) ** 2 - CHANCE * spread, 0.0)
     annealed, initial = risk[..., :-1], risk[..., -1]

@@ -32,6 +32,9 @@ SMALL_BATCH = 1 << 14
 LARGE_BATCH = 1 << 19
 """Elements from which a batch on the CPU is worked through in pieces that stay in the cache."""
 
+SMALL_KAPPA = 0.05
+"""Below it the derivative by kappa is summed element by element: a difference of two sums would lose its digits."""
+
 PIECE = 1 << 17
 """Elements of a piece."""
 
@@ -235,10 +238,11 @@ def _element_values(
 ) -> tuple[ChannelSums, Any]:
     """What is to be summed of each element, and the gradient by the input; the table's numbers broadcast."""
     z = error / table.d
-    wants_kappa, wants_d = table.kappa_by_raw is not None, table.d_by_raw is not None
+    learns_kappa, learns_d = table.kappa_by_raw is not None, table.d_by_raw is not None
     has_gaussian = not looks or bool((table.kappa == 0).any())
-    density = element_energy(xp, z, table.kappa, wants_kappa=wants_kappa, has_gaussian=has_gaussian)
-    by_d = -z * density.by_z if wants_d else None
+    each_kappa = learns_kappa and (not looks or bool((table.kappa < SMALL_KAPPA).any()))
+    density = element_energy(xp, z, table.kappa, wants_kappa=each_kappa, has_gaussian=has_gaussian)
+    by_d = -z * density.by_z if learns_kappa or learns_d else None
     if table.share is None:
         network, by_input = None, density.by_z * (1.0 / (table.d * divisor))
     else:
@@ -309,7 +313,9 @@ def _assembled(xp: Any, batch: Elements, sums: ChannelSums, table: ChannelTable,
     """Value and gradients by the raw parameters from the sums of each channel."""
     total = sums.energy if sums.network is None else sums.energy + sums.network
     by_kappa = sums.by_kappa
-    by_d = None if sums.by_d is None else sums.by_d / table.d
+    if by_kappa is None and table.kappa_by_raw is not None:  # the sum of z² exp(-x) / 2 less the energy, over kappa
+        by_kappa = (-0.5 * sums.by_d - sums.energy) / table.kappa
+    by_d = None if table.d_by_raw is None else sums.by_d / table.d
     if table.log_normalizer is not None:
         if batch.weight is None:
             weight = math.prod(batch.input.shape) / batch.input.shape[batch.axis]

@@ -248,17 +248,20 @@ def updated(xp: Any, recent: Any, old: ScaleState, batch: BatchRows) -> ScaleSta
     new = xp.where(known, xp.log(at_least(xp, candidate, TINY)), old.log_scale)
     rate = at_least(xp, 1.0 / (_cast(xp, old.batches, recent.dtype) + 1.0), RATE)
     log_scale = xp.where(first, new, old.log_scale + rate * (new - old.log_scale))
-    middle = (residual * share).sum(-1)
-    spread = (xp.abs(residual - middle[..., None]) * share).sum(-1)
-    scale = xp.exp(log_scale)
-    # an offset widens the scale, targets that are wrong by far widen the spread
-    floor = FLOOR_IN_SPREAD * xp.where(spread > 0, xp.minimum(spread, scale), scale)
+    floor = old.floor
+    if xp is not np or first.any():  # NumPy may look
+        middle = (residual * share).sum(-1)
+        spread = (xp.abs(residual - middle[..., None]) * share).sum(-1)
+        scale = xp.exp(log_scale)
+        # an offset widens the scale, targets that are wrong by far widen the spread
+        own = FLOOR_IN_SPREAD * xp.where(spread > 0, xp.minimum(spread, scale), scale)
+        floor = xp.where(first, own, old.floor)
     wider = xp.maximum(batch.half_range, RANGE_DECAY * old.half_range)
     return ScaleState(
         batches=old.batches + known,
         log_scale=log_scale,
         half_range=xp.where(first, batch.half_range, xp.where(known, wider, old.half_range)),
-        floor=xp.where(first, floor, old.floor),
+        floor=floor,
     )
 
 
