@@ -11,6 +11,8 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
+from mkc_torch._support.torch_internals import is_wrapped
+
 __all__ = [
     "Residual",
     "beside",
@@ -40,7 +42,7 @@ def beside(constant: Tensor, moving: Tensor) -> Tensor:
     What has none is added and multiplied by reference functions written in Python, half a millisecond each and a second
     at their first use.
     """
-    if not torch._C._functorch.is_functorch_wrapped_tensor(moving):
+    if not is_wrapped(moving):
         return constant
     return torch.where(torch.ones((), dtype=torch.bool, device=constant.device), constant, moving)
 

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch._support.torch_internals import forward_mode_is_active, is_wrapped
+
 if TYPE_CHECKING:
     from jaxtyping import Float
 
@@ -40,8 +42,8 @@ def _is_plain(values: Tensor) -> bool:
         and values.dtype in (torch.float32, torch.float64)
         and not values.requires_grad
         and not torch.compiler.is_compiling()
-        and not torch._C._functorch.is_functorch_wrapped_tensor(values)
-        and torch.autograd.forward_ad._current_level < 0
+        and not is_wrapped(values)
+        and not forward_mode_is_active()
     )
 
 

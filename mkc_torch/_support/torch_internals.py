@@ -4,9 +4,17 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack  # no public way out of a transform
 from torch.autograd import forward_ad
 
-__all__ = ["functorch_is_active", "in_backward", "is_transformed", "is_wrapped"]
+__all__ = [
+    "forward_mode_is_active",
+    "functorch_is_active",
+    "in_backward",
+    "is_transformed",
+    "is_wrapped",
+    "temporarily_clear_interpreter_stack",
+]
 
 
 def is_wrapped(tensor: Tensor) -> bool:
@@ -22,6 +30,11 @@ def is_transformed(tensor: Tensor) -> bool:
 def functorch_is_active() -> bool:
     """Whether a transform of ``torch.func`` is running: torch.func has no public test for it."""
     return torch._C._are_functorch_transforms_active()
+
+
+def forward_mode_is_active() -> bool:
+    """Whether a level of forward-mode differentiation is entered: torch has no public test for it."""
+    return forward_ad._current_level >= 0
 
 
 def in_backward() -> bool:

@@ -6,8 +6,9 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from torch import Tensor
+
+from mkc_torch._support.torch_internals import is_wrapped
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
@@ -25,10 +26,7 @@ _SERIES = tuple((-1) ** n / (math.factorial(n) * (n + 2)) for n in range(8))
 def few(*values: Tensor) -> bool:
     """Whether these are plain tensors of few numbers on the CPU: no transform's, and no subclass's."""
     return all(
-        type(one) is Tensor
-        and one.device.type == "cpu"
-        and one.numel() <= _FEW
-        and not torch._C._functorch.is_functorch_wrapped_tensor(one)
+        type(one) is Tensor and one.device.type == "cpu" and one.numel() <= _FEW and not is_wrapped(one)
         for one in values
     )
 

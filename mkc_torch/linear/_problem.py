@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.arguments import refuse_complex, refuse_no_tensor, refuse_not_real
+from mkc_torch._support.torch_internals import is_wrapped
 
 if TYPE_CHECKING:
     from jaxtyping import Float
-
 
 MAX_IMPLIED_CHANNELS = 16
 
@@ -127,7 +127,7 @@ class LinearProblem:
             kept = self._products_of(slice(None))
             # those made without gradients are of no use with them
             derived = self.basis.requires_grad or self.Y.requires_grad
-            if not (derived or torch._C._functorch.is_functorch_wrapped_tensor(kept[0])):
+            if not (derived or is_wrapped(kept[0])):
                 self.__dict__["_kept_products"] = kept
         return kept
 

@@ -18,6 +18,7 @@ from mkc_torch._support.arguments import (
     told,
 )
 from mkc_torch._support.arrays import Data
+from mkc_torch._support.torch_internals import functorch_is_active
 from mkc_torch.linear._implicit.at_rest import Rest
 from mkc_torch.linear._implicit.layer import Given, fit_layer, wanted
 from mkc_torch.linear._inference import Inference
@@ -80,7 +81,7 @@ def _refuse_no_covariance(covariance: Tensor) -> None:
             f"Expected argument `noise_covariance` of shape (m, m) but got {tuple(covariance.shape)}; variances alone "
             "are `d` squared."
         )
-    if covariance.device.type == "cpu" and not torch._C._are_functorch_transforms_active():
+    if covariance.device.type == "cpu" and not functorch_is_active():
         _cholesky_factor(covariance.detach().double())
 
 

@@ -6,9 +6,9 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
+from mkc_torch._support.torch_internals import is_wrapped
 from mkc_torch.simulation.protocol import Changes, Nearby, PreparedSimulation
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class Continuation:
     def __call__(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, "N m"]:
         """The residual."""
         theta, changes = self._meaning(parameters)
-        if torch._C._functorch.is_functorch_wrapped_tensor(parameters):
+        if is_wrapped(parameters):
             return self._prepared.answer(theta, changes, self._last).residual
         key = _key(parameters)
         # what was found on the way is not always found again from elsewhere

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from mkc_torch._support.torch_internals import functorch_is_active
 from mkc_torch.density.energy import energy, inverse_square
 from mkc_torch.density.normalizer import log_partition
 from mkc_torch.linear._implicit.at_rest import FitData, Rest, at_rest
@@ -67,7 +68,7 @@ class Layer:
 
 def wanted(*values: object) -> bool:
     """Whether derivatives by any of these are being recorded, or a transform of ``torch.func`` is at work."""
-    if torch._C._are_functorch_transforms_active():
+    if functorch_is_active():
         return True
     return any(
         (torch.is_grad_enabled() and value.requires_grad) or forward_ad.unpack_dual(value).tangent is not None

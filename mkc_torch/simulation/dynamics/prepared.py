@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch._support.torch_internals import is_wrapped
 from mkc_torch.nonlinear import GaussianPrior, NoFitError, fit, load_forward_mode
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.between_samples import inputs_between
@@ -209,7 +210,7 @@ class PreparedDynamics(Watched):
         """Recording less prediction, and the trajectory; see :meth:`mkc_torch.simulation.PreparedSimulation.answer`."""
         found = self.trajectory(theta, changes, near)
         # a tensor of a transform must not outlive it
-        lasting = found.converged and not torch._C._functorch.is_functorch_wrapped_tensor(found.states)
+        lasting = found.converged and not is_wrapped(found.states)
         nearby = replace(found, states=found.states.detach()) if lasting else None
         return Answer(self._residual(theta, changes, found), nearby)
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor
-from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack
 
+from mkc_torch._support.torch_internals import is_wrapped, temporarily_clear_interpreter_stack
 from mkc_torch.nonlinear import load_forward_mode
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ def solve(
         if len(norms) > _STALLED and norms[-1] > 0.5 * norms[-1 - _STALLED] and size * part > _ROUNDING:
             break
     states, left = at.states, at.left
-    transformed = any(torch._C._functorch.is_functorch_wrapped_tensor(one) for one in (left, begin))
+    transformed = any(is_wrapped(one) for one in (left, begin))
 
     def renewed() -> Recurrence:
         # nothing here is of a transform that this is asked for in, and in one it would be forward mode again
@@ -398,9 +398,9 @@ def slopes(rate: Rate, at: Float[Tensor, "S n"]) -> Float[Tensor, "S k n"]:
     mode multiplies the branch that ``torch.where`` left out by 0, so an infinite slope there asks for forward mode.
     """
     with torch.enable_grad():
-        given = at.requires_grad_() if not torch._C._functorch.is_functorch_wrapped_tensor(at) else at
+        given = at.requires_grad_() if not is_wrapped(at) else at
         rates = rate(given)
-        if not torch._C._functorch.is_functorch_wrapped_tensor(rates):
+        if not is_wrapped(rates):
             n = rates.shape[1]
             if not rates.requires_grad:
                 return at.new_zeros(len(at), n, at.shape[1])

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mkc_torch._support.torch_internals import is_wrapped
 from mkc_torch.simulation.fmu.evaluation import GROUPS, Evaluation, Group, Moments
 
 __all__ = ["evaluated"]
@@ -121,7 +122,7 @@ def _kept_slopes(ctx: Any, group: Group) -> Tensor:
     found: Tensor | None = ctx.kept.get(group)
     if found is None:
         found = _slopes(ctx.evaluation, ctx.outputs, group, *ctx.saved_tensors)
-        if not (found.requires_grad or torch._C._functorch.is_functorch_wrapped_tensor(found)):
+        if not (found.requires_grad or is_wrapped(found)):
             ctx.kept[group] = found
     return found
 
