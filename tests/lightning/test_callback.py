@@ -997,7 +997,7 @@ def test_d_and_bound_that_are_automatic_have_the_unit_of_the_targets():
         module.net = nn.Sequential(module.net, Times(unit))
         trained(module, loader(x, unit * y), max_epochs=20)
         loss = module.criterion
-        assert not loss.tails(module(x), unit * y).is_gaussian.any()
+        assert not loss.tails(module.net(x), unit * y).is_gaussian.any()
         found.append([loss.sigma.item(), loss.d.item() / unit, loss.bound.item() / unit])
     assert 0.15 < found[0][1] < 0.45
     assert found[1] == pytest.approx(found[0], rel=1e-2)
