@@ -1,5 +1,6 @@
 """One thread a worker, so that workers do not fight over the cores; forward mode loaded once."""
 
+import os
 import warnings
 
 import numpy  # noqa: F401 - its linear algebra can only be limited once it is there
@@ -10,6 +11,9 @@ from _pytest.doctest import DoctestModule
 from mkc_torch._parallel.processes import one_thread
 
 one_thread()
+
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # read where Triton is imported, which torch's compiler may do in any test
 
 
 @pytest.hookimpl(wrapper=True)

@@ -1,12 +1,7 @@
 """The kernels on a GPU where there is one, and under Triton's interpreter elsewhere."""
 
-import os
-
 import pytest
 import torch
-
-if not torch.cuda.is_available():
-    os.environ["TRITON_INTERPRET"] = "1"  # read where a kernel is defined
 
 
 @pytest.fixture(scope="session")
