@@ -3,7 +3,7 @@
 There ``Z = 2 length exp(-1 / kappa) + H(kappa)``: H is the integral of the density less its flat tail, which no longer
 depends on the length. It is a polynomial of degree 7 in ``w = (1 + 12 kappa)^(-1/2)`` on each of 16 intervals of
 [0, 1], on which kappa from infinity to 0 lies. A lookup takes a twentieth of the time of the quadrature of 32 nodes.
-The relative error of Z is 2e-7, that of its slope by kappa 4e-7, beside the rounding of exp(-1 / kappa).
+The relative error of Z is 2e-7, that of its slope by kappa 4e-7, plus the rounding of exp(-1 / kappa).
 """
 
 from __future__ import annotations

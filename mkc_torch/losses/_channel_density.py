@@ -37,7 +37,7 @@ DEFAULT_LEARNING_RATE = 1e-2
 
 
 class ChannelDensity(nn.Module):
-    """The density of each channel: what a loss has beside the way it is computed.
+    """The density of each channel: parameters and running state of a loss, without its computation.
 
     Args:
         num_channels: m.

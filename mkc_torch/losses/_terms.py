@@ -41,7 +41,7 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True)
 class Settings:
-    """What a loss computes with beside its parameters."""
+    """The fixed numbers, the state and the options that a loss is computed with."""
 
     fixed_kappa: Tensor | None
     fixed_d: Tensor | None

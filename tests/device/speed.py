@@ -107,7 +107,7 @@ def print_steps(device: torch.device, sizes: tuple[int, ...], *, compiled: bool)
             step = step_of(loss, *batch(size // CHANNELS, CHANNELS, device))
             try:
                 row = measured(step, size, rate, device)
-            except Exception as error:
+            except Exception as error:  # a compiler fails by types of its own; the row says which
                 row = f"{size:12}  {type(error).__name__}: {str(error).splitlines()[0][:80]}"
             print(f"  {name:34}{row}", flush=True)
 
