@@ -119,10 +119,10 @@ def run(words: list[str], folder: Path) -> None:
         case ["python", script, *arguments] if script.startswith("examples/"):
             run_example(script, arguments, folder)
         case ["python", "-m", module, *_] if module.startswith(
-            ("tests.benchmarks", "tests.fuzz", "tests.mutation", "tests.wheel")
+            ("tests.benchmarks", "tests.device", "tests.fuzz", "tests.mutation", "tests.wheel")
         ):
             # minutes each: here only whether it is there
-            name = f"{module}.__main__" if module == "tests.benchmarks" else module
+            name = f"{module}.__main__" if module in ("tests.benchmarks", "tests.device") else module
             assert callable(importlib.import_module(name).main)
         case ["torchrun", *arguments]:
             words = [sys.executable, "-m", "torch.distributed.run", *arguments]
