@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from mkc_torch.nonlinear._problem import Point, Problem
+from mkc_torch.nonlinear._alone import descended_alone, is_alone
+from mkc_torch.nonlinear._problem import NONLINEAR, Descent, Point, Problem
 from mkc_torch.nonlinear._quadratic import Penalty, model_curvature, objective, positive, quadratic_about
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = ["Descent", "damped_step", "descended", "within"]
-
-_NONLINEAR = 0.03
-"""Least share of a step's effect that the Jacobian did not foresee at which a new one is taken."""
 
 
 def within(box: tuple[Tensor, Tensor] | None, theta: Tensor) -> Tensor:
@@ -55,17 +53,6 @@ def damped_step(
     return step, predicted, solved & torch.isfinite(step).all(-1)
 
 
-@dataclass(frozen=True)
-class Descent:
-    point: Point
-    value: Tensor
-    quiet: Tensor  # at rest: neither the step nor the model, of fresh derivatives, promises more than the limit
-    tired: bool  # the derivatives are too old to go on with
-    taken: Tensor  # whether the last trial was accepted
-    damping: Tensor
-    n_iter: int
-
-
 def descended(
     problem: Problem,
     point: Point,
@@ -84,6 +71,10 @@ def descended(
     A problem rests when a barely damped step promises and brings no more than ``tol`` of the objective, or than
     ``allowance``; unless ``exact``, with derivatives of a point nearby too.
     """
+    if penalty is None and is_alone(problem, point):
+        return descended_alone(
+            problem, point, kappa, d, max_iter=max_iter, tol=tol, allowance=allowance, damping=damping, exact=exact
+        )
     eps = torch.finfo(point.theta.dtype).eps
     quadratic = quadratic_about(problem, point, kappa, d, penalty)
     model = model_curvature(quadratic)
@@ -125,7 +116,7 @@ def descended(
         )
         growth = torch.where(accept, 4.0, torch.where(blamed, 2.0 * growth, growth))
         damping = torch.where(done, damping, changed.clamp(100 * eps, 1e16))
-        unforeseen = _unforeseen(point, step, residual, constraint) > _NONLINEAR
+        unforeseen = _unforeseen(point, step, residual, constraint) > NONLINEAR
         led = point.stale and exact
         tired = bool((unforeseen & accept & ~rest).any()) or bool((rest & led | blamed & point.stale).any())
         done = done | (rest & (not led))

@@ -16,7 +16,17 @@ from mkc_torch._support.forward_mode import Residual, forward_tangents, reverse_
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["TANGENTS", "Constraint", "Point", "Problem", "kernel_weights", "shaped_jacobian"]
+__all__ = [
+    "NONLINEAR",
+    "TANGENTS",
+    "TRUST",
+    "Constraint",
+    "Descent",
+    "Point",
+    "Problem",
+    "kernel_weights",
+    "shaped_jacobian",
+]
 
 TANGENTS: dict[str, Callable[[Residual], Residual]] = {
     "forward": forward_tangents,
@@ -26,6 +36,12 @@ TANGENTS: dict[str, Callable[[Residual], Residual]] = {
 """Ways to a Jacobian."""
 
 Constraint = Callable[[Tensor], Tensor]
+
+NONLINEAR = 0.03
+"""Least share of a step's effect that the Jacobian did not foresee at which a new one is taken."""
+
+TRUST = 0.1
+"""Least share of the majoriser's curvature, in every direction, at which the objective's own curvature is used."""
 
 
 @dataclass(frozen=True)
@@ -61,14 +77,23 @@ class Problem:
         return residual if self.used is None else torch.where(self.used, residual, 0.0)
 
     def tangents(self, theta: Float[Tensor, "B p"], values: int) -> Float[Tensor, "B p N*m"]:
-        """The transposed Jacobian: a row for each parameter, as forward mode makes them; ``values`` is B N m."""
+        """The transposed Jacobian: a row for each parameter, as forward mode makes them; ``values`` is B N m.
+
+        A function may have a method ``tangents`` of its own, which returns the rows of one problem, (p, N, m), or None.
+        """
+        own = getattr(self.function, "tangents", None)
+        if own is not None and len(theta) == 1 and self.data is None:
+            known: Tensor | None = own(theta[0])
+            if known is not None and bool(known.isfinite().all()):
+                return self._counted(known.unsqueeze(0))
         # a batch is differentiated in one, which reverse mode of reverse mode cannot be
         way = "forward" if self.jacobian == "reverse twice" and len(theta) > 1 else self.jacobian
         function = forward_tangents(self.function, values) if way == "forward" else TANGENTS[way](self.function)
-        rows = self._over_batch(function, theta)
-        if self.used is not None:
-            rows = torch.where(self.used.unsqueeze(1), rows, 0.0)
-        return rows.flatten(2)
+        return self._counted(self._over_batch(function, theta))
+
+    def _counted(self, rows: Float[Tensor, "B p N m"]) -> Float[Tensor, "B p N*m"]:
+        """Rows of the transposed Jacobian, 0 where a residual is not used."""
+        return (rows if self.used is None else torch.where(self.used.unsqueeze(1), rows, 0.0)).flatten(2)
 
     def _constraints(self, theta: Tensor) -> Tensor:
         """Equalities and inequalities of one problem, (k,)."""
@@ -151,6 +176,19 @@ class Point:
             merged(self.normals, part.normals),
             self.stale or part.stale,
         )
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Where damped steps at fixed σ and d ended."""
+
+    point: Point
+    value: Tensor
+    quiet: Tensor  # at rest: neither the step nor the model, of fresh derivatives, promises more than the limit
+    tired: bool  # the derivatives are too old to go on with
+    taken: Tensor  # whether the last trial was accepted
+    damping: Tensor
+    n_iter: int
 
 
 def kernel_weights(residual: Tensor, kappa: Tensor, d: Tensor) -> Tensor:

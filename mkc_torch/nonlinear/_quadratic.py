@@ -9,15 +9,12 @@ import torch
 from torch import Tensor
 
 from mkc_torch.density.energy import energy_value
-from mkc_torch.nonlinear._problem import Point, Problem
+from mkc_torch.nonlinear._problem import TRUST, Point, Problem
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 __all__ = ["Penalty", "model_curvature", "objective", "positive", "prior_value", "quadratic_about"]
-
-_TRUST = 0.1
-"""Least share of the majoriser's curvature, in every direction, at which the objective's own curvature is used."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +108,7 @@ def model_curvature(quadratic: _Quadratic) -> Tensor:
     half = torch.linalg.solve_triangular(factor, own, upper=False)
     share = torch.linalg.solve_triangular(factor, half.mT, upper=False).nan_to_num(0.0, 0.0, 0.0)
     least = torch.linalg.eigvalsh(0.5 * (share + share.mT))[..., 0]
-    trusted = (failed == 0) & (least > _TRUST)
+    trusted = (failed == 0) & (least > TRUST)
     return torch.where(trusted[:, None, None], quadratic.curvature, majoriser)
 
 

@@ -4,20 +4,67 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from mkc_torch._support.torch_internals import is_wrapped
-from mkc_torch.simulation.protocol import Changes, Nearby, PreparedSimulation
+from mkc_torch._support.torch_internals import functorch_is_active, is_wrapped
+from mkc_torch.simulation.protocol import Answer, Changes, Nearby, PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Continuation"]
+__all__ = ["CompiledResidual", "Continuation", "Meaning", "Tangents", "compiled_residual", "is_plain"]
+
+Meaning = Callable[[Tensor], tuple[Tensor, Changes]]
+"""The simulation's own parameters and the changes at its ports, by the parameters of a fit."""
 
 _MOST_KEPT = 64
 """Answers of a way that are kept: a fit comes back to one of its last ones."""
+
+
+class Tangents(NamedTuple):
+    """Derivatives of a residual by the parameters of a fit, and what an answer nearby begins with."""
+
+    rows: Float[Tensor, "p N m"]
+    nearby: Nearby
+
+
+class CompiledResidual(Protocol):
+    """A residual with derivatives of its own: those of the simulation to rounding, for less."""
+
+    def answer(self, parameters: Float[Tensor, " p"], near: Nearby | None = None) -> Answer | None:
+        """As :meth:`PreparedSimulation.answer`; None where the simulation itself has to be asked."""
+        ...
+
+    def tangents(self, parameters: Float[Tensor, " p"], near: Nearby) -> Tangents | None:
+        """Derivatives where the answer is ``near``; None where the simulation itself has to be differentiated."""
+        ...
+
+
+@runtime_checkable
+class _Compilable(Protocol):
+    """A prepared simulation that can compile its residual."""
+
+    def compiled(self, meaning: Meaning, size: int) -> CompiledResidual | None:
+        """The residual by ``size`` parameters; None where it cannot be compiled."""
+        ...
+
+
+def compiled_residual(prepared: PreparedSimulation, meaning: Meaning, size: int) -> CompiledResidual | None:
+    """The compiled residual of a simulation; None where there is none.
+
+    Args:
+        prepared: the simulation.
+        meaning: of the parameters.
+        size: number of parameters.
+    """
+    return prepared.compiled(meaning, size) if isinstance(prepared, _Compilable) else None
+
+
+def is_plain(parameters: Tensor) -> bool:
+    """Whether nothing is differentiated by these parameters."""
+    return not (parameters.requires_grad or is_wrapped(parameters) or functorch_is_active())
 
 
 class Continuation:
@@ -27,27 +74,30 @@ class Continuation:
         prepared: the simulation.
         meaning: the simulation's own parameters and the changes at its ports, by those of the fit.
         near: what the first answer begins with.
+        compiled: returns the compiled residual; default that of the simulation.
     """
 
     def __init__(
         self,
         prepared: PreparedSimulation,
-        meaning: Callable[[Tensor], tuple[Tensor, Changes]],
+        meaning: Meaning,
         near: Nearby | None = None,
+        compiled: Callable[[], CompiledResidual | None] | None = None,
     ) -> None:
         self._prepared, self._meaning, self._last = prepared, meaning, near
+        self._compile = compiled
+        self._compiled: tuple[CompiledResidual | None] | None = None
         self._known: OrderedDict[bytes, Nearby] = OrderedDict()
         self._last_key = b""
 
     def __call__(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, "N m"]:
         """The residual."""
-        theta, changes = self._meaning(parameters)
         if is_wrapped(parameters):
-            return self._prepared.answer(theta, changes, self._last).residual
+            return self._prepared.answer(*self._meaning(parameters), self._last).residual
         key = _key(parameters)
         # what was found on the way is not always found again from elsewhere
         near = self._last if key == self._last_key else self._known.get(key, self._last)
-        residual, nearby = self._prepared.answer(theta, changes, near)
+        residual, nearby = self._answer(parameters, near)
         if nearby is not None:
             self._last, self._last_key = nearby, key
             self._known[key] = nearby.bare
@@ -56,10 +106,38 @@ class Continuation:
                 self._known.popitem(last=False)
         return residual
 
+    def tangents(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, "p N m"] | None:
+        """Derivatives of the residual, a row for each parameter; None where they have to be found another way."""
+        compiled = self._compiled_for(parameters) if is_plain(parameters) else None
+        if compiled is None:
+            return None
+        key = _key(parameters)
+        if key != self._last_key and key not in self._known:
+            self(parameters)
+        near = self._last if key == self._last_key else self._known.get(key)
+        found = None if near is None else compiled.tangents(parameters, near)
+        if found is None:
+            return None
+        self._last, self._last_key = found.nearby, key
+        return found.rows
+
     def near(self, parameters: Float[Tensor, " p"]) -> Nearby | None:
         """What an answer at these parameters begins with: the one that was found there, or else the last one."""
         last = None if self._last is None else self._last.bare
         return self._known.get(_key(parameters), last)
+
+    def _answer(self, parameters: Tensor, near: Nearby | None) -> Answer:
+        compiled = self._compiled_for(parameters) if is_plain(parameters) else None
+        found = None if compiled is None else compiled.answer(parameters, near)
+        return self._prepared.answer(*self._meaning(parameters), near) if found is None else found
+
+    def _compiled_for(self, parameters: Tensor) -> CompiledResidual | None:
+        if self._compiled is None:
+            if self._compile is None:
+                self._compiled = (compiled_residual(self._prepared, self._meaning, len(parameters)),)
+            else:
+                self._compiled = (self._compile(),)
+        return self._compiled[0]
 
 
 def _key(parameters: Tensor) -> bytes:

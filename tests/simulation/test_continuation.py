@@ -1,5 +1,7 @@
 """Answers depend on their arguments alone; on the way of a fit each begins with the one before."""
 
+from functools import cache
+
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -20,7 +22,9 @@ class Pendulum(Dynamics):
         return {"angle": x.speed, "speed": -p.stiffness * torch.sin(x.angle) - p.damping * x.speed}
 
 
-PREPARED = Pendulum().prepare(Recording({"time": TIME, "angle": torch.exp(-0.1 * TIME) * torch.cos(2.0 * TIME)}))
+@cache
+def prepared():
+    return Pendulum().prepare(Recording({"time": TIME, "angle": torch.exp(-0.1 * TIME) * torch.cos(2.0 * TIME)}))
 
 
 def theta(stiffness, damping=0.2):
@@ -30,26 +34,28 @@ def theta(stiffness, damping=0.2):
 @settings(max_examples=15, deadline=None)
 @given(st.lists(st.floats(0.5, 30.0), max_size=3), st.floats(0.5, 30.0))
 def test_an_answer_does_not_depend_on_what_was_asked_before(before, asked):
-    first = PREPARED.answer(theta(asked), {}).residual
+    first = prepared().answer(theta(asked), {}).residual
     for stiffness in before:
-        PREPARED.answer(theta(stiffness), {})
-        PREPARED.signals(theta(stiffness), {})
-    assert torch.equal(PREPARED.answer(theta(asked), {}).residual, first)
+        prepared().answer(theta(stiffness), {})
+        prepared().signals(theta(stiffness), {})
+    assert torch.equal(prepared().answer(theta(asked), {}).residual, first)
 
 
 @settings(max_examples=15, deadline=None)
 @given(st.floats(1.0, 10.0), st.floats(0.95, 1.05))
 def test_where_an_answer_begins_changes_it_by_rounding_alone(stiffness, factor):
-    near = PREPARED.answer(theta(factor * stiffness), {}).nearby
-    alone = PREPARED.answer(theta(stiffness), {}).residual
+    near = prepared().answer(theta(factor * stiffness), {}).nearby
+    alone = prepared().answer(theta(stiffness), {}).residual
     for beginning in (near, near.bare):
-        torch.testing.assert_close(PREPARED.answer(theta(stiffness), {}, beginning).residual, alone, rtol=0, atol=1e-8)
+        torch.testing.assert_close(
+            prepared().answer(theta(stiffness), {}, beginning).residual, alone, rtol=0, atol=1e-8
+        )
 
 
 def test_derivatives_are_those_of_the_answer_alone():
-    near = PREPARED.answer(theta(4.3), {}).nearby
+    near = prepared().answer(theta(4.3), {}).nearby
     slopes = [
-        torch.func.jacfwd(lambda p, at=at: PREPARED.answer(p, {}, at).residual)(theta(4.0)) for at in (None, near)
+        torch.func.jacfwd(lambda p, at=at: prepared().answer(p, {}, at).residual)(theta(4.0)) for at in (None, near)
     ]
     torch.testing.assert_close(*slopes, rtol=1e-6, atol=1e-8)
 
@@ -92,8 +98,8 @@ def test_each_answer_begins_with_the_one_before_and_one_that_is_asked_again_with
 def test_what_is_found_inside_of_a_transform_is_not_kept():
     simulation = Noting()
     way = Continuation(simulation, lambda p: (p, {}), Found(0.0))
-    assert PREPARED.answer(theta(4.0), {}).nearby is not None
+    assert prepared().answer(theta(4.0), {}).nearby is not None
     seen = []
-    torch.func.jvp(lambda p: seen.append(PREPARED.answer(p, {})) or seen[0].residual, (theta(4.0),), (theta(1.0),))
+    torch.func.jvp(lambda p: seen.append(prepared().answer(p, {})) or seen[0].residual, (theta(4.0),), (theta(1.0),))
     assert seen[0].nearby is None
     assert way.near(torch.tensor([1.0])) == Found(0.0, whole=False)

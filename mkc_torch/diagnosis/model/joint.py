@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.courses import combined, gained
 from mkc_torch.nonlinear import GaussianPrior, beside
-from mkc_torch.simulation.continuation import Continuation
+from mkc_torch.simulation.continuation import CompiledResidual, Continuation, compiled_residual, is_plain
 from mkc_torch.simulation.protocol import Answer, Change, FreeChange, Nearby, PreparedSimulation
 
 if TYPE_CHECKING:
@@ -112,6 +113,10 @@ class JointModel:
 
     def answer(self, parameters: Float[Tensor, " p"]) -> Answer:
         """The residual, and what one nearby begins with."""
+        compiled = self._compiled if is_plain(parameters) else None
+        found = None if compiled is None else compiled.answer(parameters, self.near)
+        if found is not None:
+            return found
         return self.prepared.answer(parameters[: self.base], self.changes(parameters), self.near)
 
     def pushed(self, parameters: Float[Tensor, " p"], port: str, change: Float[Tensor, "N c"]) -> Float[Tensor, "N m"]:
@@ -127,11 +132,25 @@ class JointModel:
 
     def begun_with(self, near: Nearby | None) -> JointModel:
         """The same with another answer to begin with."""
-        return JointModel(self.prepared, self.terms, near)
+        other = copy.copy(self)
+        vars(other).update(vars(self), near=near)  # the compiled residual too
+        return other
 
     def continuation(self) -> Continuation:
         """The residual for one fit, on whose way each answer begins with the one before."""
-        return Continuation(self.prepared, lambda p: (p[: self.base], self.changes(p)), self.near)
+        return Continuation(self.prepared, self._meaning, self.near, lambda: self._compiled)
+
+    def _meaning(self, parameters: Tensor) -> tuple[Tensor, dict[str, Change]]:
+        """The simulation's own parameters, and what the effects add at each port."""
+        return parameters[: self.base], self.changes(parameters)
+
+    @cached_property
+    def _compiled(self) -> CompiledResidual | None:
+        return compiled_residual(self.prepared, self._meaning, self.size)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the compiled residual, which another process compiles again."""
+        return {name: value for name, value in vars(self).items() if name != "_compiled"}
 
     def with_term(self, term: Term) -> JointModel:
         return JointModel(self.prepared, (*self.terms, term), self.near)

@@ -22,9 +22,9 @@ from mkc_torch.simulation.protocol import Answer, Changes, Nearby
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Correcting", "Disturbance", "Observable", "Observer", "clipped", "clipped_slope"]
+__all__ = ["CLIP", "Correcting", "Disturbance", "Observable", "Observer", "clipped", "clipped_slope"]
 
-_CLIP = 4.0
+CLIP = 4.0
 """Standard deviations of what is new in a sample beyond which it moves the states no further: it may be an outlier."""
 
 
@@ -82,13 +82,13 @@ class Observer:
 
 def clipped(new: Float[Tensor, "N m"], spread: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
     """What an observer takes of innovations of these standard deviations: a few of them at most."""
-    limit = _CLIP * spread
+    limit = CLIP * spread
     return limit * torch.tanh(new / limit)
 
 
 def clipped_slope(new: Float[Tensor, "N m"], spread: Float[Tensor, "N m"]) -> Float[Tensor, "N m"]:
     """The derivative of :func:`clipped` by the innovations."""
-    return 1.0 - torch.tanh(new / (_CLIP * spread)).square()
+    return 1.0 - torch.tanh(new / (CLIP * spread)).square()
 
 
 @dataclass(frozen=True)

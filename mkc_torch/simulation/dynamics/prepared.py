@@ -16,8 +16,11 @@ from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch._support.torch_internals import is_wrapped
 from mkc_torch.nonlinear import GaussianPrior, NoFitError, fit, load_forward_mode
 from mkc_torch.recording.recording import Recording
+from mkc_torch.simulation.continuation import Meaning
 from mkc_torch.simulation.dynamics.between_samples import inputs_between
 from mkc_torch.simulation.dynamics.checks import Moments, check_functions
+from mkc_torch.simulation.dynamics.compiled.faithful import is_faithful
+from mkc_torch.simulation.dynamics.compiled.residual import CompiledDynamics, compiled_dynamics
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.first_guess import despiked, first_guess
 from mkc_torch.simulation.dynamics.observer import Observer
@@ -79,6 +82,7 @@ class PreparedDynamics(Watched):
         self._p = p
         self.clean = torch.stack([despiked(one, self.time, self.begins) for one in self.measured.unbind(-1)], -1)
         self.counts = self.clean == self.measured
+        self._faithful: dict[int, bool] = {}
         self._check_functions()
         self._refine()
 
@@ -214,6 +218,18 @@ class PreparedDynamics(Watched):
         nearby = replace(found, states=found.states.detach()) if lasting else None
         return Answer(self._residual(theta, changes, found), nearby)
 
+    def compiled(self, meaning: Meaning, size: int) -> CompiledDynamics | None:
+        """The residual by ``size`` parameters, computed without torch; None where a function of it cannot be traced.
+
+        Args:
+            meaning: the simulation's own parameters and the changes at its ports, by these.
+            size: number of parameters.
+        """
+        stations = len(self.clock.time)
+        if stations not in self._faithful:  # shared by copies, whose functions are the same
+            self._faithful[stations] = is_faithful(self.observed(None), self.given)
+        return compiled_dynamics(self, meaning, size) if self._faithful[stations] else None
+
     def residual(
         self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
     ) -> Float[Tensor, "N m"]:
@@ -231,11 +247,17 @@ class PreparedDynamics(Watched):
         return self._simulated(theta, changes, self.trajectory(theta, changes, near))
 
     def _simulated(self, theta: Tensor, changes: Changes, found: Trajectory) -> Float[Tensor, "N m"]:
-        outputs = self._outputs(theta, found)
+        outputs = self.outputs_by_states(theta, changes, found.states[self.rows])
+        return outputs if found.converged else outputs * torch.nan
+
+    def outputs_by_states(
+        self, theta: Float[Tensor, " p"], changes: Changes, states: Float[Tensor, "N w"]
+    ) -> Float[Tensor, "N m"]:
+        """The outputs at the samples by the states there, internal states of effects and disturbances included."""
+        outputs = self._outputs(theta, states)
         if "output" in changes:
             outputs = outputs + changes["output"](outputs)
-        outputs = outputs + self.pushed_outputs(found.states[self.rows])
-        return outputs if found.converged else outputs * torch.nan
+        return outputs + self.pushed_outputs(states)
 
     def signals(self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None) -> Mapping[str, Tensor]:
         found = self.trajectory(theta, changes, near)
@@ -243,7 +265,7 @@ class PreparedDynamics(Watched):
         jump = self.jump(theta, changes)
         at_stations = stations(self.rate(theta, changes), found.states, self.grid.step.unsqueeze(-1), jump)
         at_stations = at_stations[:, : len(self.system.states)]
-        outputs = self._outputs(theta, found)
+        outputs = self._outputs(theta, found.states[self.rows])
         rates = self._rates(theta, at_stations, inputs)
         at = {
             name: self._signal(port, theta, at_stations, inputs, rates)
@@ -269,18 +291,15 @@ class PreparedDynamics(Watched):
             near: a trajectory at parameters nearby, to begin with; None to find the way alone.
             patient: go from moment to moment if it must.
         """
-        begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
-        rate = self.rate(theta, changes)
-        memories = [like for memory in self.remembering(changes).values() for like in memory.values()]
-        memories += [""] * len(self.lasting)
-        begin, jump = self._with_memories(begin, memories), self.jump(theta, changes)
+        rate, jump = self.rate(theta, changes), self.jump(theta, changes)
+        begin, memories = self.first_states(theta, changes)
         width = begin.shape[1]
         known = near if isinstance(near, Trajectory) else None
-        guess = self._with_memories(self.guess if known is None else known.states, memories)
+        guess = self.with_memories(self.guess if known is None else known.states, memories)
         linear = known is not None and known.linear is not None and known.states.shape[1] == width
         found = solve(rate, self.grid, begin, guess, known if linear else None, jump=jump)
         if not found.converged and known is not None:
-            found = solve(rate, self.grid, begin, self._with_memories(self.guess, memories), jump=jump)
+            found = solve(rate, self.grid, begin, self.with_memories(self.guess, memories), jump=jump)
         if not found.converged and known is None:
             nearer = marched(rate, self.grid, begin, guess, jump=jump)
             found = found if nearer is None else solve(rate, self.grid, begin, nearer, jump=jump)
@@ -289,12 +308,19 @@ class PreparedDynamics(Watched):
             found = found if nearer is None else solve(rate, self.grid, begin, nearer, jump=jump)
         return found
 
+    def first_states(self, theta: Float[Tensor, " p"], changes: Changes) -> tuple[Float[Tensor, "K w"], list[str]]:
+        """The states that the runs begin in, internal ones included, and the state that each of these begins like."""
+        memories = [like for memory in self.remembering(changes).values() for like in memory.values()]
+        memories += [""] * len(self.lasting)
+        begin = theta[self._p :].unflatten(0, (-1, len(self.system.states)))
+        return self.with_memories(begin, memories), memories
+
     def since_begin(self) -> Float[Tensor, " N"]:
         """Time since the beginning of each sample's run, in s."""
         first = torch.where(self.begins, torch.arange(len(self.time)), 0).cummax(0).values
         return self.time - self.time[first]
 
-    def _with_memories(self, states: Float[Tensor, "G n"], memories: Sequence[str]) -> Float[Tensor, "G w"]:
+    def with_memories(self, states: Float[Tensor, "G n"], memories: Sequence[str]) -> Float[Tensor, "G w"]:
         """The states, and internal ones that are not yet among them: like another state, or zeros."""
         n = len(self.system.states)
         more = [
@@ -382,9 +408,9 @@ class PreparedDynamics(Watched):
         acting = self.system.actuated(self.clock.time, Names(**columns), self.parameters_of(theta), run)
         return torch.stack([acting[name] for name in self.system.inputs], -1)
 
-    def _outputs(self, theta: Tensor, found: Trajectory) -> Float[Tensor, "N m"]:
+    def _outputs(self, theta: Tensor, states: Float[Tensor, "N w"]) -> Float[Tensor, "N m"]:
         p = self.parameters_of(theta)
-        x = namespace(self.system.states, found.states[self.rows, : len(self.system.states)])
+        x = namespace(self.system.states, states[:, : len(self.system.states)])
         u = namespace(self.system.inputs, self.inputs_at_rows)
         values = self.system.sensed(self.time, self.system.output(self.time, x, u, p), p, self.run)
         return torch.stack([values[name] for name in self.channels], -1)

@@ -19,6 +19,8 @@ from torch import Tensor
 
 from mkc_torch._support.torch_internals import is_wrapped, temporarily_clear_interpreter_stack
 from mkc_torch.nonlinear import load_forward_mode
+from mkc_torch.simulation.dynamics.recurrence import Recurrence
+from mkc_torch.simulation.dynamics.settings import HALVINGS, MOST_STEPS, QUICK, ROUNDING, SETTLED, STALLED
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -28,10 +30,10 @@ __all__ = [
     "Jump",
     "Linear",
     "Rate",
-    "Recurrence",
     "Trajectory",
     "carried",
     "defect",
+    "linearised_later",
     "marched",
     "slopes",
     "solve",
@@ -41,18 +43,8 @@ __all__ = [
 Rate = Callable[[Tensor], Tensor]
 """Of change of the states, (S, n) → (S, n), at the stations of a grid."""
 
-_MOST_STEPS = 30
-_STALLED = 5
-"""Steps that together do not even halve what is left lead nowhere."""
-
-_SETTLED = 1e-9
-_HALVINGS = 6
-_QUICK = 0.01
-_ROUNDING = 1e-6
 _HORIZON, _ROUGHLY = 32, 1e-4
 _DIGITS = 100.0
-_FEW = 256
-"""Moments from which on it is cheaper to join them all at once than one half to the other."""
 
 
 @dataclass(frozen=True)
@@ -124,12 +116,26 @@ class Trajectory:
         return Trajectory(self.states, self.converged)
 
 
-@dataclass(frozen=True)
 class Linear:
-    """Equations linearised near a trajectory; ``renewed`` linearises them at its states themselves."""
+    """Equations linearised near a trajectory.
 
-    recurrence: Recurrence
-    renewed: Callable[[], Recurrence]
+    Args:
+        renewed: linearises them at its states themselves.
+        recurrence: the linearised equations; None takes those of ``renewed`` when they are asked for.
+        factor: the same for NumPy, see :mod:`mkc_torch.simulation.dynamics.compiled`; None where there is none.
+    """
+
+    def __init__(
+        self, renewed: Callable[[], Recurrence], recurrence: Recurrence | None = None, factor: object | None = None
+    ) -> None:
+        self.renewed, self.factor = renewed, factor
+        self._recurrence = recurrence
+
+    @property
+    def recurrence(self) -> Recurrence:
+        if self._recurrence is None:
+            self._recurrence = self.renewed()
+        return self._recurrence
 
 
 def solve(
@@ -173,9 +179,9 @@ def solve(
     fresh, moved_on = linear is None, False
     recurrence = _recurrence(rate, states, step, grid, jump) if linear is None else linear.recurrence
     converged = False
-    settled = max(_SETTLED, _DIGITS * torch.finfo(states.dtype).eps)
+    settled = max(SETTLED, _DIGITS * torch.finfo(states.dtype).eps)
     norms = [at.norm]
-    for _ in range(_MOST_STEPS):
+    for _ in range(MOST_STEPS):
         change = recurrence.solved(torch.zeros_like(states), at.left.detach())
         size = float((change / at.scale).abs().max())
         if size < settled:
@@ -183,19 +189,19 @@ def solve(
             break
         after, part = at, 1.0
         if size < torch.inf:
-            for _ in range(_HALVINGS if fresh else 1):
+            for _ in range(HALVINGS if fresh else 1):
                 after = _Point.of(rate, at.states + part * change, step, jump)
                 if after.norm <= at.norm:
                     break
                 part *= 0.5
-        if not fresh and not after.norm <= _QUICK * at.norm:
+        if not fresh and not after.norm <= QUICK * at.norm:
             recurrence, fresh = _recurrence(rate, at.states, step, grid, jump), True
             continue
-        if after is at or (not after.norm < at.norm and size * part > _ROUNDING):
+        if after is at or (not after.norm < at.norm and size * part > ROUNDING):
             break
         at, fresh, moved_on = after, False, True
         norms.append(at.norm)
-        if len(norms) > _STALLED and norms[-1] > 0.5 * norms[-1 - _STALLED] and size * part > _ROUNDING:
+        if len(norms) > STALLED and norms[-1] > 0.5 * norms[-1 - STALLED] and size * part > ROUNDING:
             break
     states, left = at.states, at.left
     transformed = any(is_wrapped(one) for one in (left, begin))
@@ -210,7 +216,30 @@ def solve(
         recurrence = renewed() if linear is None or moved_on else linear.renewed()
     # one more step, whose value is that of rounding and whose derivative is that of the solution
     start = torch.where(origin, begin[places] - states, 0.0)
-    return Trajectory(states + recurrence.solved(start, left), converged, Linear(recurrence, renewed))
+    return Trajectory(states + recurrence.solved(start, left), converged, Linear(renewed, recurrence))
+
+
+def linearised_later(
+    functions: Callable[[], tuple[Rate, Jump | None]],
+    states: Float[Tensor, "G n"],
+    grid: Grid,
+    factor: object | None = None,
+) -> Linear:
+    """The equations of a solved trajectory, linearised when they are asked for.
+
+    Args:
+        functions: returns the rate and the jump of :func:`solve`.
+        states: of the trajectory.
+        grid: its moments.
+        factor: the linearised equations for NumPy.
+    """
+
+    def renewed() -> Recurrence:
+        with temporarily_clear_interpreter_stack():
+            rate, jump = functions()
+            return _recurrence(rate, states, grid.step.unsqueeze(-1), grid, jump)
+
+    return Linear(renewed, factor=factor)
 
 
 def marched(
@@ -242,7 +271,7 @@ def marched(
         # beyond what is solved the last state stays
         states = states[torch.minimum(index, first + horizon - stride)]
         inside = (place <= horizon).unsqueeze(-1)
-        for _ in range(_MOST_STEPS):
+        for _ in range(MOST_STEPS):
             at = _Point.of(rate, states, step, jump)
             left = torch.where(inside[1:], at.left.detach(), 0.0)
             change = torch.where(
@@ -252,7 +281,7 @@ def marched(
             if not size < torch.inf:
                 return None
             part, norm = 1.0, float((left / at.scale).square().mean())
-            for _ in range(_HALVINGS):
+            for _ in range(HALVINGS):
                 after = defect(rate, states + part * change, step, jump).detach()
                 if float((torch.where(inside[1:], after, 0.0) / at.scale).square().mean()) <= norm:
                     break
@@ -313,48 +342,6 @@ def _after(states: Float[Tensor, "G n"], jump: Jump | None) -> Float[Tensor, "G 
     return states if jump is None else jump.applied(states)
 
 
-@dataclass(frozen=True)
-class Recurrence:
-    """The recurrence ``δ[k+1] = A[k] δ[k] − B[k] D[k]``: its A, those of every second moment and so on, and B.
-
-    Neighbours are joined until few are left, which takes a few times the work of one step after the other; those few
-    are joined over 1, 2, 4 … intervals, which takes fewer operations.
-    """
-
-    carries: tuple[Tensor, ...]
-    products: tuple[Tensor, ...]
-    inverse: Tensor
-
-    def solved(self, start: Float[Tensor, "G n"], defect: Float[Tensor, "G-1 n"]) -> Float[Tensor, "G n"]:
-        pushed = _applied(self.inverse, defect)
-        return self._passed_on(start - torch.cat([torch.zeros_like(pushed[:1]), pushed]), 0)
-
-    def _passed_on(self, values: Float[Tensor, "G n"], level: int) -> Float[Tensor, "G n"]:
-        if level < len(self.carries):
-            A = self.carries[level]
-            first = values[::2]
-            second = values[1::2] + _applied(A[1::2], first[: len(values) // 2])
-            second = self._passed_on(second, level + 1)
-            later = first[1:] + _applied(A[2::2], second[: len(first) - 1])
-            return _in_turn(torch.cat([first[:1], later]), second)
-        shift = 1
-        for product in self.products:
-            carried = _applied(product, values[:-shift])
-            values = torch.cat([values[:shift], values[shift:] + carried])
-            shift *= 2
-        return values
-
-
-def _applied(matrices: Float[Tensor, "G n n"], values: Float[Tensor, "G n"]) -> Float[Tensor, "G n"]:
-    return torch.matmul(matrices, values.unsqueeze(-1)).squeeze(-1)
-
-
-def _in_turn(first: Float[Tensor, "G n"], second: Float[Tensor, "H n"]) -> Float[Tensor, "G+H n"]:
-    """Rows of the one and of the other, in turn; the first may have one more."""
-    paired = torch.stack([first[: len(second)], second], 1).flatten(0, 1)
-    return torch.cat([paired, first[len(second) :]])
-
-
 def carried(
     rate: Rate, states: Float[Tensor, "G n"], step: Float[Tensor, "G-1 1"], jump: Jump | None = None
 ) -> tuple[Float[Tensor, "G-1 n n"], Float[Tensor, "G-1 n n"]]:
@@ -378,17 +365,7 @@ def _recurrence(
         carries = carries @ jump.slope(states.detach())[:-1]
     # the first moment has none before it
     carries = torch.cat([torch.zeros_like(carries[:1]), carries])
-    longest, levels = grid.longest, []
-    while longest > _FEW:
-        levels.append(carries)
-        carries = carries[1::2] @ carries[: len(carries) // 2 * 2 : 2]
-        longest = longest // 2 + 1
-    products, shift = [], 1
-    while shift < longest:
-        products.append(carries[shift:])
-        carries = torch.cat([carries[:shift], carries[shift:] @ carries[:-shift]])
-        shift *= 2
-    return Recurrence(tuple(levels), tuple(products), inverse)
+    return Recurrence.of(carries, inverse, grid.longest)
 
 
 def slopes(rate: Rate, at: Float[Tensor, "S n"]) -> Float[Tensor, "S k n"]:

@@ -1,0 +1,194 @@
+"""The collocation of :mod:`mkc_torch.simulation.dynamics.trajectory` on NumPy arrays, and its tangents."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from mkc_torch.simulation.dynamics.compiled.affine import Affine, inverted, multiplied
+from mkc_torch.simulation.dynamics.compiled.expressions import Array
+from mkc_torch.simulation.dynamics.settings import (
+    HALVINGS,
+    MOST_STEPS,
+    QUICK,
+    ROUNDING,
+    SETTLED,
+    STALLED,
+)
+
+__all__ = ["ArrayGrid", "Factor", "Found", "Functions", "JumpFunctions", "Linearised", "linearised", "solved"]
+
+
+class JumpFunctions(Protocol):
+    """What happens to the states at the moments of a grid; see :class:`..trajectory.Jump`."""
+
+    def applied(self, states: Array) -> Array:
+        """The states just after each moment, (w, G), by those just before it."""
+        ...
+
+    def slope(self, states: Array) -> Array:
+        """Of the states after by those before, (w, w, G)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Functions:
+    """A differential equation at given parameters, for states at the ends (w, 2, G-1) and in the middle (w, G-1).
+
+    Attributes:
+        ends, middle: the rates, in the states' shape.
+        ends_slope, middle_slope: of the rates by the states, (w, w, 2, G-1) and (w, w, G-1).
+        jump: at the moments; None for nothing.
+    """
+
+    ends: Callable[[Array], Array]
+    middle: Callable[[Array], Array]
+    ends_slope: Callable[[Array], Array]
+    middle_slope: Callable[[Array], Array]
+    jump: JumpFunctions | None
+
+
+@dataclass(frozen=True)
+class ArrayGrid:
+    """The moments of trajectories that follow one another.
+
+    Attributes:
+        step: (G-1,), length of each interval in s; 0 before the beginning of a trajectory.
+        begins: (G,), where a trajectory begins.
+        longest: number of moments of the longest trajectory.
+    """
+
+    step: Array
+    begins: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    longest: int
+
+
+@dataclass(frozen=True)
+class Factor:
+    """Linearised equations, ready to be solved.
+
+    Attributes:
+        affine: the recurrence of a small change of the states.
+        inverse: how a defect arrives at the end of its interval, (w, w, G-1).
+    """
+
+    affine: Affine
+    inverse: Array
+
+    def solved(self, defect: Array) -> Array:
+        """The change that takes defects (w, K, G-1) away, (w, K, G), with first states that stay."""
+        pushed = multiplied(self.inverse, defect)
+        return self.affine.solved(np.concatenate([np.zeros_like(pushed[..., :1]), -pushed], -1))
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Equations linearised at states.
+
+    Attributes:
+        factor: ready to be solved.
+        ends, middle: the states at the ends (w, 2, G-1) and in the middle (w, G-1) of each interval.
+        behind: the slope of the defects by the states just after the left ends, (w, w, G-1).
+        middle_slope: the slope of the rates in the middle, (w, w, G-1).
+    """
+
+    factor: Factor
+    ends: Array
+    middle: Array
+    behind: Array
+    middle_slope: Array
+
+
+@dataclass(frozen=True)
+class Found:
+    """A trajectory, (w, G), and the linearised equations that it was found with."""
+
+    states: Array
+    factor: Factor
+
+
+class _Point:
+    """States on the way to a solution, with their defects, the scale of each state, and the size of the defects."""
+
+    def __init__(self, functions: Functions, grid: ArrayGrid, states: Array) -> None:
+        self.states = states
+        self.ends, self.middle, self.defect = _defect(functions, grid, states)
+        scale = np.abs(states).max(1, keepdims=True)
+        self.scale = scale + 1e-6 * scale.max() + 1e-12
+        self.norm = float(np.square(self.defect / self.scale).mean())
+
+
+def _defect(functions: Functions, grid: ArrayGrid, states: Array) -> tuple[Array, Array, Array]:
+    """The states at the ends and in the middle of each interval, and what the ends lack of Simpson's rule."""
+    h, after = grid.step, states if functions.jump is None else functions.jump.applied(states)
+    ends = np.stack([after[:, :-1], states[:, 1:]], 1)
+    rates = functions.ends(ends)
+    middle = 0.5 * (ends[:, 0] + ends[:, 1]) + 0.125 * h * (rates[:, 0] - rates[:, 1])
+    simpson = rates[:, 0] + 4.0 * functions.middle(middle) + rates[:, 1]
+    gone = np.where(h > 0, ends[:, 1] - ends[:, 0], 0.0)
+    return ends, middle, gone - h / 6.0 * simpson
+
+
+def linearised(functions: Functions, grid: ArrayGrid, states: Array) -> Linearised:
+    """The equations linearised at states (w, G)."""
+    return _linearised(functions, grid, _Point(functions, grid, states))
+
+
+def _linearised(functions: Functions, grid: ArrayGrid, at: _Point) -> Linearised:
+    h, eye = grid.step, np.eye(len(at.states))[..., None]
+    slope, middle = functions.ends_slope(at.ends), functions.middle_slope(at.middle)
+    left, right = slope[:, :, 0], slope[:, :, 1]
+    behind = -eye - h / 6.0 * (left + 4.0 * multiplied(middle, 0.5 * eye + 0.125 * h * left))
+    ahead = eye - h / 6.0 * (right + 4.0 * multiplied(middle, 0.5 * eye - 0.125 * h * right))
+    inverse = inverted(ahead)
+    carries = np.where(h > 0, -multiplied(inverse, behind), 0.0)
+    if functions.jump is not None:
+        carries = multiplied(carries, functions.jump.slope(at.states)[..., :-1])
+    carries = np.concatenate([np.zeros_like(carries[..., :1]), carries], -1)
+    return Linearised(Factor(Affine.of(carries, grid.longest), inverse), at.ends, at.middle, behind, middle)
+
+
+def solved(functions: Functions, grid: ArrayGrid, guess: Array, factor: Factor | None = None) -> Found | None:
+    """The trajectories near a guess (w, G), whose states where they begin are kept; None where none is found.
+
+    As :func:`mkc_torch.simulation.dynamics.trajectory.solve` step for step; a factor of a trajectory nearby serves as
+    long as it brings the equations to rest quickly. Warnings of NumPy are the caller's to silence.
+    """
+    at = _Point(functions, grid, guess)
+    fresh = factor is None
+    if factor is None:
+        factor = _linearised(functions, grid, at).factor
+    norms = [at.norm]
+    for _ in range(MOST_STEPS):
+        change = factor.solved(at.defect[:, None])[:, 0]
+        size = float(np.abs(change / at.scale).max())
+        if size < SETTLED:
+            return Found(at.states + change, factor)
+        after, part = at, 1.0
+        if size < np.inf:
+            for _ in range(HALVINGS if fresh else 1):
+                after = _Point(functions, grid, at.states + part * change)
+                if after.norm <= at.norm:
+                    break
+                part *= 0.5
+        if not fresh and not after.norm <= QUICK * at.norm:
+            factor, fresh = _linearised(functions, grid, at).factor, True
+            continue
+        if after is at or (not after.norm < at.norm and size * part > ROUNDING):
+            break
+        at, fresh = after, False
+        norms.append(at.norm)
+        if len(norms) > STALLED and norms[-1] > 0.5 * norms[-1 - STALLED] and size * part > ROUNDING:
+            break
+    return None
+
+
+def dense(values: Sequence[Array | float], places: Sequence[tuple[int, int]], shape: tuple[int, ...]) -> Array:
+    """A matrix of which these elements are not 0, each for all moments."""
+    found = np.zeros(shape)
+    for place, value in zip(places, values, strict=True):
+        found[place] = value
+    return found

@@ -1,0 +1,292 @@
+"""Scalar expressions of states, parameters and columns of constants, and their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["FUNCTIONS", "Array", "Expressions", "Node"]
+
+Array = NDArray[np.float64]
+
+CONSTANT, PARAMETER, STATE = 0, 1, 2
+"""What a node depends on at most."""
+
+
+def _sigmoid(x: Any) -> Any:
+    return 1.0 / (1.0 + np.exp(-x))
+
+
+def _double(x: Any) -> Any:
+    return np.multiply(x, 1.0)
+
+
+FUNCTIONS: dict[str, Callable[..., Any]] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "pow": np.power,
+    "neg": np.negative,
+    "abs": np.absolute,
+    "sign": np.sign,
+    "sqrt": np.sqrt,
+    "exp": np.exp,
+    "expm1": np.expm1,
+    "log": np.log,
+    "log1p": np.log1p,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tan": np.tan,
+    "asin": np.arcsin,
+    "acos": np.arccos,
+    "atan": np.arctan,
+    "atan2": np.arctan2,
+    "sinh": np.sinh,
+    "cosh": np.cosh,
+    "tanh": np.tanh,
+    "sigmoid": _sigmoid,
+    "hypot": np.hypot,
+    "maximum": np.maximum,
+    "minimum": np.minimum,
+    "clamp_min": np.maximum,
+    "clamp_max": np.minimum,
+    "relu": lambda x: np.maximum(x, 0.0),
+    "floor": np.floor,
+    "ceil": np.ceil,
+    "trunc": np.trunc,
+    "round": np.rint,
+    "double": _double,
+    "where": np.where,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "lt": np.less,
+    "le": np.less_equal,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "logical_and": np.logical_and,
+    "logical_or": np.logical_or,
+    "logical_not": np.logical_not,
+}
+"""The NumPy function of each operation."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """An operation on other nodes, or a leaf: "number", "column", "parameter" or "state" with its ``value``."""
+
+    operation: str
+    arguments: tuple[int, ...] = ()
+    value: float = 0.0
+
+
+class Expressions:
+    """Nodes in an order in which each follows its arguments; equal nodes are one node.
+
+    Example:
+        The derivative of ``sin(x) p`` by the state x:
+
+        >>> e = Expressions()
+        >>> x, p = e.leaf("state", 0), e.leaf("parameter", 0)
+        >>> slope = e.derivative(e.apply("mul", e.apply("sin", x), p), x)
+        >>> slope == e.apply("mul", p, e.apply("cos", x))
+        True
+    """
+
+    def __init__(self) -> None:
+        self.nodes: list[Node] = []
+        self.columns: list[Array] = []
+        self.levels: list[int] = []
+        self._leaves: list[frozenset[int]] = []
+        self._known: dict[Node, int] = {}
+        self._derivatives: dict[tuple[int, int], int] = {}
+
+    def number(self, value: float) -> int:
+        """A constant."""
+        return self._node(Node("number", (), float(value)))
+
+    def column(self, values: Array) -> int:
+        """A constant for each moment, (S,)."""
+        self.columns.append(values)
+        return self._node(Node("column", (), len(self.columns) - 1))
+
+    def leaf(self, kind: str, index: int) -> int:
+        """The parameter or state of this number."""
+        return self._node(Node(kind, (), index))
+
+    def apply(self, operation: str, *arguments: int) -> int:
+        """The operation on these nodes, simplified where an argument is 0 or 1."""
+        simple = self._simplified(operation, arguments)
+        if simple is not None:
+            return simple
+        values = [self._value(one) for one in arguments]
+        if all(one is not None for one in values):
+            with np.errstate(all="ignore"):
+                found = FUNCTIONS[operation](*values)
+            if not isinstance(found, (bool, np.bool_)):
+                return self.number(float(found))
+        return self._node(Node(operation, tuple(arguments)))
+
+    def leaves(self, node: int) -> frozenset[int]:
+        """The parameters and states that a node is made of."""
+        return self._leaves[node]
+
+    def derivative(self, node: int, leaf: int) -> int:
+        """The derivative of a node by a parameter or state, as torch has it where there are two.
+
+        Raises:
+            KeyError: an operation without a rule.
+        """
+        if node == leaf:
+            return self.number(1.0)
+        if leaf not in self._leaves[node]:
+            return self.number(0.0)
+        key = (node, leaf)
+        if key not in self._derivatives:
+            self._derivatives[key] = self._derived(node, leaf)
+        return self._derivatives[key]
+
+    def _derived(self, node: int, leaf: int) -> int:
+        operation, arguments = self.nodes[node].operation, self.nodes[node].arguments
+        if operation in _FLAT:
+            return self.number(0.0)
+        if operation == "where":
+            slopes = [self.derivative(one, leaf) for one in arguments[1:]]
+            return slopes[0] if slopes[0] == slopes[1] else self.apply("where", arguments[0], *slopes)
+        total = self.number(0.0)
+        for place, argument in enumerate(arguments):
+            slope = self.derivative(argument, leaf)
+            if self._value(slope) != 0.0:
+                total = self.apply("add", total, self.apply("mul", _RULES[operation][place](self, node), slope))
+        return total
+
+    def _node(self, node: Node) -> int:
+        if node not in self._known:
+            self._known[node] = index = len(self.nodes)
+            self.nodes.append(node)
+            own = {"parameter": PARAMETER, "state": STATE}.get(node.operation, CONSTANT)
+            self.levels.append(max([own, *(self.levels[one] for one in node.arguments)]))
+            leaves = frozenset((index,)) if own != CONSTANT else frozenset()
+            self._leaves.append(leaves.union(*(self._leaves[one] for one in node.arguments)))
+        return self._known[node]
+
+    def _value(self, node: int) -> float | None:
+        found = self.nodes[node]
+        return found.value if found.operation == "number" else None
+
+    def _simplified(self, operation: str, arguments: tuple[int, ...]) -> int | None:
+        if operation not in ("add", "sub", "mul", "div", "pow"):
+            return None
+        first, second = arguments
+        one, other = self._value(first), self._value(second)
+        if operation == "add":
+            return second if one == 0.0 else first if other == 0.0 else None
+        if operation == "sub":
+            return first if other == 0.0 else self.apply("neg", second) if one == 0.0 else None
+        if operation == "mul":
+            if 0.0 in (one, other):
+                return self.number(0.0)
+            return second if one == 1.0 else first if other == 1.0 else None
+        if operation == "div":
+            return self.number(0.0) if one == 0.0 and other != 0.0 else first if other == 1.0 else None
+        return first if other == 1.0 else self.apply("mul", first, first) if other == 2.0 else None
+
+
+_Rule = Callable[[Expressions, int], int]
+
+
+def _of(build: Callable[..., int]) -> _Rule:
+    """A rule from a function of the expressions, the node itself, and its arguments."""
+    return lambda e, node: build(e, node, *e.nodes[node].arguments)
+
+
+def _square(e: Expressions, node: int) -> int:
+    return e.apply("mul", node, node)
+
+
+def _less(e: Expressions, node: int) -> int:
+    return e.apply("sub", e.number(1.0), node)
+
+
+def _ratio(e: Expressions, one: int, other: int) -> int:
+    return e.apply("div", one, other)
+
+
+def _inverse(e: Expressions, node: int) -> int:
+    return _ratio(e, e.number(1.0), node)
+
+
+def _minus(e: Expressions, node: int) -> int:
+    return e.apply("neg", node)
+
+
+def _if(e: Expressions, operation: str, one: int, other: int) -> int:
+    """1 where a comparison holds, else 0."""
+    return e.apply("double", e.apply(operation, one, other))
+
+
+def _shared(e: Expressions, operation: str, one: int, other: int) -> int:
+    """As :func:`_if`, and a half where both are equal."""
+    half = e.apply("mul", e.number(0.5), _if(e, "eq", one, other))
+    return e.apply("add", _if(e, operation, one, other), half)
+
+
+def _power(e: Expressions, a: int, b: int) -> int:
+    return e.apply("mul", b, e.apply("pow", a, e.apply("sub", b, e.number(1.0))))
+
+
+def _logarithmic(e: Expressions, node: int, a: int) -> int:
+    slope = e.apply("mul", node, e.apply("log", a))
+    return e.apply("where", e.apply("gt", a, e.number(0.0)), slope, e.number(0.0))
+
+
+_FLAT = {"sign", "floor", "ceil", "trunc", "round", "gt", "ge", "lt", "le", "eq", "ne"} | {
+    "logical_and",
+    "logical_or",
+    "logical_not",
+}
+"""Operations whose slope is 0 wherever they have one."""
+
+_RULES: dict[str, tuple[_Rule, ...]] = {
+    "add": (_of(lambda e, _n, _a, _b: e.number(1.0)), _of(lambda e, _n, _a, _b: e.number(1.0))),
+    "sub": (_of(lambda e, _n, _a, _b: e.number(1.0)), _of(lambda e, _n, _a, _b: e.number(-1.0))),
+    "mul": (_of(lambda _e, _n, _a, b: b), _of(lambda _e, _n, a, _b: a)),
+    "div": (_of(lambda e, _n, _a, b: _inverse(e, b)), _of(lambda e, n, _a, b: _minus(e, _ratio(e, n, b)))),
+    "pow": (
+        _of(lambda e, _n, a, b: _power(e, a, b)),
+        _of(lambda e, n, a, _b: _logarithmic(e, n, a)),
+    ),
+    "neg": (_of(lambda e, _n, _a: e.number(-1.0)),),
+    "abs": (_of(lambda e, _n, a: e.apply("sign", a)),),
+    "sqrt": (_of(lambda e, n, _a: _ratio(e, e.number(0.5), n)),),
+    "exp": (_of(lambda _e, n, _a: n),),
+    "expm1": (_of(lambda e, n, _a: e.apply("add", n, e.number(1.0))),),
+    "log": (_of(lambda e, _n, a: _inverse(e, a)),),
+    "log1p": (_of(lambda e, _n, a: _inverse(e, e.apply("add", a, e.number(1.0)))),),
+    "sin": (_of(lambda e, _n, a: e.apply("cos", a)),),
+    "cos": (_of(lambda e, _n, a: _minus(e, e.apply("sin", a))),),
+    "tan": (_of(lambda e, n, _a: e.apply("add", e.number(1.0), _square(e, n))),),
+    "asin": (_of(lambda e, _n, a: _inverse(e, e.apply("sqrt", _less(e, _square(e, a))))),),
+    "acos": (_of(lambda e, _n, a: _minus(e, _inverse(e, e.apply("sqrt", _less(e, _square(e, a)))))),),
+    "atan": (_of(lambda e, _n, a: _inverse(e, e.apply("add", e.number(1.0), _square(e, a)))),),
+    "atan2": (
+        _of(lambda e, _n, a, b: _ratio(e, b, e.apply("add", _square(e, a), _square(e, b)))),
+        _of(lambda e, _n, a, b: _minus(e, _ratio(e, a, e.apply("add", _square(e, a), _square(e, b))))),
+    ),
+    "sinh": (_of(lambda e, _n, a: e.apply("cosh", a)),),
+    "cosh": (_of(lambda e, _n, a: e.apply("sinh", a)),),
+    "tanh": (_of(lambda e, n, _a: _less(e, _square(e, n))),),
+    "sigmoid": (_of(lambda e, n, _a: e.apply("mul", n, _less(e, n))),),
+    "hypot": (_of(lambda e, n, a, _b: _ratio(e, a, n)), _of(lambda e, n, _a, b: _ratio(e, b, n))),
+    "maximum": (_of(lambda e, _n, a, b: _shared(e, "gt", a, b)), _of(lambda e, _n, a, b: _shared(e, "gt", b, a))),
+    "minimum": (_of(lambda e, _n, a, b: _shared(e, "lt", a, b)), _of(lambda e, _n, a, b: _shared(e, "lt", b, a))),
+    "clamp_min": (_of(lambda e, _n, a, b: _if(e, "ge", a, b)), _of(lambda e, _n, a, b: _if(e, "lt", a, b))),
+    "clamp_max": (_of(lambda e, _n, a, b: _if(e, "le", a, b)), _of(lambda e, _n, a, b: _if(e, "gt", a, b))),
+    "relu": (_of(lambda e, _n, a: _if(e, "gt", a, e.number(0.0))),),
+    "double": (_of(lambda e, _n, _a: e.number(1.0)),),
+}
+"""The derivative of each operation by each of its arguments."""

@@ -1,0 +1,82 @@
+"""Traced functions compared with torch's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mkc_torch.nonlinear import load_forward_mode
+from mkc_torch.simulation.dynamics.compiled.functions import Block
+from mkc_torch.simulation.dynamics.compiled.traced import Traceable, traced
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["is_faithful"]
+
+_FAITHFUL = 1e-9
+"""Largest difference between traced functions and torch's, as a share of their size."""
+
+
+def is_faithful(system: Traceable, theta: Float[Tensor, " p"]) -> bool:
+    """Whether a system's functions as they are traced have the values and derivatives that torch finds, near a guess.
+
+    They have not where a function has a derivative of its own, as those of ``torch.autograd.Function`` may.
+
+    Args:
+        system: the prepared system.
+        theta: its parameters.
+    """
+    found = traced(system, lambda parameters: (parameters, {}), len(theta))
+    if found is None:
+        return False
+    load_forward_mode()
+    generator = torch.Generator().manual_seed(0)
+
+    def near(values: Tensor) -> Tensor:
+        size = values.abs().amax(0, keepdim=True) if values.dim() == 2 else values.abs()
+        return values + 0.01 * (size + 0.01) * torch.randn(values.shape, generator=generator, dtype=values.dtype)
+
+    theta = near(theta)
+    at, along = near(system.grid.spread(system.guess)), torch.randn(theta.shape, generator=generator).double()
+    moved = torch.randn(at.shape, generator=generator, dtype=at.dtype)
+    N, values = len(system.measured), theta.tolist()
+
+    def functions(theta: Tensor, states: Tensor) -> tuple[Tensor, Tensor]:
+        return system.rate(theta, {})(states), system.outputs_by_states(theta, {}, states[:N])
+
+    try:
+        expected, slopes = torch.func.jvp(functions, (theta, at), (along, moved))[:2]
+    except RuntimeError:
+        return False
+    ends, moves, rates, slope = (_ends(one) for one in (at, moved, expected[0], slopes[0]))
+    outputs, seen = expected[1].T, slopes[1].T
+    known = ((found.ends, ends, moves, rates, slope), (found.outputs, at[:N].T, moved[:N].T, outputs, seen))
+    return all(_agrees(block, values, along, *one) for block, *one in known)
+
+
+def _ends(values: Tensor) -> Tensor:
+    """Values at the stations (S, k) as those at both ends of each interval, (k, 2, G-1)."""
+    return values.unflatten(0, (-1, 3))[:, ::2].permute(2, 1, 0)
+
+
+def _agrees(
+    block: Block, parameters: Sequence[float], along: Tensor, at: Tensor, moved: Tensor, values: Tensor, slopes: Tensor
+) -> bool:
+    """Whether values (k, *) and their derivatives along a direction are those of a block, where they are finite."""
+    states = at.numpy()
+    with np.errstate(all="ignore"):
+        by_parameters = block.by_parameters.at(parameters)(states)
+        change = np.einsum("kw...,w...->k...", block.by_states.at(parameters)(states), moved.numpy())
+        change += np.einsum("kp...,p->k...", by_parameters, along[block.moving].numpy())
+        own = block.values(parameters)(states)
+    for one, other in ((own, values.numpy()), (change, slopes.numpy())):
+        finite = np.isfinite(other)
+        size = np.abs(np.where(finite, other, 0.0)).max() + np.finfo(float).tiny
+        if not bool((np.abs(np.where(finite, one - other, 0.0)) <= _FAITHFUL * size).all()):
+            return False
+    return True

@@ -1,0 +1,201 @@
+"""The residual of a traced system and its tangents, computed with NumPy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mkc_torch.simulation.continuation import Meaning, Tangents
+from mkc_torch.simulation.dynamics.compiled.affine import multiplied
+from mkc_torch.simulation.dynamics.compiled.collocation import (
+    ArrayGrid,
+    Factor,
+    Functions,
+    Linearised,
+    linearised,
+    solved,
+)
+from mkc_torch.simulation.dynamics.compiled.expressions import Array
+from mkc_torch.simulation.dynamics.compiled.functions import Correction
+from mkc_torch.simulation.dynamics.compiled.traced import Traceable, Traced, traced
+from mkc_torch.simulation.dynamics.observer import CLIP
+from mkc_torch.simulation.dynamics.trajectory import Jump, Rate, Trajectory, linearised_later
+from mkc_torch.simulation.protocol import Answer, Nearby
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["CompiledDynamics", "compiled_dynamics"]
+
+
+def compiled_dynamics(system: Traceable, meaning: Meaning, size: int) -> CompiledDynamics | None:
+    """The residual of a prepared system by ``size`` parameters; None where its functions cannot be traced.
+
+    Args:
+        system: the prepared system.
+        meaning: the simulation's own parameters and the changes at its ports, by these.
+        size: number of parameters.
+    """
+    found = traced(system, meaning, size)
+    return None if found is None else CompiledDynamics(system, meaning, size, found)
+
+
+class CompiledDynamics:
+    """The residual of a traced system: the same values and tangents as torch computes, to rounding."""
+
+    def __init__(self, system: Traceable, meaning: Meaning, size: int, functions: Traced) -> None:
+        self._system, self._meaning, self._size, self._traced = system, meaning, size, functions
+        grid = system.grid
+        self._grid = ArrayGrid(grid.step.numpy(), grid.begins.numpy(), grid.longest)
+        self._rows = system.rows.numpy()
+        self._places = self._grid.begins.cumsum() - 1
+        self._measured = np.ascontiguousarray(system.measured.numpy().T)
+
+    def answer(self, parameters: Float[Tensor, " p"], near: Nearby | None = None) -> Answer | None:
+        """The residual, NaN where a trajectory is found neither near the one given nor near the first guess.
+
+        None where no trajectory is given and none is found: there are other ways to a first one.
+        """
+        known = near if isinstance(near, Trajectory) else None
+        values = parameters.tolist()
+        with np.errstate(all="ignore"):
+            functions, first = self._functions(values), self._first(values)
+            found = None if known is None else solved(functions, self._grid, *self._begun(known, first))
+            if found is None:
+                found = solved(functions, self._grid, self._from(self._system.guess, first))
+            if found is None:
+                return None if known is None else Answer(torch.full_like(self._system.measured, torch.nan))
+            outputs = self._traced.outputs.values(values)(found.states[:, self._rows])
+            residual = self._whitened((self._measured - outputs)[:, None])[:, 0]
+        nearby = self._nearby(parameters, found.states, found.factor)
+        return Answer(torch.from_numpy(np.ascontiguousarray(residual.T)), nearby)
+
+    def _begun(self, known: Trajectory, first: Array) -> tuple[Array, Factor | None]:
+        """A trajectory nearby as a guess, and its equations linearised."""
+        factor = None if known.linear is None else known.linear.factor
+        usable = isinstance(factor, Factor) and known.states.shape[1] == self._traced.width
+        return self._from(known.states, first), factor if usable and isinstance(factor, Factor) else None
+
+    def _from(self, states: Tensor, first: Array) -> Array:
+        """A guess (w, G) that begins with these first states (w, K)."""
+        guess = self._system.with_memories(states.detach(), self._traced.memories)
+        return np.where(self._grid.begins, first[:, self._places], guess.numpy().T)
+
+    def tangents(self, parameters: Float[Tensor, " p"], near: Nearby | None) -> Tangents | None:
+        """Derivatives of the residual at parameters whose answer is known; None where it is of another system."""
+        if not isinstance(near, Trajectory) or near.states.shape[1] != self._traced.width:
+            return None
+        states, values = np.ascontiguousarray(near.states.detach().numpy().T), parameters.tolist()
+        with np.errstate(all="ignore"):
+            functions = self._functions(values)
+            linear = linearised(functions, self._grid, states)
+            rows = self._whitened(self._tangents(values, states, functions, linear))
+        tangents = torch.from_numpy(np.ascontiguousarray(np.moveaxis(rows, 0, -1)))
+        return Tangents(tangents, self._nearby(parameters, states, linear.factor))
+
+    def _tangents(self, values: Sequence[float], states: Array, functions: Functions, linear: Linearised) -> Array:
+        """(m, p, N), of the residual before it is whitened."""
+        own = self._own(values, states, functions, linear)
+        w, G = states.shape
+        pushed = np.zeros((w, len(own.parameters) + w, G))
+        pushed[:, : len(own.parameters), 1:] = -multiplied(linear.factor.inverse, own.defects)
+        pushed[np.arange(w), len(own.parameters) + np.arange(w)] = self._grid.begins
+        moved = linear.factor.affine.solved(pushed)[..., self._rows]
+        at = states[:, self._rows]
+        outputs = self._traced.outputs
+        seen = multiplied(outputs.by_states.at(values)(at), moved)
+        rows = np.zeros((len(self._measured), self._size, at.shape[1]))
+        rows[:, own.parameters] = -seen[:, : len(own.parameters)]
+        by_first = seen[:, len(own.parameters) :]
+        first = self._traced.first
+        slope = first.by_parameters.at(values)(np.empty(0)).reshape(-1, w, len(first.moving))
+        for run, state, k in zip(*slope.nonzero(), strict=True):
+            inside = self._runs[run]
+            rows[:, first.moving[k], inside] -= slope[run, state, k] * by_first[:, state, inside]
+        rows[:, outputs.moving] -= outputs.by_parameters.at(values)(at)
+        return rows
+
+    def _own(self, values: Sequence[float], states: Array, functions: Functions, linear: Linearised) -> _Defects:
+        """How the defects change with parameters at fixed states."""
+        ends, middle, new = self._traced.ends, self._traced.middle, self._traced.new
+        h, rated = self._grid.step, ends.moving
+        seen = [] if new is None else [k for k in new.moving if k not in rated]
+        parameters = [*rated, *seen]
+        defects = np.zeros((len(states), len(parameters), len(h)))
+        by_ends = ends.by_parameters.at(values)(linear.ends)
+        left, right = by_ends[:, :, 0], by_ends[:, :, 1]
+        moved = multiplied(linear.middle_slope, 0.125 * h * (left - right))
+        by_middle = middle.by_parameters.at(values)(linear.middle)
+        defects[:, : len(rated)] = -h / 6.0 * (left + 4.0 * (by_middle + moved) + right)
+        if new is not None and new.moving:
+            assert isinstance(functions.jump, Correction)
+            by_new = new.by_parameters.at(values)(states[:, self._rows])
+            after = functions.jump.by_parameters(states, by_new)[..., :-1]
+            places = [parameters.index(k) for k in new.moving]
+            defects[:, places] += np.where(h > 0, multiplied(linear.behind, after), 0.0)
+        return _Defects(parameters, defects)
+
+    def _functions(self, values: Sequence[float]) -> Functions:
+        known, jump = self._traced, None
+        if known.new is not None:
+            gain, limit = self._observed
+            new, new_slope = known.new.values(values), known.new.by_states.at(values)
+            jump = Correction(self._rows, known.places, gain, limit, new, new_slope)
+        return Functions(
+            known.ends.values(values),
+            known.middle.values(values),
+            known.ends.by_states.at(values),
+            known.middle.by_states.at(values),
+            jump,
+        )
+
+    def _first(self, values: Sequence[float]) -> Array:
+        """(w, K)."""
+        return self._traced.first.values(values)(np.empty(0)).reshape(-1, self._traced.width).T
+
+    def _whitened(self, rows: Array) -> Array:
+        """Innovations as independent residuals of one size, (m, K, N)."""
+        return rows if self._white is None else multiplied(self._white, rows)
+
+    def _nearby(self, parameters: Tensor, states: Array, factor: Factor) -> Trajectory:
+        system, meaning = self._system, self._meaning
+        found = torch.from_numpy(np.ascontiguousarray(states.T))
+
+        def functions() -> tuple[Rate, Jump | None]:
+            theta, changes = meaning(parameters)
+            return system.rate(theta, changes), system.jump(theta, changes)
+
+        return Trajectory(found, True, linearised_later(functions, found, system.grid, factor))
+
+    @cached_property
+    def _runs(self) -> list[slice]:
+        """The samples of each run."""
+        first = self._system.begins.nonzero()[:, 0].tolist()
+        return [slice(a, b) for a, b in zip(first, [*first[1:], len(self._rows)], strict=True)]
+
+    @cached_property
+    def _observed(self) -> tuple[Array, Array]:
+        """The gain (k, m, N) and the limit (m, N) of the observer's corrections."""
+        observer = self._system.observer
+        assert observer is not None
+        gain = np.ascontiguousarray(np.moveaxis(observer.gain.numpy(), 0, -1))
+        return gain, np.ascontiguousarray(CLIP * observer.spread.numpy().T)
+
+    @cached_property
+    def _white(self) -> Array | None:
+        observer = self._system.observer
+        return None if observer is None else np.ascontiguousarray(np.moveaxis(observer.white.numpy(), 0, -1))
+
+
+@dataclass(frozen=True)
+class _Defects:
+    """Derivatives of the defects (w, K, G-1) by these K parameters."""
+
+    parameters: list[int]
+    defects: Array

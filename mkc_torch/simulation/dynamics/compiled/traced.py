@@ -1,0 +1,150 @@
+"""A prepared system of differential equations as expressions of states and parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mkc_torch.simulation.continuation import Meaning
+from mkc_torch.simulation.dynamics.compiled.expressions import Array, Expressions
+from mkc_torch.simulation.dynamics.compiled.functions import Block
+from mkc_torch.simulation.dynamics.compiled.operations import OPERATIONS
+from mkc_torch.simulation.dynamics.compiled.symbol import (
+    Symbol,
+    Trace,
+    UntraceableError,
+    as_nodes,
+    parameter_symbol,
+    state_symbol,
+)
+from mkc_torch.simulation.dynamics.observer import Correcting, Observer
+from mkc_torch.simulation.dynamics.trajectory import Grid
+from mkc_torch.simulation.protocol import Changes
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+__all__ = ["Traceable", "Traced", "traced"]
+
+_FEWEST = 16
+"""Samples below which an axis of moments cannot be told from another one."""
+
+
+class Traceable(Protocol):
+    """What is needed of a prepared system of differential equations.
+
+    Attributes:
+        grid: the moments of its trajectories.
+        rows, begins: (N,), the moment of each sample, and where a run begins.
+        measured: (N, m), the outputs as recorded.
+        guess: (G, n), a first guess of the states.
+        observer: that corrects it; None where it runs freely.
+    """
+
+    grid: Grid
+    rows: Int[Tensor, " N"]
+    begins: Bool[Tensor, " N"]
+    measured: Float[Tensor, "N m"]
+    guess: Float[Tensor, "G n"]
+    observer: Observer | None
+
+    def first_states(self, theta: Tensor, changes: Changes) -> tuple[Tensor, list[str]]: ...
+    def with_memories(self, states: Tensor, memories: Sequence[str]) -> Tensor: ...
+    def rate(self, theta: Tensor, changes: Changes) -> Callable[[Tensor], Tensor]: ...
+    def jump(self, theta: Tensor, changes: Changes) -> Correcting | None: ...
+    def outputs_by_states(self, theta: Tensor, changes: Changes, states: Tensor) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class Traced:
+    """The functions of a system as expressions.
+
+    Attributes:
+        memories: the state that each internal state begins like; empty for 0.
+        first: the states that runs begin in, K w nodes.
+        ends, middle: rates at the ends (2, G-1) and in the middle (G-1,) of each interval.
+        new: innovations of an observer at the samples; None where there is no observer.
+        outputs: at the samples.
+        places: of the states that the gains of an observer are of.
+    """
+
+    memories: Sequence[str]
+    first: Block
+    ends: Block
+    middle: Block
+    new: Block | None
+    outputs: Block
+    places: Sequence[int]
+
+    @property
+    def width(self) -> int:
+        """Number of states, internal ones included."""
+        return len(self.ends.nodes)
+
+
+def traced(system: Traceable, meaning: Meaning, size: int) -> Traced | None:
+    """The functions of a system by ``size`` parameters; None where one of them cannot be traced.
+
+    Args:
+        system: the prepared system.
+        meaning: of the parameters.
+        size: number of parameters.
+    """
+    stations, samples = len(system.grid.stations), len(system.measured)
+    if system.grid.time.dtype != torch.float64 or system.grid.time.device.type != "cpu" or samples < _FEWEST + size:
+        return None
+    try:
+        return _traced(system, meaning, size, stations, samples)
+    # whatever a user's function raises on a symbol, it is not traceable; the other way computes it, or raises it again
+    except Exception:
+        return None
+
+
+def _traced(system: Traceable, meaning: Meaning, size: int, stations: int, samples: int) -> Traced:
+    e = Expressions()
+    trace = Trace(e, frozenset((stations, samples)), OPERATIONS)
+    parameters = parameter_symbol(trace, size)
+    theta, changes = meaning(parameters)
+    begin, memories = system.first_states(theta, changes)
+    width = begin.shape[1]
+    leaves = [e.leaf("state", k) for k in range(width)], [e.leaf("parameter", k) for k in range(size)]
+
+    def block(value: Tensor, length: int, arranged: Callable[[Array], Array]) -> Block:
+        nodes, shape, moments = as_nodes(value, trace)
+        if len(shape) != 2 or shape[0] != length or moments != 0:
+            raise UntraceableError(f"a result of shape {shape}")
+        return Block(e, nodes[0].tolist(), *leaves, arranged)
+
+    def at_samples() -> Symbol:
+        return state_symbol(trace, samples, width)
+
+    rates = system.rate(theta, changes)(state_symbol(trace, stations, width))
+    jump = system.jump(theta, changes)
+    new = None if jump is None else block(jump.measured - jump.predict(at_samples()), samples, _as_is)
+    return Traced(
+        memories,
+        Block(e, as_nodes(begin, trace).nodes.reshape(-1).tolist(), *leaves, _as_is),
+        block(rates, stations, _at_ends),
+        block(rates, stations, _in_the_middle),
+        new,
+        block(system.outputs_by_states(theta, changes, at_samples()), samples, _as_is),
+        () if jump is None else jump.places,
+    )
+
+
+def _as_is(column: Array) -> Array:
+    return column
+
+
+def _at_ends(column: Array) -> Array:
+    """Values at the stations as those at both ends of each interval, (2, G-1)."""
+    return np.ascontiguousarray(column.reshape(-1, 3)[:, ::2].T)
+
+
+def _in_the_middle(column: Array) -> Array:
+    return np.ascontiguousarray(column.reshape(-1, 3)[:, 1])
