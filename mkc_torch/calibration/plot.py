@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal, Protocol
 
@@ -21,6 +22,11 @@ __all__ = ["PLANES", "Calibrated", "CalibrationPlot", "draw_coverage", "draw_den
 
 PLANES = ("xy", "xz", "yz")
 _MOST_POINTS = 20_000
+_SHARES = 50
+"""Parts of the samples, each from all of the recording, by which the places that are not covered are found."""
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
 _BOX = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.9}
 _CLOSE = 5.0
 """Times the robust scatter that a close view reaches."""
@@ -256,6 +262,20 @@ def draw_density(ax: Any, c: Calibrated, points: Tensor, *, tail: bool) -> None:
         least = 1.0 / (len(e) * (edges[1] - edges[0]))
         ax.set_ylim(0.3 * least, 3.0 * max(float(fitted.max()), float(value.max())))
         ax.set_yscale("log")
+        # a formula for each label, and ticks between the decades, would take as long as the rest of the picture
+        ax.minorticks_off()
+        ax.yaxis.set_major_formatter(lambda value, _: _decade(value))
+
+
+def _decade(value: float) -> str:
+    """A power of ten in Unicode; "" for other values.
+
+    Example:
+        >>> _decade(1e-3), _decade(100.0), _decade(2.0)
+        ('10⁻³', '10²', '')
+    """
+    exponent = round(math.log10(value)) if value > 0.0 else 0
+    return f"10{str(exponent).translate(_RAISED)}" if math.isclose(value, 10.0**exponent) else ""
 
 
 def draw_coverage(ax: Any, found: Coverage, directions: Tensor) -> None:
@@ -343,10 +363,15 @@ def _lon_lat(unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _covered(lon: np.ndarray, lat: np.ndarray, directions: Tensor) -> np.ndarray:
     grid = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], -1).reshape(-1, 3)
     unit = torch.nn.functional.normalize(_thinned(directions).float(), dim=-1)
-    nearest = torch.full((len(grid),), -1.0)
-    for part in unit.split(256):  # what is compared stays in the cache
-        nearest = torch.maximum(nearest, (torch.from_numpy(grid).float() @ part.mT).amax(-1))
-    return (nearest.numpy() > np.cos(np.radians(NEAR_DEGREES))).astype(float).reshape(lon.shape)
+    places, least = torch.from_numpy(grid).float(), float(np.cos(np.radians(NEAR_DEGREES)))
+    left = torch.arange(len(grid))
+    # a few samples from all of the recording cover most places; the others are compared with the rest
+    for first in range(min(_SHARES, len(unit))):
+        for part in unit[first::_SHARES].split(256):  # what is compared stays in the cache
+            left = left[~((places[left] @ part.mT).amax(-1) > least)]
+    covered = np.ones(len(grid))
+    covered[left.numpy()] = 0.0
+    return covered.reshape(lon.shape)
 
 
 def _label(ax: Any, lon: np.ndarray, lat: np.ndarray, text: str) -> None:

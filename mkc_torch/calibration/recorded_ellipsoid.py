@@ -19,6 +19,10 @@ _ERRORS = 3.0
 """Standard errors by which two fits to the same samples may differ."""
 
 
+_MOST_ALONG = 5000
+"""Samples of the sensor's way that a second fit takes, at least, evenly: it is compared by several standard errors."""
+
+
 def recorded_ellipsoid(recording: Recording, seed: int = 0) -> EllipsoidFit:
     """The ellipsoid through the samples of a magnetometer by MKC-EM, a time series in the order of its rows.
 
@@ -47,7 +51,7 @@ def recorded_ellipsoid(recording: Recording, seed: int = 0) -> EllipsoidFit:
         raise
     went = in_each_run(points, runs, way)
     if went is not None:
-        series, weight = apart(runs, went, taken)
+        series, weight = (part[:: max(1, len(part) // _MOST_ALONG)] for part in apart(runs, went, taken))
         _refuse_other(fit, _along(EllipsoidFit(estimator), series, weight), series)
     return fit
 

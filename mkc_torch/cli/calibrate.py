@@ -112,8 +112,7 @@ def calibrate(
     console, total, failed, left = out(), 0, 0, list(recordings)
     with progress(len(recordings), output) as step, interrupts_told(lambda: not_written(left, output)):
         for path in recordings:
-            step(f"calibrating {path.name}")
-            for subject, outcome in calibrations_of(path, output / path.stem, asked, force=force):
+            for subject, outcome in calibrations_of(path, output / path.stem, asked, force=force, step=step):
                 total += 1
                 with step.aside():
                     if isinstance(outcome, Exception):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,12 +19,16 @@ from mkc_torch.cli.console import FAILURES, folder_names, folder_written, remove
 from mkc_torch.cli.correction import read_correction
 from mkc_torch.cli.exported import exports_of, left_from_before
 from mkc_torch.cli.recorded import read_accelerometer, read_magnetometer, refuse_likely_size, sensor_names
+from mkc_torch.recording.formats import Topic, read_topics
 
 __all__ = ["Asked", "Found", "calibrations_of", "read_calibration"]
 
 
 ACCELEROMETER = "accel"
 """The sensor that is no magnetometer."""
+
+Step = Callable[[str], None]
+"""Takes the name of a stage of the work."""
 
 
 class Asked(NamedTuple):
@@ -83,14 +88,26 @@ def read_calibration(path: Path) -> Calibration:
     return known
 
 
-def calibrations_of(path: Path, folder: Path, asked: Asked, *, force: bool) -> Iterator[tuple[str, Found | Exception]]:
+def calibrations_of(
+    path: Path, folder: Path, asked: Asked, *, force: bool, step: Step | None = None
+) -> Iterator[tuple[str, Found | Exception]]:
     """Calibrate each magnetometer of a file: one alone into the folder, several into folders of their names in it.
+
+    Args:
+        path: of the file.
+        folder: for the results.
+        asked: what a user asked for.
+        force: replace results.
+        step: called with a text at the beginning of each stage.
 
     Yields:
         What it is of, for messages, and the calibration with its files, or why there is none.
     """
+    say = step or (lambda _: None)
     try:
-        names = sensor_names(path, asked.columns, asked.sensor)
+        say(f"reading {path.name}")
+        topics = read_topics(path)
+        names = sensor_names(path, asked.columns, asked.sensor, topics)
         if len(names) > 1:
             _refuse_for_one(path, asked, [str(name) for name in names])
             claim_folder(folder, overwrite=force)
@@ -98,10 +115,14 @@ def calibrations_of(path: Path, folder: Path, asked: Asked, *, force: bool) -> I
         yield str(path), error
         return
     places = [folder / name for name in folder_names([str(name) for name in names])] if len(names) > 1 else [folder]
-    for name, place in zip(names, places, strict=True):
-        subject = f"{path}, sensor {name}" if len(names) > 1 else str(path)
+    for number, (name, place) in enumerate(zip(names, places, strict=True), start=1):
+        subject, which = str(path), path.name
+        if len(names) > 1:
+            subject, which = f"{path}, sensor {name}", f"{path.name}, sensor {name} ({number} of {len(names)})"
+        say(f"calibrating {which}")
+        drawing = partial(say, f"drawing the report on {which}")
         try:
-            yield subject, _calibrate(path, place, asked._replace(sensor=name), force=force)
+            yield subject, _calibrate(path, place, asked._replace(sensor=name), topics, drawing, force=force)
         except FAILURES as error:
             yield subject, error
     remove_if_empty(folder)
@@ -117,13 +138,18 @@ def _refuse_for_one(path: Path, asked: Asked, names: list[str]) -> None:
             )
 
 
-def _calibrate(path: Path, folder: Path, asked: Asked, *, force: bool) -> Found:
-    """Write calibration.json and report.html of a recording; where it is refused, the report alone says why."""
+def _calibrate(
+    path: Path, folder: Path, asked: Asked, topics: Sequence[Topic], drawing: Callable[[], None], *, force: bool
+) -> Found:
+    """Write calibration.json and report.html of a recording; where it is refused, the report alone says why.
+
+    ``topics`` are the tables of the file; ``drawing`` is called before the report is drawn.
+    """
     accel = asked.sensor == ACCELEROMETER
     if accel:
-        recording, said = read_accelerometer(path, asked.columns, asked.units), True
+        recording, said = read_accelerometer(path, asked.columns, asked.units, topics), True
     else:
-        recording, found = read_magnetometer(path, asked.columns, asked.units, asked.sensor)
+        recording, found = read_magnetometer(path, asked.columns, asked.units, asked.sensor, topics)
         said = bool(found.said & {"mag_x", "mag_y", "mag_z"})
     from mkc_torch.report import calibration_report, refusal_report
 
@@ -151,6 +177,7 @@ def _calibrate(path: Path, folder: Path, asked: Asked, *, force: bool) -> Found:
             refuse_likely_size(path, calibration.radius)
         beside, refused = _beside(calibration, asked.old)
         texts, notes, not_exported = exports_of(SensorCorrection.of(calibration), asked.exports, asked.to)
+        drawing()
         page = calibration_report(calibration, recording, against=beside)
         write_atomically(result, calibration.to_json(), overwrite=force)
         write_atomically(report, page, overwrite=force)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from mkc_torch.recording.choice import sensors_in, which_columns
 from mkc_torch.recording.formats import read_topics
-from mkc_torch.recording.formats.base import RecordingError
+from mkc_torch.recording.formats.base import RecordingError, Topic
 from mkc_torch.recording.reading import ASKED, Reading, read_file
 from mkc_torch.recording.recognise import recognised
 from mkc_torch.recording.recording import Recording
@@ -27,15 +27,19 @@ __all__ = [
 _AXES = ("mag_x", "mag_y", "mag_z")
 
 
-def sensor_names(path: Path, columns: Mapping[str, str], sensor: str | None) -> list[str | None]:
+def sensor_names(
+    path: Path, columns: Mapping[str, str], sensor: str | None, topics: Sequence[Topic] | None = None
+) -> list[str | None]:
     """The magnetometers of a file that are to be taken one by one; None where it has one alone.
+
+    ``topics`` are the file's tables, where they have been read already.
 
     Raises:
         RecordingError: nobody can tell which columns are meant.
     """
     if sensor is not None:
         return [sensor]
-    names = sensors_in(path, with_row_sensors(read_topics(path)), columns)
+    names = sensors_in(path, with_row_sensors(read_topics(path) if topics is None else topics), columns)
     return [None] if len(names) == 1 else list(names)
 
 
@@ -51,15 +55,19 @@ def refuse_no_magnetometer(path: Path, columns: Mapping[str, str], sensor: str |
 
 
 def read_magnetometer(
-    path: Path, columns: Mapping[str, str], units: Mapping[str, str], sensor: str | None
+    path: Path,
+    columns: Mapping[str, str],
+    units: Mapping[str, str],
+    sensor: str | None,
+    topics: Sequence[Topic] | None = None,
 ) -> tuple[Recording, Reading]:
-    """Read a recording of a magnetometer.
+    """Read a recording of a magnetometer; ``topics`` are the file's tables, where they have been read already.
 
     Raises:
         RecordingError: no magnetometer in it, or one whose size says that it is in another unit than it should be, and
             nothing says which it is.
     """
-    found = read_file(path, ASKED, columns=columns, units=units, sensor=sensor)
+    found = read_file(path, ASKED, columns=columns, units=units, sensor=sensor, topics=topics)
     if not set(_AXES) & set(found.columns):
         raise RecordingError(which_columns(path, read_topics(path)))
     recording = _recording(path, found)
@@ -70,13 +78,15 @@ def read_magnetometer(
     return recording, found
 
 
-def read_accelerometer(path: Path, columns: Mapping[str, str], units: Mapping[str, str]) -> Recording:
-    """Read a recording of an accelerometer.
+def read_accelerometer(
+    path: Path, columns: Mapping[str, str], units: Mapping[str, str], topics: Sequence[Topic] | None = None
+) -> Recording:
+    """Read a recording of an accelerometer; ``topics`` are the file's tables, where they have been read already.
 
     Raises:
         MissingColumnError: no column of one is recognised or named.
     """
-    recording = _recording(path, read_file(path, ASKED, columns=columns, units=units))
+    recording = _recording(path, read_file(path, ASKED, columns=columns, units=units, topics=topics))
     recording.stack("accel_x", "accel_y", "accel_z")
     return recording
 

@@ -66,6 +66,7 @@ def read_file(
     units: Mapping[str, str] | None = None,
     sensor: str | None = None,
     recognise: bool = True,
+    topics: Sequence[Topic] | None = None,
 ) -> Reading:
     """Read a file.
 
@@ -73,11 +74,12 @@ def read_file(
         path: the file.
         asked: columns that are wanted wherever they are, so that text in them is an error.
         columns, units, sensor, recognise: as :meth:`mkc_torch.recording.Recording.read` takes them.
+        topics: the file's tables, where they have been read already.
 
     Raises:
         RecordingError, MissingColumnError, FileNotFoundError, ImportError: as there.
     """
-    topics = read_topics(path)
+    topics = read_topics(path) if topics is None else topics
     if recognise and not set(_MAG) & set(columns or {}):
         topics = with_row_sensors(topics)
     return reading_of(path, topics, asked, columns=columns, units=units, sensor=sensor, recognise=recognise)

@@ -87,6 +87,7 @@ def test_residuals_stay_in_the_unit_of_the_recording_whatever_the_field_strength
     assert (b.sigma, b.d) == pytest.approx((a.sigma, a.d))
 
 
+@pytest.mark.e2e
 def test_standard_error_of_the_scaled_matrix_by_simulation():
     results = [calibrate(recorded(noisy_ellipsoid(200, seed=s)), field_strength=45.0) for s in range(40)]
     spread = torch.tensor([c.matrix for c in results]).double().std(0)
@@ -114,6 +115,7 @@ def test_gaussian_noise_rejects_nothing_and_round_trips_an_infinite_sigma():
     assert Calibration.from_json(c.to_json()) == c
 
 
+@pytest.mark.e2e
 def test_gaussian_noise_is_called_heavy_tailed_in_few_recordings_whatever_sigma_is():
     made = [calibrate(recorded(noisy_ellipsoid(200, seed=seed))) for seed in range(20)]
     assert sum(math.isfinite(c.sigma) for c in made) > 4
@@ -347,6 +349,7 @@ def test_a_few_rejections_at_the_edge_are_no_interval():
     assert disturbed_intervals(time, rejected) == ()
 
 
+@pytest.mark.e2e
 def test_broad_28_semi_axes_are_those_of_the_undisturbed_recording():
     c = calibrate(Recording.read(shared_data("magnetometer/broad_28_stationary_magnet.csv")))
     assert c.semi_axes == pytest.approx((44.17, 44.50, 45.61), abs=0.6)

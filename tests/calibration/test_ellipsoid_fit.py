@@ -304,6 +304,7 @@ def test_the_finish_of_gaussian_points_is_least_squares_of_orthogonal_distances(
     assert float((EllipsoidFit().fit(points).semi_axes_ - fit.semi_axes_).abs().max()) > 0.03
 
 
+@pytest.mark.e2e
 def test_the_finish_takes_away_the_bias_of_the_algebraic_fit():
     points = surface(200) + 1.0 * sample(0, 60, 200, 3)
     algebraic = (EllipsoidFit().fit(points).semi_axes_ - AXES).mean(0)
@@ -806,6 +807,7 @@ def circles(seed: int, normals: list[list[float]], axes: list[float], noise: flo
     return points + noise * torch.randn(points.shape, generator=generator, dtype=torch.float64)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("noise", "finish"), [(0.02, None), (0.08, None), (0.14, None), (0.08, "maximum_likelihood")])
 @pytest.mark.parametrize("long", [1.0, 5.0])

@@ -84,6 +84,7 @@ def test_real_recordings_are_neither_frozen_nor_clipped(name):
     assert faults(Recording.read(shared_data(f"magnetometer/{name}.csv"))) == []
 
 
+@pytest.mark.e2e
 @given(st.sampled_from(REAL), st.floats(0.0, 5.0), st.integers(1, 4), st.booleans())
 @settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
 def test_nor_are_they_with_coarser_digits_polled_oftener_or_with_a_rest(name, coarse, polled, rests):
@@ -102,6 +103,7 @@ def test_a_turning_sensor_of_any_digits_and_noise_has_no_fault(noise, step, spee
     assert faults(recorded(digits(turned(noise=noise, seed=seed, speed=speed), step))) == []
 
 
+@pytest.mark.e2e
 @given(
     st.sampled_from([None, 0, 1, 2]), st.integers(60, 400), st.integers(100, 1400), st.integers(0, 99), st.booleans()
 )
@@ -145,6 +147,7 @@ def test_what_is_left_of_a_clipped_recording_is_calibrated():
     assert c.semi_axes == pytest.approx((45.0, 45.0, 45.0), abs=0.4)
 
 
+@pytest.mark.e2e
 def test_standard_errors_do_not_reach_from_one_run_to_the_next():
     # two runs that begin with what is left over from the one before: joined, the lags between them would count
     points = turned(1200, noise=0.2)

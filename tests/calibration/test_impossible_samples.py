@@ -20,6 +20,7 @@ def spoiled(recording, value, places, column="mag_x"):
     return changed(recording, **{column: values})
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("value", [1e4, 32767.0, -65535.0, 1e6, 1e9, 1e12, 1e30, 1e300])
 def test_two_impossible_samples_change_nothing_and_are_named(value):
     good = tumbling(N, noise=0.3)

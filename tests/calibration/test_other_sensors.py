@@ -34,6 +34,7 @@ def recorded(points, names=ACCEL, **columns):
     return Recording({"time": time, **dict(zip(names, points.unbind(-1), strict=True)), **columns}, name="sides")
 
 
+@pytest.mark.e2e
 def test_an_accelerometer_is_calibrated_by_its_rests():
     recording = recorded(laid_down())
     c = calibrate(recording, sensor="accel")
@@ -91,6 +92,7 @@ def test_a_gyroscope_that_never_rests_has_none():
     assert rest_bias(recorded(torch.full((200, 3), float("nan")), GYRO)) is None
 
 
+@pytest.mark.e2e
 def test_the_bias_is_in_the_calibration_of_a_magnetometer():
     points = torch.cat([torch.tensor([[30.0, 20.0, 10.0]]).expand(500, 3), 45.0 * fibonacci_sphere(1500)])
     points = points + 0.3 * torch.randn(2000, 3, generator=torch.Generator().manual_seed(2))

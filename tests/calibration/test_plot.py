@@ -4,12 +4,14 @@ import re
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("matplotlib")
 
 from matplotlib import pyplot
 
 from mkc_torch.calibration import Calibration, CalibrationPlot, calibrate
+from mkc_torch.calibration.plot import _covered
 from mkc_torch.recording import simulated_recording
 
 PICTURES = {
@@ -95,3 +97,15 @@ def test_a_notebook_shows_numbers_with_their_errors(calibration):
     assert "rejected" in page
     assert repr(calibration).startswith("Calibration('simulated_sensor', 900 samples")
     assert len(repr(calibration)) < 200
+
+
+@pytest.mark.parametrize("count", [1, 30, 4000])
+def test_what_is_covered_is_what_a_direction_is_near(count):
+    lon, lat = np.meshgrid(np.linspace(-3.1, 3.1, 25), np.linspace(-1.5, 1.5, 13))
+    directions = torch.randn(count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    directions[:, 2] = directions[:, 2].abs()  # half of the sphere
+    grid = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], -1)
+    unit = (directions / directions.norm(dim=-1, keepdim=True)).numpy()
+    near = (grid @ unit.T).max(-1) > np.cos(np.radians(15.0))
+    assert 0.0 < near.mean() < 1.0
+    np.testing.assert_array_equal(_covered(lon, lat, directions), near.astype(float))

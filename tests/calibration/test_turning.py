@@ -7,7 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from mkc_torch import diagnose
 from mkc_torch.calibration.calibrate import calibrate
+from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
+from mkc_torch.calibration.recorded_ellipsoid import recorded_ellipsoid
 from mkc_torch.calibration.turning import thin_at_rest, turning, way
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation import Magnetometer
@@ -54,6 +56,7 @@ def test_a_sensor_that_mostly_rests_is_calibrated(first, share):
     assert found.rejected / N == pytest.approx(0.9 * share, abs=0.06)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_step_while_the_sensor_rests_could_be_of_any_size_and_is_none(seed):
     """It shows in one direction alone, and tangents where it is large say nothing about none."""
@@ -62,6 +65,7 @@ def test_a_step_while_the_sensor_rests_could_be_of_any_size_and_is_none(seed):
     assert not result.warnings
 
 
+@pytest.mark.e2e
 def test_a_sensor_that_rests_for_most_of_the_time_is_diagnosed_and_told_of():
     sensor = np.where(np.arange(N)[:, None] >= 1700, [3.0, -2.0, 1.0], 0.0)
     recording = tumbling(N, noise=0.3, moments=resting(N, 100, 1300), sensor=sensor)
@@ -126,6 +130,7 @@ def tilting(seed, share, tilt=0.14, size=34.0):
     )
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("tilt", [0.14, 0.3])
 def test_outliers_to_one_side_of_a_tilting_sensor_draw_no_ellipsoid_of_their_own(seed, tilt):
@@ -152,3 +157,11 @@ def test_samples_too_rare_for_a_way_have_none_and_are_calibrated_all_the_same():
 def test_where_hardly_a_sample_would_be_left_all_are_taken():
     recording = tumbling(200, noise=4.0, rate=10.0, sensor=np.where(np.arange(200)[:, None] % 3 == 0, 30.0, 0.0))
     assert int(thin_at_rest(recording.magnetometer()).sum()) >= 20
+
+
+def test_a_long_recording_is_confirmed_by_every_few_samples_of_its_way(monkeypatch):
+    lengths = []
+    fit = EllipsoidFit.fit
+    monkeypatch.setattr(EllipsoidFit, "fit", lambda self, X, *rest: lengths.append(len(X)) or fit(self, X, *rest))
+    recorded_ellipsoid(tumbling(20_000, noise=0.3))
+    assert lengths == [20_000, 5000]

@@ -1,4 +1,5 @@
 import dataclasses
+import itertools
 import math
 import re
 from html.parser import HTMLParser
@@ -9,12 +10,15 @@ import torch
 pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
 from mkc_torch.calibration.calibrate import calibrate
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.density import ChannelTails
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.recording.recording import Recording
 from mkc_torch.report import Comparison, calibration_report, refusal_report
+from mkc_torch.report.calibration import pictures
 from mkc_torch.report.words import numbers as wording
 from tests.calibration.test_calibrate import noisy_ellipsoid, recorded
 
@@ -98,6 +102,7 @@ def test_page_begins_with_the_result_in_plain_words(page):
     assert "truth 12.00 −7.50 21.00 44.98 48.54 51.45" in text
 
 
+@pytest.mark.e2e
 def test_doubtful_results_say_so_in_the_headline():
     points = noisy_ellipsoid()
     points[:120] += torch.tensor([0.0, 0.0, 60.0])
@@ -118,6 +123,7 @@ def test_c_code_holds_float_literals(calibration):
     assert "{1.0f, 2.5e-07f, -3.0f}" in wording.c_code(whole)
 
 
+@pytest.mark.e2e
 def test_names_and_warnings_are_escaped(calibration, recording):
     hostile = dataclasses.replace(calibration, recording="<b>x</b>", warnings=("a < b & c",))
     shown = calibration_report(hostile, recording)
@@ -125,6 +131,7 @@ def test_names_and_warnings_are_escaped(calibration, recording):
     assert "a &lt; b &amp; c" in shown
 
 
+@pytest.mark.e2e
 def test_units_other_than_microtesla():
     points = noisy_ellipsoid()
     columns = dict(zip(("mag_x", "mag_y", "mag_z"), (20 * points).unbind(-1), strict=True))
@@ -136,6 +143,7 @@ def test_units_other_than_microtesla():
     assert "µT per counts" in text_of(calibration_report(both, counts))
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("factor", [1e-30, 1e-6, 1e6, 1e30])
 @pytest.mark.parametrize("noise", [0.0, 0.3])
 def test_a_recording_of_any_size_has_a_page(factor, noise):
@@ -145,12 +153,14 @@ def test_a_recording_of_any_size_has_a_page(factor, noise):
     assert "nan" not in text.casefold().split()
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("count", [12, 30, 400])
 def test_small_and_exact_recordings_have_a_page(count):
     exact = recorded(noisy_ellipsoid(count, noise=0.0))
     assert "Calibrated" in text_of(calibration_report(calibrate(exact), exact))
 
 
+@pytest.mark.e2e
 def test_recording_without_time_has_samples_on_the_axis():
     plain = recorded(noisy_ellipsoid(100))
     assert "Calibrated." in text_of(calibration_report(calibrate(plain), plain))
@@ -177,6 +187,7 @@ def test_refusal_without_any_direction_has_no_map():
     assert "<svg " not in refusal_report(still, refused.value)
 
 
+@pytest.mark.e2e
 def test_pages_leave_the_settings_of_matplotlib_alone(calibration, recording):
     import matplotlib
 
@@ -185,10 +196,12 @@ def test_pages_leave_the_settings_of_matplotlib_alone(calibration, recording):
     assert dict(matplotlib.rcParams) == before
 
 
+@pytest.mark.e2e
 def test_same_input_gives_the_same_page(calibration, recording):
     assert calibration_report(calibration, recording) == calibration_report(calibration, recording)
 
 
+@pytest.mark.e2e
 def test_numbers_of_any_size_are_written_in_a_power_of_ten(recording):
     columns = {name: 1e-6 * values for name, values in recording.columns.items() if name != "time"}
     tiny = Recording(columns | {"time": recording["time"]}, units=dict.fromkeys(columns, "T"))
@@ -205,6 +218,7 @@ def test_the_noise_is_said_in_the_units_of_the_recording(calibration, page):
     assert f"The noise is {wording.noise(calibration)}." in text_of(page)
 
 
+@pytest.mark.e2e
 def test_the_noise_is_gaussian_where_the_test_for_heavy_tails_says_so_whatever_sigma_is(calibration, recording):
     heavy = dataclasses.replace(calibration, tails=ChannelTails(31.5, 0.041, 0.006))
     share = "heavy-tailed: 4.1 ± 0.6 % of the errors beyond three times that (0.27 % if Gaussian)"
@@ -216,6 +230,7 @@ def test_the_noise_is_gaussian_where_the_test_for_heavy_tails_says_so_whatever_s
     assert wording.noise(dataclasses.replace(calibration, sigma=4.35, tails=None)).endswith("field, σ = 4.35")
 
 
+@pytest.mark.e2e
 def test_backticks_are_set_as_code(calibration, recording):
     shown = dataclasses.replace(calibration, warnings=("run `mkc <x>` & so on", "one ` alone"))
     html = calibration_report(shown, recording)
@@ -223,6 +238,7 @@ def test_backticks_are_set_as_code(calibration, recording):
     assert "one ` alone" in html
 
 
+@pytest.mark.e2e
 def test_what_is_said_of_the_file_is_no_doubt_about_the_result(recording):
     time = recording["time"].clone()
     time[2000:] += 30.0
@@ -232,6 +248,7 @@ def test_what_is_said_of_the_file_is_no_doubt_about_the_result(recording):
     assert "The time has 1 gap" in text
 
 
+@pytest.mark.e2e
 def test_many_rejected_samples_lead_to_the_diagnosis():
     points = noisy_ellipsoid()
     points[:120] += torch.tensor([0.0, 0.0, 60.0])
@@ -254,3 +271,34 @@ def test_sizes_read_well():
     assert wording.size(1e-9) == "1.00e-09"
     assert wording.size(math.inf) == "inf"
     assert wording.number(-0.0, 2) == "0.00"
+
+
+@pytest.mark.parametrize("times", [1.0, 3000.0])
+def test_no_text_of_a_picture_is_cut_at_its_edge_or_covers_another_panel(recording, monkeypatch, times):
+    """Of counts with six digits too."""
+    columns = {name: values * (times if name.startswith("mag") else 1.0) for name, values in recording.columns.items()}
+    counts = Recording(columns, units=dict.fromkeys(("mag_x", "mag_y", "mag_z"), "counts"))
+    figures = []
+    monkeypatch.setattr(pictures, "svg", lambda figure, *_: figures.append(figure) or "")
+    calibration_report(calibrate(counts), counts)
+    assert len(figures) == 4
+    for figure in figures:
+        FigureCanvasAgg(figure).draw()
+        panels = [_texts(ax) for ax in figure.axes]
+        for box in itertools.chain(*panels):
+            assert box.x0 >= -2.0
+            assert box.y0 >= -2.0
+            assert box.x1 <= figure.bbox.width + 2.0
+            assert box.y1 <= figure.bbox.height + 2.0
+        for one, other in itertools.combinations(panels, 2):
+            assert not any(a.overlaps(b) for a in one for b in other)
+
+
+def _texts(ax):
+    """The boxes, in pixels, of labels and titles that are shown of a panel."""
+    low, high = sorted(ax.get_xlim())
+    ticks = [label for label in ax.get_xticklabels() if low <= label.get_position()[0] <= high]
+    low, high = sorted(ax.get_ylim())
+    ticks += [label for label in ax.get_yticklabels() if low <= label.get_position()[1] <= high]
+    texts = [*ticks, ax.xaxis.label, ax.yaxis.label, *ax.texts, ax.title, ax._left_title]
+    return [text.get_window_extent() for text in texts if text.get_visible() and text.get_text()]

@@ -436,6 +436,7 @@ def test_a_long_name_is_whole_where_there_is_room():
     assert "position along its longest direction (m)" in text_of(diagnosis_report(wide))
 
 
+@pytest.mark.e2e
 def test_whether_a_finding_extrapolates_is_said():
     diagnosis = make_diagnosis(2, samples=300)
     assert "beyond its range" not in text_of(diagnosis_report(diagnosis))
@@ -495,6 +496,7 @@ def test_what_any_test_of_evidence_says_is_shown():
     assert "Further evidence" not in text_of(diagnosis_report(made))
 
 
+@pytest.mark.e2e
 def test_drivers_that_switch_are_constant_or_missing():
     diagnosis = make_diagnosis(2, samples=400)
     time = diagnosis.traces.time

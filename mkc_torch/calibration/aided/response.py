@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
+from mkc_torch._support.forward_mode import beside
 from mkc_torch.calibration.aided.turns import Turns
 from mkc_torch.nonlinear import GaussianPrior
 
@@ -85,8 +86,8 @@ class Model:
 
     def response(self, theta: Float[Tensor, " p"]) -> Float[Tensor, "3 3"]:
         """In the unit of the measurement."""
-        count = self.entries.shape[1]
-        return self.scale * (self.entries.to(theta) @ theta[3 : 3 + count]).unflatten(0, (3, 3))
+        entries = self.scale * self.entries.to(theta)
+        return (entries @ theta[3 : 3 + entries.shape[1]]).unflatten(0, (3, 3))
 
     def start(self, offset: Float[Tensor, " 3"], response: Float[Tensor, "3 3"]) -> Float[Tensor, " p"]:
         """Parameters at an offset and near a response, and no bias."""
@@ -140,7 +141,7 @@ class Model:
         if turned is not None:
             direction = direction + torch.linalg.cross(turned, direction)
         body = (turns.to_frame.mT @ direction.unsqueeze(-1)).squeeze(-1)
-        return measured - theta[:3] - body @ response.mT
+        return beside(measured, theta[0]) - theta[:3] - body @ response.mT
 
     def first_weight(
         self, theta: Float[Tensor, " p"], measured: Float[Tensor, "N 3"], turns: Turns
@@ -155,7 +156,7 @@ class Model:
 
     def _along(self, theta: Tensor, measured: Tensor, turns: Turns) -> tuple[Tensor, Tensor | None]:
         """The field in the axes of its stretch, in its own lengths, and what errors of the rates turned it by."""
-        field = torch.linalg.solve(self.response(theta), (measured - theta[:3]).mT).mT
+        field = torch.linalg.solve(self.response(theta), (beside(measured, theta[0]) - theta[:3]).mT).mT
         along = (turns.to_frame @ field.unsqueeze(-1)).squeeze(-1)
         if turns.summed is None:
             return along, None
@@ -167,5 +168,6 @@ class Model:
 def steady(along: Float[Tensor, "N 3"], turns: Turns, weight: Float[Tensor, " N"]) -> Float[Tensor, "W 3"]:
     """The weighted mean of each stretch."""
     share = weight.unsqueeze(-1)
-    total = along.new_zeros(turns.count, 3).index_add(0, turns.window, share * along)
-    return total / share.new_zeros(turns.count, 1).index_add(0, turns.window, share)
+    total = share.new_zeros(turns.count, 1).index_add(0, turns.window, share)
+    part = beside(share / total[turns.window], along[0, 0])
+    return beside(along.new_zeros(turns.count, 3), along[0, 0]).index_add(0, turns.window, part * along)

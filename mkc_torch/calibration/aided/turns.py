@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -122,12 +123,23 @@ def _stretches(time: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
         return zero, zero
     turn = torch.linalg.vector_norm(0.5 * (rate[1:] + rate[:-1]), dim=-1) * time.diff()
     angle = torch.cat([turn.new_zeros(1), turn.cumsum(0)]).tolist()
-    gap = [False, *gaps(time).tolist()]
-    first, number, begin, window = [], [], 0, 0
-    for k, t in enumerate(time.tolist()):
-        far = t - float(time[begin]) > WINDOW or angle[k] - angle[begin] > HALF_A_TURN
-        if gap[k] or (far and k - begin >= _FEWEST):
-            begin, window = k, window + 1
-        first.append(begin)
-        number.append(window)
-    return torch.tensor(number), torch.tensor(first)
+    times, broken = time.tolist(), [*(gaps(time).nonzero().flatten() + 1).tolist(), len(time)]
+    begins = [0]
+    while begins[-1] < len(times):
+        begin = begins[-1]
+        far = min(_first_beyond(times, begin, WINDOW), _first_beyond(angle, begin, HALF_A_TURN))
+        # a gap ends a stretch of any length
+        begins.append(min(max(far, begin + _FEWEST), broken[bisect_right(broken, begin)]))
+    first = torch.tensor(begins[:-1])
+    count = torch.tensor(begins).diff()
+    return torch.arange(len(first)).repeat_interleave(count), first.repeat_interleave(count)
+
+
+def _first_beyond(values: list[float], begin: int, reach: float) -> int:
+    """The first place from ``begin`` on at which ascending values are more than ``reach`` above those there.
+
+    Example:
+        >>> _first_beyond([0.0, 1.0, 2.0, 3.0], 1, 1.5)
+        3
+    """
+    return bisect_right(values, reach, begin, key=lambda value: value - values[begin])

@@ -15,11 +15,17 @@ from mkc_torch.calibration.coverage import Coverage
 from mkc_torch.calibration.plot import PLANES, draw_coverage, draw_density, draw_residual, draw_sphere
 from mkc_torch.report.drawing import svg
 
+# fixed margins and title heights: a layout that measures every text takes as long as the drawing
+_STYLE = STYLE | {"axes.titley": 1.0, "axes.titlepad": 5.0}
+_LEFT = 0.095  # room for six digits and a sign, as of counts
+_RIGHT = 0.975
+
 
 def sphere(calibration: Calibration, points: Tensor) -> str:
     """Samples near each plane through the centre, measured and corrected, with the outline they should lie on."""
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 6.9), layout="constrained")
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(10.0, 7.1))
+        figure.subplots_adjust(left=_LEFT, right=_RIGHT, bottom=0.075, top=0.955, wspace=0.38, hspace=0.3)
         for row, corrected in zip(figure.subplots(2, 3), (False, True), strict=True):
             for ax, plane in zip(row, PLANES, strict=True):
                 draw_sphere(ax, calibration, points, plane, corrected=corrected)
@@ -29,8 +35,9 @@ def sphere(calibration: Calibration, points: Tensor) -> str:
 def residual(calibration: Calibration, points: Tensor, place: Tensor) -> str:
     """Residual of the norm over time, or over rows: all of it above, close up below."""
     c = calibration
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 4.8), layout="constrained")
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(10.0, 4.8))
+        figure.subplots_adjust(left=_LEFT, right=_RIGHT, bottom=0.105, top=0.93, hspace=0.24)
         top, close = figure.subplots(2, 1, sharex=True)
         for ax in (top, close):
             draw_residual(ax, c, points, place)
@@ -47,8 +54,9 @@ def residual(calibration: Calibration, points: Tensor, place: Tensor) -> str:
 def density(calibration: Calibration, points: Tensor) -> str:
     """The fitted density over a histogram of the residuals, linear close up and logarithmic over all."""
     unit = calibration.unit
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 3.9), layout="constrained")
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(10.0, 3.9))
+        figure.subplots_adjust(left=_LEFT, right=_RIGHT, bottom=0.13, top=0.92, wspace=0.18)
         left, right = figure.subplots(1, 2)
         draw_density(left, calibration, points, tail=False)
         draw_density(right, calibration, points, tail=True)
@@ -62,8 +70,9 @@ def density(calibration: Calibration, points: Tensor) -> str:
 
 def coverage_map(found: Coverage, directions: Tensor) -> str:
     """The sphere of directions in the sensor's axes, Mollweide: covered, not covered, samples, axes and gaps."""
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 4.6), layout="constrained")
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(10.0, 4.6))
+        figure.subplots_adjust(left=0.06, right=0.94, bottom=0.02, top=0.98)
         draw_coverage(figure.add_subplot(projection="mollweide"), found, directions)
         return svg(figure, "coverage", term("picture.about_coverage"))
 

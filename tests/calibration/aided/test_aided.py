@@ -39,6 +39,7 @@ def heading(draw, c):
     return example().heading_errors(draw, torch.tensor(c.center).double(), torch.tensor(c.matrix).double())
 
 
+@pytest.mark.e2e
 def test_a_gyroscope_gives_a_heading_where_an_ellipsoid_does_not(drawn, found):
     assert float(heading(drawn, found).square().mean().sqrt()) < 2.0
     with pytest.raises(NotIdentifiableError):
@@ -47,6 +48,7 @@ def test_a_gyroscope_gives_a_heading_where_an_ellipsoid_does_not(drawn, found):
     assert least is None or float(least.square().mean().sqrt()) > 4.0
 
 
+@pytest.mark.e2e
 def test_it_tells_by_what_and_its_standard_errors_hold(drawn, found):
     aid = found.aid
     assert (aid.by, aid.response) == ("gyroscope", "full matrix")
@@ -68,6 +70,7 @@ def test_the_gyroscopes_bias_is_told():
     assert float((moved - bias).abs().max()) < 1e-3
 
 
+@pytest.mark.e2e
 def test_json_round_trips_and_old_files_are_read(found):
     content = json.loads(found.to_json())
     assert content["schema"] == "mkc-calibration/1"
@@ -78,6 +81,7 @@ def test_json_round_trips_and_old_files_are_read(found):
     assert (old.aid, old.disturbed_unit) == (None, "s")
 
 
+@pytest.mark.e2e
 def test_the_report_says_what_stood_in(drawn, found):
     page = calibration_report(found, drawn.recording)
     assert "By the gyroscope: offset and full matrix" in page
@@ -114,6 +118,7 @@ def test_what_a_level_vehicle_does_not_determine_is_named_and_never_invented():
     assert "nan" not in c.to_json().lower()
 
 
+@pytest.mark.e2e
 def test_an_attitude_determines_offset_and_matrix(drawn):
     q = quaternions(drawn.to_world)
     c = calibrate(changed(drawn.recording, drop=GYRO, **dict(zip(Q, q.unbind(-1), strict=True))))
@@ -141,6 +146,7 @@ def test_the_simplest_response_that_explains_the_recording_is_chosen(drawn, gain
     assert c.aid.undetermined == ()
 
 
+@pytest.mark.e2e
 def test_turns_of_other_axes_or_sign_are_refused_with_the_reason(drawn):
     r = drawn.recording
     swapped = {"mag_x": r["mag_y"], "mag_y": r["mag_x"]}

@@ -57,6 +57,7 @@ def found(drawn):
     return calibrate(changed(drawn.recording, drop=GYRO), earth=field_of(drawn, 1.005))
 
 
+@pytest.mark.e2e
 def test_it_gives_offsets_and_headings_but_for_a_constant(drawn, found):
     off = (torch.tensor(found.center).double() - drawn.offset) / torch.tensor(found.center_se).double()
     assert float(off.abs().max()) < 4.0
@@ -89,6 +90,7 @@ def test_without_any_tilt_nobody_knows_on_which_side_of_the_circle_the_offset_li
     assert abs(c.center[1] + 8.0) < 4.0 * c.center_se[1] < 16.0
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("vertical", [-42.0, 42.0])
 def test_tilts_show_on_which_side_it_lies(vertical):
     c = calibrate(level(0.15, vertical=vertical), earth=EARTH)

@@ -54,6 +54,7 @@ def test_a_date_is_a_date():
         parsed_date("1.5.2026")
 
 
+@pytest.mark.e2e
 def test_a_place_determines_the_vertical_offset_of_a_level_vehicle():
     draw = torch.Generator().manual_seed(4)
     yaw = torch.linspace(0.0, 20.0, 900, dtype=torch.float64)

@@ -1,0 +1,55 @@
+"""What `mkc calibrate` is at, sensor by sensor, and that it reads a file once."""
+
+import pytest
+import torch
+
+pytest.importorskip("typer")
+pytest.importorskip("polars")
+pytest.importorskip("matplotlib")
+
+from mkc_torch.cli import calibration_files
+from mkc_torch.cli.calibration_files import Asked, calibrations_of
+from mkc_torch.recording.formats import read_topics
+from mkc_torch.recording.recording import write_table
+from tests.calibration.test_calibrate import noisy_ellipsoid
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """The files that are read, each as often as it is."""
+    found = []
+
+    def counted(path):
+        found.append(path.name)
+        return read_topics(path)
+
+    for module in ("cli.calibration_files", "cli.recorded", "recording.reading"):
+        monkeypatch.setattr(f"mkc_torch.{module}.read_topics", counted)
+    return found
+
+
+def asked(**given):
+    return Asked(**({"columns": {}, "units": {}, "sensor": None, "field_strength": None} | given))
+
+
+def test_each_sensor_of_a_file_is_told_and_the_file_is_read_once(tmp_path, reads):
+    points, stages = noisy_ellipsoid(300), []
+    columns = {f"mag{n}_{axis}": points[:, k] + n for n in range(2) for k, axis in enumerate("xyz")}
+    write_table(tmp_path / "two.csv", {"time": torch.arange(300) / 50.0} | columns)
+    outcomes = list(calibrations_of(tmp_path / "two.csv", tmp_path / "o", asked(), force=False, step=stages.append))
+    assert [isinstance(outcome, calibration_files.Found) for _, outcome in outcomes] == [True, True]
+    assert stages == [
+        "reading two.csv",
+        "calibrating two.csv, sensor mag0 (1 of 2)",
+        "drawing the report on two.csv, sensor mag0 (1 of 2)",
+        "calibrating two.csv, sensor mag1 (2 of 2)",
+        "drawing the report on two.csv, sensor mag1 (2 of 2)",
+    ]
+    assert reads == ["two.csv"]
+
+
+def test_a_file_that_is_absent_is_one_outcome(tmp_path):
+    stages = []
+    ((subject, error),) = calibrations_of(tmp_path / "a.csv", tmp_path / "o", asked(), force=False, step=stages.append)
+    assert (subject, type(error)) == (str(tmp_path / "a.csv"), FileNotFoundError)
+    assert stages == ["reading a.csv"]

@@ -1,0 +1,186 @@
+"""Recordings that are drawn for the gate: of each world, and of both proofs, always the same ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from mkc_torch._support.files import write_atomically
+from mkc_torch.challenge.dynamics.subject import dynamics, simulation_class
+from mkc_torch.challenge.dynamics.worlds import dynamics_worlds
+from mkc_torch.challenge.key import Key
+from mkc_torch.challenge.magnetometer.subject import magnetometer
+from mkc_torch.challenge.magnetometer.worlds import magnetometer_worlds
+from mkc_torch.challenge.pool import Pool, every, silent
+from mkc_torch.challenge.score import score
+from mkc_torch.challenge.subject import Case
+from mkc_torch.challenge.world import WorldCase, WorldKey, Worlds
+from mkc_torch.challenge.worlds.score import score_worlds
+from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Request
+from mkc_torch.recording.recording import write_table
+from tests.gate.work import Job
+
+SEED = 7
+
+EMPTY_PER_WORLD = 6
+HIDDEN_PER_WORLD = 2
+
+PER_PROOF = {"magnetometer": 40, "dynamics": 20}
+"""Recordings with something hidden, and as many with nothing."""
+
+Rows = Mapping[str, Mapping[str, Any]]
+"""Name of a recording to its row."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """The recordings of a family's worlds, or of a proof.
+
+    Attributes:
+        jobs: by the recordings' names in the run.
+        truths: of each, what is hidden.
+        counts: from the rows, measures in words to how many of how many.
+        outcomes: from the rows, of each recording whether it is a false alarm, or named.
+    """
+
+    jobs: Sequence[Job]
+    truths: Mapping[str, Mapping[str, Any]]
+    counts: Callable[[Rows], dict[str, str]]
+    outcomes: Callable[[Rows], dict[str, dict[str, Any]]]
+
+
+@dataclass(frozen=True)
+class _Address:
+    """A recording to be drawn: its name in the run, and the function that draws it."""
+
+    name: str
+    draw: Callable[[], Case | WorldCase]
+    simulation: str = ""
+
+
+def all_worlds(
+    output: Path, *, match: str = "", workers: int = 1, empty: int = EMPTY_PER_WORLD, hidden: int = HIDDEN_PER_WORLD
+) -> Iterator[Drawn]:
+    """Both families' worlds; of the recordings those whose name has ``match`` in it."""
+    for family in (dynamics_worlds(), magnetometer_worlds()):
+        addresses = [
+            # a number of its own for each recording, which its file's name has in it
+            _Address(name, partial(world.draw, SEED, index, hides, 1000 * place + 100 * hides + index))
+            for place, world in enumerate(family.worlds)
+            for hides, total in ((False, empty), (True, hidden if world.hides else 0))
+            for index in range(total)
+            if match in (name := f"world {family.family} {world.name} {'hidden' if hides else 'empty'} {index}")
+        ]
+        yield _of_worlds(family, *_written(addresses, output / "drawn" / f"worlds_{family.family}", workers))
+
+
+def both_proofs(
+    output: Path, *, match: str = "", workers: int = 1, sizes: Mapping[str, int] = PER_PROOF
+) -> Iterator[Drawn]:
+    """Both proofs; of the recordings those whose name has ``match`` in it."""
+    for subject in (magnetometer(), dynamics()):
+        size, text = sizes[subject.name], subject.simulations.read_text(encoding="utf-8") if subject.simulations else ""
+        addresses = [
+            _Address(name, partial(subject.draw, SEED, index, index >= size), text)
+            for index in range(2 * size)
+            if match in (name := f"proof {subject.name} {'hidden' if index < size else 'empty'} {index}")
+        ]
+        yield _of_proof(*_written(addresses, output / "drawn" / f"proof_{subject.name}", workers))
+
+
+def _written(addresses: Sequence[_Address], folder: Path, workers: int) -> tuple[list[Job], dict[str, Any]]:
+    """The jobs of recordings that are drawn and written, and their keys by the names in the run."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with Pool(workers) as pool:
+        drawn = every(pool, partial(_write, folder), addresses, partial(silent, "draw"))
+    return [job for job, _ in drawn], {job.name: key for job, key in drawn}
+
+
+def _write(folder: Path, address: _Address) -> tuple[Job, Key | WorldKey]:
+    case = address.draw()
+    recording = folder / f"{case.key.name}.csv"
+    write_table(recording, case.recording.columns, overwrite=True)
+    simulation = case.simulation if isinstance(case, WorldCase) else address.simulation
+    return Job(address.name, recording, _request(recording, simulation)), case.key
+
+
+def _of_worlds(family: Worlds, jobs: Sequence[Job], keys: Mapping[str, WorldKey]) -> Drawn:
+    def scored(rows: Rows) -> Any:
+        return score_worlds(family, list(keys.values()), _by_key(rows, {n: key.name for n, key in keys.items()}))
+
+    def counts(rows: Rows) -> dict[str, str]:
+        found = scored(rows)
+        total, cases = found.total, found.cases
+        empty, useless = [case for case in cases if not case.hides], [case for case in cases if case.key.useless]
+        return {
+            "false alarms": f"{sum(case.said.alarm for case in empty)}/{len(empty)}",
+            "strong named": f"{total.named.count}/{total.named.total}",
+            "strong named wrong": f"{total.wrong.count}/{total.wrong.total}",
+            "useless unfit": f"{sum(case.said.verdict == 'unfit' for case in useless)}/{len(useless)}",
+            "useful unfit": f"{total.useful_unfit.count}/{total.useful_unfit.total}",
+            "failed": str(sum(case.said.verdict == "failed" for case in cases)),
+        }
+
+    def outcomes(rows: Rows) -> dict[str, dict[str, Any]]:
+        cases = scored(rows).cases
+        return {
+            name: {"named": case.named} if case.hides else {"false_alarm": case.said.alarm}
+            for name, case in zip(keys, cases, strict=True)
+        }
+
+    return Drawn(jobs, {name: _truth(key.key) | _pushed(key) for name, key in keys.items()}, counts, outcomes)
+
+
+def _of_proof(jobs: Sequence[Job], keys: Mapping[str, Key]) -> Drawn:
+    names = {name: key.name for name, key in keys.items()}
+
+    def scored(rows: Rows, among: Sequence[str]) -> Any:
+        return score([keys[name] for name in among], _by_key(rows, names), thresholds=())
+
+    def counts(rows: Rows) -> dict[str, str]:
+        found = scored(rows, list(keys))
+        return {
+            "false alarms": f"{found.false_alarms.count}/{found.false_alarms.total}",
+            "strong named": f"{found.named.count}/{found.named.total}",
+            "failed": str(len(found.failed)),
+        }
+
+    def outcomes(rows: Rows) -> dict[str, dict[str, Any]]:
+        told = {}
+        for name, key in keys.items():
+            one = scored(rows, [name])
+            if key.kind == "empty":
+                told[name] = {"false_alarm": bool(one.false_alarms.count)}
+            else:
+                told[name] = {"named": bool(sum(part.named.count for part in one.power_z) or one.doubles[2])}
+        return told
+
+    return Drawn(jobs, {name: _truth(key) for name, key in keys.items()}, counts, outcomes)
+
+
+def _request(recording: Path, simulation: str) -> Request:
+    """With the text of a simulation's file, which is written beside the recording, or of the magnetometer."""
+    if not simulation:
+        return Request(simulation=MAGNETOMETER, force=True, report=False)
+    file = recording.with_suffix(".py")
+    write_atomically(file, simulation, overwrite=True)
+    of_a_sensor = recording.stem.startswith("case_")
+    name = "sensor" if of_a_sensor else simulation_class(recording)
+    return Request(simulation=f"{file}:{name}", force=True, report=False)
+
+
+def _by_key(rows: Rows, names: Mapping[str, str]) -> dict[str, Mapping[str, Any] | None]:
+    """Rows by the keys' names, as the scores take diagnoses; None where a diagnosis failed."""
+    return {key: rows[name] if name in rows and rows[name]["verdict"] else None for name, key in names.items()}
+
+
+def _truth(key: Key) -> dict[str, Any]:
+    effects = [{"effect": e.effect, "z": e.z, "z_sep": e.z_sep, "drivers": list(e.drivers)} for e in key.effects]
+    return {"kind": key.kind, "hidden": effects}
+
+
+def _pushed(key: WorldKey) -> dict[str, Any]:
+    return {"push": asdict(key.push) if key.push else None, "useless": key.useless}

@@ -1,0 +1,135 @@
+"""The right answer for a recording, and whether a row of the gate gives it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from mkc_torch.challenge.verdict import Answer, Candidate, answer
+
+
+@dataclass(frozen=True)
+class Size:
+    """A parameter's right value: ``within`` is the relative tolerance, ``errors`` the number of standard errors."""
+
+    effect: str
+    parameter: str
+    value: float
+    within: float = 0.0
+    errors: float = 0.0
+
+
+@dataclass(frozen=True)
+class Expected:
+    """The accepted answers for a recording.
+
+    Attributes:
+        names: groups of accepted effects; each group needs a claimed effect, or an alternative that the diagnosis says
+            it cannot rule out. None stands for a recording in which no effect may be claimed.
+        places: substrings, one of which has to be in a channel of the claimed effect; empty for any place.
+        refused: effects that may not be claimed.
+        verdicts: accepted verdicts; empty for any.
+        sizes: right values of parameters.
+        residual: output to the largest accepted root mean square of recording less open-loop simulation, in its unit.
+        words: phrases of an advice or warning, all of which together are accepted in place of a claim.
+    """
+
+    names: Sequence[Sequence[str]] = ()
+    places: Sequence[str] = ()
+    refused: Sequence[str] = ()
+    verdicts: Sequence[str] = ()
+    sizes: Sequence[Size] = ()
+    residual: Mapping[str, float] = field(default_factory=dict)
+    words: Sequence[str] = ()
+
+
+def judged(row: Mapping[str, Any], expected: Expected) -> dict[str, Any]:
+    """Whether a row is right, by name, verdict, sizes and residual, and what is wrong with it.
+
+    Args:
+        row: of the gate, as :func:`tests.gate.row.row` gives it.
+        expected: the right answer.
+
+    Returns:
+        ``right`` and, in ``wrong``, a sentence for each fault.
+
+    Example:
+        >>> row = {"verdict": "unfit", "findings": [], "residual_after": {}, "sentences": []}
+        >>> judged(row, Expected(verdicts=("adequate",)))
+        {'right': False, 'wrong': ['the verdict is unfit, not adequate']}
+    """
+    said = answer(row if row["verdict"] else None)
+    wrong = []
+    if expected.verdicts and said.verdict not in expected.verdicts:
+        wrong.append(f"the verdict is {said.verdict}, not {' or '.join(expected.verdicts)}")
+    if said.verdict == "failed":
+        wrong = [f"no diagnosis: {row.get('failed') or 'no reason given'}"]
+    elif not (expected.words and _says(row, expected.words)):
+        wrong += _wrong_names(said, expected) + _wrong_sizes(row, expected.sizes)
+        wrong += _wrong_residuals(row["residual_after"], expected.residual)
+    return {"right": not wrong, "wrong": wrong}
+
+
+def _says(row: Mapping[str, Any], words: Sequence[str]) -> bool:
+    return any(all(word in sentence for word in words) for sentence in row["sentences"])
+
+
+def _wrong_names(said: Answer, expected: Expected) -> list[str]:
+    claimed = [finding.named.effect for finding in said.claims]
+    if not expected.names:
+        return [f"{', '.join(claimed)} claimed where nothing is to be named"] if claimed else []
+    told = ", ".join(claimed) or "nothing"
+    wrong = [
+        f"{' or '.join(group)} is not claimed but {told}" for group in expected.names if not _is_named(said, group)
+    ]
+    accepted = {name for group in expected.names for name in group}
+    first = said.claims[0] if said.claims else None
+    if first and not {first.named.effect, *(other.effect for other in first.others)} & accepted:
+        wrong.append(f"{first.named.effect} is claimed first")
+    wrong += [f"{name} is claimed" for name in expected.refused if name in claimed]
+    if first and expected.places and not wrong and not _is_at(first.named, expected.places):
+        wrong.append(f"{first.named.effect} is claimed at {', '.join(sorted(first.named.at))}")
+    return wrong
+
+
+def _is_named(said: Answer, group: Sequence[str]) -> bool:
+    """Claimed, or rightly undecided: among the alternatives of a claim that the recording cannot rule out."""
+    return any(candidate.effect in group for finding in said.claims for candidate in (finding.named, *finding.others))
+
+
+def _is_at(named: Candidate, places: Sequence[str]) -> bool:
+    return any(place in channel for place in places for channel in named.at)
+
+
+def _wrong_sizes(row: Mapping[str, Any], sizes: Sequence[Size]) -> list[str]:
+    wrong = []
+    for size in sizes:
+        value, error = _parameter(row, size)
+        if value is None:
+            wrong.append(f"no {size.parameter} of {size.effect}")
+            continue
+        allowed = max(size.within * abs(size.value), size.errors * error)
+        if not abs(value - size.value) <= allowed:
+            wrong.append(f"{size.parameter} of {size.effect} is {value:.4g}, not {size.value:.4g} +- {allowed:.2g}")
+    return wrong
+
+
+def _parameter(row: Mapping[str, Any], size: Size) -> tuple[float | None, float]:
+    for finding in row["findings"]:
+        for parameter in finding["parameters"]:
+            if finding["effect"] == size.effect and parameter["name"] == size.parameter:
+                error = parameter["standard_error"]
+                return float(parameter["value"]), 0.0 if error is None else float(error)
+    return None, math.nan
+
+
+def _wrong_residuals(after: Mapping[str, float | None], most: Mapping[str, float]) -> list[str]:
+    wrong = []
+    for output, limit in most.items():
+        residual = after.get(output)
+        if residual is None or not residual <= limit:
+            told = "unknown" if residual is None else f"{residual:.4g}"
+            wrong.append(f"the residual of {output} is {told}, not at most {limit:.4g}")
+    return wrong

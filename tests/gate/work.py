@@ -1,0 +1,107 @@
+"""Diagnoses in processes of their own, each with a time limit, its CPU seconds counted."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import resource
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mkc_torch.cli.diagnosis_request import Request
+
+_PRELOADED = "mkc_torch.cli.diagnosis_files"
+"""Imported once; the processes are forked from there, so that none waits for torch."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A recording to diagnose, as ``mkc diagnose`` would be asked to."""
+
+    name: str
+    recording: Path
+    request: Request
+
+
+def diagnosed(
+    jobs: Sequence[Job], output: Path, *, workers: int, limit_s: float, task: Callable[[Job, Path], None] | None = None
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The rows of all jobs, by name, as they are done.
+
+    Args:
+        jobs: in the order in which they are begun.
+        output: a folder for each recording goes there.
+        workers: processes at once.
+        limit_s: wall seconds after which a diagnosis is ended and counts as failed.
+        task: writes ``row.json`` into the folder that it is given; default :func:`diagnose_job`.
+    """
+    # Any, for the base class of contexts has no Process in its type
+    context: Any = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([_PRELOADED])
+    # the preloaded process reads it: threads of OpenMP would not survive a fork
+    os.environ["OMP_NUM_THREADS"] = "1"
+
+    def one(job: Job) -> dict[str, Any]:
+        folder = output / job.name.replace(" ", "_").replace("/", "_")
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "row.json").unlink(missing_ok=True)
+        started = time.perf_counter()
+        process = context.Process(target=task or diagnose_job, args=(job, folder))
+        process.start()
+        process.join(limit_s)
+        late = process.is_alive()
+        if late:
+            process.kill()
+            process.join()
+        return _row_of(folder, f"over the limit of {limit_s:g} s" if late else "", time.perf_counter() - started)
+
+    with ThreadPoolExecutor(workers) as pool:
+        futures = {pool.submit(one, job): job.name for job in jobs}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+
+
+def _row_of(folder: Path, failed: str, wall_seconds: float) -> dict[str, Any]:
+    file = folder / "row.json"
+    if file.is_file() and not failed:
+        found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        return found
+    empty: dict[str, Any] = {"verdict": "", "p_value": None, "findings": [], "residual_before": {}}
+    seconds = {"cpu_seconds": None, "wall_seconds": round(wall_seconds, 2)}
+    return empty | {"residual_after": {}, "sentences": [], "failed": failed or "the process ended"} | seconds
+
+
+def diagnose_job(job: Job, folder: Path) -> None:
+    """Diagnose in this process and write ``row.json``, beside ``diagnosis.json`` and ``model.json``."""
+    from mkc_torch._parallel.pool import allow_copies
+    from mkc_torch._parallel.processes import keep_memory, one_thread
+    from mkc_torch.cli.console import Look
+    from mkc_torch.cli.diagnosis_files import diagnose_file
+    from tests.gate.row import row
+
+    one_thread()
+    keep_memory()
+    allow_copies(0)
+    for old in ("diagnosis.json", "model.json"):
+        (folder / old).unlink(missing_ok=True)
+    cpu, wall = _cpu_seconds(), time.perf_counter()
+    outcomes = diagnose_file(job.recording, folder, job.request, Look(terminal=False, width=100))
+    seconds = {
+        "cpu_seconds": round(_cpu_seconds() - cpu, 2),
+        "wall_seconds": round(time.perf_counter() - wall, 2),
+        "memory_gib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
+    }
+    failed = "; ".join(outcome.text for outcome in outcomes if outcome.failed)
+    found = row(folder, job.recording, job.request) | ({"failed": failed} if failed else {}) | seconds
+    (folder / "row.json").write_text(json.dumps(found), encoding="utf-8")
+
+
+def _cpu_seconds() -> float:
+    """User and system time of this process and of its children that have ended."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(part.ru_utime + part.ru_stime for part in used)
