@@ -1,5 +1,6 @@
 """One thread a worker, so that workers do not fight over the cores; forward mode loaded once."""
 
+import gc
 import os
 import warnings
 
@@ -11,6 +12,7 @@ from _pytest.doctest import DoctestModule
 from mkc_torch._parallel.processes import one_thread
 
 one_thread()
+gc.set_threshold(100_000)  # collecting makes a million objects that stay
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read where Triton is imported, which torch's compiler may do in any test
@@ -18,7 +20,7 @@ if not torch.cuda.is_available():
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collect_file():
-    """Tests hold no doctests: without this every one of their files would be collected twice."""
+    """Tests hold no doctests: with --doctest-modules every one of their files would be collected twice."""
     return [one for one in (yield) if not isinstance(one, DoctestModule)]
 
 

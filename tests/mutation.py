@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PYTEST = ("-q", "-p", "no:cacheprovider", "--assert=plain")  # assertions need no words here, and rewriting takes time
+PYTEST = ("-q", "-m", "not slow", "--doctest-modules", "-p", "no:cacheprovider", "--assert=plain")  # rewriting is slow
 LOADED = ("torch", "torch._dynamo", "numpy", "scipy.stats", "scipy.optimize", "hypothesis", "sklearn.linear_model")
 SLACK = 30  # seconds that a test may take beyond five times what it takes under coverage
 OUTPUT = Path("output.txt")  # in the copy: what the last tests wrote

@@ -18,6 +18,7 @@ def found():
     return list(rows())
 
 
+@pytest.mark.manual
 def test_the_page_says_of_each_what_is_said(found):
     text = PAGE.read_text(encoding="utf-8")
     assert text.startswith(HEAD)
@@ -25,6 +26,7 @@ def test_the_page_says_of_each_what_is_said(found):
     assert told == [row(bad, said) for bad, said in found]
 
 
+@pytest.mark.manual
 def test_the_page_has_each_under_its_heading(found, monkeypatch):
     monkeypatch.setattr("tests.bad_inputs.rows", lambda: iter(found))
     assert page() == PAGE.read_text(encoding="utf-8")
@@ -35,6 +37,7 @@ def test_they_are_many_and_differ():
     assert len(set(given)) == len(given) >= 80
 
 
+@pytest.mark.manual
 def test_each_is_told_in_sentences(found):
     for bad, said in found:
         assert re.search(r"[.:][)\"`]*$|\.$", said), (bad.given, said)
@@ -44,5 +47,6 @@ def test_each_is_told_in_sentences(found):
         assert not re.search(r"/tmp|\.py\"?, line|0x7f", said), said
 
 
+@pytest.mark.manual
 def test_most_are_said_differently(found):
     assert len({said for _, said in found}) > 0.8 * len(found)

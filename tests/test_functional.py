@@ -410,6 +410,7 @@ def test_jacrev_jacfwd_and_hessian_agree(function):
     assert any(block.abs().max() > 1e-3 for row in curvature for block in row)
 
 
+@pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
 def test_compiled_nll_equals_eager_in_value_and_gradient():
     compiled = torch.compile(mkc_nll, fullgraph=True)
@@ -425,6 +426,7 @@ def test_compiled_nll_equals_eager_in_value_and_gradient():
         )
 
 
+@pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
 def test_compiled_energy_in_float32_is_right_where_one_minus_exp_is_zero():
     e = torch.linspace(0.5, 3.0, 64)  # long enough for vector instructions
@@ -568,6 +570,7 @@ def test_under_vmap_parameters_go_through_as_they_are(function):
     torch.testing.assert_close(found, torch.stack([called(function, sigma=s.abs()) for s in sigma]))
 
 
+@pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
 def test_compiled_parameters_are_looked_at_where_they_are_numbers():
     compiled = torch.compile(mkc_nll, fullgraph=True)

@@ -177,6 +177,7 @@ def test_what_is_no_loss_and_what_the_loss_refuses_is_refused():
     assert float(metric.weight.sum()) == 0.0
 
 
+@pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
 def test_the_loss_may_be_compiled():
     loss = made()

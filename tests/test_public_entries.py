@@ -84,6 +84,7 @@ def test_a_spoilt_argument_is_refused_or_answered_with_numbers(name, argument):
     assert wrong(name, argument) == {}
 
 
+@pytest.mark.e2e
 @settings(max_examples=25, deadline=None)
 @given(st.data())
 def test_so_of_those_that_take_long(data):

@@ -43,7 +43,7 @@ def main() -> None:
             file.extractall(place, filter="data")
         (tree,) = place.glob("mkc_torch-*")
         shutil.rmtree(tree / "mkc_torch")  # the wheel is what is tested
-        sys.exit(run(python, "-m", "pytest", "-q", "-p", "no:cacheprovider", *asked.tests, cwd=tree))
+        sys.exit(run(python, "-m", "pytest", "-q", "-m", "not slow", "-p", "no:cacheprovider", *asked.tests, cwd=tree))
 
 
 if __name__ == "__main__":

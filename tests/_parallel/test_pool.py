@@ -15,6 +15,7 @@ import torch
 
 from mkc_torch._parallel import pool as _pool
 from mkc_torch._parallel.pool import Parcels, allow_copies, meanwhile, shared
+from tests.started import started
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="copies are forked on Linux alone")
 
@@ -226,22 +227,17 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_whatever_ends_this_process_ends_its_copies(number):
-    process = subprocess.Popen(
-        [sys.executable, "-c", ENDED],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    assert process.stdout is not None
-    for _ in range(2):
-        process.stdout.readline()
-    # a terminal interrupts all of them
-    os.killpg(process.pid, number) if number == signal.SIGINT else process.kill()
-    # the copies have its streams too, which end when the last one has
-    said, errors = process.communicate(timeout=60)
+    with started("-c", ENDED) as process:
+        assert process.stdout is not None
+        for _ in range(2):
+            process.stdout.readline()
+        # a terminal interrupts all of them
+        os.killpg(process.pid, number) if number == signal.SIGINT else process.kill()
+        # the copies have its streams too, which end when the last one has
+        said, errors = process.communicate(timeout=60)
     assert said == ("interrupted\n" if number == signal.SIGINT else "")
     assert errors == ""
 
@@ -306,6 +302,7 @@ CODE = """
 """
 
 
+@pytest.mark.process
 def test_a_diagnosis_is_the_same_by_one_core_as_by_two():
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(CODE)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

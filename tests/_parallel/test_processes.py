@@ -10,6 +10,7 @@ import torch
 from mkc_torch._parallel.processes import cores, keep_memory
 
 
+@pytest.mark.process
 def test_what_was_imported_is_out_of_the_collectors_sight_to_the_end():
     code = (
         "import atexit, gc, torch; from mkc_torch._parallel.processes import keep_modules\n"
@@ -28,6 +29,7 @@ def test_kept_memory_serves_as_before():
     assert float(torch.ones(5_000_000).sum()) == 5_000_000.0
 
 
+@pytest.mark.process
 def test_linear_algebra_computes_in_one_thread():
     code = (
         "import torch, numpy\nfrom threadpoolctl import threadpool_info\n"
@@ -78,6 +80,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.process
 @pytest.mark.skipif(cores() < 2 or os.name == "nt", reason="one core, or no such signal")
 def test_an_interrupt_where_it_is_asked_whether_to_stop_keeps_nobody_waiting(tmp_path):
     script = tmp_path / "interrupted.py"

@@ -189,6 +189,7 @@ def test_other_columns_than_those_of_the_fit_are_refused(frame):
         refuse_other_columns("X", value, ("a", "c"))
 
 
+@pytest.mark.process
 def test_no_library_of_frames_is_imported():
     gone = "sys.modules['pandas'] = sys.modules['polars'] = sys.modules['sklearn'] = None"
     code = f"import sys; {gone}; import mkc_torch.linear"

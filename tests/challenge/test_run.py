@@ -37,7 +37,7 @@ def apply(model, path):
     return {f"field_{axis}": recording[f"mag_{axis}"] for axis in "xyz"}
 
 
-@pytest.fixture(scope="module", params=[1, 2])
+@pytest.fixture(scope="module", params=[1, pytest.param(2, marks=pytest.mark.process)])
 def run(request, tmp_path_factory):
     output = tmp_path_factory.mktemp("challenge") / "out"
     told = []

@@ -88,6 +88,7 @@ def test_each_recording_is_compared_with_the_simulation_that_lies_ready_for_it(t
     ]
 
 
+@pytest.mark.e2e
 def test_a_real_diagnosis_is_scored(tmp_path):
     command = ("challenge", "--worlds", "--per-world", 1, "--only", "white", "--hidden-per-world", 0, "--duration", 15)
     result = mkc(*command, "--workers", 1, "--seed", 2, "--output", tmp_path / "a")

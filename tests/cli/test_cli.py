@@ -90,11 +90,13 @@ def test_calibrate_writes_both_files_and_a_summary(good, tmp_path):
     assert result.stderr == ""
 
 
+@pytest.mark.e2e
 def test_output_in_a_pipe_has_no_escape_codes(good, tmp_path):
     result = mkc("calibrate", good, tmp_path / "absent.csv", "--output", tmp_path / "out")
     assert "\x1b" not in result.stdout + result.stderr
 
 
+@pytest.mark.e2e
 def test_one_failing_recording_does_not_stop_the_others(good, tmp_path):
     other = table(tmp_path / "other.csv", noisy_ellipsoid(200, seed=3))
     result = mkc("calibrate", good, tmp_path / "absent.csv", other, "--output", tmp_path / "out")
@@ -105,6 +107,7 @@ def test_one_failing_recording_does_not_stop_the_others(good, tmp_path):
     assert second == "mkc: 1 of 3 recordings were not calibrated."
 
 
+@pytest.mark.e2e
 def test_existing_results_are_kept_without_force(good, tmp_path):
     assert mkc("calibrate", good, "--output", tmp_path).exit_code == 0
     before = (tmp_path / "good" / "calibration.json").read_bytes()
@@ -175,6 +178,7 @@ def test_constant_column_and_coplanar_points(tmp_path):
     refused(mkc("calibrate", path, "--output", tmp_path / "out"), "in a plane")
 
 
+@pytest.mark.e2e
 def test_unsorted_and_repeated_times_are_told(tmp_path):
     time = torch.arange(300) / 50.0
     time[[4, 5]] = time[[5, 4]]
@@ -193,6 +197,7 @@ def test_values_beyond_all_measure_are_refused(tmp_path, factor):
     refused(mkc("calibrate", path, "--output", tmp_path / "out"), str(path), "no magnetic field")
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("factor", [1e-9, 1e9])
 def test_any_usual_unit_will_do(tmp_path, factor):
     path = table(tmp_path / "scaled.csv", noisy_ellipsoid() * factor)
@@ -214,6 +219,7 @@ def test_output_without_permission(good, tmp_path):
     refused(mkc("calibrate", good, "--output", tmp_path / "locked"), "permission denied")
 
 
+@pytest.mark.e2e
 def test_a_write_that_fails_leaves_no_half_file(good, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device", "calibration.json")
@@ -235,6 +241,7 @@ def test_usage_errors_exit_with_two(good, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.e2e
 def test_columns_and_units_of_the_users_own(tmp_path):
     points = 20.0 * noisy_ellipsoid(300)
     path = tmp_path / "own.csv"
@@ -263,6 +270,7 @@ def test_not_identifiable_writes_a_report_and_no_calibration(tmp_path):
     assert "+z" in page
 
 
+@pytest.mark.e2e
 def test_broad_28(tmp_path):
     path = shared_data("magnetometer/broad_28_stationary_magnet.csv")
     assert mkc("calibrate", path, "--output", tmp_path).exit_code == 0
@@ -350,6 +358,7 @@ def test_apply_warns_of_a_recording_in_another_unit(calibrated, tmp_path):
     assert "median length 48.2" in result.stdout
 
 
+@pytest.mark.e2e
 def test_what_a_user_wrote_is_printed_as_it_is(calibrated, tmp_path):
     """Rich would make a cross of :X: and bold of [b]."""
     odd = tmp_path / "no:X:[b]file.csv"
@@ -413,6 +422,7 @@ def test_demo_finds_what_is_concealed_and_corrects_a_second_recording(calibrated
     assert (folder.parent / "again.csv").read_bytes() == (folder / "corrected.csv").read_bytes()
 
 
+@pytest.mark.e2e
 def test_demo_refuses_an_existing_folder_and_files_of_the_users_own(calibrated, tmp_path):
     folder, _ = calibrated
     refused(mkc("demo", "--output", folder), "not empty", "--force")
@@ -426,6 +436,7 @@ def test_demo_refuses_an_existing_folder_and_files_of_the_users_own(calibrated, 
         (tmp_path / name).unlink()
 
 
+@pytest.mark.e2e
 def test_recording_of_the_demo_calibrates_to_the_same_numbers(calibrated, tmp_path):
     folder, _ = calibrated
     assert mkc("calibrate", folder / "recording.csv", "--output", tmp_path).exit_code == 0
@@ -442,6 +453,7 @@ def run(*arguments, encoding_of_pipes="utf-8"):
     )  # fmt: skip
 
 
+@pytest.mark.process
 def test_real_process_in_a_pipe(good, tmp_path):
     absent = tmp_path / "absent.csv"
     done = run("-m", "mkc_torch.cli", "calibrate", str(good), str(absent), "--output", str(tmp_path / "out"))
@@ -452,6 +464,7 @@ def test_real_process_in_a_pipe(good, tmp_path):
     assert done.stderr.splitlines()[0] == f"mkc: {absent}: there is no such file."
 
 
+@pytest.mark.process
 def test_a_pipe_that_knows_no_greek(calibrated, tmp_path):
     command = ("calibrate", str(calibrated[0] / "recording.csv"), "--output", str(tmp_path / "out"))
     done = run("-m", "mkc_torch.cli", *command, encoding_of_pipes="ascii")
@@ -480,6 +493,7 @@ def test_a_recording_without_a_name_is_refused(good, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.process
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 def test_a_full_disk_behind_the_terminal_is_told_in_a_line(good, tmp_path):
     with Path("/dev/full").open("w") as full:

@@ -26,6 +26,7 @@ from mkc_torch.diagnosis import DiagnosedModel
 from mkc_torch.diagnosis.files.diagnosis_json import validate
 from mkc_torch.recording.recording import Recording, write_table
 from tests.diagnosis.factory import make_diagnosis
+from tests.started import started
 
 AXES = ("mag_x", "mag_y", "mag_z")
 WRITTEN = ["diagnosis.json", "model.json", "report.html"]
@@ -176,6 +177,7 @@ def test_existing_results_are_kept_without_force(stepped):
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
 
 
+@pytest.mark.e2e
 def test_force_replaces_results_and_keeps_other_files(tmp_path):
     path, folder = quiet(tmp_path / "a.csv"), tmp_path / "a"
     folder.mkdir()
@@ -190,10 +192,12 @@ def test_force_replaces_results_and_keeps_other_files(tmp_path):
     assert content_of(folder)["verdict"] == "adequate"
 
 
+@pytest.mark.e2e
 def test_no_time_column(tmp_path):
     assert "no column `time`" in warnings_of(quiet(tmp_path / "a.csv", time=None), tmp_path / "out")
 
 
+@pytest.mark.e2e
 def test_a_clock_that_jumps(tmp_path):
     clock = sensor(QUIET)["time"]
     clock[250:] += 5.0
@@ -204,6 +208,7 @@ def test_a_clock_that_jumps(tmp_path):
         assert words in told
 
 
+@pytest.mark.e2e
 def test_columns_that_can_drive_nothing(tmp_path):
     slope = torch.linspace(20.0, 30.0, 500, dtype=torch.float64)
     slope = slope + 0.1 * torch.randn(500, generator=torch.Generator().manual_seed(0))
@@ -219,6 +224,7 @@ def test_columns_that_can_drive_nothing(tmp_path):
         assert words in told
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(("factor", "unit", "option"), [(0.01, "gauss", "gauss"), (1000.0, "nanotesla", "nT")])
 def test_other_units_are_asked_for_and_converted(tmp_path, factor, unit, option):
     scaled = {name: factor * sensor(QUIET)[name] for name in AXES}
@@ -228,6 +234,7 @@ def test_other_units_are_asked_for_and_converted(tmp_path, factor, unit, option)
     assert content_of(tmp_path / "own" / "a")["baseline"]["rmse"] == pytest.approx(0.3, rel=0.2)
 
 
+@pytest.mark.e2e
 def test_raw_counts_are_told_of_and_keep_their_name(tmp_path):
     path = quiet(tmp_path / "a.csv", **{name: 100.0 * sensor(QUIET)[name] for name in AXES})
     assert "may be raw counts" in warnings_of(path, tmp_path / "out")
@@ -261,6 +268,7 @@ def test_a_sensor_at_rest(tmp_path):
     assert "Turn the sensor" in result.output
 
 
+@pytest.mark.e2e
 def test_one_failing_recording_does_not_stop_the_other(tmp_path):
     good, bad = quiet(tmp_path / "good.csv"), tmp_path / "bad.csv"
     bad.write_text("time,mag_x,mag_y,mag_z\n0,1,two,3\n")
@@ -271,6 +279,7 @@ def test_one_failing_recording_does_not_stop_the_other(tmp_path):
     assert "good against magnetometer" in result.stdout
 
 
+@pytest.mark.e2e
 def test_experiments_are_diagnosed_each_on_its_own(tmp_path):
     long, short = sensor(QUIET), {name: values[:20] for name, values in sensor(QUIET).items()}
     columns = {name: torch.cat([long[name], short[name]]) for name in long}
@@ -284,6 +293,7 @@ def test_experiments_are_diagnosed_each_on_its_own(tmp_path):
     assert content_of(tmp_path / "out" / "a" / "flight_1")["recording"] == "a/flight/1"
 
 
+@pytest.mark.e2e
 def test_columns_of_the_users_own(tmp_path):
     columns = {name.replace("mag_", "u"): values for name, values in sensor(QUIET).items()}
     path = table(tmp_path / "a.csv", columns)
@@ -350,6 +360,7 @@ def test_without_a_model_none_is_written_and_an_old_one_goes(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["diagnosis.json", "report.html"]
 
 
+@pytest.mark.e2e
 def test_text_for_a_terminal_is_set_to_its_width(stepped):
     request = diagnosis_files.Request(surrogates=19, force=True, report=False)
     folder = stepped[1].parent / "wide"
@@ -358,24 +369,19 @@ def test_text_for_a_terminal_is_set_to_its_width(stepped):
     assert sorted(path.name for path in folder.iterdir()) == WRITTEN[:2]
 
 
-def started(*arguments):
-    return subprocess.Popen(
-        [sys.executable, "-m", "mkc_torch.cli", *map(str, arguments)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8", start_new_session=True,
-        env=os.environ | {"PYTHONIOENCODING": "utf-8", "FORCE_COLOR": "1"},
-    )  # fmt: skip
-
-
+@pytest.mark.process
 @pytest.mark.skipif(os.name == "nt", reason="signals are another thing there")
 def test_an_interrupt_ends_all_processes_and_leaves_nothing(tmp_path):
     recordings = [quiet(tmp_path / f"{name}.csv") for name in "abcdef"]
     out = tmp_path / "out"
-    process = started("diagnose", *recordings, "--output", out, *QUICK)
-    waited = time.monotonic() + 60.0
-    while not out.is_dir() and process.poll() is None and time.monotonic() < waited:
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)
-    _, told = process.communicate(timeout=60)
+    command = ("-m", "mkc_torch.cli", "diagnose", *recordings, "--output", out, *QUICK)
+    environment = os.environ | {"PYTHONIOENCODING": "utf-8", "FORCE_COLOR": "1"}
+    with started(*command, env=environment, encoding="utf-8") as process:
+        waited = time.monotonic() + 60.0
+        while not out.is_dir() and process.poll() is None and time.monotonic() < waited:
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGINT)
+        _, told = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "Traceback" not in told
     assert [path.name for path in out.rglob("*") if path.is_file() and path.name not in WRITTEN] == []
@@ -390,6 +396,7 @@ def test_a_process_that_dies_is_told(tmp_path):
     assert "its process ended" in outcome.text
 
 
+@pytest.mark.e2e
 def test_challenge(tmp_path):
     folder = tmp_path / "proof"
     command = ("challenge", "--cases", 1, "--empty", 1, "--seed", 4, "--duration", 15, "--workers", 1)

@@ -136,6 +136,7 @@ def test_exports_of_an_earlier_calibration_are_told_and_kept(good, tmp_path):
     assert (tmp_path / "good" / "px4.params").read_bytes() == before
 
 
+@pytest.mark.e2e
 def test_the_new_one_stands_beside_the_old_one(done, tmp_path):
     old = done[0] / "calibration.json"
     before = old.read_bytes()
@@ -254,6 +255,7 @@ def test_a_full_disk_names_the_file(good, tmp_path, monkeypatch):
     assert not (tmp_path / "out" / "good").exists()
 
 
+@pytest.mark.process
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 @pytest.mark.parametrize(
     "command",

@@ -15,6 +15,7 @@ pytest.importorskip("polars")
 from mkc_torch.cli import console
 from tests.calibration.test_calibrate import noisy_ellipsoid
 from tests.cli.test_cli import mkc, table
+from tests.started import started
 
 SLOW = """
 import pathlib, sys, time
@@ -30,15 +31,14 @@ except BaseException as error:
 def test_one_line_while_torch_is_imported(tmp_path):
     (tmp_path / "torch.py").write_text(SLOW)
     begun = tmp_path / "begun"
-    process = subprocess.Popen(
-        [sys.executable, "-c", "from mkc_torch.cli import main; main()", "demo", "--output", str(begun)],
-        stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
-    )  # fmt: skip
-    waited = time.monotonic() + 60.0
-    while not begun.exists() and process.poll() is None and time.monotonic() < waited:
-        time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=60)
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    code = "from mkc_torch.cli import main; main()"
+    with started("-c", code, "demo", "--output", begun, env=os.environ | {"PYTHONPATH": path}) as process:
+        waited = time.monotonic() + 60.0
+        while not begun.exists() and process.poll() is None and time.monotonic() < waited:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=60)
     assert told == "mkc: interrupted; nothing was written.\n"
     assert process.returncode == 130
 
@@ -78,6 +78,7 @@ def told(result, sentence):
     assert result.stderr == f"mkc: interrupted; {sentence}\n"
 
 
+@pytest.mark.e2e
 def test_calibrate_says_for_which_recordings_nothing_was_written(tmp_path, monkeypatch):
     paths = [table(tmp_path / f"{name}.csv", noisy_ellipsoid(200)) for name in "abc"]
     interrupting(monkeypatch, "calibration_files", "fit", after=1)
@@ -96,6 +97,7 @@ def test_diagnose_says_so_too(tmp_path, monkeypatch):
     )
 
 
+@pytest.mark.e2e
 def test_apply_and_demo_say_so_too(tmp_path, monkeypatch):
     path = table(tmp_path / "a.csv", noisy_ellipsoid(200))
     assert mkc("calibrate", path, "--output", tmp_path).exit_code == 0

@@ -105,6 +105,7 @@ def tank(tmp_path_factory):
     return folder, source, result
 
 
+@pytest.mark.e2e
 def test_a_dynamics_diagnosis_reads_well(tank):
     folder, _, result = tank
     place = folder / "out" / "runs"
@@ -127,6 +128,7 @@ def test_a_dynamics_diagnosis_reads_well(tank):
     assert "Tank" in page
 
 
+@pytest.mark.e2e
 def test_a_model_simulates_another_recording(tank, tmp_path):
     folder, source, _ = tank
     new, output = tank_table(tmp_path / "new.csv", drag=0.15, seed=5), tmp_path / "corrected.csv"
@@ -146,6 +148,7 @@ def test_a_model_simulates_another_recording(tank, tmp_path):
     assert float((corrected["level"] - Recording.read(new)["level"]).square().mean().sqrt()) < 0.008
 
 
+@pytest.mark.e2e
 def test_the_python_that_is_written_runs_and_gives_the_same(tank):
     folder, source, _ = tank
     place = folder / "out" / "runs"
@@ -168,6 +171,7 @@ def test_the_python_that_is_written_runs_and_gives_the_same(tank):
     assert float((plain.simulated(theta, {})[:, 0] - expected).abs().max()) > 0.02
 
 
+@pytest.mark.e2e
 def test_what_was_corrected_is_diagnosed_again_from_anywhere(tank, tmp_path, monkeypatch):
     """From where the base class lies, from the results, and from elsewhere; and what comes of it once more."""
     folder, _, _ = tank
@@ -199,6 +203,7 @@ def test_what_was_corrected_is_diagnosed_again_from_anywhere(tank, tmp_path, mon
     assert load_simulation(f"{alone / 'corrected.py'}:CorrectedTank").name == "CorrectedTank"
 
 
+@pytest.mark.e2e
 def test_without_a_simulation_columns_decide(thermistor, tmp_path):
     _, table, output = thermistor
     result = mkc("diagnose", table, "--output", output)
@@ -231,6 +236,7 @@ def test_a_function_of_inputs(thermistor):
     assert not any(words in page + result.stdout for words in FOREIGN)
 
 
+@pytest.mark.e2e
 def test_columns_are_renamed_and_the_unit_is_the_magnetometers(thermistor, tmp_path):
     source, table, output = thermistor
     known = Recording.read(table)
@@ -266,6 +272,7 @@ def test_noise_and_inputs_are_declared_by_name(thermistor, monkeypatch):
     assert given["between"] == {"temperature": "held"}
 
 
+@pytest.mark.e2e
 def test_what_a_simulator_wrote(tmp_path):
     def signal(time):
         return torch.sin(1.1 * time) + 0.6 * torch.sin(2.7 * time + 1.0)
@@ -349,6 +356,7 @@ def decay_table(path, *, zero=False):
     return path
 
 
+@pytest.mark.e2e
 def test_a_declared_input_that_is_not_used_is_no_crash(tmp_path):
     (tmp_path / "decay.py").write_text(UNUSED)
     command = ("--simulation", f"{tmp_path / 'decay.py'}:Decay", "--output", tmp_path / "out", "--surrogates", 19)

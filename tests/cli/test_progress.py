@@ -16,6 +16,7 @@ from mkc_torch.cli import console
 from mkc_torch.cli.console import drawing, progress
 from tests.calibration.test_calibrate import noisy_ellipsoid
 from tests.cli.test_cli import table
+from tests.started import started
 
 posix = pytest.mark.skipif(os.name == "nt", reason="there are no pseudo-terminals")
 
@@ -23,25 +24,25 @@ posix = pytest.mark.skipif(os.name == "nt", reason="there are no pseudo-terminal
 def on_a_terminal(*arguments):
     """Exit code and what a terminal of 100 columns was sent."""
     ours, theirs = os.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mkc_torch.cli", *map(str, arguments)], stdin=theirs, stdout=theirs, stderr=theirs,
-        env={name: value for name, value in os.environ.items() if name not in ("NO_COLOR", "CI")}
-        | {"TERM": "xterm-256color", "COLUMNS": "100", "PYTHONIOENCODING": "utf-8"},
-    )  # fmt: skip
-    os.close(theirs)
-    seen = b""
-    while True:
-        try:
-            part = os.read(ours, 1 << 16)
-        except OSError:  # the other end is closed
-            break
-        if not part:
-            break
-        seen += part
-    os.close(ours)
-    return process.wait(), seen.decode()
+    environment = {name: value for name, value in os.environ.items() if name not in ("NO_COLOR", "CI")}
+    environment |= {"TERM": "xterm-256color", "COLUMNS": "100", "PYTHONIOENCODING": "utf-8"}
+    command = ("-m", "mkc_torch.cli", *arguments)
+    with started(*command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment) as process:
+        os.close(theirs)
+        seen = b""
+        while True:
+            try:
+                part = os.read(ours, 1 << 16)
+            except OSError:  # the other end is closed
+                break
+            if not part:
+                break
+            seen += part
+        os.close(ours)
+        return process.wait(), seen.decode()
 
 
+@pytest.mark.process
 @posix
 def test_one_recording_has_its_name_and_the_time(tmp_path):
     path = table(tmp_path / "good.csv", noisy_ellipsoid(3000), time=torch.arange(3000) / 50.0)
@@ -54,6 +55,7 @@ def test_one_recording_has_its_name_and_the_time(tmp_path):
     assert "report.html" in plain
 
 
+@pytest.mark.process
 @posix
 def test_experiments_are_counted_while_copies_work(tmp_path):
     count = 300
@@ -136,6 +138,7 @@ def test_short_work_and_a_folder_that_cannot_be_written_leave_no_file(tmp_path, 
     assert (tmp_path / "file").read_text() == "mine"
 
 
+@pytest.mark.process
 def test_a_diagnosis_tells_its_stages():
     from mkc_torch import diagnose
     from mkc_torch.recording.demonstration import concealed_recording

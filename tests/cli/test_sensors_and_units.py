@@ -62,6 +62,7 @@ def test_results_of_several_sensors_are_kept(folder):
     refused(mkc("calibrate", folder / "two.csv", "--output", folder / "out"), "two exists and is not empty", "--force")
 
 
+@pytest.mark.e2e
 def test_one_sensor_that_fails_does_not_keep_the_others(folder, tmp_path):
     table = Recording.read(folder / "two.csv", recognise=False)
     flat_one = dict(table.columns) | {f"mag1_{axis}": torch.full((COUNT,), 20.0) for axis in "xyz"}
@@ -73,6 +74,7 @@ def test_one_sensor_that_fails_does_not_keep_the_others(folder, tmp_path):
     assert (tmp_path / "out" / "a" / "mag0" / "calibration.json").is_file()
 
 
+@pytest.mark.e2e
 def test_one_of_several_can_be_chosen(folder, tmp_path):
     result = mkc("calibrate", folder / "two.csv", "--output", tmp_path, "--sensor", "mag1")
     assert result.exit_code == 0, result.output
@@ -120,6 +122,7 @@ def test_units_are_written_in_one_option_or_in_several(texts):
     assert parsed_units(texts) == {"mag": "gauss", "time": "ms"}
 
 
+@pytest.mark.e2e
 def test_units_are_asked_for_and_then_converted(folder, tmp_path):
     path = folder / "gauss.csv"
     refused(mkc("calibrate", path, "--output", tmp_path / "no"), "in gauss", "`--unit mag=gauss`")

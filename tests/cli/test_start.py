@@ -61,6 +61,7 @@ def test_work_does_need_them(tmp_path):
     assert "was loaded" in done.stderr
 
 
+@pytest.mark.process
 def test_a_calibration_loads_no_compiler(tmp_path):
     path = tmp_path / "a.csv"
     write_table(path, simulated_recording()[0].columns)

@@ -114,6 +114,7 @@ def written(folder: Path):
     return {path.name: path.read_text() for path in paths if path.is_file() and path.suffix != ".tmp"}
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("name", ["calibrate", pytest.param("apply", marks=pytest.mark.slow), "diagnose"])
 def test_killed_at_any_write_leaves_whole_files_alone_and_the_next_run_works(commands, name):
     command, files = commands[name]
@@ -130,6 +131,7 @@ def test_killed_at_any_write_leaves_whole_files_alone_and_the_next_run_works(com
         assert not list(place.rglob(".*.tmp"))
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     "name", ["calibrate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("apply", "diagnose"))]
 )
@@ -147,6 +149,7 @@ def test_a_disk_that_is_full_at_any_size_is_told_and_loses_nothing(commands, nam
         assert all(text.endswith(ENDS[Path(file).suffix]) for file, text in after.items())
 
 
+@pytest.mark.process
 def test_two_runs_into_one_folder_do_not_mix(commands, monkeypatch):
     command, files = commands["calibrate"]
     second, fsync = [], os.fsync

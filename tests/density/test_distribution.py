@@ -168,6 +168,7 @@ def test_icdf_takes_any_shape_and_broadcasts():
     torch.testing.assert_close(p.icdf(torch.tensor(0.3)), alone)
 
 
+@pytest.mark.e2e
 def test_icdf_of_many_probabilities_equals_icdf_of_few():
     p = distribution(0.4, 20.0)
     probability = torch.linspace(0, 1, 150_001, dtype=torch.float64)

@@ -238,6 +238,7 @@ def test_efficiency_is_measured():
     assert bandwidth_for_efficiency(double(1.0)) == INF
 
 
+@pytest.mark.e2e
 @sampled
 @given(st.integers(5, 40), st.floats(0.3, 5.0), st.integers(0, 10**6))
 def test_breakdown_point_of_one_coefficient(N, h, seed):

@@ -1,11 +1,14 @@
 """The verdict follows from what is known of the whole recording, not from whether something was named."""
 
 import numpy as np
+import pytest
 
 from mkc_torch import Recording, diagnose
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling
+
+pytestmark = pytest.mark.e2e
 
 
 def in_units(recording, **units):

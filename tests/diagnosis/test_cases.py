@@ -48,6 +48,7 @@ def confirmed(diagnosis):
     return [one.effect for one in diagnosis.findings if one.grade in CONFIRMED]
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(
     ("name", "between"),
     [
@@ -65,6 +66,7 @@ def test_what_an_input_does_between_samples_is_found_whatever_the_simulation_say
     assert angle.residual == pytest.approx(0.005, rel=0.1)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(
     ("name", "size", "white"),
     [

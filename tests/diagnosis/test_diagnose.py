@@ -52,6 +52,7 @@ def named(request):
     return request.param, drivers, parameter, value, diagnose(Magnetometer(), recording_of(effect))
 
 
+@pytest.mark.e2e
 def test_it_is_named_with_its_driver(named):
     effect, drivers, _, _, diagnosis = named
     assert diagnosis.verdict == "explained"
@@ -59,6 +60,7 @@ def test_it_is_named_with_its_driver(named):
     assert diagnosis.findings[0].p_value <= 0.05
 
 
+@pytest.mark.e2e
 def test_its_size_is_within_its_errors(named):
     _, _, name, value, diagnosis = named
     (parameter,) = [p for p in diagnosis.findings[0].parameters if p.name == name]
@@ -67,12 +69,14 @@ def test_its_size_is_within_its_errors(named):
     assert np.abs(np.array(parameter.value) - value).max() < 0.25 * np.abs(value).max()
 
 
+@pytest.mark.e2e
 def test_the_fit_improves_on_blocks_that_it_has_not_seen(named):
     held = named[-1].findings[0].held_out
     assert held.confidence_interval[0] > 0.0
     assert held.rmse_after < held.rmse_before
 
 
+@pytest.mark.e2e
 def test_the_file_is_valid_and_says_the_same(named):
     effect, *_, diagnosis = named
     content = json.loads(diagnosis_to_json(diagnosis))
@@ -80,6 +84,7 @@ def test_the_file_is_valid_and_says_the_same(named):
     assert content["findings"][0]["effect"] == effect
 
 
+@pytest.mark.e2e
 def test_the_model_takes_it_off_another_recording(named):
     effect, *_, diagnosis = named
     model = DiagnosedModel.from_json(diagnosis.model.to_json())
@@ -91,23 +96,27 @@ def test_the_model_takes_it_off_another_recording(named):
     assert bool(notes) == (effect == "hard_iron_step")
 
 
+@pytest.mark.e2e
 def test_a_step_is_found_to_the_sample_or_nearly():
     effect = 4.0 * GAIN * (TIME[:, None] >= 23.4)
     assert diagnose(Magnetometer(), recording_of(effect)).findings[0].onset == pytest.approx(23.4, abs=0.3)
 
 
+@pytest.mark.e2e
 def test_nothing_is_found_where_nothing_is():
     found = [diagnose(Magnetometer(), tumbling(N, noise=0.4, sensor=outliers(s), seed=s, **COLUMNS)) for s in range(4)]
     assert sum(d.verdict != "adequate" for d in found) <= 1
     assert all(d.model is not None for d in found)
 
 
+@pytest.mark.e2e
 def test_the_same_seed_gives_the_same_diagnosis():
     recording = recording_of(np.zeros((N, 3)))
     first, second = (diagnosis_to_json(diagnose(Magnetometer(), recording, seed=5)) for _ in range(2))
     assert first == second
 
 
+@pytest.mark.e2e
 def test_a_time_offset_and_a_name_change_nothing():
     recording = recording_of(HIDDEN["current_field"][0])
     moved = Recording({**recording.columns, "time": recording["time"] + 1000.0}, name="other", units=recording.units)
@@ -116,6 +125,7 @@ def test_a_time_offset_and_a_name_change_nothing():
     assert np.allclose(a.findings[0].parameters[0].value, b.findings[0].parameters[0].value, rtol=1e-3)
 
 
+@pytest.mark.e2e
 def test_the_driver_s_copy_is_a_rival_that_cannot_be_told_apart():
     recording = recording_of(HIDDEN["current_field"][0], spare=3.0 * CURRENT + 1.0)
     (finding, *_) = diagnose(Magnetometer(), recording).findings
@@ -123,12 +133,14 @@ def test_the_driver_s_copy_is_a_rival_that_cannot_be_told_apart():
     assert ("spare",) in [a.drivers for a in finding.alternatives if not a.separable]
 
 
+@pytest.mark.e2e
 def test_the_level_holds_with_three_hundred_columns():
     random = np.random.default_rng(4)
     many = {f"column_{k}": np.cumsum(random.standard_normal(N)) for k in range(300)}
     assert diagnose(Magnetometer(), tumbling(N, noise=0.4, sensor=outliers(), **many)).verdict == "adequate"
 
 
+@pytest.mark.e2e
 def test_without_its_driver_a_model_refuses():
     model = diagnose(Magnetometer(), recording_of(HIDDEN["current_field"][0])).model
     with pytest.raises(MissingColumnError, match=r"current_field by the column `current`.*--columns current=NAME"):
@@ -242,6 +254,7 @@ def test_two_rows_are_too_few():
         diagnose(Magnetometer(), tumbling(2))
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(("name", "onset", "step"), [
     ("broad_34_attached_magnet_3cm", 51.5, (1.3, -0.5, -13.4)),
     ("broad_36_attached_magnet_5cm", 54.8, (-0.7, -0.1, 5.7)),

@@ -67,6 +67,7 @@ def explained(diagnosis, effect):
     return finding
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(("size", "seed"), [(0.2, 0), pytest.param(0.05, 2, marks=pytest.mark.slow)])
 def test_air_drag_is_named_and_sized(size, seed):
     """Of a body whose flow turns laminar at small speeds."""
@@ -89,6 +90,7 @@ def test_dry_friction_is_named_and_sized():
     assert finding.alternatives[0].effect == "stribeck_friction"
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("seed", [0, 1])
 def test_where_nothing_is_hidden_nothing_is_found(seed):
     diagnosis = diagnose(Pendulum(), swung(lambda _, __: 0.0, seed), **QUICK)
@@ -129,6 +131,7 @@ def filled(leak, seed=0):
     return Recording({name: torch.from_numpy(column) for name, column in columns.items()}, name="tanks")
 
 
+@pytest.mark.e2e
 def test_a_pipe_between_two_tanks_is_named_and_sized():
     finding = explained(diagnose(Tanks(), filled(0.15), **QUICK), "coupling")
     exchange, error = value(finding, "exchange")
@@ -137,6 +140,7 @@ def test_a_pipe_between_two_tanks_is_named_and_sized():
     assert finding.held_out.rmse_after == pytest.approx(0.02, rel=0.25)
 
 
+@pytest.mark.e2e
 def test_two_tanks_apart_are_adequate():
     assert diagnose(Tanks(), filled(0.0), **QUICK).verdict == "adequate"
 
@@ -193,6 +197,7 @@ def without_small_ones(command):
     return command - np.clip(command, -0.14, 0.14)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(
     ("hidden", "name", "size"), [(with_play, "backlash", "half_gap"), (without_small_ones, "dead_zone", "width")]
 )
@@ -204,6 +209,7 @@ def test_play_and_a_dead_zone_are_told_apart(hidden, name, size):
     assert all(alternative.separable for alternative in finding.alternatives)
 
 
+@pytest.mark.e2e
 def test_a_hysteretic_spring_is_named_and_sized():
     """Of a body between joints whose unloading is not that of the catalogue: three quarters of β, one of β′."""
 
@@ -232,6 +238,7 @@ class Buoy(Dynamics):
         return {"heave": x.speed, "speed": u.push - 4.0 * x.heave - p.drag * x.speed}
 
 
+@pytest.mark.e2e
 def test_water_that_moves_along_is_named_and_sized():
     time = np.arange(400) * 0.05
     push = np.sin(1.3 * time) + np.sin(2.9 * time)
@@ -258,6 +265,7 @@ class Ball(Dynamics):
         return {"x": x.vx, "y": x.vy, "vx": -p.drag * speed * x.vx, "vy": -9.81 - p.drag * speed * x.vy}
 
 
+@pytest.mark.e2e
 def test_a_ball_that_spins_is_named_and_sized():
     """With a spin that dies away."""
 
@@ -306,6 +314,7 @@ class Sinking(Dynamics):
         return {"height": x.speed, "speed": -9.81 - 0.8 * x.speed}
 
 
+@pytest.mark.e2e
 def test_what_is_under_all_the_time_is_pushed_by_a_constant_force():
     """Archimedes' push and any other constant one are not told apart, and nobody claims it."""
 
@@ -338,6 +347,7 @@ def dropped(ball):
     return Recording({**columns, "experiment": number}, name=ball)
 
 
+@pytest.mark.e2e
 def test_a_light_ball_is_braked_by_the_air():
     """Each of a few short drops could have been pushed as well: the air is what would explain it best."""
     diagnosis = diagnose(Fall(), dropped("Whiffle_Ball_1"), **QUICK)
@@ -348,6 +358,7 @@ def test_a_light_ball_is_braked_by_the_air():
     assert finding.held_out.outputs["height"].after < 0.1 * finding.held_out.outputs["height"].before
 
 
+@pytest.mark.e2e
 def test_of_a_heavy_ball_nothing_is_said():
     """Its drops are not noise alone, but no effect predicts blocks of them that the fit has not seen."""
     diagnosis = diagnose(Fall(), dropped("Bowling_Ball"), **QUICK)

@@ -66,6 +66,7 @@ def diagnosed(recording, monkeypatch):
     return run
 
 
+@pytest.mark.e2e
 def test_a_search_that_fails_leaves_what_was_found(diagnosed):
     def fails(*_):
         raise NoFitError("No slope by damping.")
@@ -76,6 +77,7 @@ def test_a_search_that_fails_leaves_what_was_found(diagnosed):
     assert "The search beside what was found was given up. No slope by damping." in diagnosis.warnings
 
 
+@pytest.mark.e2e
 def test_a_bug_in_an_effect_is_no_search_that_fails(diagnosed):
     def broken(*_):
         raise ValueError("the effect's own")
@@ -101,12 +103,14 @@ def test_a_search_that_wanders_off_changes_nothing_of_what_was_found(diagnosed, 
         assert found.standard_error == pytest.approx(expected.standard_error, rel=1e-9)
 
 
+@pytest.mark.e2e
 def test_a_search_without_an_effect_of_a_possible_sign_finds_nothing(recording):
     diagnosis = diagnose(Sled(), recording, effects=EFFECTS)
     assert len(diagnosis.findings) == 1  # beside it only a drag that drives would fit
     assert not any("given up" in warning for warning in diagnosis.warnings)
 
 
+@pytest.mark.e2e
 def test_what_drives_the_simulation_away_is_found_from_where_it_began(recording):
     """Without its spring the sled is fitted with a damping of thousands, and beside that no spring has its size."""
     diagnosis = diagnose(Sled(), recording, effects=EFFECTS)

@@ -10,6 +10,8 @@ from mkc_torch import diagnose
 from mkc_torch.simulation import Dynamics, Parameter
 from tests.diagnosis.test_dynamics_diagnosis import QUICK, Pendulum, explained, measured, swung, value
 
+pytestmark = pytest.mark.e2e
+
 
 class Body(Dynamics):
     """Heated, in a room whose temperature is known."""

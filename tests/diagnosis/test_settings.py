@@ -135,17 +135,20 @@ def test_what_is_no_settings_is_refused(other):
         diagnosis(other)
 
 
+@pytest.mark.e2e
 def test_the_known_driver_is_named_and_told_from_the_column(usual):
     (finding,) = usual.findings
     (rival,) = finding.alternatives
     assert (finding.effect, rival.effect, rival.separable) == ("current_field", "driver_offset", True)
 
 
+@pytest.mark.e2e
 def test_without_its_handicap_the_column_is_named():
     (finding,) = diagnosis(Settings(naming=NamingSettings(roleless=0.0, follower=0.0))).findings
     assert finding.effect == "driver_offset"
 
 
+@pytest.mark.e2e
 def test_rivals_nearer_than_asked_for_are_inseparable(usual):
     far = 2.0 * usual.findings[0].alternatives[0].log_likelihood_gap
     (finding,) = diagnosis(Settings(naming=NamingSettings(separable=far))).findings
@@ -153,6 +156,7 @@ def test_rivals_nearer_than_asked_for_are_inseparable(usual):
     assert finding.alternatives[0].told_by
 
 
+@pytest.mark.e2e
 def test_a_warning_is_said_from_the_gain_that_is_asked_for(usual):
     told = [warning for warning in usual.warnings if "Something smooth remains along load" in warning]
     assert len(told) == 1
@@ -161,11 +165,13 @@ def test_a_warning_is_said_from_the_gain_that_is_asked_for(usual):
     assert (usual.verdict, quiet.verdict) == ("unexplained", "explained")
 
 
+@pytest.mark.e2e
 def test_fewer_folds_are_other_evidence(usual):
     held_out = diagnosis(Settings(confirmation=ConfirmationSettings(folds=3))).findings[0].held_out
     assert held_out.log_likelihood_gain != usual.findings[0].held_out.log_likelihood_gain
 
 
+@pytest.mark.e2e
 def test_residuals_are_rejected_below_the_weight_that_is_asked_for(usual):
     rejecting = diagnosis(Settings(noise=NoiseSettings(rejected_below=0.8)))
     assert rejecting.candidates[0].log_likelihood_gain != usual.candidates[0].log_likelihood_gain

@@ -69,6 +69,7 @@ def run_shell(block, folder):
             run(words, folder)
 
 
+@pytest.mark.manual
 @pytest.mark.parametrize("page", WITH_BLOCKS, ids=lambda page: page.stem)
 def test_every_block_of_a_page_runs(page, folder):
     if page.stem in NEEDS:

@@ -95,6 +95,7 @@ def test_sigma_of_gaussian_noise_is_infinite_in_half_of_all_samples():
 # --- pictures
 
 
+@pytest.mark.manual
 def test_the_script_makes_the_pictures_of_the_page(tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(sys, "argv", ["loss_pictures.py", "--output", str(tmp_path)])

@@ -74,6 +74,7 @@ def test_pictures_are_small_and_shown():
     assert shown == set(kept)
 
 
+@pytest.mark.manual
 def test_every_public_name_has_a_place(site):
     pytest.importorskip("lightning")
     ids = set().union(*(Page(path).ids for path in (site / "api").glob("*.html")))
@@ -82,6 +83,7 @@ def test_every_public_name_has_a_place(site):
     assert names - ids == set()
 
 
+@pytest.mark.manual
 def test_the_parts_of_a_docstring_are_told_apart(site):
     page = (site / "api" / "losses.html").read_text(encoding="utf-8")
     assert "Example:" not in page  # read as a section, and so set as code
@@ -90,6 +92,7 @@ def test_the_parts_of_a_docstring_are_told_apart(site):
         assert re.search(rf"<b><code>{name}</code></b>|<code>{name}</code>", page)
 
 
+@pytest.mark.manual
 def test_pictures_are_there_and_nothing_is_fetched(site):
     for path in site.rglob("*.html"):
         for target in Page(path).loads:
@@ -100,11 +103,13 @@ def test_pictures_are_there_and_nothing_is_fetched(site):
                 assert place.exists(), f"{path.name}: {target}"
 
 
+@pytest.mark.manual
 def test_style_sheets_name_no_other_place(site):
     for path in site.rglob("*.css"):
         assert not re.search(r"url\(\s*[\"']?https?:|@import", path.read_text(encoding="utf-8")), path.name
 
 
+@pytest.mark.manual
 def test_no_page_needs_more_than_a_telephone_has(site):
     width = pytest.importorskip("tests.report.test_phone_width")
     if width.CHROMIUM is None:

@@ -48,6 +48,8 @@ def test_the_second_command_of_the_readme_is_the_one_that_tests():
     found = subprocess.run(["awk", program, README], capture_output=True, text=True, check=True).stdout
     assert found.strip() == [block.text for block in blocks(README) if block.language == "sh"][1]
     assert found.strip().endswith(".venv/bin/python -m pytest -q -n auto")
+    assert "bash -euo pipefail -c \"$test_command -m 'not slow' --dist loadscope\"\n" in script
+    assert "python -m pytest -q -n auto --doctest-modules mkc_torch\n" in script
 
 
 def test_the_readme_leads_to_every_page():

@@ -40,6 +40,7 @@ def diagnosis():
     return diagnose(Magnetometer(), recording, effects=(*CATALOGUE, SupplyOffset()), surrogates=19, max_findings=1)
 
 
+@pytest.mark.e2e
 def test_it_is_named_by_the_role_its_column_is_called(diagnosis):
     assert [(f.effect, f.drivers) for f in diagnosis.findings] == [("supply_offset", ("voltage",))]
 
@@ -56,6 +57,7 @@ def test_a_curve_without_a_name_is_tried_on_its_column_too():
     assert ("unknown", ("voltage",)) in tried
 
 
+@pytest.mark.e2e
 def test_the_finding_speaks_with_its_words(diagnosis):
     (finding,) = diagnosis.findings
     assert finding.equation == SupplyOffset.equation
@@ -69,6 +71,7 @@ def test_the_finding_speaks_with_its_words(diagnosis):
     assert (error < 0.1).all()
 
 
+@pytest.mark.e2e
 def test_the_model_takes_it_off_again(diagnosis):
     time = np.arange(300) / 50.0
     voltage = 12.0 + np.cos(3.0 * time)

@@ -33,6 +33,7 @@ def drops(ball):
     ]
 
 
+@pytest.mark.manual
 def test_a_light_ball_is_slowed_by_air_and_its_other_drop_says_so(loaded, tmp_path):
     one, other = drops("Whiffle_Ball_1")
     (proof,) = loaded("held_out").prove(loaded("falling_balls").Ball(), one, [other], max_findings=1)
@@ -46,6 +47,7 @@ def test_a_light_ball_is_slowed_by_air_and_its_other_drop_says_so(loaded, tmp_pa
     assert (tmp_path / "drop.png").stat().st_size > 10_000
 
 
+@pytest.mark.manual
 def test_nothing_is_found_on_a_heavy_ball(loaded):
     one, other = drops("Bowling_Ball")
     (proof,) = loaded("held_out").prove(loaded("falling_balls").Ball(), one, [other], max_findings=1)
@@ -55,6 +57,7 @@ def test_nothing_is_found_on_a_heavy_ball(loaded):
     assert before == pytest.approx(after, rel=0.05)
 
 
+@pytest.mark.manual
 def test_the_number_of_the_run_is_no_output(loaded):
     """Runs of one table come back with their numbers, which are always right."""
     one, other = drops("Whiffle_Ball_1")

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.manual
+
 
 @pytest.fixture(scope="module")
 def example():

@@ -23,6 +23,7 @@ def example():
     return module
 
 
+@pytest.mark.manual
 def test_mkc_em_is_within_two_standard_errors_of_its_limits_to_the_oracle(example):
     X, Y = example.design(), example.recordings(DRAWS, seed=7)
     ratio, error = example.ratio(MKCRegression().fit(X, Y).coef_, example.oracle(Y))

@@ -88,6 +88,7 @@ def test_table_5(monkeypatch, capsys, tmp_path):
     assert_is_picture(tmp_path / "a.png")
 
 
+@pytest.mark.manual
 def test_figures(monkeypatch, capsys, tmp_path):
     run(example("lel_figures"), monkeypatch, "--draws", 20, "--samples", 1000, "--output", tmp_path)
     assert "Figures 1 and 2" in capsys.readouterr().out

@@ -55,6 +55,7 @@ def test_outliers_are_one_sided_and_in_one_channel(example):
     assert float(away[:, 1].min()) > -0.6
 
 
+@pytest.mark.manual
 def test_mkc_em_is_closer_to_the_clean_function_than_the_squared_error_and_hubers(example):
     error = {name: float(example.errors(example.trained(name, 0.25, 0, 8)).square().mean().sqrt())
              for name in ("MSE", "Huber", example.MKC_EM)}  # fmt: skip
@@ -83,6 +84,7 @@ def test_wrong_targets_are_two_to_ten_times_too_large_and_none_is_held_out(tabul
     torch.testing.assert_close(bad.held_out_y, good.held_out_y, rtol=0.0, atol=0.0)
 
 
+@pytest.mark.manual
 @pytest.mark.parametrize(("name", "of_mse", "of_oracle"), [("diabetes", 0.6, 1.1), ("Friedman 1", 0.3, 1.3)])
 def test_mkc_em_does_on_corrupted_tables_nearly_as_well_as_without_the_wrong_rows(tabular, name, of_mse, of_oracle):
     task = dataclasses.replace(tabular.TASKS[name], epochs=20)
@@ -110,6 +112,7 @@ def test_targets_are_so_many_steps_after_their_windows(series):
     torch.testing.assert_close(series.ahead(count) - last, torch.tensor(series.AHEAD).expand(len(last), -1).float())
 
 
+@pytest.mark.manual
 def test_mkc_forecasts_the_series_better_than_the_squared_error_from_windows_of_either_kind(series):
     every = {name: series.errors(series.trained(name, 0.2, 3, 4), 0.2, 3).square().mean(-1).sqrt()
              for name in ("MSE", series.MKC_EM, series.MKC_HEAD)}  # fmt: skip
@@ -160,6 +163,7 @@ def test_a_share_of_the_targets_is_wrong_and_no_other(wrong_targets, kind):
         assert torch.equal(new[wrong].sort(0).values, target[wrong].sort(0).values)
 
 
+@pytest.mark.manual
 def test_wrong_targets_leaves_no_row_out(wrong_targets, tmp_path):
     pytest.importorskip("matplotlib")
     arguments = ["--tables", "diabetes", "--shares", "0", "0.3", "--seeds", "1", "--steps", "120", "--no-cleaner"]

@@ -27,6 +27,7 @@ def test_figure_3_the_density_comes_within_hundredths_of_the_greatest_likelihood
     assert float(module.mean_log_density(e, fit.sigma).mean()) > module.entropy(0.2) - 0.04
 
 
+@pytest.mark.manual
 def test_figures_4_to_6(monkeypatch, capsys, tmp_path):
     run(example("figures_4_to_6"), monkeypatch, "--draws", 8, "--output", tmp_path)
     printed = " ".join(capsys.readouterr().out.split())
@@ -45,6 +46,7 @@ def test_algorithm_3_is_at_rest_within_three_iterations_where_mkc_em_ends():
     assert float((fit.coef_ - path.theta[-1]).abs().median()) < 1e-4
 
 
+@pytest.mark.manual
 def test_the_error_over_the_bandwidth_falls_rises_and_ends_at_wls():
     module = example("figures_4_to_6")
     console = module.Console(quiet=True)
@@ -65,6 +67,7 @@ def test_error_bound(monkeypatch, capsys, tmp_path):
     assert_is_picture(tmp_path / "a.png")
 
 
+@pytest.mark.manual
 def test_table_1(monkeypatch, capsys):
     module = example("table_1")
     run(module, monkeypatch, "--draws", 20, "--timed", 1)
@@ -103,6 +106,7 @@ def test_figure_7(monkeypatch, capsys, tmp_path, recordings):
     assert_is_picture(tmp_path / "a.png")
 
 
+@pytest.mark.manual
 def test_comparison(monkeypatch, capsys, tmp_path):
     module = example("comparison")
     few = [e for e in module.ENTRIES if e.name.startswith(("LeastSquares", "MEstimator huber", "RANSAC", "MKC"))]
@@ -147,6 +151,7 @@ def test_mkc_em_loses_less_than_one_per_cent_on_gaussian_data():
     assert float(spread) < 0.01
 
 
+@pytest.mark.manual
 def test_all_runs_scripts_and_links_what_they_left(monkeypatch, capsys, tmp_path):
     module = example("all")
     run_all = ["all", "--output", str(tmp_path), "--small", "--only", "figures_2_3", "figure_7"]

@@ -41,6 +41,7 @@ def test_peers_are_their_definitions(example):
     torch.testing.assert_close(example.CLoss()(logits, labels), (0.25 * (1.0 - torch.exp(-2.0 * square))).mean())
 
 
+@pytest.mark.manual
 def test_the_graduated_loss_does_not_memorise_and_names_the_wrong_labels(example):
     data = example.digits(0.6, seed=0)
     module, reference = (example.trained(name, data, 0, 30) for name in (example.GRADUATED, example.CROSS_ENTROPY))
@@ -52,6 +53,7 @@ def test_the_graduated_loss_does_not_memorise_and_names_the_wrong_labels(example
     assert right < 0.08
 
 
+@pytest.mark.manual
 def test_table_and_picture(example, monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(example, "SHARES", (0.0, example.SHOWN))
     found = example.table(seeds=1, epochs=1)

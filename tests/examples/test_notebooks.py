@@ -25,6 +25,7 @@ def test_nothing_of_a_run_is_kept(path):
     assert set(content["metadata"]) == {"kernelspec", "language_info"}
 
 
+@pytest.mark.manual
 @each_notebook
 def test_every_cell_runs(path, tmp_path, monkeypatch):
     """As plain Python in this process, which spares a kernel; what the cells assert is asserted."""

@@ -28,6 +28,7 @@ def test_the_true_attitude_shows_the_published_step(example, number, step):
     assert np.abs(example.step_by_attitude(folder, case) - step).max() < 0.6
 
 
+@pytest.mark.manual
 def test_what_is_found_is_printed_and_drawn(example, monkeypatch, tmp_path, capsys):
     case = example.CASES[0]
     folder = shared_data(f"magnetometer/{case.name}.csv").parent

@@ -158,6 +158,7 @@ def test_each_epoch_ends_with_the_likeliest_density_of_its_residuals(kind):
     assert_fitted(module.criterion, error)
 
 
+@pytest.mark.e2e
 def test_on_a_linear_model_it_agrees_with_the_regression():
     torch.manual_seed(0)
     x, truth = torch.randn(1000, 3), torch.tensor([1.0, -2.0, 0.5])
@@ -649,6 +650,7 @@ def test_a_copy_of_the_module_adds_nothing_and_the_module_can_be_pickled():
     assert_fitted(module.criterion, error)
 
 
+@pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 @pytest.mark.filterwarnings("ignore:.* should not be instantiated. Methods on autograd functions")
 @pytest.mark.parametrize("how", ["module", "in place", "whole"])
@@ -831,6 +833,7 @@ def test_it_can_be_quiet(options):
 # --- checkpoints
 
 
+@pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore:Checkpoint directory .* exists and is not empty")
 @pytest.mark.parametrize(
     ("saved", "kind", "options"),
@@ -958,6 +961,7 @@ def test_processes_end_with_equal_parameters_from_all_their_residuals(tmp_path):
 # --- without Lightning
 
 
+@pytest.mark.process
 def test_nothing_else_imports_lightning():
     root = Path(mkc_torch.__file__).parent
     importers = set()
@@ -989,6 +993,7 @@ def test_a_scale_that_follows_the_residuals_is_frozen_and_fitted_from_the_first_
     torch.testing.assert_close(module.criterion.sigma, given.criterion.sigma, rtol=0.1, atol=0.0)
 
 
+@pytest.mark.e2e
 def test_d_and_bound_that_are_automatic_have_the_unit_of_the_targets():
     x, y = permuted(1)
     found = []
@@ -1054,6 +1059,7 @@ def permuted(seed, count=1200):
     return x, y
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(("kind", "d"), [(FIXED, 1.0), (LEARNED, 1.0), (FIXED, 5.0), (LEARNED, "auto")])
 def test_from_any_start_half_of_the_targets_may_be_permuted(kind, d):
     x, y = permuted(0)

@@ -583,6 +583,7 @@ def free_port():
         return s.getsockname()[1]
 
 
+@pytest.mark.process
 def test_processes_add_up_to_the_histogram_of_all_residuals(tmp_path):
     multiprocessing.spawn(_reduced, (free_port(), str(tmp_path)), nprocs=2)
     one, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))

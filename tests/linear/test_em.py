@@ -146,6 +146,7 @@ def best_from(X: Tensor, Y: Tensor, fit: MKCRegression, i: int | None = None) ->
 # efficiency
 
 
+@pytest.mark.e2e
 def test_nothing_is_lost_on_gaussian_data():
     X, noise = sample(0, 200, 4), sample(1, 1500, 200)
     fit = MKCRegression().fit(X, noise)
@@ -312,6 +313,7 @@ def test_the_default_bound_covers_the_residuals():
 # where it could go wrong
 
 
+@pytest.mark.e2e
 def test_d_does_not_collapse_where_a_fit_interpolates():
     X, y = sample(0, 200, 20, 9), sample(1, 200, 20)
     X, y = X.unsqueeze(-2), y.unsqueeze(-1)

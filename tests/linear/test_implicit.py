@@ -86,6 +86,7 @@ def test_gradients_are_differences_of_fits_in_both_modes():
     assert gradcheck(fixed_point, inputs, check_forward_ad=True, check_batched_grad=True, fast_mode=True)
 
 
+@pytest.mark.e2e
 def test_second_derivatives_are_differences_of_first_ones():
     X, y, weight = line(0, N=10, n=2)
     inputs = leaves(X, y, weight, torch.tensor(1.7).double(), torch.tensor(0.6).double())
@@ -166,6 +167,7 @@ def em(*inputs: Tensor) -> tuple[Tensor, ...]:
     return fit.coef_, fit.sigma_, fit.d_, fit.log_likelihood_
 
 
+@pytest.mark.e2e
 def test_gradients_of_the_maximum_are_differences_of_fits():
     X, Y, weight, _, _ = channels(0, N=40)
     inputs = leaves(X, Y, weight)
@@ -200,6 +202,7 @@ def one_channel(X: Tensor, y: Tensor, weight: Tensor, bound: Tensor) -> tuple[Te
     return fit.coef_, fit.sigma_, fit.d_, fit.log_likelihood_, fit.weights_
 
 
+@pytest.mark.e2e
 def test_every_result_of_em_in_every_argument_in_both_modes():
     X, y, weight = line(0, N=25, n=2)
     inputs = leaves(X, y, weight, torch.tensor([20.0]).double())
@@ -472,6 +475,7 @@ def test_bad_input_is_refused_as_ever():
 # learning
 
 
+@pytest.mark.e2e
 def test_features_under_a_robust_last_layer_learn_from_contaminated_samples():
     generator = torch.Generator().manual_seed(0)
     x = torch.rand(24, 40, 1, generator=generator, dtype=torch.float64) * 4 - 2

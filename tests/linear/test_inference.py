@@ -154,6 +154,7 @@ def test_a_series_of_no_lags_is_the_sandwich_and_a_slow_one_is_less_certain(esti
     assert float(series.standard_error_[0]) > 1.3 * float(independent.standard_error_[0])
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("outliers", [0.0, 0.1, 0.2])
 @pytest.mark.parametrize(
     "estimator", [MMRegression(starts=40), MEstimator("tukey"), ReweightedLeastSquares(starts=40)], ids=label
@@ -205,6 +206,7 @@ def test_predictions_of_good_values_are_covered():
     assert 0.92 <= float(held.double().mean()) <= 0.97
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("covariance", ["sandwich", "hac", "homoscedastic"])
 @pytest.mark.parametrize("channels", [1, 2])
 @pytest.mark.parametrize(

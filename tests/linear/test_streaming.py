@@ -236,6 +236,7 @@ def test_samples_of_parts_are_the_sample_of_all():
 # --- what follows
 
 
+@pytest.mark.e2e
 def test_predictions_weights_intervals_and_summary():
     X, Y = problem(0)
     fit, memory = StreamedMKCRegression().fit(cut(X, Y)), in_memory(X, Y)

@@ -133,6 +133,7 @@ def _errors_of_ranks(rank, folder):
     assert folder
 
 
+@pytest.mark.process
 def test_two_ranks_are_one(tmp_path):
     assert run(_fits, tmp_path) == [0, 0]
     one, other = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
@@ -147,6 +148,7 @@ def test_two_ranks_are_one(tmp_path):
             torch.testing.assert_close(fields[field], expected, rtol=1e-8, atol=1e-14, msg=f"{name} {field}")
 
 
+@pytest.mark.process
 def test_results_and_errors_of_a_group(tmp_path):
     assert run(_errors_of_ranks, tmp_path) == [0, 0]
 
@@ -177,6 +179,7 @@ def _killed(rank, folder):
         os._exit(7)
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("ranks", [2, 3])
 def test_a_rank_that_is_killed_is_an_error_on_all(ranks, tmp_path):
     assert run(_killed, tmp_path, ranks) == [7] * (ranks - 1) + [-signal.SIGKILL]

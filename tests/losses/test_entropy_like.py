@@ -341,6 +341,7 @@ def test_a_curve_with_outliers_and_the_minimum_of_scipy(dtype):
         np.testing.assert_allclose(found.best.numpy(), best.x, rtol=0, atol=1e-5)
 
 
+@pytest.mark.e2e
 def test_a_torch_model_by_its_parameters():
     torch.manual_seed(0)
     model = nn.Sequential(nn.Linear(1, 3), nn.Tanh(), nn.Linear(3, 1)).double()

@@ -324,6 +324,7 @@ def test_only_gradients_that_are_wanted_are_made(mode, monkeypatch):
         torch.testing.assert_close(list(found), expected, rtol=0.0, atol=0.0)
 
 
+@pytest.mark.e2e
 @pytest.mark.usefixtures("arithmetic")
 @pytest.mark.parametrize("mode", [mode for mode in MODES if not mode.startswith("robust")])
 @pytest.mark.parametrize("weighted", [False, True])

@@ -317,6 +317,7 @@ def error(loss, share, *, graduated=False, classes=20, epochs=40, seed=0):
     return found, low, wrong
 
 
+@pytest.mark.e2e
 def test_with_two_in_five_labels_wrong_the_error_is_a_fraction_of_that_of_cross_entropy():
     reference, *_ = error(nn.CrossEntropyLoss(), 0.4)
     fixed, *_ = error(GeneralizedCrossEntropyLoss(), 0.4)
@@ -329,6 +330,7 @@ def test_with_two_in_five_labels_wrong_the_error_is_a_fraction_of_that_of_cross_
     assert low[~wrong].double().mean() < 0.02
 
 
+@pytest.mark.e2e
 def test_right_labels_are_learned_as_well_as_with_cross_entropy():
     reference, *_ = error(nn.CrossEntropyLoss(), 0.0)
     assert error(GeneralizedCrossEntropyLoss(), 0.0)[0] < reference + 0.01

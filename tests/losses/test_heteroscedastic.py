@@ -195,6 +195,7 @@ def test_vmap_of_the_loss_and_its_gradient_equals_each_alone():
     torch.testing.assert_close(vmap(grad(loss, 2))(*tensors), slopes)
 
 
+@pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
 def test_traced_loss_equals_eager_over_two_batch_sizes():
     loss = HeteroscedasticMKCLoss(30.0)

@@ -86,6 +86,7 @@ def compiled(options, backend):
     return loss, own, torch.compile(own, fullgraph=True, backend=backend)
 
 
+@pytest.mark.e2e
 @compiler
 def test_a_traced_loss_is_the_same_algorithm_over_300_batches():
     """The graph that the compiler takes, computed as it is."""
@@ -108,6 +109,7 @@ def test_a_compiled_loss_is_the_same_algorithm_over_300_batches(options):
     torch.testing.assert_close(*found, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.e2e
 @compiler
 def test_a_compiled_backward_pass_uses_the_state_of_its_forward_pass(monkeypatch):
     """On a loss small enough to be compiled in seconds: the share and the bandwidth alone change.
@@ -146,6 +148,7 @@ def test_a_compiled_loss_takes_weights_and_batches_of_any_size(options, weighted
     torch.testing.assert_close(own.state_dict(), loss.state_dict(), rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.e2e
 @compiler
 def test_impl_compile_is_impl_eager(monkeypatch):
     torch.compiler.reset()
@@ -165,6 +168,7 @@ def test_an_unknown_implementation_is_refused():
 # --- NumPy and torch
 
 
+@pytest.mark.e2e
 @each_mode
 def test_torch_is_the_same_algorithm_as_numpy_over_300_batches(options, monkeypatch):
     def choose(which):
@@ -233,10 +237,20 @@ def meta_step(loss, shape, dtype, weight):
 
 
 @each_mode
-@pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
-@pytest.mark.parametrize("weighted", [None, torch.float32, torch.bool], ids=["plain", "weighted", "masked"])
 @pytest.mark.parametrize(
-    ("channel_dim", "dtype"), [(None, torch.float32), (1, torch.float16), (-1, torch.float64)], ids=str
+    ("reduction", "weighted", "channel_dim", "dtype"),
+    [  # each pair of choices once
+        ("none", None, None, torch.float32),
+        ("none", torch.float32, 1, torch.float16),
+        ("none", torch.bool, -1, torch.float64),
+        ("mean", None, 1, torch.float16),
+        ("mean", torch.float32, -1, torch.float64),
+        ("mean", torch.bool, None, torch.float32),
+        ("sum", None, -1, torch.float64),
+        ("sum", torch.float32, None, torch.float32),
+        ("sum", torch.bool, 1, torch.float16),
+    ],
+    ids=str,
 )
 def test_a_training_step_looks_at_no_value_and_copies_nothing_from_the_host(
     options, reduction, weighted, channel_dim, dtype

@@ -292,6 +292,7 @@ def trained(model, loss, optimiser, steps, found):
         optimiser.step()
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("at", [1, 121, 122, 123, 124])
 @pytest.mark.parametrize("options", [*ROBUST.values(), {"objective": "likelihood"}], ids=[*ROBUST, "likelihood"])
 def test_training_that_is_saved_and_loaded_goes_on_to_the_bit(options, at):
@@ -447,6 +448,7 @@ def processes():
     return queue.get(), queue.get()
 
 
+@pytest.mark.process
 def test_a_scale_is_the_geometric_mean_of_those_of_processes_that_have_had_residuals_and_the_range_the_widest(
     processes,
 ):
@@ -460,6 +462,7 @@ def test_a_scale_is_the_geometric_mean_of_those_of_processes_that_have_had_resid
     assert one["batches"] == [1, 1, 0]
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("place", ["inside", "outside"])
 @pytest.mark.parametrize("kind", ROBUST)
 def test_processes_have_the_same_scale_and_schedule(processes, kind, place):

@@ -680,6 +680,7 @@ def test_repr_shows_the_numbers_of_each_channel_and_which_are_followed():
 # --- transforms of whole modules
 
 
+@pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
 def test_compiled_loss_equals_eager_over_two_batch_sizes():
     loss = made(sigma=[0.7, 3.0, 100.0])
@@ -825,6 +826,7 @@ def test_what_is_refused_goes_through_under_vmap():
     torch.testing.assert_close(vmap(loss)(x, x, weight.unsqueeze(-1).expand(4, 3)), weight * loss(x, x) / 4)
 
 
+@pytest.mark.e2e
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # torch's compiler raises its own
 def test_what_is_refused_goes_through_a_compiled_loss():
     loss = made(reduction="none", **FIXED)

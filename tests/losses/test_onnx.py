@@ -75,6 +75,7 @@ def trained(loss):
     return module
 
 
+@pytest.mark.e2e
 def test_a_head_and_its_likelihood():
     torch.manual_seed(0)
     module = Predicted()
@@ -91,6 +92,7 @@ def test_a_head_at_every_place_of_an_image():
     )
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(
     "options",
     [
@@ -104,6 +106,7 @@ def test_a_loss_of_given_numbers(options):
     refuse_other(Criterion(MKCLoss(2, **options)), batch)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("settled", [False, True])
 def test_a_loss_that_follows_its_residuals_before_and_after_it_has_settled(settled):
     module = trained(MKCLoss(2))
@@ -112,6 +115,7 @@ def test_a_loss_that_follows_its_residuals_before_and_after_it_has_settled(settl
     refuse_other(module, batch)
 
 
+@pytest.mark.e2e
 def test_the_losses_of_labels_and_without_a_scale():
     torch.manual_seed(0)
     refuse_other(Criterion(GeneralizedCrossEntropyLoss(), 3), lambda count: batch(count, labels=True))

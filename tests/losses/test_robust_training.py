@@ -67,6 +67,7 @@ def rmse(model, x, truth):
         return float((model(x) - truth).square().mean().sqrt())
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(("scale", "offset"), [(1e-6, 0.0), (1e6, 0.0), (1e-3, 0.1), (200.0, 1000.0)])
 def test_a_target_of_any_unit_and_offset_is_learned_as_a_standardised_one(scale, offset):
     x, truth, y = sampled()
@@ -77,6 +78,7 @@ def test_a_target_of_any_unit_and_offset_is_learned_as_a_standardised_one(scale,
     assert plain < 0.1
 
 
+@pytest.mark.e2e
 def test_a_plain_network_learns_targets_that_nobody_scaled():
     x, truth, y = sampled()
     truth, y = 1000.0 + 200.0 * truth, wrong(1000.0 + 200.0 * y, 0.2, "factor 1000")
@@ -95,6 +97,7 @@ def test_a_plain_network_learns_targets_that_nobody_scaled():
     assert errors[1] > 10.0
 
 
+@pytest.mark.e2e
 def test_on_clean_targets_it_is_as_good_as_least_squares():
     errors = []
     for seed in range(3):
@@ -104,6 +107,7 @@ def test_on_clean_targets_it_is_as_good_as_least_squares():
     assert ours < 1.02 * squares
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("kind", ["one-sided", "factor 1000", "uniform"])
 def test_half_of_the_targets_may_be_wrong(kind):
     x, truth, y = sampled()
@@ -119,6 +123,7 @@ def test_half_of_the_targets_may_be_wrong_where_d_is_given():
     assert rmse(trained(loss, x, wrong(y, 0.5, "one-sided")), x, truth) < 0.15
 
 
+@pytest.mark.e2e
 def test_half_of_the_targets_may_be_permuted_among_each_other():
     errors = []
     for seed in (3, 4):
@@ -132,6 +137,7 @@ def test_half_of_the_targets_may_be_permuted_among_each_other():
     assert ours < 0.9 * squares
 
 
+@pytest.mark.e2e
 def test_sigma_and_d_describe_the_noise():
     x, _, y = sampled(noise=0.3)
     clean, heavy = MKCLoss(1), MKCLoss(1)
@@ -143,6 +149,7 @@ def test_sigma_and_d_describe_the_noise():
     assert float(heavy.bound) == pytest.approx(10.0, rel=0.2)
 
 
+@pytest.mark.e2e
 def test_what_is_watched_after_the_schedule_falls_while_the_network_gets_better():
     """The network term in training and the value in evaluation, by which a scheduler or early stopping goes."""
     x, truth, y = sampled()

@@ -161,6 +161,7 @@ def draws():
     return loss, MKCDistribution(loss.sigma.detach(), loss.d.detach(), loss.bound).sample((20_000,))
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("level", [0.5, 0.9, 0.99])
 def test_interval_covers_draws_of_the_density_at_its_level_with_equal_tails(draws, level):
     loss, y = draws

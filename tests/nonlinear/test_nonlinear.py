@@ -60,6 +60,7 @@ def linear_residual(X: Tensor, y: Tensor):
 # the minimum
 
 
+@pytest.mark.e2e
 def test_least_squares_is_that_of_scipy():
     residual = residual_to(noisy(0))
     found = minimise(residual, START, tol=1e-15)
@@ -536,6 +537,7 @@ def test_a_parameter_without_effect_has_an_infinite_error():
     torch.testing.assert_close(error[:3], fit(residual, START).standard_error(), rtol=0.05, atol=0)
 
 
+@pytest.mark.e2e
 @settings(derandomize=True, deadline=None, max_examples=15)
 @given(seed=st.integers(0, 1000), exponent=st.integers(-6, 6), share=st.floats(0.0, 0.3))
 def test_the_unit_of_the_residual_does_not_matter(seed, exponent, share):

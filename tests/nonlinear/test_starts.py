@@ -43,6 +43,7 @@ def single():
     return fit(off, START, data=DATA, lower=LOW, upper=HIGH)
 
 
+@pytest.mark.e2e
 def test_thirty_two_starts_find_what_one_does_not(many, single):
     assert int(((single.theta - K).abs() < 0.05).sum()) <= 8
     assert bool(single.converged.all())
@@ -53,6 +54,7 @@ def test_thirty_two_starts_find_what_one_does_not(many, single):
     assert single.agreeing.tolist() == [1] * 20
 
 
+@pytest.mark.e2e
 def test_what_a_fit_explains_tells_the_right_minimum_from_another(many, single):
     right = (single.theta - K).abs().squeeze(-1) < 0.05
     share = single.explained(Y.unsqueeze(-1)).squeeze(-1)
@@ -61,6 +63,7 @@ def test_what_a_fit_explains_tells_the_right_minimum_from_another(many, single):
     assert float(many.explained(Y.unsqueeze(-1)).min()) > 0.9
 
 
+@pytest.mark.e2e
 def test_the_result_is_that_of_a_fit_from_the_best_end(many):
     again = fit(off, many.theta, data=DATA, lower=LOW, upper=HIGH, graduate=False)
     torch.testing.assert_close(many.theta, again.theta, rtol=1e-6, atol=0)
@@ -68,6 +71,7 @@ def test_the_result_is_that_of_a_fit_from_the_best_end(many):
     torch.testing.assert_close(many.log_likelihood, again.log_likelihood, rtol=0, atol=1e-6)
 
 
+@pytest.mark.e2e
 def test_a_batch_is_a_loop_and_a_seed_gives_the_same(many):
     for seed in (2, 7):
         alone = fit(one(seed), START[seed], lower=LOW, upper=HIGH, starts=32)

@@ -50,6 +50,7 @@ def assert_centre(found, whole):
         assert abs(mine - other) <= 2.0 * max(error, other_error)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("name", sorted(set(SAMPLES) - {"clipped", "frozen_sensor"}))
 def test_the_centre_is_that_of_the_whole_recording(name, whole):
     recording = read(name)

@@ -559,6 +559,7 @@ def test_a_file_that_only_claims_to_be_parquet_is_an_error(tmp_path):
 # --- the optional library
 
 
+@pytest.mark.process
 def test_the_module_imports_without_the_table_reader():
     code = "import sys; sys.modules['polars'] = None; import mkc_torch.recording.recording"
     subprocess.run([sys.executable, "-c", code], check=True)

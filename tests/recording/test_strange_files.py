@@ -239,6 +239,7 @@ def test_rows_of_several_topics_are_told_apart(tmp_path):
     np.testing.assert_allclose(recording["accel_x"].numpy(), OTHER[:, 0], atol=1e-3)
 
 
+@pytest.mark.e2e
 def test_a_corrected_file_of_two_sensors_has_the_rows_of_the_one(tmp_path):
     path = write(tmp_path, table("time,id,mag_x,mag_y,mag_z", *two(("0", "1"))))
     run = CliRunner()

@@ -34,6 +34,7 @@ def temperature():
     return 20.0 + 4.0 * torch.sin(0.23 * times()) + 2.0 * torch.sin(0.71 * times())
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(
     ("values", "effect", "size"),
     [
@@ -66,6 +67,7 @@ def test_a_driver_is_named_and_corrects_another_recording():
     assert float((columns["y"] - table["y"]).abs().median()) < 0.035
 
 
+@pytest.mark.e2e
 def test_clocks_that_differ_by_less_than_a_sample_are_no_finding():
     found = diagnose(Paired(simulator()), recorded(signal(times() + 0.02)), surrogates=19)
     assert found.verdict == "adequate"

@@ -21,6 +21,7 @@ def cases():
     return {name: draw(1, index) for name, index in FIRST_OF_EACH.items()}
 
 
+@pytest.mark.e2e
 def test_the_same_address_gives_the_same_case(cases):
     again = draw(1, FIRST_OF_EACH["tanks"])
     assert canonical([again.key]) == canonical([cases["tanks"].key])

@@ -40,6 +40,7 @@ def quiet(tmp_path_factory):
     return result, output
 
 
+@pytest.mark.e2e
 def test_the_key_is_sealed(quiet):
     _, output = quiet
     assert digest((output / "key.json").read_text().rstrip("\n")) == (output / "key_hash.txt").read_text().strip()
@@ -73,6 +74,7 @@ def test_recordings_do_not_tell_what_is_hidden(quiet):
     }  # fmt: skip
 
 
+@pytest.mark.e2e
 def test_a_real_diagnosis_is_scored_and_its_model_runs_free(tmp_path):
     output = tmp_path / "out"
     result = run_challenge(

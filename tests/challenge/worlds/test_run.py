@@ -36,7 +36,7 @@ def cheap(paths, folder):
 FAMILIES = {"dynamics": dynamics_worlds(), "magnetometer": magnetometer_worlds(15.0)}
 
 
-@pytest.fixture(scope="module", params=FAMILIES)
+@pytest.fixture(scope="module", params=[pytest.param("dynamics", marks=pytest.mark.e2e), "magnetometer"])
 def done(request, tmp_path_factory):
     output = tmp_path_factory.mktemp("worlds") / "out"
     told = []
@@ -121,6 +121,7 @@ def test_a_larger_run_contains_a_smaller_one(tmp_path):
     assert first == again
 
 
+@pytest.mark.process
 def test_two_processes_draw_the_same(tmp_path):
     worlds = FAMILIES["dynamics"]
     for workers in (1, 2):

@@ -143,6 +143,7 @@ def line_and_drivers(count):
     return line, drivers
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("count", [2, 30])
 def test_a_port_that_is_not_pointwise(count):
     """Both where all columns are made and where the promising ones have to be chosen by reverse mode."""
@@ -176,6 +177,7 @@ def test_curves_are_legendre_polynomials():
     np.testing.assert_allclose(found, expected - expected.mean(0), atol=1e-12)
 
 
+@pytest.mark.e2e
 def test_the_diagnosis_has_it_on_the_same_samples_and_warns_of_what_remains():
     recording = tumbling(N, noise=NOISE, sensor=along(LOAD) + outliers(), load=LOAD, **walks(2))
     found = diagnose(Magnetometer(), recording, surrogates=19, max_findings=0)

@@ -67,6 +67,7 @@ def test_one_direction_is_found_with_its_course():
     assert float(torch.corrcoef(torch.stack([predicted, truth]))[0, 1]) > 0.95
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("variances", [(1.0, 1.0, 1.0), (2.0, 0.5, 0.5), (1.0, 0.0, 0.0)])
 def test_channels_apart_have_p_values_that_are_no_smaller_than_uniform(variances):
     p = torch.tensor([common_cause(*searching(np.diag(variances), seed)[:2]).p_value for seed in range(60)])
@@ -96,6 +97,7 @@ def diagnosis():
     return diagnose(Magnetometer("norm"), recording), recording
 
 
+@pytest.mark.e2e
 def test_a_cause_that_was_not_recorded_is_found(diagnosis):
     found, _ = diagnosis
     (finding,) = found.findings
@@ -104,6 +106,7 @@ def test_a_cause_that_was_not_recorded_is_found(diagnosis):
     assert "no column recorded" in headline(found)
 
 
+@pytest.mark.e2e
 def test_its_size_and_course_are_those_of_the_cause(diagnosis):
     found, _ = diagnosis
     (finding,) = found.findings
@@ -116,6 +119,7 @@ def test_its_size_and_course_are_those_of_the_cause(diagnosis):
     assert abs(np.corrcoef(at, finding.curve.value[:, 0])[0, 1]) > 0.97
 
 
+@pytest.mark.e2e
 def test_it_is_judged_on_blocks_that_its_course_has_not_seen(diagnosis):
     """The noise of 0.5 µT is what the best correction leaves; a course that had seen the blocks would leave less."""
     held = diagnosis[0].findings[0].held_out
@@ -123,6 +127,7 @@ def test_it_is_judged_on_blocks_that_its_course_has_not_seen(diagnosis):
     assert 0.49 < held.rmse_after < held.rmse_before
 
 
+@pytest.mark.e2e
 def test_its_model_goes_through_a_file_and_leaves_the_offset_at_the_end(diagnosis):
     found, recording = diagnosis
     model = DiagnosedModel.from_json(found.model.to_json())
@@ -139,6 +144,7 @@ def test_its_model_goes_through_a_file_and_leaves_the_offset_at_the_end(diagnosi
     validate(json.loads(diagnosis_to_json(found)))
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("whole", [False, True])
 def test_a_column_that_goes_as_the_cause_in_part_is_told_to_stand_in(whole):
     """One that is the cause is not, and neither needs a name that says what it measures."""
@@ -151,6 +157,7 @@ def test_a_column_that_goes_as_the_cause_in_part_is_told_to_stand_in(whole):
     assert all(warning.startswith("What aux leaves of the offset goes on") for warning in told)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("seed", [0, 1, 3])
 def test_axes_that_wander_for_themselves_are_noise(seed):
     """One draw in two hundred would be one cause, for a tenth of the level; these are none of those."""

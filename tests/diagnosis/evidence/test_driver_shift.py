@@ -47,11 +47,13 @@ def warning(shift):
     return said(shift, Term(effect, column, {}), EvidenceSettings()).warnings
 
 
+@pytest.mark.e2e
 def test_no_shifted_copy_of_a_lively_driver_gains_as_much():
     N = 2000
     assert found(N, load(N), current=load(N) + 2.0) == DriverShift(38, 0, pytest.approx(10.0))
 
 
+@pytest.mark.e2e
 def test_copies_of_a_ramp_do_as_well_as_the_ramp():
     N = 2000
     ramp = np.linspace(0.0, 3.0, N)
@@ -61,6 +63,7 @@ def test_copies_of_a_ramp_do_as_well_as_the_ramp():
     assert f"{shift.as_good} of 38 copies of load, shifted by up to 10 s, gain as much for current_field" in sentence
 
 
+@pytest.mark.e2e
 def test_where_there_is_nothing_to_shift_there_is_none():
     N = 2000
     step = np.where(np.arange(N) < 900, 0.0, 1.0)
@@ -74,6 +77,7 @@ def test_few_copies_are_no_reason_for_a_warning():
     assert len(warning(DriverShift(38, 4, 20.0))) == 1
 
 
+@pytest.mark.e2e
 def test_a_finding_of_a_diagnosis_has_it():
     N = 1500
     recording = tumbling(N, noise=0.4, sensor=GAIN * load(N)[:, None], current=load(N) + 2.0)

@@ -52,7 +52,7 @@ def with_findings():
     return Case(base, search.first, search.found, search.evidence, search.blocks, drivers, 0, Settings())
 
 
-@pytest.fixture(scope="module", params=[without_findings, with_findings])
+@pytest.fixture(scope="module", params=[without_findings, pytest.param(with_findings, marks=pytest.mark.e2e)])
 def case(request):
     return request.param()
 

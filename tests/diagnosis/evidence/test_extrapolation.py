@@ -123,6 +123,7 @@ def diagnosis():
     return diagnose(Magnetometer(), recording, surrogates=19, max_findings=1)
 
 
+@pytest.mark.e2e
 def test_a_finding_of_a_diagnosis_has_it(diagnosis):
     (finding,) = diagnosis.findings
     assert finding.effect == "current_field"
@@ -130,6 +131,7 @@ def test_a_finding_of_a_diagnosis_has_it(diagnosis):
     assert not [w for w in diagnosis.warnings if "extrapolate" in w]
 
 
+@pytest.mark.e2e
 def test_what_is_found_later_belongs_to_the_model_without_a_finding_too():
     """A drift that is large where the driver is high would speak for it, or against it."""
     drift = np.outer(np.maximum(TIME - 15.0, 0.0), [0.5, -0.3, 0.2])

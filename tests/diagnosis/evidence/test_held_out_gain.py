@@ -58,6 +58,7 @@ def beside(fits):
     return without, [held_out(fit, blocks) for fit in fits]
 
 
+@pytest.mark.e2e
 def test_what_is_not_confirmed_by_itself_is_judged_beside_the_other(fits, beside):
     without_small, (none, _, both) = beside
     without = without_small(none, none, both)
@@ -74,6 +75,7 @@ def test_what_is_confirmed_by_itself_is_not_judged_again(beside):
     assert without_small(none, both, both) is None
 
 
+@pytest.mark.e2e
 def test_a_diagnosis_says_so(monkeypatch):
     monkeypatch.setattr(held_out_gain, "_confirmed", lambda *_: False)
     current = np.sign(np.sin(2.0 * np.pi * TIME / 3.7))

@@ -46,6 +46,7 @@ def interval(size, seed, *, spoilt=(0, 0), effect=STEP, shape=None):
     return onset_interval(base.model, SimpleNamespace(fit=best, scene=scene, look=scene.under()))
 
 
+@pytest.mark.e2e
 def test_the_interval_holds_the_onset_about_as_often_as_it_says():
     found = [interval(0.5, seed) for seed in range(25)]
     assert sum(low <= TRUE <= high for low, high in found) >= 22
@@ -53,6 +54,7 @@ def test_the_interval_holds_the_onset_about_as_often_as_it_says():
     assert 5.0 / RATE < width < 0.25 * N / RATE
 
 
+@pytest.mark.e2e
 def test_a_larger_step_is_known_better():
     widths = [np.median([np.subtract(*interval(size, seed)[::-1]) for seed in range(3)]) for size in (0.4, 1.2, 6.0)]
     assert widths[0] > 2.0 * widths[1] > 2.0 * widths[2]
@@ -81,6 +83,7 @@ def test_the_critical_value_is_that_of_a_change_point():
     assert np.mean(np.maximum(*sides) <= _CRITICAL) == pytest.approx(0.95, abs=0.01)
 
 
+@pytest.mark.e2e
 def test_a_diagnosis_tells_it():
     sensor = np.array([1.6, -1.2, 0.8]) * (np.arange(2000) >= 900)[:, None]
     diagnosis = diagnose(Magnetometer(), tumbling(2000, noise=0.5, sensor=sensor))

@@ -30,6 +30,7 @@ def test_nothing_is_said_of_short_ones(stretches):
     assert rejected_warning(TIME, weights(*stretches) if stretches else torch.ones(3000, 1), Settings()) == ()
 
 
+@pytest.mark.e2e
 def test_a_magnet_that_passes_is_told_of_by_a_diagnosis():
     time = np.arange(2000) / 50.0
     away = np.stack([1.0 + 0.0 * time, 0.3 * (time - 21.0), 0.0 * time], -1)

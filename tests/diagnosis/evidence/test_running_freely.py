@@ -49,6 +49,7 @@ def test_what_runs_freely_already_stays_the_same():
     assert again.held_out == (KEPT,)
 
 
+@pytest.mark.e2e
 def test_fits_under_pushes_are_fitted_to_their_free_runs_and_judged_by_these():
     base, one = under_pushes()
     alone = freed(base)

@@ -73,6 +73,7 @@ def always(_fit, _evidence):
     return True
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("seed", [0, 1])
 def test_sensors_that_are_alike_share_one_number(seed):
     fit, evidence, blocks = fit_of(recorded(share=(1.0, 1.0), seed=seed), OF["sensor_lag"])
@@ -86,6 +87,7 @@ def test_sensors_that_are_alike_share_one_number(seed):
     assert float(simple.residual.square().mean().sqrt()) == pytest.approx(NOISE, rel=0.1)
 
 
+@pytest.mark.e2e
 def test_where_one_sensor_is_quick_each_keeps_its_own():
     fit, evidence, blocks = fit_of(recorded(share=(1.0, 0.0)), OF["sensor_lag"])
     kept, after = simplified(fit, evidence, blocks, always, NamingSettings())
@@ -94,6 +96,7 @@ def test_where_one_sensor_is_quick_each_keeps_its_own():
     assert fit.parameters[-2:].tolist() == pytest.approx([1.0, 0.0], abs=0.2)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(("exchange", "size"), [((0.2, 0.2), 1), ((0.3, 0.1), 2)])
 def test_what_equals_exchange_is_one_number(exchange, size):
     fit, evidence, blocks = fit_of(recorded(exchange), OF["coupling"], start=0.1)
@@ -102,6 +105,7 @@ def test_what_equals_exchange_is_one_number(exchange, size):
     assert simple.parameters[-size:].tolist() == pytest.approx(list(exchange[:size]), abs=0.02)
 
 
+@pytest.mark.e2e
 def test_a_form_that_makes_no_finding_any_more_is_not_taken():
     fit, evidence, blocks = fit_of(recorded((0.2, 0.2)), OF["coupling"], start=0.1)
     asked = []
@@ -114,6 +118,7 @@ def test_a_form_that_makes_no_finding_any_more_is_not_taken():
     assert asked == [((1,), N)]
 
 
+@pytest.mark.e2e
 def test_an_earlier_effect_is_simplified_beside_a_later_one():
     fit, evidence, blocks = fit_of(recorded((0.3, 0.1), (1.0, 1.0)), OF["sensor_lag"], OF["coupling"], start=0.2)
     simple, _ = simplified(fit, evidence, blocks, always, NamingSettings())
@@ -126,6 +131,7 @@ def test_an_effect_without_a_simpler_form_stays():
     assert simplified(fit, evidence, blocks, always, NamingSettings()) == (fit, evidence)
 
 
+@pytest.mark.e2e
 def test_the_simpler_form_is_written_and_read_like_the_other():
     recording = recorded((0.2, 0.2))
     simple, _ = simplified(*fit_of(recording, OF["coupling"], start=0.1), always, NamingSettings())

@@ -44,6 +44,7 @@ def test_what_is_switched_comes_and_goes(size, phi, seed):
     )
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("lasts", [True, False])
 def test_a_diagnosis_says_which_of_the_two_its_step_is(lasts):
     generator = torch.Generator().manual_seed(2)

@@ -1,10 +1,13 @@
 """The noise that is left, as a user reads it."""
 
+import pytest
 import torch
 
 from mkc_torch import Recording, diagnose
 from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
 from mkc_torch.simulation import Magnetometer
+
+pytestmark = pytest.mark.e2e
 
 
 def told(step, correlation):

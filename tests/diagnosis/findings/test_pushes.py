@@ -132,6 +132,7 @@ def test_a_push_by_itself_is_nought_along_what_it_does_not_depend_on_within_the_
     assert 0.9 <= float(inside) <= 0.99
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("push", ["white", "slow"])
 def test_the_noise_of_a_fit_is_the_push_that_was_drawn(push):
     world = swung_in_the_world(push)

@@ -44,6 +44,7 @@ def reached(sentence):
     return float(sentence.split(" it follows angle to ")[1].removesuffix(" rad."))
 
 
+@pytest.mark.e2e
 def test_an_input_of_the_other_sign_is_told():
     told = told_of(at(swung(effect=-1.0, N=N)[0]))
     assert told[0].startswith("With the sign of `torque` turned round it follows angle to 0.00")
@@ -52,12 +53,14 @@ def test_an_input_of_the_other_sign_is_told():
     assert not any("does not matter" in one for one in told)
 
 
+@pytest.mark.e2e
 def test_an_input_that_acts_late_is_told_with_its_delay():
     told = told_of(at(swung(late=5, N=N)[0]))
     assert told[0].startswith("With `torque` late by 0.25 s it follows angle to 0.00")
     assert reached(told[0]) == pytest.approx(NOISE, rel=0.2)
 
 
+@pytest.mark.e2e
 def test_a_parameter_of_the_other_sign_is_told_though_its_range_forbids_it():
     told = told_of(at(swung(N=N)[0], system=UpsideDown))
     assert told[0].startswith("With `stiffness` = -")
@@ -66,12 +69,14 @@ def test_a_parameter_of_the_other_sign_is_told_though_its_range_forbids_it():
     assert value == pytest.approx(-9.0, abs=0.1)
 
 
+@pytest.mark.e2e
 def test_an_input_that_does_nothing_does_not_matter():
     recording, _ = swung(effect=0.0, N=N)
     told = told_of(fitted(JointModel(Pendulum().prepare(recording)), torch.tensor([9.0, 0.15, 0.3, 0.0]).double()))
     assert "`torque` does not matter: held at its mean the simulation follows angle as well." in told
 
 
+@pytest.mark.e2e
 def test_an_input_that_acts_matters():
     """With a fifth of the stiffness missing."""
     told = told_of(at(swung(N=N)[0], stiffness=7.0))

@@ -69,6 +69,7 @@ def shape(recording, effect, **settings):
     return shape_of(fit, 0, terms, EvidenceSettings(**settings))
 
 
+@pytest.mark.e2e
 def test_a_name_of_the_right_shape_is_not_doubted_in_ten_draws():
     found = [shape(sailed(2.0, seed), QuadraticDrag()) for seed in SEEDS]
     assert [one.curve for one in found] == [None] * len(found)
@@ -92,6 +93,7 @@ def test_a_name_of_another_shape_is_the_nearest_with_a_formula_that_is_neither_a
     assert "sign(speed)" in found.formula
 
 
+@pytest.mark.e2e
 def test_how_much_better_a_curve_has_to_be_is_set():
     found = shape(sailed(2.0, 0), LinearDrag(), shape_nats=1e4)
     assert found.free_curve_gain > 30.0

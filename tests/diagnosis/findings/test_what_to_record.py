@@ -10,6 +10,8 @@ from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling
 
+pytestmark = pytest.mark.e2e
+
 N = 2000
 TIME = np.arange(N) / 50.0
 CURRENT = 1.5 * np.sin(2.0 * np.pi * TIME / 9.0)

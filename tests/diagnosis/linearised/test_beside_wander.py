@@ -41,6 +41,7 @@ def test_excursions_of_a_wander_count(use):
     assert float(local.counts.mean()) > 0.98
 
 
+@pytest.mark.e2e
 def test_bursts_beside_a_wander_do_not_count():
     """They are smaller than the wander's excursions: the plain fit lets most of them through."""
     burst = np.zeros((N, 3))
@@ -72,6 +73,7 @@ def bursts_of_one_sign(seed, share=0.15):
     return added, torch.from_numpy(hit)
 
 
+@pytest.mark.e2e
 def test_the_small_ones_of_many_bursts_do_not_count_for_a_wander():
     """Many bursts make the likeliest density a wide one, in which the smaller outliers count like samples."""
     kept = []
@@ -83,6 +85,7 @@ def test_the_small_ones_of_many_bursts_do_not_count_for_a_wander():
     assert sum(kept) / 3 < 0.35
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(("step", "size"), [(0.0, 0.7), (0.05, 1.5)])
 def test_the_mild_samples_of_bursts_do_not_count(step, size):
     """Most are within three scales of the noise, and beside a wander the fit's own parameters hide them."""
@@ -148,6 +151,7 @@ def slow_in_the_world(seed, keep=0.998, size=0.8):
     return turns(np.arange(N) / RATE).inv().apply(drift)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_colour_beside_a_wander_is_the_likeliest(seed):
     """What wanders in the sensor's axes and what is slow in the world's take long to tell apart."""
@@ -160,6 +164,7 @@ def test_the_colour_beside_a_wander_is_the_likeliest(seed):
     assert float((slow[2:6, 1:].mean(0) / slow[-200:, 1:].mean(0)).min()) > 30.0
 
 
+@pytest.mark.e2e
 def test_what_counts_keeps_its_wander():
     fit, _, local = local_of(walk([0.05, 0.05, 0.05]), "attitude")
     counted = local.counts > 0
@@ -168,6 +173,7 @@ def test_what_counts_keeps_its_wander():
     assert float(local.values[counted].std()) > 1.0
 
 
+@pytest.mark.e2e
 def test_each_axis_has_its_own_share_of_the_wander():
     steps = np.array([0.08, 0.02, 0.02])
     _, tangents, local = local_of(walk(steps), "attitude")
@@ -205,6 +211,7 @@ def test_another_colour_is_the_search_that_begins_with_it():
     assert told.evidence > found.evidence + 10.0
 
 
+@pytest.mark.e2e
 def test_white_noise_is_left_as_it_is():
     fit, _, local = local_of(np.zeros((N, 3)), "attitude")
     values, counts = fit.pseudo(NoiseSettings())

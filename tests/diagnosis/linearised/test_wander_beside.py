@@ -1,8 +1,12 @@
 """An offset that wanders must not take the name of physics that is beside it."""
 
+import pytest
+
 from mkc_torch import diagnose
 from mkc_torch.challenge.magnetometer.generator import draw
 from mkc_torch.simulation import Magnetometer
+
+pytestmark = pytest.mark.e2e
 
 
 def test_a_nonlinearity_beside_a_wandering_offset_is_named_alone():

@@ -49,6 +49,7 @@ def with_shape(base, effect, shape):
     return best, Scene(base, best, best.model.terms, tangents, pseudo - counts * moved, counts, Settings()).under()
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("onset", [FIRST / RATE + 0.02, LAST / RATE - 0.02])
 def test_an_onset_in_a_burst_of_outliers_is_taken_from_its_middle(burst, onset):
     best, look = with_shape(burst, STEP, {"onset": onset})
@@ -58,6 +59,7 @@ def test_an_onset_in_a_burst_of_outliers_is_taken_from_its_middle(burst, onset):
     assert moved.converged
 
 
+@pytest.mark.e2e
 def test_an_onset_that_the_search_clearly_prefers_is_taken(burst):
     best, *_ = with_shape(burst, STEP, {"onset": TRUE - 4.0})
     _, look = with_shape(burst, STEP, {"onset": TRUE})
@@ -66,6 +68,7 @@ def test_an_onset_that_the_search_clearly_prefers_is_taken(burst):
     assert moved.log_likelihood > best.log_likelihood + 10.0
 
 
+@pytest.mark.e2e
 def test_what_has_no_shape_or_does_not_converge_stays(burst, monkeypatch):
     best, look = with_shape(burst, CUBIC, {})
     assert coloured(best, look) is best

@@ -27,6 +27,7 @@ def located(fit, draws=39, level=0.05):
     )
 
 
+@pytest.mark.e2e
 def test_drag_that_is_hidden_beside_pushes_is_named_and_sized():
     base = swung_in_the_world("slow", drag=0.4).fit
     terms, found = candidates(base, DYNAMICS), located(base)
@@ -69,6 +70,7 @@ def test_what_is_far_behind_at_first_is_not_fitted_any_further():
     assert _within_reach([7, 3, 5], fits, [-10.0, -59.0, -61.0], behind) == ([7, 3], ["best", "near"])
 
 
+@pytest.mark.e2e
 def test_the_one_that_is_left_out_is_still_in_the_ranking():
     base = swung_in_the_world("slow", drag=0.4).fit
     strict = dataclasses.replace(FEW, search=dataclasses.replace(FEW.search, behind=0.0, behind_share=0.0))

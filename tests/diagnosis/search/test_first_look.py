@@ -19,6 +19,8 @@ from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import RATE, tumbling
 
+pytestmark = pytest.mark.e2e
+
 rounds = importlib.import_module("mkc_torch.diagnosis.rounds")
 
 N = 2000

@@ -40,6 +40,7 @@ def found():
     return prepared, terms, locate(base, terms, level=0.05, surrogates=19, generator=generator, settings=Settings())
 
 
+@pytest.mark.e2e
 def test_the_first_of_the_ranking_has_a_shape_between_those_tried(found):
     prepared, terms, located = found
     first = located.scene.terms[located.ranking[0].number]
@@ -49,6 +50,7 @@ def test_the_first_of_the_ranking_has_a_shape_between_those_tried(found):
     assert abs(first.shape["onset"] - float(prepared.time[671])) < 0.25 * spacing
 
 
+@pytest.mark.e2e
 def test_its_gain_is_no_less_than_that_of_any_shape_tried(found):
     _, _, located = found
     gains = located.look.gains.ratio[:, 0]
@@ -92,6 +94,7 @@ def test_gains_of_other_candidates_are_those_of_a_search_with_them():
     )
 
 
+@pytest.mark.e2e
 def test_a_joint_fit_at_another_moment_gives_way_to_that_of_the_search(monkeypatch):
     sensor = np.zeros((N, 3))
     sensor[671:] = [0.7, -0.7, 0.7]

@@ -46,6 +46,7 @@ def told(diagnosis):
     return [warning for warning in diagnosis.warnings if "another burst of outliers" in warning]
 
 
+@pytest.mark.e2e
 def test_one_burst_among_others_is_no_effect():
     """A pole beside the path would explain the mild one, and nothing else."""
     diagnosis = diagnosis_of(bursts(MILD | OTHERS))
@@ -56,6 +57,7 @@ def test_one_burst_among_others_is_no_effect():
     assert "field_gradient by position_x, position_y, position_z" in warning
 
 
+@pytest.mark.e2e
 def test_what_is_passed_more_than_once_is_an_effect():
     place = np.array([values[420] for values in POSITION.values()]) + 0.05
     diagnosis = diagnosis_of(pole(place) + bursts(OTHERS))

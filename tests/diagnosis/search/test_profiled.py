@@ -36,6 +36,7 @@ def strongest(found, terms):
     return terms[number].effect.id, number
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("push", ["white", "slow"])
 def test_beside_pushes_from_which_nothing_is_missing_p_values_are_not_small(push):
     """Of four recordings: two p-values below 0.05 come about by chance once in seventy times."""
@@ -54,6 +55,7 @@ def hidden():
     return parts, profiled(*parts, DRAWS, torch.Generator().manual_seed(1))
 
 
+@pytest.mark.e2e
 def test_drag_that_is_hidden_beside_pushes_is_beyond_all_draws_and_has_its_name():
     (_, terms, *_), found = hidden()
     assert found.p_value == pytest.approx(1.0 / (1 + DRAWS))
@@ -65,6 +67,7 @@ def test_drag_that_is_hidden_beside_pushes_is_beyond_all_draws_and_has_its_name(
     assert float(found.gamma[drag][0]) == pytest.approx(0.4, rel=0.5)
 
 
+@pytest.mark.e2e
 def test_the_observer_that_is_kept_is_for_the_pushes_that_a_candidate_leaves():
     (fit, terms, *_), found = hidden()
     known = fit.model.prepared.observer.disturbances[0].size

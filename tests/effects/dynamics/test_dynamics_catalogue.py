@@ -300,6 +300,7 @@ REVERSING = {"coulomb_friction", "stribeck_friction"}
 class TestNeeds:
     """Effects are tried where they can mean something."""
 
+    @pytest.mark.e2e
     def test_of_a_pendulum(self):
         places = tried(prepared(Pendulum, angle=torch.cos(3.0 * TIME)))
         of_speed = EVERYWHERE | REVERSING | {"cubic_stiffness", "hard_stop", "position_periodic_force", "added_mass"}

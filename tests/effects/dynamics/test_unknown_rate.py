@@ -59,6 +59,7 @@ def diagnosis():
     return diagnose(Pendulum(), recording, effects=effects, surrogates=19, max_findings=1)
 
 
+@pytest.mark.e2e
 def test_a_force_that_is_in_no_catalogue_is_found_without_a_name(diagnosis):
     assert diagnosis.verdict == "unexplained"
     (finding,) = diagnosis.findings
@@ -71,6 +72,7 @@ def test_a_force_that_is_in_no_catalogue_is_found_without_a_name(diagnosis):
     assert "; δ(rate of speed) = " in finding.equation
 
 
+@pytest.mark.e2e
 def test_its_model_comes_back_with_the_same_curve(diagnosis):
     again = DiagnosedModel.from_json(diagnosis.model.to_json(), simulation=Pendulum())
     assert again.terms[0].effect.along == diagnosis.model.terms[0].effect.along

@@ -77,6 +77,7 @@ def recording(source, moment):
     return Recording({"time": time, **readings, **where}, units=dict.fromkeys(where, "m"))
 
 
+@pytest.mark.e2e
 def test_a_pole_beside_the_path_is_found_where_it_is():
     source = (4.9, 0.8, 1.6)
     diagnosis = diagnose(Magnetometer(), recording(source, 4.0))

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.e2e
+
 
 def test_kernels_compile_for_a_gpu_and_read_four_numbers_at_once():
     triton = pytest.importorskip("triton")

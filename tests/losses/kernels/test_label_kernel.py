@@ -169,6 +169,7 @@ def test_other_targets_shapes_and_transforms_take_the_formulas(device):
 # --- behind torch.library
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(("dtype", "weighted"), [(torch.float32, True), (torch.float16, False)])
 def test_operators_are_well_formed(device, dtype, weighted):
     from mkc_torch.losses.kernels import label_operators as operators

@@ -77,6 +77,7 @@ def test_value_gradients_and_state_are_those_of_torch(device, mode, dtype):
     assert_agrees(device, (37, 3), mode, dtype, weighted=dtype == torch.float64)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("mode", ["fixed", "learned", "as it comes"])
 @pytest.mark.parametrize(
     ("shape", "axis"), [((33, 1), -1), ((64, 4), -1), ((3, 4, 6, 5), 1), ((300, 5), -1), ((2, 20), -1), ((9000, 2), -1)]
@@ -105,6 +106,7 @@ def test_strided_predictions_and_targets(device, make):
     torch.testing.assert_close(*found)
 
 
+@pytest.mark.e2e
 def test_the_schedule_is_annealed_as_by_torch(device):
     kernel, eager = (MKCLoss(1, impl=impl).double().to(device) for impl in ("triton", "eager"))
     for loss in (kernel, eager):
@@ -171,6 +173,7 @@ def test_a_loss_that_has_seen_nothing_takes_its_scale_from_the_batch_it_evaluate
     assert int(kernel.residual_scale.batches.sum()) == 0
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("mode", ["fixed", "learned", "as it comes"])
 @pytest.mark.parametrize("reduction", ["mean", "none"])
 @compiler
@@ -196,6 +199,7 @@ class _Named:
         return self.call(*given)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("mode", ["fixed", "as it comes"])
 def test_operators_are_well_formed(device, mode):
     from mkc_torch.losses.kernels import operators

@@ -201,6 +201,7 @@ def operands(dtype, weighted, device):
     return (*tensors, None if weight is None else weight.to(device), bound, 1)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(("dtype", "weighted"), [(torch.float32, "weighted"), (torch.float16, "none")])
 def test_operators_are_well_formed(device, dtype, weighted):
     from mkc_torch.losses.kernels import sample_operators as operators
@@ -213,6 +214,7 @@ def test_operators_are_well_formed(device, dtype, weighted):
     torch.library.opcheck(operators.sample_slopes, (*detached, True, [True, False, True], grad))
 
 
+@pytest.mark.e2e
 @compiler
 @pytest.mark.parametrize("reduction", ["mean", "none"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])

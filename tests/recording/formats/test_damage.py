@@ -58,6 +58,7 @@ many = settings(max_examples=50, deadline=None)
 few = settings(max_examples=25, deadline=None)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("kind", FILES)
 @many
 @given(share=st.floats(0.0, 1.0))
@@ -104,6 +105,7 @@ def test_what_is_whole_of_a_file_cut_in_its_middle_is_kept_and_the_loss_told(kin
     assert "cut off" in said
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("kind", FILES)
 @few
 @given(places=st.lists(st.tuples(st.floats(0.0, 1.0), st.binary(min_size=1, max_size=8)), min_size=1, max_size=4))
@@ -146,6 +148,7 @@ def test_a_parquet_file_over_which_polars_would_end_this_process_is_damaged(tmp_
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.e2e
 def test_an_hdf5_file_that_leads_its_library_round_in_a_circle_is_damaged(tmp_path, monkeypatch):
     h5py = pytest.importorskip("h5py")
     monkeypatch.setattr(trial, "_PATIENCE", (4.0, 0.0))
@@ -182,6 +185,7 @@ MAGIC = {
 }
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("ending", MAGIC)
 @few
 @given(rest=st.binary(max_size=400))

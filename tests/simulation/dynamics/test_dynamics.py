@@ -77,6 +77,7 @@ class TestFit:
         assert values["speed at the start"] == pytest.approx(FIRST[1], abs=0.03)
         assert float(fit.d) == pytest.approx(0.01, rel=0.2)
 
+    @pytest.mark.e2e
     def test_the_position_where_the_speed_alone_is_measured(self):
         values, _ = found(Pendulum(), table(time=TIME, speed=noisy(TRUTH[1], 0.02)))
         assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.03)
@@ -97,6 +98,7 @@ class TestFit:
         assert values["stiffness"] == pytest.approx(STIFFNESS, abs=0.02)
         assert values["damping"] == pytest.approx(DAMPING, abs=0.01)
 
+    @pytest.mark.e2e
     def test_few_samples_a_period_are_refined(self):
         """Four samples a period: with one step for each the stiffness would be off by a tenth."""
         time = np.arange(60) * 0.5
@@ -159,6 +161,7 @@ class TestFit:
         by_order, by_name = made(Pendulum, derivative=derivative).prepare(recording), Pendulum().prepare(recording)
         torch.testing.assert_close(by_order.residual(by_name.start(), {}), by_name.residual(by_name.start(), {}))
 
+    @pytest.mark.e2e
     def test_an_output_that_is_no_state(self):
         def output(self, time, x, u, p):  # noqa: ARG001
             return {"tip": p.length * torch.sin(x.angle)}
@@ -290,6 +293,7 @@ class TestSegments:
 
     time = np.arange(1500) * 0.01
 
+    @pytest.mark.e2e
     def test_a_chaotic_record_is_fitted_in_segments_and_not_as_a_whole(self):
         recording = table(time=self.time, **dict(zip("xyz", noisy(lorenz(self.time), 0.1), strict=True)))
         values, fit = found(made(Lorenz, segment=1.0), recording)
@@ -532,6 +536,7 @@ def dragged(pull):
     return np.array(places)
 
 
+@pytest.mark.e2e
 def test_a_simulation_that_sticks_is_gone_through_moment_by_moment(monkeypatch):
     """Friction that is nearly a jump: no trajectory is found at once, and a corrected simulation must have one."""
     time = np.arange(80) * 0.02
@@ -576,6 +581,7 @@ class TestUndetermined:
         assert told.startswith("The recording does not determine `mass` and `spring`, but only what they are together")
         assert "direction 0.71 mass + 0.71 spring, relative" in told
 
+    @pytest.mark.e2e
     def test_it_is_a_warning_of_the_diagnosis(self):
         diagnosis = diagnose(made(Oscillator, step=0.02), self.recording, effects=(), surrogates=19)
         assert sum("does not determine `mass` and `spring`" in warning for warning in diagnosis.warnings) == 1

@@ -34,6 +34,7 @@ def pendulum():
     return Pendulum().prepare(recorded(ALONG, angle=angle + NOISE * np.random.default_rng(0).standard_normal(400)))
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(("stiffness", "damping"), [(90.0, 1.5), (90.0, 0.015), (0.9, 1.5)])
 def test_parameters_ten_times_off_are_brought_home(pendulum, stiffness, damping):
     guess = torch.cat([torch.tensor([stiffness, damping], dtype=torch.float64), pendulum.given[2:]])

@@ -152,6 +152,7 @@ def test_a_recording_of_nothing_but_zero_quaternions_is_refused_as_such():
         Magnetometer().prepare(recording)
 
 
+@pytest.mark.e2e
 def test_a_vehicle_that_hardly_tilts_is_warned_of():
     view = Magnetometer().prepare(tumbling(500, noise=0.3, size=(1.0, 0.05, 0.05), attitude=True))
     assert view.view == "attitude"

@@ -56,6 +56,7 @@ def test_an_attitude_may_be_off_by_its_own_noise(attitude):
     assert prepared(attitude).view == "attitude"
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("size", [10.0, 40.0])
 def test_a_change_of_the_sensor_is_no_fault_of_the_attitude(size):
     right = quaternions(turns(TIME))
@@ -64,6 +65,7 @@ def test_a_change_of_the_sensor_is_no_fault_of_the_attitude(size):
     assert prepared(right, sensor=np.outer(np.sin(TIME) ** 2, [0.8, -0.5, 0.3]) * size).view == "attitude"
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(
     ("attitude", "words"),
     [
@@ -90,6 +92,7 @@ def test_what_is_left_is_told_in_the_measurements_unit():
     assert "Without that 0.5" in sentence
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize(
     ("rate", "words"),
     [
@@ -111,6 +114,7 @@ def test_a_wrong_gyroscope_is_left_out_where_the_length_holds_together_with_a_st
     assert view.prior is not None
 
 
+@pytest.mark.e2e
 def test_wrong_turns_are_told_of_where_the_length_determines_nothing():
     little = tumbling(N, noise=0.5, size=(1.0, 0.1, 0.1), moments=0.3 * TIME)
     rate = 0.3 * body_rate(0.3 * TIME, (1.0, 0.1, 0.1))
@@ -122,6 +126,7 @@ def test_wrong_turns_are_told_of_where_the_length_determines_nothing():
     assert "degrees per second" in wrong.warnings[0]
 
 
+@pytest.mark.e2e
 def test_a_view_that_is_asked_for_is_taken_and_knows_what_is_wrong_with_its_turns():
     table = changed(tumbling(N, noise=0.5), **quaternions(turns(TIME - 0.5)), **rates(-body_rate(TIME)))
     views = [Magnetometer(use=use).prepare(table) for use in ("attitude", "gyro", "norm")]
@@ -139,6 +144,7 @@ def test_right_turns_have_nothing_wrong():
     assert [Magnetometer(use=use).prepare(table).wrong_turns for use in ("attitude", "gyro")] == ["", ""]
 
 
+@pytest.mark.e2e
 def test_a_simulation_whose_turns_are_wrong_is_unfit_and_says_why():
     table = changed(tumbling(N, noise=0.5, sensor=STEP), **rates(-body_rate(TIME)))
     found = diagnose(Magnetometer(use="gyro"), table, surrogates=19)
@@ -146,6 +152,7 @@ def test_a_simulation_whose_turns_are_wrong_is_unfit_and_says_why():
     assert "The rates seem to have the other sign" in found.world.reasons[0]
 
 
+@pytest.mark.e2e
 def test_a_part_starts_the_length_where_all_samples_do_not():
     half = tumbling(N, noise=0.3, moments=np.where(TIME < 30.0, TIME, 30.0 + 0.02 * (TIME - 30.0)))
     points = half.magnetometer() + torch.as_tensor(np.outer(TIME > 30.0, [300.0, 0.0, 0.0]))
@@ -164,6 +171,7 @@ def test_samples_that_cover_too_little_start_nothing():
     assert sphere_of_all(little.magnetometer(), torch.arange(N)) is None
 
 
+@pytest.mark.e2e
 def test_a_step_is_named_by_the_length_where_the_gyroscope_is_in_degrees():
     recording = changed(
         tumbling(N, noise=0.5, seed=1, moments=SLOW, sensor=STEP), **rates(np.rad2deg(0.1 * body_rate(SLOW)))

@@ -148,6 +148,7 @@ def test_ports(view):
     assert view.state == {"view": "gyro", "unit": "µT", "strength": view.strength}
 
 
+@pytest.mark.e2e
 def test_a_hand_that_turns_too_little_for_the_length_is_followed_by_the_gyroscope():
     recording = tumbling(500, noise=0.2, size=(1.0, 0.3, 0.3), gyro=True)
     with pytest.raises(NotIdentifiableError, match="Directions not covered"):
@@ -165,6 +166,7 @@ def test_a_turn_about_one_axis_determines_no_offset_along_it():
 SMALL_TILTS = (1.0, 0.12, 0.12)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("seed", range(3))
 def test_a_matrix_that_shrinks_what_hardly_turns_gains_nothing(seed):
     """The noise is that of the sensor: a smaller field of it would be the likelier one, and its offset far away."""
@@ -176,6 +178,7 @@ def test_a_matrix_that_shrinks_what_hardly_turns_gains_nothing(seed):
     assert float(torch.linalg.det(matrix)) == pytest.approx(1.0, abs=0.25)
 
 
+@pytest.mark.e2e
 def test_axes_that_are_turned_against_the_gyroscope_are_no_effect():
     angle = np.radians(4.0)
     turned = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])

@@ -98,6 +98,7 @@ def test_too_few_samples_have_none():
     assert heading_jumps(torch.zeros(1), torch.eye(3)[None], torch.zeros(1, 3), torch.zeros(1, 3)) == ()
 
 
+@pytest.mark.e2e
 def test_the_port_is_there_where_the_heading_jumps_and_takes_the_error_back():
     assert "heading" not in Magnetometer().prepare(tumbling(400, attitude=True, gyro=True)).ports
     assert "heading" not in Magnetometer().prepare(changed(recorded(400, {200: 20.0}), gyro_x=None)).ports
@@ -115,6 +116,7 @@ def test_the_port_is_there_where_the_heading_jumps_and_takes_the_error_back():
     assert float(view.residual(truth, {}).abs().max()) > 5.0
 
 
+@pytest.mark.e2e
 def test_a_reset_is_named_with_its_size_and_the_current_beside_it_is_right():
     N = 1500
     time = np.arange(N) / RATE
@@ -137,6 +139,7 @@ def test_a_reset_is_named_with_its_size_and_the_current_beside_it_is_right():
     assert any("by 14.0° at 14.0 s (gyroscope: " in sentence for sentence in result.warnings)
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("name", ["quadrotor_compass1", "quadrotor_compass3"])
 def test_the_autopilot_of_a_quadrotor_set_its_heading_anew_at_take_off(name):
     recording = Recording.read(shared_data(f"magnetometer/{name}.csv")).sorted_by_time()
@@ -147,6 +150,7 @@ def test_the_autopilot_of_a_quadrotor_set_its_heading_anew_at_take_off(name):
     assert "at 103.2 s" in told
 
 
+@pytest.mark.e2e
 def test_what_was_said_of_the_compass_that_steers_the_heading_is_the_heading_s():
     result = diagnose(Magnetometer(), Recording.read(shared_data("magnetometer/quadrotor_compass1.csv")))
     first = result.findings[0]
@@ -155,6 +159,7 @@ def test_what_was_said_of_the_compass_that_steers_the_heading_is_the_heading_s()
     assert result.corrected.rmse < 0.5 * result.baseline.rmse
 
 
+@pytest.mark.e2e
 def test_a_quadrotor_s_current_is_found_beside_its_heading_s_jumps():
     recording = Recording.read(shared_data("magnetometer/quadrotor_compass3.csv"))
     result = diagnose(Magnetometer(), recording)

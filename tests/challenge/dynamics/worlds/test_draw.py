@@ -27,6 +27,7 @@ def test_the_worlds_are_all_there():
     assert [name for name, world in WORLDS.items() if not world.hides] == ["useless"]
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("name", WORLDS)
 def test_the_same_address_gives_the_same_case_under_another_number(name):
     one, other = (WORLDS[name].draw(3, 1, False, number) for number in (1, 7))
@@ -41,6 +42,7 @@ def test_the_same_address_gives_the_same_case_under_another_number(name):
     )
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("name", WORLDS)
 def test_nothing_is_hidden_in_an_empty_case(name):
     for index in range(3):
@@ -55,6 +57,7 @@ def test_nothing_is_hidden_in_an_empty_case(name):
             assert key.push.over_noise >= 1.5
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("name", ["white", "gusts", "held"])
 def test_a_push_acts_in_every_second_case_with_something_hidden(name):
     keys = [WORLDS[name].draw(3, index, True, index).key for index in range(2)]
@@ -63,6 +66,7 @@ def test_a_push_acts_in_every_second_case_with_something_hidden(name):
     assert all(key.key.kind in ("single", "outside") for key in keys)
 
 
+@pytest.mark.e2e
 def test_a_push_makes_a_hidden_effect_harder_to_see():
     """z is that of the noise that is there: with the same effect and size it falls when a push is added."""
     from mkc_torch.challenge.dynamics.errors import draw_errors
@@ -97,6 +101,7 @@ def test_a_held_input_is_held_in_the_integration(held):
     np.testing.assert_array_equal(course.inputs, at)
 
 
+@pytest.mark.e2e
 def test_the_world_of_held_inputs_differs_from_its_linear_twin_by_more_than_its_noise():
     """Otherwise nothing would be asked there."""
     from dataclasses import replace
@@ -135,6 +140,7 @@ def test_far_starts_are_ten_times_off_and_the_true_ones_are_not(index, tmp_path)
     assert set(np.round(np.log10(ratios), 6)) <= {-1.0, 1.0}
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("index", range(6))
 def test_a_useless_simulation_cannot_follow(index):
     key = WORLDS["useless"].draw(3, index, False, index).key
@@ -142,6 +148,7 @@ def test_a_useless_simulation_cannot_follow(index):
     assert key.follows <= MOST_FOLLOWED
 
 
+@pytest.mark.e2e
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_the_right_simulation_can_follow(system):
     """So that a small share means a useless simulation and not a poor fit."""

@@ -112,6 +112,7 @@ def test_responses_are_those_of_the_true_system(system):
     np.testing.assert_allclose(linear, true, atol=0.02 * np.abs(true).max())
 
 
+@pytest.mark.e2e
 def test_under_a_push_traces_that_look_like_it_weigh_less():
     """Draws of noise and push together are white of variance one in that metric, in the mean over many."""
     scene, errors = scene_of("tanks")
