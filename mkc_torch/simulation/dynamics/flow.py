@@ -18,10 +18,36 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-__all__ = ["flow_along", "flow_of"]
+__all__ = ["flow_along", "flow_of", "plausible_rates"]
 
 _ABOUT = 0.1
 """Share of its spread by which a state may be off at least."""
+
+
+_USUAL = 0.99
+"""Quantile of a state's rates over a recording that process noise may be as large as."""
+
+
+def plausible_rates(
+    prepared: Observable, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None
+) -> Float[np.ndarray, " p"]:
+    """Sizes of process noise of each rate that are plausible: as large as the rates that this recording shows.
+
+    Args:
+        prepared: the simulation.
+        theta, changes, near: of its trajectory.
+    """
+    system = prepared.system
+    n = len(system.states)
+    states = prepared.trajectory(theta, changes, near).states.detach()
+    free = prepared.observed(None)
+    rates = free.rate(theta, changes)(prepared.grid.spread(states[:, : states.shape[1] - len(prepared.lasting)]))
+    shown = torch.quantile(rates[::3, :n].detach().abs(), _USUAL, 0)
+    span = states[:, :n].amax(0) - states[:, :n].amin(0)
+    lasted = (prepared.time[-1] - prepared.time[0]).clamp(min=torch.finfo(span.dtype).tiny)
+    places = [system.states.index(name) for name in prepared.pushable]
+    largest: np.ndarray = torch.maximum(shown, span / lasted)[places].double().cpu().numpy()
+    return largest
 
 
 def flow_of(
