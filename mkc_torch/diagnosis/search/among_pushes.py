@@ -13,19 +13,18 @@ from torch import Tensor
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_beside
-from mkc_torch.diagnosis.model.in_the_world import beside_effects, between_beside_effects, noise_around, pushed
+from mkc_torch.diagnosis.model.in_the_world import beside_effects, between_beside_effects, pushed
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, continuous
 from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
 from mkc_torch.diagnosis.search.locate import Located
 from mkc_torch.diagnosis.search.look import Scene
+from mkc_torch.diagnosis.search.own_noise import noise_of_fit, priced, with_own_noise
 from mkc_torch.diagnosis.search.preference import Preference
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.ties import in_order
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
-from mkc_torch.simulation.dynamics.noise import NoiseOfTheWorld, noise_of
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 __all__ = ["located_among_pushes"]
@@ -49,7 +48,6 @@ def located_among_pushes(
     generator: torch.Generator,
     declared: Mapping[str, float],
     fixed: Mapping[str, str],
-    free: FittedModel | None = None,
     settings: Settings,
 ) -> Located:
     """The strongest candidate beside a fit under pushes.
@@ -62,7 +60,6 @@ def located_among_pushes(
         generator: of the draws.
         declared: standard deviation of the white noise of outputs that it is known of.
         fixed: what inputs do between samples that it is known of.
-        free: the same as it runs freely; None where that loses the recording.
         settings: the numbers that decide.
 
     Raises:
@@ -94,7 +91,7 @@ def located_among_pushes(
         common = base.model.prepared, [terms[number] for number in chosen]
         first = at_once([partial(_fit_of, base, terms[number], found, number) for number in chosen], *common)
         chosen, first = _within_reach(chosen, first, [prefer.score_with_shape(fit, base) for fit in first], settings)
-        works = [partial(_with_own_noise, fit, declared, settings) for fit in first]
+        works = [partial(with_own_noise, fit, declared, settings) for fit in first]
         fits = at_once(works, *common)
         best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer, settings)
         best = beside_effects(best, noise_of_fit(best, declared), declared, settings.noise)
@@ -111,6 +108,7 @@ def located_among_pushes(
         look.linearised,
         compared=fits,
         longer=found.longer,
+        with_noise=True,
     )
 
 
@@ -178,33 +176,6 @@ def _within_reach(
     return [chosen[place] for place in kept], [fits[place] for place in kept]
 
 
-def _with_own_noise(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> FittedModel:
-    """The joint fit of a candidate with the noise that is left beside it at its likeliest sizes, and its shape too."""
-    noise = noise_around(fit, declared, settings.noise, noise_of_fit(fit, declared))
-    prepared = fit.model.prepared
-    if noise is None or not isinstance(prepared, PreparedDynamics):
-        return shape_fitted(fit)
-    model = JointModel(prepared.observed(noise.observer), fit.model.terms, fit.model.near)
-    try:
-        again = fitted(model, fit.parameters, fit.bound, graduate=False)
-    except NoFitError:
-        return shape_fitted(fit)
-    return shape_fitted(again if priced(again, settings) > priced(fit, settings) else fit)
-
-
-def priced(fit: FittedModel, settings: Settings) -> float:
-    """Log-likelihood less the price of the disturbances in a fit's noise."""
-    prepared = fit.model.prepared
-    observer = prepared.observer if isinstance(prepared, PreparedDynamics) else None
-    return fit.log_likelihood - settings.noise.pushed * (0 if observer is None else len(observer.disturbances))
-
-
-def noise_of_fit(fit: FittedModel, declared: Mapping[str, float]) -> NoiseOfTheWorld | None:
-    """The noise that a fit is under."""
-    prepared = fit.model.prepared
-    return noise_of(prepared, declared) if isinstance(prepared, PreparedDynamics) else None
-
-
 def _needless(base: FittedModel, best: FittedModel, declared: Mapping[str, float], settings: Settings) -> bool:
     """Whether the noise that was found beside an effect does as much without it.
 
@@ -219,7 +190,7 @@ def _needless(base: FittedModel, best: FittedModel, declared: Mapping[str, float
         without = fitted(model, best.parameters[:own], base.bound, graduate=False)
     except NoFitError:
         return False
-    bare = _with_own_noise(without, declared, settings)
+    bare = with_own_noise(without, declared, settings)
     price = 0.5 * (best.model.size - own) * math.log(len(base.residual))
     return priced(best, settings) - priced(bare, settings) < price
 
@@ -234,9 +205,7 @@ def _by_own_noise(
     settings: Settings,
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
     """The likeliest of the fits, and the ranking with how far each is behind it; others are behind all of them."""
-    scores = [
-        prefer.score_with_shape(fit, base) + (priced(fit, settings) - fit.log_likelihood) for fit in fits
-    ]
+    scores = [prefer.score_with_shape(fit, base) + (priced(fit, settings) - fit.log_likelihood) for fit in fits]
     best = in_order(scores, [fit.model.terms[-1] for fit in fits])[0]
     behind: dict[Key, tuple[float, int]] = {}
     for number, score in zip(chosen, scores, strict=True):
