@@ -12,7 +12,7 @@ import torch
 
 from mkc_torch._parallel.pool import meanwhile
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
-from mkc_torch.diagnosis.evidence.simpler_form import simplified
+from mkc_torch.diagnosis.evidence.simpler_form import simpler_by_price, simplified
 from mkc_torch.diagnosis.evidence.unrecorded_cause import course_without, located_cause
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
@@ -210,7 +210,12 @@ def _taken_up(
         return replace(over, unconfirmed=located)
     if len(search.found) == asked.max_findings:
         return replace(over, cut=True)
-    fit, simpler = simplified(located.fit, after, search.blocks, holds, asked.settings.naming)
+    fit, simpler = located.fit, after
+    if located.with_noise:
+        fit = simpler_by_price(located.fit, asked.declared, asked.settings)
+        simpler = after if fit is located.fit else held_out(fit, search.blocks)
+    else:
+        fit, simpler = simplified(located.fit, after, search.blocks, holds, asked.settings.naming)
     paired = simpler if same is None or fit is not located.fit else paired
     after = simpler
     found = (*search.found, replace(located, fit=fit))

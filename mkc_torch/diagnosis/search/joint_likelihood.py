@@ -1,8 +1,8 @@
 """Noise and physics chosen together: what each candidate gains when every model has the noise that suits it best.
 
-Under the noise that is likeliest without a candidate nearly all that it does can be process noise, and little is left to
-be gained. So the likelihood with a candidate and that without are each the largest over the same models of the noise,
-for the recording and for draws alike. A candidate's gain counts how far the disturbance falls.
+Under the noise that is likeliest without a candidate, nearly all that the candidate does can be process noise. So the
+likelihood with a candidate and that without are each the largest over the same models of the noise, for the recording
+and for draws alike. A candidate's gain counts how far the disturbance falls.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.likelihoods import Columns, LogLikelihoods, log_likelihoods
 from mkc_torch.simulation.dynamics.disturbances import NoiseModel, filter_models, observer_of
-from mkc_torch.simulation.dynamics.flow import flow_of, plausible_rates
+from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid, key_of
 from mkc_torch.simulation.dynamics.observer import Observable, Observer, clipped_slope
@@ -110,10 +110,11 @@ class _Scene:
     counted: Flow
     series: SeriesAlong
     columns: Columns
+    largest: Float[np.ndarray, " p+m"]
 
     def likelihoods(self, models: Sequence[NoiseModel], draws: SeriesAlong | None = None) -> LogLikelihoods:
         series = self.series if draws is None else joined(self.series, draws)
-        return log_likelihoods(self.counted, models, series, self.columns)
+        return log_likelihoods(self.counted, models, series, self.columns, self.largest)
 
     def residual(self, number: int | None, model: NoiseModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The recording whitened beside a candidate (N, m), the candidate's sizes and the parameters' shift."""
@@ -173,9 +174,7 @@ def joint_likelihood(
     size = base.residual.square().mul(counts).sum(0).div(counts.sum(0).clamp(min=1.0)).sqrt()
     sensor = (size if observer is None else observer.sensor).tolist()
     white = NoiseModel(tuple(max(one, 1e-300) for one in sensor), (), tuple(declared) or (False,) * len(channels))
-    theta, changes = base.parameters[: base.model.base], base.model.changes(base.parameters)
-    largest = plausible_rates(prepared, theta, changes, base.model.near)
-    grid = NoiseGrid(scene.counted, white, largest)
+    grid = NoiseGrid(scene.counted, white)
     known = [] if observer is None else [NoiseModel.of(observer.disturbances, sensor, names, channels, white.known)]
     keys = [term.key for term in terms]
     found = _refined(scene, grid, [one for one in known if grid.plausible(one)], keys)
@@ -219,7 +218,9 @@ def _scene(base: FittedModel, terms: Sequence[Term], tangents: Tangents, counts:
         tuple(one.shape[-1] for one in tangents.candidates),
         tuple(term.effect.one_sided for term in terms),
     )
-    return _Scene(prepared, flow, counted, series, columns)
+    theta, changes = base.parameters[: model.base], model.changes(base.parameters)
+    largest = plausible_sizes(prepared, theta, changes, model.near)
+    return _Scene(prepared, flow, counted, series, columns, largest)
 
 
 def _along(flow: Flow, prepared: PreparedDynamics, residual: Tensor, moved: Float[np.ndarray, "N m K"]) -> SeriesAlong:

@@ -87,14 +87,21 @@ class LogLikelihoods:
         )
 
 
-def log_likelihoods(flow: Flow, models: Sequence[NoiseModel], series: SeriesAlong, columns: Columns) -> LogLikelihoods:
-    """The log-likelihoods.
+def log_likelihoods(
+    flow: Flow,
+    models: Sequence[NoiseModel],
+    series: SeriesAlong,
+    columns: Columns,
+    largest: Float[np.ndarray, " p+m"] | None = None,
+) -> LogLikelihoods:
+    """The log-likelihoods; -inf where a disturbance, at the likeliest scale, is larger than is plausible.
 
     Args:
         flow: of the trajectory; its ``counts`` say which samples count.
         models: of the noise, alike in which outputs' white noise is declared.
         series: Y series to explain, the recording's the first one.
         columns: what may explain them.
+        largest: plausible size of a disturbance of each rate and each output, in their units; None for any.
     """
     B, C, Y = len(models), len(columns.sizes), series.count
     gains = gains_of(flow, filter_models(flow, models))
@@ -116,16 +123,17 @@ def log_likelihoods(flow: Flow, models: Sequence[NoiseModel], series: SeriesAlon
         norm = np.maximum(np.linalg.norm(candidates, axis=0), 1e-300)
         rest /= norm
         power = np.square(left).sum(0)
-        without[number] = level + _log_likelihood(power, n, free)
+        reach = _reach(models[number], largest)
+        without[number] = np.where(_scale(power, n, free) <= reach, level + _log_likelihood(power, n, free), -np.inf)
         inner = rest.T @ left
         for members, index in groups:
             explained, solved, found = _explained(rest, inner, members, index, columns.one_sided)
             remains = np.maximum(power - explained, 1e-12 * power)
-            beside[number, members] = level + _log_likelihood(remains, n, free)
+            size = _scale(remains, n, free)
+            beside[number, members] = np.where(size <= reach, level + _log_likelihood(remains, n, free), -np.inf)
             sizes[number, index] = solved / norm[index]
             rank[members] = np.maximum(rank[members], found)
-            if free:
-                scale[number, members] = np.sqrt(remains[:, 0] / max(n, 1))
+            scale[number, members] = size[:, 0]
     return LogLikelihoods(tuple(models), without, beside, sizes, rank, scale)
 
 
@@ -153,6 +161,18 @@ def _log_likelihood(power: Float[np.ndarray, "*c Y"], n: int, free: bool) -> Flo
         return -0.5 * power
     result: np.ndarray = -0.5 * n * np.log(np.maximum(power, 1e-300) / max(n, 1))
     return result
+
+
+def _scale(power: Float[np.ndarray, "*c Y"], n: int, free: bool) -> Float[np.ndarray, "*c Y"]:
+    """Of the noise, over that of its model."""
+    return np.sqrt(power / max(n, 1)) if free else np.ones_like(power)
+
+
+def _reach(model: NoiseModel, largest: Float[np.ndarray, " p+m"] | None) -> float:
+    """Scale up to which the disturbances of a model are of a plausible size."""
+    if largest is None:
+        return np.inf
+    return min((float(largest[place]) / size for place, size, _ in model.pushes if size > 0.0), default=np.inf)
 
 
 def _explained(

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.observer import Observable
 from mkc_torch.simulation.dynamics.trajectory import carried, slopes
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-__all__ = ["flow_along", "flow_of", "plausible_rates"]
+__all__ = ["flow_along", "flow_of", "plausible_sizes"]
 
 _ABOUT = 0.1
 """Share of its spread by which a state may be off at least."""
@@ -28,10 +29,16 @@ _USUAL = 0.99
 """Quantile of a state's rates over a recording that process noise may be as large as."""
 
 
-def plausible_rates(
+_SLOW = 0.5
+"""Share of an output's robust variation that a slow error of its sensor may have at most."""
+
+
+def plausible_sizes(
     prepared: Observable, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None
-) -> Float[np.ndarray, " p"]:
-    """Sizes of process noise of each rate that are plausible: as large as the rates that this recording shows.
+) -> Float[np.ndarray, " p+m"]:
+    """Plausible sizes of process noise of each rate, and of a slow error of each output, in their units.
+
+    Process noise is no larger than the rates that this recording shows; a sensor's error is smaller than what it shows.
 
     Args:
         prepared: the simulation.
@@ -46,7 +53,9 @@ def plausible_rates(
     span = states[:, :n].amax(0) - states[:, :n].amin(0)
     lasted = (prepared.time[-1] - prepared.time[0]).clamp(min=torch.finfo(span.dtype).tiny)
     places = [system.states.index(name) for name in prepared.pushable]
-    largest: np.ndarray = torch.maximum(shown, span / lasted)[places].double().cpu().numpy()
+    varies = _SLOW * robust_scale(prepared.measured - prepared.measured.median(0).values)
+    varies = torch.where(varies > 0, varies, torch.inf)
+    largest: np.ndarray = torch.cat([torch.maximum(shown, span / lasted)[places], varies]).double().cpu().numpy()
     return largest
 
 

@@ -5,15 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mkc_torch.simulation.dynamics.disturbances import NoiseModel, longest_run, usual_size
 from mkc_torch.simulation.dynamics.kalman import Flow
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 __all__ = ["NoiseGrid", "key_of"]
 
@@ -37,12 +33,10 @@ class NoiseGrid:
     Attributes:
         flow: of the trajectory.
         white: the sensors' white noise alone.
-        largest: (p,), size of process noise of each rate above which it is not plausible, in the rate's unit.
     """
 
     flow: Flow
     white: NoiseModel
-    largest: Float[np.ndarray, " p"]
 
     def singles(self) -> list[NoiseModel]:
         """White noise alone, and one disturbance of each place, size and time constant beside it."""
@@ -83,8 +77,9 @@ class NoiseGrid:
                 for by in (1.0, factor, 1.0 / factor)
                 if lasting > 0 and by != f
             ]
-            for other in sizes + times:
-                found.append(replace(model, pushes=(*model.pushes[:d], other, *model.pushes[d + 1 :])))
+            found += [
+                replace(model, pushes=(*model.pushes[:d], other, *model.pushes[d + 1 :])) for other in sizes + times
+            ]
         several = len(model.sensor) > 1
         for j, known in enumerate(model.known):
             if several and not known:
@@ -95,12 +90,9 @@ class NoiseGrid:
         return [one for one in found if self.plausible(one)]
 
     def plausible(self, model: NoiseModel) -> bool:
-        """Whether each disturbance is of a size and a time constant that this recording can show."""
-        p = self.flow.rates
+        """Whether each disturbance is of a time constant that this recording can show."""
         return all(
-            (place >= p or size <= self.largest[place])
-            and (lasting == 0.0 or _SHORTEST * self._step <= lasting <= self._longest)
-            for place, size, lasting in model.pushes
+            lasting == 0.0 or _SHORTEST * self._step <= lasting <= self._longest for _, _, lasting in model.pushes
         )
 
     @property

@@ -175,12 +175,13 @@ def _filtered(flow: Flow, gains: Gains, part: slice, series: SeriesAlong) -> Flo
     N, m, K = series.new.shape
     count = 1 if N <= _WHOLE else -(-N // _STRETCH)
     way = _Stretches.of(flow, gains, part, series, count)
-    start = np.zeros((count, way.B, way.k, K))
+    B, k = way.carry.shape[2:4]
+    start = np.zeros((count, B, k, K))
     if count > 1:
         end, passed_on = way.run(start)[1:]
         for g in range(count - 1):
             start[g + 1] = end[g] + passed_on[g] @ start[g]
-    return way.run(start)[0].reshape(-1, way.B, m, K)[:N]
+    return way.run(start)[0].reshape(-1, B, m, K)[:N]
 
 
 @dataclass(frozen=True)
@@ -193,14 +194,6 @@ class _Stretches:
     white: Float[np.ndarray, "L G B m m"]
     new: Float[np.ndarray, "L G m K"]
     shift: Float[np.ndarray, "L G n K"]
-
-    @property
-    def B(self) -> int:
-        return self.carry.shape[2]
-
-    @property
-    def k(self) -> int:
-        return self.carry.shape[-1]
 
     @classmethod
     def of(cls, flow: Flow, gains: Gains, part: slice, series: SeriesAlong, count: int) -> _Stretches:
