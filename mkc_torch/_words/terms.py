@@ -104,6 +104,7 @@ TERMS: dict[str, str] = {
     "evidence.surely": "surely better on [unit.unseen_blocks]",
     "evidence.probably": "probably better on [unit.unseen_blocks], not surely",
     "evidence.not_shown": "not shown to be better on [unit.unseen_blocks]",
+    "evidence.not_against": "[unit.unseen_blocks] do not speak against it",
     "evidence.worse": "worse on [unit.unseen_blocks]",
     "evidence.because": "{better}: {reason}",
     "evidence.blocks_differ": "from block to block the gain differs by more than itself, so it may be chance",

@@ -139,9 +139,9 @@ def diagnose(
     if missed:
         # one effect may be what it lacks to follow; what it lacks beside that is told once it follows
         asked = replace(asked, max_findings=min(max_findings, 1))
-    hopeless = lost_from_the_start(world, declared, settings.evidence)
+    hopeless = lost_from_the_start(world)
     progress(f"trying {len(terms)} effects")
-    search = begun(base, () if hopeless else terms, asked, generator, world.free)
+    search = begun(base, () if hopeless else terms, asked, generator)
 
     def case(search: Search) -> Case:
         free = running_freely(base, world.free, search.found, search.evidence, search.blocks)

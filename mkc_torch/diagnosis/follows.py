@@ -16,7 +16,7 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["follows_of", "misses", "size_of", "units_of"]
+__all__ = ["follows_of", "misses", "pooled", "size_of", "units_of"]
 
 _FAR = 5.0
 """Robust standard deviations from the median at which a value ends, for a mean that outliers do not move."""
@@ -92,6 +92,14 @@ def follows_of(
 def misses(follows: Sequence[Follows], least: float) -> tuple[Follows, ...]:
     """The outputs that the simulation does not follow: less than this share of their variation is explained."""
     return tuple(one for one in follows if not one.explained >= least)
+
+
+def pooled(follows: Sequence[Follows]) -> float:
+    """Share of the variation that is explained, of all outputs together, each by its own variation.
+
+    A lost output explains nothing; worse than its mean is no better than that.
+    """
+    return sum(max(one.explained, 0.0) for one in follows) / len(follows) if follows else 0.0
 
 
 def _middle(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:

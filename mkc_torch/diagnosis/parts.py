@@ -128,7 +128,8 @@ class HeldOut:
     """Evidence on blocks that the fit has not seen; the gain in nats per sample, with its 95 % interval.
 
     ``outputs`` has each output's residuals; ``left`` says of which blocks the free run leaves the recording's range,
-    which enter no mean, and is empty where none does.
+    which enter no mean, and is empty where none does. Where noise and physics were chosen together the blocks can speak
+    against a finding but do not decide: one step ahead any process noise predicts as well.
     """
 
     log_likelihood_gain: float
@@ -138,6 +139,7 @@ class HeldOut:
     unit: str
     outputs: Mapping[str, Sizes] = field(default_factory=dict)
     left: str = ""
+    decides: bool = True
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,7 +12,7 @@ import torch
 
 from mkc_torch._parallel.pool import meanwhile
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
-from mkc_torch.diagnosis.evidence.simpler_form import simplified
+from mkc_torch.diagnosis.evidence.simpler_form import simpler_by_price, simplified
 from mkc_torch.diagnosis.evidence.unrecorded_cause import course_without, located_cause
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
@@ -22,6 +23,7 @@ from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.noise.colour import correlation_time
 from mkc_torch.diagnosis.noise.innovations import innovation_gain
 from mkc_torch.diagnosis.search.among_pushes import located_among_pushes
+from mkc_torch.diagnosis.search.elimination import needless_term, without
 from mkc_torch.diagnosis.search.first_look import p_value_beside
 from mkc_torch.diagnosis.search.locate import Located, locate
 from mkc_torch.diagnosis.search.preference import alike
@@ -62,6 +64,8 @@ def _holds(
     """
     difference = after.log_likelihood - before.log_likelihood
     gain, (low, high) = gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))
+    if first and located.with_noise:
+        return high >= 0.0
     if first:
         plain = located.beyond > settings.beyond_doubt and high > 0.0
         price = 0.5 * located.fit.model.sizes[-1] * math.log(len(after.log_likelihood))
@@ -102,7 +106,6 @@ def begun(
     terms: tuple[Term, ...],
     asked: Asked,
     generator: torch.Generator,
-    free: FittedModel | None = None,
 ) -> Search:
     """The first search, and its finding, if unseen blocks confirm it."""
     prepared = base.model.prepared
@@ -112,7 +115,7 @@ def begun(
     first = None
     with meanwhile([partial(held_out, base, blocks)], common_parts(prepared, ())) as judged:
         if terms:
-            first = _located(base, terms, asked, generator, free=free)
+            first = _located(base, terms, asked, generator)
         [evidence] = judged()
     begun = Search(first, (), None, blocks, (evidence,), terms)
     if first is None:
@@ -146,7 +149,6 @@ def _located(
     generator: torch.Generator,
     *,
     parts: bool = True,
-    free: FittedModel | None = None,
 ) -> Located:
     if pushed(fit):
         return located_among_pushes(
@@ -157,7 +159,6 @@ def _located(
             generator=generator,
             declared=asked.declared,
             fixed=asked.fixed,
-            free=free,
             settings=asked.settings,
         )
     return locate(
@@ -201,7 +202,7 @@ def _taken_up(
             one, before, evidence, search.blocks, asked.seed, asked.settings.confirmation, first=not search.found
         )
 
-    same = _under_the_same(beside, located.fit)
+    same = None if located.with_noise else _under_the_same(beside, located.fit)
     paired = (
         after if same is None else _surer(before, (held_out(same, search.blocks), after), search.blocks, asked.seed)
     )
@@ -209,7 +210,12 @@ def _taken_up(
         return replace(over, unconfirmed=located)
     if len(search.found) == asked.max_findings:
         return replace(over, cut=True)
-    fit, simpler = simplified(located.fit, after, search.blocks, holds, asked.settings.naming)
+    fit, simpler = located.fit, after
+    if located.with_noise:
+        fit = simpler_by_price(located.fit, asked.declared, asked.settings)
+        simpler = after if fit is located.fit else held_out(fit, search.blocks)
+    else:
+        fit, simpler = simplified(located.fit, after, search.blocks, holds, asked.settings.naming)
     paired = simpler if same is None or fit is not located.fit else paired
     after = simpler
     found = (*search.found, replace(located, fit=fit))
@@ -217,9 +223,34 @@ def _taken_up(
     left = tuple(t for t in search.left if not _same(t, located.term, near, asked.settings))
     pairs = (*search.pairs, (before, paired))
     taken = replace(search, found=found, evidence=(*search.evidence, after), pairs=pairs, left=left)
+    if located.with_noise:
+        taken = _eliminated(taken, asked)
+    found = taken.found
     # a p-value of 0 is that of a look that sees nothing
     full = len(found) == asked.max_findings and not 0.0 < _beside(taken, asked) <= asked.level
     return replace(taken, left=()) if full else taken
+
+
+def _eliminated(search: Search, asked: Asked) -> Search:
+    """Without findings whose effect the others have taken over; what is left is one model, fitted anew."""
+    declared, settings = asked.declared, asked.settings
+    while len(search.found) > 1:
+        final = search.found[-1].fit
+        number = needless_term(final, declared, settings)
+        fit = None if number is None else without(final, number, declared, settings)
+        if number is None or fit is None:
+            break
+        kept = [one for place, one in enumerate(search.found) if place != number]
+        fits = [fit]
+        while len(fits[0].model.terms) > 1:
+            less = without(fits[0], len(fits[0].model.terms) - 1, declared, settings)
+            if less is None:
+                return search
+            fits.insert(0, less)
+        found = tuple(replace(one, fit=each, term=each.model.terms[-1]) for one, each in zip(kept, fits, strict=True))
+        evidence = (search.evidence[0], *(held_out(each, search.blocks) for each in fits))
+        search = replace(search, found=found, evidence=evidence, pairs=tuple(itertools.pairwise(evidence)))
+    return search
 
 
 def _surer(before: Evidence, ways: Sequence[Evidence], blocks: HeldOutBlocks, seed: int) -> Evidence:

@@ -258,7 +258,8 @@ class EvidenceSettings(_Stage):
         white_level: share of white channels that are called correlated, half of it by either criterion (Ljung & Box,
             Biometrika 65, 1978; Bartlett, J. R. Stat. Soc. Suppl. 8, 1946).
         followed: share of an output's variation that a free run has to explain to follow it at all.
-        mended: the same with findings, for them to make a simulation follow that does not by itself.
+        useful: share of all outputs' variation, each by its own, that the best model's free run has to explain for a
+            simulation that does not follow to be judged at all.
         above_floor: times a declared noise floor above which a residual is more than the sensor's noise.
         shape_level: chance with which a free curve is as much better where a name's shape is right, below which the
             name is but the nearest in the catalogue, and
@@ -282,7 +283,7 @@ class EvidenceSettings(_Stage):
     student_closer: float = 0.5
     white_level: float = 0.01
     followed: float = 0.5
-    mended: float = 0.9
+    useful: float = 0.35
     above_floor: float = 1.5
     shape_level: float = 0.001
     shape_nats: float = 6.0

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from mkc_torch.diagnosis.findings.pushes import forcing_of, pushes_of
-from mkc_torch.diagnosis.findings.reasons import at_ends, reasons_of, wrong_turns
-from mkc_torch.diagnosis.follows import follows_of, misses
+from mkc_torch.diagnosis.findings.reasons import reasons_of, wrong_turns
+from mkc_torch.diagnosis.follows import follows_of, misses, pooled
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.in_the_world import InTheWorld, freed, noise_around
 from mkc_torch.diagnosis.result import Finding
@@ -28,7 +28,6 @@ class Around:
 
     follows: tuple[Follows, ...]
     corrected: tuple[Follows, ...]
-    ends: tuple[str, ...]
     noise: NoiseOfTheWorld | None
     lost: bool = False
 
@@ -38,7 +37,8 @@ class Around:
             return True
         if not misses(self.follows, settings.followed):
             return False
-        return not self.corrected or bool(self.ends) or bool(misses(self.corrected, settings.mended))
+        shares = [pooled(one) for one in (self.follows, self.corrected) if one]
+        return not shares or max(shares) < settings.useful
 
 
 def alone(base: InTheWorld, declared: Mapping[str, float]) -> tuple[Follows, ...]:
@@ -49,11 +49,9 @@ def alone(base: InTheWorld, declared: Mapping[str, float]) -> tuple[Follows, ...
     return follows_of(prepared, None if free is None else free.residual, declared, floor)
 
 
-def lost_from_the_start(base: InTheWorld, declared: Mapping[str, float], settings: EvidenceSettings) -> bool:
-    """Whether nothing is to be searched: it does not follow, and its turns or parameters are what they cannot be."""
-    if wrong_turns(base.fit.model.prepared):
-        return True
-    return bool(misses(alone(base, declared), settings.followed)) and bool(at_ends(base.fit))
+def lost_from_the_start(base: InTheWorld) -> bool:
+    """Whether nothing is to be searched: its recorded turns are what they cannot be."""
+    return bool(wrong_turns(base.fit.model.prepared))
 
 
 def around(base: InTheWorld, final: FittedModel, declared: Mapping[str, float], noise: NoiseSettings) -> Around:
@@ -72,7 +70,7 @@ def around(base: InTheWorld, final: FittedModel, declared: Mapping[str, float], 
         free = freed(final)
         floor = [one.noise_floor for one in follows]
         corrected = () if free is None else follows_of(free.model.prepared, free.residual, declared, floor)
-    return Around(follows, corrected, at_ends(final), left, bool(wrong_turns(final.model.prepared)))
+    return Around(follows, corrected, left, bool(wrong_turns(final.model.prepared)))
 
 
 def world_of(base: InTheWorld, final: FittedModel, known: Around, *, unfit: bool) -> World:
@@ -113,7 +111,9 @@ def verdict_of(
     """
     if known.unfit(settings):
         return "unfit"
-    pushed = known.noise is not None and bool(known.noise.disturbed.disturbances)
+    disturbances = () if known.noise is None else known.noise.disturbed.disturbances
+    # beside a finding a sensor's own slow error is noise, and told as that
+    pushed = any(one.at_rate or not findings for one in disturbances)
     above = [
         one
         for one in (known.corrected if findings else known.follows)

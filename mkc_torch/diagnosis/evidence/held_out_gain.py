@@ -43,7 +43,8 @@ def test(case: Case) -> Told:
     outputs, left = sizes_of(case.prepared, case.units, before, after, case.blocks)
     one = next(iter(outputs.values())) if len(outputs) == 1 and case.of_states else None
     sizes = (case.rms(before), case.rms(after)) if one is None else (one.before, one.after)
-    return said(HeldOut(gain, interval, *sizes, case.prepared.unit, outputs, left), note)
+    held = HeldOut(gain, interval, *sizes, case.prepared.unit, outputs, left, not case.located.with_noise)
+    return said(held, note)
 
 
 def said(held: HeldOut | None, note: str) -> Told:

@@ -1,18 +1,27 @@
-"""What was found under pushes, fitted to its free run again: what residuals are told of, and pictures show."""
+"""What was found beside noise, as a free run: what residuals are computed from, and pictures show."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
 
+from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.density.fit import fit_density
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_out
 from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.in_the_world import freed, pushed
+from mkc_torch.diagnosis.model.in_the_world import at_liberty, freed, pushed
+from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.search.locate import Located
+from mkc_torch.functional import mkc_nll, mkc_weight
 from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 __all__ = ["RunningFreely", "running_freely"]
+
+
+_REACH = 3.0
+"""Robust scales of a residual that the domain of its density reaches to at least."""
 
 
 @dataclass(frozen=True)
@@ -34,28 +43,74 @@ def running_freely(
     """The free runs; what was found as it is, where one of them loses the recording.
 
     Args:
-        base: the simulation alone, perhaps under pushes.
+        base: the simulation alone, perhaps under process noise.
         alone: as it runs freely; None where that loses the recording.
-        found: with one finding more each, under the pushes that are left.
+        found: with one finding more each, under the noise that is left.
         evidence: of these on blocks.
         blocks: the blocks.
     """
     as_it_is = RunningFreely(base, found, evidence)
-    if not any(pushed(fit) for fit in (base, *(one.fit for one in found))):
+    if not any(pushed(fit) for fit in (base, *(one.fit for one in found))) or alone is None:
         return as_it_is
-    free = [alone, *(freed(one.fit) for one in found)]
-    if any(one is None for one in free):
+    works = [
+        partial(_released if _of_sensors(one.fit) else _refitted, one.fit, known, blocks)
+        for one, known in zip(found, evidence[1:], strict=True)
+    ]
+    runs = at_once([partial(_judged, alone, evidence[0], blocks), *works], alone.model.prepared)
+    known_runs = [one for one in runs if one is not None]
+    if len(known_runs) < len(runs):
         return as_it_is
-    fits = [one for one in free if one is not None]
-    judged = at_once([partial(_judged, fit, blocks) for fit in fits], fits[0].model.prepared)
-    if any(one is None for one in judged):
-        return as_it_is
-    again = tuple(replace(one, fit=fit) for one, fit in zip(found, fits[1:], strict=True))
-    return RunningFreely(fits[0], again, tuple(one for one in judged if one is not None))
+    again = tuple(replace(one, fit=fit) for one, (fit, _) in zip(found, known_runs[1:], strict=True))
+    return RunningFreely(known_runs[0][0], again, tuple(judged for _, judged in known_runs))
 
 
-def _judged(fit: FittedModel, blocks: HeldOutBlocks) -> Evidence | None:
+def _of_sensors(fit: FittedModel) -> bool:
+    """Whether only errors of sensors are left beside a fit: its parameters are then those of a free run."""
+    prepared = fit.model.prepared
+    observer = prepared.observer if isinstance(prepared, PreparedDynamics) else None
+    return observer is not None and not any(one.at_rate for one in observer.disturbances)
+
+
+_Run = tuple[FittedModel, Evidence]
+
+
+def _released(fit: FittedModel, known: Evidence, blocks: HeldOutBlocks) -> _Run | None:
+    """The free run at a fit's own parameters, on all samples and, at each fold's, on blocks."""
+    model = JointModel(at_liberty(fit.model.prepared), fit.model.terms, fit.model.near)
+    residual = model.residual(fit.parameters).detach()
+    if not bool(residual.isfinite().all()):
+        return _refitted(fit, known, blocks)
+    unseen = residual.clone()
+    for number, parameters in enumerate(known.parameters):
+        out = model.residual(parameters).detach()
+        seen = blocks.fold == number
+        unseen[seen] = out[seen]
+    if not bool(unseen.isfinite().all()):
+        return _refitted(fit, known, blocks)
+    bound = fit.bound.maximum(_REACH * robust_scale(residual))
+    density = fit_density(residual, bound=bound)
+    sigma, d = density.sigma, density.d
+    free = replace(
+        fit,
+        model=model,
+        residual=residual,
+        sigma=sigma,
+        d=d,
+        weights=mkc_weight(residual, sigma, d),
+        bound=bound,
+        log_likelihood=-float(mkc_nll(residual, sigma, d, bound).sum()),
+    )
+    return free, replace(known, residual=unseen, sigma=sigma, d=d)
+
+
+def _refitted(fit: FittedModel, _: Evidence, blocks: HeldOutBlocks) -> _Run | None:
+    """A fit of the free run: parameters beside process noise may need it."""
+    free = freed(fit)
+    return None if free is None else _judged(free, None, blocks)
+
+
+def _judged(fit: FittedModel, _: Evidence | None, blocks: HeldOutBlocks) -> _Run | None:
     try:
-        return held_out(fit, blocks)
+        return fit, held_out(fit, blocks)
     except NoFitError:
         return None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,14 +12,15 @@ from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.noise.innovations import either_way
-from mkc_torch.diagnosis.settings import NamingSettings
+from mkc_torch.diagnosis.search.own_noise import priced, with_own_noise
+from mkc_torch.diagnosis.settings import NamingSettings, Settings
 from mkc_torch.nonlinear import NoFitError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-__all__ = ["simplified"]
+__all__ = ["simpler_by_price", "simplified"]
 
 Holds = Callable[[FittedModel, Evidence], bool]
 
@@ -57,13 +59,41 @@ def simplified(
     return fit, evidence
 
 
+def simpler_by_price(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> FittedModel:
+    """The fit with the simpler form of each effect that the recording does not tell from it.
+
+    Each form has the noise that it leaves; the recording tells them apart by more nats than the numbers between them
+    cost (Schwarz), and than rivals have to differ by.
+
+    Args:
+        fit: with all effects that were found.
+        declared: standard deviation of the white noise of outputs that it is known of.
+        settings: the numbers that decide.
+    """
+    for number in range(len(fit.model.terms)):
+        start = _simpler(fit, number)
+        if start is None:
+            continue
+        model, parameters = start
+        try:
+            other = with_own_noise(fitted(model, parameters, fit.bound, graduate=False), declared, settings)
+        except NoFitError:
+            continue
+        price = 0.5 * (fit.model.size - model.size) * math.log(len(fit.residual))
+        if priced(fit, settings) - priced(other, settings) < max(price, settings.naming.separable):
+            fit = other
+    return fit
+
+
 def _simpler(fit: FittedModel, number: int) -> tuple[JointModel, Float[Tensor, " p"]] | None:
     """The model with the simpler form of one effect, and where to start; None where there is none."""
     terms = list(fit.model.terms)
     simpler = terms[number].effect.simpler
     if simpler is None:
         return None
-    terms[number] = replace(terms[number], effect=simpler)
+    known = simpler.shapes(fit.model.prepared.time)[0]
+    shape = {name: value for name, value in terms[number].shape.items() if name in known}
+    terms[number] = replace(terms[number], effect=simpler, shape=shape)
     model = JointModel(fit.model.prepared, terms, fit.model.near)
     size = model.sizes[number]
     if size >= fit.model.sizes[number]:

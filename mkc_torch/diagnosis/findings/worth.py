@@ -20,6 +20,7 @@ __all__ = [
     "grade_of",
     "sizeless",
     "small",
+    "vetoed",
     "worth_correcting",
 ]
 
@@ -61,7 +62,22 @@ def confirmed(finding: Finding) -> bool:
     if sizeless(finding):
         return False
     held = finding.held_out
-    return held is None or confirmation(held.log_likelihood_gain, held.confidence_interval) == "surely"
+    if held is None:
+        return True
+    kind = confirmation(held.log_likelihood_gain, held.confidence_interval)
+    return kind == "surely" if held.decides else not vetoed(held)
+
+
+def vetoed(held_out: HeldOut) -> bool:
+    """Whether unseen blocks speak against a finding: the free run is farther off, or it is less likely for no gain.
+
+    Example:
+        >>> vetoed(HeldOut(0.0, (-0.1, 0.1), 2.0, 1.0, "m")), vetoed(HeldOut(0.0, (-0.1, 0.1), 2.0, 2.2, "m"))
+        (False, True)
+    """
+    less = change(held_out)
+    worse = confirmation(held_out.log_likelihood_gain, held_out.confidence_interval) == "worse"
+    return less < -SMALL or (worse and less < SMALL)
 
 
 def sizeless(finding: Finding) -> bool:

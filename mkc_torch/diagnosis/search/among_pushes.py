@@ -13,25 +13,27 @@ from torch import Tensor
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_beside
-from mkc_torch.diagnosis.model.in_the_world import beside_effects, between_beside_effects, noise_around, pushed
+from mkc_torch.diagnosis.model.in_the_world import beside_effects, between_beside_effects, pushed
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, continuous
+from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
 from mkc_torch.diagnosis.search.locate import Located
 from mkc_torch.diagnosis.search.look import Scene
+from mkc_torch.diagnosis.search.own_noise import noise_of_fit, priced, with_own_noise
 from mkc_torch.diagnosis.search.preference import Preference
-from mkc_torch.diagnosis.search.profiled import Profiled, profiled
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.ties import in_order
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
-from mkc_torch.simulation.dynamics.noise import noise_of
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 __all__ = ["located_among_pushes"]
 
 _CURVES = 2
 """Free curves that are fitted beside the leading candidates."""
+
+_PART = 0.3
+"""Share of the largest gain below which a candidate is not fitted."""
 
 Kind = tuple[Key, str]
 """Of a candidate, and for a curve what it is over."""
@@ -46,7 +48,6 @@ def located_among_pushes(
     generator: torch.Generator,
     declared: Mapping[str, float],
     fixed: Mapping[str, str],
-    free: FittedModel | None = None,
     settings: Settings,
 ) -> Located:
     """The strongest candidate beside a fit under pushes.
@@ -59,7 +60,6 @@ def located_among_pushes(
         generator: of the draws.
         declared: standard deviation of the white noise of outputs that it is known of.
         fixed: what inputs do between samples that it is known of.
-        free: the same as it runs freely; None where that loses the recording.
         settings: the numbers that decide.
 
     Raises:
@@ -68,7 +68,17 @@ def located_among_pushes(
     terms = tuple(terms)
     tangents = tangents_of(base.model, base.parameters, settings.noise, terms)
     values, counts = base.pseudo(settings.noise)
-    found = profiled(base, terms, tangents, base.residual, counts, surrogates, generator)
+    channels = base.model.prepared.channels
+    found = joint_likelihood(
+        base,
+        terms,
+        tangents,
+        counts,
+        surrogates,
+        generator,
+        level=level,
+        declared=[name in declared for name in channels],
+    )
     if found is None:
         raise NoFitError("The simulation's trajectory is lost at the fitted values.")
     prefer = Preference(terms, base.model.prepared, settings.naming)
@@ -81,12 +91,10 @@ def located_among_pushes(
         common = base.model.prepared, [terms[number] for number in chosen]
         first = at_once([partial(_fit_of, base, terms[number], found, number) for number in chosen], *common)
         chosen, first = _within_reach(chosen, first, [prefer.score_with_shape(fit, base) for fit in first], settings)
-        works = [
-            partial(_own, base, free, terms[number], fit, found.gamma[number], declared, settings)
-            for number, fit in zip(chosen, first, strict=True)
-        ]
+        works = [partial(with_own_noise, fit, declared, settings) for fit in first]
         fits = at_once(works, *common)
-        best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer)
+        best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer, settings)
+        best = beside_effects(best, noise_of_fit(best, declared), declared, settings.noise)
         best = between_beside_effects(best, declared, fixed, settings.noise)
     needless = bool(fits) and _needless(base, best, declared, settings)
     return Located(
@@ -99,11 +107,12 @@ def located_among_pushes(
         look,
         look.linearised,
         compared=fits,
-        longer=found.longer(level),
+        longer=found.longer,
+        with_noise=True,
     )
 
 
-def _ranked(found: Profiled, terms: tuple[Term, ...], prefer: Preference) -> tuple[Ranked, ...]:
+def _ranked(found: JointLikelihood, terms: tuple[Term, ...], prefer: Preference) -> tuple[Ranked, ...]:
     """By gain less Akaike's price of the numbers and the handicap, each physics at its best shape."""
     numbers = found.gain.new_tensor([float(len(continuous(term))) for term in terms])
     handicap = [prefer.handicap(term, float(one)) for term, one in zip(terms, found.gain, strict=True)]
@@ -115,15 +124,18 @@ def _ranked(found: Profiled, terms: tuple[Term, ...], prefer: Preference) -> tup
     return tuple(Ranked(n, float(found.gain[n]), float(score.max() - score[n])) for n in best.values())
 
 
-def _chosen(found: Profiled, ranking: Sequence[Ranked], terms: tuple[Term, ...], most: int) -> list[int]:
+def _chosen(found: JointLikelihood, ranking: Sequence[Ranked], terms: tuple[Term, ...], most: int) -> list[int]:
     """The leading candidates, each at its best shape, and the curve that gains most over each thing at their places."""
     chosen: dict[Kind, int] = {}
+    least = _PART * float(found.gain.max())
     for one in ranking[:most]:
-        chosen[_kind(terms[one.number])] = one.number
+        if one.gain >= least:
+            chosen[_kind(terms[one.number])] = one.number
     places = {terms[number].port for number in chosen.values()}
     curves = [n for n, term in enumerate(terms) if term.effect.is_curve and term.port in places]
     for number in sorted(curves, key=lambda n: -float(found.gain[n]))[:_CURVES]:
-        chosen.setdefault(_kind(terms[number]), number)
+        if found.gain[number] >= least:
+            chosen.setdefault(_kind(terms[number]), number)
     return list(chosen.values())
 
 
@@ -131,12 +143,13 @@ def _kind(term: Term) -> Kind:
     return term.key, term.effect.along if term.effect.is_curve else ""
 
 
-def _fit_of(base: FittedModel, term: Term, found: Profiled, number: int) -> FittedModel:
+def _fit_of(base: FittedModel, term: Term, found: JointLikelihood, number: int) -> FittedModel:
     """The joint fit of a candidate, under the pushes that it leaves by the search."""
     prepared = base.model.prepared
     assert isinstance(prepared, PreparedDynamics)
-    smaller = prepared.observed(found.observers[number])
-    start = torch.cat([_inside(base, base.parameters + found.shift[number]), found.gamma[number]])
+    begin = found.start(number)
+    smaller = prepared.observed(begin.observer)
+    start = torch.cat([_inside(base, base.parameters + begin.shift), begin.gamma])
     model = JointModel(smaller, (*base.model.terms, term), base.model.near)
     there = fitted_beside(base, model, start, graduate=False)
     if there.model.prepared is smaller:
@@ -163,35 +176,6 @@ def _within_reach(
     return [chosen[place] for place in kept], [fits[place] for place in kept]
 
 
-def _own(
-    base: FittedModel,
-    free: FittedModel | None,
-    term: Term,
-    fit: FittedModel,
-    gamma: Tensor,
-    declared: Mapping[str, float],
-    settings: Settings,
-) -> FittedModel:
-    """The joint fit of a candidate, under the noise that it leaves.
-
-    Begun with its first fit under the pushes, and from the free run with the amplitudes of the search: what a push has
-    taken over is not always given back.
-    """
-    prepared = base.model.prepared
-    assert isinstance(prepared, PreparedDynamics)
-    under = shape_fitted(beside_effects(fit, noise_of(prepared, declared), declared, settings.noise))
-    if free is None or not pushed(under):
-        return under
-    start = torch.cat([free.parameters, gamma])
-    model = free.model.with_term(term)
-    works = [partial(fitted_beside, free, model, one) for one in (start, _with_none(free, term))]
-    tried = at_once(works, model.prepared, [term])
-    running = shape_fitted(max(tried, key=lambda one: one.log_likelihood))
-    left = noise_around(running, declared, settings.noise)
-    white = left is not None and left.observer is None
-    return running if white or running.log_likelihood > under.log_likelihood else under
-
-
 def _needless(base: FittedModel, best: FittedModel, declared: Mapping[str, float], settings: Settings) -> bool:
     """Whether the noise that was found beside an effect does as much without it.
 
@@ -206,15 +190,9 @@ def _needless(base: FittedModel, best: FittedModel, declared: Mapping[str, float
         without = fitted(model, best.parameters[:own], base.bound, graduate=False)
     except NoFitError:
         return False
-    bare = beside_effects(without, noise_of(prepared, declared), declared, settings.noise)
+    bare = with_own_noise(without, declared, settings)
     price = 0.5 * (best.model.size - own) * math.log(len(base.residual))
-    return best.log_likelihood - bare.log_likelihood < price
-
-
-def _with_none(free: FittedModel, term: Term) -> Tensor:
-    """The parameters of a free run with nothing of an effect."""
-    size = free.model.with_term(term).size - free.model.size
-    return torch.cat([free.parameters, free.parameters.new_zeros(size)])
+    return priced(best, settings) - priced(bare, settings) < price
 
 
 def _by_own_noise(
@@ -224,9 +202,10 @@ def _by_own_noise(
     fits: Sequence[FittedModel],
     terms: tuple[Term, ...],
     prefer: Preference,
+    settings: Settings,
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
     """The likeliest of the fits, and the ranking with how far each is behind it; others are behind all of them."""
-    scores = [prefer.score_with_shape(fit, base) for fit in fits]
+    scores = [prefer.score_with_shape(fit, base) + (priced(fit, settings) - fit.log_likelihood) for fit in fits]
     best = in_order(scores, [fit.model.terms[-1] for fit in fits])[0]
     behind: dict[Key, tuple[float, int]] = {}
     for number, score in zip(chosen, scores, strict=True):

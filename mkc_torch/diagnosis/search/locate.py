@@ -56,6 +56,7 @@ class Located:
         compared: fits of the leading candidates, each under the noise of the world that it leaves; none where all are
             under the same.
         longer: times as long a recording that would show it has to be, if it is there; infinite where nobody knows.
+        with_noise: whether noise and physics were chosen together.
     """
 
     term: Term
@@ -69,6 +70,7 @@ class Located:
     stretch: tuple[int, int] | None = None
     compared: Sequence[FittedModel] = ()
     longer: float = math.inf
+    with_noise: bool = False
 
     @property
     def scene(self) -> Scene:

@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.unit_text import sized
+from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
+from mkc_torch.effects.dynamics.coulomb_friction import CoulombFriction
 from mkc_torch.effects.dynamics.rate import RateEffect
 
 if TYPE_CHECKING:
@@ -40,6 +42,10 @@ class StribeckFriction(RateEffect):
     advice = "Add dry friction with a rise towards standstill."
     choices = ("width",)
     source = "Stribeck (1902); Armstrong-Hélouvry, Control of Machines with Friction (1991)"
+
+    @property
+    def simpler(self) -> Effect:
+        return CoulombFriction()
 
     def equation_of(self, shape: Shape, context: Context) -> str:
         width = sized(float(shape["width"]), context.unit_of("own"))

@@ -6,7 +6,7 @@ import math
 
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain
-from mkc_torch.diagnosis.findings.worth import SMALL, change, confirmation
+from mkc_torch.diagnosis.findings.worth import SMALL, change, confirmation, vetoed
 from mkc_torch.diagnosis.result import Diagnosis, HeldOut, Sizes
 from mkc_torch.diagnosis.world import World
 from mkc_torch.report.diagnosis.numbers import improvement
@@ -34,6 +34,8 @@ def better(held_out: HeldOut) -> str:
         'not shown to be better on unseen blocks: from block to block the gain differs by more than itself, so it ...'
     """
     kind = confirmation(held_out.log_likelihood_gain, held_out.confidence_interval)
+    if not held_out.decides and kind != "surely" and not vetoed(held_out):
+        return term("evidence.not_against")
     told = term(_BETTER[kind])
     reason = _reason(held_out, surely=kind == "surely")
     return term("evidence.because", better=told, reason=reason) if reason else told

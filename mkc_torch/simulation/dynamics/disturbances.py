@@ -18,7 +18,17 @@ from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Disturbed", "disturbed", "models_of", "observer_of", "resized", "usual_size"]
+__all__ = [
+    "Disturbed",
+    "NoiseModel",
+    "disturbed",
+    "filter_models",
+    "longest_run",
+    "models_of",
+    "observer_of",
+    "resized",
+    "usual_size",
+]
 
 _SIZES = (0.1, 1.0, 10.0, 100.0)
 """Tried, over that at which a disturbance moves an output by as much as its white noise."""
@@ -64,12 +74,38 @@ class Disturbed:
 
 
 @dataclass(frozen=True)
-class _Noise:
-    """One model of the noise: disturbances by their number of place, size and time constant, and what is declared."""
+class NoiseModel:
+    """A model of the noise.
+
+    Attributes:
+        sensor: standard deviation of each output's white noise, in its unit.
+        pushes: disturbances: the number of the rate, or of an output after all rates; the standard deviation in the
+            unit of that rate or output; the time constant in s, 0 for one that is new at each sample.
+        known: of each output whether its white noise is declared.
+    """
 
     sensor: tuple[float, ...]
     pushes: tuple[tuple[int, float, float], ...] = ()
     known: tuple[bool, ...] = ()
+
+    def disturbances(self, rates: Sequence[str], outputs: Sequence[str], scale: float = 1.0) -> tuple[Disturbance, ...]:
+        """The disturbances by the names of rates and outputs, their sizes times a scale."""
+        names, p = (*rates, *outputs), len(rates)
+        return tuple(Disturbance(names[a], a < p, lasting, scale * size) for a, size, lasting in self.pushes)
+
+    @classmethod
+    def of(
+        cls,
+        disturbances: Sequence[Disturbance],
+        sensor: Sequence[float],
+        rates: Sequence[str],
+        outputs: Sequence[str],
+        known: Sequence[bool] = (),
+    ) -> NoiseModel:
+        """The model with these disturbances."""
+        places = (*rates, *outputs)
+        pushes = tuple((_place(places, one, len(rates)), one.size, one.lasting) for one in disturbances)
+        return cls(tuple(sensor), pushes, tuple(known) or (False,) * len(outputs))
 
 
 def disturbed(
@@ -93,7 +129,7 @@ def disturbed(
         most: disturbances at most.
     """
     p, m = flow.rates, len(channels)
-    best = _Noise(tuple(floor.tolist()), (), tuple(known))
+    best = NoiseModel(tuple(floor.tolist()), (), tuple(known))
     best, value = _white(flow, best)
     gains: list[float] = []
     for _ in range(most):
@@ -132,7 +168,7 @@ def resized(flow: Flow, names: Sequence[str], channels: Sequence[str], known: Di
     """
     places = [*names, *channels]
     pushes = tuple((_place(places, one, len(names)), one.size, one.lasting) for one in known.disturbances)
-    noise = _Noise(tuple(known.sensor.tolist()), pushes, known.declared)
+    noise = NoiseModel(tuple(known.sensor.tolist()), pushes, known.declared)
     tried = [replace(noise, pushes=tuple((a, share * s, t) for a, s, t in pushes)) for share in _SHARES]
     values, scales = _likelihoods(flow, tried)
     number = int(np.nan_to_num(values, nan=-np.inf).argmax())
@@ -153,7 +189,7 @@ def resized(flow: Flow, names: Sequence[str], channels: Sequence[str], known: Di
 
 
 def _told(
-    noise: _Noise,
+    noise: NoiseModel,
     gains: Sequence[float],
     flow: Flow,
     names: Sequence[str],
@@ -167,10 +203,10 @@ def _told(
     return Disturbed(found, _errors(flow, noise), tuple(gains), sensor, value, noise.known)
 
 
-def _candidates(flow: Flow, known: _Noise, places: int) -> list[tuple[int, float, float]]:
+def _candidates(flow: Flow, known: NoiseModel, places: int) -> list[tuple[int, float, float]]:
     """Disturbances of any place, time constant and size that is not there yet."""
     p = flow.rates
-    longest = _longest(flow)
+    longest = longest_run(flow)
     usual = float(np.median(flow.step[flow.step > 0]))
     lasting = sorted({max(share * longest, 2.0 * usual) for share in _LASTING})
     sensor = np.array(known.sensor)
@@ -187,7 +223,7 @@ def _candidates(flow: Flow, known: _Noise, places: int) -> list[tuple[int, float
     return found
 
 
-def _longest(flow: Flow) -> float:
+def longest_run(flow: Flow) -> float:
     """Length of the longest run in s."""
     ends = np.flatnonzero(np.concatenate([flow.step <= 0, [True]]))
     total = np.concatenate([[0.0], flow.step.cumsum()])
@@ -222,7 +258,7 @@ def usual_size(flow: Flow, place: int, lasting: float, sensor: Float[np.ndarray,
     return 1.0 / most if 0.0 < most < math.inf else math.inf
 
 
-def _models(flow: Flow, noises: Sequence[_Noise]) -> Models:
+def filter_models(flow: Flow, noises: Sequence[NoiseModel]) -> Models:
     p = flow.rates
     D = max(sum(1 for one in noise.pushes if one[2] > 0) for noise in noises)
     B = len(noises)
@@ -239,16 +275,16 @@ def _models(flow: Flow, noises: Sequence[_Noise]) -> Models:
     return Models(white, place, size, lasting, np.array([noise.sensor for noise in noises]))
 
 
-def _likelihoods(flow: Flow, noises: Sequence[_Noise]) -> tuple[np.ndarray, np.ndarray]:
+def _likelihoods(flow: Flow, noises: Sequence[NoiseModel]) -> tuple[np.ndarray, np.ndarray]:
     """Of each, its scale profiled out, and that scale; at the scale it has, where some of the sensors' is declared."""
     parts = _parts(flow)
-    found = filtered(parts, _models(flow, noises))
+    found = filtered(parts, filter_models(flow, noises))
     return robust_likelihood(found, parts.mine, flow.reach, free=not any(noises[0].known))
 
 
-def _exactly(flow: Flow, noise: _Noise) -> tuple[float, float]:
+def _exactly(flow: Flow, noise: NoiseModel) -> tuple[float, float]:
     """The same of one, in one stretch: without a push there is nothing that corrects a filter which begins inside."""
-    found = filtered_whole(flow, _models(flow, [noise]))
+    found = filtered_whole(flow, filter_models(flow, [noise]))
     values, scales = robust_likelihood(found, flow.counts[:, None], flow.reach, free=not any(noise.known))
     return float(values[0]), float(scales[0])
 
@@ -258,12 +294,12 @@ def _parts(flow: Flow) -> Parts:
     return flow.in_parts(_STRETCH, _BEFORE, _MOST_STRETCHES)
 
 
-def _scaled(noise: _Noise, scale: float) -> _Noise:
+def _scaled(noise: NoiseModel, scale: float) -> NoiseModel:
     pushes = tuple((place, scale * size, lasting) for place, size, lasting in noise.pushes)
     return replace(noise, sensor=tuple(scale * one for one in noise.sensor), pushes=pushes)
 
 
-def _white(flow: Flow, noise: _Noise) -> tuple[_Noise, float]:
+def _white(flow: Flow, noise: NoiseModel) -> tuple[NoiseModel, float]:
     """The sensors' white noise alone, each output by itself where there are several."""
     if not any(noise.known):
         new = flow.new
@@ -276,7 +312,7 @@ def _white(flow: Flow, noise: _Noise) -> tuple[_Noise, float]:
     return _scaled(noise, scale), value
 
 
-def _finer(flow: Flow, noise: _Noise) -> _Noise:
+def _finer(flow: Flow, noise: NoiseModel) -> NoiseModel:
     """Sizes, time constants and the sensors' noise one after the other, on a grid that closes in; the scale at once."""
     power = 1.0
     for _ in range(_ROUNDS):
@@ -302,7 +338,7 @@ def _finer(flow: Flow, noise: _Noise) -> _Noise:
     return noise
 
 
-def _errors(flow: Flow, noise: _Noise) -> tuple[float, ...]:
+def _errors(flow: Flow, noise: NoiseModel) -> tuple[float, ...]:
     """Of the logarithm of each size, by the curvature of the likelihood."""
     if not noise.pushes:
         return ()
@@ -364,7 +400,7 @@ def models_of(
 ) -> Models:
     places = [*names, *channels]
     pushes = tuple((_place(places, one, len(names)), one.size, one.lasting) for one in disturbances)
-    return _models(flow, [_Noise(tuple(sensor.tolist()), pushes, (False,) * len(channels))])
+    return filter_models(flow, [NoiseModel(tuple(sensor.tolist()), pushes, (False,) * len(channels))])
 
 
 def _place(places: Sequence[str], one: Disturbance, rates: int) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.observer import Observable
 from mkc_torch.simulation.dynamics.trajectory import carried, slopes
@@ -18,10 +19,44 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-__all__ = ["flow_along", "flow_of"]
+__all__ = ["flow_along", "flow_of", "plausible_sizes"]
 
 _ABOUT = 0.1
 """Share of its spread by which a state may be off at least."""
+
+
+_USUAL = 0.99
+"""Quantile of a state's rates over a recording that process noise may be as large as."""
+
+
+_SLOW = 0.5
+"""Share of an output's robust variation that a slow error of its sensor may have at most."""
+
+
+def plausible_sizes(
+    prepared: Observable, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None
+) -> Float[np.ndarray, " p+m"]:
+    """Plausible sizes of process noise of each rate, and of a slow error of each output, in their units.
+
+    Process noise is no larger than the rates that this recording shows; a sensor's error is smaller than what it shows.
+
+    Args:
+        prepared: the simulation.
+        theta, changes, near: of its trajectory.
+    """
+    system = prepared.system
+    n = len(system.states)
+    states = prepared.trajectory(theta, changes, near).states.detach()
+    free = prepared.observed(None)
+    rates = free.rate(theta, changes)(prepared.grid.spread(states[:, : states.shape[1] - len(prepared.lasting)]))
+    shown = torch.quantile(rates[::3, :n].detach().abs(), _USUAL, 0)
+    span = states[:, :n].amax(0) - states[:, :n].amin(0)
+    lasted = (prepared.time[-1] - prepared.time[0]).clamp(min=torch.finfo(span.dtype).tiny)
+    places = [system.states.index(name) for name in prepared.pushable]
+    varies = _SLOW * robust_scale(prepared.measured - prepared.measured.median(0).values)
+    varies = torch.where(varies > 0, varies, torch.inf)
+    largest: np.ndarray = torch.cat([torch.maximum(shown, span / lasted)[places], varies]).double().cpu().numpy()
+    return largest
 
 
 def flow_of(

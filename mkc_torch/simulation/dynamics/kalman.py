@@ -166,6 +166,10 @@ class Models:
     def __len__(self) -> int:
         return len(self.white)
 
+    def part(self, rows: slice) -> Models:
+        """Some of them."""
+        return Models(self.white[rows], self.place[rows], self.size[rows], self.lasting[rows], self.sensor[rows])
+
 
 @dataclass(frozen=True)
 class Start:

@@ -1,0 +1,53 @@
+"""Backward elimination: a finding whose effect later findings have taken over is dropped."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import partial
+
+from mkc_torch.diagnosis.model.at_once import at_once
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted, without_term
+from mkc_torch.diagnosis.search.own_noise import priced, with_own_noise
+from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.nonlinear import NoFitError
+
+__all__ = ["needless_term", "without"]
+
+
+def needless_term(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> int | None:
+    """The effect of a joint fit that does not pay its price beside the others; None where each one does.
+
+    The price of an effect is half the logarithm of the number of samples for each of its numbers (Schwarz, Annals of
+    Statistics 6, 1978, 461).
+
+    Args:
+        fit: with several effects.
+        declared: standard deviation of the white noise of outputs that it is known of.
+        settings: the numbers that decide.
+    """
+    count = len(fit.model.terms)
+    if count < 2:
+        return None
+    works = [partial(_loss, fit, number, declared, settings) for number in range(count)]
+    losses = at_once(works, fit.model.prepared, fit.model.terms)
+    weakest = min(range(count), key=losses.__getitem__)
+    return weakest if losses[weakest] < 0.0 else None
+
+
+def _loss(fit: FittedModel, number: int, declared: Mapping[str, float], settings: Settings) -> float:
+    """Nats that a fit without an effect is less likely by, less the effect's price."""
+    less = without(fit, number, declared, settings)
+    if less is None:
+        return math.inf
+    price = 0.5 * fit.model.sizes[number] * math.log(len(fit.residual))
+    return priced(fit, settings) - priced(less, settings) - price
+
+
+def without(fit: FittedModel, number: int, declared: Mapping[str, float], settings: Settings) -> FittedModel | None:
+    """The joint fit without one of its effects, under the noise that is then left; None where it has no answer."""
+    start = without_term(fit, number)
+    try:
+        return with_own_noise(fitted(start.model, start.parameters, fit.bound, graduate=False), declared, settings)
+    except NoFitError:
+        return None

@@ -1,0 +1,197 @@
+"""Log-likelihoods of series with and without each candidate under many models of the noise, in one computation.
+
+For a model of the noise a Kalman filter whitens all series together: the recording, draws of noise, and the tangents of
+the simulation's parameters and of the candidates. What is left is one regression a candidate. The log-likelihood is the
+restricted one, its scale profiled out, so that the flexibility of process noise has its price in log det S and that of
+the parameters in the log det of their tangents (Harville, Journal of the American Statistical Association 72, 1977).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mkc_torch.simulation.dynamics.disturbances import NoiseModel, filter_models
+from mkc_torch.simulation.dynamics.kalman import Flow
+from mkc_torch.simulation.dynamics.whitening import SeriesAlong, gains_of, joined, whitened
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["Columns", "LogLikelihoods", "log_likelihoods"]
+
+_SINGULAR = 1e-9
+"""Share of a candidate's squares, or of their largest eigenvalue, below which a direction of it counts as absent."""
+
+PRICE = 6.0
+"""Nats that a disturbance has to gain to be in the noise, as those of the baseline."""
+
+_DEPENDENT = 1e-10
+"""Share of the largest singular value of the parameters' tangents below which a direction of them counts as absent."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Tangents along a trajectory: of the parameters, then of each candidate.
+
+    Attributes:
+        series: the tangents.
+        parameters: number of parameters.
+        sizes: numbers of each candidate.
+        one_sided: (C,), whether a candidate's size has one sign only.
+    """
+
+    series: SeriesAlong
+    parameters: int
+    sizes: tuple[int, ...]
+    one_sided: tuple[bool, ...]
+
+    def places(self, number: int) -> slice:
+        """Where a candidate's tangents stand among all of them."""
+        first = self.parameters + sum(self.sizes[:number])
+        return slice(first, first + self.sizes[number])
+
+
+@dataclass(frozen=True)
+class LogLikelihoods:
+    """Log-likelihoods of Y series under B models of the noise, and the first series' estimates.
+
+    Attributes:
+        models: the models of the noise.
+        without: (B, Y), without a candidate, in nats.
+        beside: (B, C, Y), with each candidate.
+        sizes: (B, q), of all candidates one after the other, for the first series.
+        rank: (C,), directions of each candidate that the parameters leave.
+        scale: (B, C), of the first series' noise with each candidate, over that of the model.
+    """
+
+    models: tuple[NoiseModel, ...]
+    without: Float[np.ndarray, "B Y"]
+    beside: Float[np.ndarray, "B C Y"]
+    sizes: Float[np.ndarray, "B q"]
+    rank: Float[np.ndarray, " C"]
+    scale: Float[np.ndarray, "B C"]
+
+    def and_more(self, other: LogLikelihoods) -> LogLikelihoods:
+        """With those under other models."""
+        return LogLikelihoods(
+            (*self.models, *other.models),
+            np.concatenate([self.without, other.without]),
+            np.concatenate([self.beside, other.beside]),
+            np.concatenate([self.sizes, other.sizes]),
+            np.maximum(self.rank, other.rank),
+            np.concatenate([self.scale, other.scale]),
+        )
+
+
+def log_likelihoods(
+    flow: Flow,
+    models: Sequence[NoiseModel],
+    series: SeriesAlong,
+    columns: Columns,
+    largest: Float[np.ndarray, " p+m"] | None = None,
+) -> LogLikelihoods:
+    """The log-likelihoods; -inf where a disturbance, at the likeliest scale, is larger than is plausible.
+
+    Args:
+        flow: of the trajectory; its ``counts`` say which samples count.
+        models: of the noise, alike in which outputs' white noise is declared.
+        series: Y series to explain, the recording's the first one.
+        columns: what may explain them.
+        largest: plausible size of a disturbance of each rate and each output, in their units; None for any.
+    """
+    B, C, Y = len(models), len(columns.sizes), series.count
+    gains = gains_of(flow, filter_models(flow, models))
+    used = flow.counts > 0
+    without, beside = np.full((B, Y), -np.inf), np.full((B, C, Y), -np.inf)
+    sizes, scale, rank = np.zeros((B, sum(columns.sizes))), np.ones((B, C)), np.zeros(C)
+    groups = _by_size(columns.sizes)
+    free = not any(models[0].known)
+    for number, values in whitened(flow, gains, joined(series, columns.series)):
+        rows = values[used]
+        if not np.isfinite(rows).all():
+            continue
+        y, own, candidates = np.split(rows, [Y, Y + columns.parameters], 1)
+        basis, log_det = _basis(own)
+        n = len(rows) - basis.shape[1]
+        level = -gains.log_spread[number] - log_det - PRICE * len(models[number].pushes)
+        left = y - basis @ (basis.T @ y)
+        rest = candidates - basis @ (basis.T @ candidates)
+        norm = np.maximum(np.linalg.norm(candidates, axis=0), 1e-300)
+        rest /= norm
+        power = np.square(left).sum(0)
+        reach = _reach(models[number], largest)
+        without[number] = np.where(_scale(power, n, free) <= reach, level + _log_likelihood(power, n, free), -np.inf)
+        inner = rest.T @ left
+        for members, index in groups:
+            explained, solved, found = _explained(rest, inner, members, index, columns.one_sided)
+            remains = np.maximum(power - explained, 1e-12 * power)
+            size = _scale(remains, n, free)
+            beside[number, members] = np.where(size <= reach, level + _log_likelihood(remains, n, free), -np.inf)
+            sizes[number, index] = solved / norm[index]
+            rank[members] = np.maximum(rank[members], found)
+            scale[number, members] = size[:, 0]
+    return LogLikelihoods(tuple(models), without, beside, sizes, rank, scale)
+
+
+def _by_size(sizes: Sequence[int]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Candidates of as many numbers: which they are, and the places of their tangents."""
+    first = np.concatenate([[0], np.cumsum(sizes)])
+    groups = []
+    for size in sorted(set(sizes)):
+        members = np.array([c for c, one in enumerate(sizes) if one == size], dtype=int)
+        groups.append((members, first[members][:, None] + np.arange(size)))
+    return groups
+
+
+def _basis(own: Float[np.ndarray, "M p"]) -> tuple[Float[np.ndarray, "M k"], float]:
+    """An orthonormal basis of the parameters' tangents, and half the log det of their products."""
+    if not own.shape[1]:
+        return own, 0.0
+    basis, values, _ = np.linalg.svd(own, full_matrices=False)
+    kept = values > _DEPENDENT * max(values.max(), 1e-300)
+    return basis[:, kept], float(np.log(values[kept]).sum())
+
+
+def _log_likelihood(power: Float[np.ndarray, "*c Y"], n: int, free: bool) -> Float[np.ndarray, "*c Y"]:
+    if not free:
+        return -0.5 * power
+    result: np.ndarray = -0.5 * n * np.log(np.maximum(power, 1e-300) / max(n, 1))
+    return result
+
+
+def _scale(power: Float[np.ndarray, "*c Y"], n: int, free: bool) -> Float[np.ndarray, "*c Y"]:
+    """Of the noise, over that of its model."""
+    return np.sqrt(power / max(n, 1)) if free else np.ones_like(power)
+
+
+def _reach(model: NoiseModel, largest: Float[np.ndarray, " p+m"] | None) -> float:
+    """Scale up to which the disturbances of a model are of a plausible size."""
+    if largest is None:
+        return np.inf
+    return min((float(largest[place]) / size for place, size, _ in model.pushes if size > 0.0), default=np.inf)
+
+
+def _explained(
+    rest: Float[np.ndarray, "M Q"],
+    inner: Float[np.ndarray, "Q Y"],
+    members: np.ndarray,
+    index: np.ndarray,
+    one_sided: Sequence[bool],
+) -> tuple[Float[np.ndarray, "c Y"], Float[np.ndarray, "c q"], Float[np.ndarray, " c"]]:
+    """Squares that candidates of one size explain, minus the first series' estimates, and the candidates' ranks."""
+    q = index.shape[1]
+    flat = rest[:, index.ravel()].reshape(len(rest), len(members), q)
+    gram = np.einsum("nca,ncb->cab", flat, flat)
+    values, vectors = np.linalg.eigh(gram)
+    kept = values > np.maximum(_SINGULAR, _SINGULAR * values[:, -1:])
+    inverse = (vectors * np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)[:, None]) @ vectors.swapaxes(1, 2)
+    own = inner[index]
+    solved = inverse @ own
+    # the residual falls by what an effect adds: a negative slope is a positive size
+    barred = np.array([one_sided[c] for c in members])[:, None] & (solved >= 0).all(1)
+    explained = np.where(barred, 0.0, (own * solved).sum(1))
+    return explained, np.where(barred[:, :1], 0.0, -solved[:, :, 0]), kept.sum(1)

@@ -1,0 +1,43 @@
+"""Joint fits under the noise that each of them leaves, and what their noise costs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.in_the_world import noise_around
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shaped import shape_fitted
+from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation.dynamics.noise import NoiseOfTheWorld, noise_of
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+
+__all__ = ["noise_of_fit", "priced", "with_own_noise"]
+
+
+def with_own_noise(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> FittedModel:
+    """The joint fit of a candidate with the noise that is left beside it at its likeliest sizes, and its shape too."""
+    noise = noise_around(fit, declared, settings.noise, noise_of_fit(fit, declared))
+    prepared = fit.model.prepared
+    if noise is None or not isinstance(prepared, PreparedDynamics):
+        return shape_fitted(fit)
+    model = JointModel(prepared.observed(noise.observer), fit.model.terms, fit.model.near)
+    try:
+        again = fitted(model, fit.parameters, fit.bound, graduate=False)
+    except NoFitError:
+        return shape_fitted(fit)
+    return shape_fitted(again if priced(again, settings) > priced(fit, settings) else fit)
+
+
+def priced(fit: FittedModel, settings: Settings) -> float:
+    """Log-likelihood less the price of the disturbances in a fit's noise."""
+    prepared = fit.model.prepared
+    observer = prepared.observer if isinstance(prepared, PreparedDynamics) else None
+    return fit.log_likelihood - settings.noise.pushed * (0 if observer is None else len(observer.disturbances))
+
+
+def noise_of_fit(fit: FittedModel, declared: Mapping[str, float]) -> NoiseOfTheWorld | None:
+    """The noise that a fit is under."""
+    prepared = fit.model.prepared
+    return noise_of(prepared, declared) if isinstance(prepared, PreparedDynamics) else None

@@ -1,0 +1,246 @@
+"""Series along a linearised trajectory, whitened under many models of the noise.
+
+A Kalman filter's gains depend on the model of the noise alone, so one pass over its covariances whitens any number of
+series: a recording, draws of noise, tangents of parameters and of candidate effects. A series is given relative to the
+trajectory, with the jumps that it makes in the states, and the filter follows the difference: so the series of an
+unstable system stay finite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mkc_torch.simulation.dynamics.kalman import Flow, Models
+from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["Gains", "SeriesAlong", "gains_of", "joined", "relative_to", "whitened"]
+
+_CELLS = 24_000_000
+"""Numbers of whitened series that are held at once: 192 MB."""
+
+_WHOLE = 1500
+"""Samples up to which a recording is filtered in one pass; longer ones in stretches side by side, in two."""
+
+_STRETCH = 300
+"""Samples of such a stretch."""
+
+
+@dataclass(frozen=True)
+class SeriesAlong:
+    """K series along a trajectory.
+
+    Attributes:
+        new: (N, m, K), what each adds to the outputs beside the trajectory's own states.
+        shift: (N-1, n, K), what each adds to the trajectory's states on the way to the next sample.
+    """
+
+    new: Float[np.ndarray, "N m K"]
+    shift: Float[np.ndarray, "N-1 n K"]
+
+    @property
+    def count(self) -> int:
+        """Number of series."""
+        return self.new.shape[-1]
+
+
+@dataclass(frozen=True)
+class Gains:
+    """The filters of B models of the noise.
+
+    Attributes:
+        models: the models.
+        gain: (N, B, k, m), of states and lasting disturbances; 0 where a sample does not count.
+        white: (N, B, m, m), what makes the innovations of a sample independent, of variance 1; 0 likewise.
+        log_spread: (B,), sum of the logarithms of the innovations' standard deviations, of the samples that count.
+    """
+
+    models: Models
+    gain: Float[np.ndarray, "N B k m"]
+    white: Float[np.ndarray, "N B m m"]
+    log_spread: Float[np.ndarray, " B"]
+
+
+def joined(*series: SeriesAlong) -> SeriesAlong:
+    """Series beside one another."""
+    return SeriesAlong(
+        np.concatenate([one.new for one in series], -1), np.concatenate([one.shift for one in series], -1)
+    )
+
+
+def gains_of(flow: Flow, models: Models) -> Gains:
+    """The gains of filters along a flow.
+
+    Args:
+        flow: of the trajectory.
+        models: B models of the noise.
+    """
+    n, D = flow.carried.shape[1], models.place.shape[1]
+    N, m = flow.new.shape
+    P = filtered_whole(flow, models, keep=True).prior[:, 0]
+    if P.shape[1:] != (len(models), n + D, n + D):  # states that nothing pushes are known
+        P = np.zeros((N, len(models), n + D, n + D))
+    C = _seen(flow, models)
+    cross = P @ C.swapaxes(-1, -2)
+    variance = models.sensor[:, :, None] ** 2 * np.eye(m)
+    S = C @ cross + variance
+    used = flow.counts > 0
+    # a sample of which some outputs do not count is whitened by those that do
+    both = used[:, None, :, None] & used[:, None, None, :]
+    S = np.where(both, S, np.eye(m))
+    cross = cross * used[:, None, None, :]
+    gain = np.linalg.solve(S, cross.swapaxes(-1, -2)).swapaxes(-1, -2)
+    L = np.linalg.cholesky(S)
+    white = np.linalg.inv(L) * used[:, None, :, None]
+    spread = np.log(np.diagonal(L, axis1=-2, axis2=-1)) * used[:, None]
+    return Gains(models, gain, white, spread.sum((0, 2)))
+
+
+def whitened(flow: Flow, gains: Gains, series: SeriesAlong) -> Iterator[tuple[int, Float[np.ndarray, "N m K"]]]:
+    """The series under each model of the noise: the number of the model, and its innovations, of variance 1.
+
+    Args:
+        flow: of the trajectory.
+        gains: of the models.
+        series: K series.
+    """
+    N, m, K = series.new.shape
+    B = len(gains.models)
+    block = max(1, min(B, _CELLS // max(N * m * K, 1)))
+    for first in range(0, B, block):
+        part = slice(first, min(first + block, B))
+        found = _filtered(flow, gains, part, series)
+        for number in range(found.shape[1]):
+            yield first + number, found[:, number]
+
+
+def relative_to(
+    flow: Flow,
+    gain: Float[np.ndarray, "N k m"],
+    places: Float[np.ndarray, " D"],
+    lasting: Float[np.ndarray, " D"],
+    innovations: Float[np.ndarray, "N m K"],
+    corrects: Float[np.ndarray, "N m"] | float = 1.0,
+) -> SeriesAlong:
+    """The series whose innovations, under a filter with these gains, are given.
+
+    Args:
+        flow: of the trajectory.
+        gain: of the filter.
+        places: what each of its D lasting disturbances acts on: a rate, or p and more for an output.
+        lasting: their time constants in s.
+        innovations: of each series.
+        corrects: share of an innovation that the filter corrects by.
+    """
+    n, p, D = flow.carried.shape[1], flow.rates, len(places)
+    scale = np.broadcast_to(corrects, innovations.shape[:2])[..., None]
+    jump = gain @ (scale * innovations)
+    new = innovations.copy()
+    shift = flow.carried @ jump[:-1, :n]
+    if D:
+        phi = np.where(flow.step[:, None] > 0, np.exp(-flow.step[:, None] / lasting), 0.0)
+        value = np.zeros((D, innovations.shape[-1]))
+        for row in range(len(innovations)):
+            if row:
+                value = phi[row - 1][:, None] * value
+            for d, place in enumerate(places):
+                if place >= p:
+                    new[row, int(place) - p] += value[d]
+            value = value + jump[row, n:]
+            if row < len(shift):
+                for d, place in enumerate(places):
+                    if place < p:
+                        shift[row] += flow.pushed[row][:, int(place), None] * value[d]
+    return SeriesAlong(new, shift)
+
+
+def _seen(flow: Flow, models: Models) -> Float[np.ndarray, "N B m k"]:
+    N, m, n = flow.seen.shape
+    B, D = models.place.shape
+    own = (models.place[:, None, :] == flow.rates + np.arange(m)[:, None]).astype(float)
+    C = np.empty((N, B, m, n + D))
+    C[..., :n] = flow.seen[:, None]
+    C[..., n:] = own
+    return C
+
+
+def _filtered(flow: Flow, gains: Gains, part: slice, series: SeriesAlong) -> Float[np.ndarray, "N B m K"]:
+    """Whiten in one stretch, or in stretches side by side: from states of 0, then from where the one before it ends."""
+    N, m, K = series.new.shape
+    count = 1 if N <= _WHOLE else -(-N // _STRETCH)
+    way = _Stretches.of(flow, gains, part, series, count)
+    B, k = way.carry.shape[2:4]
+    start = np.zeros((count, B, k, K))
+    if count > 1:
+        end, passed_on = way.run(start)[1:]
+        for g in range(count - 1):
+            start[g + 1] = end[g] + passed_on[g] @ start[g]
+    return way.run(start)[0].reshape(-1, B, m, K)[:N]
+
+
+@dataclass(frozen=True)
+class _Stretches:
+    """G stretches of L samples each under B models, with the series: arrays by place in the stretch, then stretch."""
+
+    carry: Float[np.ndarray, "L G B k k"]
+    seen: Float[np.ndarray, "L G B m k"]
+    gain: Float[np.ndarray, "L G B k m"]
+    white: Float[np.ndarray, "L G B m m"]
+    new: Float[np.ndarray, "L G m K"]
+    shift: Float[np.ndarray, "L G n K"]
+
+    @classmethod
+    def of(cls, flow: Flow, gains: Gains, part: slice, series: SeriesAlong, count: int) -> _Stretches:
+        N = len(flow.new)
+        models = gains.models.part(part)
+        length = -(-N // count)
+
+        def cut(values: np.ndarray) -> np.ndarray:
+            more = np.zeros((length * count - len(values), *values.shape[1:]))
+            return np.concatenate([values, more]).reshape(count, length, *values.shape[1:]).swapaxes(0, 1)
+
+        return cls(
+            cut(_carried(flow, models)),
+            cut(_seen(flow, models)),
+            cut(gains.gain[:, part]),
+            cut(gains.white[:, part]),
+            cut(series.new),
+            cut(series.shift),
+        )
+
+    def run(
+        self, start: Float[np.ndarray, "G B k K"]
+    ) -> tuple[Float[np.ndarray, "G L B m K"], Float[np.ndarray, "G B k K"], Float[np.ndarray, "G B k k"]]:
+        """The innovations from these states; the states after the last sample, and what they keep of the first ones."""
+        L, G, B, k, _ = self.carry.shape
+        m, K = self.new.shape[2:]
+        n = self.shift.shape[2]
+        out = np.empty((G, L, B, m, K))
+        state, kept = start, np.broadcast_to(np.eye(k), (G, B, k, k))
+        for row in range(L):
+            left = self.new[row][:, None] - self.seen[row] @ state
+            np.matmul(self.white[row], left, out=out[:, row])
+            state = self.carry[row] @ (state + self.gain[row] @ left)
+            state[:, :, :n] -= self.shift[row][:, None]
+            if G > 1:
+                kept = self.carry[row] @ (kept - self.gain[row] @ (self.seen[row] @ kept))
+        return out, state, kept
+
+
+def _carried(flow: Flow, models: Models) -> Float[np.ndarray, "N-1 B k k"]:
+    """States and lasting disturbances at the next sample by those at a sample."""
+    n, p, (B, D) = flow.carried.shape[1], flow.rates, models.place.shape
+    acts = (np.arange(p)[:, None] == models.place[:, None, :]).astype(float)
+    A = np.zeros((len(flow.step), B, n + D, n + D))
+    A[..., :n, :n] = flow.carried[:, None]
+    A[..., :n, n:] = flow.pushed[:, None] @ acts
+    index = n + np.arange(D)
+    step = flow.step[:, None, None]
+    A[..., index, index] = np.where(step > 0, np.exp(-step / models.lasting), 0.0)
+    return A

@@ -1,0 +1,130 @@
+"""Noise and physics chosen together beside a pendulum that something unrecorded drives."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+import torch
+
+from mkc_torch.diagnosis.linearised.tangents import tangents_of
+from mkc_torch.diagnosis.search.joint_likelihood import joint_likelihood
+from mkc_torch.diagnosis.settings import NoiseSettings
+from mkc_torch.effects import DYNAMICS
+from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid
+from tests.diagnosis.pushed import at_the_truth, candidates, swung_in_the_world
+
+DRAWS, LEVEL = 39, 0.05
+SEEDS = tuple(range(1, 5))
+
+
+@functools.cache
+def scene(noise, seed):
+    """Fit, candidates, tangents, and what counts of the residual."""
+    fit = at_the_truth(noise, seed)
+    terms = candidates(fit, DYNAMICS)
+    return fit, terms, tangents_of(fit.model, fit.parameters, NoiseSettings(), terms), torch.ones_like(fit.residual)
+
+
+def search(parts, draws=DRAWS, seed=1, **options):
+    return joint_likelihood(*parts, draws, torch.Generator().manual_seed(seed), level=LEVEL, **options)
+
+
+@functools.cache
+def searched(noise, seed):
+    return search(scene(noise, seed), seed=seed)
+
+
+def strongest(found, terms):
+    """Name and number of the candidate that gains most for its numbers."""
+    number = int((found.gain - found.dof).argmax())
+    return terms[number].effect.id, number
+
+
+@pytest.mark.parametrize("noise", ["white", "slow"])
+def test_p_values_are_not_small_where_process_noise_is_all_that_is_missing(noise):
+    """Of four recordings: two p-values below 0.05 come about by chance once in seventy times."""
+    values = sorted(searched(noise, seed).p_value for seed in SEEDS)
+    assert values[1] > 0.05
+    assert values[2] > 0.1
+
+
+@functools.cache
+def hidden():
+    """A search beside the fit of a pendulum with a hidden quadratic drag."""
+    fit = swung_in_the_world("slow", drag=0.4).fit
+    terms = candidates(fit, DYNAMICS)
+    tangents = tangents_of(fit.model, fit.parameters, NoiseSettings(), terms)
+    parts = fit, terms, tangents, fit.pseudo(NoiseSettings())[1]
+    return parts, search(parts)
+
+
+def test_hidden_drag_is_beyond_all_draws_and_has_its_name_and_size():
+    (_, terms, *_), found = hidden()
+    assert found.p_value == pytest.approx(1.0 / (1 + DRAWS))
+    assert found.beyond > 3.0
+    name, number = strongest(found, terms)
+    assert name in ("quadratic_drag", "power_law")
+    drag = [term.effect.id for term in terms].index("quadratic_drag")
+    assert float(found.gain[number] - found.gain[drag]) < 2.0
+    assert float(found.start(drag).gamma[0]) == pytest.approx(0.4, rel=0.5)
+    assert float(found.gain[drag]) > float(found.needed[drag])
+
+
+def test_process_noise_falls_where_physics_explains_what_it_stood_for():
+    (_, terms, *_), found = hidden()
+    drag = [term.effect.id for term in terms].index("quadratic_drag")
+
+    def of_rate(model):
+        return sum(size for place, size, _ in model.pushes if place == 0)
+
+    assert of_rate(found.noise[drag]) < of_rate(found.without)
+
+
+def test_a_candidate_that_the_parameters_span_gains_nothing():
+    """The simulation has a damping of its own."""
+    found, terms = searched("white", 1), scene("white", 1)[1]
+    number = [(term.effect.id, term.port) for term in terms].index(("linear_drag", "rate of rate"))
+    assert float(found.dof[number]) == 0.0
+    assert float(found.gain[number]) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("factor", [1e-9, 1e6])
+def test_gains_do_not_depend_on_the_units_of_a_candidate(factor):
+    fit, terms, tangents, counts = scene("slow", 1)
+    other = dataclasses.replace(tangents, candidates=tuple(factor * one for one in tangents.candidates))
+    known, found = searched("slow", 1), search((fit, terms, other, counts))
+    torch.testing.assert_close(found.gain, known.gain, rtol=1e-4, atol=1e-4)
+    assert found.p_value == known.p_value
+    assert torch.equal(found.dof, known.dof)
+    number = strongest(known, terms)[1]
+    torch.testing.assert_close(factor * found.start(number).gamma, known.start(number).gamma, rtol=1e-4, atol=0.0)
+
+
+def test_a_candidate_without_a_trace_gains_nothing():
+    fit, terms, tangents, counts = scene("white", 1)
+    none = dataclasses.replace(tangents, candidates=tuple(0.0 * one for one in tangents.candidates))
+    found = search((fit, terms, none, counts), draws=9)
+    assert float(found.gain.abs().max()) < 1e-6
+    assert not bool(found.dof.any())
+
+
+def test_one_sided_candidates_gain_by_no_value_of_the_other_sign():
+    found, terms = searched("white", 2), scene("white", 2)[1]
+    for number, term in enumerate(terms):
+        if term.effect.one_sided and float(found.gain[number]) > 1e-9:
+            assert bool((found.start(number).gamma >= 0.0).any()), term.effect.id
+
+
+def test_a_lost_trajectory_is_not_searched(monkeypatch):
+    monkeypatch.setattr("mkc_torch.diagnosis.search.joint_likelihood.flow_of", lambda *_: None)
+    assert search(scene("white", 1), draws=9) is None
+
+
+def test_process_noise_of_an_implausible_size_is_not_tried():
+    found = searched("white", 1)
+    grid = NoiseGrid(found.scene.counted, found.without, np.array([1e-12]))
+    assert all(place > 0 for model in grid.singles() for place, _, _ in model.pushes)
+    # an oscillator's rate changes by several rad/s²
+    largest = max(size for model in found.noise for place, size, _ in model.pushes if place == 0)
+    assert largest < 20.0

@@ -1,0 +1,78 @@
+"""Restricted log-likelihoods with and without candidates, against regressions written out."""
+
+import numpy as np
+import pytest
+
+from mkc_torch.diagnosis.search.likelihoods import PRICE, Columns, log_likelihoods
+from mkc_torch.simulation.dynamics.disturbances import NoiseModel
+from mkc_torch.simulation.dynamics.whitening import SeriesAlong
+from tests.simulation.dynamics.test_whitening import oscillator
+
+WHITE = NoiseModel((0.5,), (), (False,))
+
+
+def series(values):
+    return SeriesAlong(values[:, None, :], np.zeros((len(values) - 1, 2, values.shape[1])))
+
+
+def scene(sizes=(1, 2), one_sided=(False, False), seed=0):
+    random = np.random.default_rng(seed)
+    flow = oscillator(N=80, seed=seed)
+    own, candidates = random.normal(size=(80, 2)), random.normal(size=(80, sum(sizes)))
+    y = random.normal(size=(80, 3))
+    return flow, y, own, candidates, Columns(series(np.concatenate([own, candidates], 1)), 2, sizes, one_sided)
+
+
+def test_under_white_noise_they_are_those_of_restricted_least_squares():
+    flow, y, own, candidates, columns = scene()
+    found = log_likelihoods(flow, [WHITE], series(y), columns)
+    used = flow.counts[:, 0] > 0
+    n = used.sum() - 2
+
+    def left(columns):
+        solved = np.linalg.lstsq(columns[used], y[used], rcond=None)[0]
+        return np.square(y[used] - columns[used] @ solved).sum(0) / 0.25
+
+    level = -used.sum() * np.log(0.5) - 0.5 * np.linalg.slogdet(own[used].T @ own[used] / 0.25)[1]
+    np.testing.assert_allclose(found.without[0], level - 0.5 * n * np.log(left(own) / n))
+    for number, place in enumerate((slice(0, 1), slice(1, 3))):
+        both = np.concatenate([own, candidates[:, place]], 1)
+        np.testing.assert_allclose(found.beside[0, number], level - 0.5 * n * np.log(left(both) / n))
+    np.testing.assert_array_equal(found.rank, [1, 2])
+
+
+def test_sizes_are_minus_the_slopes_of_the_first_series():
+    flow, y, own, candidates, columns = scene()
+    used = flow.counts[:, 0] > 0
+    both = np.concatenate([own, candidates[:, 1:]], 1)[used]
+    solved = np.linalg.lstsq(both, y[used, 0], rcond=None)[0]
+    found = log_likelihoods(flow, [WHITE], series(y), columns)
+    np.testing.assert_allclose(found.sizes[0, 1:], -solved[2:])
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_candidate_of_one_sign_gains_by_that_sign_only(sign):
+    flow, _, own, candidates, columns = scene(sizes=(1,), one_sided=(True,))
+    y = sign * 5.0 * candidates[:, :1] + 0.1 * own[:, :1]
+    found = log_likelihoods(flow, [WHITE], series(y), columns)
+    gain = found.beside[0, 0, 0] - found.without[0, 0]
+    assert (gain > 10.0) == (sign < 0)
+    assert sign < 0 or gain == 0.0
+
+
+def test_each_disturbance_has_its_price():
+    flow, y, _, _, columns = scene()
+    # a disturbance of size 0 changes nothing else
+    idle = NoiseModel((0.5,), ((1, 1e-200, 1.0),), (False,))
+    found = log_likelihoods(flow, [WHITE, idle], series(y), columns)
+    np.testing.assert_allclose(found.without[0] - found.without[1], PRICE)
+
+
+def test_a_declared_noise_has_no_free_scale():
+    flow, y, _, _, columns = scene()
+    declared = NoiseModel((0.5,), (), (True,))
+    one = log_likelihoods(flow, [declared], series(y), columns).without
+    other = log_likelihoods(flow, [declared], series(2.0 * y), columns).without
+    free = log_likelihoods(flow, [WHITE], series(y), columns).without
+    assert ((one - other) > 20.0).all()
+    assert (free > one).all()
