@@ -141,7 +141,7 @@ def diagnose(
         asked = replace(asked, max_findings=min(max_findings, 1))
     hopeless = lost_from_the_start(world)
     progress(f"trying {len(terms)} effects")
-    search = begun(base, () if hopeless else terms, asked, generator)
+    search = begun(base, () if hopeless else terms, asked, generator, world.free)
 
     def case(search: Search) -> Case:
         free = running_freely(base, world.free, search.found, search.evidence, search.blocks)

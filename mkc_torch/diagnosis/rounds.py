@@ -12,7 +12,7 @@ import torch
 
 from mkc_torch._parallel.pool import meanwhile
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
-from mkc_torch.diagnosis.evidence.simpler_form import simpler_by_price, simplified
+from mkc_torch.diagnosis.evidence.simpler_form import simpler_by_price, simpler_last, simplified
 from mkc_torch.diagnosis.evidence.unrecorded_cause import course_without, located_cause
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
@@ -26,6 +26,7 @@ from mkc_torch.diagnosis.search.among_pushes import located_among_pushes
 from mkc_torch.diagnosis.search.elimination import needless_term, without
 from mkc_torch.diagnosis.search.first_look import p_value_beside
 from mkc_torch.diagnosis.search.locate import Located, locate
+from mkc_torch.diagnosis.search.own_noise import priced
 from mkc_torch.diagnosis.search.preference import alike
 from mkc_torch.diagnosis.settings import ConfirmationSettings, Settings
 from mkc_torch.nonlinear import NoFitError
@@ -106,6 +107,7 @@ def begun(
     terms: tuple[Term, ...],
     asked: Asked,
     generator: torch.Generator,
+    free: FittedModel | None = None,
 ) -> Search:
     """The first search, and its finding, if unseen blocks confirm it."""
     prepared = base.model.prepared
@@ -115,14 +117,14 @@ def begun(
     first = None
     with meanwhile([partial(held_out, base, blocks)], common_parts(prepared, ())) as judged:
         if terms:
-            first = _located(base, terms, asked, generator)
+            first = _located(base, terms, asked, generator, free=free)
         [evidence] = judged()
     begun = Search(first, (), None, blocks, (evidence,), terms)
     if first is None:
         return begun
     taken = _taken_up(begun, base, first, asked)
     if taken.found:
-        return taken
+        return _in_two_steps(begun, taken, asked, generator)
     cause = located_cause(base, first, asked.level, asked.surrogates)
     if cause is None:
         return taken
@@ -137,7 +139,8 @@ def continued(search: Search, asked: Asked, generator: torch.Generator) -> Searc
         return replace(search, left=())
     fit = search.found[-1].fit
     try:
-        return _taken_up(search, fit, _located(fit, search.left, asked, generator, parts=False), asked)
+        taken = _taken_up(search, fit, _located(fit, search.left, asked, generator, parts=False), asked)
+        return _in_two_steps(search, taken, asked, generator)
     except NoFitError as error:
         return replace(search, left=(), given_up=str(error))  # what was found before is not to be lost
 
@@ -149,6 +152,7 @@ def _located(
     generator: torch.Generator,
     *,
     parts: bool = True,
+    free: FittedModel | None = None,
 ) -> Located:
     if pushed(fit):
         return located_among_pushes(
@@ -159,6 +163,7 @@ def _located(
             generator=generator,
             declared=asked.declared,
             fixed=asked.fixed,
+            free=free,
             settings=asked.settings,
         )
     return locate(
@@ -229,6 +234,48 @@ def _taken_up(
     # a p-value of 0 is that of a look that sees nothing
     full = len(found) == asked.max_findings and not 0.0 < _beside(taken, asked) <= asked.level
     return replace(taken, left=()) if full else taken
+
+
+def _in_two_steps(before: Search, after: Search, asked: Asked, generator: torch.Generator) -> Search:
+    """The last finding as a simpler physics with another one beside it, where the two are as good.
+
+    A form with more numbers can stand for two effects, as friction that falls with speed does for dry friction and drag.
+
+    Args:
+        before: without the last finding.
+        after: with it.
+        asked: of the diagnosis.
+        generator: of draws.
+    """
+    declared, settings = asked.declared, asked.settings
+    if len(after.found) != len(before.found) + 1 or not after.left or not after.found[-1].with_noise:
+        return after
+    last = after.found[-1]
+    simple = simpler_last(last.fit, declared, settings)
+    if simple is None:
+        return after
+    try:
+        further = _located(simple, after.left, asked, generator, parts=False)
+    except NoFitError:
+        return after
+    if further.p_value > asked.level or _score(further.fit, settings) < _score(last.fit, settings):
+        return after
+    first = replace(last, fit=simple, term=simple.model.terms[-1])
+    evidence = held_out(simple, before.blocks)
+    step = replace(
+        after,
+        found=(*before.found, first),
+        evidence=(*before.evidence, evidence),
+        pairs=(*before.pairs, (before.evidence[-1], evidence)),
+    )
+    both = _taken_up(step, simple, further, asked)
+    return both if len(both.found) > len(after.found) else after
+
+
+def _score(fit: FittedModel, settings: Settings) -> float:
+    """Log-likelihood less the price of the noise and, by Schwarz, of the numbers of effects and their shapes."""
+    numbers = fit.model.size + sum(len(term.effect.fitted_shape) for term in fit.model.terms)
+    return priced(fit, settings) - 0.5 * math.log(len(fit.residual)) * numbers
 
 
 def _eliminated(search: Search, asked: Asked) -> Search:

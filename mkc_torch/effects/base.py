@@ -56,6 +56,7 @@ class Effect(ABC):
     Attributes:
         port: name or kind of the ports where it acts; default "sensor".
         needs: parts that such a port must have; default none.
+        excludes: parts that such a port must not have, as another form of the effect is for those; default none.
         roles: of the columns that drive it, as :mod:`mkc_torch.diagnosis.model.drivers` gives them; default empty, it
             follows time or the signal alone.
         driver_optional: whether one with roles is tried without a driver too; default False.
@@ -113,6 +114,7 @@ class Effect(ABC):
 
     port: str = "sensor"
     needs: tuple[str, ...] = ()
+    excludes: tuple[str, ...] = ()
     roles: tuple[str, ...] = ()
     driver_optional: bool = False
     follows_signal: bool = False

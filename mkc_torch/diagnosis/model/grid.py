@@ -53,7 +53,8 @@ def within_a_sample(term: Term, prepared: PreparedSimulation) -> bool:
 
 def _fits(effect: Effect, name: str, port: Port) -> bool:
     """Whether an effect acts at a port."""
-    return effect.port in (name, port.kind) and set(effect.needs) <= set(port.parts)
+    known = set(port.parts)
+    return effect.port in (name, port.kind) and set(effect.needs) <= known and known.isdisjoint(effect.excludes)
 
 
 def absolute(effect: Effect, shape: Shape, port: Port, driver: Driver | None = None) -> Shape:

@@ -10,11 +10,13 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from mkc_torch.diagnosis.follows import size_of
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_beside
-from mkc_torch.diagnosis.model.in_the_world import beside_effects, between_beside_effects, pushed
+from mkc_torch.diagnosis.model.in_the_world import beside_effects, between_beside_effects, freed, noise_around, pushed
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, continuous
 from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
 from mkc_torch.diagnosis.search.locate import Located
@@ -35,6 +37,9 @@ _CURVES = 2
 _PART = 0.3
 """Share of the largest gain below which a candidate is not fitted."""
 
+_CLOSER = 0.95
+"""Times the residual of a free run that a rival's has to be, for the rival to go first."""
+
 Kind = tuple[Key, str]
 """Of a candidate, and for a curve what it is over."""
 
@@ -48,6 +53,7 @@ def located_among_pushes(
     generator: torch.Generator,
     declared: Mapping[str, float],
     fixed: Mapping[str, str],
+    free: FittedModel | None = None,
     settings: Settings,
 ) -> Located:
     """The strongest candidate beside a fit under pushes.
@@ -60,6 +66,7 @@ def located_among_pushes(
         generator: of the draws.
         declared: standard deviation of the white noise of outputs that it is known of.
         fixed: what inputs do between samples that it is known of.
+        free: the same as it runs freely; None where that loses the recording.
         settings: the numbers that decide.
 
     Raises:
@@ -91,9 +98,13 @@ def located_among_pushes(
         common = base.model.prepared, [terms[number] for number in chosen]
         first = at_once([partial(_fit_of, base, terms[number], found, number) for number in chosen], *common)
         chosen, first = _within_reach(chosen, first, [prefer.score_with_shape(fit, base) for fit in first], settings)
-        works = [partial(with_own_noise, fit, declared, settings) for fit in first]
+        works = [
+            partial(_likelier, base, free, terms[number], fit, found.start(number).gamma, declared, settings)
+            for number, fit in zip(chosen, first, strict=True)
+        ]
         fits = at_once(works, *common)
         best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer, settings)
+        best, ranking = _by_free_run(best, ranking, fits, terms, settings)
         best = beside_effects(best, noise_of_fit(best, declared), declared, settings.noise)
         best = between_beside_effects(best, declared, fixed, settings.noise)
     needless = bool(fits) and _needless(base, best, declared, settings)
@@ -176,6 +187,39 @@ def _within_reach(
     return [chosen[place] for place in kept], [fits[place] for place in kept]
 
 
+def _likelier(
+    base: FittedModel,
+    free: FittedModel | None,
+    term: Term,
+    fit: FittedModel,
+    gamma: Tensor,
+    declared: Mapping[str, float],
+    settings: Settings,
+) -> FittedModel:
+    """The joint fit of a candidate under the noise that it leaves, begun with its first fit or from the free run.
+
+    Process noise that the first fit began with has taken over what the effect does, and not all of it is given back.
+    """
+    under = with_own_noise(fit, declared, settings)
+    if free is None or not pushed(under):
+        return under
+    model = free.model.with_term(term)
+    starts = (torch.cat([free.parameters, gamma]), torch.cat([free.parameters, torch.zeros_like(gamma)]))
+    works = [partial(fitted_beside, free, model, one) for one in starts]
+    running = shape_fitted(max(at_once(works, model.prepared, [term]), key=lambda one: one.log_likelihood))
+    noise = noise_around(running, declared, settings.noise)
+    if noise is not None and noise.observer is not None:
+        prepared = running.model.prepared
+        assert isinstance(prepared, PreparedDynamics)
+        observed = JointModel(prepared.observed(noise.observer), running.model.terms, running.model.near)
+        try:
+            running = fitted(observed, running.parameters, base.bound, graduate=False)
+        except NoFitError:
+            return under
+    running = with_own_noise(running, declared, settings)
+    return running if priced(running, settings) > priced(under, settings) else under
+
+
 def _needless(base: FittedModel, best: FittedModel, declared: Mapping[str, float], settings: Settings) -> bool:
     """Whether the noise that was found beside an effect does as much without it.
 
@@ -193,6 +237,29 @@ def _needless(base: FittedModel, best: FittedModel, declared: Mapping[str, float
     bare = with_own_noise(without, declared, settings)
     price = 0.5 * (best.model.size - own) * math.log(len(base.residual))
     return priced(best, settings) - priced(bare, settings) < price
+
+
+def _by_free_run(
+    best: FittedModel,
+    ranking: tuple[Ranked, ...],
+    fits: Sequence[FittedModel],
+    terms: tuple[Term, ...],
+    settings: Settings,
+) -> tuple[FittedModel, tuple[Ranked, ...]]:
+    """Of candidates that the likelihood does not tell apart the one whose free run follows the recording best."""
+    gaps = {terms[one.number].key: one.gap for one in ranking}
+    near = [fit for fit in fits if gaps[fit.model.terms[-1].key] < settings.naming.separable]
+    keys = list(dict.fromkeys(fit.model.terms[-1].key for fit in near))
+    if len(keys) < 2:
+        return best, ranking
+    runs = at_once([partial(freed, fit) for fit in near], best.model.prepared, [fit.model.terms[-1] for fit in near])
+    sizes = [math.inf if run is None else float(size_of(run.residual).log().sum()) for run in runs]
+    first = min(range(len(near)), key=sizes.__getitem__)
+    own = next(size for fit, size in zip(near, sizes, strict=True) if fit is best)
+    if not sizes[first] < own + len(best.d) * math.log(_CLOSER):
+        return best, ranking
+    key = near[first].model.terms[-1].key
+    return near[first], tuple(sorted(ranking, key=lambda one: (terms[one.number].key != key, one.gap)))
 
 
 def _by_own_noise(

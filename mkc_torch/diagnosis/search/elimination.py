@@ -18,8 +18,8 @@ __all__ = ["needless_term", "without"]
 def needless_term(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> int | None:
     """The effect of a joint fit that does not pay its price beside the others; None where each one does.
 
-    The price of an effect is half the logarithm of the number of samples for each of its numbers (Schwarz, Annals of
-    Statistics 6, 1978, 461).
+    The price of an effect is half the logarithm of the number of samples for each of its numbers and each fitted number
+    of its shape (Schwarz, Annals of Statistics 6, 1978, 461), and what tells two models apart.
 
     Args:
         fit: with several effects.
@@ -32,7 +32,7 @@ def needless_term(fit: FittedModel, declared: Mapping[str, float], settings: Set
     works = [partial(_loss, fit, number, declared, settings) for number in range(count)]
     losses = at_once(works, fit.model.prepared, fit.model.terms)
     weakest = min(range(count), key=losses.__getitem__)
-    return weakest if losses[weakest] < 0.0 else None
+    return weakest if losses[weakest] < settings.naming.separable else None
 
 
 def _loss(fit: FittedModel, number: int, declared: Mapping[str, float], settings: Settings) -> float:
@@ -40,7 +40,8 @@ def _loss(fit: FittedModel, number: int, declared: Mapping[str, float], settings
     less = without(fit, number, declared, settings)
     if less is None:
         return math.inf
-    price = 0.5 * fit.model.sizes[number] * math.log(len(fit.residual))
+    numbers = fit.model.sizes[number] + len(fit.model.terms[number].effect.fitted_shape)
+    price = 0.5 * numbers * math.log(len(fit.residual))
     return priced(fit, settings) - priced(less, settings) - price
 
 

@@ -46,7 +46,7 @@ class PowerLaw(RateEffect):
 
     id = "power_law"
     general = True
-    fitted_shape: Mapping[str, tuple[float, float]] = {"exponent": (0.3, 3.5)}
+    fitted_shape: Mapping[str, tuple[float, float]] = {"exponent": (0.3, 6.0)}
     explanation = "Something drives the state back by a power of its size, as natural convection or an orifice does."
     advice = "Add a term with this exponent; it tells what kind of flow or spring it is."
     source = "Churchill & Chu (1975), of natural convection; Torricelli's law; Clift, Grace & Weber (1978), of drag"

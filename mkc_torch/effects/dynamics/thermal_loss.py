@@ -33,6 +33,7 @@ class ThermalLoss(RateEffect):
 
     id = "thermal_loss"
     needs: tuple[str, ...] = ("own", "temperature")
+    excludes: tuple[str, ...] = (SURROUNDINGS,)  # a body radiates to its surroundings where they are known
     gain = "loss"
     equation = "δṪ = −γ (T⁴ − T₀⁴) / (4 T₀³)"
     explanation = "The body loses heat with the fourth power of its absolute temperature: it radiates."
@@ -42,6 +43,7 @@ class ThermalLoss(RateEffect):
     def __init__(self, *, beside: bool = False) -> None:
         if beside:
             self.needs, self.choices = ("own", "temperature", SURROUNDINGS), (SURROUNDINGS,)
+            self.excludes = ()
             self.equation = "δṪ = −γ (T⁴ − u⁴) / (4 T₀³)"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002

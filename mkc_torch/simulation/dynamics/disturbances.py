@@ -48,6 +48,9 @@ They are 3,600 samples, which tell the size of an oscillator's white push to som
 _SHARES = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01)
 """Of known sizes, tried where an effect may have made some of a push needless."""
 
+_IMPLAUSIBLE = 1e12
+"""Nats that a disturbance of an implausible size is behind: it is taken where there is no other."""
+
 _FINER = (0.5, 0.63, 0.8, 1.0, 1.26, 1.6, 2.0)
 _ROUNDS = 3
 
@@ -116,6 +119,7 @@ def disturbed(
     known: Sequence[bool],
     least: float,
     most: int,
+    largest: Float[np.ndarray, " p+m"] | None = None,
 ) -> Disturbed:
     """The likeliest noise along a flow: one disturbance after the other is taken up, whichever gains most.
 
@@ -127,6 +131,7 @@ def disturbed(
         known: whether it is known.
         least: nats that a disturbance has to gain.
         most: disturbances at most.
+        largest: plausible size of a disturbance of each rate and each output, in their units; None for any.
     """
     p, m = flow.rates, len(channels)
     best = NoiseModel(tuple(floor.tolist()), (), tuple(known))
@@ -136,9 +141,8 @@ def disturbed(
         tried = [replace(best, pushes=(*best.pushes, one)) for one in _candidates(flow, best, p + m)]
         if not tried:
             break
-        values, scales = _likelihoods(flow, tried)
-        number = int(np.nan_to_num(values, nan=-np.inf).argmax())
-        other = _finer(flow, _scaled(tried[number], float(scales[number])))
+        number, scale = _likeliest(flow, tried, largest)
+        other = _finer(flow, _scaled(tried[number], scale), largest)
         more, scale = _exactly(flow, other)
         # the others may have come nearer to their best as well
         nearer = replace(other, pushes=other.pushes[:-1])
@@ -153,11 +157,18 @@ def disturbed(
     if len(gains) < 2:
         return found
     # one may have stood for another that was found later
-    fewer = resized(flow, names, channels, found, least)
+    fewer = resized(flow, names, channels, found, least, largest)
     return fewer if len(fewer.disturbances) < len(gains) else found
 
 
-def resized(flow: Flow, names: Sequence[str], channels: Sequence[str], known: Disturbed, least: float) -> Disturbed:
+def resized(
+    flow: Flow,
+    names: Sequence[str],
+    channels: Sequence[str],
+    known: Disturbed,
+    least: float,
+    largest: Float[np.ndarray, " p+m"] | None = None,
+) -> Disturbed:
     """The same disturbances at the sizes that they have along another flow, without those that are needless there.
 
     Args:
@@ -165,14 +176,14 @@ def resized(flow: Flow, names: Sequence[str], channels: Sequence[str], known: Di
         names, channels: as of :func:`disturbed`.
         known: the disturbances.
         least: nats that each has to gain.
+        largest: as of :func:`disturbed`.
     """
     places = [*names, *channels]
     pushes = tuple((_place(places, one, len(names)), one.size, one.lasting) for one in known.disturbances)
     noise = NoiseModel(tuple(known.sensor.tolist()), pushes, known.declared)
     tried = [replace(noise, pushes=tuple((a, share * s, t) for a, s, t in pushes)) for share in _SHARES]
-    values, scales = _likelihoods(flow, tried)
-    number = int(np.nan_to_num(values, nan=-np.inf).argmax())
-    best = _finer(flow, _scaled(tried[number], float(scales[number])))
+    number, scale = _likeliest(flow, tried, largest)
+    best = _finer(flow, _scaled(tried[number], scale), largest)
     value, scale = _exactly(flow, best)
     best = _scaled(best, scale)
     gains: list[float] = []
@@ -282,6 +293,22 @@ def _likelihoods(flow: Flow, noises: Sequence[NoiseModel]) -> tuple[np.ndarray, 
     return robust_likelihood(found, parts.mine, flow.reach, free=not any(noises[0].known))
 
 
+def _likeliest(
+    flow: Flow, noises: Sequence[NoiseModel], largest: Float[np.ndarray, " p+m"] | None
+) -> tuple[int, float]:
+    """The number of the likeliest model whose disturbances are of a plausible size at its scale, and that scale."""
+    values, scales = _likelihoods(flow, noises)
+    values = np.nan_to_num(values, nan=-np.inf)
+    if largest is not None:
+        allowed = [
+            all(scale * size <= largest[place] for place, size, _ in noise.pushes)
+            for noise, scale in zip(noises, scales, strict=True)
+        ]
+        values = np.where(allowed, values, values - _IMPLAUSIBLE)
+    number = int(values.argmax())
+    return number, float(scales[number])
+
+
 def _exactly(flow: Flow, noise: NoiseModel) -> tuple[float, float]:
     """The same of one, in one stretch: without a push there is nothing that corrects a filter which begins inside."""
     found = filtered_whole(flow, filter_models(flow, [noise]))
@@ -312,7 +339,7 @@ def _white(flow: Flow, noise: NoiseModel) -> tuple[NoiseModel, float]:
     return _scaled(noise, scale), value
 
 
-def _finer(flow: Flow, noise: NoiseModel) -> NoiseModel:
+def _finer(flow: Flow, noise: NoiseModel, largest: Float[np.ndarray, " p+m"] | None) -> NoiseModel:
     """Sizes, time constants and the sensors' noise one after the other, on a grid that closes in; the scale at once."""
     power = 1.0
     for _ in range(_ROUNDS):
@@ -330,9 +357,8 @@ def _finer(flow: Flow, noise: NoiseModel) -> NoiseModel:
                 others += [(place, size, f**power * lasting) for f in _FINER if f != 1.0]
                 others += [(place, f ** (0.5 * power) * size, lasting / f**power) for f in _FINER if f != 1.0]
             tried += [replace(noise, pushes=(*noise.pushes[:d], one, *noise.pushes[d + 1 :])) for one in others]
-        values, scales = _likelihoods(flow, tried)
-        number = int(np.nan_to_num(values, nan=-np.inf).argmax())
-        noise = _scaled(tried[number], float(scales[number]))
+        number, scale = _likeliest(flow, tried, largest)
+        noise = _scaled(tried[number], scale)
         if number == 0:
             power *= 0.4
     return noise

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mkc_torch.simulation.dynamics.disturbances import Disturbed, disturbed, models_of, observer_of, resized
 from mkc_torch.simulation.dynamics.first_fit import floor_of, without_noise
-from mkc_torch.simulation.dynamics.flow import flow_of
+from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.kalman import smoothed
 from mkc_torch.simulation.dynamics.observer import Observable, Observer
 from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
@@ -56,8 +56,9 @@ def likeliest_noise(
     if flow is None or not all(bool(np.isfinite(one).all()) for one in (flow.carried, flow.seen, flow.new, flow.shift)):
         return None
     names, channels = prepared.pushable, prepared.channels
+    largest = plausible_sizes(prepared, theta, changes, near)
     if known is not None and known.disturbances:
-        found = resized(flow, names, channels, known, least)
+        found = resized(flow, names, channels, known, least, largest)
         return NoiseOfTheWorld(found, observer_of(flow, found.disturbances, found.sensor, names, channels))
     floor = floor_of(prepared)
     if without_noise(floor):
@@ -66,7 +67,7 @@ def likeliest_noise(
     sensor = floor.new_tensor(
         [declared.get(name, float(one)) for name, one in zip(prepared.channels, floor, strict=True)]
     )
-    found = disturbed(flow, names, channels, sensor, given, least, most)
+    found = disturbed(flow, names, channels, sensor, given, least, most, largest)
     return NoiseOfTheWorld(found, observer_of(flow, found.disturbances, found.sensor, names, channels))
 
 
