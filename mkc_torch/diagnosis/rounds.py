@@ -12,7 +12,7 @@ import torch
 
 from mkc_torch._parallel.pool import meanwhile
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
-from mkc_torch.diagnosis.evidence.simpler_form import simpler_by_price, simpler_last, simplified
+from mkc_torch.diagnosis.evidence.simpler_form import simpler_by_price, simplified
 from mkc_torch.diagnosis.evidence.unrecorded_cause import course_without, located_cause
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
@@ -239,7 +239,7 @@ def _taken_up(
 def _in_two_steps(before: Search, after: Search, asked: Asked, generator: torch.Generator) -> Search:
     """The last finding as a simpler physics with another one beside it, where the two are as good.
 
-    A form with more numbers can stand for two effects, as friction that falls with speed does for dry friction and drag.
+    A form with more numbers can stand for two effects: friction that falls with speed for dry friction and drag.
 
     Args:
         before: without the last finding.
@@ -247,13 +247,15 @@ def _in_two_steps(before: Search, after: Search, asked: Asked, generator: torch.
         asked: of the diagnosis.
         generator: of draws.
     """
-    declared, settings = asked.declared, asked.settings
+    settings = asked.settings
     if len(after.found) != len(before.found) + 1 or not after.left or not after.found[-1].with_noise:
         return after
     last = after.found[-1]
-    simple = simpler_last(last.fit, declared, settings)
-    if simple is None:
+    simpler = last.term.effect.simpler
+    near = [fit for fit in last.compared if simpler is not None and fit.model.terms[-1].effect.id == simpler.id]
+    if not near or simpler is None or simpler.id == last.term.effect.id:
         return after
+    simple = max(near, key=lambda fit: priced(fit, settings))
     try:
         further = _located(simple, after.left, asked, generator, parts=False)
     except NoFitError:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-__all__ = ["simpler_by_price", "simpler_last", "simplified"]
+__all__ = ["simpler_by_price", "simplified"]
 
 Holds = Callable[[FittedModel, Evidence], bool]
 
@@ -83,18 +83,6 @@ def simpler_by_price(fit: FittedModel, declared: Mapping[str, float], settings: 
         if priced(fit, settings) - priced(other, settings) < max(price, settings.naming.separable):
             fit = other
     return fit
-
-
-def simpler_last(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> FittedModel | None:
-    """The fit with another, simpler physics for its last effect; None where that has none, or no answer."""
-    effect = fit.model.terms[-1].effect
-    start = _simpler(fit, len(fit.model.terms) - 1)
-    if start is None or effect.simpler is None or effect.simpler.id == effect.id:
-        return None
-    try:
-        return with_own_noise(fitted(*start, fit.bound, graduate=False), declared, settings)
-    except NoFitError:
-        return None
 
 
 def _simpler(fit: FittedModel, number: int) -> tuple[JointModel, Float[Tensor, " p"]] | None:
