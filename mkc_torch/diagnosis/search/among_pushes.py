@@ -162,9 +162,12 @@ def _fit_of(base: FittedModel, term: Term, found: JointLikelihood, number: int) 
     smaller = prepared.observed(begin.observer)
     start = torch.cat([_inside(base, base.parameters + begin.shift), begin.gamma])
     model = JointModel(smaller, (*base.model.terms, term), base.model.near)
-    there = fitted_beside(base, model, start, graduate=False)
-    if there.model.prepared is smaller:
-        return there
+    none = torch.cat([base.parameters, torch.zeros_like(begin.gamma)])
+    # far along the tangents there may be no trajectory
+    for one in (start, none):
+        there = fitted_beside(base, model, one, graduate=False)
+        if there.model.prepared is smaller:
+            return there
     return fitted_beside(base, base.model.with_term(term), start, graduate=False)
 
 
