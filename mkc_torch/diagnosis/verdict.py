@@ -32,7 +32,7 @@ class Around:
     lost: bool = False
 
     def unfit(self, settings: EvidenceSettings) -> bool:
-        """Whether the simulation does not follow, and no finding makes it follow with parameters that it allows."""
+        """Whether neither the simulation nor it with its findings explains what the recording varies by."""
         if self.lost:
             return True
         if not misses(self.follows, settings.followed):
@@ -121,6 +121,7 @@ def verdict_of(
     ]
     clean = white and not pushed and not structure and not above
     if not findings:
-        return "adequate" if clean else "unexplained"
+        follows = not misses(known.follows, settings.followed)
+        return "adequate" if clean and follows else "unexplained"
     named = all(one.grade in ("left out", "real but small") for one in findings)
     return "explained" if named and clean else "unexplained"
