@@ -61,7 +61,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The diagnosis of a recording, or of several together, as ``diagnosis.json`` has it and what its report draws beside it.
+    """The diagnosis of a recording, or of several together: what ``diagnosis.json`` and its report have.
 
     Attributes:
         recording, simulation, samples, level: what was asked: names, number of samples used, false-alarm level.

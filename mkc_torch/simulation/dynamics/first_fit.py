@@ -29,18 +29,24 @@ __all__ = ["floor_of", "over_short_horizons", "strong_observer", "without_noise"
 _CORRECTIONS = (100.0, 10.0)
 """Sizes of the pushes that the corrections are for, over that at which they move an output by its noise."""
 
+_SHORTEST = 1000.0
+"""The same of the shortest horizon, for a guess that the first of them loses."""
+
 _STEPS = 60
 
 
-def over_short_horizons(prepared: Observable, theta: Float[Tensor, " p"]) -> Float[Tensor, " p"] | None:
+def over_short_horizons(
+    prepared: Observable, theta: Float[Tensor, " p"], *, shortest: bool = False
+) -> Float[Tensor, " p"] | None:
     """Parameters that predict over short horizons, from a guess that may be ten times off; None where there are none.
 
     Args:
         prepared: the simulation.
         theta: the guess.
+        shortest: begin with a horizon that is shorter still.
     """
     low, high = prepared.bounds
-    for size in _CORRECTIONS:
+    for size in (_SHORTEST, *_CORRECTIONS) if shortest else _CORRECTIONS:
         observer = strong_observer(prepared, theta, size)
         if observer is None:
             return None
