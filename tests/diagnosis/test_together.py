@@ -8,8 +8,10 @@ import torch
 from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
 from mkc_torch.diagnosis.joined import joined
+from mkc_torch.effects import CATALOGUE
 from mkc_torch.recording.recording import RecordingError
 from mkc_torch.simulation import Dynamics, Magnetometer, Paired, Static
+from tests.simulation.tumbling import tumbling
 
 
 class Decay(Dynamics):
@@ -70,6 +72,17 @@ def test_a_simulation_without_states_has_one_clock():
     assert result.samples == 120
     assert bool((result.traces.time.diff() > 0).all())
     assert any("b is counted" in warning for warning in result.warnings)
+
+
+def test_an_offset_that_changed_between_two_recordings_is_a_step_between_them():
+    first, second = tumbling(400, noise=0.3), tumbling(400, noise=0.3, seed=1)
+    moved = Recording({**second.columns, "mag_x": second["mag_x"] + 5.0}, name="b")
+    both = [Recording(first.columns, name="a"), moved]
+    step = tuple(effect for effect in CATALOGUE if effect.id == "hard_iron_step")
+    finding = diagnose(Magnetometer(), both, effects=step, surrogates=19).findings[0]
+    end = float(first["time"][-1])
+    assert end - 0.5 < finding.onset < end + 10.5
+    assert finding.parameters[0].value == pytest.approx((5.0, 0.0, 0.0), abs=0.3)
 
 
 def test_what_a_simulator_wrote_is_compared_at_its_own_times():

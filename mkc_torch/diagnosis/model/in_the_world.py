@@ -19,7 +19,7 @@ from mkc_torch.diagnosis.model.no_first_fit import no_first_fit
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError
-from mkc_torch.simulation.dynamics.first_fit import over_short_horizons, strong_observer
+from mkc_torch.simulation.dynamics.first_fit import over_short_horizons, strongly_observed
 from mkc_torch.simulation.dynamics.noise import NoiseOfTheWorld, likeliest_noise, noise_of
 from mkc_torch.simulation.dynamics.other_starts import other_starts
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
@@ -339,10 +339,10 @@ def _from_short(
     """The same from parameters that predict over short horizons, along an observer that corrects by much."""
     prepared = model.prepared
     assert isinstance(prepared, PreparedDynamics)
-    observer = strong_observer(prepared, start, _STRONG)
-    if observer is None:
+    observed = strongly_observed(prepared, start, _STRONG)
+    if observed is None:
         return None
-    strong = JointModel(prepared.observed(observer), model.terms)
+    strong = JointModel(observed, model.terms)
     try:
         fit = fitted(strong, start, bound, graduate=False)
     except NoFitError:
@@ -362,10 +362,9 @@ def _from_given(
     """Fits under the noise that is around a user's own values: what is missing may drive any fit without it away."""
     prepared = model.prepared
     assert isinstance(prepared, PreparedDynamics)
-    observer = strong_observer(prepared, start, _STRONG)
-    if observer is None or bound is None:
+    strong = strongly_observed(prepared, start, _STRONG)
+    if strong is None or bound is None:
         return None
-    strong = prepared.observed(observer)
     noise = likeliest_noise(
         strong, start, {}, None, declared=declared, least=settings.pushed, most=settings.pushes, known=None
     )
