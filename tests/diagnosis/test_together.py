@@ -17,16 +17,16 @@ from tests.simulation.tumbling import tumbling
 class Decay(Dynamics):
     states = ("level",)
     outputs = ("level",)
-    parameters = {"rate": 0.8}
+    parameters = {"rate": 0.8}  # noqa: RUF012
 
-    def derivative(self, time, x, u, p):
+    def derivative(self, time, x, u, p):  # noqa: ARG002
         return {"level": -p.rate * x.level}
 
 
 class Line(Static):
     inputs, outputs, parameters = ("heat",), ("voltage",), {"slope": 1.0}
 
-    def output(self, time, u, p):
+    def output(self, time, u, p):  # noqa: ARG002
         return {"voltage": p.slope * u.heat}
 
 
