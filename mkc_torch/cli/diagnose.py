@@ -31,6 +31,7 @@ from mkc_torch.cli.diagnosis_request import (
     MAGNETOMETER,
     SIMULATIONS,
     SURROGATES,
+    TOGETHER,
     Outcome,
     Request,
     is_file_of_a_simulation,
@@ -64,6 +65,13 @@ def diagnose(
         str | None,
         typer.Option(metavar="COLUMN", help="Column that separates runs in one table; default: experiment, if any."),
     ] = None,
+    together: Annotated[
+        bool,
+        typer.Option(
+            "--together",
+            help="One simulation and one set of findings for all REC, each with its own start; into OUTPUT/together.",
+        ),
+    ] = False,
     noise: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=SIZE", help="White noise of an output's sensor, if it is known: angle=0.005"),
@@ -84,7 +92,8 @@ def diagnose(
 ) -> None:
     """Say what a simulation lacks: where recordings differ from it, by what physics, how sure, and how much it helps.
 
-    Each REC gets diagnosis.json, model.json (for `mkc apply`) and report.html. Exits with 0 when every recording was
+    Each REC gets diagnosis.json, model.json (for `mkc apply`) and report.html; with --together all of them get one of
+    each. Exits with 0 when every recording was
     diagnosed, whatever was found, and 1 when some were not.
     """
     recordings, texts = without_units(recordings, unit or [])
@@ -111,6 +120,8 @@ def diagnose(
     one_thread()
     keep_memory()
     look = Look.of(out())
+    if together:
+        raise typer.Exit(_all_together(output, request, look, recordings))
     with (
         interrupts_told(lambda: not_written(left, output)),
         progress(len(recordings), output) as step,
@@ -136,6 +147,18 @@ def _diagnosed(output: Path, request: Request, look: Look, step: Steps | None, p
     from mkc_torch.cli.diagnosis_files import diagnose_file
 
     return diagnose_file(path, output / path.stem, request, look, step)
+
+
+def _all_together(output: Path, request: Request, look: Look, paths: list[Path]) -> int:
+    """Diagnoses the recordings as one; returns the exit code."""
+    from mkc_torch.cli.diagnosis_files import diagnose_together
+
+    with interrupts_told(lambda: not_written([output / TOGETHER], output)), progress(1, output) as step:
+        step("diagnosing the recordings together")
+        outcomes = diagnose_together(paths, output / TOGETHER, request, look, step)
+        _tell(outcomes, step)
+        step(None)
+    return int(any(outcome.failed for outcome in outcomes))
 
 
 def _waited_for(result: Callable[[], list[Outcome]], path: Path) -> list[Outcome]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
 from functools import partial
@@ -18,6 +18,7 @@ from mkc_torch.cli.recorded import read_magnetometer, read_table, refuse_no_magn
 from mkc_torch.diagnosis import Diagnosis, diagnose
 from mkc_torch.diagnosis.files.python_source import SourceError
 from mkc_torch.recording.recording import Recording, RecordingError
+from mkc_torch.recording.together import joint_name
 from mkc_torch.simulation.load import load_simulation, raised_in
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = [
     "WRITTEN",
     "diagnose_file",
+    "diagnose_together",
     "named_simulation",
     "paired_simulation",
     "simulation_of",
@@ -60,6 +62,36 @@ def diagnose_file(
         if all(outcome.failed for outcome in outcomes):
             remove_if_empty(folder)
     return [replace(outcome, note=note) for outcome in outcomes]
+
+
+def diagnose_together(
+    paths: Sequence[Path], folder: Path, request: Request, look: Look, step: Callable[[str], None] | None = None
+) -> list[Outcome]:
+    """Diagnose files as one: one simulation and one set of findings for all of them, into one folder.
+
+    A file that cannot be read keeps the others from being diagnosed, for it was asked for them all. ``step`` is told
+    what is done.
+    """
+    recordings, notes = [], []
+    for path in paths:
+        try:
+            own, note = _decided(path, request)
+            recordings.append(_read(path, own))
+        except Exception as error:
+            return [_failed(path, "", error)]
+        notes.append(note)
+    subject = Path(joint_name([path.name for path in paths]))
+    try:
+        simulation = simulation_of(own)
+        claim_folder(folder, overwrite=request.force, files=WRITTEN)
+    except Exception as error:
+        return [_failed(subject, "", error)]
+    with folder_written(folder):
+        told = partial(_tell, step, f"diagnosing {subject}")
+        outcome = _outcome(subject, "", simulation, recordings, folder, own, look, told)
+        if outcome.failed:
+            remove_if_empty(folder)
+    return [replace(outcome, note=next((note for note in notes if note), ""))]
 
 
 def _decided(path: Path, request: Request) -> tuple[Request, str]:
@@ -126,7 +158,7 @@ def _outcome(
     path: Path,
     label: str,
     simulation: Simulation,
-    recording: Recording,
+    recording: Recording | Sequence[Recording],
     folder: Path,
     request: Request,
     look: Look,

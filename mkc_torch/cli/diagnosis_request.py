@@ -12,6 +12,7 @@ __all__ = [
     "MAGNETOMETER",
     "SIMULATIONS",
     "SURROGATES",
+    "TOGETHER",
     "Outcome",
     "Request",
     "is_file_of_a_simulation",
@@ -25,6 +26,9 @@ SIMULATIONS = (MAGNETOMETER,)
 BETWEEN = ("held", "linear", "smooth")
 LEVEL = 0.05
 SURROGATES = 99
+
+TOGETHER = "together"
+"""Folder of what is diagnosed with ``--together``."""
 
 
 @dataclass(frozen=True)

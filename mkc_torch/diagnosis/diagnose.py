@@ -22,6 +22,7 @@ from mkc_torch.diagnosis.evidence.after_the_search import answers_of, parts_ahea
 from mkc_torch.diagnosis.evidence.base import Case
 from mkc_torch.diagnosis.evidence.running_freely import running_freely
 from mkc_torch.diagnosis.follows import misses
+from mkc_torch.diagnosis.joined import joined
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import FittedModel
@@ -35,7 +36,7 @@ from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
-from mkc_torch.simulation.protocol import Simulation, refuse_no_recording
+from mkc_torch.simulation.protocol import Simulation
 
 __all__ = ["diagnose"]
 
@@ -51,7 +52,7 @@ MAX_FINDINGS = 3
 
 def diagnose(
     simulation: Simulation,
-    recording: Recording,
+    recording: Recording | Sequence[Recording],
     *,
     effects: Sequence[Effect] = CATALOGUE,
     level: float = LEVEL,
@@ -63,7 +64,7 @@ def diagnose(
     between: Mapping[str, str] | None = None,
     progress: Callable[[str], object] = lambda _: None,
 ) -> Diagnosis:
-    """What a simulation lacks, by one recording of what it simulates.
+    """What a simulation lacks, by one recording of what it simulates, or by several together.
 
     The simulation's own parameters are fitted together with every candidate: effect × driver × shape. The strongest
     one is judged by the same search on draws of the fitted noise, and by whether it predicts blocks that the fit has
@@ -71,9 +72,14 @@ def diagnose(
     the catalogue, a wander that moves a sensor's axes along one direction is told as "unknown": a cause that no column
     recorded.
 
+    Several recordings of one system are diagnosed together: one set of parameters and of findings for all of them, and
+    states at the start for each. Physics repeats from run to run, slow noise and disturbances do not. Of a simulation
+    without states the recordings follow one another on one clock.
+
     Args:
         simulation: of the recording, such as :class:`mkc_torch.simulation.Magnetometer`.
-        recording: with named columns; see :class:`mkc_torch.Recording`.
+        recording: with named columns, see :class:`mkc_torch.Recording`; or a sequence of recordings with the same
+            columns in the same units.
         effects: the catalogue to search; :data:`mkc_torch.effects.CATALOGUE` and whatever a user adds.
         level: rate of false alarms, in (0, 1).
         surrogates: draws of noise for each p-value; at least ``1 / level - 1``.
@@ -92,7 +98,8 @@ def diagnose(
 
     Raises:
         TypeError: an argument of another kind: the name of a simulation, of a file or of an effect, or a class.
-        ValueError: an argument out of range, too few samples, or a recording that the simulation refuses.
+        ValueError: an argument out of range, too few samples, recordings whose columns or units differ, or a recording
+            that the simulation refuses.
         MissingColumnError: the recording lacks a column that the simulation needs.
 
     Example:
@@ -103,7 +110,7 @@ def diagnose(
         True
     """
     refuse_no_simulation(simulation)
-    refuse_no_recording("recording", recording)
+    recording, names = joined(simulation, recording)
     effects = checked_effects(effects)
     check_numbers(level, surrogates, max_findings, seed)
     refuse_no_settings(settings)
@@ -153,7 +160,8 @@ def diagnose(
     def diagnosis(search: Search, known: Case, done: Sequence[Any]) -> Diagnosis:
         final = search.found[-1].fit if search.found else base
         whole = Whole(simulation, drivers, terms, world, final, asked, search.cut)
-        return with_rest(assembled(whole, answers_of(known, done)), search)
+        told = with_rest(assembled(whole, answers_of(known, done)), search)
+        return replace(told, recordings=names)
 
     known = [simulation, base, base.model, *common_parts(prepared, terms)]
 

@@ -61,7 +61,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The diagnosis of one recording, as ``diagnosis.json`` has it and what its report draws beside it.
+    """The diagnosis of a recording, or of several together: what ``diagnosis.json`` and its report have.
 
     Attributes:
         recording, simulation, samples, level: what was asked: names, number of samples used, false-alarm level.
@@ -79,6 +79,7 @@ class Diagnosis:
         model: the simulation's sensor or system with the findings in it; None where there is none to apply.
         evidence: what the tests say that are asked of the whole diagnosis.
         world: how the simulation follows the recording, and the noise of the world around it.
+        recordings: names of the recordings that were diagnosed together; empty for a single one.
 
     Example:
         >>> import torch
@@ -115,6 +116,7 @@ class Diagnosis:
     model: CorrectingModel | None = field(default=None, repr=False, compare=False)
     evidence: tuple[Told, ...] = ()
     world: World = field(default_factory=World)
+    recordings: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         found = ", ".join(finding.effect for finding in self.findings) or "nothing found"

@@ -294,6 +294,38 @@ def test_experiments_are_diagnosed_each_on_its_own(tmp_path):
 
 
 @pytest.mark.e2e
+def test_recordings_are_diagnosed_together(tmp_path):
+    a, b = quiet(tmp_path / "a.csv"), table(tmp_path / "b.csv", sensor(QUIET + 1, start=7.0))
+    result = diagnosed(a, b, "--together", "--output", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "a, b against magnetometer" in result.stdout
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["together"]
+    folder = tmp_path / "out" / "together"
+    assert sorted(p.name for p in folder.iterdir()) == WRITTEN
+    content = content_of(folder)
+    validate(content)
+    assert (content["recording"], content["samples"]) == (["a", "b"], 1000)
+    assert "a, b" in (folder / "report.html").read_text(encoding="utf-8")
+    refused(diagnosed(a, b, "--together", "--output", tmp_path / "out"), "together", "--force")
+
+
+def test_recordings_that_differ_are_not_diagnosed_together(tmp_path):
+    a, b = quiet(tmp_path / "a.csv"), quiet(tmp_path / "b.csv", current=torch.ones(500))
+    refused(
+        diagnosed(a, b, "--together", "--output", tmp_path / "out"),
+        "b and a cannot be diagnosed together, for their columns differ: b has `current`, which a has not.",
+    )
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_recording_that_cannot_be_read_keeps_all_from_being_diagnosed_together(tmp_path):
+    a, bad = quiet(tmp_path / "a.csv"), tmp_path / "bad.csv"
+    bad.write_text("time,mag_x,mag_y,mag_z\n0,1,two,3\n")
+    refused(diagnosed(a, bad, "--together", "--output", tmp_path / "out"), f"mkc: {bad}: column `mag_y` holds text")
+    assert not (tmp_path / "out" / "together").exists()
+
+
+@pytest.mark.e2e
 def test_columns_of_the_users_own(tmp_path):
     columns = {name.replace("mag_", "u"): values for name, values in sensor(QUIET).items()}
     path = table(tmp_path / "a.csv", columns)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.density.fit import fit_density
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, scored
 from mkc_torch.diagnosis.evidence.smooth_curves import TIME, Smooth, curves_of, smooth_tangents
@@ -31,6 +32,9 @@ _PENALTIES = (1e-3, 3e-2, 1.0)
 
 _MIDDLE = 3e-2
 """The strength that columns are taken up with."""
+
+_REACH = 3.0
+"""Robust standard deviations of the residual that the domain of its density holds at least."""
 
 _ROUNDS = 2
 """Rounds of reweighting, by the density that the round before has left."""
@@ -238,7 +242,10 @@ def _judged(problem: _Problem, chosen: Sequence[_Step], fit: FittedModel, blocks
     for _ in range(_ROUNDS):
         weights = used * mkc_weight(left, sigma.unsqueeze(1), d.unsqueeze(1)) / d.square().unsqueeze(1)
         left = torch.stack([_reweighted(problem, c, s, w) for c, s, w in zip(columns, chosen, weights, strict=True)])
-        density = fit_density(left, bound=bound, weight=used.expand_as(left), tol=1e-6)
+        weight = used.expand_as(left)
+        # a curve that runs away on one fold leaves more than the domain holds
+        room = bound.maximum(_REACH * robust_scale(left, weight).amax(0))
+        density = fit_density(left, bound=room, weight=weight, tol=1e-6)
         sigma, d = density.sigma, density.d
     score = torch.stack(
         [scored(e, s, size * fit.d, fit.bound) for e, s, size in zip(left * fit.d, sigma, d, strict=True)]

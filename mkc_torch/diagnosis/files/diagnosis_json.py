@@ -46,7 +46,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
     d = diagnosis
     content = {
         "schema": SCHEMA,
-        "recording": d.recording,
+        "recording": list(d.recordings) or d.recording,
         "simulation": d.simulation,
         "samples": d.samples,
         "level": d.level,

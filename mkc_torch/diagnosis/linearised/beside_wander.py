@@ -32,6 +32,9 @@ _MEDIANS = 75
 _ALIKE = 1e-10
 """Smallest eigenvalue, over the largest, of tangents on scales of their own that still tells them apart."""
 
+_REACH = 3.0
+"""Robust standard deviations of the residual that the domain of its density holds at least."""
+
 _SETTLED = 5e-3
 """Share of the residuals that may still come to count or cease to."""
 
@@ -84,7 +87,8 @@ def beside_wander(
         # beside a wander the simulation's own parameters are not where a fit without one has them
         course = course + explained(fit.residual - course, counts, tangents.nuisance)
         quick = fit.residual - course
-        density = fit_density(quick, bound=fit.bound)
+        # beside the course of a fit that is far off the residual may be larger than its domain
+        density = fit_density(quick, bound=fit.bound.maximum(_REACH * robust_scale(quick)))
         before = counts
         values, counts = pseudo_residual(quick, density.sigma, density.d, settings.rejected_below)
         alone = out_of_bursts((quick.abs() <= settings.far * robust_scale(quick)).to(quick.dtype), settings)

@@ -10,14 +10,18 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.diagnosis.follows import follows_of, pooled
 from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.no_first_fit import no_first_fit
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.nonlinear import NoFitError
-from mkc_torch.simulation.dynamics.first_fit import over_short_horizons, strong_observer
+from mkc_torch.simulation.dynamics.first_fit import over_short_horizons, strongly_observed
 from mkc_torch.simulation.dynamics.noise import NoiseOfTheWorld, likeliest_noise, noise_of
+from mkc_torch.simulation.dynamics.other_starts import other_starts
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -42,6 +46,15 @@ _ROUNDS = 2
 
 _FIRST = 3
 """Samples, for each state, that a run's first states are known by."""
+
+_OTHER_STARTS = 3
+"""Further starts that fits are made from, where the first ones fail."""
+
+_NOTHING = 0.05
+"""Share of the outputs' variation up to which a first fit explains nothing."""
+
+_ROOM = 3.0
+"""Robust standard deviations of the residual that a domain holds at least."""
 
 _STRONG = 10.0
 """Size of the pushes that a first observer is for, over that at which they move an output by its noise."""
@@ -129,22 +142,55 @@ def simulation_in_the_world(
 ) -> InTheWorld:
     """The simulation alone, from as many starts as it takes to trust its first fit.
 
+    Where fits from the first starts fail or explain nothing, others between and around the user's values are tried,
+    and shorter horizons.
+
     Raises:
-        NoFitError: it has no finite answer wherever it begins.
+        NoFitError: no start has a finite answer; the message says in words what was tried.
     """
     model, starts = JointModel(prepared), [prepared.start()]
-    if isinstance(prepared, PreparedDynamics):
-        short = over_short_horizons(prepared, prepared.given)
-        starts += [] if short is None else [short]
-    tried = at_once([partial(_free, model, start) for start in starts], prepared)
-    known_fits = [one for one in tried if one is not None]
-    if not known_fits and len(starts) == 1:
-        fitted(model, starts[0])  # it says why there is none
-    free = max(known_fits, key=lambda one: one.log_likelihood) if known_fits else None
-    if free is not None:
-        bound = settings.domain * free.bound.maximum(free.bound.mean())
-        free = fitted(free.model, free.parameters, bound, graduate=False)
-    return in_the_world(free, declared, settings, beside=starts[1:], model=model)
+    if not isinstance(prepared, PreparedDynamics):
+        try:
+            return in_the_world(_wider(fitted(model, starts[0]), settings), declared, settings, model=model)
+        except NoFitError as error:
+            raise NoFitError(no_first_fit(prepared)) from error
+    short = over_short_horizons(prepared, prepared.given)
+    starts += [] if short is None else [short]
+    free = _likeliest_free(model, starts)
+    if free is not None and _explains(free):
+        return in_the_world(_wider(free, settings), declared, settings, beside=starts[1:], model=model)
+    others = other_starts(prepared, starts[0], _OTHER_STARTS)
+    works = [partial(over_short_horizons, prepared, one, shortest=True) for one in (prepared.given, *others.starts)]
+    further = [one for one in at_once(works, prepared) if one is not None]
+    more = [one for one in (free, _likeliest_free(model, [*others.starts, *further])) if one is not None]
+    free = _wider(max(more, key=lambda one: one.log_likelihood), settings) if more else None
+    try:
+        found = in_the_world(free, declared, settings, beside=[*starts[1:], *further], model=model)
+    except NoFitError as error:
+        raise NoFitError(no_first_fit(prepared, others)) from error
+    return replace(found, starts=len(starts) + others.tried + len(further))
+
+
+def _likeliest_free(model: JointModel, starts: Sequence[Float[Tensor, " p"]]) -> FittedModel | None:
+    """The likeliest fit of the free run from several starts; None where it has no finite answer from any of them."""
+    tried = at_once([partial(_free, model, start) for start in starts], model.prepared)
+    return max((one for one in tried if one is not None), key=lambda one: one.log_likelihood, default=None)
+
+
+def _explains(free: FittedModel) -> bool:
+    """Whether a free run explains anything of what was recorded."""
+    return pooled(follows_of(free.model.prepared, free.residual, {}, None)) > _NOTHING
+
+
+def _wider(free: FittedModel, settings: NoiseSettings) -> FittedModel:
+    """The same fit on the wider domain that all models are compared on; as it is where it is lost there."""
+    bound = settings.domain * free.bound.maximum(free.bound.mean())
+    # residuals at the end can be larger than those that the domain was chosen by
+    bound = bound.maximum(_ROOM * robust_scale(free.residual))
+    try:
+        return fitted(free.model, free.parameters, bound, graduate=False)
+    except NoFitError:
+        return free
 
 
 def in_the_world(
@@ -293,10 +339,10 @@ def _from_short(
     """The same from parameters that predict over short horizons, along an observer that corrects by much."""
     prepared = model.prepared
     assert isinstance(prepared, PreparedDynamics)
-    observer = strong_observer(prepared, start, _STRONG)
-    if observer is None:
+    observed = strongly_observed(prepared, start, _STRONG)
+    if observed is None:
         return None
-    strong = JointModel(prepared.observed(observer), model.terms)
+    strong = JointModel(observed, model.terms)
     try:
         fit = fitted(strong, start, bound, graduate=False)
     except NoFitError:
@@ -316,10 +362,9 @@ def _from_given(
     """Fits under the noise that is around a user's own values: what is missing may drive any fit without it away."""
     prepared = model.prepared
     assert isinstance(prepared, PreparedDynamics)
-    observer = strong_observer(prepared, start, _STRONG)
-    if observer is None or bound is None:
+    strong = strongly_observed(prepared, start, _STRONG)
+    if strong is None or bound is None:
         return None
-    strong = prepared.observed(observer)
     noise = likeliest_noise(
         strong, start, {}, None, declared=declared, least=settings.pushed, most=settings.pushes, known=None
     )

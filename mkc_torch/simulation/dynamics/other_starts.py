@@ -1,0 +1,107 @@
+"""Further starts for a first fit that failed: the user's values, values between and around them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["OtherStarts", "other_starts"]
+
+_BETWEEN = (0.25, 0.5, 0.75)
+"""Shares of the way from the user's values to the start that failed."""
+
+_FACTORS = (-1.0, 0.1, 10.0, 0.03, 30.0, 0.3, 3.0, 0.0)
+"""Factors by which one parameter, or all of them, may be off."""
+
+_MOST_TRIED = 60
+"""Starts that are simulated at most."""
+
+
+@dataclass(frozen=True)
+class OtherStarts:
+    """Starts whose free run stays finite, and how the others are lost.
+
+    Attributes:
+        starts: (p,) each, those with the smallest residual first.
+        tried: number of starts that were simulated.
+        output: the output that is lost first with the user's values; empty where none is.
+        until: time in s of that, since the recording's first sample; 0 where the equations have no trajectory at all.
+        parameter, value, lasts: the parameter whose change alone keeps the run finite for longest, its value then, and
+            until when in s; an empty name where no change of a single parameter helps.
+    """
+
+    starts: tuple[Float[Tensor, " p"], ...]
+    tried: int
+    output: str = ""
+    until: float = 0.0
+    parameter: str = ""
+    value: float = 0.0
+    lasts: float = 0.0
+
+
+def other_starts(prepared: PreparedDynamics, start: Float[Tensor, " p"], count: int) -> OtherStarts:
+    """Starts for a fit that failed, by free runs: the user's values, and others between and around them.
+
+    The states at the start of a run are those of the first guess.
+
+    Args:
+        prepared: the simulation.
+        start: where a fit failed.
+        count: starts to return at most.
+    """
+    free, given = prepared.observed(None), prepared.given
+    variation = robust_scale(free.measured - free.measured.median(0).values).clamp(min=1e-300)
+    usable: list[tuple[float, Tensor]] = []
+    output, until, best, tried = "", 0.0, (-1, 0.0, -1.0), 0
+    for number, theta in itertools.islice(_distinct(prepared, start), _MOST_TRIED):
+        tried += 1
+        residual = free.residual(theta, {}).detach()
+        lost = ~residual.isfinite()
+        rows = lost.any(-1).nonzero().flatten()
+        lasts = float(prepared.time[rows[0]] - prepared.time[0]) if len(rows) else float("inf")
+        if torch.equal(theta, given) and len(rows):
+            output, until = prepared.channels[int(lost[rows[0]].nonzero()[0])], lasts
+        if number >= 0 and lasts > best[2]:
+            best = number, float(theta[number]), lasts
+        if not len(rows):
+            usable.append((float((robust_scale(residual) / variation).clamp(min=1e-300).log().sum()), theta))
+    usable.sort(key=lambda one: one[0])
+    starts = tuple(theta for _, theta in usable[:count])
+    if not output or best[2] <= until:
+        return OtherStarts(starts, tried, output, until)
+    return OtherStarts(starts, tried, output, until, prepared.parameter_names[best[0]], *best[1:])
+
+
+def _distinct(prepared: PreparedDynamics, start: Tensor) -> Iterator[tuple[int, Tensor]]:
+    """The candidates within the bounds, each once; a candidate's parameter is -1 where several are changed."""
+    low, high = prepared.bounds
+    known: list[Tensor] = []
+    for number, theta in _candidates(prepared.given, start, len(start) - prepared.beginnings):
+        inside = torch.minimum(torch.maximum(theta, low), high)
+        if bool(inside.isfinite().all()) and not any(torch.equal(inside, one) for one in known):
+            known.append(inside)
+            yield number, inside
+
+
+def _candidates(given: Tensor, start: Tensor, own: int) -> Iterator[tuple[int, Tensor]]:
+    yield -1, given
+    for share in _BETWEEN:
+        yield -1, torch.cat([torch.lerp(given[:own], start[:own], share), given[own:]])
+    for factor in _FACTORS:
+        for number in range(own):
+            theta = given.clone()
+            theta[number] = factor * theta[number]
+            yield number, theta
+        if own > 1:
+            yield -1, torch.cat([factor * given[:own], given[own:]])
