@@ -17,7 +17,7 @@ from mkc_torch.diagnosis.findings.finding import finding_of
 from mkc_torch.diagnosis.findings.noise import noise_summary
 from mkc_torch.diagnosis.findings.separability import separability
 from mkc_torch.diagnosis.findings.shape import shape_of
-from mkc_torch.diagnosis.findings.worth import grade_of
+from mkc_torch.diagnosis.findings.worth import grade_of, sizeless
 from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.model.drivers import Drivers
 from mkc_torch.diagnosis.model.fit import FittedModel
@@ -72,9 +72,9 @@ def assembled(whole: Whole, answers: Answers) -> Diagnosis:
     first, final, settings = case.first, case.final, asked.settings
     known = around(whole.base, whole.final, asked.declared, settings.noise)
     unfit = known.unfit(settings.evidence)
-    findings = (
-        () if unfit else tuple(_finding(case.found, number, final, whole, answers) for number in range(len(case.found)))
-    )
+    tried = [] if unfit else [_finding(case.found, number, final, whole, answers) for number in range(len(case.found))]
+    without_size = [one for one in tried if one.grade == "not confirmed" and sizeless(one)]
+    findings = tuple(one for one in tried if one not in without_size)
     diagnosis = Diagnosis(
         recording=prepared.recording.name,
         simulation=prepared.name,
@@ -97,6 +97,7 @@ def assembled(whole: Whole, answers: Answers) -> Diagnosis:
             *whole.drivers.warnings,
             *_time_warnings(prepared),
             *answers.warnings,
+            *(_no_size(one) for one in without_size),
         ),
         candidates=_candidates(first),
         separability=separability(first) if first else _nothing_to_separate(),
@@ -105,7 +106,7 @@ def assembled(whole: Whole, answers: Answers) -> Diagnosis:
         evidence=answers.of_all,
         world=world_of(whole.base, whole.final, known, unfit=unfit),
     )
-    there = first is not None and first.p_value <= asked.level and not case.found
+    there = first is not None and first.p_value <= asked.level and not findings
     structure = there or bool(diagnosis.remaining) or whole.cut or nameless(final.fit)
     # of a trajectory it has been asked for what pushes it
     white = known.noise is not None or _white(diagnosis)
@@ -124,6 +125,13 @@ def _finding(found: Sequence[Located], number: int, final: Estimate, whole: Whol
     if shape is not None and shape.curve is not None:
         grade = "nearest in the catalogue"
     return replace(finding, grade=grade, shape=shape)
+
+
+def _no_size(finding: Finding) -> str:
+    return (
+        f"{finding.effect}: p = {finding.p_value:.2g} after the whole search, but in the free run its size is 0 within "
+        "its standard error, so it does not count as a finding."
+    )
 
 
 def _white(diagnosis: Diagnosis) -> bool:
