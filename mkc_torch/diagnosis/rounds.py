@@ -60,7 +60,8 @@ def _holds(
     Blocks weigh samples as if their noise was white, and miss what is plain in coloured noise: of the first finding,
     which the draws of noise have judged, they need only to lean its way, or not clearly the other way where it is plain
     beyond all draws; or to confirm it, by more than its number of parameters is worth, once the noise is filtered
-    white. What comes after a finding also has what that one's form left over, and they have to confirm it, or to lean
+    white. Where noise and physics were chosen together blocks only veto a first finding: one step ahead process noise
+    predicts as well. What comes after a finding also has what that one's form left over, and they have to confirm it, or to lean
     its way where it is plain beyond all draws.
     """
     difference = after.log_likelihood - before.log_likelihood

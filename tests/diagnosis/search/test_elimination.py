@@ -1,0 +1,49 @@
+"""Findings whose effect others have taken over are dropped, and those that pay their price are kept."""
+
+import dataclasses
+import functools
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.search.elimination import needless_term, without
+from mkc_torch.diagnosis.search.own_noise import noise_of_fit, priced
+from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.effects import DYNAMICS
+from tests.diagnosis.pushed import candidates, swung_in_the_world
+
+
+@functools.cache
+def with_effects(*names):
+    """A pendulum with hidden quadratic drag, fitted with these effects."""
+    base = swung_in_the_world("slow", drag=0.4).fit
+    terms = candidates(base, DYNAMICS)
+    model, start = base.model, base.parameters
+    for name in names:
+        term = next(one for one in terms if one.effect.id == name and one.port == "rate of rate")
+        model = model.with_term(term)
+        start = torch.cat([start, start.new_zeros(model.size - len(start))])
+    return fitted(model, start, base.bound, graduate=False)
+
+
+def test_an_effect_that_does_nothing_beside_the_true_one_is_dropped():
+    fit = with_effects("constant_force", "quadratic_drag")
+    assert needless_term(fit, {}, Settings()) == 0
+    less = without(fit, 0, {}, Settings())
+    assert [term.effect.id for term in less.model.terms] == ["quadratic_drag"]
+    (drag,) = less.model.gammas(less.parameters)[0].tolist()
+    assert drag == pytest.approx(0.4, abs=0.15)
+
+
+def test_a_single_effect_is_never_dropped():
+    assert needless_term(with_effects("quadratic_drag"), {}, Settings()) is None
+
+
+def test_each_disturbance_of_a_fit_has_its_price():
+    fit, settings = with_effects("quadratic_drag"), Settings()
+    count = len(noise_of_fit(fit, {}).disturbed.disturbances)
+    assert count > 0
+    assert fit.log_likelihood - priced(fit, settings) == pytest.approx(count * settings.noise.pushed)
+    free = dataclasses.replace(settings, noise=dataclasses.replace(settings.noise, pushed=0.0))
+    assert priced(fit, free) == pytest.approx(fit.log_likelihood)
