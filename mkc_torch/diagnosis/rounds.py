@@ -61,8 +61,8 @@ def _holds(
     which the draws of noise have judged, they need only to lean its way, or not clearly the other way where it is plain
     beyond all draws; or to confirm it, by more than its number of parameters is worth, once the noise is filtered
     white. Where noise and physics were chosen together blocks only veto a first finding: one step ahead process noise
-    predicts as well. What comes after a finding also has what that one's form left over, and they have to confirm it, or to lean
-    its way where it is plain beyond all draws.
+    predicts as well. What comes after a finding also has what that one's form left over, and they have to confirm it,
+    or to lean its way where it is plain beyond all draws.
     """
     difference = after.log_likelihood - before.log_likelihood
     gain, (low, high) = gain_interval(difference, blocks.block, torch.Generator().manual_seed(seed))
