@@ -77,6 +77,7 @@ TERMS: dict[str, str] = {
     "world.nothing": "nothing",
     "world.more_outputs": "and {count} more outputs; see the table of all",
     "world.floor": "{size} ({source})",
+    "world.floor_unknown": "unknown (sampled more slowly than it changes)",
     "world.declared": "declared",
     "world.samples": "estimated",
     "world.quantisation": "the steps of its numbers",

@@ -18,6 +18,15 @@ if TYPE_CHECKING:
 
 __all__ = ["follows_of", "misses", "pooled", "size_of", "units_of"]
 
+_SLOWER = 1e-4
+"""Share of an output's variation below which a floor that was estimated from samples tells nothing."""
+
+_DECIMALS = 7
+"""Decimals up to which the numbers of a file are taken for rounded ones."""
+
+_ROUNDED = 1e-12
+"""Of a number: by so much a rounded one may be off."""
+
 _FAR = 5.0
 """Robust standard deviations from the median at which a value ends, for a mean that outliers do not move."""
 
@@ -75,13 +84,15 @@ def follows_of(
     units = units_of(prepared)
     found = []
     for k, name in enumerate(prepared.channels):
-        of_steps = float(steps[k]) / 12.0**0.5
+        of_steps = max(float(steps[k]), _resolution(recorded[:, k])) / 12.0**0.5
         size, source = float(estimated[k]), "samples"
         if name in declared:
             size, source = declared[name], "declared"
         elif of_steps > size:
             size, source = of_steps, "quantisation"
         whole = float(variation[k])
+        if source != "declared" and size < _SLOWER * whole:
+            size = math.nan  # sampled more slowly than the noise changes, which no sample then shows
         share = 0.0 if lost else 1.0 - (float(left[k]) / whole) ** 2 if whole > 0 else 0.0
         found.append(
             Follows(name, units[k], float(left[k]), whole, share, size, source, whole, float(last[k]))  # type: ignore[arg-type]
@@ -92,6 +103,20 @@ def follows_of(
 def misses(follows: Sequence[Follows], least: float) -> tuple[Follows, ...]:
     """The outputs that the simulation does not follow: less than this share of their variation is explained."""
     return tuple(one for one in follows if not one.explained >= least)
+
+
+def _resolution(values: Float[Tensor, " N"]) -> float:
+    """The quantum of numbers that a file has with a few decimals; 0 where they have more than a few.
+
+    Example:
+        >>> _resolution(torch.tensor([98.2, 94.4, 91.4], dtype=torch.float64))
+        0.1
+    """
+    for decimals in range(_DECIMALS):
+        scaled = values * 10.0**decimals
+        if bool(((scaled - scaled.round()).abs() <= _ROUNDED * scaled.abs().clamp(min=1.0)).all()):
+            return float(10.0**-decimals)
+    return 0.0
 
 
 def pooled(follows: Sequence[Follows]) -> float:

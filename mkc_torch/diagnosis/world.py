@@ -46,7 +46,7 @@ class Follows:
         explained: share of the variation's square that the simulation explains; below 0 where it is worse than none.
         noise_floor: size of the sensor's white noise; ``floor_source`` says whether it was "declared", or estimated
             from what is new from one of the "samples" to the next, or from the steps of the recording's numbers,
-            "quantisation".
+            "quantisation"; NaN where the sampling is slower than the noise.
         mean_predicts, last_value_predicts: residual of two trivial predictions: the mean, and the sample before.
     """
 

@@ -1,11 +1,12 @@
 """How well a simulation follows each output: sizes, shares, floors and what trivial predictions reach."""
 
+import math
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from mkc_torch.diagnosis.follows import follows_of, misses, size_of
+from mkc_torch.diagnosis.follows import follows_of, misses, pooled, size_of
 from mkc_torch.simulation.protocol import Port
 from tests.diagnosis.factory import make_follows
 
@@ -142,3 +143,20 @@ def test_an_output_of_unknown_share_is_missed():
     known = make_follows(explained=0.95)
     assert misses((known, make_follows(explained=torch.nan)), 0.5)[0] is not known
     assert misses((known,), 0.95) == ()
+
+
+def test_a_floor_is_never_below_the_quantum_of_the_numbers_of_the_file():
+    rounded = ((20.0 + 5.0 * WAVE + 0.001 * randn(N, 1)) * 10.0).round() / 10.0
+    one = followed(rounded, 0.3 * WAVE, floor=[0.002])[0]
+    assert (one.noise_floor, one.floor_source) == (pytest.approx(0.1 / 12.0**0.5), "quantisation")
+
+
+def test_a_floor_that_the_sampling_cannot_show_is_unknown():
+    assert math.isnan(followed(WAVE, 0.3 * WAVE, floor=[1e-6])[0].noise_floor)
+    assert followed(WAVE, 0.3 * WAVE, {"angle": 1e-6}, floor=[1e-6])[0].noise_floor == 1e-6
+
+
+def test_sizes_pool_each_by_its_own_variation_and_worse_than_the_mean_is_nothing():
+    known = (make_follows(explained=0.8), make_follows(explained=0.4), make_follows(explained=-3.0))
+    assert pooled(known) == pytest.approx(0.4)
+    assert pooled(()) == 0.0

@@ -75,6 +75,8 @@ def _followed(one: Follows, *, lost: bool) -> str:
 
 
 def _floor(one: Follows) -> str:
+    if not math.isfinite(one.noise_floor):
+        return term("world.floor_unknown")
     return term("world.floor", size=_sized(one.noise_floor, one.unit), source=term(_SOURCES[one.floor_source]))
 
 
