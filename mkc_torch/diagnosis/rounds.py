@@ -252,9 +252,9 @@ def _in_two_steps(before: Search, after: Search, asked: Asked, generator: torch.
     if len(after.found) != len(before.found) + 1 or not after.left or not after.found[-1].with_noise:
         return after
     last = after.found[-1]
-    simpler = last.term.effect.simpler
+    simpler = last.term.effect.reduces_to
     near = [fit for fit in last.compared if simpler is not None and fit.model.terms[-1].effect.id == simpler.id]
-    if not near or simpler is None or simpler.id == last.term.effect.id:
+    if not near:
         return after
     simple = max(near, key=lambda fit: priced(fit, settings))
     try:

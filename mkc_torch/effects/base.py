@@ -84,6 +84,7 @@ class Effect(ABC):
         shape_units: name of a number of the shape to its unit, of those that have one whatever is recorded; default
             times that are called onset, lag, delay or time_constant.
         along: the part of the signal that it mainly follows, along which its curve is drawn; default none.
+        reduces_to: another effect that this one is with fewer numbers, its shape among this one's; default None.
         simpler: the same physics with fewer numbers in γ, each of which stands for several of this one's, one after
             the other; its shapes are the same. It is taken where it predicts unseen blocks as well. Default None.
 
@@ -115,6 +116,7 @@ class Effect(ABC):
     port: str = "sensor"
     needs: tuple[str, ...] = ()
     excludes: tuple[str, ...] = ()
+    reduces_to: Effect | None = None
     roles: tuple[str, ...] = ()
     driver_optional: bool = False
     follows_signal: bool = False

@@ -118,6 +118,7 @@ def test_what_effects_can_do_beside():
     assert {type(e) for e in CATALOGUE if e.has_basis} == {FieldGradient, MagneticPole}
     assert {e.id for e in CATALOGUE if e.has_code} == {e.id for e in DYNAMICS} | {"output_saturation"}
     assert {e.id for e in CATALOGUE if e.simpler} == {"coupling", "sensor_lag"}
+    assert {e.id: e.reduces_to.id for e in CATALOGUE if e.reduces_to} == {"stribeck_friction": "coulomb_friction"}
     assert {e.id for e in CATALOGUE if e.is_curve} == {"unknown"}
     assert {e.id for e in CATALOGUE if e.general} == {"power_law", "hidden_lag", "hidden_mode"}
     assert {e.id for e in SENSOR if e.continuous} == {"hard_iron_step", "offset_drift", "temperature_offset"}

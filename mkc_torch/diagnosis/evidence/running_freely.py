@@ -61,7 +61,7 @@ def running_freely(
     if len(known_runs) < len(runs):
         return as_it_is
     again = tuple(replace(one, fit=fit) for one, (fit, _) in zip(found, known_runs[1:], strict=True))
-    return RunningFreely(known_runs[0][0], again, tuple(judged for _, judged in known_runs))
+    return RunningFreely(alone, again, tuple(judged for _, judged in known_runs))
 
 
 def _of_sensors(fit: FittedModel) -> bool:

@@ -71,7 +71,7 @@ def simpler_by_price(fit: FittedModel, declared: Mapping[str, float], settings: 
         settings: the numbers that decide.
     """
     for number in range(len(fit.model.terms)):
-        start = _simpler(fit, number)
+        start = _simpler(fit, number, other=True)
         if start is None:
             continue
         model, parameters = start
@@ -85,10 +85,17 @@ def simpler_by_price(fit: FittedModel, declared: Mapping[str, float], settings: 
     return fit
 
 
-def _simpler(fit: FittedModel, number: int) -> tuple[JointModel, Float[Tensor, " p"]] | None:
-    """The model with the simpler form of one effect, and where to start; None where there is none."""
+def _simpler(fit: FittedModel, number: int, *, other: bool = False) -> tuple[JointModel, Float[Tensor, " p"]] | None:
+    """The model with the simpler form of one effect, and where to start; None where there is none.
+
+    Args:
+        fit: with effects.
+        number: of the effect.
+        other: also as another effect, that it is with fewer numbers.
+    """
     terms = list(fit.model.terms)
-    simpler = terms[number].effect.simpler
+    effect = terms[number].effect
+    simpler = effect.simpler or (effect.reduces_to if other else None)
     if simpler is None:
         return None
     known = simpler.shapes(fit.model.prepared.time)[0]

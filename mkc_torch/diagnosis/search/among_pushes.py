@@ -138,7 +138,7 @@ def _ranked(found: JointLikelihood, terms: tuple[Term, ...], prefer: Preference)
 def _chosen(found: JointLikelihood, ranking: Sequence[Ranked], terms: tuple[Term, ...], most: int) -> list[int]:
     """The leading candidates, each at its best shape, and the curve that gains most over each thing at their places."""
     chosen: dict[Kind, int] = {}
-    least = _PART * float(found.gain.max())
+    least = _PART * max(one.gain for one in ranking[:most])
     for one in ranking[:most]:
         if one.gain >= least:
             chosen[_kind(terms[one.number])] = one.number
@@ -249,9 +249,13 @@ def _by_free_run(
     terms: tuple[Term, ...],
     settings: Settings,
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
-    """Of candidates that the likelihood does not tell apart the one whose free run follows the recording best."""
+    """Of candidates that the likelihood does not tell apart the one whose free run follows the recording best.
+
+    One with more numbers than the likeliest always follows better, and does not go first for that.
+    """
     gaps = {terms[one.number].key: one.gap for one in ranking}
-    near = [fit for fit in fits if gaps[fit.model.terms[-1].key] < settings.naming.separable]
+    alike = [fit for fit in fits if gaps[fit.model.terms[-1].key] < settings.naming.separable]
+    near = [fit for fit in alike if fit is best or _numbers(fit) <= _numbers(best)]
     keys = list(dict.fromkeys(fit.model.terms[-1].key for fit in near))
     if len(keys) < 2:
         return best, ranking
@@ -263,6 +267,11 @@ def _by_free_run(
         return best, ranking
     key = near[first].model.terms[-1].key
     return near[first], tuple(sorted(ranking, key=lambda one: (terms[one.number].key != key, one.gap)))
+
+
+def _numbers(fit: FittedModel) -> int:
+    """Of the last effect and its shape."""
+    return fit.model.sizes[-1] + len(fit.model.terms[-1].effect.fitted_shape)
 
 
 def _by_own_noise(

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.unit_text import sized
-from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.dynamics.coulomb_friction import CoulombFriction
 from mkc_torch.effects.dynamics.rate import RateEffect
@@ -36,16 +35,13 @@ class StribeckFriction(RateEffect):
     relative: Mapping[str, tuple[str, str]] = {"width": ("own", "typical"), "stribeck_speed": ("own", "typical")}
     fitted_shape: Mapping[str, tuple[float, float]] = {"stribeck_speed": (0.05, 2.0)}
     needs = ("reversing",)  # at speeds of one sign it is a constant force
+    reduces_to = CoulombFriction()
     gain = "friction"
     equation = "δv̇ = −(γ₁ + γ₂ exp(−(v/v_s)²)) tanh(v / w)"
     explanation = "Dry friction holds against the motion, more of it at small speeds than at large ones."
     advice = "Add dry friction with a rise towards standstill."
     choices = ("width",)
     source = "Stribeck (1902); Armstrong-Hélouvry, Control of Machines with Friction (1991)"
-
-    @property
-    def simpler(self) -> Effect:
-        return CoulombFriction()
 
     def equation_of(self, shape: Shape, context: Context) -> str:
         width = sized(float(shape["width"]), context.unit_of("own"))
