@@ -51,11 +51,10 @@ def plausible_sizes(
     own, guess = states[:, : states.shape[1] - len(prepared.lasting)], prepared.guess[:, :n]
     # a free run may rest where the recording moves
     ways = (own, torch.cat([guess, own[:, n:]], -1))
-    shown, span = torch.zeros_like(own[0, :n]), torch.zeros_like(own[0, :n])
+    shown, span = torch.zeros_like(own[0, :n]), own[:, :n].amax(0) - own[:, :n].amin(0)
     for way in ways:
         rates = free.rate(theta, changes)(prepared.grid.spread(way))[::3, :n].detach().abs().nan_to_num(0.0, 0.0)
         shown = torch.maximum(shown, torch.quantile(rates, _USUAL, 0))
-        span = torch.maximum(span, way[:, :n].amax(0) - way[:, :n].amin(0))
     lasted = (prepared.time[-1] - prepared.time[0]).clamp(min=torch.finfo(span.dtype).tiny)
     places = [system.states.index(name) for name in prepared.pushable]
     varies = _SLOW * robust_scale(prepared.measured - prepared.measured.median(0).values)
