@@ -43,13 +43,13 @@ def join_recordings(recordings: Sequence[Recording], clock: Clock = "restart") -
         RecordingError: there is none, or columns, units or labels differ; the message says which.
 
     Example:
-        >>> bench = Recording({"time": torch.tensor([0.0, 0.1]), "speed": torch.zeros(2)}, name="bench")
-        >>> road = Recording({"time": torch.tensor([7.0, 7.1]), "speed": torch.ones(2)}, name="road")
+        >>> bench = Recording({"time": torch.tensor([0.0, 0.5]), "speed": torch.zeros(2)}, name="bench")
+        >>> road = Recording({"time": torch.tensor([7.0, 7.5]), "speed": torch.ones(2)}, name="road")
         >>> both = join_recordings([bench, road])
         >>> both.name, both.labels["experiment"], both["experiment"].tolist()
         ('bench, road', ('bench', 'road'), [0.0, 0.0, 1.0, 1.0])
         >>> both["time"].tolist()
-        [0.0, 0.1, 0.0, 0.1]
+        [0.0, 0.5, 0.0, 0.5]
     """
     if not recordings:
         raise RecordingError("there is no recording to diagnose; give one at least.")
