@@ -33,8 +33,8 @@ class Tangents(NamedTuple):
 class CompiledResidual(Protocol):
     """A residual with derivatives of its own: those of the simulation to rounding, for less."""
 
-    def answer(self, parameters: Float[Tensor, " p"], near: Nearby | None = None) -> Answer | None:
-        """As :meth:`PreparedSimulation.answer`; None where the simulation itself has to be asked."""
+    def answer(self, parameters: Float[Tensor, " p"], near: Nearby | None = None) -> Answer:
+        """As :meth:`PreparedSimulation.answer`."""
         ...
 
     def tangents(self, parameters: Float[Tensor, " p"], near: Nearby) -> Tangents | None:
@@ -128,8 +128,9 @@ class Continuation:
 
     def _answer(self, parameters: Tensor, near: Nearby | None) -> Answer:
         compiled = self._compiled_for(parameters) if is_plain(parameters) else None
-        found = None if compiled is None else compiled.answer(parameters, near)
-        return self._prepared.answer(*self._meaning(parameters), near) if found is None else found
+        if compiled is not None:
+            return compiled.answer(parameters, near)
+        return self._prepared.answer(*self._meaning(parameters), near)
 
     def _compiled_for(self, parameters: Tensor) -> CompiledResidual | None:
         if self._compiled is None:

@@ -14,6 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mkc_torch.simulation.dynamics.loops.kalman_filter import filter_samples
+from mkc_torch.simulation.dynamics.loops.machine_code import machine_code
+
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
@@ -234,30 +237,66 @@ def run(flow: Parts, models: Models, *, keep: bool = False, start: Start | None 
         start: what each stretch begins with; None where one that begins inside knows nothing of the samples before,
             and nobody asks what is left of it.
     """
+    if start is None:
+        begins = np.where(flow.inside[:, None, None], flow.spread, np.zeros((len(models), 1)))
+        found, end = _run(flow, models, start_of(begins, models), keep=keep, through=False)
+        return found, end
+    return _run(flow, models, start, keep=keep, through=True)
+
+
+def _run(flow: Parts, models: Models, start: Start, *, keep: bool, through: bool) -> tuple[Filtered, End]:
+    N, G, m = flow.new.shape
+    B, k = len(models), start.state.shape[-1]
+    step = flow.step[:, :, None, None]
+    phi = np.where(step > 0, np.exp(-step / models.lasting), 0.0)
+    renewed = models.size**2 * (1.0 - phi**2)
+    kept = (N, G, B, k, k) if keep else (0, G, B, k, k)
+    found = Filtered(
+        np.empty((N, G, B, m)), np.empty((N, G, B, m)), np.empty(kept), np.empty(kept[:4]), np.empty(kept[:4]),
+        np.empty(kept),
+    )  # fmt: skip
+    compiled = machine_code(filter_samples)
+    if compiled is None:
+        end = _sample_by_sample(flow, models, start, phi, renewed, found, keep=keep, through=through)
+    else:
+        end = End(start.state.copy(), start.covariance.copy(), np.tile(np.eye(k), (G if through else 0, B, 1, 1)))
+        whole = [
+            flow.carried, flow.pushed, flow.shift, phi, renewed, flow.seen, flow.new, flow.counts, models.white,
+            models.place, models.sensor**2,
+        ]  # fmt: skip
+        compiled(
+            *[np.ascontiguousarray(one) for one in whole], _CLIP, end.state, end.covariance, end.kept,
+            found.standard, found.log_spread, found.prior, found.state, found.after, found.posterior,
+        )  # fmt: skip
+    np.log(found.log_spread, out=found.log_spread)
+    return found, end
+
+
+def _sample_by_sample(
+    flow: Parts,
+    models: Models,
+    start: Start,
+    phi: Float[np.ndarray, "L-1 G B D"],
+    renewed: Float[np.ndarray, "L-1 G B D"],
+    found: Filtered,
+    *,
+    keep: bool,
+    through: bool,
+) -> End:
+    """What :func:`filter_samples` does, all stretches and models at once in NumPy; writes into ``found``."""
     N, G, m = flow.new.shape
     n, p, B = flow.carried.shape[2], flow.pushed.shape[-1], len(models)
     D = models.place.shape[1]
     k = n + D
-    at_rate = models.place < p
     # a disturbance pushes its rate alone
-    acts = np.where(at_rate[:, None], np.arange(p)[:, None] == models.place[:, None], 0.0)  # (B, p, D)
+    acts = np.where((models.place < p)[:, None], np.arange(p)[:, None] == models.place[:, None], 0.0)  # (B, p, D)
     C = np.zeros((G, B, m, k))
     for j in range(m):
         C[:, :, j, n:] = models.place == p + j
-    through = start is not None
-    if start is None:
-        start = start_of(np.where(flow.inside[:, None, None], flow.spread, np.zeros((B, 1))), models)
     state, P = start.state, start.covariance
     index = n + np.arange(D)
     variance = models.sensor**2
-    standard, log_spread = np.empty((N, G, B, m)), np.empty((N, G, B, m))
-    kept = (N, G, B, k, k) if keep else (0, G, B, k, k)
-    priors, posteriors = np.empty(kept), np.empty(kept)
-    states, afters = np.empty(kept[:4]), np.empty(kept[:4])
     A = np.zeros((G, B, k, k))
-    step = flow.step[:, :, None, None]
-    phi = np.where(step > 0, np.exp(-step / models.lasting), 0.0)
-    renewed = models.size**2 * (1.0 - phi**2)
     whitened = bool(models.white.any())
     left = np.broadcast_to(np.eye(k), P.shape)
     for row in range(N):
@@ -279,14 +318,14 @@ def run(flow: Parts, models: Models, *, keep: bool = False, start: Start | None 
                 P[..., :n, :n] += white @ white.swapaxes(2, 3)
         C[..., :n] = flow.seen[row][:, None]
         if keep:
-            priors[row], states[row] = P, state
+            found.prior[row], found.state[row] = P, state
         for j in range(m):
             c = C[:, :, j]
             Pc = (P @ c[..., None])[..., 0]
             S = (c * Pc).sum(-1) + variance[:, j]
             root = np.sqrt(np.maximum(S, 1e-300))
             z = (flow.new[row, :, j, None] - (c * state).sum(-1)) / root
-            standard[row, :, :, j], log_spread[row, :, :, j] = z, root
+            found.standard[row, :, :, j], found.log_spread[row, :, :, j] = z, root
             used = flow.counts[row, :, j, None]
             pulled = used * _CLIP * np.tanh(z / _CLIP) / root
             state = state + Pc * pulled[..., None]
@@ -295,9 +334,8 @@ def run(flow: Parts, models: Models, *, keep: bool = False, start: Start | None 
             if through:
                 left = left - gain[..., None] * (c[..., None, :] @ left)
         if keep:
-            afters[row], posteriors[row] = state, P
-    np.log(log_spread, out=log_spread)
-    return Filtered(standard, log_spread, priors, states, afters, posteriors), End(state, P, left)
+            found.after[row], found.posterior[row] = state, P
+    return End(state, P, left)
 
 
 def robust_likelihood(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["HALVINGS", "MOST_STEPS", "QUICK", "ROUNDING", "SETTLED", "STALLED"]
+__all__ = ["HALVINGS", "HORIZON", "MOST_STEPS", "QUICK", "ROUGHLY", "ROUNDING", "SETTLED", "STALLED"]
 
 MOST_STEPS = 30
 """Steps at most."""
@@ -21,3 +21,9 @@ QUICK = 0.01
 
 ROUNDING = 1e-6
 """Change, as a share of each state's size, below which defects that no longer shrink are of rounding."""
+
+HORIZON = 32
+"""Moments by which the horizon of a guess grows that is found step by step."""
+
+ROUGHLY = 1e-4
+"""Change, as a share of each state's size, at which such a guess is good enough for its horizon to grow."""

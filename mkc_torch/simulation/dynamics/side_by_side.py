@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mkc_torch.simulation.dynamics.kalman import End, Filtered, Flow, Models, Parts, Start, filtered, run, start_of
+from mkc_torch.simulation.dynamics.loops.kalman_filter import filter_samples
+from mkc_torch.simulation.dynamics.loops.machine_code import machine_code
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -32,14 +34,17 @@ _SAME = 1e-7
 
 
 def filtered_whole(flow: Flow, models: Models, *, keep: bool = False) -> Filtered:
-    """What :func:`filtered` leaves of a flow in one stretch, N steps of a few matrices, in steps of many.
+    """What :func:`filtered` leaves of a flow in one stretch.
 
-    It takes three or four runs of a stretch's length, whatever N; where that is not enough, or N is small, as many
-    steps as the longest run of the recording has samples.
+    Without machine code the N steps of a few matrices are made in steps of many: three or four runs of a stretch's
+    length, whatever N; where that is not enough, or N is small, as many steps as the longest run of the recording has
+    samples.
     """
     N = len(flow.new)
     if not models.white.any() and not models.place.shape[1]:
         return _unpushed(flow, models)
+    if machine_code(filter_samples) is not None:
+        return filtered(flow.whole, models, keep=keep)
     if _FEW * _STRETCH > N:
         return _run_by_run(flow, models, keep=keep)
     stretches = _stretches(flow)

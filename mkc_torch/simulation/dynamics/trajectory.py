@@ -20,7 +20,16 @@ from torch import Tensor
 from mkc_torch._support.torch_internals import is_wrapped, temporarily_clear_interpreter_stack
 from mkc_torch.nonlinear import load_forward_mode
 from mkc_torch.simulation.dynamics.recurrence import Recurrence
-from mkc_torch.simulation.dynamics.settings import HALVINGS, MOST_STEPS, QUICK, ROUNDING, SETTLED, STALLED
+from mkc_torch.simulation.dynamics.settings import (
+    HALVINGS,
+    HORIZON,
+    MOST_STEPS,
+    QUICK,
+    ROUGHLY,
+    ROUNDING,
+    SETTLED,
+    STALLED,
+)
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -43,7 +52,6 @@ __all__ = [
 Rate = Callable[[Tensor], Tensor]
 """Of change of the states, (S, n) → (S, n), at the stations of a grid."""
 
-_HORIZON, _ROUGHLY = 32, 1e-4
 _DIGITS = 100.0
 
 
@@ -248,7 +256,7 @@ def marched(
     begin: Float[Tensor, "K n"],
     guess: Float[Tensor, "G n"],
     *,
-    stride: int = _HORIZON,
+    stride: int = HORIZON,
     jump: Jump | None = None,
 ) -> Float[Tensor, "G n"] | None:
     """A guess that is near the trajectories, from one that is not: they are solved over a horizon that grows.
@@ -287,7 +295,7 @@ def marched(
                     break
                 part *= 0.5
             states = states + part * change
-            if size * part < _ROUGHLY:
+            if size * part < ROUGHLY:
                 break
     return states
 

@@ -8,13 +8,15 @@ unstable system stay finite.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mkc_torch.simulation.dynamics.kalman import Flow, Models
+from mkc_torch.simulation.dynamics.loops.machine_code import machine_code
+from mkc_torch.simulation.dynamics.loops.whiten import whiten_samples
 from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
 
 if TYPE_CHECKING:
@@ -173,6 +175,9 @@ def _seen(flow: Flow, models: Models) -> Float[np.ndarray, "N B m k"]:
 def _filtered(flow: Flow, gains: Gains, part: slice, series: SeriesAlong) -> Float[np.ndarray, "N B m K"]:
     """Whiten in one stretch, or in stretches side by side: from states of 0, then from where the one before it ends."""
     N, m, K = series.new.shape
+    compiled = machine_code(whiten_samples)
+    if compiled is not None:
+        return _by_machine_code(compiled, flow, gains, part, series)
     count = 1 if N <= _WHOLE else -(-N // _STRETCH)
     way = _Stretches.of(flow, gains, part, series, count)
     B, k = way.carry.shape[2:4]
@@ -182,6 +187,21 @@ def _filtered(flow: Flow, gains: Gains, part: slice, series: SeriesAlong) -> Flo
         for g in range(count - 1):
             start[g + 1] = end[g] + passed_on[g] @ start[g]
     return way.run(start)[0].reshape(-1, B, m, K)[:N]
+
+
+def _by_machine_code(
+    compiled: Callable[..., object], flow: Flow, gains: Gains, part: slice, series: SeriesAlong
+) -> Float[np.ndarray, "N B m K"]:
+    models, (N, m, K) = gains.models.part(part), series.new.shape
+    step = flow.step[:, None, None]
+    phi = np.where(step > 0, np.exp(-step / models.lasting), 0.0)
+    out = np.empty((len(models), N, m, K))
+    whole = [
+        flow.carried, flow.pushed, phi, models.place, flow.seen, gains.gain[:, part], gains.white[:, part],
+        series.new, series.shift,
+    ]  # fmt: skip
+    compiled(*[np.ascontiguousarray(one) for one in whole], out)
+    return out.swapaxes(0, 1)
 
 
 @dataclass(frozen=True)

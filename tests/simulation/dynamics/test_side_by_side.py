@@ -12,6 +12,12 @@ from tests.simulation.dynamics.oscillating import answering, course, flow, pushe
 from tests.simulation.dynamics.test_kalman import BOTH, MODELS, model, together
 
 
+@pytest.fixture(autouse=True)
+def without_machine_code(monkeypatch):
+    """Stretches side by side serve where Numba is absent."""
+    monkeypatch.setattr(side_by_side, "machine_code", lambda _: None)
+
+
 def recorded(along, outliers=0.05, seed=0):
     """A flow whose speed was pushed, with outliers among its samples, some of which do not count."""
     random = np.random.default_rng(seed)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mkc_torch.simulation.dynamics.compiled.expressions import Array
+from mkc_torch.simulation.dynamics.loops.machine_code import machine_code
+from mkc_torch.simulation.dynamics.loops.recurrence import pass_on
 
 __all__ = ["Affine", "inverted", "multiplied"]
 
@@ -16,7 +18,9 @@ _FEW = 128
 
 @dataclass(frozen=True)
 class Affine:
-    """The recurrence ``δ[k+1] = A[k] δ[k] + v[k+1]``, its products over growing intervals (Blelloch, 1990).
+    """The recurrence ``δ[k+1] = A[k] δ[k] + v[k+1]``: moment after moment in machine code, or by its products.
+
+    Products over growing intervals: Blelloch, "Prefix Sums and Their Applications" (1990).
 
     Attributes:
         carries: A of all moments, those of every second moment and so on, (w, w, G) each; 0 where a trajectory begins.
@@ -35,6 +39,8 @@ class Affine:
     @classmethod
     def of(cls, carries: Array, longest: int) -> Affine:
         """From A as it arrives at each moment, and the number of moments of the longest trajectory."""
+        if machine_code(pass_on) is not None:
+            return cls((carries,), ())
         levels = []
         while longest > _FEW:
             levels.append(carries)
@@ -51,6 +57,11 @@ class Affine:
 
     def solved(self, pushed: Array, level: int = 0) -> Array:
         """δ for v, (w, K, G) both."""
+        compiled = None if self.products else machine_code(pass_on)
+        if compiled is not None:
+            values = np.array(pushed, order="C")
+            compiled(self.carries[0], values)
+            return values
         if level < len(self.carries):
             A, G = self.carries[level], pushed.shape[-1]
             found = np.empty_like(pushed)

@@ -12,14 +12,26 @@ from mkc_torch.simulation.dynamics.compiled.affine import Affine, inverted, mult
 from mkc_torch.simulation.dynamics.compiled.expressions import Array
 from mkc_torch.simulation.dynamics.settings import (
     HALVINGS,
+    HORIZON,
     MOST_STEPS,
     QUICK,
+    ROUGHLY,
     ROUNDING,
     SETTLED,
     STALLED,
 )
 
-__all__ = ["ArrayGrid", "Factor", "Found", "Functions", "JumpFunctions", "Linearised", "linearised", "solved"]
+__all__ = [
+    "ArrayGrid",
+    "Factor",
+    "Found",
+    "Functions",
+    "JumpFunctions",
+    "Linearised",
+    "linearised",
+    "marched",
+    "solved",
+]
 
 
 class JumpFunctions(Protocol):
@@ -184,6 +196,42 @@ def solved(functions: Functions, grid: ArrayGrid, guess: Array, factor: Factor |
         if len(norms) > STALLED and norms[-1] > 0.5 * norms[-1 - STALLED] and size * part > ROUNDING:
             break
     return None
+
+
+def marched(functions: Functions, grid: ArrayGrid, guess: Array) -> Array | None:
+    """A guess near the trajectories, solved roughly over a horizon that grows; None where there is none.
+
+    As :func:`mkc_torch.simulation.dynamics.trajectory.marched` step for step.
+
+    Args:
+        functions: the differential equation.
+        grid: the moments.
+        guess: (w, G), of all states; those where trajectories begin are kept.
+    """
+    index = np.arange(guess.shape[1])
+    first = np.maximum.accumulate(np.where(grid.begins, index, 0))
+    place, states = index - first, guess
+    for horizon in range(HORIZON, grid.longest + HORIZON, HORIZON):
+        # beyond what is solved the last state stays
+        states = states[:, np.minimum(index, first + horizon - HORIZON)]
+        inside = place <= horizon
+        for _ in range(MOST_STEPS):
+            at = _Point(functions, grid, states)
+            left = np.where(inside[1:], at.defect, 0.0)
+            change = np.where(inside, _linearised(functions, grid, at).factor.solved(left[:, None])[:, 0], 0.0)
+            size = float(np.abs(change / at.scale).max())
+            if not size < np.inf:
+                return None
+            part, norm = 1.0, float(np.square(left / at.scale).mean())
+            for _ in range(HALVINGS):
+                after = np.where(inside[1:], _defect(functions, grid, states + part * change)[2], 0.0)
+                if float(np.square(after / at.scale).mean()) <= norm:
+                    break
+                part *= 0.5
+            states = states + part * change
+            if size * part < ROUGHLY:
+                break
+    return states
 
 
 def dense(values: Sequence[Array | float], places: Sequence[tuple[int, int]], shape: tuple[int, ...]) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch.nonlinear import load_forward_mode
 from mkc_torch.simulation.continuation import Meaning, Tangents
 from mkc_torch.simulation.dynamics.compiled.affine import multiplied
 from mkc_torch.simulation.dynamics.compiled.collocation import (
@@ -19,6 +20,7 @@ from mkc_torch.simulation.dynamics.compiled.collocation import (
     Functions,
     Linearised,
     linearised,
+    marched,
     solved,
 )
 from mkc_torch.simulation.dynamics.compiled.expressions import Array
@@ -57,10 +59,10 @@ class CompiledDynamics:
         self._places = self._grid.begins.cumsum() - 1
         self._measured = np.ascontiguousarray(system.measured.numpy().T)
 
-    def answer(self, parameters: Float[Tensor, " p"], near: Nearby | None = None) -> Answer | None:
-        """The residual, NaN where a trajectory is found neither near the one given nor near the first guess.
+    def answer(self, parameters: Float[Tensor, " p"], near: Nearby | None = None) -> Answer:
+        """The residual; NaN where no trajectory is found near the one given, nor near the first guess.
 
-        None where no trajectory is given and none is found: there are other ways to a first one.
+        Without a trajectory given, one is also searched over a horizon that grows.
         """
         known = near if isinstance(near, Trajectory) else None
         values = parameters.tolist()
@@ -68,10 +70,13 @@ class CompiledDynamics:
             functions, first = self._functions(values), self._first(values)
             found = None if known is None else solved(functions, self._grid, *self._begun(known, first))
             if found is None:
-                found = solved(functions, self._grid, self._from(self._system.guess, first))
+                guess = self._from(self._system.guess, first)
+                found = solved(functions, self._grid, guess)
+                nearer = marched(functions, self._grid, guess) if found is None and known is None else None
+                found = found if nearer is None else solved(functions, self._grid, nearer)
             if found is None:
-                return None if known is None else Answer(torch.full_like(self._system.measured, torch.nan))
-            outputs = self._traced.outputs.values(values)(found.states[:, self._rows])
+                return Answer(torch.full_like(self._system.measured, torch.nan))
+            outputs = self._outputs(parameters, found.states[:, self._rows])
             residual = self._whitened((self._measured - outputs)[:, None])[:, 0]
         nearby = self._nearby(parameters, found.states, found.factor)
         return Answer(torch.from_numpy(np.ascontiguousarray(residual.T)), nearby)
@@ -95,30 +100,57 @@ class CompiledDynamics:
         with np.errstate(all="ignore"):
             functions = self._functions(values)
             linear = linearised(functions, self._grid, states)
-            rows = self._whitened(self._tangents(values, states, functions, linear))
+            rows = self._whitened(-self._output_tangents(parameters, states, functions, linear))
         tangents = torch.from_numpy(np.ascontiguousarray(np.moveaxis(rows, 0, -1)))
         return Tangents(tangents, self._nearby(parameters, states, linear.factor))
 
-    def _tangents(self, values: Sequence[float], states: Array, functions: Functions, linear: Linearised) -> Array:
-        """(m, p, N), of the residual before it is whitened."""
+    def _outputs(self, parameters: Tensor, states: Array) -> Array:
+        """(m, N), by the states at the samples."""
+        if self._traced.outputs is not None:
+            return self._traced.outputs.values(parameters.tolist())(states)
+        return self._outputs_by_torch(parameters, torch.from_numpy(np.ascontiguousarray(states.T))).numpy().T
+
+    def _outputs_by_torch(self, parameters: Tensor, states: Tensor) -> Tensor:
+        """(N, m), by the states at the samples (N, w)."""
+        return self._system.outputs_by_states(*self._meaning(parameters), states)
+
+    def _output_tangents(self, parameters: Tensor, states: Array, functions: Functions, linear: Linearised) -> Array:
+        """Derivatives of the outputs by all parameters, (m, p, N)."""
+        values = parameters.tolist()
+        moved, at = self._state_tangents(values, states, functions, linear), states[:, self._rows]
+        outputs = self._traced.outputs
+        if outputs is not None:
+            rows = multiplied(outputs.by_states.at(values)(at), moved)
+            rows[:, outputs.moving] += outputs.by_parameters.at(values)(at)
+            return rows
+        load_forward_mode()
+        point = parameters, torch.from_numpy(np.ascontiguousarray(at.T))
+        along = torch.eye(self._size, dtype=parameters.dtype), torch.from_numpy(np.ascontiguousarray(moved.T))
+
+        def tangent(direction: Tensor, states: Tensor) -> Tensor:
+            return torch.func.jvp(self._outputs_by_torch, point, (direction, states))[1]
+
+        found = torch.func.vmap(tangent, in_dims=(0, 1))(*along)
+        return np.ascontiguousarray(found.numpy().transpose(2, 0, 1))
+
+    def _state_tangents(
+        self, values: Sequence[float], states: Array, functions: Functions, linear: Linearised
+    ) -> Array:
+        """Derivatives of the states at the samples by all parameters, (w, p, N)."""
         own = self._own(values, states, functions, linear)
         w, G = states.shape
         pushed = np.zeros((w, len(own.parameters) + w, G))
         pushed[:, : len(own.parameters), 1:] = -multiplied(linear.factor.inverse, own.defects)
         pushed[np.arange(w), len(own.parameters) + np.arange(w)] = self._grid.begins
         moved = linear.factor.affine.solved(pushed)[..., self._rows]
-        at = states[:, self._rows]
-        outputs = self._traced.outputs
-        seen = multiplied(outputs.by_states.at(values)(at), moved)
-        rows = np.zeros((len(self._measured), self._size, at.shape[1]))
-        rows[:, own.parameters] = -seen[:, : len(own.parameters)]
-        by_first = seen[:, len(own.parameters) :]
+        rows = np.zeros((w, self._size, moved.shape[2]))
+        rows[:, own.parameters] = moved[:, : len(own.parameters)]
+        by_first = moved[:, len(own.parameters) :]
         first = self._traced.first
         slope = first.by_parameters.at(values)(np.empty(0)).reshape(-1, w, len(first.moving))
         for run, state, k in zip(*slope.nonzero(), strict=True):
             inside = self._runs[run]
-            rows[:, first.moving[k], inside] -= slope[run, state, k] * by_first[:, state, inside]
-        rows[:, outputs.moving] -= outputs.by_parameters.at(values)(at)
+            rows[:, first.moving[k], inside] += slope[run, state, k] * by_first[:, state, inside]
         return rows
 
     def _own(self, values: Sequence[float], states: Array, functions: Functions, linear: Linearised) -> _Defects:

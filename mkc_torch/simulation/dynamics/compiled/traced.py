@@ -69,7 +69,7 @@ class Traced:
         first: the states that runs begin in, K w nodes.
         ends, middle: rates at the ends (2, G-1) and in the middle (G-1,) of each interval.
         new: innovations of an observer at the samples; None where there is no observer.
-        outputs: at the samples.
+        outputs: at the samples; None where they cannot be traced, as of effects that join samples.
         places: of the states that the gains of an observer are of.
     """
 
@@ -78,7 +78,7 @@ class Traced:
     ends: Block
     middle: Block
     new: Block | None
-    outputs: Block
+    outputs: Block | None
     places: Sequence[int]
 
     @property
@@ -126,13 +126,17 @@ def _traced(system: Traceable, meaning: Meaning, size: int, stations: int, sampl
     rates = system.rate(theta, changes)(state_symbol(trace, stations, width))
     jump = system.jump(theta, changes)
     new = None if jump is None else block(jump.measured - jump.predict(at_samples()), samples, _as_is)
+    try:
+        outputs = block(system.outputs_by_states(theta, changes, at_samples()), samples, _as_is)
+    except Exception:  # whatever a function raises on a symbol; torch computes it, or raises it again
+        outputs = None
     return Traced(
         memories,
         Block(e, as_nodes(begin, trace).nodes.reshape(-1).tolist(), *leaves, _as_is),
         block(rates, stations, _at_ends),
         block(rates, stations, _in_the_middle),
         new,
-        block(system.outputs_by_states(theta, changes, at_samples()), samples, _as_is),
+        outputs,
         () if jump is None else jump.places,
     )
 

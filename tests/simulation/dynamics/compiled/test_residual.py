@@ -16,10 +16,12 @@ from mkc_torch.nonlinear import fit
 from mkc_torch.recording import Recording
 from mkc_torch.simulation import Dynamics, Parameter
 from mkc_torch.simulation.continuation import Continuation
+from mkc_torch.simulation.dynamics.compiled.collocation import marched
 from mkc_torch.simulation.dynamics.disturbances import observer_of
 from mkc_torch.simulation.dynamics.first_fit import floor_of
 from mkc_torch.simulation.dynamics.flow import flow_along
 from mkc_torch.simulation.dynamics.observer import Disturbance
+from mkc_torch.simulation.dynamics.trajectory import marched as torch_marched
 
 TIME = torch.linspace(0.0, 4.0, 81, dtype=torch.float64)
 
@@ -134,9 +136,6 @@ def assert_like_torch(model, parameters, *, rtol=1e-9, further=True):
     assert beside is not None
     for near in (beside, beside.bare, nearby, None):
         ours = compiled.answer(parameters, near)
-        if ours is None:  # torch's own way marches to a first trajectory
-            assert near is None
-            continue
         torch.testing.assert_close(
             ours.residual, theirs.residual, rtol=0, atol=rtol * float(theirs.residual.abs().max())
         )
@@ -225,12 +224,8 @@ def sized(effect, port, shape):
     return found
 
 
-UNTRACEABLE = {"sensor_lag"}
-"""Effects that pass on from moment to moment what the simulation puts out."""
-
-
 @pytest.mark.parametrize("corrected", [False, True])
-def test_every_effect_is_as_torch_has_it_or_left_to_torch(corrected):
+def test_every_effect_is_as_torch_has_it(corrected):
     prepared = Driven().prepare(recorded(2))
     prepared = observed(prepared) if corrected else prepared
     seen = set()
@@ -238,9 +233,9 @@ def test_every_effect_is_as_torch_has_it_or_left_to_torch(corrected):
         model = JointModel(prepared, (term,))
         gamma = 0.02 * torch.ones(model.size - model.base, dtype=torch.float64)
         parameters = torch.cat([prepared.given, gamma])
-        if model._compiled is None:
-            assert term.effect.id in UNTRACEABLE, term.effect.id
-            continue
+        assert model._compiled is not None, term.effect.id
+        # an effect that passes on from moment to moment what the simulation puts out is computed by torch
+        assert (model._compiled._traced.outputs is None) == (term.effect.id == "sensor_lag")
         seen.add((term.effect.id, prepared.ports[term.port].kind or "output"))
         if prepared.answer(parameters[: model.base], model.changes(parameters)).nearby is not None:
             assert_like_torch(model, parameters, further=False)
@@ -280,6 +275,28 @@ def test_a_fit_uses_the_compiled_residual():
     assert bool(fit(way, prepared.given, jacobian="reverse twice").converged)
 
 
+def test_a_march_is_that_of_torch():
+    prepared = Driven().prepare(recorded(2))
+    theta = prepared.given
+    compiled = prepared.compiled(lambda p: (p, {}), len(theta))
+    far = torch.where(prepared.grid.begins.unsqueeze(-1), prepared.guess, -2.0 * prepared.guess + 1.0)
+    theirs = torch_marched(prepared.rate(theta, {}), prepared.grid, prepared.first_states(theta, {})[0], far)
+    ours = marched(compiled._functions(theta.tolist()), compiled._grid, far.numpy().T)
+    assert_close(torch.from_numpy(ours.T.copy()), theirs, 1e-7)
+    solved = compiled.answer(theta).nearby.states
+    assert_close(theirs, solved, 1e-3)
+    assert (far - solved).abs().max() > 0.5
+
+
+def test_a_trajectory_that_is_found_by_a_march_alone():
+    prepared = Driven().prepare(recorded(2))
+    theta = prepared.given
+    expected = prepared.answer(theta, {}).residual
+    compiled = prepared.compiled(lambda p: (p, {}), len(theta))
+    prepared.guess = torch.where(prepared.grid.begins.unsqueeze(-1), prepared.guess, 1e3 * prepared.guess)
+    assert_close(compiled.answer(theta).residual, expected, 1e-8)
+
+
 def test_no_trajectory_is_no_answer():
     class Exploding(Single):
         def derivative(self, time, x, u, p):  # noqa: ARG002
@@ -289,6 +306,6 @@ def test_no_trajectory_is_no_answer():
     compiled = prepared.compiled(lambda p: (p, {}), 2)
     near = compiled.answer(torch.tensor([-0.1, 1.0], dtype=torch.float64)).nearby
     lost = torch.tensor([1e3, 1.0], dtype=torch.float64)
-    assert compiled.answer(lost) is None
+    assert bool(compiled.answer(lost).residual.isnan().all())
     assert bool(compiled.answer(lost, near).residual.isnan().all())
     assert math.isnan(float(prepared.answer(lost, {}, near).residual[0, 0]))

@@ -1,0 +1,24 @@
+"""The recurrence of :class:`mkc_torch.simulation.dynamics.compiled.affine.Affine`, moment after moment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+__all__ = ["pass_on"]
+
+
+def pass_on(carries: Any, values: Any) -> None:
+    """``δ[k+1] = A[k] δ[k] + v[k+1]``, in place.
+
+    Args:
+        carries: A as it arrives at each moment, (w, w, G); 0 where a trajectory begins.
+        values: v, (w, K, G); δ afterwards.
+    """
+    w, K, G = values.shape
+    for moment in range(1, G):
+        for i in range(w):
+            for j in range(w):
+                a = carries[i, j, moment]
+                if a != 0.0:
+                    for s in range(K):
+                        values[i, s, moment] += a * values[j, s, moment - 1]

@@ -1,0 +1,87 @@
+"""The whitening of :func:`mkc_torch.simulation.dynamics.whitening.whitened`, sample after sample."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+__all__ = ["whiten_samples"]
+
+
+def whiten_samples(
+    carried: Any,
+    pushed: Any,
+    phi: Any,
+    place: Any,
+    seen: Any,
+    gain: Any,
+    white: Any,
+    new: Any,
+    shift: Any,
+    out: Any,
+) -> None:
+    """Whiten K series of N samples under B models of the noise; writes into ``out``.
+
+    Args:
+        carried, pushed: (N-1, n, n) and (N-1, n, p), of the flow.
+        phi: (N-1, B, D), share of a lasting disturbance that stays until the next sample.
+        place: (B, D), what a lasting disturbance acts on.
+        seen: (N, m, n), outputs by states.
+        gain, white: (N, B, k, m) and (N, B, m, m), of the filters.
+        new, shift: (N, m, K) and (N-1, n, K), of the series.
+        out: (B, N, m, K), the innovations.
+    """
+    N, m, K = new.shape
+    n, p = pushed.shape[1], pushed.shape[2]
+    B, D = place.shape
+    k = n + D
+    state, moved, left = np.empty((k, K)), np.empty((k, K)), np.empty((m, K))
+    for b in range(B):
+        state[:] = 0.0
+        for row in range(N):
+            for output in range(m):
+                for s in range(K):
+                    left[output, s] = new[row, output, s]
+                for i in range(n):
+                    c = seen[row, output, i]
+                    if c != 0.0:
+                        for s in range(K):
+                            left[output, s] -= c * state[i, s]
+                for d in range(D):
+                    if place[b, d] == p + output:
+                        for s in range(K):
+                            left[output, s] -= state[n + d, s]
+            for output in range(m):
+                for s in range(K):
+                    out[b, row, output, s] = white[row, b, output, 0] * left[0, s]
+                for other in range(1, output + 1):
+                    w = white[row, b, output, other]
+                    for s in range(K):
+                        out[b, row, output, s] += w * left[other, s]
+            if row == N - 1:
+                break
+            for i in range(k):
+                for output in range(m):
+                    w = gain[row, b, i, output]
+                    if w != 0.0:
+                        for s in range(K):
+                            state[i, s] += w * left[output, s]
+            for i in range(n):
+                for s in range(K):
+                    moved[i, s] = -shift[row, i, s]
+                for j in range(n):
+                    w = carried[row, i, j]
+                    if w != 0.0:
+                        for s in range(K):
+                            moved[i, s] += w * state[j, s]
+                for d in range(D):
+                    if place[b, d] < p:
+                        w = pushed[row, i, place[b, d]]
+                        for s in range(K):
+                            moved[i, s] += w * state[n + d, s]
+            for d in range(D):
+                w = phi[row, b, d]
+                for s in range(K):
+                    moved[n + d, s] = w * state[n + d, s]
+            state, moved = moved, state
