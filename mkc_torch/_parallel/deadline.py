@@ -88,12 +88,13 @@ def is_limited() -> bool:
 
 
 @contextmanager
-def limited(limit: float = math.inf, *, interruptible: bool = True) -> Iterator[Deadline]:
+def limited(limit: float = math.inf, *, interruptible: bool = True, begin: float | None = None) -> Iterator[Deadline]:
     """A deadline for all work within the block, in the place of one that there was.
 
     Args:
         limit: seconds; infinite for none.
         interruptible: also stop at an interrupt, where :func:`stopped_by_interrupt` asks for that.
+        begin: moment from which the seconds count, by :func:`time.monotonic`; None for now.
 
     Example:
         >>> with limited(0.0):
@@ -101,7 +102,8 @@ def limited(limit: float = math.inf, *, interruptible: bool = True) -> Iterator[
         Traceback (most recent call last):
         mkc_torch._parallel.deadline.Stopped: time limit
     """
-    deadline = Deadline(limit, _interrupted.get() if interruptible else None)
+    event = _interrupted.get() if interruptible else None
+    deadline = Deadline(limit, event, monotonic() if begin is None else begin)
     token = _deadline.set(deadline)
     try:
         yield deadline

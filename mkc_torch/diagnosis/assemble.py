@@ -95,7 +95,7 @@ def assembled(whole: Whole, answers: Answers) -> Diagnosis:
         samples=len(prepared.time),
         level=asked.level,
         noise=noise_summary(final, settings.noise),
-        candidates_tried=len(whole.terms),
+        candidates_tried=0 if first is None and whole.stop is not None else len(whole.terms),
         surrogates=0 if asked.quick else asked.surrogates,
         seed=asked.seed,
         p_value=_p_value(first, whole),

@@ -26,12 +26,12 @@ _MOMENT_S = 1.0
 """Seconds that free runs of what was found may take."""
 
 
-def nothing_known(reason: Reason, seconds: float, where: str) -> BaseException:
+def nothing_known(reason: Reason, limit: float, where: str) -> BaseException:
     """What is raised where the simulation's first fit had not ended."""
     if reason == "interrupt":
         return KeyboardInterrupt()
     return TimeoutError(
-        f"{where}the time limit of {seconds:.3g} s was over before the simulation's first fit had ended, so nothing is "
+        f"{where}the time limit of {limit:g} s was over before the simulation's first fit had ended, so nothing is "
         "known. Allow more time, or diagnose a part of the recording."
     )
 

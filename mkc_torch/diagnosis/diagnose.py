@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from time import monotonic
 
 import torch
 
@@ -119,6 +120,7 @@ def diagnose(
         >>> result.verdict in ("adequate", "explained", "unexplained")
         True
     """
+    begin = monotonic()
     refuse_no_simulation(simulation)
     recording, names = joined(simulation, recording)
     effects = checked_effects(effects)
@@ -142,13 +144,14 @@ def diagnose(
     fixed = checked_between(between, tuple(getattr(prepared, "between", ())))
     asked = Asked(level, surrogates, max_findings, seed, settings, declared, fixed, quick)
     known = UnderWay(simulation, effects, names, asked)
-    with limited(math.inf if time_limit is None else time_limit) as deadline, counting(progress):
+    limit = math.inf if time_limit is None else time_limit
+    with limited(limit, begin=begin) as deadline, counting(progress):
         try:
             return _diagnosed(known, prepared, where, progress)
         except Stopped as stopped:
             reason, seconds = stopped.reason, deadline.elapsed
     if known.world is None:
-        raise nothing_known(reason, seconds, where)
+        raise nothing_known(reason, limit, where)
     progress("writing down what is known")
     return cut_short(known, reason, seconds)
 
