@@ -32,24 +32,23 @@ def price(numbers: float, samples: int, candidates: int) -> float:
     return 0.5 * numbers * math.log(max(samples, 1)) + math.log(max(candidates, 1))
 
 
-def pays(gain: float, numbers: float, samples: int, candidates: int, separable: float) -> bool:
-    """Whether a gain is clearly more than its price: by as much as two models that are told apart differ by.
+def pays(gain: float, numbers: float, samples: int, candidates: int) -> bool:
+    """Whether a gain is more than its price.
 
     Args:
         gain: log-likelihood gain, in nats.
         numbers: of the candidate.
         samples, candidates: of the recording and of the search.
-        separable: nats from which two models are told apart.
 
     Example:
-        >>> pays(20.0, 2, 1000, 91, 4.5), pays(15.0, 2, 1000, 91, 4.5)
+        >>> pays(12.0, 2, 1000, 91), pays(11.0, 2, 1000, 91)
         (True, False)
     """
-    return gain - price(numbers, samples, candidates) > separable
+    return gain > price(numbers, samples, candidates)
 
 
 def any_pays(look: Look, possible: Bool[Tensor, " tried"]) -> float:
-    """:data:`COUNTS` if one of the first candidates of a look gains clearly more than its price, else the other.
+    """:data:`COUNTS` if one of the first candidates of a look gains more than its price, else the other.
 
     Args:
         look: at candidates beside a fit.
@@ -58,6 +57,5 @@ def any_pays(look: Look, possible: Bool[Tensor, " tried"]) -> float:
     scene, tried = look.scene, len(possible)
     samples, physics = int(scene.counts.sum()), len({term.key for term in scene.terms[:tried]})
     gain = torch.where(possible, 0.5 * look.gains.ratio[:tried, 0], 0.0).tolist()
-    separable = scene.settings.naming.separable
     known = zip(gain, look.gains.dof[:tried].tolist(), strict=True)
-    return COUNTS if any(pays(one, numbers, samples, physics, separable) for one, numbers in known) else COUNTS_NOT
+    return COUNTS if any(pays(one, numbers, samples, physics) for one, numbers in known) else COUNTS_NOT
