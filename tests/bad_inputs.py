@@ -156,6 +156,7 @@ def of_fmu(content: bytes | None) -> Callable[[Path], str]:
 
 
 DONE = "@done/rec/calibration.json"
+DIAGNOSE = ("diagnose", "@rec.csv", "--simulation", "magnetometer", "--output", "@out")
 COMMANDS: dict[str, tuple[str, ...]] = {
     "a recording that is not there": ("calibrate", "@other.csv", "--output", "@out"),
     "a folder": ("calibrate", "@folder", "--output", "@out"),
@@ -186,6 +187,9 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     ),
     "`--to mavlink`": ("export", DONE, "--to", "mavlink", "--output", "@out.params"),
     "a simulation that is not there": ("diagnose", "@rec.csv", "--simulation", "@sim.py", "--output", "@out"),
+    "`--time-limit 0`": (*DIAGNOSE, "--time-limit", "0"),
+    "`--time-limit soon`": (*DIAGNOSE, "--time-limit", "soon"),
+    "`--quick --surrogates 99`": (*DIAGNOSE, "--quick", "--surrogates", "99"),
     "a simulation of no kind": ("diagnose", "@rec.csv", "--simulation", "@none.json", "--output", "@out"),
 }  # fmt: skip
 

@@ -268,10 +268,16 @@ def entries() -> Iterator[Entry]:
     yield Entry(("simulation.Parameter",), mkc_torch.simulation.Parameter, {"value": 1.0, "lower": 0.0, "upper": 2.0})
     yield Entry(
         ("diagnosis.diagnose",),
-        lambda level, surrogates, seed, simulation, recording: (
-            diagnose(simulation, recording, level=level, surrogates=surrogates, seed=seed).p_value
-        ),
-        {"level": 0.05, "surrogates": 19, "seed": 0, "simulation": "wrong", "recording": "wrong"},
+        lambda simulation, recording, **options: diagnose(simulation, recording, **options).p_value,
+        {
+            "level": 0.05,
+            "surrogates": 19,
+            "seed": 0,
+            "quick": False,
+            "time_limit": 60.0,
+            "simulation": "wrong",
+            "recording": "wrong",
+        },
     )
 
 

@@ -12,14 +12,16 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any, TypeVar
 
 import torch
 
+from mkc_torch._parallel.deadline import check_deadline, is_limited
 from mkc_torch._parallel.processes import cores
+from mkc_torch._parallel.progress import count, counted, silently
 
 __all__ = ["Parcels", "allow_copies", "meanwhile", "shared"]
 
@@ -33,6 +35,9 @@ _PARENT_DEATH = 1
 
 _BYTES = 4
 """Of the number of a work, which a pipe gives out whole."""
+
+_ASKED_EVERY_S = 0.1
+"""Seconds after which it is asked again whether to wait on for copies."""
 
 _copies = 0
 _ahead: list[Future[dict[int, bytes]]] = []
@@ -48,20 +53,25 @@ def allow_copies(most: int | None = None) -> None:
     _copies = (cores() - 1 if most is None else most) if sys.platform == "linux" else 0
 
 
-def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) -> list[T]:
+def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = (), thing: str = "") -> list[T]:
     """The results of all works, in their order; who works at which makes no difference to any.
 
     Args:
         works: none needs what another one leaves behind. What a copy could not do, or not send, is done here.
         known: objects that results may hold and that are not copied with them; the rest of a result can be pickled.
+        thing: name of what each work is about, where progress counts them.
+
+    Raises:
+        Stopped: the deadline of what this is a part of is over; no copy is left.
 
     Example:
         >>> shared([lambda: 2 + 2, lambda: 3 + 3])
         [4, 6]
     """
+    check_deadline()
     if len(works) < 2:
         return [work() for work in works]
-    with _begun(works, min(_copies, len(works) - 1), known) as results:
+    with _begun(works, min(_copies, len(works) - 1), known, thing=thing) as results:
         return results()
 
 
@@ -124,12 +134,12 @@ class _Unpacker(pickle.Unpickler):
 
 @contextmanager
 def _begun(
-    works: Sequence[Callable[[], T]], copies: int, known: Iterable[object], *, ahead: bool = False
+    works: Sequence[Callable[[], T]], copies: int, known: Iterable[object], *, ahead: bool = False, thing: str = ""
 ) -> Iterator[Callable[[], list[T]]]:
     """Works that copies have begun with, as a function for all results; no copy is left in the end."""
     parcels = Parcels(known)
     if copies < 1:
-        yield lambda: [_done(work, parcels) for work in works]
+        yield lambda: [_done(work, parcels, thing) for work in counted(works, len(works), thing)]
         return
     # whoever reads a number has that work
     todo, entry = os.pipe()
@@ -143,7 +153,7 @@ def _begun(
     try:
         begun += _forked(pool, copies)
         _ahead.extend(begun if ahead else ())
-        yield lambda: _results(works, parcels, todo, begun)
+        yield lambda: _results(works, parcels, todo, begun, thing)
     finally:
         with _uninterrupted():
             _ahead[:] = [copy for copy in _ahead if copy not in begun]
@@ -174,14 +184,29 @@ def _uninterrupted() -> Iterator[None]:
 
 
 def _results(
-    works: Sequence[Callable[[], T]], parcels: Parcels, todo: int, copies: list[Future[dict[int, bytes]]]
+    works: Sequence[Callable[[], T]],
+    parcels: Parcels,
+    todo: int,
+    copies: list[Future[dict[int, bytes]]],
+    thing: str,
 ) -> list[T]:
-    done = {number: _done(works[number], parcels) for number in _taken(todo)}
+    done = {}
+    for number in _taken(todo):
+        # the last ones are taken first, by whomever
+        count(thing, len(works) - 1 - number, len(works))
+        done[number] = _done(works[number], parcels, thing)
     for copy in copies:
+        _waited_for(copy)
         with suppress(BrokenProcessPool):
             done |= {number: parcels.unpacked(parcel) for number, parcel in copy.result().items()}
     # what a copy could not do fails here as it would without copies
     return [done[number] if number in done else _done(work, parcels) for number, work in enumerate(works)]
+
+
+def _waited_for(copy: Future[dict[int, bytes]]) -> None:
+    """Wait until a copy is done, or until this process has to stop."""
+    while is_limited() and not wait([copy], _ASKED_EVERY_S).done:
+        check_deadline()
 
 
 def _taken(todo: int) -> Iterator[int]:
@@ -190,9 +215,11 @@ def _taken(todo: int) -> Iterator[int]:
         yield int.from_bytes(taken, "big")
 
 
-def _done(work: Callable[[], T], parcels: Parcels) -> T:
-    """As a copy would send it."""
-    result = work()
+def _done(work: Callable[[], T], parcels: Parcels, thing: str = "") -> T:
+    """As a copy would send it; a work that is counted counts nothing itself."""
+    check_deadline()
+    with silently() if thing else nullcontext():
+        result = work()
     try:
         return parcels.unpacked(parcels.packed(result))
     except Exception:  # what cannot be sent
@@ -217,7 +244,8 @@ def _begin(works: Sequence[Callable[[], object]], todo: int, parcels: Parcels, n
 def _take_part() -> dict[int, bytes]:
     works, todo, parcels = _task
     done = {}
-    for number in _taken(todo):
-        with suppress(Exception):
-            done[number] = parcels.packed(works[number]())
+    with silently():
+        for number in _taken(todo):
+            with suppress(Exception):
+                done[number] = parcels.packed(works[number]())
     return done

@@ -52,6 +52,7 @@ TERMS: dict[str, str] = {
     "verdict.course_alone": "Its course over time is all that is known of it.",
     "verdict.explained": "What was found explains what the simulation left over.",
     "verdict.structure": "Structure remains that no effect in the catalogue accounts for.",
+    "verdict.unfinished": "The search was not finished, so what else is missing is not known.",
     "verdict.yet_structure": "Yet structure remains that no effect in the catalogue accounts for.",
     "verdict.residual": "{residual}, [unit.root_mean_square] on [unit.unseen_data].",
     "verdict.chance": "If nothing were missing, a search like this, of {candidates} candidates, would find as much in"
@@ -96,6 +97,7 @@ TERMS: dict[str, str] = {
     "world.nothing_named": "nothing: physics is named only beside a simulation that follows",
     "world.nothing_sure": "nothing surely; {findings}",
     "world.graded": "{finding}: {grade}",
+    "world.unfinished": "not known; the search was not finished",
     "world.structure": "structure without a name",
     "world.follows_note": "Robust sizes of recording less simulation, the simulation running freely. The noise floor is"
     " the sensor's own. Off by as much as the mean or more: the simulation tells nothing of that output.",
@@ -117,6 +119,7 @@ TERMS: dict[str, str] = {
     " ({p} if the name were right)",
     "evidence.as_good": "a free curve of the same variables is not clearly better ({p})",
     "evidence.not_measured": "not measured",
+    "evidence.no_p_value": "not known: no p-value was computed",
     "evidence.smallest": "{p}, the smallest that {surrogates} surrogates can show",
     "evidence.after_the_search": "{evidence}, after the whole search",
     "evidence.searched": "{evidence}; {candidates} candidates tried, [unit.level] {level}",
@@ -399,6 +402,9 @@ TERMS: dict[str, str] = {
     # what a command says besides
     "command.failed": "mkc: {sentence}",
     "command.interrupted": "mkc: interrupted; {left}",
+    "command.part": "{thing} {number} of {total}",
+    "command.part_and_time": "{thing} {number} of {total}, about {seconds} s",
+    "command.stopped": "what was known until then was written for {recordings}",
     "command.nothing_written": "nothing was written for {recordings}",
     "command.incomplete": "{folders} may be incomplete",
     "command.all_written": "all was written.",

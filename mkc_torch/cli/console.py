@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
+import math
 import os
 import re
 import sys
@@ -16,7 +18,17 @@ from time import monotonic
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    SpinnerColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+)
+from rich.text import Text
 
 from mkc_torch._support.files import folder_held
 from mkc_torch._words.terms import term
@@ -185,6 +197,8 @@ class Steps:
         self.name, self.done, self.total = "", 0, total
         self._bar = bar
         self._task = None if bar is None else bar.add_task("", total=total)
+        self._part: tuple[str, int, int] | None = None
+        self._timed = None if bar is None else bar.add_task("", total=None, visible=False)
 
     def __call__(self, name: str | None) -> None:
         """To be called with the name of each thing begun, and with None when one is done."""
@@ -192,12 +206,37 @@ class Steps:
             self.done += 1
         else:
             self.name = name
+        self._part = None
         if self._bar is None or self._task is None:
             return
         if name is None:
             self._bar.advance(self._task)
         else:
             self._bar.update(self._task, description=name)
+
+    def part(self, thing: str, done: int, total: int) -> None:
+        """How many of the things that the stage is made of are done."""
+        known = self._part
+        self._part = thing, done, total
+        if self._bar is None or self._timed is None:
+            return
+        if known is None or (known[0], known[2]) != (thing, total) or done < known[1]:
+            self._bar.reset(self._timed, total=total, completed=done, visible=False)
+        else:
+            self._bar.update(self._timed, completed=done)
+
+    @property
+    def part_done(self) -> str:
+        """The thing that is being done, of how many, and how long the rest takes at the rate so far."""
+        if self._part is None or self._part[1] >= self._part[2]:
+            return ""
+        thing, done, total = self._part
+        task = None if self._bar is None else next(one for one in self._bar.tasks if one.id == self._timed)
+        if task is None or task.time_remaining is None:
+            return term("command.part", thing=thing, number=done + 1, total=total)
+        return term(
+            "command.part_and_time", thing=thing, number=done + 1, total=total, seconds=math.ceil(task.time_remaining)
+        )
 
     def count(self, name: str, done: int, total: int) -> None:
         """Name what is being done, and how much of it is."""
@@ -250,7 +289,8 @@ def _note(steps: Steps, folder: Path, elapsed: float) -> None:
     with suppress(OSError):  # no place for it is no reason to end the work
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "progress.txt").open("a", encoding="utf-8") as file:
-            file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}  after {elapsed / 60:.0f} min: {count}{steps.name}\n")
+            doing = "; ".join(filter(None, [steps.name, steps.part_done]))
+            file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}  after {elapsed / 60:.0f} min: {count}{doing}\n")
 
 
 @contextmanager
@@ -260,14 +300,26 @@ def _shown(total: int) -> Iterator[Steps]:
         yield Steps(None, total)
         return
     over = (BarColumn(), MofNCompleteColumn()) if total > 1 else ()
-    parts = (SpinnerColumn(), TextColumn("{task.description}", markup=False), *over, TimeElapsedColumn())
+    part = _PartColumn()
+    parts = (SpinnerColumn(), TextColumn("{task.description}", markup=False), part, *over, TimeElapsedColumn())
     with (
         Progress(
             *parts, console=console, transient=True, auto_refresh=False, redirect_stdout=False, redirect_stderr=False
         ) as bar,
         _repeated(lambda: bar.refresh() if bar.live.is_started else None, _EVERY),
     ):
-        yield Steps(bar, total)
+        part.steps = Steps(bar, total)
+        yield part.steps
+
+
+class _PartColumn(ProgressColumn):
+    """How much of a stage is done."""
+
+    steps: Steps | None = None
+
+    def render(self, task: Task) -> Text:  # noqa: ARG002
+        """The words, as of now."""
+        return Text("" if self.steps is None else self.steps.part_done)
 
 
 @contextmanager
@@ -307,12 +359,24 @@ def not_written(recordings: Iterable[Path], output: Path) -> str:
         'nothing was written for a.csv, b.csv.'
     """
     paths = list(recordings)
-    there = [path for path in paths if (output / path.stem).is_dir()]
-    absent = ", ".join(str(path) for path in paths if path not in there)
-    told = [term("command.nothing_written", recordings=absent)] if absent else []
+    stopped = [path for path in paths if _holds_a_stopped_one(output / path.stem)]
+    there = [path for path in paths if path not in stopped and (output / path.stem).is_dir()]
+    absent = ", ".join(str(path) for path in paths if path not in there and path not in stopped)
+    known = ", ".join(str(path) for path in stopped)
+    told = [term("command.stopped", recordings=known)] if known else []
+    told += [term("command.nothing_written", recordings=absent)] if absent else []
     folders = ", ".join(str(output / path.stem) for path in there)
     told += [term("command.incomplete", folders=folders)] if there else []
     return f"{'; '.join(told)}." if told else term("command.all_written")
+
+
+def _holds_a_stopped_one(folder: Path) -> bool:
+    """Whether a folder has a diagnosis in it, of a recording or an experiment of it, that was stopped by the user."""
+    for file in folder.rglob("diagnosis.json"):
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            if json.loads(file.read_text(encoding="utf-8"))["search"]["stopped"]["reason"] == "interrupt":
+                return True
+    return False
 
 
 def remove_if_empty(folder: Path) -> None:

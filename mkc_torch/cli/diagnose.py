@@ -88,13 +88,21 @@ def diagnose(
         typer.Option(metavar="N", help=f"Draws of noise for each p-value; default: {SURROGATES}, more at a low level."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, metavar="S", help="Of the draws of noise.")] = 0,
+    quick: Annotated[
+        bool,
+        typer.Option("--quick", help="A first look in less time: no p-values, false alarms not controlled."),
+    ] = False,
+    time_limit: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", help="Stop after so long, for each REC, and write what is known then."),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
 ) -> None:
     """Say what a simulation lacks: where recordings differ from it, by what physics, how sure, and how much it helps.
 
     Each REC gets diagnosis.json, model.json (for `mkc apply`) and report.html; with --together all of them get one of
-    each. Exits with 0 when every recording was
-    diagnosed, whatever was found, and 1 when some were not.
+    each. Exits with 0 when every recording was diagnosed, whatever was found, also in the time limit, and 1 when some
+    were not. Ctrl-C stops the search, writes what is known, and exits with 130; a second one ends at once.
     """
     recordings, texts = without_units(recordings, unit or [])
     request = Request(
@@ -106,8 +114,10 @@ def diagnose(
         noise=_noise(noise or []),
         between=_between(between or []),
         level=_level(level),
-        surrogates=_surrogates(surrogates, level),
+        surrogates=_surrogates(surrogates, level, quick=quick),
         seed=seed,
+        quick=quick,
+        time_limit=_time_limit(time_limit),
         force=force,
     )
     refuse_same_names(recordings)
@@ -136,6 +146,8 @@ def diagnose(
             _tell(outcomes, step)
             total += len(outcomes)
             failed += sum(outcome.failed for outcome in outcomes)
+            if any(outcome.interrupted for outcome in outcomes):
+                raise KeyboardInterrupt
             left.remove(path)
             step(None)
     if total > 1 and failed:
@@ -157,6 +169,8 @@ def _all_together(output: Path, request: Request, look: Look, paths: list[Path])
         step("diagnosing the recordings together")
         outcomes = diagnose_together(paths, output / TOGETHER, request, look, step)
         _tell(outcomes, step)
+        if any(outcome.interrupted for outcome in outcomes):
+            raise KeyboardInterrupt
         step(None)
     return int(any(outcome.failed for outcome in outcomes))
 
@@ -262,8 +276,18 @@ def _level(level: float) -> float:
     return level
 
 
-def _surrogates(count: int | None, level: float) -> int:
+def _time_limit(seconds: float | None) -> float | None:
+    if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
+        raise typer.BadParameter(
+            f"--time-limit must be a number of seconds above 0 but is {seconds:g}; leave it out for no limit."
+        )
+    return seconds
+
+
+def _surrogates(count: int | None, level: float, *, quick: bool) -> int:
     """Draws for each p-value: no p-value can be smaller than one over their number plus one."""
+    if quick and count is not None:
+        raise typer.BadParameter("--quick draws no surrogates; leave out --surrogates, or --quick to have p-values.")
     fewest = math.ceil(1.0 / level - 1.0 - 1e-9)
     if count is None:
         return max(SURROGATES, fewest)

@@ -6,12 +6,12 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mkc_torch._parallel.deadline import stopped_by_interrupt
 from mkc_torch._support.files import claim_folder, write_atomically
-from mkc_torch.cli.console import FAILURES, Look, folder_names, folder_written, remove_if_empty, sentence_of
+from mkc_torch.cli.console import FAILURES, Look, Steps, folder_names, folder_written, remove_if_empty, sentence_of
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request, is_file_of_a_simulation
 from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.cli.recorded import read_magnetometer, read_table, refuse_no_magnetometer
@@ -57,8 +57,10 @@ def diagnose_file(
         parts, outcomes = list(_parts(recording, simulation, folder)), []
         for number, (label, part, place) in enumerate(parts, start=1):
             which = f", experiment {label} ({number} of {len(parts)})" if len(parts) > 1 else ""
-            told = partial(_tell, step, f"diagnosing {path.name}{which}")
+            told = Told(step, f"diagnosing {path.name}{which}")
             outcomes.append(_outcome(path, label, simulation, part, place, request, look, told))
+            if outcomes[-1].interrupted:
+                break
         if all(outcome.failed for outcome in outcomes):
             remove_if_empty(folder)
     return [replace(outcome, note=note) for outcome in outcomes]
@@ -87,7 +89,7 @@ def diagnose_together(
     except Exception as error:
         return [_failed(subject, "", error)]
     with folder_written(folder):
-        told = partial(_tell, step, f"diagnosing {subject}")
+        told = Told(step, f"diagnosing {subject}")
         outcome = _outcome(subject, "", simulation, recordings, folder, own, look, told)
         if outcome.failed:
             remove_if_empty(folder)
@@ -115,9 +117,26 @@ def _read(path: Path, request: Request) -> Recording:
     return read_table(path, request.columns, request.units)
 
 
-def _tell(step: Callable[[str], None] | None, subject: str, stage: str) -> None:
-    if step is not None:
-        step(f"{subject}: {stage}")
+class Told:
+    """What is being done with a subject, and how much of it is, told to the steps of a command; to nobody without.
+
+    Args:
+        step: the steps, or what is called with each stage.
+        subject: what is worked on.
+    """
+
+    def __init__(self, step: Callable[[str], None] | None, subject: str) -> None:
+        self._step, self._subject = step, subject
+
+    def __call__(self, stage: str) -> None:
+        """A stage has begun."""
+        if self._step is not None:
+            self._step(f"{self._subject}: {stage}")
+
+    def count(self, thing: str, done: int, total: int) -> None:
+        """So many of so many things of the stage are done."""
+        if isinstance(self._step, Steps):
+            self._step.part(thing, done, total)
 
 
 def write_diagnosis(
@@ -162,28 +181,32 @@ def _outcome(
     folder: Path,
     request: Request,
     look: Look,
-    progress: Callable[[str], None],
+    progress: Told,
 ) -> Outcome:
     try:
         # the whole folder was claimed before
         claim_folder(folder, overwrite=request.force or not label, files=WRITTEN)
         with folder_written(folder) if label else nullcontext():
-            diagnosis = diagnose(
-                simulation,
-                recording,
-                level=request.level,
-                surrogates=request.surrogates,
-                seed=request.seed,
-                noise=request.noise,
-                between=request.between,
-                progress=progress,
-            )
+            with stopped_by_interrupt():
+                diagnosis = diagnose(
+                    simulation,
+                    recording,
+                    level=request.level,
+                    surrogates=request.surrogates,
+                    seed=request.seed,
+                    noise=request.noise,
+                    between=request.between,
+                    quick=request.quick,
+                    time_limit=request.time_limit,
+                    progress=progress,
+                )
             progress("writing the report")
             files = write_diagnosis(diagnosis, folder, force=request.force, report=request.report)
     except Exception as error:
         own = raised_in(request.simulation, error) if is_file_of_a_simulation(request.simulation) else None
         return _failed(path, label, own or error)
-    return Outcome(look.set(lambda console: show(console, diagnosis, files)), failed=False)
+    stopped = diagnosis.stop is not None and diagnosis.stop.reason == "interrupt"
+    return Outcome(look.set(lambda console: show(console, diagnosis, files)), failed=False, interrupted=stopped)
 
 
 def named_simulation(name: str) -> Simulation:

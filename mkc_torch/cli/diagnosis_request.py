@@ -48,6 +48,8 @@ class Request:
     level: float = LEVEL
     surrogates: int = SURROGATES
     seed: int = 0
+    quick: bool = False
+    time_limit: float | None = None
     force: bool = False
     report: bool = True
 
@@ -61,12 +63,13 @@ class Request:
 class Outcome:
     """A recording, or one experiment of it: its summary, or the sentence that says why there is none.
 
-    ``note`` is a sentence on what was decided for the user.
+    ``note`` is a sentence on what was decided for the user; ``interrupted`` says that the user stopped it.
     """
 
     text: str
     failed: bool
     note: str = ""
+    interrupted: bool = False
 
 
 def is_file_of_a_simulation(name: str) -> bool:

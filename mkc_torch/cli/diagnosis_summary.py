@@ -31,6 +31,8 @@ def show(console: Console, diagnosis: Diagnosis, files: list[Path]) -> None:
     if d.simulation:
         told = term("label.against", recording=told, simulation=plain(d.simulation))
     console.print(Text(told, style="bold"))
+    for notice in top.said_first(d):
+        console.print(Text(notice, style="bold yellow"))
     console.print(Text(top.headline(d), style=_STYLE[top.tone(d)]))
     console.print(_facts(_four_answers(d)))
     for i, finding in enumerate(d.findings, 1):
@@ -88,7 +90,8 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
         yield term("label.in"), say.experiments(f.experiments)
     yield term("label.driven_by"), say.driven_by(f)
     evidence = numbers.evidence(f.p_value, diagnosis.surrogates)
-    yield term("label.how_sure"), term("evidence.after_the_search", evidence=evidence)
+    sure = evidence if f.p_value is None else term("evidence.after_the_search", evidence=evidence)
+    yield term("label.how_sure"), sure
     if f.shape is not None:
         yield term("label.shape"), "; ".join(filter(None, [say.shape(f), plain(f.shape.formula)]))
     if f.held_out is None:

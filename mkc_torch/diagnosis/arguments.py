@@ -73,6 +73,13 @@ def check_numbers(level: float, surrogates: int, max_findings: int, seed: int) -
         )
 
 
+def check_limits(quick: object, time_limit: object) -> None:
+    """Refuse a quick look that is no bool, and a time limit that is no number above 0."""
+    refuse_other_type("quick", quick, bool, "bool", "True for a first look without p-values")
+    if time_limit is not None:
+        checked_number("time_limit", time_limit, 0.0, advice="seconds, such as 60; None is for no limit")
+
+
 BETWEEN = ("held", "linear", "smooth")
 """What an input can do between two samples."""
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 
+from mkc_torch._parallel.deadline import within
 from mkc_torch.diagnosis.evidence.after_the_search import Answers
 from mkc_torch.diagnosis.evidence.one_stretch import called
 from mkc_torch.diagnosis.evidence.remaining import nameless
@@ -17,7 +19,7 @@ from mkc_torch.diagnosis.findings.finding import finding_of
 from mkc_torch.diagnosis.findings.noise import noise_summary
 from mkc_torch.diagnosis.findings.separability import separability
 from mkc_torch.diagnosis.findings.shape import shape_of
-from mkc_torch.diagnosis.findings.worth import grade_of, sizeless
+from mkc_torch.diagnosis.findings.worth import grade_in_short, grade_of, sizeless
 from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.model.drivers import Drivers
 from mkc_torch.diagnosis.model.fit import FittedModel
@@ -27,12 +29,17 @@ from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import Candidate, Diagnosis, Finding, Separability, Traces
 from mkc_torch.diagnosis.rounds import Asked, Search
 from mkc_torch.diagnosis.search.locate import Located
-from mkc_torch.diagnosis.verdict import around, verdict_of, world_of
+from mkc_torch.diagnosis.stop import Stop, notices
+from mkc_torch.diagnosis.verdict import Around, alone, around, lost_from_the_start, verdict_of, world_of
+from mkc_torch.diagnosis.world import World
 from mkc_torch.recording.unit_warnings import unit_warnings
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
 __all__ = ["Whole", "assembled", "with_rest"]
+
+_MOMENT_S = 1.0
+"""Seconds that a part of a stopped diagnosis may take that is of use beside what was found."""
 
 _HINTED = 0.15
 """p-value up to which the strongest candidate is told, though it does not count."""
@@ -50,6 +57,7 @@ class Whole:
         final: with all findings, under the pushes that are left.
         asked: for.
         cut: whether there was more to be found than was asked for.
+        stop: why the search was stopped before its end, and what was not done.
     """
 
     simulation: Simulation
@@ -59,6 +67,12 @@ class Whole:
     final: FittedModel
     asked: Asked
     cut: bool
+    stop: Stop | None = None
+
+    @property
+    def in_short(self) -> bool:
+        """Whether parts that take long are left out."""
+        return self.asked.quick or self.stop is not None
 
 
 def assembled(whole: Whole, answers: Answers) -> Diagnosis:
@@ -70,7 +84,7 @@ def assembled(whole: Whole, answers: Answers) -> Diagnosis:
     """
     case, prepared, asked = answers.case, answers.case.prepared, whole.asked
     first, final, settings = case.first, case.final, asked.settings
-    known = around(whole.base, whole.final, asked.declared, settings.noise)
+    known = _around(whole)
     unfit = known.unfit(settings.evidence)
     tried = [] if unfit else [_finding(case.found, number, final, whole, answers) for number in range(len(case.found))]
     without_size = [one for one in tried if one.grade == "not confirmed" and sizeless(one)]
@@ -81,16 +95,17 @@ def assembled(whole: Whole, answers: Answers) -> Diagnosis:
         samples=len(prepared.time),
         level=asked.level,
         noise=noise_summary(final, settings.noise),
-        candidates_tried=len(whole.terms),
-        surrogates=asked.surrogates,
+        candidates_tried=0 if first is None and whole.stop is not None else len(whole.terms),
+        surrogates=0 if asked.quick else asked.surrogates,
         seed=asked.seed,
-        p_value=first.p_value if first else 1.0,
+        p_value=_p_value(first, whole),
         verdict="adequate",
         findings=findings,
         baseline=case.spread(case.held_out[0]),
         corrected=case.spread(case.held_out[-1]),
         advice=(),
         warnings=(
+            *notices(whole.stop, quick=asked.quick),
             *prepared.recording.warnings,
             *unit_warnings(prepared.recording),
             *prepared.warnings,
@@ -104,20 +119,27 @@ def assembled(whole: Whole, answers: Answers) -> Diagnosis:
         traces=_traces(prepared, whole.drivers, case.base, final),
         model=model_of(final, whole.simulation),
         evidence=answers.of_all,
-        world=world_of(whole.base, whole.final, known, unfit=unfit),
+        world=_world(whole, known, unfit=unfit),
+        quick=asked.quick,
+        stop=whole.stop,
     )
     there = first is not None and first.p_value <= asked.level and not findings
     structure = there or bool(diagnosis.remaining) or whole.cut or nameless(final.fit)
     # of a trajectory it has been asked for what pushes it
     white = known.noise is not None or _white(diagnosis)
     verdict = verdict_of(known, findings, structure=structure, white=white, settings=settings.evidence)
+    if whole.stop is not None and verdict != "unfit":
+        verdict = "unexplained"  # nobody knows what the rest of the search would have found
     diagnosis = replace(diagnosis, verdict=verdict)
     return replace(diagnosis, advice=advice_of(diagnosis))
 
 
 def _finding(found: Sequence[Located], number: int, final: Estimate, whole: Whole, answers: Answers) -> Finding:
     """A finding, with what the tests say of it, its shape and its grade."""
-    finding = replace(finding_of(found[number], final, number), evidence=answers.of_findings[number])
+    quick = whole.asked.quick
+    finding = replace(finding_of(found[number], final, number, quick=quick), evidence=answers.of_findings[number])
+    if whole.in_short:
+        return replace(finding, grade=grade_in_short(finding))
     shape = None
     if isinstance(whole.final.model.prepared, PreparedDynamics):
         shape = shape_of(whole.final, number, whole.terms, whole.asked.settings.evidence)
@@ -127,10 +149,41 @@ def _finding(found: Sequence[Located], number: int, final: Estimate, whole: Whol
     return replace(finding, grade=grade, shape=shape)
 
 
+def _around(whole: Whole) -> Around:
+    """What stands around the fits; of a stopped search no more than is known in a moment."""
+    settings, declared = whole.asked.settings.noise, whole.asked.declared
+    if whole.stop is None:
+        return around(whole.base, whole.final, declared, settings)
+    known = within(_MOMENT_S, partial(around, whole.base, whole.final, declared, settings))
+    if known is not None:
+        return known
+    # how the simulation follows with what was found is not known, so it is not called unfit either
+    follows = () if whole.final.model.terms else alone(whole.base, declared)
+    return Around(follows, (), None, lost_from_the_start(whole.base))
+
+
+def _world(whole: Whole, known: Around, *, unfit: bool) -> World:
+    if whole.stop is None:
+        return world_of(whole.base, whole.final, known, unfit=unfit)
+    world = within(_MOMENT_S, partial(world_of, whole.base, whole.final, known, unfit=unfit))
+    return World(known.follows, starts=whole.base.starts) if world is None else world
+
+
+def _p_value(first: Located | None, whole: Whole) -> float | None:
+    """Of the strongest candidate; None where no noise was drawn."""
+    if whole.asked.quick or (first is None and whole.stop is not None):
+        return None
+    return 1.0 if first is None else first.p_value
+
+
+def _sure(p_value: float | None) -> str:
+    return "it pays its price in likelihood" if p_value is None else f"p = {p_value:.2g} after the whole search"
+
+
 def _no_size(finding: Finding) -> str:
     return (
-        f"{finding.effect}: p = {finding.p_value:.2g} after the whole search, but in the free run its size is 0 within "
-        "its standard error, so it does not count as a finding."
+        f"{finding.effect}: {_sure(finding.p_value)}, but in the free run its size is 0 within its standard error, so "
+        "it does not count as a finding."
     )
 
 
@@ -142,7 +195,7 @@ def _white(diagnosis: Diagnosis) -> bool:
 
 def with_rest(diagnosis: Diagnosis, search: Search) -> Diagnosis:
     """With what the last search found that does not count, and why there was no other."""
-    more = [_not_confirmed(search.unconfirmed)] if search.unconfirmed else []
+    more = [_not_confirmed(search.unconfirmed, quick=diagnosis.quick)] if search.unconfirmed else []
     if diagnosis.verdict == "unexplained" and not search.found and search.first is not None:
         more += _short_of_the_level(search.first, diagnosis.level)
     if search.given_up:
@@ -176,12 +229,12 @@ def _nothing_to_separate() -> Separability:
     return Separability((), torch.zeros(0, 0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
 
 
-def _not_confirmed(located: Located) -> str:
+def _not_confirmed(located: Located, *, quick: bool) -> str:
     shape = described(located.term.effect, located.term.shape)
     what = f"{called(located.term)} ({shape})" if shape else called(located.term)
     return (
-        f"{what}: p = {located.p_value:.2g} after the whole search, but it does not predict blocks better that the fit "
-        "has not seen, so it does not count as a finding."
+        f"{what}: {_sure(None if quick else located.p_value)}, but it does not predict blocks better that the fit has "
+        "not seen, so it does not count as a finding."
     )
 
 

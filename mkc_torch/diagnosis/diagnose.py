@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from time import monotonic
 
 import torch
 
+from mkc_torch._parallel.deadline import Stopped, limited
 from mkc_torch._parallel.pool import meanwhile, shared
+from mkc_torch._parallel.progress import counting
 from mkc_torch.diagnosis.arguments import (
+    check_limits,
     check_numbers,
     checked_between,
     checked_effects,
@@ -17,26 +21,23 @@ from mkc_torch.diagnosis.arguments import (
     refuse_no_settings,
     refuse_no_simulation,
 )
-from mkc_torch.diagnosis.assemble import Whole, assembled, with_rest
-from mkc_torch.diagnosis.evidence.after_the_search import answers_of, parts_ahead
-from mkc_torch.diagnosis.evidence.base import Case
-from mkc_torch.diagnosis.evidence.running_freely import running_freely
+from mkc_torch.diagnosis.cut_short import cut_short, nothing_known
+from mkc_torch.diagnosis.evidence.after_the_search import parts_ahead
 from mkc_torch.diagnosis.follows import misses
 from mkc_torch.diagnosis.joined import joined
 from mkc_torch.diagnosis.model.at_once import common_parts
-from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.in_the_world import at_liberty, between_samples, simulation_in_the_world
 from mkc_torch.diagnosis.result import Diagnosis
-from mkc_torch.diagnosis.rounds import Asked, Search, begun, continued
-from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.diagnosis.rounds import Asked, begun, continued
+from mkc_torch.diagnosis.settings import Settings, quick_settings
+from mkc_torch.diagnosis.under_way import UnderWay
 from mkc_torch.diagnosis.verdict import alone, lost_from_the_start
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
-from mkc_torch.simulation.protocol import Simulation
+from mkc_torch.simulation.protocol import PreparedSimulation, Simulation
 
 __all__ = ["diagnose"]
 
@@ -62,6 +63,8 @@ def diagnose(
     settings: Settings = Settings(),  # noqa: B008
     noise: Mapping[str, float] | None = None,
     between: Mapping[str, str] | None = None,
+    quick: bool = False,
+    time_limit: float | None = None,
     progress: Callable[[str], object] = lambda _: None,
 ) -> Diagnosis:
     """What a simulation lacks, by one recording of what it simulates, or by several together.
@@ -91,7 +94,14 @@ def diagnose(
             estimated otherwise.
         between: what an input does between two samples, "held" or "linear", where it is known; otherwise whichever is
             likelier. Of differential equations only.
-        progress: called with what is being done, as each stage begins.
+        quick: a first look that draws no noise: candidates count by their likelihood's price alone, leading ones are
+            refitted from fewer starts, and tests of evidence that take long are left out. There are no p-values then,
+            and nobody knows the rate of false alarms.
+        time_limit: seconds after which the search is stopped; what is known then is returned, and ``stop`` says what
+            was not done. None for no limit.
+        progress: called with what is being done, as each stage begins. Where it has a method
+            ``count(thing, done, total)`` too, that is called with how many of the things that a stage is made of are
+            done: candidates that are fitted, say.
 
     Returns:
         The diagnosis.
@@ -101,6 +111,7 @@ def diagnose(
         ValueError: an argument out of range, too few samples, recordings whose columns or units differ, or a recording
             that the simulation refuses.
         MissingColumnError: the recording lacks a column that the simulation needs.
+        TimeoutError: the time limit was over before the simulation's first fit had ended.
 
     Example:
         >>> from mkc_torch.recording.demonstration import simulated_recording
@@ -109,11 +120,14 @@ def diagnose(
         >>> result.verdict in ("adequate", "explained", "unexplained")
         True
     """
+    begin = monotonic()
     refuse_no_simulation(simulation)
     recording, names = joined(simulation, recording)
     effects = checked_effects(effects)
     check_numbers(level, surrogates, max_findings, seed)
+    check_limits(quick, time_limit)
     refuse_no_settings(settings)
+    settings = quick_settings(settings) if quick else settings
     fewest = settings.search.fewest_samples
     where = f"{recording.name}: " if recording.name else ""
     if len(recording) < fewest:
@@ -128,55 +142,60 @@ def diagnose(
         )
     declared = checked_noise(noise, prepared.channels)
     fixed = checked_between(between, tuple(getattr(prepared, "between", ())))
-    asked = Asked(level, surrogates, max_findings, seed, settings, declared, fixed)
-    generator = torch.Generator().manual_seed(seed)
+    asked = Asked(level, surrogates, max_findings, seed, settings, declared, fixed, quick)
+    known = UnderWay(simulation, effects, names, asked)
+    limit = math.inf if time_limit is None else time_limit
+    with limited(limit, begin=begin) as deadline, counting(progress):
+        try:
+            return _diagnosed(known, prepared, where, progress)
+        except Stopped as stopped:
+            reason, seconds = stopped.reason, deadline.elapsed
+    if known.world is None:
+        raise nothing_known(reason, limit, where)
+    progress("writing down what is known")
+    return cut_short(known, reason, seconds)
+
+
+def _diagnosed(
+    known: UnderWay, prepared: PreparedSimulation, where: str, progress: Callable[[str], object]
+) -> Diagnosis:
+    """The diagnosis, unless it is stopped; ``known`` has what is known then."""
+    asked = known.asked
+    declared, fixed, settings = asked.declared, asked.fixed, asked.settings
+    generator = torch.Generator().manual_seed(asked.seed)
     if isinstance(prepared, PreparedDynamics):
         prepared = prepared.holding(fixed)
+        if asked.quick:
+            known.asked = asked = replace(asked, max_findings=min(asked.max_findings, 1), judged=False)
     progress("fitting the simulation alone")
-    world = simulation_in_the_world(prepared, declared, settings.noise)
-    world = between_samples(world, declared, fixed, settings.noise)
+    world = simulation_in_the_world(prepared, declared, settings.noise, known.keep_world)
+    known.world = world = between_samples(world, declared, fixed, settings.noise)
+    known.fitted = True
     base = world.fit
-    prepared = at_liberty(base.model.prepared)
-    roles = frozenset(role for effect in effects for role in effect.roles)
-    measured: frozenset[str] = getattr(simulation, "measured", frozenset())
-    drivers = find_drivers(prepared.recording, simulation.columns, settings.drivers, roles, measured)
-    terms = candidate_terms(prepared, drivers.drivers, effects)
+    terms = known.candidates[1]
     _refuse_no_noise(base, where)
-    missed = misses(alone(world, declared), settings.evidence.followed)
-    if missed:
+    if misses(alone(world, declared), settings.evidence.followed):
         # one effect may be what it lacks to follow; what it lacks beside that is told once it follows
-        asked = replace(asked, max_findings=min(max_findings, 1))
+        known.asked = asked = replace(asked, max_findings=min(asked.max_findings, 1))
     hopeless = lost_from_the_start(world)
     progress(f"trying {len(terms)} effects")
-    search = begun(base, () if hopeless else terms, asked, generator, world.free)
-
-    def case(search: Search) -> Case:
-        free = running_freely(base, world.free, search.found, search.evidence, search.blocks)
-        found, pairs = free.found, search.pairs
-        return Case(
-            free.base, search.first, found, free.held_out, search.blocks, drivers.drivers, seed, settings, pairs=pairs
-        )
-
-    def diagnosis(search: Search, known: Case, done: Sequence[Any]) -> Diagnosis:
-        final = search.found[-1].fit if search.found else base
-        whole = Whole(simulation, drivers, terms, world, final, asked, search.cut)
-        told = with_rest(assembled(whole, answers_of(known, done)), search)
-        return replace(told, recordings=names)
-
-    known = [simulation, base, base.model, *common_parts(prepared, terms)]
-
+    search = begun(base, () if hopeless else terms, asked, generator, world.free, known.keep_search)
+    known.search, tests = search, known.tests
+    common = [known.simulation, base, base.model, *common_parts(at_liberty(base.model.prepared), terms)]
     while search.left:
-        so_far = case(search)
+        case = known.case(search)
         # most often there is nothing more
-        with meanwhile(parts_ahead(so_far), [*known, *search.parts]) as done:
+        with meanwhile(parts_ahead(case, tests), [*common, *search.parts]) as done:
             progress(f"trying {len(search.left)} effects beside {len(search.found)} found")
-            after = continued(search, asked, generator)
+            after = continued(search, asked, generator, known.keep_search)
             if after.found == search.found:
-                return diagnosis(after, so_far, done())
-        search = after
-    so_far = case(search)
+                known.search = after
+                return known.diagnosis(after, case, done(), tests)
+        known.search = search = after
+    case = known.case(search)
     progress("checking what was found")
-    return diagnosis(search, so_far, shared(parts_ahead(so_far), [*known, *search.parts]))
+    done_ahead = shared(parts_ahead(case, tests), [*common, *search.parts], "test of evidence")
+    return known.diagnosis(search, case, done_ahead, tests)
 
 
 def _refuse_no_noise(base: FittedModel, where: str) -> None:

@@ -8,6 +8,7 @@ from mkc_torch._support.html_table import html_table
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain, typeset
 from mkc_torch.diagnosis.parts import Finding
+from mkc_torch.diagnosis.stop import Stop
 from mkc_torch.diagnosis.world import Verdict
 from mkc_torch.effects import words_of
 
@@ -22,13 +23,20 @@ _VERDICTS: dict[Verdict, str] = {
 
 
 def as_html(
-    recording: str, simulation: str, verdict: Verdict, findings: Sequence[Finding], sentences: Sequence[str]
+    recording: str,
+    simulation: str,
+    verdict: Verdict,
+    findings: Sequence[Finding],
+    sentences: Sequence[str],
+    *,
+    stop: Stop | None = None,
 ) -> str:
-    """The table, with sentences below it: advice and warnings."""
+    """The table, with sentences below it: advice and warnings; first of all why the search was stopped, if it was."""
     names = term("label.against", recording=plain(recording) or term("label.recording"), simulation=plain(simulation))
     heads = ("", "grade", "p", "on unseen data")
     rows = [_row(finding) for finding in findings]
-    below = [term(_VERDICTS[verdict]), *(typeset(one) for one in sentences)]
+    first = term(_VERDICTS[verdict]) if stop is None else term("verdict.unfinished")
+    below = [first, *(typeset(one) for one in sentences)]
     for finding in findings:
         below = [one.replace(finding.effect, words_of(finding.effect)) for one in below]
     return html_table(names, heads, rows, below)
@@ -38,4 +46,4 @@ def _row(f: Finding) -> tuple[str, ...]:
     drivers = f" ({', '.join(plain(name) for name in f.drivers)})" if f.drivers else ""
     held = f.held_out
     change = "" if held is None else f"{held.rmse_before:.3g} → {held.rmse_after:.3g} {plain(held.unit)}".rstrip()
-    return words_of(f.effect) + drivers, f.grade, f"{f.p_value:.2g}", change
+    return words_of(f.effect) + drivers, f.grade, "" if f.p_value is None else f"{f.p_value:.2g}", change

@@ -211,6 +211,7 @@ class Finding:
     ``moments`` are those at which an effect sets in that does so several times, the first of them its onset.
     ``references`` are what the equation counts its drivers from, ``advice`` what to do about it, ``again`` what becomes
     of it in another recording; one that is ``placed`` belongs to the place or the attitude of this recording.
+    ``p_value`` is that after the whole search; None in a quick look, which draws no noise.
     ``grade`` is what it is worth, ``shape`` whether its name's shape is the recording's; None where that is not asked.
     ``evidence`` is what the tests say that are asked of each finding.
     """
@@ -223,7 +224,7 @@ class Finding:
     equation: str
     explanation: str
     parameters: tuple[Parameter, ...]
-    p_value: float
+    p_value: float | None
     alternatives: tuple[Alternative, ...]
     plausible: bool
     plausibility: str

@@ -31,6 +31,7 @@ from mkc_torch.diagnosis.parts import (
     value_of,
 )
 from mkc_torch.diagnosis.plot.accessor import DiagnosisPlot
+from mkc_torch.diagnosis.stop import Stop
 from mkc_torch.diagnosis.world import Verdict, World
 
 __all__ = [
@@ -53,6 +54,7 @@ __all__ = [
     "SmoothCorrection",
     "Spread",
     "StateMap",
+    "Stop",
     "Table",
     "Told",
     "Traces",
@@ -67,7 +69,8 @@ class Diagnosis:
         recording, simulation, samples, level: what was asked: names, number of samples used, false-alarm level.
         noise: the noise model that structure was tested against.
         candidates_tried, surrogates, seed: the size of the search.
-        p_value: of the strongest candidate after the whole search.
+        p_value: of the strongest candidate after the whole search; None in a quick look, and where the search was
+            stopped before it was known.
         verdict: "unfit", "adequate", "explained" or "unexplained".
         findings: strongest first.
         baseline, corrected: the simulation without and with the findings, on held-out blocks.
@@ -80,6 +83,8 @@ class Diagnosis:
         evidence: what the tests say that are asked of the whole diagnosis.
         world: how the simulation follows the recording, and the noise of the world around it.
         recordings: names of the recordings that were diagnosed together; empty for a single one.
+        quick: whether it is a quick look, which draws no noise: no p-values, and no known rate of false alarms.
+        stop: why the search was stopped before its end, and what was not done; None where it was not.
 
     Example:
         >>> import torch
@@ -103,7 +108,7 @@ class Diagnosis:
     candidates_tried: int
     surrogates: int
     seed: int
-    p_value: float
+    p_value: float | None
     verdict: Verdict
     findings: tuple[Finding, ...]
     baseline: Spread
@@ -117,13 +122,16 @@ class Diagnosis:
     evidence: tuple[Told, ...] = ()
     world: World = field(default_factory=World)
     recordings: tuple[str, ...] = ()
+    quick: bool = False
+    stop: Stop | None = None
 
     def __repr__(self) -> str:
         found = ", ".join(finding.effect for finding in self.findings) or "nothing found"
         return f"Diagnosis({self.recording!r} against {self.simulation!r}: {self.verdict}; {found})"
 
     def _repr_html_(self) -> str:
-        return as_html(self.recording, self.simulation, self.verdict, self.findings, (*self.advice, *self.warnings))
+        sentences = (*self.advice, *self.warnings)
+        return as_html(self.recording, self.simulation, self.verdict, self.findings, sentences, stop=self.stop)
 
     @property
     def plot(self) -> DiagnosisPlot:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import torch
 
 from mkc_torch._parallel.pool import meanwhile
-from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out
+from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, blocks_of, gain_interval, held_out, on_all
 from mkc_torch.diagnosis.evidence.simpler_form import simpler_by_price, simplified
 from mkc_torch.diagnosis.evidence.unrecorded_cause import course_without, located_cause
 from mkc_torch.diagnosis.model.at_once import common_parts
@@ -34,7 +34,10 @@ from mkc_torch.nonlinear import NoFitError
 
 @dataclass(frozen=True)
 class Asked:
-    """The arguments of :func:`diagnose` that are numbers, or hold them."""
+    """The arguments of :func:`diagnose` that are numbers, or hold them.
+
+    ``judged`` says whether blocks that the fits have not seen judge what is found.
+    """
 
     level: float
     surrogates: int
@@ -43,6 +46,8 @@ class Asked:
     settings: Settings
     declared: Mapping[str, float] = field(default_factory=dict)
     fixed: Mapping[str, str] = field(default_factory=dict)
+    quick: bool = False
+    judged: bool = True
 
 
 def _holds(
@@ -103,29 +108,47 @@ class Search:
         return self.first, *self.found, *fits, *(fit.model for fit in fits), self.blocks, *self.evidence, *pairs
 
 
+Keep = Callable[[Search], object]
+"""What is called with a search so far, for it may be stopped before its end."""
+
+
+def _kept_nowhere(_: Search) -> None:
+    """Nobody asks for a search so far."""
+
+
 def begun(
     base: FittedModel,
     terms: tuple[Term, ...],
     asked: Asked,
     generator: torch.Generator,
     free: FittedModel | None = None,
+    keep: Keep = _kept_nowhere,
 ) -> Search:
-    """The first search, and its finding, if unseen blocks confirm it."""
+    """The first search, and its finding, if unseen blocks confirm it; ``keep`` is called with what is known so far."""
     prepared = base.model.prepared
     correlation = max(correlation_time(one) for one in base.pseudo(asked.settings.noise)[0].unbind(1))
     confirmation = asked.settings.confirmation
     blocks = blocks_of(len(base.residual), math.ceil(correlation), confirmation, first_samples(prepared))
     first = None
-    with meanwhile([partial(held_out, base, blocks)], common_parts(prepared, ())) as judged:
+    so_far = Search(None, (), None, blocks, (), terms)
+    keep(so_far)
+    with meanwhile([partial(_evidence, base, blocks, asked)], common_parts(prepared, ())) as judged:
         if terms:
-            first = _located(base, terms, asked, generator, free=free)
+            first = _located(
+                base, terms, asked, generator, free=free, keep=lambda first: keep(replace(so_far, first=first))
+            )
+        keep(replace(so_far, first=first))
         [evidence] = judged()
     begun = Search(first, (), None, blocks, (evidence,), terms)
+    keep(begun)
     if first is None:
         return begun
     taken = _taken_up(begun, base, first, asked)
+    keep(taken)
     if taken.found:
         return _in_two_steps(begun, taken, asked, generator)
+    if asked.quick:
+        return taken
     cause = located_cause(base, first, asked.level, asked.surrogates)
     if cause is None:
         return taken
@@ -134,13 +157,14 @@ def begun(
     return replace(_taken_up(replace(taken, first=cause), base, cause, asked, after), left=())
 
 
-def continued(search: Search, asked: Asked, generator: torch.Generator) -> Search:
+def continued(search: Search, asked: Asked, generator: torch.Generator, keep: Keep = _kept_nowhere) -> Search:
     """The next search, beside what was found; none where a first look shows nothing."""
     if _quiet(search, asked):
         return replace(search, left=())
     fit = search.found[-1].fit
     try:
         taken = _taken_up(search, fit, _located(fit, search.left, asked, generator, parts=False), asked)
+        keep(taken)
         return _in_two_steps(search, taken, asked, generator)
     except NoFitError as error:
         return replace(search, left=(), given_up=str(error))  # what was found before is not to be lost
@@ -154,6 +178,7 @@ def _located(
     *,
     parts: bool = True,
     free: FittedModel | None = None,
+    keep: Callable[[Located], object] = lambda _: None,
 ) -> Located:
     if pushed(fit):
         return located_among_pushes(
@@ -166,6 +191,8 @@ def _located(
             fixed=asked.fixed,
             free=free,
             settings=asked.settings,
+            quick=asked.quick,
+            keep=keep,
         )
     return locate(
         fit,
@@ -174,7 +201,9 @@ def _located(
         surrogates=asked.surrogates,
         generator=generator,
         settings=asked.settings,
-        parts=parts,
+        parts=parts and not asked.quick,
+        quick=asked.quick,
+        keep=keep,
     )
 
 
@@ -188,7 +217,18 @@ def _beside(search: Search, asked: Asked) -> float:
     last, settings = search.found[-1], asked.settings
     near = _near(last.fit, settings)
     others = [all(not _same(term, one.term, near, settings) for one in search.found) for term in last.scene.terms]
-    return p_value_beside(last, others, settings.confirmation.glance, torch.Generator().manual_seed(asked.seed))
+    generator = torch.Generator().manual_seed(asked.seed)
+    return p_value_beside(last, others, settings.confirmation.glance, generator, quick=asked.quick)
+
+
+def _evidence(fit: FittedModel, blocks: HeldOutBlocks, asked: Asked) -> Evidence:
+    """Of a fit on blocks that it has not seen; on all samples where nobody asks those."""
+    return held_out(fit, blocks) if asked.judged else on_all(fit)
+
+
+def _more_beside(search: Search, asked: Asked) -> bool:
+    """Whether a first look beside all findings shows another one; its p-value is 0 where it cannot see any."""
+    return not asked.quick and 0.0 < _beside(search, asked) <= asked.level
 
 
 def _taken_up(
@@ -200,7 +240,7 @@ def _taken_up(
         return over
     before = search.evidence[-1]
     if after is None:
-        after = held_out(located.fit, search.blocks)
+        after = _evidence(located.fit, search.blocks, asked)
 
     def holds(fit: FittedModel, evidence: Evidence) -> bool:
         one = replace(located, fit=fit)
@@ -219,7 +259,7 @@ def _taken_up(
     fit, simpler = located.fit, after
     if located.with_noise:
         fit = simpler_by_price(located.fit, asked.declared, asked.settings)
-        simpler = after if fit is located.fit else held_out(fit, search.blocks)
+        simpler = after if fit is located.fit else _evidence(fit, search.blocks, asked)
     else:
         fit, simpler = simplified(located.fit, after, search.blocks, holds, asked.settings.naming)
     paired = simpler if same is None or fit is not located.fit else paired
@@ -232,8 +272,7 @@ def _taken_up(
     if located.with_noise:
         taken = _eliminated(taken, asked)
     found = taken.found
-    # a p-value of 0 is that of a look that sees nothing
-    full = len(found) == asked.max_findings and not 0.0 < _beside(taken, asked) <= asked.level
+    full = len(found) == asked.max_findings and not _more_beside(taken, asked)
     return replace(taken, left=()) if full else taken
 
 
@@ -249,7 +288,7 @@ def _in_two_steps(before: Search, after: Search, asked: Asked, generator: torch.
         generator: of draws.
     """
     settings = asked.settings
-    if len(after.found) != len(before.found) + 1 or not after.left or not after.found[-1].with_noise:
+    if asked.quick or len(after.found) != len(before.found) + 1 or not after.left or not after.found[-1].with_noise:
         return after
     last = after.found[-1]
     simpler = last.term.effect.reduces_to

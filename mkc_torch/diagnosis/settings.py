@@ -7,7 +7,7 @@ set by judgement, on the project's own generated recordings.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 from mkc_torch._support.arguments import checked_number, checked_whole, refuse_other_type
 
@@ -324,3 +324,18 @@ class Settings:
             kind = type(stage.default)
             name = kind.__name__
             refuse_other_type(stage.name, getattr(self, stage.name), kind, name, f"pass one, {name}()")
+
+
+_QUICK = {"refitted": 3, "refitted_elsewhere": 1, "parts": 1, "leading": 1, "shapes": 2, "own_noise": 3}
+"""Most that a quick look refits, of each number of :class:`SearchSettings`."""
+
+
+def quick_settings(settings: Settings) -> Settings:
+    """The same for a quick look, which refits fewer candidates.
+
+    Example:
+        >>> quick_settings(Settings()).search.own_noise
+        3
+    """
+    search = settings.search
+    return replace(settings, search=replace(search, **{k: min(v, getattr(search, k)) for k, v in _QUICK.items()}))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
+from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch._support.torch_internals import functorch_is_active, is_wrapped
 from mkc_torch.simulation.protocol import Answer, Changes, Nearby, PreparedSimulation
 
@@ -92,6 +93,7 @@ class Continuation:
 
     def __call__(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, "N m"]:
         """The residual."""
+        check_deadline()
         if is_wrapped(parameters):
             return self._prepared.answer(*self._meaning(parameters), self._last).residual
         key = _key(parameters)

@@ -7,7 +7,7 @@ from functools import partial
 
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.density.fit import fit_density
-from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_out
+from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_out, on_all
 from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.in_the_world import at_liberty, freed, pushed
@@ -17,7 +17,7 @@ from mkc_torch.functional import mkc_nll, mkc_weight
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
-__all__ = ["RunningFreely", "running_freely"]
+__all__ = ["RunningFreely", "running_freely", "running_unjudged"]
 
 
 _REACH = 3.0
@@ -62,6 +62,21 @@ def running_freely(
         return as_it_is
     again = tuple(replace(one, fit=fit) for one, (fit, _) in zip(found, known_runs[1:], strict=True))
     return RunningFreely(alone, again, tuple(judged for _, judged in known_runs))
+
+
+def running_unjudged(base: FittedModel, alone: FittedModel | None, found: tuple[Located, ...]) -> RunningFreely:
+    """The same on all samples, where nobody asks blocks that the fits have not seen.
+
+    Args:
+        base, alone, found: as of :func:`running_freely`.
+    """
+    fits = [base, *(one.fit for one in found)]
+    if any(pushed(fit) for fit in fits) and alone is not None:
+        free = [alone, *(freed(one.fit) for one in found)]
+        known = [one for one in free if one is not None]
+        fits = known if len(known) == len(free) else fits
+    again = tuple(replace(one, fit=fit) for one, fit in zip(found, fits[1:], strict=True))
+    return RunningFreely(fits[0], again, tuple(on_all(fit) for fit in fits))
 
 
 def _of_sensors(fit: FittedModel) -> bool:

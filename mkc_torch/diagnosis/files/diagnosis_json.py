@@ -60,6 +60,8 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
             "surrogates": d.surrogates,
             "seed": d.seed,
             "starts": d.world.starts,
+            "quick": d.quick,
+            "stopped": None if d.stop is None else asdict(d.stop),
         },
         "findings": [_finding(f) for f in d.findings],
         "forcing": forcing_of(d.world),

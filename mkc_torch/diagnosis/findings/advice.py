@@ -17,15 +17,24 @@ __all__ = ["advice_of", "nothing_shows"]
 def nothing_shows(diagnosis: Diagnosis) -> bool:
     """Whether the simulation may be used as it is: it follows, and what is left is the sensor's noise."""
     d = diagnosis
-    quiet = bool(d.findings) or d.p_value > d.level
+    quiet = bool(d.findings) or d.p_value is None or d.p_value > d.level
     return d.verdict == "adequate" and quiet and not d.remaining and follows_all(d.world)
 
 
 def advice_of(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Sentences on what to do, the most important first; effects by their ids."""
     d = diagnosis
+    if d.stop is not None:
+        return ("Let the search end: what stands here is what was known when it was stopped.",)
     if d.verdict == "unfit":
         return _mend_first(d)
+    if d.quick:
+        return ("Confirm it by a full diagnosis.", *_after_the_search(d))
+    return _after_the_search(d)
+
+
+def _after_the_search(diagnosis: Diagnosis) -> tuple[str, ...]:
+    d = diagnosis
     if nothing_shows(d):
         return (_USE, *(_hold_back(f) for f in d.findings))
     advice = [sentence for finding in d.findings for sentence in _of(finding, alone=len(d.findings) == 1)]

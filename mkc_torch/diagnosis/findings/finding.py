@@ -45,13 +45,14 @@ _NORMAL_95 = 1.959964
 """Standard errors to either side that a 95 % interval of a normal variable reaches."""
 
 
-def finding_of(located: Located, final: Estimate, number: int) -> Finding:
+def finding_of(located: Located, final: Estimate, number: int, *, quick: bool = False) -> Finding:
     """The finding for the effect ``number`` of the final model, without its evidence.
 
     Args:
         located: the search that named it.
         final: the final parameters.
         number: of the effect among the model's terms.
+        quick: whether no noise was drawn, so that there is no p-value.
     """
     term = final.fit.model.terms[number]
     gamma, covariance = _own(final, number)
@@ -73,7 +74,7 @@ def finding_of(located: Located, final: Estimate, number: int) -> Finding:
         equation="; ".join([term.effect.equation_of(term.shape, context), *told_as]),
         explanation=term.effect.explanation,
         parameters=(*parameters_of(term, gamma, covariance, context), *shape),
-        p_value=located.p_value,
+        p_value=None if quick else located.p_value,
         alternatives=_alternatives(located, term),
         plausible=plausible,
         plausibility=told,

@@ -17,6 +17,7 @@ __all__ = [
     "change",
     "confirmation",
     "confirmed",
+    "grade_in_short",
     "grade_of",
     "sizeless",
     "small",
@@ -127,6 +128,17 @@ def grade_of(finding: Finding) -> Grade:
     if not confirmed(finding):
         return "not confirmed"
     return "real but small" if small(finding) else "left out"
+
+
+def grade_in_short(finding: Finding) -> Grade:
+    """The same where no noise was drawn, or nobody asked for its shape: only unseen blocks can confirm it.
+
+    Blocks that only speak against a finding, as those of process noise do, do not.
+    """
+    held = finding.held_out
+    if held is None or not held.decides:
+        return "not confirmed"
+    return grade_of(finding)
 
 
 def worth_correcting(finding: Finding) -> bool:

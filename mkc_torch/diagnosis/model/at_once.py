@@ -14,14 +14,17 @@ __all__ = ["at_once", "common_parts"]
 T = TypeVar("T")
 
 
-def at_once(works: Sequence[Callable[[], T]], prepared: PreparedSimulation, terms: Sequence[Term] = ()) -> list[T]:
+def at_once(
+    works: Sequence[Callable[[], T]], prepared: PreparedSimulation, terms: Sequence[Term] = (), thing: str = ""
+) -> list[T]:
     """The results of works, in their order.
 
     Args:
         works: none needs what another one leaves behind.
         prepared, terms: a simulation and effects that results may hold.
+        thing: name of what each work is about, where progress counts them.
     """
-    return shared(works, common_parts(prepared, terms))
+    return shared(works, common_parts(prepared, terms), thing)
 
 
 def common_parts(prepared: PreparedSimulation, terms: Sequence[Term]) -> list[object]:

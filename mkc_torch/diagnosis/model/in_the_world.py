@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -138,12 +138,15 @@ def noise_around(
 
 
 def simulation_in_the_world(
-    prepared: PreparedSimulation, declared: Mapping[str, float], settings: NoiseSettings
+    prepared: PreparedSimulation,
+    declared: Mapping[str, float],
+    settings: NoiseSettings,
+    keep: Callable[[InTheWorld], object] = lambda _: None,
 ) -> InTheWorld:
     """The simulation alone, from as many starts as it takes to trust its first fit.
 
     Where fits from the first starts fail or explain nothing, others between and around the user's values are tried,
-    and shorter horizons.
+    and shorter horizons. ``keep`` is called with the first fit, before its noise is known.
 
     Raises:
         NoFitError: no start has a finite answer; the message says in words what was tried.
@@ -157,6 +160,8 @@ def simulation_in_the_world(
     short = over_short_horizons(prepared, prepared.given)
     starts += [] if short is None else [short]
     free = _likeliest_free(model, starts)
+    if free is not None:
+        keep(InTheWorld(free, free, None, len(starts)))
     if free is not None and _explains(free):
         return in_the_world(_wider(free, settings), declared, settings, beside=starts[1:], model=model)
     others = other_starts(prepared, starts[0], _OTHER_STARTS)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch._support.forward_mode import forward_jacobian
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects.context import Context, Shape
@@ -113,6 +114,7 @@ class JointModel:
 
     def answer(self, parameters: Float[Tensor, " p"]) -> Answer:
         """The residual, and what one nearby begins with."""
+        check_deadline()
         compiled = self._compiled if is_plain(parameters) else None
         found = None if compiled is None else compiled.answer(parameters, self.near)
         if found is not None:
@@ -121,6 +123,7 @@ class JointModel:
 
     def pushed(self, parameters: Float[Tensor, " p"], port: str, change: Float[Tensor, "N c"]) -> Float[Tensor, "N m"]:
         """The residual with a change at a port that does not depend on its signal."""
+        check_deadline()
         changes = self.changes(parameters)
         added = {**changes, port: summed(changes.get(port), FreeChange(_constant(change)))}
         return self.prepared.answer(parameters[: self.base], added, self.near).residual

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -40,6 +40,9 @@ _PART = 0.3
 _CLOSER = 0.95
 """Times the residual of a free run that a rival's has to be, for the rival to go first."""
 
+_FIT = "fit of a leading candidate"
+"""What progress counts."""
+
 Kind = tuple[Key, str]
 """Of a candidate, and for a curve what it is over."""
 
@@ -55,6 +58,8 @@ def located_among_pushes(
     fixed: Mapping[str, str],
     free: FittedModel | None = None,
     settings: Settings,
+    quick: bool = False,
+    keep: Callable[[Located], object] = lambda _: None,
 ) -> Located:
     """The strongest candidate beside a fit under pushes.
 
@@ -68,6 +73,8 @@ def located_among_pushes(
         fixed: what inputs do between samples that it is known of.
         free: the same as it runs freely; None where that loses the recording.
         settings: the numbers that decide.
+        quick: draw no noise, and refit each leading candidate from one start.
+        keep: called with what is known before the leading candidates are refitted.
 
     Raises:
         NoFitError: the fit's trajectory is lost.
@@ -85,6 +92,7 @@ def located_among_pushes(
         generator,
         level=level,
         declared=[name in declared for name in channels],
+        quick=quick,
     )
     if found is None:
         raise NoFitError("The simulation's trajectory is lost at the fitted values.")
@@ -92,34 +100,43 @@ def located_among_pushes(
     look = Scene(base, base, terms, tangents, values, counts, settings).under()
     ranking = _ranked(found, terms, prefer)
     best = _fit_of(base, terms[ranking[0].number], found, ranking[0].number)
-    fits: Sequence[FittedModel] = ()
-    if found.p_value <= level:
-        chosen = _chosen(found, ranking, terms, settings.search.own_noise)
-        common = base.model.prepared, [terms[number] for number in chosen]
-        first = at_once([partial(_fit_of, base, terms[number], found, number) for number in chosen], *common)
-        chosen, first = _within_reach(chosen, first, [prefer.score_with_shape(fit, base) for fit in first], settings)
-        works = [
-            partial(_likelier, base, free, terms[number], fit, found.start(number).gamma, declared, settings)
-            for number, fit in zip(chosen, first, strict=True)
-        ]
-        fits = at_once(works, *common)
-        best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer, settings)
-        best, ranking = _by_free_run(best, ranking, fits, terms, settings)
-        best = beside_effects(best, noise_of_fit(best, declared), declared, settings.noise)
-        best = between_beside_effects(best, declared, fixed, settings.noise)
-    needless = bool(fits) and _needless(base, best, declared, settings)
-    return Located(
+    located = Located(
         best.model.terms[-1],
         best,
-        1.0 if needless else found.p_value,
+        found.p_value,
         found.beyond,
         ranking,
         look.noise,
         look,
         look.linearised,
-        compared=fits,
         longer=found.longer,
         with_noise=True,
+    )
+    keep(located)
+    fits: Sequence[FittedModel] = ()
+    if found.p_value <= level:
+        chosen = _chosen(found, ranking, terms, settings.search.own_noise)
+        common = base.model.prepared, [terms[number] for number in chosen]
+        first = at_once([partial(_fit_of, base, terms[number], found, number) for number in chosen], *common, _FIT)
+        chosen, first = _within_reach(chosen, first, [prefer.score_with_shape(fit, base) for fit in first], settings)
+        likelier = partial(_likelier, quick=quick)
+        works = [
+            partial(likelier, base, free, terms[number], fit, found.start(number).gamma, declared, settings)
+            for number, fit in zip(chosen, first, strict=True)
+        ]
+        fits = at_once(works, *common, _FIT)
+        best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer, settings)
+        best, ranking = _by_free_run(best, ranking, fits, terms, settings)
+        best = beside_effects(best, noise_of_fit(best, declared), declared, settings.noise)
+        best = best if quick else between_beside_effects(best, declared, fixed, settings.noise)
+    needless = bool(fits) and _needless(base, best, declared, settings)
+    return replace(
+        located,
+        term=best.model.terms[-1],
+        fit=best,
+        p_value=1.0 if needless else found.p_value,
+        ranking=ranking,
+        compared=fits,
     )
 
 
@@ -198,13 +215,18 @@ def _likelier(
     gamma: Tensor,
     declared: Mapping[str, float],
     settings: Settings,
+    *,
+    quick: bool = False,
 ) -> FittedModel:
     """The joint fit of a candidate under the noise that it leaves, begun with its first fit or from the free run.
 
     Process noise that the first fit began with has taken over what the effect does, and not all of it is given back.
+    A quick look begins from the free run only where the first fit is no likelier than the simulation alone.
     """
     under = with_own_noise(fit, declared, settings)
     if free is None or not pushed(under):
+        return under
+    if quick and priced(under, settings) > priced(base, settings):
         return under
     model = free.model.with_term(term)
     starts = (torch.cat([free.parameters, gamma]), torch.cat([free.parameters, torch.zeros_like(gamma)]))

@@ -8,11 +8,14 @@ import torch
 
 from mkc_torch.diagnosis.search.locate import Located
 from mkc_torch.diagnosis.search.p_value import judged
+from mkc_torch.diagnosis.search.quick import any_pays
 
 __all__ = ["p_value_beside"]
 
 
-def p_value_beside(located: Located, possible: Sequence[bool], surrogates: int, generator: torch.Generator) -> float:
+def p_value_beside(
+    located: Located, possible: Sequence[bool], surrogates: int, generator: torch.Generator, *, quick: bool = False
+) -> float:
     """The p-value of the strongest other candidate beside an effect, where the search for that effect linearised.
 
     The candidates, the noise and the samples that count are those of that search; the effect's own tangents are taken
@@ -23,6 +26,7 @@ def p_value_beside(located: Located, possible: Sequence[bool], surrogates: int, 
         possible: whether each of its ``terms`` would be another finding.
         surrogates: draws of noise.
         generator: of the draws.
+        quick: draw none; ask whether one gains more than its price.
 
     Returns:
         0 where an effect may bend a trajectory: there refits find what straight lines do not.
@@ -34,5 +38,7 @@ def p_value_beside(located: Located, possible: Sequence[bool], surrogates: int, 
     mask = torch.tensor(list(possible)) & beside.possible
     if not bool(mask.any()):
         return 1.0
+    if quick:
+        return any_pays(beside, mask)
     noise = scene.settings.noise
     return judged(beside.linearised, beside.noise, beside.gains, mask, surrogates, generator, noise)[0]

@@ -19,6 +19,7 @@ from mkc_torch.diagnosis.linearised.tangents import Tangents
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.likelihoods import Columns, LogLikelihoods, log_likelihoods
+from mkc_torch.diagnosis.search.quick import COUNTS, COUNTS_NOT, price
 from mkc_torch.simulation.dynamics.disturbances import NoiseModel, filter_models, observer_of
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.kalman import Flow
@@ -114,7 +115,8 @@ class _Scene:
 
     def likelihoods(self, models: Sequence[NoiseModel], draws: SeriesAlong | None = None) -> LogLikelihoods:
         series = self.series if draws is None else joined(self.series, draws)
-        return log_likelihoods(self.counted, models, series, self.columns, self.largest)
+        thing = "kind of noise" if draws is None else "draws under noise"
+        return log_likelihoods(self.counted, models, series, self.columns, self.largest, thing)
 
     def residual(self, number: int | None, model: NoiseModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The recording whitened beside a candidate (N, m), the candidate's sizes and the parameters' shift."""
@@ -152,6 +154,7 @@ def joint_likelihood(
     *,
     level: float,
     declared: Sequence[bool] = (),
+    quick: bool = False,
 ) -> JointLikelihood | None:
     """The search beside a fit of differential equations; None where its trajectory is lost.
 
@@ -164,6 +167,7 @@ def joint_likelihood(
         generator: of the draws.
         level: of false alarms.
         declared: of each output whether its white noise is declared.
+        quick: draw nothing; there is an effect if any candidate gains more than its price.
     """
     scene = _scene(base, terms, tangents, counts)
     if scene is None:
@@ -184,7 +188,11 @@ def joint_likelihood(
     strongest = int((gains - found.rank).argmax())
     left, *_ = scene.residual(strongest, found.models[int(found.beside[:, strongest, 0].argmax())])
     p_value, beyond, needed = 0.0, np.inf, np.zeros(len(terms))
-    for kind in _kinds(found):
+    if quick:
+        samples, tried = int(scene.counted.counts.sum()), len(set(keys))
+        needed = np.array([price(one, samples, tried) for one in found.rank])
+        p_value = COUNTS if bool((gains > needed).any()) else COUNTS_NOT
+    for kind in () if quick else _kinds(found):
         one = _judged(scene, found, kind, left, draws, generator, level)
         if one[0] >= p_value:
             p_value, needed = one[0], np.maximum(needed, one[2])

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mkc_torch._parallel.deadline import check_deadline
+from mkc_torch._parallel.progress import counted
 from mkc_torch.simulation.dynamics.disturbances import NoiseModel, filter_models
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.whitening import SeriesAlong, gains_of, joined, whitened
@@ -93,6 +95,7 @@ def log_likelihoods(
     series: SeriesAlong,
     columns: Columns,
     largest: Float[np.ndarray, " p+m"] | None = None,
+    thing: str = "",
 ) -> LogLikelihoods:
     """The log-likelihoods; -inf where a disturbance, at the likeliest scale, is larger than is plausible.
 
@@ -102,6 +105,7 @@ def log_likelihoods(
         series: Y series to explain, the recording's the first one.
         columns: what may explain them.
         largest: plausible size of a disturbance of each rate and each output, in their units; None for any.
+        thing: name of what a model of the noise is to the user, where progress counts them.
     """
     B, C, Y = len(models), len(columns.sizes), series.count
     gains = gains_of(flow, filter_models(flow, models))
@@ -110,7 +114,8 @@ def log_likelihoods(
     sizes, scale, rank = np.zeros((B, sum(columns.sizes))), np.ones((B, C)), np.zeros(C)
     groups = _by_size(columns.sizes)
     free = not any(models[0].known)
-    for number, values in whitened(flow, gains, joined(series, columns.series)):
+    for number, values in counted(whitened(flow, gains, joined(series, columns.series)), B, thing):
+        check_deadline()
         rows = values[used]
         if not np.isfinite(rows).all():
             continue

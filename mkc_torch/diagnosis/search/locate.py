@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -27,6 +27,7 @@ from mkc_torch.diagnosis.search.look import Look, Scene
 from mkc_torch.diagnosis.search.one_stretch import telling_stretch
 from mkc_torch.diagnosis.search.p_value import judged
 from mkc_torch.diagnosis.search.preference import Preference
+from mkc_torch.diagnosis.search.quick import any_pays
 from mkc_torch.diagnosis.search.ranking import Ranked, ranked
 from mkc_torch.diagnosis.search.rivals import by_joint_fits
 from mkc_torch.diagnosis.search.strongest import refitted, strongest
@@ -87,6 +88,8 @@ def locate(
     generator: torch.Generator,
     settings: Settings,
     parts: bool = True,
+    quick: bool = False,
+    keep: Callable[[Located], object] = lambda _: None,
 ) -> Located:
     """Search the candidates beside a fit.
 
@@ -98,6 +101,8 @@ def locate(
         generator: of the draws.
         settings: the numbers that decide.
         parts: also start from fits to parts of the recording, for where one model over all of it runs away.
+        quick: draw no noise; the strongest candidate counts if it gains more than its price.
+        keep: called with what is known before the strongest candidate is named with care.
     """
     terms = tuple(terms)
     prefer = Preference(terms, base.model.prepared, settings.naming)
@@ -118,7 +123,9 @@ def locate(
     # a copy names it already, while this process asks whether there is anything to be named
     with meanwhile([naming], known) as answer:
         look = seen = scene.under()
-        p_value, beyond = _judged(look, tried, surrogates, generator)
+        p_value, beyond = (
+            (any_pays(look, look.possible[:tried]), math.inf) if quick else _judged(look, tried, surrogates, generator)
+        )
         noise, beside_nothing = look.noise, look.linearised
         if p_value <= level and beyond < settings.search.doubted:
             for colour in look.linearised.plausible(settings.noise.plausible):
@@ -131,10 +138,15 @@ def locate(
             stretch = telling_stretch(scene.values, scene.counts, trace, scene.tangents.nuisance, settings)
         if stretch is not None:
             rest = scene.without(stretch).under()
-            p_other, beyond_other = _judged(rest, tried, surrogates, generator)
+            p_other, beyond_other = (
+                (any_pays(rest, rest.possible[:tried]), math.inf)
+                if quick
+                else _judged(rest, tried, surrogates, generator)
+            )
             p_value, beyond = max(p_value, p_other), min(beyond, beyond_other)
             beside_nothing = rest.linearised
         ranking = ranked(look, prefer)
+        keep(Located(best.model.terms[-1], best, p_value, beyond, ranking, noise, seen, beside_nothing))
         if p_value <= level:
             [named] = answer()
             best, ranking, seen = named.fit, named.ranking, named.look

@@ -79,7 +79,7 @@ def strongest(
     likeliest = torch.stack([log_p for _, log_p in lists]).amin(0)
     order = [terms[number] for number in in_order((-likeliest).tolist(), terms)]
     leading = _at_best_shapes(_leading(list(fits.values()), base, prefer, search), base, order, prefer, search.shapes)
-    shaped = at_once([partial(refined, fit, base) for fit in leading], base.model.prepared, terms)
+    shaped = at_once([partial(refined, fit, base) for fit in leading], base.model.prepared, terms, "leading candidate")
     keys = {fit.model.terms[-1].key for fit in shaped}
     parted = shaped, [fit for key, fit in fits.items() if key not in keys]
     fitted = [fit for part in parted for fit in best_first(part, base, prefer)]
@@ -160,7 +160,9 @@ def _refit_all(
 ) -> list[T]:
     """Put the joint refit of each into ``fits``, where it is the better one of its physics; others go on beside."""
     works = [partial(fitted_beside, base, base.model.with_term(term), start) for term, start in listed]
-    done: list[Any] = at_once([*works, *beside], base.model.prepared, [term for term, _ in listed])
+    done: list[Any] = at_once(
+        [*works, *beside], base.model.prepared, [term for term, _ in listed], "fit of a candidate"
+    )
     for (term, _), fit in zip(listed, done, strict=False):
         if term.key not in fits or prefer.score(fit, base) > prefer.score(fits[term.key], base):
             fits[term.key] = fit
@@ -190,7 +192,7 @@ def _at_best_shapes(
         others = [t for t in terms if t.key == own.key and t.shape != own.shape]
         tried += [(place, other) for other in others[:most] if "onset" not in own.shape]
     works = [partial(_reshaped, fits[k], base, other) for k, other in tried]
-    refits = at_once(works, base.model.prepared, terms)
+    refits = at_once(works, base.model.prepared, terms, "shape of a leading candidate")
     best = list(fits)
     for (place, _), refit in zip(tried, refits, strict=True):
         best[place] = max(best[place], refit, key=lambda fit: prefer.score(fit, base))

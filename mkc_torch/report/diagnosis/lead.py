@@ -76,7 +76,7 @@ def _sure_of_pushes(diagnosis: Diagnosis) -> Iterator[str]:
     known = [push for push in diagnosis.world.pushes if math.isfinite(push.nats)]
     if known:
         yield term("world.less_likely", nats=size(known[0].nats), place=plain(known[0].place))
-        if diagnosis.p_value > diagnosis.level:
+        if diagnosis.p_value is not None and diagnosis.p_value > diagnosis.level:
             yield term("world.no_physics")
 
 
@@ -89,7 +89,7 @@ def _in_short(finding: Finding, diagnosis: Diagnosis) -> Iterator[str]:
     if told:
         yield f"{told}."
     yield f"{_place(f, diagnosis)}."
-    sure = probability(f.p_value)
+    sure = evidence(None, 0) if f.p_value is None else probability(f.p_value)
     if f.held_out is None:
         yield f"{sure}; {term('evidence.not_measured')}: {_closed(f.held_out_note)}"
         return
@@ -116,9 +116,11 @@ def residual_alone(diagnosis: Diagnosis) -> str:
     return term("verdict.residual", residual=f"{size(d.baseline.rmse)} {plain(d.traces.unit)}".rstrip())
 
 
-def chance(p_value: float, diagnosis: Diagnosis) -> str:
-    """What a p-value means, in a sentence."""
+def chance(p_value: float | None, diagnosis: Diagnosis) -> str:
+    """What a p-value means, in a sentence; None where no noise was drawn."""
     d = diagnosis
+    if p_value is None:
+        return f"{capital(evidence(None, 0))}."
     told = share(p_value)
     return term(
         "verdict.chance",

@@ -227,13 +227,15 @@ def probability(value: float) -> str:
     return f"p = {value:.2g}" if value >= 1e-4 else "p < 0.0001"
 
 
-def evidence(value: float, surrogates: int) -> str:
-    """A p-value, and whether more surrogates could have made it smaller.
+def evidence(value: float | None, surrogates: int) -> str:
+    """A p-value, and whether more surrogates could have made it smaller; None where no noise was drawn.
 
     Example:
-        >>> evidence(0.005, 199), evidence(0.02, 199)
-        ('p = 0.005, the smallest that 199 surrogates can show', 'p = 0.02')
+        >>> evidence(0.005, 199), evidence(0.02, 199), evidence(None, 0)
+        ('p = 0.005, the smallest that 199 surrogates can show', 'p = 0.02', 'not known: no p-value was computed')
     """
+    if value is None:
+        return term("evidence.no_p_value")
     if not _least(value, surrogates):
         return probability(value)
     return term("evidence.smallest", p=probability(value), surrogates=f"{surrogates:,}")

@@ -13,10 +13,22 @@ from mkc_torch.diagnosis.findings.advice import nothing_shows
 from mkc_torch.diagnosis.findings.following import follows_all
 from mkc_torch.diagnosis.findings.worth import carries_over, small, worth_correcting
 from mkc_torch.diagnosis.result import Diagnosis, Finding
+from mkc_torch.diagnosis.stop import notices
 from mkc_torch.report.diagnosis.findings import finding_name, inseparable, rivals, unrecorded, with_names
 from mkc_torch.report.words.numbers import size
 
-__all__ = ["Tone", "apply_command", "headline", "left_in_short", "left_open", "reasons", "to_do", "tone", "warned"]
+__all__ = [
+    "Tone",
+    "apply_command",
+    "headline",
+    "left_in_short",
+    "left_open",
+    "reasons",
+    "said_first",
+    "to_do",
+    "tone",
+    "warned",
+]
 
 Tone = Literal["good", "found", "faint", "open"]
 """Nothing is missing; physics is, and it is named; nothing that is worth correcting; the simulation does not follow, or
@@ -86,6 +98,8 @@ def _named(finding: Finding, *, alone: bool) -> str:
 def left_open(diagnosis: Diagnosis) -> str:
     """What no finding accounts for; empty where there is nothing."""
     d = diagnosis
+    if d.stop is not None:
+        return term("verdict.unfinished")
     beside = any(worth_correcting(f) for f in d.findings)
     if d.verdict == "unexplained" and d.world.pushes:
         rates, places = _driven(d)
@@ -93,7 +107,8 @@ def left_open(diagnosis: Diagnosis) -> str:
         return term(pair[int(beside)], places=several(places))
     if d.remaining:
         return term("verdict.yet_smooth" if beside else "verdict.smooth", columns=several(d.remaining))
-    if not d.findings and d.p_value <= d.level and d.verdict == "adequate":
+    passed = d.p_value is not None and d.p_value <= d.level
+    if not d.findings and passed and d.verdict == "adequate":
         return term("verdict.unnamed")
     if d.verdict != "unexplained":
         return ""
@@ -115,6 +130,8 @@ def left_in_short(diagnosis: Diagnosis) -> str:
     d = diagnosis
     if not left_open(d):
         return ""
+    if d.stop is not None:
+        return term("world.unfinished")
     if d.verdict == "unexplained" and d.world.pushes:
         rates, places = _driven(d)
         return term("world.rate_of", place=several(places)) if rates else several(places)
@@ -133,11 +150,23 @@ def to_do(diagnosis: Diagnosis) -> list[str]:
 
 
 def warned(diagnosis: Diagnosis) -> list[str]:
-    """The warnings by weight: what casts doubt on a finding or its driver first; effects in them by their names."""
+    """The warnings by weight: what casts doubt on a finding or its driver first; effects in them by their names.
+
+    What says that all is a quick look, or that the search was stopped, stands apart, before everything else.
+    """
     d, ids = diagnosis, _ids(diagnosis)
     doubted = {name for f in d.findings for name in (f.effect, *f.drivers)}
-    ordered = sorted(d.warnings, key=lambda sentence: doubted.isdisjoint(re.findall(r"\w+", sentence)))
+    first = said_first(d)
+    ordered = sorted(
+        [one for one in d.warnings if one not in first],
+        key=lambda sentence: doubted.isdisjoint(re.findall(r"\w+", sentence)),
+    )
     return [capital(with_names(sentence, ids)) for sentence in ordered]
+
+
+def said_first(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """What a reader has to know before anything else: that it is a quick look, or that the search was stopped."""
+    return notices(diagnosis.stop, quick=diagnosis.quick)
 
 
 def _ids(diagnosis: Diagnosis) -> set[str]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from torch import Tensor
 
+from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch.simulation.dynamics.kalman import Flow, Models, Parts, filtered, robust_likelihood
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer
 from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
@@ -288,6 +289,7 @@ def filter_models(flow: Flow, noises: Sequence[NoiseModel]) -> Models:
 
 def _likelihoods(flow: Flow, noises: Sequence[NoiseModel]) -> tuple[np.ndarray, np.ndarray]:
     """Of each, its scale profiled out, and that scale; at the scale it has, where some of the sensors' is declared."""
+    check_deadline()
     parts = _parts(flow)
     found = filtered(parts, filter_models(flow, noises))
     return robust_likelihood(found, parts.mine, flow.reach, free=not any(noises[0].known))

@@ -24,6 +24,7 @@ from mkc_torch.diagnosis.result import (
     Told,
 )
 from mkc_torch.diagnosis.settings import EvidenceSettings
+from mkc_torch.diagnosis.stop import Stop
 from mkc_torch.effects import CATALOGUE
 from tests.diagnosis.factory import make_diagnosis, with_evidence
 
@@ -59,7 +60,7 @@ def test_keys_are_those_of_the_format(content):
         "schema", "recording", "simulation", "samples", "level", "p_value", "verdict", "follows", "reasons", "noise",
         "search", "findings", "forcing", "remaining", "baseline", "corrected", "ceiling", "advice", "warnings",
     }  # fmt: skip
-    assert set(content["search"]) == {"candidates", "surrogates", "seed", "starts"}
+    assert set(content["search"]) == {"candidates", "surrogates", "seed", "starts", "quick", "stopped"}
     assert set(content["findings"][0]) == {
         "effect", "grade", "drivers", "channels", "intervals", "onset", "equation", "explanation", "parameters",
         "p_value", "shape", "held_out", "held_out_note", "alternatives", "plausible", "plausibility", "advice",
@@ -223,6 +224,25 @@ def test_numbers_that_are_not_finite_are_refused_with_their_place():
         diagnosis_to_json(with_finding(make_diagnosis(1), parameters=(bad,)))
     with pytest.raises(DiagnosisFileError, match="`p_value` is nan"):
         diagnosis_to_json(make_diagnosis(1, p_value=math.nan))
+
+
+def test_a_quick_look_has_no_p_value():
+    told = written(with_finding(make_diagnosis(1, p_value=None, quick=True), p_value=None))
+    assert (told["p_value"], told["findings"][0]["p_value"], told["search"]["quick"]) == (None, None, True)
+    for bad in (told | {"p_value": 0.01}, told | {"search": told["search"] | {"quick": False}}):
+        with pytest.raises(DiagnosisFileError):
+            validate(bad)
+
+
+def test_a_stopped_search_says_why_and_what_was_not_done():
+    told = written(make_diagnosis(0, p_value=None, stop=Stop("time limit", 60.2, ("the search for effects",))))
+    assert told["search"]["stopped"] == {
+        "reason": "time limit", "seconds": 60.2, "not_done": ["the search for effects"],
+    }  # fmt: skip
+    assert written(make_diagnosis(0))["search"]["stopped"] is None
+    del told["search"]["stopped"]["not_done"]
+    with pytest.raises(DiagnosisFileError, match="not_done"):
+        validate(told)
 
 
 def test_missing_evidence_needs_its_reason():

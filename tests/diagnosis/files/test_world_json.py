@@ -51,7 +51,8 @@ def first_edition():
         del content[key]
     for key in ("process", "sensor", "between"):
         del content["noise"][key]
-    del content["search"]["starts"]
+    for key in ("starts", "quick", "stopped"):
+        del content["search"][key]
     for finding in content["findings"]:
         del finding["grade"], finding["shape"], finding["held_out"]["outputs"], finding["held_out"]["left"]
     return content | {"schema": "mkc-diagnosis/1"}

@@ -1,0 +1,165 @@
+"""Long work stops between its steps: when its time is over, and at an interrupt, and leaves no process behind."""
+
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+
+import pytest
+
+from mkc_torch._parallel.deadline import Stopped, check_deadline, is_limited, limited, stopped_by_interrupt, within
+from mkc_torch._parallel.pool import allow_copies, meanwhile, shared
+from tests.started import started
+
+linux = pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked elsewhere")
+posix = pytest.mark.skipif(os.name == "nt", reason="signals are another thing there")
+
+
+@pytest.fixture
+def a_copy():
+    allow_copies(1)
+    yield
+    allow_copies(0)
+
+
+def test_nothing_is_limited_outside_of_a_block():
+    check_deadline()
+    with limited(60.0):
+        check_deadline()
+        assert is_limited()
+    assert not is_limited()
+
+
+def test_time_that_is_over_stops_the_next_step():
+    with limited(60.0, begin=time.monotonic() - 61.0), pytest.raises(Stopped) as told:
+        check_deadline()
+    assert told.value.reason == "time limit"
+
+
+def test_stopped_is_no_failure_that_code_could_deal_with_and_can_be_sent():
+    assert not issubclass(Stopped, Exception)
+    assert pickle.loads(pickle.dumps(Stopped("interrupt"))).reason == "interrupt"
+
+
+def test_what_is_of_use_in_time_alone():
+    assert within(60.0, lambda: 1) == 1
+    assert within(0.0, check_deadline) is None
+    with limited(0.0):
+        assert within(60.0, lambda: check_deadline() or 1) == 1  # with a deadline of its own
+
+
+@posix
+def test_the_first_interrupt_stops_at_the_next_step_and_the_second_one_is_as_usual(monkeypatch):
+    monkeypatch.setattr("mkc_torch._parallel.deadline._SAME_INTERRUPT_S", 0.0)
+    with stopped_by_interrupt(), limited():
+        check_deadline()
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(Stopped) as told:
+            check_deadline()
+        assert told.value.reason == "interrupt"
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@posix
+def test_an_interrupt_that_comes_twice_at_once_is_one():
+    with stopped_by_interrupt(), limited():
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)  # from the terminal, and from a parent process
+        with pytest.raises(Stopped):
+            check_deadline()
+
+
+@posix
+def test_another_handler_and_another_thread_stay_as_they_are():
+    known = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with stopped_by_interrupt():
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, known)
+
+    def elsewhere():
+        with stopped_by_interrupt():
+            seen.append(signal.getsignal(signal.SIGINT))
+
+    seen = []
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    thread.join()
+    assert seen == [signal.default_int_handler]
+
+
+@pytest.mark.parametrize("copies", [0, pytest.param(1, marks=linux)])
+def test_no_work_is_begun_once_it_is_time(copies):
+    allow_copies(copies)
+    try:
+        done = []
+        with limited(0.0), pytest.raises(Stopped):
+            shared([lambda: done.append(1)] * 3)
+        assert done == []
+    finally:
+        allow_copies(0)
+
+
+@linux
+@pytest.mark.usefixtures("a_copy")
+def test_a_copy_that_is_waited_for_is_ended():
+    with limited(0.3), meanwhile([signal.pause]) as answer:
+        time.sleep(0.2)  # the copy has the only work
+        with pytest.raises(Stopped):
+            answer()
+    assert multiprocessing.active_children() == []
+
+
+@linux
+@pytest.mark.usefixtures("a_copy")
+def test_a_copy_stops_itself_too():
+    def work():
+        while True:
+            check_deadline()
+            time.sleep(0.01)
+
+    with limited(0.3), pytest.raises(Stopped):
+        shared([work, work])
+    assert multiprocessing.active_children() == []
+
+
+STOPPED = """
+import os, sys, time
+from mkc_torch._parallel.deadline import Stopped, check_deadline, limited, stopped_by_interrupt
+from mkc_torch._parallel.pool import allow_copies, shared
+
+def work():
+    print(flush=True)
+    while os.getpid() != here:
+        time.sleep(0.1)  # a copy asks for nothing
+    while True:
+        check_deadline()
+        time.sleep(0.01)
+
+here = os.getpid()
+allow_copies(1)
+with stopped_by_interrupt(), limited():
+    try:
+        shared([work] * 2)
+    except Stopped as stopped:
+        print(stopped.reason, flush=True)
+"""
+
+
+@linux
+@pytest.mark.process
+def test_an_interrupt_of_all_processes_stops_work_and_ends_its_copies():
+    with started("-c", STOPPED) as process:
+        for _ in range(2):
+            process.stdout.readline()
+        os.killpg(process.pid, signal.SIGINT)
+        # the copies have its streams too, which end when the last one has
+        said, errors = process.communicate(timeout=60)
+    assert (said, errors) == ("interrupt\n", "")
+    assert process.returncode == 0
