@@ -18,11 +18,13 @@ from mkc_torch.diagnosis.model.in_the_world import beside_effects, between_besid
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term, continuous
+from mkc_torch.diagnosis.search.free_runs import free_runs
 from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
 from mkc_torch.diagnosis.search.locate import Located
 from mkc_torch.diagnosis.search.look import Scene
 from mkc_torch.diagnosis.search.own_noise import noise_of_fit, priced, with_own_noise
 from mkc_torch.diagnosis.search.preference import Preference
+from mkc_torch.diagnosis.search.quick import price
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.ties import in_order
 from mkc_torch.diagnosis.settings import Settings
@@ -39,6 +41,9 @@ _PART = 0.3
 
 _CLOSER = 0.95
 """Times the residual of a free run that a rival's has to be, for the rival to go first."""
+
+_DOUBT = 10.0
+"""Nats beyond its price that a candidate has to gain to count without draws."""
 
 _FIT = "fit of a leading candidate"
 """What progress counts."""
@@ -114,17 +119,26 @@ def located_among_pushes(
     )
     keep(located)
     fits: Sequence[FittedModel] = ()
-    if found.p_value <= level:
+    p_value = found.p_value
+    runs = [] if quick or free is None else free_runs(free, terms, settings)
+    if p_value > level and _plain(base, [fit for _, fit in runs], terms, declared, settings):
+        p_value = 1.0 / (1.0 + surrogates)
+    if p_value <= level:
         chosen = _chosen(found, ranking, terms, settings.search.own_noise)
         common = base.model.prepared, [terms[number] for number in chosen]
         first = at_once([partial(_fit_of, base, terms[number], found, number) for number in chosen], *common, _FIT)
         chosen, first = _within_reach(chosen, first, [prefer.score_with_shape(fit, base) for fit in first], settings)
-        likelier = partial(_likelier, quick=quick)
-        works = [
-            partial(likelier, base, free, terms[number], fit, found.start(number).gamma, declared, settings)
-            for number, fit in zip(chosen, first, strict=True)
-        ]
-        fits = at_once(works, *common, _FIT)
+        known = {terms[number].key: fit for number, fit in runs}
+        works = []
+        for number, fit in zip(chosen, first, strict=True):
+            gamma, running = found.start(number).gamma, known.pop(terms[number].key, None)
+            works.append(
+                partial(_likelier, base, free, terms[number], fit, gamma, declared, settings, running, quick=quick)
+            )
+        more = [(number, fit) for number, fit in runs if terms[number].key in known]
+        works += [partial(_under_own_noise, fit, base, declared, settings) for _, fit in more]
+        chosen += [number for number, _ in more]
+        fits = at_once(works, base.model.prepared, [terms[number] for number in chosen], _FIT)
         best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer, settings)
         best, ranking = _by_free_run(best, ranking, fits, terms, settings)
         best = beside_effects(best, noise_of_fit(best, declared), declared, settings.noise)
@@ -134,7 +148,7 @@ def located_among_pushes(
         located,
         term=best.model.terms[-1],
         fit=best,
-        p_value=1.0 if needless else found.p_value,
+        p_value=1.0 if needless else p_value,
         ranking=ranking,
         compared=fits,
     )
@@ -215,6 +229,7 @@ def _likelier(
     gamma: Tensor,
     declared: Mapping[str, float],
     settings: Settings,
+    running: FittedModel | None = None,
     *,
     quick: bool = False,
 ) -> FittedModel:
@@ -222,16 +237,27 @@ def _likelier(
 
     Process noise that the first fit began with has taken over what the effect does, and not all of it is given back.
     A quick look begins from the free run only where the first fit is no likelier than the simulation alone.
+    ``running`` is the candidate's free run where it is fitted already.
     """
     under = with_own_noise(fit, declared, settings)
     if free is None or not pushed(under):
         return under
     if quick and priced(under, settings) > priced(base, settings):
         return under
-    model = free.model.with_term(term)
-    starts = (torch.cat([free.parameters, gamma]), torch.cat([free.parameters, torch.zeros_like(gamma)]))
-    works = [partial(fitted_beside, free, model, one) for one in starts]
-    running = shape_fitted(max(at_once(works, model.prepared, [term]), key=lambda one: one.log_likelihood))
+    if running is None:
+        model = free.model.with_term(term)
+        starts = (torch.cat([free.parameters, gamma]), torch.cat([free.parameters, torch.zeros_like(gamma)]))
+        works = [partial(fitted_beside, free, model, one) for one in starts]
+        tried = at_once(works, model.prepared, [term])
+        running = shape_fitted(max(tried, key=lambda one: one.log_likelihood))
+    running = _under_own_noise(running, base, declared, settings)
+    return running if priced(running, settings) > priced(under, settings) else under
+
+
+def _under_own_noise(
+    running: FittedModel, base: FittedModel, declared: Mapping[str, float], settings: Settings
+) -> FittedModel:
+    """A free run under the noise that is around it; as it is, where that loses the recording."""
     noise = noise_around(running, declared, settings.noise)
     if noise is not None and noise.observer is not None:
         prepared = running.model.prepared
@@ -240,9 +266,33 @@ def _likelier(
         try:
             running = fitted(observed, running.parameters, base.bound, graduate=False)
         except NoFitError:
-            return under
-    running = with_own_noise(running, declared, settings)
-    return running if priced(running, settings) > priced(under, settings) else under
+            return running
+    return with_own_noise(running, declared, settings)
+
+
+def _plain(
+    base: FittedModel,
+    runs: Sequence[FittedModel],
+    terms: Sequence[Term],
+    declared: Mapping[str, float],
+    settings: Settings,
+) -> bool:
+    """Whether a candidate's fit is so much likelier than the simulation under any noise that no draws are needed.
+
+    A likelihood ratio exceeds k with a probability of at most 1/k without the effect (Markov's inequality; Wasserman,
+    Ramdas & Balakrishnan, PNAS 117 (2020), 16880); what the fit of its numbers and the choice among the candidates gain
+    is taken off.
+    """
+    if not runs:
+        return False
+    works = [partial(with_own_noise, base, declared, settings)]
+    works += [partial(_under_own_noise, fit, base, declared, settings) for fit in runs]
+    alone, *others = at_once(works, base.model.prepared, [fit.model.terms[-1] for fit in runs])
+    samples, kinds = int(alone.residual.numel()), len({term.key for term in terms})
+    return any(
+        priced(fit, settings) - priced(alone, settings) > _DOUBT + price(_numbers(fit), samples, kinds)
+        for fit in others
+    )
 
 
 def _needless(base: FittedModel, best: FittedModel, declared: Mapping[str, float], settings: Settings) -> bool:

@@ -1,0 +1,122 @@
+"""Free runs of candidates: fits without process noise, where the simulation alone is far from the recording.
+
+Process noise around a fit that is wrong follows the recording so closely that straight lines along that trajectory say
+little of what is missing. A candidate that is right needs no process noise: its free run follows the recording.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.linearised.tangents import tangents_of
+from mkc_torch.diagnosis.model.at_once import at_once
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
+from mkc_torch.diagnosis.model.shaped import shape_fitted
+from mkc_torch.diagnosis.model.term import Key, Term
+from mkc_torch.diagnosis.settings import Settings
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["free_runs", "linear_gains"]
+
+PHYSICS = 5
+"""Kinds of physics of which free runs are fitted."""
+
+SHAPES = 3
+"""Shapes of each that a fit begins with."""
+
+BEHIND_NATS, BEHIND_SHARE = 50.0, 0.5
+"""Candidates farther behind the largest gain than both of these, in nats and as a share of it, are not fitted."""
+
+
+def free_runs(free: FittedModel, terms: Sequence[Term], settings: Settings) -> list[tuple[int, FittedModel]]:
+    """Fits of the free runs of the candidates that gain most beside the free run of the simulation alone.
+
+    Args:
+        free: the fit of the free run without a candidate.
+        terms: candidates.
+        settings: of the diagnosis.
+
+    Returns:
+        Numbers of the terms that the fits began with, one for each kind of physics, and the fits.
+    """
+    gains, sizes = linear_gains(free, terms, settings)
+    chosen = _chosen(gains, terms)
+    if not chosen:
+        return []
+    known = free.model.prepared, [terms[number] for number in chosen]
+    works = [partial(_fit, free, terms[number], sizes[number]) for number in chosen]
+    best: dict[Key, tuple[int, FittedModel]] = {}
+    for number, fit in zip(chosen, at_once(works, *known), strict=True):
+        key = terms[number].key
+        if key not in best or fit.log_likelihood > best[key][1].log_likelihood:
+            best[key] = number, fit
+    kept = _near([fit.log_likelihood - free.log_likelihood for _, fit in best.values()])
+    leading = [one for one, near in zip(best.values(), kept, strict=True) if near]
+    shaped = at_once([partial(shape_fitted, fit) for _, fit in leading], *known)
+    return [(number, fit) for (number, _), fit in zip(leading, shaped, strict=True)]
+
+
+def linear_gains(
+    free: FittedModel, terms: Sequence[Term], settings: Settings
+) -> tuple[list[float], list[Float[Tensor, " q"]]]:
+    """Gains of candidates along straight lines, in white noise, and their sizes.
+
+    Args:
+        free: the fit that the lines begin at.
+        terms: candidates.
+        settings: of the diagnosis.
+
+    Returns:
+        Log-likelihood ratios in nats, 0 where the size has a sign that the physics does not allow; and the sizes.
+    """
+    tangents = tangents_of(free.model, free.parameters, settings.noise, terms)
+    values, counts = free.pseudo(settings.noise)
+    weight = counts / free.d
+    y = (values * weight).flatten()
+    own = torch.linalg.qr((tangents.nuisance * weight.unsqueeze(-1)).flatten(0, 1))[0]
+    y = y - own @ (own.mT @ y)
+    power, samples = float(y.square().sum()), float(counts.sum())
+    gains, sizes = [], []
+    for term, columns in zip(terms, tangents.candidates, strict=True):
+        moved = (columns * weight.unsqueeze(-1)).flatten(0, 1)
+        moved = moved - own @ (own.mT @ moved)
+        scale = moved.norm(dim=0).clamp(min=1e-300)
+        size = -torch.linalg.lstsq(moved / scale, y.unsqueeze(-1), driver="gelsd").solution[:, 0] / scale
+        within = size.clamp(term.effect.least, term.effect.most)
+        left = float((y + moved @ within).square().sum())
+        better = math.isfinite(left) and left < power
+        gains.append(0.5 * samples * math.log(power / max(left, 1e-300)) if better else 0.0)
+        sizes.append(within)
+    return gains, sizes
+
+
+def _chosen(gains: Sequence[float], terms: Sequence[Term]) -> list[int]:
+    """Each leading kind of physics at the shapes that gain most."""
+    order = sorted(range(len(terms)), key=lambda number: -gains[number])
+    able = [terms[number].key for number in order if gains[number] > 0.0 and not terms[number].effect.is_curve]
+    keys = list(dict.fromkeys(able))[:PHYSICS]
+    largest = [max(gains[n] for n in order if terms[n].key == key) for key in keys]
+    near = [key for key, kept in zip(keys, _near(largest), strict=True) if kept]
+    return [n for key in near for n in [n for n in order if terms[n].key == key and gains[n] > 0.0][:SHAPES]]
+
+
+def _near(gains: Sequence[float]) -> list[bool]:
+    """Which gains are near enough to the largest."""
+    largest = max(gains, default=0.0)
+    least = min(largest - BEHIND_NATS, (1.0 - BEHIND_SHARE) * largest)
+    return [gain >= least for gain in gains]
+
+
+def _fit(free: FittedModel, term: Term, size: Float[Tensor, " q"]) -> FittedModel:
+    model = free.model.with_term(term)
+    starts = (torch.cat([free.parameters, size]), torch.cat([free.parameters, torch.zeros_like(size)]))
+    fits = [fitted_beside(free, model, start, graduate=False) for start in starts]
+    return max(fits, key=lambda fit: fit.log_likelihood)
