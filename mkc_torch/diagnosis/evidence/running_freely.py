@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 
+import torch
+
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.density.fit import fit_density
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, held_out, on_all
 from mkc_torch.diagnosis.model.at_once import at_once
-from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.in_the_world import at_liberty, freed, pushed
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.search.locate import Located
@@ -53,7 +55,7 @@ def running_freely(
     if not any(pushed(fit) for fit in (base, *(one.fit for one in found))) or alone is None:
         return as_it_is
     works = [
-        partial(_released if _of_sensors(one.fit) else _refitted, one.fit, known, blocks)
+        partial(_released if _of_sensors(one.fit) else _refitted, one.fit, known, blocks, alone)
         for one, known in zip(found, evidence[1:], strict=True)
     ]
     runs = at_once([partial(_judged, alone, evidence[0], blocks), *works], alone.model.prepared)
@@ -89,19 +91,19 @@ def _of_sensors(fit: FittedModel) -> bool:
 _Run = tuple[FittedModel, Evidence]
 
 
-def _released(fit: FittedModel, known: Evidence, blocks: HeldOutBlocks) -> _Run | None:
+def _released(fit: FittedModel, known: Evidence, blocks: HeldOutBlocks, alone: FittedModel) -> _Run | None:
     """The free run at a fit's own parameters, on all samples and, at each fold's, on blocks."""
     model = JointModel(at_liberty(fit.model.prepared), fit.model.terms, fit.model.near)
     residual = model.residual(fit.parameters).detach()
     if not bool(residual.isfinite().all()):
-        return _refitted(fit, known, blocks)
+        return _refitted(fit, known, blocks, alone)
     unseen = residual.clone()
     for number, parameters in enumerate(known.parameters):
         out = model.residual(parameters).detach()
         seen = blocks.fold == number
         unseen[seen] = out[seen]
     if not bool(unseen.isfinite().all()):
-        return _refitted(fit, known, blocks)
+        return _refitted(fit, known, blocks, alone)
     bound = fit.bound.maximum(_REACH * robust_scale(residual))
     density = fit_density(residual, bound=bound)
     sigma, d = density.sigma, density.d
@@ -118,10 +120,20 @@ def _released(fit: FittedModel, known: Evidence, blocks: HeldOutBlocks) -> _Run 
     return free, replace(known, residual=unseen, sigma=sigma, d=d)
 
 
-def _refitted(fit: FittedModel, _: Evidence, blocks: HeldOutBlocks) -> _Run | None:
-    """A fit of the free run: parameters beside process noise may need it."""
-    free = freed(fit)
-    return None if free is None else _judged(free, None, blocks)
+def _refitted(fit: FittedModel, _: Evidence, blocks: HeldOutBlocks, alone: FittedModel) -> _Run | None:
+    """A fit of the free run: from the parameters beside process noise, which may need it, and from those without."""
+    ways = [partial(freed, fit), partial(_from_alone, fit, alone)]
+    tried = [one for one in at_once(ways, alone.model.prepared, fit.model.terms) if one is not None]
+    return _judged(max(tried, key=lambda one: one.log_likelihood), None, blocks) if tried else None
+
+
+def _from_alone(fit: FittedModel, alone: FittedModel) -> FittedModel | None:
+    model = JointModel(at_liberty(fit.model.prepared), fit.model.terms, alone.model.near)
+    start = torch.cat([alone.parameters, fit.parameters.new_zeros(model.size - alone.model.size)])
+    try:
+        return fitted(model, start, fit.bound, graduate=False)
+    except NoFitError:
+        return None
 
 
 def _judged(fit: FittedModel, _: Evidence | None, blocks: HeldOutBlocks) -> _Run | None:
