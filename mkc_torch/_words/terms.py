@@ -103,6 +103,7 @@ TERMS: dict[str, str] = {
     " likely without it.",
     # how strong the evidence is
     "evidence.surely": "surely better on [unit.unseen_blocks]",
+    "evidence.surely_likelier": "surely likelier on [unit.unseen_blocks]",
     "evidence.probably": "probably better on [unit.unseen_blocks], not surely",
     "evidence.not_shown": "not shown to be better on [unit.unseen_blocks]",
     "evidence.not_against": "[unit.unseen_blocks] do not speak against it",
@@ -110,6 +111,9 @@ TERMS: dict[str, str] = {
     "evidence.because": "{better}: {reason}",
     "evidence.blocks_differ": "from block to block the gain differs by more than itself, so it may be chance",
     "evidence.in_the_tail": "what is likelier is in the tail, not in the middle of the residual",
+    "evidence.tail_less_likely": "what is less likely is in the tail, not in the middle of the residual",
+    "evidence.free_run_farther": "the free run is farther off there, though it is likelier from sample to sample",
+    "evidence.free_run_closer": "the free run is closer there, though it is less likely from sample to sample",
     "evidence.on_unseen": "On [unit.unseen_data]: {change}.",
     "evidence.one_size": "{output} {change}",
     "evidence.with_floor": "{change}, noise floor {floor}",
