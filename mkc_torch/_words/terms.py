@@ -296,6 +296,7 @@ TERMS: dict[str, str] = {
     "table.told_apart": "can this recording tell them apart?",
     "table.held_out_blocks": "[unit.held_out] blocks",
     "table.residual": "residual, [unit.rms]",
+    "table.of_the_fit": "of the fit's samples in use, [unit.rms]",
     "table.log_likelihood": "log-likelihood, [unit.nats_a_sample]",
     "table.sigma": "σ",
     "table.d": "d",

@@ -59,6 +59,8 @@ PAIRS = (
     Pair("do not speak against it", "[Nn]ot confirmed", "finding"),
     Pair("differs by more than itself", rf"95 %: −{NUMBER} to −|95 %: [1-9]", "row"),
     Pair("not measured", r"nats a sample", "row"),
+    # two sizes of the same name: of an output, robust, and of the fit's samples
+    Pair(r"held-out blocks residual, rms", r"→.*\), noise floor", "report"),
     # what is missing
     Pair("Nothing is missing", CLAIM, "report"),
     Pair("Nothing is missing", "[Nn]earest in the catalogue", "report"),
