@@ -179,7 +179,7 @@ def _slow(g: Generator, plant: Plant, trial: Trial) -> tuple[Slow, ...]:
 def _push(
     stream: Callable[[str], Generator], world: str, index: int, hidden: bool, scene: Scene, errors: Errors
 ) -> Pushed | None:
-    """In worlds that have one; where something is hidden, in every second case of any world with white noise."""
+    """In worlds that have one; where something is hidden, in every second case of any world but that of slow errors."""
     always = world in (LASTING_ALONE, LASTING_RUNS) or (world in KINDS and not hidden)
     beside = hidden and index % 2 == 0 and world != SLOW_SENSOR
     if not (always or beside):
