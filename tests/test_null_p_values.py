@@ -95,6 +95,7 @@ def test_the_command_writes_table_picture_and_p_values_and_goes_on(tmp_path, mon
     command = ["--output", str(tmp_path), "--kinds", "white", "held inputs", "--surrogates", "39", "--per-kind"]
     assert null_p_values.main([*command, "1"]) == 0
     assert null_p_values.main([*command, "3"]) == 0
+    assert set(null_p_values.run(tmp_path, ["white"], 3, {"seed": 1, "surrogates": 39})) == {"white", "held inputs"}
     assert asked == [("white", 39), ("held inputs", 39)] * 3  # the first pair is not searched again
     stored = json.loads((tmp_path / "p_values.json").read_text(encoding="utf-8"))
     assert stored["p_values"] == {"white": [0.01] * 3, "held inputs": [0.5] * 3}

@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(
     output: Path, kinds: Sequence[str], per_kind: int, settings: Mapping[str, Any], p_value: PValue | None = None
 ) -> dict[str, list[float]]:
-    """The p-values of each kind, kept in ``p_values.json`` as they come.
+    """The p-values of each kind, kept in ``p_values.json`` as they come, with those that are there of other kinds.
 
     Args:
         output: folder; what it has of the same settings is not searched again.
@@ -79,7 +79,7 @@ def run(
             file.write_text(json.dumps({"settings": dict(settings), "p_values": found}, indent=1), encoding="utf-8")
             print(f"{index + 1}/{per_kind} {kind}: {values[-1]:.3g}", file=sys.stderr)
     print(f"{time.process_time() - started:.0f} CPU seconds", file=sys.stderr)
-    return {kind: found[kind][:per_kind] for kind in kinds}
+    return {kind: found[kind] for kind in KINDS if kind in found}
 
 
 def searched(empty: Recording, surrogates: int) -> float:
