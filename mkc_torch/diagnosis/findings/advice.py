@@ -100,8 +100,8 @@ def _by_its_curve(finding: Finding, d: Diagnosis) -> str:
     what = f"the formula {formula}" if formula else "the curve of the report"
     of = f" of {', '.join(f.drivers)}" if f.drivers else ""
     return (
-        f"Do not build {_called(f, d)} in: what this recording shows has another form. Look for physics with {what}{of}, "
-        "or use that within the range that was recorded."
+        f"Do not build {_called(f, d)} in: what this recording shows has another form. Look for physics with {what}{of},"
+        " or use that within the range that was recorded."
     )
 
 
@@ -115,8 +115,8 @@ def _hold_back(finding: Finding, d: Diagnosis) -> str:
         )
     wider = f", with {', '.join(f.drivers)} over a wider range," if f.drivers else ","
     return (
-        f"Do not correct for {_called(f, d)} yet: blocks that the fit has not seen do not confirm it. Record again, for "
-        f"longer{wider} and see whether it comes back."
+        f"Do not correct for {_called(f, d)} yet: blocks that the fit has not seen do not confirm it. Record again, for"
+        f" longer{wider} and see whether it comes back."
     )
 
 
