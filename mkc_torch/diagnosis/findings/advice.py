@@ -100,8 +100,8 @@ def _by_its_curve(finding: Finding, d: Diagnosis) -> str:
     what = f"the formula {formula}" if formula else "the curve of the report"
     of = f" of {', '.join(f.drivers)}" if f.drivers else ""
     return (
-        f"Do not build {_called(f, d)} in: what this recording shows has another form. Look for physics with {what}{of},"
-        " or use that within the range that was recorded."
+        f"Do not build {_called(f, d)} in: what this recording shows has another form. Look for physics with"
+        f" {what}{of}, or use that within the range that was recorded."
     )
 
 
