@@ -248,3 +248,12 @@ def test_worlds_are_scored_by_their_keys(tmp_path):
     assert (counts["false alarms"], counts["useless unfit"], counts["failed"]) == ("0/6", "1/1", "0")
     rows[useless] = row(finding("offset_drift"))
     assert family.outcomes(rows)[useless] == {"false_alarm": True}
+
+
+def test_what_one_run_cannot_tell_is_counted_apart(tmp_path):
+    (family, _) = drawn.all_worlds(tmp_path, match="world dynamics lasting_push empty", empty=2, hidden=0)
+    assert len(family.jobs) == 2
+    rival = finding("backlash", alternatives=("dead_zone",))
+    rows = {job.name: row(one) for job, one in zip(family.jobs, (finding("backlash"), rival), strict=True)}
+    counts = family.counts(rows)
+    assert (counts["false alarms"], counts["a name alone where one run cannot tell"]) == ("0/0", "1/2")

@@ -41,7 +41,7 @@ class WorldKey:
         key: what was hidden, if anything, and how well it could be seen.
         push: what disturbs.
         useless: why the simulation is of no use; "" where it is of use.
-        follows: of a useless one, the share of an output's variation that its best fit explains.
+        follows: of a useless one, the largest share of an output's variation that its best fit explains.
     """
 
     world: str
@@ -80,6 +80,9 @@ class World:
         draw: a case of it.
         aims: what is asked of diagnoses there.
         hides: something may be hidden in it.
+        right_to_say, wrong_to_say: what is right to say in it, and what is not.
+        half: by default as many recordings have something hidden as have nothing; else a third as many.
+        apart: what is claimed in it is counted apart, and not in the row of all worlds.
     """
 
     name: str
@@ -87,6 +90,23 @@ class World:
     draw: Draw
     aims: Sequence[Threshold]
     hides: bool = True
+    right_to_say: str = ""
+    wrong_to_say: str = ""
+    half: bool = False
+    apart: bool = False
+
+    def hidden(self, empty: int, asked: int | None = None) -> int:
+        """How many recordings have something hidden, beside so many that have nothing, unless a number is asked for.
+
+        Example:
+            >>> World("white", "", lambda *_: None, ()).hidden(60)
+            20
+        """
+        if not self.hides:
+            return 0
+        if asked is not None:
+            return asked
+        return empty if self.half else empty // 3
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,9 @@ def challenge(
     hidden_per_world: Annotated[
         int | None,
         typer.Option(
-            metavar="H", min=0, help="With --worlds: recordings with something hidden in each; default: a third of N."
+            metavar="H",
+            min=0,
+            help="With --worlds: recordings with something hidden in each; default: what each world asks for.",
         ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,

@@ -59,7 +59,10 @@ def _facts(world: WorldScore) -> list[tuple[str, str]]:
         ("a wrong name claimed", world.wrong),
         ("nearest in the catalogue", world.nearest),
         ("outside, a name claimed", world.outside_wrong),
+        ("told as the sensor's", world.sensor_told),
     )
     facts += [(label, share_text(share)) for label, share in shares if share.total]
+    if world.apart:
+        facts += [("a name alone", share_text(world.alone)), ("cannot be told", share_text(world.undecided))]
     facts += [(why, ", ".join(f"{v} {n}" for v, n in told.items() if n)) for why, told in world.reasons.items()]
     return facts

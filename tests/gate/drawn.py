@@ -70,7 +70,7 @@ def all_worlds(
             # a number of its own for each recording, which its file's name has in it
             _Address(name, partial(world.draw, SEED, index, hides, 1000 * place + 100 * hides + index))
             for place, world in enumerate(family.worlds)
-            for hides, total in ((False, empty), (True, hidden if world.hides else 0))
+            for hides, total in ((False, empty), (True, world.hidden(empty, hidden)))
             for index in range(total)
             if match in (name := f"world {family.family} {world.name} {'hidden' if hides else 'empty'} {index}")
         ]
@@ -114,9 +114,14 @@ def _of_worlds(family: Worlds, jobs: Sequence[Job], keys: Mapping[str, WorldKey]
     def counts(rows: Rows) -> dict[str, str]:
         found = scored(rows)
         total, cases = found.total, found.cases
-        empty, useless = [case for case in cases if not case.hides], [case for case in cases if case.key.useless]
+        apart = {world.name for world in family.worlds if world.apart}
+        together = [case for case in cases if case.key.world not in apart]
+        empty, useless = [case for case in together if not case.hides], [case for case in cases if case.key.useless]
+        of_apart = [case for case in cases if case.key.world in apart]
+        counted_apart = f"{sum(case.alone for case in of_apart)}/{len(of_apart)}"
         return {
             "false alarms": f"{sum(case.said.alarm for case in empty)}/{len(empty)}",
+            **({"a name alone where one run cannot tell": counted_apart} if of_apart else {}),
             "strong named": f"{total.named.count}/{total.named.total}",
             "strong named wrong": f"{total.wrong.count}/{total.wrong.total}",
             "useless unfit": f"{sum(case.said.verdict == 'unfit' for case in useless)}/{len(useless)}",

@@ -183,7 +183,14 @@ def test_smaller_and_not_shown_to_be_better_never_stand_together_without_the_rea
     for held, reason in (
         (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m"), "from block to block the gain differs by more than itself"),
         (HeldOut(0.13, (-0.4, 0.66), 1.0, 0.29, "m", left=left), left[1:].rstrip(".")),
-        (HeldOut(0.3, (0.2, 0.4), 1.0, 1.3, "m"), "in the tail"),
+        (HeldOut(0.3, (0.2, 0.4), 1.0, 1.3, "m"), "surely likelier on unseen blocks: what is likelier is in the tail"),
+        (HeldOut(0.3, (0.2, 0.4), 1.0, 1.0, "m"), "surely likelier on unseen blocks: what is likelier is in the tail"),
+        (HeldOut(-0.3, (-0.4, -0.2), 1.0, 0.5, "m"), "worse on unseen blocks: what is less likely is in the tail"),
+        (
+            HeldOut(0.3, (0.2, 0.4), 1.0, 1.3, "m", decides=False),
+            "not shown to be better on unseen blocks: the free run",
+        ),
+        (HeldOut(-0.3, (-0.4, -0.2), 1.0, 0.5, "m", decides=False), "do not speak against it: the free run is closer"),
     ):
         assert reason in unseen.better(held)
         assert unseen.left(held) == ""

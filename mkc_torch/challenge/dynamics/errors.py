@@ -22,6 +22,23 @@ NOISE = (0.005, 0.02)
 """Standard deviation of an output's errors, over that of the output."""
 
 
+@dataclass(frozen=True)
+class Slow:
+    """A slow error of one output beside its others: autoregressive of first order and stationary.
+
+    Attributes:
+        size: standard deviation over that of the output's other errors; 0 where there is none.
+        lasting: correlation time in samples.
+    """
+
+    size: float
+    lasting: float
+
+    def correlations(self, samples: int) -> Array:
+        """Matrix (T, T) of a run."""
+        return np.exp(-np.abs(np.subtract.outer(range(samples), range(samples))) / self.lasting)
+
+
 class Whitening(Protocol):
     """What weighs traces of the outputs by the noise in them."""
 
@@ -31,23 +48,47 @@ class Whitening(Protocol):
 
 @dataclass(frozen=True)
 class Errors:
-    """Of each output the standard deviation, and of all the correlation from sample to sample and the family."""
+    """Of each output the standard deviation, and of all the correlation from sample to sample and the family.
+
+    Beside these errors each output may have a ``slow`` one; empty where none has.
+    """
 
     deviations: tuple[float, ...]
     correlation: float
     family: str
+    slow: tuple[Slow, ...] = ()
 
     def numbers(self, outputs: tuple[str, ...]) -> Mapping[str, Any]:
         """As JSON has it."""
         told = dict(zip(outputs, self.deviations, strict=True))
-        return {"deviation": told, "correlation": self.correlation, "family": self.family}
+        slow = {
+            name: {"over_noise": one.size, "samples": one.lasting}
+            for name, one in zip(outputs, self.slow, strict=False)
+        }
+        return {"deviation": told, "correlation": self.correlation, "family": self.family} | (
+            {"slow": slow} if slow else {}
+        )
 
     def whitened(self, traces: Array) -> Array:
         """Columns (M, q) of traces (m, T, R, q), or (M,) of (m, T, R), in standard deviations of independent errors."""
         scaled = traces / np.reshape(self.deviations, (-1, *[1] * (traces.ndim - 1)))
+        if self.slow:
+            return np.stack([self._beside_slow(of, one) for of, one in zip(self.slow, scaled, strict=True)]).reshape(
+                -1, *traces.shape[3:]
+            )
         white = scaled.copy()
         white[:, 1:] = (scaled[:, 1:] - self.correlation * scaled[:, :-1]) / np.sqrt(1.0 - self.correlation**2)
         return white.reshape(-1, *traces.shape[3:])
+
+    def _beside_slow(self, slow: Slow, values: Array) -> Array:
+        """An output's (T, R, *), run by run alike."""
+        samples = len(values)
+        covariance = np.eye(samples)
+        if self.correlation:
+            covariance = Slow(1.0, -1.0 / float(np.log(self.correlation))).correlations(samples)
+        covariance = covariance + slow.size**2 * slow.correlations(samples)
+        white = np.linalg.solve(np.linalg.cholesky(covariance), values.reshape(samples, -1))
+        return np.asarray(white, dtype=np.float64).reshape(values.shape)
 
 
 def draw_errors(g: Generator, outputs: Array) -> Errors:
@@ -65,7 +106,12 @@ def sample(g: Generator, errors: Errors, samples: int, runs: int) -> Array:
             return autoregressive((errors.correlation,), deviation, errors.family).sample(g, samples).numpy()
         return deviation * unit_variance(g, errors.family, samples).numpy()
 
-    return np.stack([np.stack([one(d) for _ in range(runs)], -1) for d in errors.deviations])
+    values = np.stack([np.stack([one(d) for _ in range(runs)], -1) for d in errors.deviations])
+    for own, deviation, slow in zip(values, errors.deviations, errors.slow, strict=False):  # none, or one for each
+        if slow.size:
+            process = autoregressive((float(np.exp(-1.0 / slow.lasting)),), slow.size * deviation)
+            own += np.stack([process.sample(g, samples).numpy() for _ in range(runs)], -1)
+    return values
 
 
 def spoil(g: Generator, errors: Errors, samples: int, runs: int) -> tuple[Array, np.ndarray]:

@@ -25,6 +25,7 @@ SAID: Sequence[Column] = (
     *((verdict, lambda world, verdict=verdict: str(world.verdicts[verdict])) for verdict in VERDICTS),
     ("unexplained, at the right state", lambda world: share_text(world.unexplained_located)),
     ("at the right state", lambda world: share_text(world.located)),
+    ("told as the sensor's", lambda world: share_text(world.sensor_told)),
 )
 """Of recordings with nothing hidden, and of useless simulations."""
 
@@ -40,6 +41,14 @@ NAMED: Sequence[Column] = (
     ("outside: nearest, or unknown", lambda world: share_text(world.outside_nearest)),
 )
 """Of recordings with something hidden."""
+
+
+APART: Sequence[Column] = (
+    ("recordings", lambda world: str(world.empty + world.hidden)),
+    ("a name alone, not the hidden one's", lambda world: share_text(world.alone)),
+    ("said that it cannot be told", lambda world: share_text(world.undecided)),
+)
+"""Of worlds that are counted apart, with something hidden or nothing."""
 
 
 def held(measured: Measured) -> str:
@@ -76,6 +85,8 @@ def worlds_page(score: WorldsScore, settings: Mapping[str, Any]) -> str:
         hiding=[world for world in _rows(score) if world.hidden],
         said=SAID,
         named=NAMED,
+        counted=APART,
+        apart=[world for world in _rows(score) if world.apart],
         passed=sum(m.holds for m in asked),
         asked=len(asked),
         settings=settings,
@@ -90,11 +101,17 @@ def worlds_summary(score: WorldsScore, settings: Mapping[str, Any]) -> str:
     lines += _table(SAID, _rows(score))
     if hiding := [world for world in _rows(score) if world.hidden]:
         lines += ["", *_table(NAMED, hiding)]
+    if apart := [world for world in _rows(score) if world.apart]:
+        lines += ["", *_table(APART, apart)]
     lines += ["", "| world | asked | measured | holds |", "|---|---|---|---|"]
     lines += [
         f"| {world.name} | {m.threshold.sentence} | {measured_text(m)} | {_marked(held(m))} |"
         for world in _rows(score)
         for m in world.measured
+    ]
+    lines += ["", "| world | what it is like | right | not right |", "|---|---|---|---|"]
+    lines += [
+        f"| {world.name} | {world.sentence} | {world.right_to_say} | {world.wrong_to_say} |" for world in score.worlds
     ]
     for world in score.worlds:
         lines += [""] * bool(world.reasons)

@@ -28,6 +28,17 @@ def driven_state(diagnosis: Mapping[str, Any] | None) -> str | None:
     return _from_noise(diagnosis) or _from_forcing(diagnosis) or _from_findings(diagnosis)
 
 
+def sensor_errs(diagnosis: Mapping[str, Any] | None) -> bool:
+    """It says that a sensor errs slowly beside its white noise.
+
+    Example:
+        >>> sensor_errs({"noise": {"sensor": {"height": {"size": 0.4}}}}), sensor_errs({"noise": {}})
+        (True, False)
+    """
+    sensors = _mapping(_mapping((diagnosis or {}).get("noise")).get("sensor"))
+    return any(_number(_mapping(told).get("size")) > 0.0 for told in sensors.values())
+
+
 def _from_noise(diagnosis: Mapping[str, Any]) -> str | None:
     process = _mapping(_mapping(diagnosis.get("noise")).get("process"))
     ratios = {state: _ratio(_mapping(told)) for state, told in process.items()}

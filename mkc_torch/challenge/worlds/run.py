@@ -62,7 +62,7 @@ def run_worlds(
         worlds: of a family.
         only: names of worlds; default all.
         per_world: recordings with nothing hidden in each world, or with a useless simulation.
-        hidden: recordings with something hidden in each world but the useless; default a third of the others.
+        hidden: recordings with something hidden in each world but the useless; default what each world says.
         seed: of everything that is drawn.
         output: a folder that is empty or does not exist.
         workers: processes.
@@ -73,7 +73,6 @@ def run_worlds(
         ValueError: a world that is not there, or no recording asked for.
     """
     asked = chosen(worlds, only)
-    hidden = per_world // 3 if hidden is None else hidden
     addresses = _addresses(asked, seed, per_world, hidden)
     if not addresses:
         raise ValueError("Expected per_world and hidden to ask for one recording at least but both are 0.")
@@ -97,7 +96,7 @@ def run_worlds(
         "worlds": ", ".join(world.name for world in asked),
         "seed": seed,
         "empty_per_world": per_world,
-        "hidden_per_world": hidden,
+        "hidden_per_world": _hidden_told(asked, per_world, hidden),
         **worlds.settings,
         "workers": workers,
         "key_sha256": digest(text),
@@ -127,16 +126,21 @@ def chosen(worlds: Worlds, only: Sequence[str]) -> list[World]:
 def count(worlds: Worlds, only: Sequence[str], per_world: int, hidden: int | None) -> int:
     """How many recordings a run has."""
     asked = chosen(worlds, only)
-    more = per_world // 3 if hidden is None else hidden
-    return len(asked) * per_world + more * sum(world.hides for world in asked)
+    return sum(per_world + world.hidden(per_world, hidden) for world in asked)
 
 
-def _addresses(asked: Sequence[World], seed: int, per_world: int, hidden: int) -> list[_Address]:
+def _hidden_told(asked: Sequence[World], per_world: int, hidden: int | None) -> int | str:
+    """How many recordings of a world have something hidden, "20 or 60" where worlds differ."""
+    numbers = sorted({world.hidden(per_world, hidden) for world in asked if world.hides} or {0})
+    return numbers[0] if len(numbers) == 1 else " or ".join(map(str, numbers))
+
+
+def _addresses(asked: Sequence[World], seed: int, per_world: int, hidden: int | None) -> list[_Address]:
     """All cases in a random order, so that names tell nothing."""
     plain = [
         (world, index, hides)
         for world in asked
-        for hides, total in ((False, per_world), (True, hidden if world.hides else 0))
+        for hides, total in ((False, per_world), (True, world.hidden(per_world, hidden)))
         for index in range(total)
     ]
     order = torch.randperm(len(plain), generator=generator(seed, "worlds", "order")).tolist()

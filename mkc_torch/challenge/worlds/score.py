@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from mkc_torch.challenge.binomial import Share
@@ -23,10 +23,10 @@ from mkc_torch.challenge.verdict import (
     named_right,
 )
 from mkc_torch.challenge.world import WorldKey, Worlds
-from mkc_torch.challenge.worlds.reader import driven_state
+from mkc_torch.challenge.worlds.reader import driven_state, sensor_errs
 
 TOTAL = "all useful"
-"""Name of the row of all worlds in which the simulation is of use."""
+"""Name of the row of all worlds in which the simulation is of use, but for those that are counted apart."""
 
 LEAST_PUSH = 2.0
 """From this share of the sensor's noise on, a push has to be seen and located."""
@@ -34,11 +34,15 @@ LEAST_PUSH = 2.0
 
 @dataclass(frozen=True)
 class Told:
-    """A case and what was said of it; ``state`` is the one that the diagnosis says is driven."""
+    """A case and what was said of it.
+
+    ``state`` is the one that the diagnosis says is driven; ``sensor`` whether it says that a sensor errs slowly.
+    """
 
     key: WorldKey
     said: Answer
     state: str | None
+    sensor: bool = False
 
     @property
     def hides(self) -> bool:
@@ -71,6 +75,21 @@ class Told:
         return bool(self.said.claims) and self.said.claims[0].named.effect != UNKNOWN and not self.named
 
     @property
+    def alone(self) -> bool:
+        """The first claim has a name, beside which no other is possible, and which is not the hidden one's."""
+        first = self.said.claims[0] if self.said.claims else None
+        if first is None or first.others or first.named.effect == UNKNOWN:
+            return False
+        return not (self.hides and self.named)
+
+    @property
+    def undecided(self) -> bool:
+        """It is said that it cannot be told: unexplained without a claim, or a claim with alternatives."""
+        if self.said.claims:
+            return bool(self.said.claims[0].others)
+        return self.said.verdict == UNEXPLAINED
+
+    @property
     def nearest(self) -> bool:
         """Nothing is claimed, but something is said to be the nearest in the catalogue."""
         return not self.said.claims and bool(self.said.nearest)
@@ -97,6 +116,7 @@ class Told:
             "useless": self.key.useless,
             "verdict": self.said.verdict,
             "driven": self.state,
+            "sensor_errs": self.sensor,
             "findings": [{"effect": f.named.effect, "grade": f.grade} for f in self.said.findings],
         }
 
@@ -106,7 +126,7 @@ class WorldScore:
     """One world. Shares are of recordings with nothing hidden, or of useless ones, but for those after ``hidden``.
 
     Attributes:
-        name, sentence: of the world.
+        name, sentence, right_to_say, wrong_to_say, apart: of the world.
         empty: how many of those there were.
         verdicts: what was said of them, and what failed.
         false_alarms: physics claimed to be missing, of those that were diagnosed.
@@ -114,6 +134,9 @@ class WorldScore:
         adequate, unfit: that verdict, of all.
         unexplained_located: that verdict at the pushed state, of those with a push of at least twice the noise.
         located: the pushed state, whatever the verdict, of the same.
+        sensor_told: said that a sensor errs slowly, of those whose sensor does so by at least twice its white noise.
+        alone: a name beside which no other is possible and which is not the hidden one's, of all, hidden or not.
+        undecided: "it cannot be told", unexplained or with alternatives, of the same.
         useful_unfit: that verdict, of those of use with nothing hidden, or an effect at z of at least ten.
         reasons: of useless ones, why to what was said.
         hidden: how many recordings had something hidden, ``strong`` of them an effect of the catalogue with z and z_sep
@@ -136,6 +159,9 @@ class WorldScore:
     unfit: Share
     unexplained_located: Share
     located: Share
+    sensor_told: Share
+    alone: Share
+    undecided: Share
     useful_unfit: Share
     reasons: Mapping[str, Mapping[str, int]]
     hidden: int
@@ -149,6 +175,9 @@ class WorldScore:
     outside_nearest: Share
     failed: tuple[str, ...]
     measured: tuple[Measured, ...]
+    right_to_say: str = ""
+    wrong_to_say: str = ""
+    apart: bool = False
 
 
 @dataclass(frozen=True)
@@ -180,15 +209,27 @@ def score_worlds(
         keys: of all cases.
         diagnoses: name of a recording to the content of its ``diagnosis.json``; a name that is missing failed.
     """
-    told = [Told(key, answer(diagnoses.get(key.name)), driven_state(diagnoses.get(key.name))) for key in keys]
+    told = [_told(key, diagnoses.get(key.name)) for key in keys]
     drawn = [world for world in worlds.worlds if any(case.key.world == world.name for case in told)]
     scores = tuple(
-        score_of(world.name, world.sentence, [case for case in told if case.key.world == world.name], world.aims)
+        replace(
+            score_of(world.name, world.sentence, [case for case in told if case.key.world == world.name], world.aims),
+            right_to_say=world.right_to_say,
+            wrong_to_say=world.wrong_to_say,
+            apart=world.apart,
+        )
         for world in drawn
     )
-    useful = [case for case in told if not case.key.useless]
-    total = score_of(TOTAL, "every world in which the simulation is of use", useful, worlds.totals)
+    apart = {world.name for world in drawn if world.apart}
+    useful = [case for case in told if not case.key.useless and case.key.world not in apart]
+    total = score_of(
+        TOTAL, "every world in which the simulation is of use, but for those counted apart", useful, worlds.totals
+    )
     return WorldsScore(scores, total, tuple(told))
+
+
+def _told(key: WorldKey, diagnosis: Mapping[str, Any] | None) -> Told:
+    return Told(key, answer(diagnosis), driven_state(diagnosis), sensor_errs(diagnosis))
 
 
 def score_of(name: str, sentence: str, cases: Sequence[Told], asked: Sequence[Threshold]) -> WorldScore:
@@ -212,6 +253,11 @@ def score_of(name: str, sentence: str, cases: Sequence[Told], asked: Sequence[Th
         "unfit": share_of(empty, lambda case: case.said.verdict == UNFIT),
         "unexplained_located": share_of(pushed, lambda case: case.said.verdict == UNEXPLAINED and case.located),
         "located": share_of(pushed, lambda case: case.located),
+        "sensor_told": share_of([case for case in empty if _sensor_to_be_told(case)], lambda case: case.sensor),
+        "alone": share_of(
+            [case for case in cases if case.said.verdict != FAILED and not case.key.useless], lambda case: case.alone
+        ),
+        "undecided": share_of([case for case in cases if not case.key.useless], lambda case: case.undecided),
         "useful_unfit": share_of(useful, lambda case: case.said.verdict == UNFIT),
         "reasons": {
             why: _verdicts([case for case in useless if case.key.useless == why])
@@ -236,6 +282,11 @@ def _to_be_located(case: Told) -> bool:
     """A state is pushed, and by enough; a sensor that is disturbed has none."""
     push = case.key.push
     return push is not None and push.at != "sensor" and push.over_noise >= LEAST_PUSH
+
+
+def _sensor_to_be_told(case: Told) -> bool:
+    push = case.key.push
+    return push is not None and push.at == "sensor" and push.over_noise >= LEAST_PUSH
 
 
 def _verdicts(cases: Sequence[Told]) -> dict[str, int]:

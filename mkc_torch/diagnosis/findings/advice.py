@@ -36,10 +36,10 @@ def advice_of(diagnosis: Diagnosis) -> tuple[str, ...]:
 def _after_the_search(diagnosis: Diagnosis) -> tuple[str, ...]:
     d = diagnosis
     if nothing_shows(d):
-        return (_USE, *(_hold_back(f) for f in d.findings))
-    advice = [sentence for finding in d.findings for sentence in _of(finding, alone=len(d.findings) == 1)]
+        return (_USE, *(_hold_back(f, d) for f in d.findings))
+    advice = [sentence for finding in d.findings for sentence in _of(finding, d)]
     advice += _of_what_remains(d)
-    use = [_called(f) for f in d.findings if carries_over(f)]
+    use = [_called(f, d) for f in d.findings if carries_over(f)]
     if use:
         advice.append(f"The model found here corrects for {', '.join(use)}: confirm it on a second recording.")
     return tuple(dict.fromkeys(advice))
@@ -78,54 +78,54 @@ def _find_what_pushes(push: Push) -> str:
     )
 
 
-def _of(finding: Finding, *, alone: bool) -> Iterator[str]:
+def _of(finding: Finding, d: Diagnosis) -> Iterator[str]:
     f = finding
     near = [a for a in f.alternatives if not a.separable]
     if f.grade == "nearest in the catalogue":
-        yield _by_its_curve(f)
+        yield _by_its_curve(f, d)
         return
     if not worth_correcting(f):
-        yield _hold_back(f)
+        yield _hold_back(f, d)
     elif not f.plausible:
-        yield f"The size of {f.effect} is not plausible: look for another cause before correcting it."
+        yield f"The size of {_called(f, d)} is not plausible: look for another cause before correcting it."
     if near:
         yield _tell_apart(f, near)
     if f.plausible and worth_correcting(f):
         what = _SWITCHED if f.comes_and_goes else f.advice
         if what and near:
-            yield f"If it is {_called(f)}: {_small_letter(what)}"
+            yield f"If it is {_called(f, d)}: {_small_letter(what)}"
         elif what:
-            yield what if alone else f"{_called(f)}: {_small_letter(what)}"
+            yield what if len(d.findings) == 1 else f"{_called(f, d)}: {_small_letter(what)}"
 
 
 def _small_letter(sentence: str) -> str:
     return f"{sentence[:1].lower()}{sentence[1:]}"
 
 
-def _by_its_curve(finding: Finding) -> str:
+def _by_its_curve(finding: Finding, d: Diagnosis) -> str:
     """What to do where the form that a name claims is not the recording's."""
     f = finding
     formula = f.shape.formula if f.shape is not None else ""
     what = f"the formula {formula}" if formula else "the curve of the report"
     of = f" of {', '.join(f.drivers)}" if f.drivers else ""
     return (
-        f"Do not build {_called(f)} in: what this recording shows has another form. Look for physics with {what}{of}, "
-        "or use that within the range that was recorded."
+        f"Do not build {_called(f, d)} in: what this recording shows has another form. Look for physics with"
+        f" {what}{of}, or use that within the range that was recorded."
     )
 
 
-def _hold_back(finding: Finding) -> str:
+def _hold_back(finding: Finding, d: Diagnosis) -> str:
     """Why not to correct for it."""
     f = finding
     if f.grade == "real but small" and f.held_out is not None:
         return (
-            f"Leave {_called(f)} alone, unless means over many samples matter: it makes the residual of a sample "
+            f"Leave {_called(f, d)} alone, unless means over many samples matter: it makes the residual of a sample "
             f"smaller by {max(100.0 * change(f.held_out), 0.0):.1f} % only."
         )
     wider = f", with {', '.join(f.drivers)} over a wider range," if f.drivers else ","
     return (
-        f"Do not correct for {_called(f)} yet: blocks that the fit has not seen do not confirm it. Record again, for "
-        f"longer{wider} and see whether it comes back."
+        f"Do not correct for {_called(f, d)} yet: blocks that the fit has not seen do not confirm it. Record again, for"
+        f" longer{wider} and see whether it comes back."
     )
 
 
@@ -137,10 +137,15 @@ _SWITCHED = (
 )
 
 
-def _called(finding: Finding) -> str:
-    if not is_curve(finding.effect):
-        return finding.effect
-    return f"the curve along {', '.join(finding.drivers)}" if finding.drivers else "the course without a recorded cause"
+def _called(finding: Finding, d: Diagnosis) -> str:
+    """Its name, with the place where another finding has the same name."""
+    f = finding
+    if is_curve(f.effect):
+        name = f"the curve along {', '.join(f.drivers)}" if f.drivers else "the course without a recorded cause"
+    else:
+        name = f.effect
+    same = [other for other in d.findings if (other.effect, other.drivers) == (f.effect, f.drivers)]
+    return f"{name} on the {', '.join(f.channels)}" if len(same) > 1 and f.channels else name
 
 
 def _tell_apart(finding: Finding, near: Sequence[Alternative]) -> str:

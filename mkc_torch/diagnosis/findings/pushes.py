@@ -109,7 +109,7 @@ def _lagged(series: Float[Tensor, "k N"]) -> Float[Tensor, "k N"]:
 def _sentences(push: Push, course: Pushed, prepared: PreparedDynamics) -> tuple[str, ...]:
     what = f"rate of {push.place}" if push.at_rate else push.place
     step = float(prepared.time.diff().median())
-    if push.lasting > 1.5 * step:
+    if push.lasting > 0.0:
         told = [f"What pushes {what} is not white: it keeps its value for about {push.lasting:.2g} s."]
     else:
         told = [f"What pushes {what} is white: it is new at each sample."]

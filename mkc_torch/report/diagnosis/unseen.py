@@ -6,7 +6,7 @@ import math
 
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain
-from mkc_torch.diagnosis.findings.worth import SMALL, change, confirmation, vetoed
+from mkc_torch.diagnosis.findings.worth import SMALL, Confirmation, change, confirmation, vetoed
 from mkc_torch.diagnosis.result import Diagnosis, HeldOut, Sizes
 from mkc_torch.diagnosis.world import World
 from mkc_torch.report.diagnosis.numbers import improvement
@@ -20,8 +20,8 @@ _BETTER = {
     "not shown": "evidence.not_shown",
     "worse": "evidence.worse",
 }
-_WORSE = -0.01
-"""Share by which a residual is larger that goes with a likelier model, from which that is told."""
+_UNCHANGED = 5e-4
+"""Share below which a residual counts as no smaller: "surely better" is not said of it, likelier though it be."""
 
 
 def better(held_out: HeldOut) -> str:
@@ -34,20 +34,32 @@ def better(held_out: HeldOut) -> str:
         'not shown to be better on unseen blocks: from block to block the gain differs by more than itself, so it ...'
     """
     kind = confirmation(held_out.log_likelihood_gain, held_out.confidence_interval)
-    if not held_out.decides and kind != "surely" and not vetoed(held_out):
-        return term("evidence.not_against")
-    told = term(_BETTER[kind])
-    reason = _reason(held_out, surely=kind == "surely")
-    return term("evidence.because", better=told, reason=reason) if reason else told
+    told, reason = _freely(held_out, kind) if not held_out.decides else _by_likelihood(held_out, kind)
+    return term("evidence.because", better=term(told), reason=reason) if reason else term(told)
 
 
-def _reason(held_out: HeldOut, *, surely: bool) -> str:
-    """Why residuals and likelihood disagree; empty where they do not."""
-    if surely:
-        return term("evidence.in_the_tail") if change(held_out) < _WORSE else ""
-    if change(held_out) < SMALL:
-        return ""
-    return _within(held_out.left) or term("evidence.blocks_differ")
+def _freely(held_out: HeldOut, kind: Confirmation) -> tuple[str, str]:
+    """A term and a reason where the free run decides."""
+    if vetoed(held_out):
+        if kind in ("surely", "probably"):
+            return _BETTER["not shown"], term("evidence.free_run_farther")
+        return _by_likelihood(held_out, kind)
+    if kind == "surely":
+        return _by_likelihood(held_out, kind)
+    return "evidence.not_against", term("evidence.free_run_closer") if kind == "worse" else ""
+
+
+def _by_likelihood(held_out: HeldOut, kind: Confirmation) -> tuple[str, str]:
+    """A term, and why residuals and likelihood disagree; empty where they do not."""
+    less = change(held_out)
+    if kind == "surely":
+        if less >= _UNCHANGED:
+            return _BETTER[kind], ""
+        return "evidence.surely_likelier", term("evidence.in_the_tail")
+    if less < SMALL:
+        return _BETTER[kind], ""
+    why = term("evidence.tail_less_likely" if kind == "worse" else "evidence.blocks_differ")
+    return _BETTER[kind], _within(held_out.left) or why
 
 
 def _within(sentence: str) -> str:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mkc_torch.challenge.draws import generator
-from mkc_torch.challenge.dynamics.errors import OUTLIERS, Errors, sample, spoil
+from mkc_torch.challenge.dynamics.errors import OUTLIERS, Errors, Slow, sample, spoil
 from mkc_torch.challenge.dynamics.generator import SYSTEMS, draw
 from mkc_torch.challenge.dynamics.second import ratio_to_oracle
 from mkc_torch.challenge.dynamics.subject import dynamics, simulation_class
@@ -119,3 +119,32 @@ def test_outliers_are_far_and_few():
     assert mask.sum() == 2 * round(OUTLIERS * 400)
     assert (np.abs(bad[mask]) >= 2.5).all()
     assert not bad[~mask].any()
+
+
+SLOW_ERRORS = Errors((0.5, 2.0), 0.0, "gaussian", (Slow(3.0, 20.0), Slow(0.0, 20.0)))
+
+
+def test_a_slow_error_lies_beside_the_white_one_and_is_autoregressive():
+    values = sample(generator(3), SLOW_ERRORS, 200, 1500)
+    slow, other = values[0] / 0.5, values[1] / 2.0
+    assert slow.var() == pytest.approx(1.0 + 9.0, rel=0.03)
+    assert other.var() == pytest.approx(1.0, rel=0.03)
+    for lag in (1, 10, 40):
+        assert (slow[lag:] * slow[:-lag]).mean() == pytest.approx(9.0 * np.exp(-lag / 20.0), abs=0.3)
+        assert (other[lag:] * other[:-lag]).mean() == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.5])
+def test_white_and_slow_errors_together_are_whitened(correlation):
+    errors = dataclasses.replace(SLOW_ERRORS, correlation=correlation)
+    white = errors.whitened(sample(generator(4), errors, 60, 800)).reshape(2, 60, 800)
+    for one in white:
+        found = one @ one.T / one.shape[1]
+        np.testing.assert_allclose(found, np.eye(60), atol=0.2)
+
+
+def test_slow_errors_whiten_several_traces_as_one_after_the_other():
+    traces = np.random.default_rng(1).standard_normal((2, 30, 3, 4))
+    together = SLOW_ERRORS.whitened(traces)
+    alone = np.stack([SLOW_ERRORS.whitened(traces[..., k]) for k in range(4)], -1)
+    np.testing.assert_allclose(together, alone, atol=1e-12)

@@ -25,6 +25,7 @@ WORLDS = Worlds(
     (
         World("white", "white noise", never, aims.WHITE),
         World("pushed_white", "white force noise", never, aims.PUSHED),
+        World("lasting", "one run", never, aims.LASTING, right_to_say="unexplained", half=True, apart=True),
         World("useless", "of no use", never, aims.USELESS, hides=False),
     ),
     aims.TOTALS,
@@ -169,6 +170,61 @@ def test_outside_the_catalogue_only_a_wrong_name_is_wrong():
     assert counts(world(result, "white").outside_nearest) == (3, 5)
     assert world(result, "white").strong == 0
     assert held(aim(result.total, "outside_wrong")) == "not held"
+
+
+def with_rival(effect):
+    rival = {"effect": "dead_zone", "drivers": [], "channels": [], "separable": False}
+    return finding(effect) | {"alternatives": [rival]}
+
+
+def test_where_one_run_cannot_tell_a_name_alone_is_counted_apart():
+    answers = {
+        "alone": says("explained", finding("backlash")),
+        "rival": says("explained", with_rival("backlash")),
+        "open": says("unexplained"),
+        "unnamed": says("explained", finding("unknown")),
+        "adequate": says("adequate"),
+        "refused": None,
+        "right": says("explained", finding("backlash")),
+        "mistaken": says("explained", finding("dead_zone")),
+    }
+    keys = [key(n, "lasting", push=3.0, kind="single" if n in ("right", "mistaken") else "empty") for n in answers]
+    result = score_worlds(WORLDS, keys, answers)
+    scored = world(result, "lasting")
+    assert counts(scored.alone) == (2, 7)  # "alone" and "mistaken"
+    assert counts(scored.undecided) == (2, 8)  # "rival" and "open"
+    assert held(aim(scored, "alone")) == "not held"
+    assert (scored.apart, scored.right_to_say) == (True, "unexplained")
+    assert (result.total.empty, result.total.hidden) == (0, 0)
+    pytest.importorskip("jinja2")
+    page, text = worlds_page(result, SETTINGS), worlds_summary(result, SETTINGS)
+    for words in ("a name alone, not the hidden one", "said that it cannot be told", "(2 of 7; 3.7-71.0 %)"):
+        assert words in page
+        assert words in text
+    quiet = score_worlds(WORLDS, [key("a")], {"a": says("adequate")})
+    assert "cannot be told" not in worlds_page(quiet, SETTINGS)
+
+
+def test_a_sensor_that_errs_slowly_is_told_by_its_own_noise():
+    slow = {"noise": {"sensor": {"height": {"size": 1.0, "standard_error": 0.1}}}}
+    answers = {
+        "told": says("unexplained") | slow,
+        "not": says("unexplained", driven="speed"),
+        "small": says("adequate"),
+    }
+    keys = [
+        dataclasses.replace(key(name), push=KeyPush("slow_sensor", "sensor", 1.0, "m", 1.5 if name == "small" else 4.0))
+        for name in answers
+    ]
+    assert counts(world(score_worlds(WORLDS, keys, answers), "white").sensor_told) == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("half", "asked", "hidden"), [(False, None, 20), (True, None, 60), (True, 6, 6), (False, 6, 6)]
+)
+def test_how_many_hide_something(half, asked, hidden):
+    assert World("white", "", never, (), half=half).hidden(60, asked) == hidden
+    assert World("useless", "", never, (), hides=False).hidden(60, asked) == 0
 
 
 def all_kinds():

@@ -163,3 +163,12 @@ def test_where_something_shows_it_is_not(changes, told):
 
 def test_effects_of_the_catalogue_say_what_another_recording_shows():
     assert HardIronStep.again != OffsetDrift.again
+
+
+def test_two_findings_of_one_name_are_told_apart_by_their_place():
+    made = make_diagnosis(1, samples=50)
+    first = dataclasses.replace(made.findings[0], alternatives=(), channels=("rate of speed",))
+    second = dataclasses.replace(first, grade="not confirmed", channels=("rate of climb",))
+    told = " ".join(advice_of(dataclasses.replace(made, findings=(first, second))))
+    assert "corrects for hard_iron_step on the rate of speed:" in told
+    assert "Do not correct for hard_iron_step on the rate of climb yet" in told

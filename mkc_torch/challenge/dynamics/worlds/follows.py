@@ -32,8 +32,8 @@ class Guess:
     bounds: Sequence[tuple[float, float]]
 
 
-def best_share(g: Generator, guess: Guess, trial: Trial, outputs: Array) -> float:
-    """Of the variation of outputs (m, T, R) what the best fit explains, of the output where it explains least.
+def best_shares(g: Generator, guess: Guess, trial: Trial, outputs: Array) -> list[float]:
+    """What the best fit to all outputs (m, T, R) explains of the variation of each.
 
     Levenberg's and Marquardt's method for parameters and first states. Below 0 where the mean would do better.
     """
@@ -68,7 +68,8 @@ def best_share(g: Generator, guess: Guess, trial: Trial, outputs: Array) -> floa
     k = int(cost.argmin())
     explained = 1.0 - np.square(left(best[[k]])[0].reshape(len(outputs), -1)).mean(1)
     total = np.square((outputs - middle) / scale).mean((1, 2))
-    return float((1.0 - (1.0 - explained) / total).min())
+    shares: list[float] = (1.0 - (1.0 - explained) / total).tolist()
+    return shares
 
 
 def _starts(g: Generator, guess: Guess, low: Array, high: Array) -> list[Array]:

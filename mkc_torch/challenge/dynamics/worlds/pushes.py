@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
@@ -14,6 +15,9 @@ from mkc_torch.challenge.dynamics.plant import Array, Plant, Trial
 
 SLOW = (0.03, 0.15)
 """Correlation time of a slow push, as a share of a run."""
+
+LASTING = (0.3, 1.0)
+"""The same of a push that lasts."""
 
 GUSTS, GUST = (2, 5), (0.04, 0.15)
 """How many gusts a run has, and the length of each as a share of it."""
@@ -48,10 +52,17 @@ def white(g: Generator, trial: Trial, fine: int) -> Push:
     return Push(values, covariance, {})
 
 
-def slow(g: Generator, trial: Trial, fine: int) -> Push:
-    """Ornstein and Uhlenbeck's process of variance 1, stationary from the beginning of each run."""
+def slow(g: Generator, trial: Trial, fine: int, lasting: tuple[float, float] = SLOW) -> Push:
+    """Ornstein and Uhlenbeck's process of variance 1, stationary from the beginning of each run and new in each.
+
+    Args:
+        g: of the draws.
+        trial: the runs.
+        fine: steps of the integration between two samples.
+        lasting: range of the correlation time, as a share of a run.
+    """
     intervals, runs = trial.samples - 1, trial.runs
-    constant = log_uniform(g, *SLOW) * intervals * trial.step
+    constant = log_uniform(g, *lasting) * intervals * trial.step
     keep = np.exp(-trial.step / fine / constant)
     values = normal(g, intervals * fine, runs).numpy()
     values[1:] *= np.sqrt(1.0 - keep**2)
@@ -78,7 +89,15 @@ def gusts(g: Generator, trial: Trial, fine: int) -> Push:
     return Push(np.repeat(values, fine, 0), covariance, {})
 
 
+SHORT = ("pushed_white", "pushed_slowly", "gusts")
+"""Worlds whose pushes act in other worlds too, in every second recording with something hidden."""
+
+LASTING_ALONE, LASTING_RUNS = "lasting_push", "lasting_push_runs"
+"""Worlds whose push lasts about as long as a run, in one run and in four; it acts in every recording of theirs."""
+
+_lasting = partial(slow, lasting=LASTING)
+
 KINDS: Mapping[str, Callable[[Generator, Trial, int], Push]] = MappingProxyType(
-    {"pushed_white": white, "pushed_slowly": slow, "gusts": gusts}
+    {"pushed_white": white, "pushed_slowly": slow, "gusts": gusts, LASTING_ALONE: _lasting, LASTING_RUNS: _lasting}
 )
 """By the world that has it."""

@@ -21,19 +21,29 @@ def magnetometer_worlds(duration: float = DURATION) -> Worlds:
         ['white', 'coloured', 'wander', 'bursts', 'orientations', 'useless']
     """
 
-    def world(name: str, sentence: str, asked: tuple[Threshold, ...]) -> World:
-        return World(name, sentence, partial(draw, name, duration), asked)
+    def world(name: str, sentence: str, asked: tuple[Threshold, ...], right: str) -> World:
+        return World(
+            name, sentence, partial(draw, name, duration), asked, right_to_say=right, wrong_to_say=aims.CLAIMED
+        )
 
     useless = partial(draw_useless, duration)
     return Worlds(
         "magnetometer",
         (
-            world("white", "white sensor noise", aims.WHITE),
-            world("coloured", "sensor noise correlated from sample to sample", aims.ORDINARY),
-            world("wander", "an offset that wanders", aims.ORDINARY),
-            world("bursts", "disturbances in some stretches", aims.ORDINARY),
-            world("orientations", "the sensor rests in one orientation after another", aims.WHITE),
-            World("useless", "the view cannot follow the recording", useless, aims.USELESS, hides=False),
+            world("white", "white sensor noise", aims.WHITE, aims.QUIET),
+            world("coloured", "sensor noise correlated from sample to sample", aims.ORDINARY, aims.NAMELESS),
+            world("wander", "an offset that wanders", aims.ORDINARY, aims.NAMELESS),
+            world("bursts", "disturbances in some stretches", aims.ORDINARY, aims.NAMELESS),
+            world("orientations", "the sensor rests in one orientation after another", aims.WHITE, aims.QUIET),
+            World(
+                "useless",
+                "the view cannot follow the recording",
+                useless,
+                aims.USELESS,
+                hides=False,
+                right_to_say="unfit",
+                wrong_to_say="adequate",
+            ),
         ),
         aims.TOTALS,
         {"duration_s": duration},

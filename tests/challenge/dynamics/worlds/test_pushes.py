@@ -13,7 +13,7 @@ from mkc_torch.challenge.dynamics.oracle import range_of, tangents
 from mkc_torch.challenge.dynamics.plant import Trial
 from mkc_torch.challenge.dynamics.scene import Scene
 from mkc_torch.challenge.dynamics.worlds.noise import OVER_NOISE, PushedErrors, draw_push, responses
-from mkc_torch.challenge.dynamics.worlds.pushes import GUSTS, KINDS, SLOW, gusts, slow, white
+from mkc_torch.challenge.dynamics.worlds.pushes import GUSTS, KINDS, LASTING, SLOW, gusts, slow, white
 
 STEP, FINE = 0.05, 8
 
@@ -51,6 +51,14 @@ def test_a_slow_push_forgets_exponentially():
         found = (values[lag:] * values[:-lag]).mean()
         assert found == pytest.approx(np.exp(-lag * STEP / constant), abs=0.03)
         assert many.covariance[0, 0, lag] == pytest.approx(np.exp(-lag * STEP / constant))
+
+
+def test_a_lasting_push_is_one_that_forgets_within_a_run_or_so():
+    many = KINDS["lasting_push_runs"](generator(2), trial(100, 4000), 1)
+    constant = many.words["correlation time"]
+    assert LASTING[0] <= constant / (99 * STEP) <= LASTING[1]
+    found = (many.fine[60:] * many.fine[:-60]).mean()
+    assert found == pytest.approx(np.exp(-60 * STEP / constant), abs=0.04)
 
 
 def test_gusts_are_level_in_some_stretches_and_absent_in_others():

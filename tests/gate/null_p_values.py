@@ -1,0 +1,152 @@
+"""The p-values of empty recordings, for each kind of noise: `python -m tests.gate.null_p_values --output DIR`.
+
+Draws empty recordings of a mass on a spring under six kinds of noise, searches each as `mkc diagnose` does, and takes
+the p-value of that search, which is `p_value` of `diagnosis.json`. Writes `p_values.json`, `null_p_values.svg` with a
+histogram for each kind, and `summary.md`: Kolmogorov's distance from the uniform distribution, and the share below the
+level with the interval of Clopper and Pearson. A run into the same folder goes on where it was ended.
+
+    python -m tests.gate.null_p_values --per-kind 40 --output null
+    python -m tests.gate.null_p_values --per-kind 5 --kinds white "held inputs" --output quick
+
+Above the level a p-value is only as fine as it has to be: the search draws noise until six draws come up to the
+recording, and asks no other kind of noise once one makes it likely.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mkc_torch.challenge.binomial import share, uniformity
+from mkc_torch.recording.recording import Recording
+from tests.gate.null_recordings import KINDS, Spring, recording
+
+LEVEL = 0.05
+BINS = 20
+
+PValue = Callable[[Recording, int], float]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run it; 0 whatever the p-values are like."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, required=True, help="folder for the p-values, picture and summary")
+    parser.add_argument("--per-kind", type=int, default=40, help="recordings of each kind")
+    parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS), help="kinds of noise")
+    parser.add_argument("--surrogates", type=int, default=199, help="draws of noise in each search")
+    parser.add_argument("--seed", type=int, default=1, help="of all recordings")
+    asked = parser.parse_args(arguments)
+    settings = {"seed": asked.seed, "surrogates": asked.surrogates}
+    found = run(asked.output, asked.kinds, asked.per_kind, settings)
+    rows = {kind: numbers(values) for kind, values in found.items()}
+    (asked.output / "summary.md").write_text("\n".join(table(rows)) + "\n", encoding="utf-8")
+    (asked.output / "null_p_values.svg").write_text(picture(found), encoding="utf-8")
+    print("\n".join(table(rows)))
+    return 0
+
+
+def run(
+    output: Path, kinds: Sequence[str], per_kind: int, settings: Mapping[str, Any], p_value: PValue | None = None
+) -> dict[str, list[float]]:
+    """The p-values of each kind, kept in ``p_values.json`` as they come, with those that are there of other kinds.
+
+    Args:
+        output: folder; what it has of the same settings is not searched again.
+        kinds: of :data:`KINDS`.
+        per_kind: recordings of each.
+        settings: ``seed`` and ``surrogates``.
+        p_value: of a recording, with so many surrogates; default :func:`searched`.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    file = output / "p_values.json"
+    stored = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    found: dict[str, list[float]] = stored["p_values"] if stored.get("settings") == dict(settings) else {}
+    started, search = time.process_time(), p_value or searched
+    for index in range(per_kind):
+        for kind in kinds:  # by turns, so that a run that is ended has as many of each
+            values = found.setdefault(kind, [])
+            if len(values) > index:
+                continue
+            values.append(search(recording(kind, 1000 * settings["seed"] + index), settings["surrogates"]))
+            file.write_text(json.dumps({"settings": dict(settings), "p_values": found}, indent=1), encoding="utf-8")
+            print(f"{index + 1}/{per_kind} {kind}: {values[-1]:.3g}", file=sys.stderr)
+    print(f"{time.process_time() - started:.0f} CPU seconds", file=sys.stderr)
+    return {kind: found[kind] for kind in KINDS if kind in found}
+
+
+def searched(empty: Recording, surrogates: int) -> float:
+    """The p-value of the first search; nothing that it finds is kept, which no p-value depends on."""
+    from mkc_torch import diagnose
+
+    return diagnose(Spring(), empty, surrogates=surrogates, level=LEVEL, max_findings=0).p_value
+
+
+def numbers(p_values: Sequence[float]) -> dict[str, float]:
+    """What a row of the table has.
+
+    Example:
+        >>> numbers([0.01, 0.2, 0.5, 0.9])["below"]
+        0.25
+    """
+    distance, p = uniformity(p_values)
+    below = share(sum(value <= LEVEL for value in p_values), len(p_values))
+    return {
+        "recordings": len(p_values),
+        "distance": distance,
+        "uniform_p": p,
+        "below": below.value,
+        "low": below.low,
+        "high": below.high,
+    }
+
+
+def table(rows: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """The table in Markdown."""
+    lines = [
+        f"| kind of noise | recordings | p ≤ {LEVEL:g} | 95 % interval | Kolmogorov's distance | p if uniform |",
+        "|---|---:|---:|---|---:|---:|",
+    ]
+    return lines + [
+        f"| {kind} | {row['recordings']:.0f} | {100.0 * row['below']:.1f} % "
+        f"| {100.0 * row['low']:.1f} to {100.0 * row['high']:.1f} % "
+        f"| {row['distance']:.2f} | {row['uniform_p']:.2g} |"
+        for kind, row in rows.items()
+    ]
+
+
+def picture(found: Mapping[str, Sequence[float]]) -> str:
+    """A histogram for each kind, with the height of a uniform distribution, as SVG."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    from mkc_torch.report.drawing import svg
+
+    across = min(3, len(found))
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "mkc", "font.size": 9.0}):
+        figure = Figure(figsize=(3.2 * across, 2.2 * math.ceil(len(found) / across)), layout="constrained")
+        axes = np.atleast_1d(
+            figure.subplots(math.ceil(len(found) / across), across, sharex=True, squeeze=False)
+        ).ravel()
+        for ax, (kind, values) in zip(axes, found.items(), strict=False):
+            counts, edges = np.histogram(values, np.linspace(0.0, 1.0, BINS + 1))
+            ax.stairs(counts, edges, fill=True, color="#7fb8da")
+            ax.axhline(len(values) / BINS, color="#D55E00", lw=1.2)
+            ax.set_title(f"{kind} ({len(values)})", fontsize=9, loc="left")
+            ax.spines[["top", "right"]].set_visible(False)
+            ax.margins(x=0)
+        for ax in axes[len(found) :]:
+            ax.set_visible(False)
+        figure.supxlabel("p-value of an empty recording", fontsize=9)
+        return svg(figure, "null", "Histograms of the p-values of empty recordings, one for each kind of noise")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,281 @@
+"""Statements of a report that exclude each other: a pair is a line of ``PAIRS``, what numbers rule out of ``RULES``."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from html.parser import HTMLParser
+from typing import Literal
+
+import torch
+from rich.console import Console
+
+from mkc_torch._words.terms import term
+from mkc_torch.cli.diagnosis_summary import show
+from mkc_torch.diagnosis.findings.worth import carries_over, sizeless, worth_correcting
+from mkc_torch.diagnosis.result import Diagnosis, Finding
+from mkc_torch.report.diagnosis.lead import lead
+from mkc_torch.report.diagnosis.page import diagnosis_report
+from mkc_torch.report.diagnosis.verdict import headline, to_do, warned
+
+Where = Literal["row", "finding", "report"]
+
+REASON = "|".join(
+    re.escape(term(f"evidence.{key}"))
+    for key in ("blocks_differ", "in_the_tail", "tail_less_likely", "free_run_farther", "free_run_closer")
+) + "|leaves the recording's range"  # fmt: skip
+"""Why likelihood and residual disagree."""
+
+CLAIM = r"[Ll]eft out of the simulation"
+PUSH = r"[Ss]omething unrecorded pushes|[Ss]omething slow is added"
+NUMBER = r"\d[\d.]*(?: × 10\S+)?"
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two patterns that may not both be in a row, what is said of a finding, or a report, unless a third is there."""
+
+    first: str
+    second: str
+    where: Where
+    unless: str = ""
+
+
+PAIRS = (
+    # unseen blocks
+    Pair("surely better", "no change", "row", r"\d % less"),
+    Pair("surely better", r"\d % more", "row", r"\d % less"),
+    Pair("surely better", "[Nn]ot confirmed", "finding"),
+    Pair("surely better", "free run is farther off", "row"),
+    Pair("surely better", rf"95 %: (−{NUMBER}|0(\.0+)?) to", "row"),
+    Pair("[Nn]ot confirmed on", r"\b([5-9]|\d\d) % less", "finding", REASON),
+    Pair("not shown to be better", r"\b([5-9]|\d\d) % less", "row", REASON),
+    Pair("(?<!surely )worse on unseen", r"\b([5-9]|\d\d) % less", "row", REASON),
+    Pair("worse on unseen", CLAIM, "finding"),
+    Pair("do not speak against it", rf"95 %: −{NUMBER} to −", "row", REASON),
+    Pair("do not speak against it", "[Nn]ot confirmed", "finding"),
+    Pair("differs by more than itself", rf"95 %: −{NUMBER} to −|95 %: [1-9]", "row"),
+    Pair("not measured", r"nats a sample", "row"),
+    # two sizes of the same name: of an output, robust, and of the fit's samples
+    Pair(r"held-out blocks residual, rms", r"→.*\), noise floor", "report"),
+    # what is missing
+    Pair("Nothing is missing", CLAIM, "report"),
+    Pair("Nothing is missing", "[Nn]earest in the catalogue", "report"),
+    Pair("Nothing is missing", "[Nn]ot confirmed|[Rr]eal, but small", "report", "worth correcting"),
+    Pair("Nothing is missing", PUSH, "report"),
+    Pair("Nothing is missing", "[Ss]tructure remains|remains along|does not follow|structure without a name", "report"),
+    Pair("no physics in the catalogue explains it", CLAIM, "report"),
+    Pair("No physics stands out", CLAIM, "report"),
+    Pair("Something is there that noise alone rarely makes", r"named +nothing surely", "report"),
+    Pair(r"named\W+nothing\b(?! surely)", f"{CLAIM}|[Nn]earest in the catalogue", "report"),
+    Pair(r"unexplained\W+nothing\b", f"Yet |{PUSH}|[Ss]tructure remains", "report", "explained"),
+    # what is left
+    Pair("What is left is the sensor's noise", PUSH, "report"),
+    Pair("What is left is the sensor's noise", "[Ss]tructure remains|remains along|Look for what drives", "report"),
+    Pair("anew at each sample", "is not white", "row"),
+    Pair(r"for about \S+ s at a time", "is white: it is new at each sample", "row"),
+    # what to do
+    Pair("Use the simulation as it is", f"{CLAIM}|{PUSH}|[Nn]earest in the catalogue", "report"),
+    Pair("Use the simulation as it is", "does not follow|[Ss]tructure remains|remains along|Do not rely", "report"),
+    Pair("Use the simulation as it is", "The model found here corrects|mkc apply", "report"),
+    Pair("Do not rely on this simulation", f"{CLAIM}|mkc apply|Use the simulation", "report"),
+    Pair("does not follow the recording", f"{CLAIM}|[Nn]earest in the catalogue|mkc apply", "report"),
+    # where
+    Pair("throughout the recording", r"mainly (from|in)|everywhere|first at|anew at|from \S+ s on", "row"),
+    Pair("everywhere", r"mainly (from|in)", "finding"),
+    # how sure
+    Pair(CLAIM, r"size is 0 within its standard error", "finding"),
+)
+
+Rule = Callable[[Diagnosis], bool]
+
+
+def _claims(d: Diagnosis) -> list[Finding]:
+    return [f for f in d.findings if f.grade in ("left out", "real but small")]
+
+
+def _moments(f: Finding) -> list[float]:
+    onset = [] if f.onset is None else [f.onset]
+    return [*onset, *(f.onset_interval or ()), *f.moments, *(moment for pair in f.intervals for moment in pair)]
+
+
+def _outside(d: Diagnosis) -> bool:
+    known = d.traces.time[d.traces.time.isfinite()]
+    low, high = float(known.min()), float(known.max())
+    edge = 1e-9 * max(abs(low), abs(high))
+    return any(not low - edge <= moment <= high + edge for f in d.findings for moment in _moments(f))
+
+
+def _advised(d: Diagnosis, start: str) -> list[str]:
+    return [sentence for sentence in d.advice if sentence.startswith(start)]
+
+
+def _claimed_and_refused(d: Diagnosis) -> bool:
+    """The same name is to be corrected for and not to be."""
+    use = " ".join(_advised(d, "The model found here corrects for")).partition(":")[0]
+    corrected = set(re.split(", | for ", use)[1:])
+    refused = [re.sub(r"(Do not correct for|Do not build|Leave) (.*?)( yet| in:| alone).*", r"\2", one)
+               for start in ("Do not correct", "Do not build", "Leave") for one in _advised(d, start)]  # fmt: skip
+    return bool(corrected.intersection(refused))
+
+
+def _two_residuals(d: Diagnosis) -> bool:
+    """A page's residuals of the simulation as it is: of unseen blocks in its table, and of the first finding."""
+    held = d.findings[0].held_out if d.findings else None
+    if held is None or held.outputs or len(d.traces.channels) > 1 or not math.isfinite(d.baseline.rmse):
+        return False
+    return not math.isclose(held.rmse_before, d.baseline.rmse, rel_tol=1e-6)
+
+
+RULES: dict[str, Rule] = {
+    "an interval or onset outside of the recording": _outside,
+    "an interval that ends before it begins": lambda d: any(a > b for f in d.findings for a, b in f.intervals),
+    "a claim whose size is 0 within its error": lambda d: any(sizeless(f) for f in _claims(d)),
+    "a claim above the level": lambda d: any(f.p_value > d.level for f in _claims(d)),
+    "a claim that is worse in the free run": lambda d: any(
+        f.held_out is not None
+        and not f.held_out.decides
+        and f.held_out.rmse_after > 1.05 * f.held_out.rmse_before
+        and not f.held_out.outputs
+        for f in _claims(d)
+    ),
+    "left out, and no form of the recording's": lambda d: any(
+        f.shape is not None and f.shape.curve is not None for f in _claims(d)
+    ),
+    "adequate with a finding": lambda d: d.verdict == "adequate" and bool(d.findings),
+    "adequate with a push": lambda d: d.verdict == "adequate" and bool(d.world.pushes),
+    "adequate with a forcing": lambda d: d.verdict == "adequate" and bool(d.world.forcing),
+    "adequate with what remains": lambda d: d.verdict == "adequate" and bool(d.remaining),
+    "adequate with a warning of a disturbance": lambda d: (
+        d.verdict == "adequate"
+        and any(re.search("pushes|is driven|disturbs|something smooth remains|more structure", w) for w in d.warnings)
+    ),
+    "explained without a claim": lambda d: d.verdict == "explained" and not _claims(d),
+    "explained with a finding that is no claim": lambda d: (
+        d.verdict == "explained" and len(_claims(d)) < len(d.findings)
+    ),
+    "explained with a push of a rate": lambda d: d.verdict == "explained" and any(p.at_rate for p in d.world.pushes),
+    "unfit with a finding": lambda d: d.verdict == "unfit" and bool(d.findings),
+    "unfit where every output is followed": lambda d: (
+        d.verdict == "unfit" and bool(d.world.follows) and all(one.explained > 0.9 for one in d.world.follows)
+    ),
+    "reasons why it does not follow where it does": lambda d: d.verdict != "unfit" and bool(d.world.reasons),
+    "to be corrected and not to be": _claimed_and_refused,
+    "a model to apply that nothing is worth": lambda d: (
+        bool(_advised(d, "The model found here")) and not any(carries_over(f) for f in d.findings)
+    ),
+    "not plausible, and to be corrected": lambda d: any(carries_over(f) and not f.plausible for f in d.findings),
+    "not to be told apart from itself": lambda d: any(
+        (a.effect, a.drivers, a.at) == (f.effect, f.drivers, "") for f in d.findings for a in f.alternatives
+    ),
+    "two residuals of the simulation as it is": _two_residuals,
+    "shares of runs that are no shares": lambda d: any(
+        f.experiments and not math.isclose(sum(f.experiments), 1.0, abs_tol=0.02) for f in d.findings
+    ),
+    "a floor above what is left by far, and adequate": lambda d: (
+        d.verdict == "adequate" and any(one.residual > 3.0 * one.noise_floor for one in d.world.follows)
+    ),
+    "worth correcting in an unfit simulation": lambda d: (
+        d.verdict == "unfit" and any(map(worth_correcting, d.findings))
+    ),
+    "numbers of the gain outside of their own interval": lambda d: any(
+        f.held_out is not None
+        and torch.isfinite(torch.tensor(f.held_out.confidence_interval)).all()
+        and not f.held_out.confidence_interval[0] <= f.held_out.log_likelihood_gain <= f.held_out.confidence_interval[1]
+        for f in d.findings
+    ),
+}
+
+
+def contradictions(diagnosis: Diagnosis, *, page: bool = True) -> list[str]:
+    """What contradicts itself in a diagnosis, its summary on the terminal, and its page.
+
+    Args:
+        diagnosis: the result.
+        page: with the whole page, whose pictures take a second; else with the box at its top.
+    """
+    told = [f"by its numbers: {name}" for name, broken in RULES.items() if broken(diagnosis)]
+    texts = {"terminal": terminal_rows(diagnosis), "box": box_rows(diagnosis)}
+    if page:
+        texts["page"] = page_rows(diagnosis_report(diagnosis))
+    for place, rows in texts.items():
+        told += [f"{place}: {found}" for found in _in_text(rows, diagnosis)]
+    return told
+
+
+def _in_text(rows: Sequence[str], d: Diagnosis) -> Iterator[str]:
+    alone = len(d.findings) == 1
+    for pair in PAIRS:
+        if pair.where == "row":
+            parts = list(rows)
+        elif pair.where == "finding":
+            parts = ["\n".join(rows)] if alone else _sections(rows)
+        else:
+            parts = ["\n".join(rows)]
+        for part in parts:
+            first, second = re.search(pair.first, part), re.search(pair.second, part)
+            if first and second and not (pair.unless and re.search(pair.unless, part)):
+                yield f"{first[0]!r} and {second[0]!r} in one {pair.where}: {part[:400]}"
+
+
+def _sections(rows: Sequence[str]) -> list[str]:
+    """What is said of each of several findings, which begin with a number."""
+    end = next((k for k, row in enumerate(rows) if re.match("[Tt]ogether", row)), None)
+    rows = [*rows[:end], *([] if end is None else rows[end + 1 :])]
+    begins = [k for k, row in enumerate(rows) if re.match(r"\d+( ·|  )", row)]
+    return ["\n".join(rows[a:b]) for a, b in zip(begins, [*begins[1:], len(rows)], strict=False)]
+
+
+def terminal_rows(diagnosis: Diagnosis) -> list[str]:
+    """The summary on a wide terminal, a row a label; lines that go on with a label belong to its row."""
+    out = io.StringIO()
+    show(Console(file=out, width=4000, color_system=None), diagnosis, [])
+    rows: list[str] = []
+    for line in out.getvalue().splitlines():
+        if line.startswith(" ") and rows:
+            rows[-1] += f"; {line.strip()}"
+        elif line.strip():
+            rows.append(line.rstrip())
+    return rows
+
+
+def box_rows(diagnosis: Diagnosis) -> list[str]:
+    """The box at the top of a page, with what to do and the warnings."""
+    rows = [headline(diagnosis), *(f"{question} {' '.join(lines)}" for question, lines in lead(diagnosis))]
+    return [row.replace("`", "") for row in [*rows, *to_do(diagnosis), *warned(diagnosis)]]
+
+
+class _Rows(HTMLParser):
+    """Rows of tables, paragraphs and headings, without styles and pictures."""
+
+    ENDS = frozenset(("tr", "p", "li", "h1", "h2", "h3", "figcaption", "summary", "pre", "footer"))
+    SKIPPED = frozenset(("style", "svg", "script", "title"))
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: list[str] = [""]
+        self.inside = 0
+
+    def handle_starttag(self, tag: str, attrs: Sequence[tuple[str, str | None]]) -> None:  # noqa: ARG002
+        self.inside += tag in self.SKIPPED
+        self.rows[-1] += " "
+
+    def handle_endtag(self, tag: str) -> None:
+        self.inside -= tag in self.SKIPPED
+        self.rows[-1] += " "
+        if tag in self.ENDS:
+            self.rows.append("")
+
+    def handle_data(self, data: str) -> None:
+        if not self.inside:
+            self.rows[-1] += data
+
+
+def page_rows(page: str) -> list[str]:
+    """The text of a page, a row of a table, a paragraph or a heading at a time."""
+    parser = _Rows()
+    parser.feed(page)
+    return [told for row in parser.rows if (told := " ".join(row.replace("\u00a0", " ").split()))]

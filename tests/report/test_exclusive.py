@@ -1,0 +1,230 @@
+"""No two statements of a report exclude each other; which ones do is the table in ``exclusive``."""
+
+import dataclasses
+import functools
+import re
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+pytest.importorskip("matplotlib")
+pytest.importorskip("jinja2")
+pytest.importorskip("rich")
+
+from mkc_torch import diagnose
+from mkc_torch.diagnosis.evidence import held_out_gain
+from mkc_torch.diagnosis.findings.advice import advice_of
+from mkc_torch.diagnosis.findings.worth import grade_of, sizeless
+from mkc_torch.diagnosis.result import Alternative, Diagnosis, HeldOut, Parameter, Sizes
+from mkc_torch.diagnosis.settings import EvidenceSettings
+from mkc_torch.diagnosis.verdict import Around, verdict_of
+from mkc_torch.diagnosis.world import Shape, World
+from mkc_torch.recording import demonstration
+from mkc_torch.simulation import Magnetometer
+from tests.diagnosis.factory import PUSHED, make_diagnosis, make_follows
+from tests.diagnosis.pushed import Pendulum, UpsideDown, swung
+from tests.report.exclusive import PAIRS, Pair, _in_text, contradictions, page_rows, terminal_rows
+
+END = 3.98  # s, of the factory's 200 samples
+LEVEL = 0.05
+LEFT = "In 1 of 25 blocks the free run leaves the recording's range."
+
+sizes = st.sampled_from((1e-3, 0.3, 0.57, 0.9996, 1.0, 1.004, 1.04, 1.3))
+"""Residual after over before."""
+
+
+@st.composite
+def held_outs(draw, unit="rad"):
+    gain = draw(st.floats(-0.5, 0.5))
+    low, high = (draw(st.floats(0.001, 0.6)) for _ in range(2))
+    before, ratio = draw(st.floats(0.01, 10.0)), draw(sizes)
+    outputs = {"angle": Sizes(before, ratio * before, unit)}
+    if draw(st.booleans()):
+        outputs["rate"] = Sizes(2.0 * before, 2.0 * draw(sizes) * before, "rad/s")
+    return HeldOut(
+        gain, (gain - low, gain + high), before, ratio * before, unit,
+        outputs if draw(st.booleans()) else {}, draw(st.sampled_from(("", LEFT))), decides=draw(st.booleans()),
+    )  # fmt: skip
+
+
+@st.composite
+def findings(draw, place):
+    (template,) = make_diagnosis(1, samples=20).findings
+    begin = draw(st.floats(0.0, END))
+    held = draw(st.none() | held_outs())
+    value = draw(st.floats(0.01, 5.0))
+    spans = ((begin, min(begin + 0.5, END)),) if draw(st.booleans()) else ()
+    finding = dataclasses.replace(
+        template,
+        effect=draw(st.sampled_from(("linear_drag", "coulomb_friction", "constant_force"))),
+        channels=(place,),
+        intervals=spans,
+        onset=draw(st.none() | st.just(begin)),
+        parameters=(Parameter("size", value, draw(st.none() | st.just(draw(st.floats(0.1, 2.0)) * value)), "m/s²"),),
+        p_value=draw(st.floats(0.001, LEVEL)),
+        alternatives=tuple(
+            Alternative("backlash", (), 3.0, draw(st.booleans())) for _ in range(draw(st.integers(0, 1)))
+        ),
+        plausible=draw(st.booleans()),
+        plausibility="such sizes occur",
+        evidence=(held_out_gain.said(held, "" if held else "One side of it is too short."),),
+    )
+    shape = draw(st.none() | st.just(Shape(40.0, 0.002, finding.curve, "x^1.5")) | st.just(Shape(0.5, 0.4)))
+    grade = "nearest in the catalogue" if shape is not None and shape.curve is not None else grade_of(finding)
+    return dataclasses.replace(finding, shape=shape, grade=grade)
+
+
+@dataclasses.dataclass
+class Case:
+    """A diagnosis that is told in few words where a test fails."""
+
+    diagnosis: Diagnosis
+
+    def __repr__(self):
+        d = self.diagnosis
+        return f"{d.verdict}: {[(f.effect, f.grade, f.held_out) for f in d.findings]}, {d.world.pushes}, {d.remaining}"
+
+
+@st.composite
+def diagnoses(draw):
+    """A diagnosis put together as ``assembled`` does it: grades, verdict and advice are the project's own."""
+    found = [draw(findings(place)) for place in ("rate of rate", "rate of angle", "torque")[: draw(st.integers(0, 3))]]
+    found = [one for one in found if not (one.grade == "not confirmed" and sizeless(one))]
+    white = draw(st.booleans())
+    pushes = () if draw(st.booleans()) else (dataclasses.replace(PUSHED, at_rate=draw(st.booleans())),)
+    noise = 0.005 * draw(st.floats(0.9, 1.2) if white and not pushes else st.floats(1.0, 20.0))
+    lost = draw(st.booleans()) and draw(st.booleans())
+    source = draw(st.sampled_from(("samples", "declared")))
+    one = make_follows(residual=0.36, explained=0.12) if lost else make_follows(residual=noise, floor_source=source)
+    known = Around((one,), (), SimpleNamespace(disturbed=SimpleNamespace(disturbances=pushes)), lost=lost)
+    if lost:
+        found = []
+    p_value = found[0].p_value if found else draw(st.floats(0.001, 1.0))
+    remaining = ("torque",) if draw(st.booleans()) and not lost else ()
+    structure = (p_value <= LEVEL and not found) or bool(remaining)
+    verdict = verdict_of(known, found, structure=structure, white=white, settings=EvidenceSettings())
+    reasons = ("Another start reaches 0.006 rad.",) if verdict == "unfit" else ()
+    world = World((one,), reasons, pushes, {"torque": "held"})
+    made = make_diagnosis(
+        0, samples=200, simulation="Pendulum", p_value=p_value, verdict=verdict, world=world, remaining=remaining,
+        warnings=(),
+    )  # fmt: skip
+    made = dataclasses.replace(made, findings=tuple(found))
+    held = [f.held_out for f in found if f.held_out is not None]
+    if held:
+        made = dataclasses.replace(
+            made,
+            baseline=dataclasses.replace(made.baseline, rmse=held[0].rmse_before),
+            corrected=dataclasses.replace(made.corrected, rmse=held[-1].rmse_after),
+        )
+    return Case(dataclasses.replace(made, advice=advice_of(made)))
+
+
+@settings(max_examples=250, deadline=None)
+@given(case=diagnoses())
+def test_no_summary_of_any_diagnosis_contradicts_itself(case):
+    assert contradictions(case.diagnosis, page=False) == []
+
+
+@pytest.mark.slow
+@settings(max_examples=25, deadline=None)
+@given(case=diagnoses())
+def test_no_page_of_any_diagnosis_contradicts_itself(case):
+    assert contradictions(case.diagnosis) == []
+
+
+REAL = {
+    "nothing hidden": lambda: diagnose(Pendulum(), swung("none", N=300)[0], surrogates=39),
+    "drag hidden": lambda: diagnose(Pendulum(), swung("none", N=300, drag=0.3)[0], surrogates=39),
+    "pushed slowly": lambda: diagnose(Pendulum(), swung("slow", N=300)[0], surrogates=39),
+    "gravity of the wrong sign": lambda: diagnose(UpsideDown(), swung("none", N=300)[0], surrogates=39),
+    "loudspeaker": lambda: diagnose(Magnetometer(), demonstration.simulated_recording()[0], surrogates=39),
+}
+
+
+@functools.cache
+def real(name):
+    return REAL[name]()
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("name", REAL)
+def test_no_report_of_a_recording_contradicts_itself(name):
+    assert contradictions(real(name)) == []
+
+
+@pytest.mark.parametrize("pair", PAIRS, ids=lambda pair: f"{pair.first[:30]}, {pair.second[:30]}")
+def test_a_pair_excludes_something_and_allows_either_alone(pair):
+    assert re.compile(pair.first).pattern
+    assert not re.search(pair.first, "")
+    assert not re.search(pair.second, "")
+    assert re.compile(pair.unless)
+
+
+SPOILT = {
+    "adequate with a finding": {"verdict": "adequate"},
+    "unfit with a finding": {"verdict": "unfit"},
+    "not confirmed": {"grade": "not confirmed"},
+    "outside of the recording": {"onset": 99.0},
+    "a claim above the level": {"p_value": 0.3},
+    "a claim whose size is 0": {"parameters": (Parameter("size", 0.1, 0.4, "µT"),)},
+    "an interval that ends before": {"intervals": ((2.0, 1.0),)},
+    "left out, and no form": {"shape": Shape(40.0, 0.002, make_diagnosis(1, samples=20).findings[0].curve)},
+    "to be corrected and not to be": {
+        "advice": (
+            "The model found here corrects for linear_drag: confirm it on a second recording.",
+            "Do not correct for linear_drag yet: blocks that the fit has not seen do not confirm it.",
+        )
+    },
+    "Use the simulation as it is": {"advice": ("Use the simulation as it is, within what this recording covers.",)},
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_a_report_that_contradicts_itself_is_caught(name):
+    made = make_diagnosis(1, samples=200)
+    (finding,) = made.findings
+    held = finding.held_out
+    made = dataclasses.replace(
+        made,
+        findings=(dataclasses.replace(finding, onset=1.0),),
+        baseline=dataclasses.replace(made.baseline, rmse=held.rmse_before),
+    )
+    assert contradictions(made, page=False) == []
+    of_finding = {k: v for k, v in SPOILT[name].items() if hasattr(finding, k) and k != "advice"}
+    of_all = {k: v for k, v in SPOILT[name].items() if k not in of_finding}
+    spoilt = dataclasses.replace(made, findings=(dataclasses.replace(made.findings[0], **of_finding),), **of_all)
+    assert any(name in told for told in contradictions(spoilt, page=False)), contradictions(spoilt, page=False)
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "held out  angle 0.300 → 0.300 rad (no change); surely better on unseen blocks; +0.3 nats a sample",
+        "held out  residual 1.00 → 0.06 m (94 % less); not shown to be better on unseen blocks",
+        "where  throughout the recording, mainly from 1.0 to 2.0 s",
+        "held out  unseen blocks do not speak against it; −0.3 nats a sample (95 %: −0.400 to −0.200)",
+        "Nothing is missing that this recording could show. linear drag: left out of the simulation",
+        "The simulation does not follow the recording. Use the simulation as it is",
+    ],
+)
+def test_each_kind_of_pair_is_found_in_a_text(row):
+    assert list(_in_text([row], make_diagnosis(1, samples=20)))
+
+
+def test_what_is_said_of_one_finding_is_not_held_against_another():
+    pair = Pair("surely better", "[Nn]ot confirmed", "finding")
+    assert pair in PAIRS
+    rows = ["1 · Drag", "surely better on unseen blocks", "2 · Friction", "not confirmed on unseen blocks"]
+    assert not list(_in_text(rows, make_diagnosis(2, samples=20)))
+    assert list(_in_text([*rows, "surely better on unseen blocks"], make_diagnosis(2, samples=20)))
+
+
+def test_a_page_and_a_terminal_are_read_row_by_row():
+    page = "<style>p{}</style><h1>One</h1><table><tr><th>where</th><td>from<br>1&nbsp;s</td></tr></table><p>two</p>"
+    assert page_rows(page) == ["One", "where from 1 s", "two"]
+    rows = terminal_rows(make_diagnosis(1, samples=20))
+    assert [row for row in rows if row.startswith("to do")] == [rows[-2]]
+    assert "confirm it on a second recording" in rows[-2]
