@@ -247,7 +247,7 @@ def _likelier(
     if running is None:
         model = free.model.with_term(term)
         starts = (torch.cat([free.parameters, gamma]), torch.cat([free.parameters, torch.zeros_like(gamma)]))
-        works = [partial(fitted_beside, free, model, one) for one in starts]
+        works = [partial(fitted_beside, free, model, one, graduate=False) for one in starts]
         tried = at_once(works, model.prepared, [term])
         running = shape_fitted(max(tried, key=lambda one: one.log_likelihood))
     running = _under_own_noise(running, base, declared, settings)
