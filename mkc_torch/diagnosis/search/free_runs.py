@@ -26,14 +26,14 @@ if TYPE_CHECKING:
 
 __all__ = ["free_runs", "linear_gains"]
 
-PHYSICS = 5
+PHYSICS = 8
 """Kinds of physics of which free runs are fitted."""
 
-SHAPES = 3
-"""Shapes of each that a fit begins with."""
+SHAPES = 2
+"""Shapes of each that fits begin with."""
 
 BEHIND_NATS, BEHIND_SHARE = 50.0, 0.5
-"""Candidates farther behind the largest gain than both of these, in nats and as a share of it, are not fitted."""
+"""Fits farther behind the largest gain than both of these, in nats and as a share of it, are given up."""
 
 
 def free_runs(free: FittedModel, terms: Sequence[Term], settings: Settings) -> list[tuple[int, FittedModel]]:
@@ -99,13 +99,14 @@ def linear_gains(
 
 
 def _chosen(gains: Sequence[float], terms: Sequence[Term]) -> list[int]:
-    """Each leading kind of physics at the shapes that gain most."""
+    """Each leading kind of physics at the shapes that gain most.
+
+    Lines at a fit that is far off say little of how much each gains, so none of the leading ones is left out for it.
+    """
     order = sorted(range(len(terms)), key=lambda number: -gains[number])
-    able = [terms[number].key for number in order if gains[number] > 0.0 and not terms[number].effect.is_curve]
-    keys = list(dict.fromkeys(able))[:PHYSICS]
-    largest = [max(gains[n] for n in order if terms[n].key == key) for key in keys]
-    near = [key for key, kept in zip(keys, _near(largest), strict=True) if kept]
-    return [n for key in near for n in [n for n in order if terms[n].key == key and gains[n] > 0.0][:SHAPES]]
+    able = [number for number in order if gains[number] > 0.0 and not terms[number].effect.is_curve]
+    keys = list(dict.fromkeys(terms[number].key for number in able))[:PHYSICS]
+    return [n for key in keys for n in [n for n in able if terms[n].key == key][:SHAPES]]
 
 
 def _near(gains: Sequence[float]) -> list[bool]:

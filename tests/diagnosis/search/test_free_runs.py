@@ -1,0 +1,134 @@
+"""Free runs of candidates find what process noise around a simulation that is far off hides."""
+
+import math
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.search.free_runs import (
+    BEHIND_NATS,
+    BEHIND_SHARE,
+    SHAPES,
+    free_runs,
+    linear_gains,
+)
+from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.effects import DYNAMICS
+from mkc_torch.recording import Recording
+from mkc_torch.simulation import Dynamics, Parameter
+
+STEP, SAMPLES, DRAG = 0.05, 240, 0.3
+
+
+class Cart(Dynamics):
+    """A cart that is driven by a force; nothing slows it."""
+
+    states = ("speed",)
+    inputs = ("force",)
+    parameters = {"gain": Parameter(1.0, lower=0.0)}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"speed": p.gain * u.force}
+
+
+def recording(drag, noise=0.01, seed=0):
+    time = STEP * torch.arange(SAMPLES, dtype=torch.float64)
+    force = 1.0 + torch.sin(0.9 * time)
+    speed, found, parts = 0.5, [], 50
+    for k in range(SAMPLES):
+        found.append(speed)
+        ahead = force[min(k + 1, SAMPLES - 1)]
+        for part in range(parts):
+            pushed = torch.lerp(force[k], ahead, (part + 0.5) / parts)
+            speed += STEP / parts * float(pushed - drag * speed * abs(speed))
+    generator = torch.Generator().manual_seed(seed)
+    seen = torch.tensor(found, dtype=torch.float64) + noise * torch.randn(SAMPLES, generator=generator).double()
+    return Recording({"time": time, "force": force, "speed": seen})
+
+
+def free_fit(drag):
+    prepared = Cart().prepare(recording(drag))
+    return fitted(JointModel(prepared), prepared.start())
+
+
+def of_physics(fit):
+    return candidate_terms(fit.model.prepared, (), DYNAMICS)
+
+
+def test_the_drag_that_is_left_out_leads_and_is_sized():
+    fit = free_fit(DRAG)
+    terms = of_physics(fit)
+    runs = free_runs(fit, terms, Settings())
+    number, best = max(runs, key=lambda one: one[1].log_likelihood)
+    by_effect = {terms[n].effect.id: run for n, run in runs}
+    assert "quadratic_drag" in by_effect
+    drag = by_effect["quadratic_drag"]
+    assert float(drag.parameters[-1]) == pytest.approx(DRAG, rel=0.02)
+    assert float(drag.residual.std()) == pytest.approx(0.01, rel=0.15)
+    assert drag.log_likelihood > best.log_likelihood - 2.0
+    assert drag.log_likelihood - fit.log_likelihood > 200.0
+    assert best.model.terms[-1].key == terms[number].key
+
+
+def test_gains_are_those_of_least_squares_within_the_range_of_the_physics():
+    fit = free_fit(DRAG)
+    terms = of_physics(fit)
+    gains, sizes = linear_gains(fit, terms, Settings())
+    assert len(gains) == len(sizes) == len(terms)
+    for term, gain, size in zip(terms, gains, sizes, strict=True):
+        assert gain >= 0.0
+        assert bool(((size >= term.effect.least) & (size <= term.effect.most)).all())
+    place = [term.effect.id for term in terms].index("linear_drag")
+    model = fit.model.with_term(terms[place])
+    start = torch.cat([fit.parameters, torch.zeros(1, dtype=torch.float64)])
+    columns = torch.func.jacfwd(model.residual)(start).flatten(0, 1)
+    left = torch.linalg.lstsq(columns, fit.residual.flatten().unsqueeze(-1)).solution
+    after = fit.residual.flatten() - columns @ left[:, 0]
+    own = columns[:, :-1]
+    before = fit.residual.flatten()
+    before = before - own @ torch.linalg.lstsq(own, before.unsqueeze(-1)).solution[:, 0]
+    expected = 0.5 * SAMPLES * math.log(float(before.square().sum() / after.square().sum()))
+    assert gains[place] == pytest.approx(expected, rel=1e-3)
+    assert sizes[place].tolist() == pytest.approx([-float(left[-1])], rel=1e-3)
+
+
+def test_a_drag_that_pushes_gains_nothing():
+    fit = free_fit(-0.03)
+    terms = of_physics(fit)
+    gains, sizes = linear_gains(fit, terms, Settings())
+    drags = [n for n, term in enumerate(terms) if term.effect.id == "quadratic_drag"]
+    assert [gains[n] for n in drags] == [0.0]
+    assert [sizes[n].tolist() for n in drags] == [[0.0]]
+
+
+def test_what_is_far_behind_is_given_up():
+    fit = free_fit(DRAG)
+    gains = [run.log_likelihood - fit.log_likelihood for _, run in free_runs(fit, of_physics(fit), Settings())]
+    assert min(gains) >= min(max(gains) - BEHIND_NATS, (1.0 - BEHIND_SHARE) * max(gains)) - 1e-6
+
+
+def test_each_leading_physics_is_fitted_from_its_best_shapes(monkeypatch):
+    tried = []
+
+    def fit_of(free, term, size):  # noqa: ARG001
+        tried.append(term)
+        return free
+
+    monkeypatch.setattr("mkc_torch.diagnosis.search.free_runs._fit", fit_of)
+    monkeypatch.setattr("mkc_torch.diagnosis.search.free_runs.PHYSICS", 3)
+    fit = free_fit(DRAG)
+    terms = of_physics(fit)
+    free_runs(fit, terms, Settings())
+    gains = dict(zip(map(id, terms), linear_gains(fit, terms, Settings())[0], strict=True))
+    keys = {term.key for term in tried}
+    assert len(keys) == 3
+    assert not any(term.effect.is_curve for term in tried)
+    for key in keys:
+        own = sorted((gains[id(term)] for term in terms if term.key == key), reverse=True)
+        assert (
+            sorted((gains[id(term)] for term in tried if term.key == key), reverse=True)
+            == [gain for gain in own if gain > 0.0][:SHAPES]
+        )
