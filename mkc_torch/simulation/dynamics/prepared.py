@@ -16,7 +16,7 @@ from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch._support.torch_internals import is_wrapped
 from mkc_torch.nonlinear import GaussianPrior, NoFitError, fit, load_forward_mode
 from mkc_torch.recording.recording import Recording
-from mkc_torch.simulation.continuation import Meaning
+from mkc_torch.simulation.continuation import Meaning, is_plain
 from mkc_torch.simulation.dynamics.between_samples import inputs_between
 from mkc_torch.simulation.dynamics.checks import Moments, check_functions
 from mkc_torch.simulation.dynamics.compiled.faithful import is_faithful
@@ -26,6 +26,7 @@ from mkc_torch.simulation.dynamics.first_guess import despiked, first_guess
 from mkc_torch.simulation.dynamics.observer import Observer
 from mkc_torch.simulation.dynamics.ports import RATES, Places, common_unit
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
+from mkc_torch.simulation.dynamics.settings import HORIZON
 from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, defect, marched, solve, stations
 from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
 from mkc_torch.simulation.dynamics.watched import Watched
@@ -301,12 +302,22 @@ class PreparedDynamics(Watched):
         if not found.converged and known is not None:
             found = solve(rate, self.grid, begin, self.with_memories(self.guess, memories), jump=jump)
         if not found.converged and known is None:
-            nearer = marched(rate, self.grid, begin, guess, jump=jump)
+            nearer = self._marched(theta, changes, guess, HORIZON)
             found = found if nearer is None else solve(rate, self.grid, begin, nearer, jump=jump)
         if not found.converged and patient:
-            nearer = marched(rate, self.grid, begin, guess, stride=_PATIENT, jump=jump)
+            nearer = self._marched(theta, changes, guess, _PATIENT)
             found = found if nearer is None else solve(rate, self.grid, begin, nearer, jump=jump)
         return found
+
+    def _marched(
+        self, theta: Tensor, changes: Changes, guess: Float[Tensor, "G w"], stride: int
+    ) -> Float[Tensor, "G w"] | None:
+        """A guess near the trajectory, solved over a horizon that grows; None where there is none."""
+        compiled = self.compiled(lambda parameters: (parameters, changes), len(theta)) if is_plain(theta) else None
+        if compiled is not None:
+            return compiled.marched(theta, guess, stride)
+        rate, jump = self.rate(theta, changes), self.jump(theta, changes)
+        return marched(rate, self.grid, self.first_states(theta, changes)[0], guess, stride=stride, jump=jump)
 
     def first_states(self, theta: Float[Tensor, " p"], changes: Changes) -> tuple[Float[Tensor, "K w"], list[str]]:
         """The states that the runs begin in, internal ones included, and the state that each of these begins like."""

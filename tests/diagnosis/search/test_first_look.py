@@ -93,8 +93,8 @@ def test_a_search_beside_a_finding_is_made_where_a_first_look_shows_something(mo
         begun.append(1)
         return locate(*arguments, **options)
 
-    def looked(*arguments):
-        seen.append(p_value_beside(*arguments))
+    def looked(*arguments, **options):
+        seen.append(p_value_beside(*arguments, **options))
         return seen[-1]
 
     monkeypatch.setattr(rounds, "locate", counted)

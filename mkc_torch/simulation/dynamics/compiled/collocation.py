@@ -198,40 +198,56 @@ def solved(functions: Functions, grid: ArrayGrid, guess: Array, factor: Factor |
     return None
 
 
-def marched(functions: Functions, grid: ArrayGrid, guess: Array) -> Array | None:
+def marched(functions: Functions, grid: ArrayGrid, guess: Array, stride: int = HORIZON) -> Array | None:
     """A guess near the trajectories, solved roughly over a horizon that grows; None where there is none.
 
-    As :func:`mkc_torch.simulation.dynamics.trajectory.marched` step for step.
+    As :func:`mkc_torch.simulation.dynamics.trajectory.marched`, but the horizon grows by twice as much after each
+    success, and by a quarter of that after each failure.
 
     Args:
         functions: the differential equation.
         grid: the moments.
         guess: (w, G), of all states; those where trajectories begin are kept.
+        stride: moments by which the horizon grows at least.
     """
     index = np.arange(guess.shape[1])
     first = np.maximum.accumulate(np.where(grid.begins, index, 0))
-    place, states = index - first, guess
-    for horizon in range(HORIZON, grid.longest + HORIZON, HORIZON):
+    place, states, horizon, growth = index - first, guess, 0, stride
+    while horizon < grid.longest:
         # beyond what is solved the last state stays
-        states = states[:, np.minimum(index, first + horizon - HORIZON)]
-        inside = place <= horizon
-        for _ in range(MOST_STEPS):
-            at = _Point(functions, grid, states)
-            left = np.where(inside[1:], at.defect, 0.0)
-            change = np.where(inside, _linearised(functions, grid, at).factor.solved(left[:, None])[:, 0], 0.0)
-            size = float(np.abs(change / at.scale).max())
-            if not size < np.inf:
-                return None
-            part, norm = 1.0, float(np.square(left / at.scale).mean())
-            for _ in range(HALVINGS):
-                after = np.where(inside[1:], _defect(functions, grid, states + part * change)[2], 0.0)
-                if float(np.square(after / at.scale).mean()) <= norm:
-                    break
-                part *= 0.5
-            states = states + part * change
-            if size * part < ROUGHLY:
-                break
+        held = states[:, np.minimum(index, first + horizon)]
+        tried, settled = _solved_to(functions, grid, held, place <= horizon + growth)
+        if not settled and growth > stride:
+            growth = max(stride, growth // 4)
+            continue
+        if tried is None:
+            return None
+        states, horizon = tried, horizon + growth
+        growth = 2 * growth if settled else stride
     return states
+
+
+def _solved_to(
+    functions: Functions, grid: ArrayGrid, states: Array, inside: np.ndarray[tuple[int], np.dtype[np.bool_]]
+) -> tuple[Array | None, bool]:
+    """States solved roughly at the moments inside, None where they are lost; and whether they came to rest."""
+    for _ in range(MOST_STEPS):
+        at = _Point(functions, grid, states)
+        left = np.where(inside[1:], at.defect, 0.0)
+        change = np.where(inside, _linearised(functions, grid, at).factor.solved(left[:, None])[:, 0], 0.0)
+        size = float(np.abs(change / at.scale).max())
+        if not size < np.inf:
+            return None, False
+        part, norm = 1.0, float(np.square(left / at.scale).mean())
+        for _ in range(HALVINGS):
+            after = np.where(inside[1:], _defect(functions, grid, states + part * change)[2], 0.0)
+            if float(np.square(after / at.scale).mean()) <= norm:
+                break
+            part *= 0.5
+        states = states + part * change
+        if size * part < ROUGHLY:
+            return states, True
+    return states, False
 
 
 def dense(values: Sequence[Array | float], places: Sequence[tuple[int, int]], shape: tuple[int, ...]) -> Array:

@@ -81,6 +81,16 @@ class CompiledDynamics:
         nearby = self._nearby(parameters, found.states, found.factor)
         return Answer(torch.from_numpy(np.ascontiguousarray(residual.T)), nearby)
 
+    def marched(
+        self, parameters: Float[Tensor, " p"], guess: Float[Tensor, "G w"], stride: int
+    ) -> Float[Tensor, "G w"] | None:
+        """States near the trajectory, by :func:`..collocation.marched` from a guess; None where there are none."""
+        values = parameters.tolist()
+        with np.errstate(all="ignore"):
+            begun = self._from(guess, self._first(values))
+            found = marched(self._functions(values), self._grid, begun, stride)
+        return None if found is None else torch.from_numpy(np.ascontiguousarray(found.T))
+
     def _begun(self, known: Trajectory, first: Array) -> tuple[Array, Factor | None]:
         """A trajectory nearby as a guess, and its equations linearised."""
         factor = None if known.linear is None else known.linear.factor
