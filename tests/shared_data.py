@@ -6,6 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2] / "shared" / "data"
 CASES = ROOT.parent / "cases"
+REAL = ROOT.parent / "real"
 
 
 def shared_data(path: str) -> Path:
@@ -16,6 +17,11 @@ def shared_data(path: str) -> Path:
 def shared_case(path: str) -> Path:
     """The same of the cases, each a recording with a simulation of it, whose right answer is known."""
     return _there(CASES / path)
+
+
+def shared_real(path: str) -> Path:
+    """The same of the real recordings whose missing physics is known."""
+    return _there(REAL / path)
 
 
 def _there(found: Path) -> Path:

@@ -10,7 +10,7 @@ import pytest
 
 from mkc_torch import Recording, diagnose
 from mkc_torch.simulation import load_simulation
-from tests.shared_data import shared_case
+from tests.shared_data import shared_case, shared_real
 
 AS_WRITTEN, CONFIRMED = "left out", ("left out", "real but small")
 INPUT, DRAG = "torque", ("linear_drag", "quadratic_drag", "power_law")
@@ -186,3 +186,49 @@ def test_the_fit_of_two_tanks_is_found_and_the_rest_is_not_called_noise():
     assert (level.unit, level.residual < 0.65) == ("V", True)
     assert level.explained > 0.9
     assert diagnosis.verdict in ("explained", "unexplained")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param("stiff_240", marks=pytest.mark.e2e), pytest.param("resonant_600", marks=slow)]
+)
+def test_a_load_on_a_flexible_shaft_is_a_hidden_mode(name):
+    diagnosis = diagnosed(f"two_mass/{name}.csv", "two_mass/naive.py:Drive")
+    assert diagnosis.verdict == "explained"
+    found = first(diagnosis, "hidden_mode", "rate of speed")
+    assert found.grade == AS_WRITTEN
+    assert value(found, "share") == pytest.approx(0.849, abs=0.02)
+    assert value(found, "period") == pytest.approx(0.2231, abs=0.001)
+
+
+@functools.cache
+def real(recording, simulation):
+    """Of a real recording whose missing physics is known, once."""
+    path, (file, name) = shared_real(recording), simulation.split(":")
+    return diagnose(load_simulation(f"{shared_real(file)}:{name}"), Recording.read(path))
+
+
+@pytest.mark.e2e
+def test_a_rocket_that_coasts_is_braked_by_the_square_of_its_speed():
+    diagnosis = real("rocket/juno.csv", "rocket/naive.py:Rocket")
+    assert diagnosis.verdict == "explained"
+    found = first(diagnosis, "quadratic_drag", "rate of speed")
+    assert found.grade == AS_WRITTEN
+    # by hand 9.2e-5 1/m
+    assert value(found, "drag") == pytest.approx(9.2e-5, rel=0.15)
+
+
+@pytest.mark.e2e
+def test_a_mug_loses_heat_by_a_high_power_of_its_temperature():
+    diagnosis = real("mug/run.csv", "mug/naive.py:Cooling")
+    assert diagnosis.verdict == "explained"
+    assert first(diagnosis, "power_law", "rate of temp").grade == AS_WRITTEN
+
+
+@slow
+def test_a_pendulum_on_a_shaft_is_stopped_by_dry_friction():
+    diagnosis = real("pendulum_encoder/run.csv", "pendulum_encoder/naive.py:Pendulum")
+    found = first(diagnosis, "coulomb_friction", "rate of speed")
+    assert found.grade == AS_WRITTEN
+    # by hand 0.206 rad/s²
+    assert value(found, "friction") == pytest.approx(0.206, rel=0.1)
+    assert "quadratic_drag" in confirmed(diagnosis)
