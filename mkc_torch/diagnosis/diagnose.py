@@ -28,6 +28,7 @@ from mkc_torch.diagnosis.joined import joined
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.in_the_world import at_liberty, between_samples, simulation_in_the_world
+from mkc_torch.diagnosis.model.step import with_smaller_step
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.rounds import Asked, begun, continued
 from mkc_torch.diagnosis.settings import Settings, quick_settings
@@ -172,14 +173,20 @@ def _diagnosed(
     known.world = world = between_samples(world, declared, fixed, settings.noise)
     known.fitted = True
     base = world.fit
-    terms = known.candidates[1]
     _refuse_no_noise(base, where)
+    finer = with_smaller_step(base, settings.noise)
+    if finer is not None:
+        return _diagnosed(known.anew(), finer, where, progress)
+    terms = known.candidates[1]
     if misses(alone(world, declared), settings.evidence.followed):
         # one effect may be what it lacks to follow; what it lacks beside that is told once it follows
         known.asked = asked = replace(asked, max_findings=min(asked.max_findings, 1))
     hopeless = lost_from_the_start(world)
     progress(f"trying {len(terms)} effects")
     search = begun(base, () if hopeless else terms, asked, generator, world.free, known.keep_search)
+    finer = with_smaller_step(search.found[-1].fit, settings.noise) if search.found else None
+    if finer is not None:
+        return _diagnosed(known.anew(), finer, where, progress)
     known.search, tests = search, known.tests
     common = [known.simulation, base, base.model, *common_parts(at_liberty(base.model.prepared), terms)]
     while search.left:

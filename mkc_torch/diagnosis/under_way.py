@@ -55,6 +55,11 @@ class UnderWay:
         """Remember what was found."""
         self.search = search
 
+    def anew(self) -> UnderWay:
+        """The same from the beginning; what is known stays until it is known anew."""
+        self._candidates = None
+        return self
+
     @property
     def tests(self) -> tuple[EvidenceTest, ...]:
         """The tests of evidence."""

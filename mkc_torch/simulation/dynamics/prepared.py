@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 __all__ = ["PreparedDynamics"]
 
 _FINEST = 8
+"""Steps of integration between two samples at most."""
 
 _PATIENT = 2
 """Moments at a time of a march that has to find its way."""
@@ -89,7 +90,7 @@ class PreparedDynamics(Watched):
 
     def _lay_out(self, parts: int) -> None:
         """Nodes and stations, each interval between samples in so many parts."""
-        N = len(self.time)
+        N, self.parts = len(self.time), parts
         inside = ~self.begins[1:]
         count = torch.where(inside, parts, 1)
         before = torch.arange(N - 1).repeat_interleave(count)
@@ -129,6 +130,16 @@ class PreparedDynamics(Watched):
         other = copy.copy(self)
         other.between = {**self.between, **between}
         other.inputs = other._between(self.inputs_at_rows)
+        for known in ("_start", "warnings"):
+            other.__dict__.pop(known, None)
+        return other
+
+    def finer(self) -> PreparedDynamics | None:
+        """The same with half the step of integration; None where the user set the step, or it is the smallest."""
+        if self.system.step is not None or 2 * self.parts > _FINEST:
+            return None
+        other = copy.copy(self)
+        other._lay_out(2 * self.parts)
         for known in ("_start", "warnings"):
             other.__dict__.pop(known, None)
         return other

@@ -1,0 +1,50 @@
+"""Whether a fit depends on the step of integration."""
+
+from __future__ import annotations
+
+import torch
+
+from mkc_torch.diagnosis.linearised.estimate import estimate
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.settings import NoiseSettings
+from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+
+__all__ = ["with_smaller_step"]
+
+MOVED_ERRORS = 0.5
+"""Standard errors by which half the step has to move a parameter for the step to matter."""
+
+NEGLIGIBLE = 1e-3
+"""Share of every parameter below which a move is not compared with its standard error."""
+
+
+def with_smaller_step(fit: FittedModel, settings: NoiseSettings) -> PreparedDynamics | None:
+    """The system with half the step, where that moves a parameter of the fit by more than half its standard error.
+
+    Args:
+        fit: of a simulation with or without effects.
+        settings: of the noise that standard errors are of.
+
+    Returns:
+        None where the step does not matter, where the user set it, or where it is as small as it gets.
+    """
+    known, model = fit.model.prepared, fit.model
+    if not isinstance(known, PreparedDynamics):
+        return None
+    finer = known.finer()
+    if finer is None:
+        return None
+    try:
+        again = fitted(JointModel(finer, model.terms), fit.parameters, fit.bound, graduate=False)
+    except NoFitError:
+        return None
+    move = (again.parameters - fit.parameters).abs()
+    # states at the start are no result
+    told = torch.ones_like(move, dtype=torch.bool)
+    told[model.base - known.beginnings : model.base] = False
+    if not bool((move > NEGLIGIBLE * fit.parameters.abs())[told].any()):
+        return None
+    error = estimate(fit, settings).standard_error
+    return finer.observed(None) if bool((move > MOVED_ERRORS * error)[told].any()) else None
