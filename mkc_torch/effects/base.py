@@ -67,6 +67,8 @@ class Effect(ABC):
         general: whether it has named ones as special cases, such as drags or an added mass; these go first where they
             do as well. Default False.
         unrecorded: whether it is a course along time that stands for a cause in no column; default False.
+        remembers: whether its change at a moment depends on the signal at other moments; of effects in series on an
+            input or an output those act first. Default False.
 
     Of its amplitude and its shape:
 
@@ -124,6 +126,7 @@ class Effect(ABC):
     is_curve: bool = False
     general: bool = False
     unrecorded: bool = False
+    remembers: bool = False
 
     least: float = -math.inf
     most: float = math.inf

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.effects.paired.alike import SEVERAL
 from mkc_torch.simulation.protocol import Changes, Port, Sizes
 
 if TYPE_CHECKING:
@@ -42,9 +43,16 @@ def output_ports(
         >>> [(name, port.kind, port.unit) for name, port in ports.items()]
         [('all outputs', 'outputs', 'rad'), ('output angle', 'output', 'rad')]
     """
-    ports = {ALL: Port(tuple(channels), unit, wanders=True, kind="outputs", run=run)}
+    several = dict.fromkeys(
+        [SEVERAL] * (len(channels) > 1 and len({units[name] for name in channels}) == 1), channels[0]
+    )
+    if several and all(_is_angle(name, units[name], measured[:, k]) for k, name in enumerate(channels)):
+        several["angle"] = channels[0]
+    of_all = dict.fromkeys(several, unit)
+    ports = {ALL: Port(tuple(channels), unit, True, kind="outputs", parts=several, part_units=of_all, run=run)}
     for k, name in enumerate(channels):
-        parts = {"own": name, "compared": name} | ({"fixed zero": name} if name in fixed else {})
+        known = ["fixed zero"] * (name in fixed) + ["angle"] * _is_angle(name, units[name], measured[:, k])
+        parts = dict.fromkeys(("own", "compared", *known), name)
         ports[f"output {name}"] = Port(
             (name,),
             units[name],
@@ -55,6 +63,37 @@ def output_ports(
             run=run,
         )
     return ports
+
+
+def _is_angle(name: str, unit: str, values: Float[Tensor, " N"]) -> bool:
+    """Whether an output is the angle of a joint: by its unit, or where that is not known by its name and its range."""
+    if unit:
+        return unit in ("rad", "°")
+    return bool(_JOINTS & set(name.lower().split("_"))) and float(values.abs().max()) <= _TURN
+
+
+_JOINTS = frozenset(
+    (
+        "angle",
+        "base",
+        "elbow",
+        "flex",
+        "hip",
+        "joint",
+        "knee",
+        "lift",
+        "pan",
+        "pitch",
+        "roll",
+        "shoulder",
+        "tilt",
+        "wrist",
+    )
+)
+"""Words of which the names of joints are made."""
+
+_TURN = 6.3
+"""Largest angle in rad of a joint that no unit tells of."""
 
 
 def changed_outputs(outputs: Float[Tensor, "N m"], channels: Sequence[str], changes: Changes) -> Float[Tensor, "N m"]:

@@ -37,6 +37,7 @@ class Backlash(ShareEffect):
     """
 
     id = "backlash"
+    remembers = True
     relative: Mapping[str, tuple[str, str]] = {"half_gap": ("own", "largest")}
     fitted_shape: Mapping[str, tuple[float, float]] = {"half_gap": (0.01, 0.5)}
     equation = "δu = γ (y − u),  y = max(u − c, min(u + c, y before))"

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mkc_torch.effects.base import GainEffect
 from mkc_torch.effects.context import Context, Shape
+from mkc_torch.effects.paired.alike import SEVERAL
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -26,7 +27,7 @@ class Offset(GainEffect):
 
     id = "offset"
     port = "output"
-    needs = ("own", "compared")
+    needs: tuple[str, ...] = ("own", "compared")
     gain = "offset"
     equation = "δy = γ"
     explanation = "What is measured lies beside what is simulated by a constant."
@@ -36,3 +37,10 @@ class Offset(GainEffect):
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
         return torch.ones_like(context.time)
+
+
+class SeveralOffsets(Offset):
+    """The same at all outputs, each beside what is simulated by a constant of its own."""
+
+    port = "outputs"
+    needs = (SEVERAL,)

@@ -1,0 +1,63 @@
+"""A joint that gravity pulls aside."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.effects.base import Effect
+from mkc_torch.effects.context import Context, Quantity, Shape
+from mkc_torch.effects.paired.alike import SEVERAL
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["GravitySag", "SeveralSag"]
+
+_PER_DEGREE = math.pi / 180.0
+
+
+class GravitySag(Effect):
+    """A joint sags under the weight that it carries, most where the link is level and not where it hangs.
+
+    A servo without integral action holds a load with a steady error: the load's torque over its stiffness. Within a
+    small range of angles a sag cannot be told from an offset.
+
+    Simulation: adds ``γ₁ cos y + γ₂ sin y`` to an output y that is an angle.
+    Drivers: none but the output.
+    Units: γ in the output's unit.
+    Plausible: up to 0.5 rad.
+    Source: static error of a proportional joint controller under gravity; Spong, Hutchinson & Vidyasagar, "Robot
+        Modeling and Control" (2006), 8.1.
+    """
+
+    id = "gravity_sag"
+    port = "output"
+    needs: tuple[str, ...] = ("own", "compared", "angle")
+    follows_signal = True
+    plausible = 0.5
+    plausible_unit = "rad"
+    equation = "δy = γ₁ cos y + γ₂ sin y"
+    explanation = "Gravity pulls the joint aside, by how far depends on its angle: it sags under its load."
+    advice = "Add the load's torque over the joint's stiffness, or feed gravity forward in its controller."
+    again = "a sag changes with the angle and the load, an offset does not"
+    source = "Spong, Hutchinson & Vidyasagar, Robot Modeling and Control (2006), 8.1"
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return tuple(Quantity(f"sag_by_{name}", len(context.channels), context.signal_unit) for name in ("cos", "sin"))
+
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:  # noqa: ARG002
+        angle = context.signal * (_PER_DEGREE if context.signal_unit == "°" else 1.0)
+        by_cos, by_sin = gamma.unflatten(0, (2, -1)).unbind()
+        return by_cos * torch.cos(angle) + by_sin * torch.sin(angle)
+
+
+class SeveralSag(GravitySag):
+    """The same at all joints, each with a sag of its own."""
+
+    port = "outputs"
+    needs = (SEVERAL, "angle")
