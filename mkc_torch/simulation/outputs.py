@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -43,15 +44,13 @@ def output_ports(
         >>> [(name, port.kind, port.unit) for name, port in ports.items()]
         [('all outputs', 'outputs', 'rad'), ('output angle', 'output', 'rad')]
     """
-    several = dict.fromkeys(
-        [SEVERAL] * (len(channels) > 1 and len({units[name] for name in channels}) == 1), channels[0]
-    )
-    if several and all(_is_angle(name, units[name], measured[:, k]) for k, name in enumerate(channels)):
-        several["angle"] = channels[0]
-    of_all = dict.fromkeys(several, unit)
-    ports = {ALL: Port(tuple(channels), unit, True, kind="outputs", parts=several, part_units=of_all, run=run)}
+    angles = [_is_angle(name, units[name], measured[:, k]) for k, name in enumerate(channels)]
+    alike = len(channels) > 1 and len({units[name] for name in channels}) == 1
+    joined = dict.fromkeys([SEVERAL, *["angle"] * all(angles)], channels[0]) if alike else {}
+    port = Port(tuple(channels), unit, wanders=True, kind="outputs", run=run)
+    ports = {ALL: replace(port, parts=joined, part_units=dict.fromkeys(joined, unit))}
     for k, name in enumerate(channels):
-        known = ["fixed zero"] * (name in fixed) + ["angle"] * _is_angle(name, units[name], measured[:, k])
+        known = ["fixed zero"] * (name in fixed) + ["angle"] * angles[k]
         parts = dict.fromkeys(("own", "compared", *known), name)
         ports[f"output {name}"] = Port(
             (name,),
@@ -73,22 +72,7 @@ def _is_angle(name: str, unit: str, values: Float[Tensor, " N"]) -> bool:
 
 
 _JOINTS = frozenset(
-    (
-        "angle",
-        "base",
-        "elbow",
-        "flex",
-        "hip",
-        "joint",
-        "knee",
-        "lift",
-        "pan",
-        "pitch",
-        "roll",
-        "shoulder",
-        "tilt",
-        "wrist",
-    )
+    "angle base elbow flex hip joint knee lift pan pitch roll shoulder tilt wrist yaw".split()  # noqa: SIM905
 )
 """Words of which the names of joints are made."""
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkc_torch.diagnosis.model.joint import in_order_of_the_chain
+from mkc_torch.effects.kinds import zero_of
 from mkc_torch.recording.recording import DEFAULT_UNITS
 from mkc_torch.simulation.dynamics.definition import Dynamics
 from mkc_torch.simulation.dynamics.ports import memory_at
@@ -229,14 +230,14 @@ def _parts(state: str, system: Dynamics) -> dict[str, str]:
     """Expressions of what an effect on the rate of a state refers to."""
     known = {name: one if isinstance(one, Parameter) else Parameter(one) for name, one in system.parameters.items()}
     position = next((name for name, rate in kinematic(system, known).items() if rate == state), state)
-    celsius = system.units.get(state, DEFAULT_UNITS.get(state, "")) == "°C"
+    zero = zero_of(system.units.get(state, DEFAULT_UNITS.get(state, "")))
     return {
         "own": f"x.{state}",
         **dict.fromkeys(("position", "angle", "deflection"), f"x.{position}"),
         "surroundings": f"u.{surroundings(system).get(state, '')}",
         "load": "load",
         "rate": f'self.plain_rates(time, x, u, p)["{state}"]',
-        "zero": "273.15" if celsius else "0.0",
+        "zero": repr(zero),
     }
 
 

@@ -45,6 +45,7 @@ DYNAMICS: tuple[Effect, ...] = (
     CubicStiffness(),
     PositionPeriodicForce(),
     PowerLaw("difference"),
+    PowerLaw("excess"),
     PowerLaw("position"),
     PowerLaw(),
     BoucWenHysteresis(),

@@ -48,7 +48,14 @@ class Delay(Effect):
 
 
 class SeveralDelays(Delay):
-    """The same at all outputs, each late by a time of its own; one for all if that does as well."""
+    """The same at all outputs, each late by a time of its own; one for all if that does as well.
+
+    Simulation: adds ``y(t − γ) − y(t)``, for each output.
+    Drivers: none but the outputs.
+    Units: γ in s.
+    Plausible: any size.
+    Source: that of :class:`Delay`.
+    """
 
     port = "outputs"
     needs = (SEVERAL,)

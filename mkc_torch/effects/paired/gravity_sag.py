@@ -57,7 +57,14 @@ class GravitySag(Effect):
 
 
 class SeveralSag(GravitySag):
-    """The same at all joints, each with a sag of its own."""
+    """The same at all joints, each with a sag of its own.
+
+    Simulation: adds ``γ₁ cos y + γ₂ sin y``, for each output.
+    Drivers: none but the outputs.
+    Units: γ in the outputs' unit.
+    Plausible: up to 0.5 rad.
+    Source: that of :class:`GravitySag`.
+    """
 
     port = "outputs"
     needs = (SEVERAL, "angle")

@@ -40,7 +40,14 @@ class Offset(GainEffect):
 
 
 class SeveralOffsets(Offset):
-    """The same at all outputs, each beside what is simulated by a constant of its own."""
+    """The same at all outputs, each beside what is simulated by a constant of its own.
+
+    Simulation: adds γ, for each output.
+    Drivers: none but the outputs.
+    Units: γ in the outputs' unit.
+    Plausible: any size.
+    Source: that of :class:`Offset`.
+    """
 
     port = "outputs"
     needs = (SEVERAL,)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.dynamics.backlash import played
+from mkc_torch.effects.courses import played
 from mkc_torch.effects.paired.alike import SEVERAL
 
 if TYPE_CHECKING:
@@ -61,7 +61,14 @@ class OutputBacklash(Effect):
 
 
 class SeveralBacklash(OutputBacklash):
-    """The same at all outputs, each with a gap of its own: the joints of an arm."""
+    """The same at all outputs, each with a gap of its own: the joints of an arm.
+
+    Simulation: adds ``p − y``, for each output.
+    Drivers: none but the outputs.
+    Units: γ, half the width of each gap, in the outputs' unit.
+    Plausible: γ ≥ 0.
+    Source: that of :class:`OutputBacklash`.
+    """
 
     port = "outputs"
     needs = (SEVERAL,)
