@@ -12,7 +12,7 @@ from mkc_torch.effects.runs import first_of_runs, passed_on, passed_on_within, r
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["after", "combined", "gained", "lagged", "per", "played"]
+__all__ = ["after", "combined", "gained", "in_contact", "lagged", "per", "played"]
 
 _LEAST = 1e-12
 
@@ -94,4 +94,26 @@ def played(
     """
     first = first_of_runs(run_numbers(time) if run is None else run)
     gap = torch.where(first, torch.zeros_like(values), half_gap)
-    return passed_on_within(values - gap, values + gap)
+    touched, side = in_contact(values.detach(), gap.detach())
+    return values[touched] + side * gap
+
+
+def in_contact(values: Float[Tensor, " N"], gap: Float[Tensor, " N"]) -> tuple[Int[Tensor, " N"], Float[Tensor, " N"]]:
+    """Where a load behind play was last in contact with its drive: the samples, and the sides, 0 where there is no gap.
+
+    By these what is behind play is differentiated without differentiating each step of the way.
+
+    Args:
+        values: of the drive.
+        gap: half the width of the gap at each sample; 0 at the first one of each run.
+
+    Example:
+        >>> in_contact(torch.tensor([0.0, 1.0, 3.0, 2.0]), torch.tensor([0.0, 1.0, 1.0, 1.0]))
+        (tensor([0, 1, 2, 2]), tensor([ 0., -1., -1., -1.]))
+    """
+    low, high = values - gap, values + gap
+    load = passed_on_within(low, high)
+    below, above = load == low, load == high
+    number = torch.arange(len(values), device=values.device)
+    touched = torch.where(below | above, number, torch.zeros_like(number)).cummax(0).values
+    return touched, (above.to(values.dtype) - below.to(values.dtype))[touched]

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.courses import played
+from mkc_torch.effects.courses import in_contact
 from mkc_torch.effects.paired.alike import SEVERAL
+from mkc_torch.effects.runs import first_of_runs
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -77,6 +78,9 @@ class SeveralBacklash(OutputBacklash):
 
 def _crossed(own: Float[Tensor, " N"], gap: Tensor, context: Context) -> Float[Tensor, " N"]:
     """What play adds to an output; its slope at no gap is that from a gap just above."""
-    start = torch.where(gap > 0.0, 0.0, _START * own.detach().abs().amax())
-    open_gap, closed = (played(own, context.time, one, context.runs) for one in (gap + start, start))
-    return open_gap - closed
+    known = own.detach()
+    size = torch.where(gap.detach() > 0.0, gap.detach(), _START * known.abs().amax())
+    inside = ~first_of_runs(context.runs)
+    touched, side = in_contact(known, size * inside)
+    behind = torch.where(gap > 0.0, own[touched], own)
+    return behind - own + side * gap * inside
