@@ -17,6 +17,9 @@ MOTION: tuple[Kind, ...] = ("angle", "rotation", "position", "speed")
 CELSIUS = ("°C", "degC", "deg_C", "celsius", "Celsius")
 """Ways to write degrees Celsius."""
 
+_JOINTS = "angle base elbow flex hip joint knee lift pan pitch roll shoulder tilt wrist yaw"
+"""Words of which the names of joints' angles are made."""
+
 _UNITS: dict[str, Kind] = {
     **dict.fromkeys((*CELSIUS, "K", "degK", "kelvin", "°F", "degF"), "temperature"),
     **dict.fromkeys(("rad", "°", "deg"), "angle"),
@@ -32,7 +35,7 @@ _NAMES: dict[str, Kind] = {
     **dict.fromkeys(("temp", "temperature", "indoor", "outdoor", "ambient"), "temperature"),
     **dict.fromkeys(("level", "tank"), "level"),
     **dict.fromkeys(("speed", "velocity"), "speed"),
-    **dict.fromkeys(("angle", "joint"), "angle"),
+    **dict.fromkeys(_JOINTS.split(), "angle"),
     **dict.fromkeys(("voltage", "volt", "volts"), "voltage"),
     "current": "current",
     "pressure": "pressure",

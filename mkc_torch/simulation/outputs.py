@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.effects.kinds import kind_of
 from mkc_torch.effects.paired.alike import SEVERAL
 from mkc_torch.simulation.protocol import Changes, Port, Sizes
 
@@ -66,15 +67,8 @@ def output_ports(
 
 def _is_angle(name: str, unit: str, values: Float[Tensor, " N"]) -> bool:
     """Whether an output is the angle of a joint: by its unit, or where that is not known by its name and its range."""
-    if unit:
-        return unit in ("rad", "°")
-    return bool(_JOINTS & set(name.lower().split("_"))) and float(values.abs().max()) <= _TURN
+    return kind_of(unit, name) == "angle" and (bool(unit) or float(values.abs().max()) <= _TURN)
 
-
-_JOINTS = frozenset(
-    "angle base elbow flex hip joint knee lift pan pitch roll shoulder tilt wrist yaw".split()  # noqa: SIM905
-)
-"""Words of which the names of joints are made."""
 
 _TURN = 6.3
 """Largest angle in rad of a joint that no unit tells of."""

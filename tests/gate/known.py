@@ -50,7 +50,8 @@ def real() -> Iterator[Known]:
     pan = Expected((("backlash",), ("input_delay", "input_lag", "delay", "sensor_lag")), residual={"pan": 1.2 * 0.0024})
     yield _known(REAL, "so101", "pan.csv", "Servo", pan)
     play = Expected(
-        (("backlash",), ("delay", "input_delay", "sensor_lag"), ("offset", "gravity_sag")), residual={"pan": 1.2 * 0.0024}
+        (("backlash",), ("delay", "input_delay", "sensor_lag"), ("offset", "gravity_sag")),
+        residual={"pan": 1.2 * 0.0024},
     )
     yield Known("real so101 recording", REAL / "so101" / "recording.csv", str(REAL / "so101" / "command.csv"), play)
     drag = Expected(((DRAG,),), sizes=(Size(DRAG, "drag", 9.2e-5, within=0.1),), residual={"altitude": 1.2 * 2.2})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -32,6 +33,13 @@ class Offset(GainEffect):
     equation = "δy = γ"
     explanation = "What is measured lies beside what is simulated by a constant."
     advice = "Check the sensor's zero, and where the simulator has its own."
+    by_kind: Mapping[str, tuple[str, str]] = {
+        "angle": (
+            "What is measured lies beside what is simulated by a constant, as a wrong zero or a load does.",
+            "Check the joint's zero. Where it carries a load, gravity pulls a servo aside like this: compare with the "
+            "load's torque over the joint's stiffness.",
+        ),
+    }
     again = "an offset is there without a signal too"
     source = "Doebelin, Measurement Systems (2003), 3.2"
 
