@@ -92,7 +92,7 @@ def test_a_second_effect_that_is_needed_too():
     pan = {"pan": 0.0025}
     assert judged(row(finding("backlash"), late, after=pan), REAL["real so101 pan Servo"])["right"]
     told = judged(row(finding("backlash"), after=pan), REAL["real so101 pan Servo"])["wrong"]
-    assert told == ["input_delay or delay or sensor_lag is not claimed but backlash"]
+    assert told == ["input_delay or input_lag or delay or sensor_lag is not claimed but backlash"]
 
 
 def test_a_claim_in_the_wrong_place_is_wrong():

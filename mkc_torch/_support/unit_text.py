@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 
-__all__ = ["quotient", "ratio", "sized", "tidy"]
+__all__ = ["duration", "quotient", "ratio", "sized", "tidy"]
 
 _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -35,6 +35,24 @@ def sized(value: float, unit: str = "") -> str:
     else:
         told = f"{value / 10.0**power:.4g} × 10{str(power).replace('-', '⁻').translate(_POWERS)}"
     return f"{told} {unit}".rstrip().replace("-", "−", 1) if value < 0 else f"{told} {unit}".rstrip()
+
+
+def duration(seconds: float) -> str:
+    """A time to two digits, in the unit that a person reads it in: s, min, h or d.
+
+    Example:
+        >>> duration(0.0312), duration(95.0), duration(420.0), duration(7560.0), duration(260000.0)
+        ('0.031 s', '95 s', '7 min', '2.1 h', '3 d')
+    """
+    for most, size, unit in _TIMES:
+        if abs(seconds) < most:
+            return sized(float(f"{seconds / size:.2g}"), unit)
+    return sized(float(f"{seconds / _DAY:.2g}"), "d")
+
+
+_DAY = 86400.0
+_TIMES = (120.0, 1.0, "s"), (7200.0, 60.0, "min"), (2.0 * _DAY, 3600.0, "h")
+"""Below how many seconds a time is told in a unit, the unit's seconds, and the unit."""
 
 
 def tidy(unit: str) -> str:

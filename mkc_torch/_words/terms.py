@@ -40,6 +40,7 @@ TERMS: dict[str, str] = {
     "verdict.left_out": "Left out of the simulation: {findings}.",
     "verdict.small": "Real, but small beside the noise: {findings}.",
     "verdict.unconfirmed": "Found, but not confirmed on [unit.unseen_blocks]: {findings}.",
+    "verdict.cannot_be": "Found, but of a size that cannot be right: {findings}.",
     "verdict.unconfirmed_and_small": "Found, but not confirmed on [unit.unseen_blocks] and too small to be worth"
     " correcting: {findings}.",
     "verdict.or_a_rival": "{finding}, or a rival",
@@ -69,6 +70,7 @@ TERMS: dict[str, str] = {
     "grade.left_out": "left out of the simulation",
     "grade.small": "real, but small beside the noise",
     "grade.not_confirmed": "not confirmed on [unit.unseen_blocks]",
+    "grade.cannot_be": "not confirmed, as its size cannot be right",
     "grade.nearest": "nearest in the catalogue",
     # how the simulation follows, and the noise of the world
     "world.follows_to": "{output} follows to {residual}; noise floor {floor}; explains {share} of its variation",

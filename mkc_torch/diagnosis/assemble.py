@@ -113,6 +113,7 @@ def assembled(whole: Whole, answers: Answers) -> Diagnosis:
             *_time_warnings(prepared),
             *answers.warnings,
             *(_no_size(one) for one in without_size),
+            *(doubt for one in findings for doubt in one.doubts),
         ),
         candidates=_candidates(first),
         separability=separability(first) if first else _nothing_to_separate(),

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mkc_torch.density.tails import ChannelTails
 from mkc_torch.diagnosis.world import Curve, Grade, Shape
+from mkc_torch.effects.kinds import Kind
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -211,6 +212,9 @@ class Finding:
     ``moments`` are those at which an effect sets in that does so several times, the first of them its onset.
     ``references`` are what the equation counts its drivers from, ``advice`` what to do about it, ``again`` what becomes
     of it in another recording; one that is ``placed`` belongs to the place or the attitude of this recording.
+    ``kind`` is what kind of quantity it acts on, such as "temperature"; empty where that is not known.
+    ``cannot_be`` says that its size cannot be right, see ``plausibility``; ``doubts`` are sentences on numbers of its
+    shape at the ends of their ranges.
     ``p_value`` is that after the whole search; None in a quick look, which draws no noise.
     ``grade`` is what it is worth, ``shape`` whether its name's shape is the recording's; None where that is not asked.
     ``evidence`` is what the tests say that are asked of each finding.
@@ -237,6 +241,9 @@ class Finding:
     advice: str = ""
     again: str = ""
     placed: bool = False
+    kind: Kind = ""
+    cannot_be: bool = False
+    doubts: tuple[str, ...] = ()
     grade: Grade = "left out"
     shape: Shape | None = None
     evidence: tuple[Told, ...] = ()

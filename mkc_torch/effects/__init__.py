@@ -15,11 +15,11 @@ from __future__ import annotations
 
 from mkc_torch.effects.base import Effect, GainEffect, in_words
 from mkc_torch.effects.context import Context, Quantity, Shape
-from mkc_torch.effects.courses import lagged
+from mkc_torch.effects.courses import lagged, played
 from mkc_torch.effects.dynamics import DYNAMICS
-from mkc_torch.effects.dynamics.backlash import played
 from mkc_torch.effects.dynamics.rate import beyond
 from mkc_torch.effects.dynamics.unknown_near_ends import curve_within
+from mkc_torch.effects.kinds import kind_of
 from mkc_torch.effects.paired import PAIRED
 from mkc_torch.effects.paired.between import shifted
 from mkc_torch.effects.sensor import ATTITUDE, SENSOR
@@ -46,6 +46,7 @@ __all__ = [
     "beyond",
     "curve_within",
     "is_curve",
+    "kind_of",
     "lagged",
     "played",
     "shifted",

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.courses import gained, per
+from mkc_torch.effects.kinds import kind_at
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -45,6 +46,8 @@ class Effect(ABC):
         equation: what it adds, in symbols; :meth:`equation_of` where the shape chooses its form.
         explanation: a sentence on what happens.
         advice: a sentence on what to do about it.
+        by_kind: explanation and advice by the kind of quantity that it acts on, such as "temperature", see
+            :mod:`mkc_torch.effects.kinds`, where the plain ones do not suit it; default none.
         again: what becomes of it in another recording, a clause such as "a warm-up comes again after a cold start";
             default empty, nothing is said of it.
         source: where the physics and its size are from.
@@ -67,6 +70,8 @@ class Effect(ABC):
         general: whether it has named ones as special cases, such as drags or an added mass; these go first where they
             do as well. Default False.
         unrecorded: whether it is a course along time that stands for a cause in no column; default False.
+        remembers: whether its change at a moment depends on the signal at other moments; of effects in series on an
+            input or an output those act first. Default False.
 
     Of its amplitude and its shape:
 
@@ -80,6 +85,8 @@ class Effect(ABC):
             least and greatest value, in the same shares where it is relative or continuous. ``change`` and
             ``quantities`` have to take it as a tensor, and ``change`` to have a slope in it. One that is always
             positive is fitted as its logarithm.
+        natural_ends: of numbers that are fitted, which end of the range, "least" or "greatest", is a value like any
+            other; at another end a number is to be doubted. Default none.
         choices: names of the numbers that choose a form and are not measured; the equation tells them.
         shape_units: name of a number of the shape to its unit, of those that have one whatever is recorded; default
             times that are called onset, lag, delay or time_constant.
@@ -108,6 +115,7 @@ class Effect(ABC):
     equation: str = ""
     explanation: str = ""
     advice: str = ""
+    by_kind: Mapping[str, tuple[str, str]] = {}
     again: str = ""
     source: str = ""
     plausible: float = math.inf
@@ -124,12 +132,14 @@ class Effect(ABC):
     is_curve: bool = False
     general: bool = False
     unrecorded: bool = False
+    remembers: bool = False
 
     least: float = -math.inf
     most: float = math.inf
     relative: Mapping[str, tuple[str, str]] = {}
     continuous: Mapping[str, tuple[float, float]] = {}
     fitted_shape: Mapping[str, tuple[float, float]] = {}
+    natural_ends: Mapping[str, tuple[str, ...]] = {}
     choices: tuple[str, ...] = ()
     shape_units: Mapping[str, str] = dict.fromkeys(("onset", "lag", "delay", "time_constant"), "s")
     along: str = ""
@@ -180,6 +190,14 @@ class Effect(ABC):
     def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002
         """The equation in the form that the shape chose; default ``equation``."""
         return self.equation
+
+    def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:  # noqa: ARG002
+        """The explanation for the kind of quantity that it acts on, with sizes where it tells them."""
+        return self.by_kind.get(kind_at(context), (self.explanation, self.advice))[0]
+
+    def advised(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:  # noqa: ARG002
+        """The advice for the kind of quantity that it acts on, with sizes where it tells them."""
+        return self.by_kind.get(kind_at(context), (self.explanation, self.advice))[1]
 
     def components(self, quantity: str, shape: Shape, context: Context) -> tuple[str, ...]:  # noqa: ARG002
         """What each number of a quantity is, in their order; default empty, they are one for each channel."""

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.effects.runs import first_of_runs, passed_on, run_numbers
+from mkc_torch.effects.runs import first_of_runs, passed_on, passed_on_within, run_numbers
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["after", "combined", "gained", "lagged", "per"]
+__all__ = ["after", "combined", "gained", "in_contact", "lagged", "per", "played"]
 
 _LEAST = 1e-12
 
@@ -71,3 +71,49 @@ def lagged(
     away = values - values[0]
     before = torch.cat([away[:1], away[:-1]])
     return values[0] + passed_on(keep, (late - keep) * before + (1.0 - late) * away)
+
+
+def played(
+    values: Float[Tensor, " N"],
+    time: Float[Tensor, " N"],
+    half_gap: float | Tensor,
+    run: Int[Tensor, " N"] | None = None,
+) -> Float[Tensor, " N"]:
+    """Values behind play, in the middle of the gap at the first sample of each run.
+
+    Args:
+        values: of the drive, at the samples.
+        time: of the samples in s.
+        half_gap: half the width of the gap, in the values' unit; at least 0.
+        run: of each sample's run; None where a run begins when time goes back, and only there.
+
+    Example:
+        >>> there_and_back = torch.tensor([0.0, 1.0, 3.0, 2.0, 1.0, 0.0])
+        >>> played(there_and_back, torch.arange(6.0), 1.0)
+        tensor([0., 0., 2., 2., 2., 1.])
+    """
+    first = first_of_runs(run_numbers(time) if run is None else run)
+    gap = torch.where(first, torch.zeros_like(values), half_gap)
+    touched, side = in_contact(values.detach(), gap.detach())
+    return values[touched] + side * gap
+
+
+def in_contact(values: Float[Tensor, " N"], gap: Float[Tensor, " N"]) -> tuple[Int[Tensor, " N"], Float[Tensor, " N"]]:
+    """Where a load behind play was last in contact with its drive: the samples, and the sides, 0 where there is no gap.
+
+    By these what is behind play is differentiated without differentiating each step of the way.
+
+    Args:
+        values: of the drive.
+        gap: half the width of the gap at each sample; 0 at the first one of each run.
+
+    Example:
+        >>> in_contact(torch.tensor([0.0, 1.0, 3.0, 2.0]), torch.tensor([0.0, 1.0, 1.0, 1.0]))
+        (tensor([0, 1, 2, 2]), tensor([ 0., -1., -1., -1.]))
+    """
+    low, high = values - gap, values + gap
+    load = passed_on_within(low, high)
+    below, above = load == low, load == high
+    number = torch.arange(len(values), device=values.device)
+    touched = torch.where(below | above, number, torch.zeros_like(number)).cummax(0).values
+    return touched, (above.to(values.dtype) - below.to(values.dtype))[touched]

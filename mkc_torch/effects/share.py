@@ -28,6 +28,7 @@ class ShareEffect(GainEffect):
 
     port = "input"
     follows_signal = True
+    natural_ends: Mapping[str, tuple[str, ...]] = {"softness": ("least", "greatest")}
     least, most = 0.0, 1.0
     needs: tuple[str, ...] = ("own",)
     plausible = 1.5

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from mkc_torch.effects.kinds import kind_of
+from mkc_torch.effects.paired.alike import SEVERAL
 from mkc_torch.simulation.protocol import Changes, Port, Sizes
 
 if TYPE_CHECKING:
@@ -42,9 +45,14 @@ def output_ports(
         >>> [(name, port.kind, port.unit) for name, port in ports.items()]
         [('all outputs', 'outputs', 'rad'), ('output angle', 'output', 'rad')]
     """
-    ports = {ALL: Port(tuple(channels), unit, wanders=True, kind="outputs", run=run)}
+    angles = [_is_angle(name, units[name], measured[:, k]) for k, name in enumerate(channels)]
+    alike = len(channels) > 1 and len({units[name] for name in channels}) == 1
+    joined = dict.fromkeys([SEVERAL, *["angle"] * all(angles)], channels[0]) if alike else {}
+    port = Port(tuple(channels), unit, wanders=True, kind="outputs", run=run)
+    ports = {ALL: replace(port, parts=joined, part_units=dict.fromkeys(joined, unit))}
     for k, name in enumerate(channels):
-        parts = {"own": name, "compared": name} | ({"fixed zero": name} if name in fixed else {})
+        known = ["fixed zero"] * (name in fixed) + ["angle"] * angles[k]
+        parts = dict.fromkeys(("own", "compared", *known), name)
         ports[f"output {name}"] = Port(
             (name,),
             units[name],
@@ -55,6 +63,15 @@ def output_ports(
             run=run,
         )
     return ports
+
+
+def _is_angle(name: str, unit: str, values: Float[Tensor, " N"]) -> bool:
+    """Whether an output is the angle of a joint: by its unit, or where that is not known by its name and its range."""
+    return kind_of(unit, name) == "angle" and (bool(unit) or float(values.abs().max()) <= _TURN)
+
+
+_TURN = 6.3
+"""Largest angle in rad of a joint that no unit tells of."""
 
 
 def changed_outputs(outputs: Float[Tensor, "N m"], channels: Sequence[str], changes: Changes) -> Float[Tensor, "N m"]:

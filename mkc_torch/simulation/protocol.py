@@ -135,6 +135,17 @@ class Port:
     run: Int[Tensor, " G"] | None = None
     memory: Mapping[str, str] = field(default_factory=dict)
 
+    def in_series(self, name: str) -> bool:
+        """Whether effects at this port, called ``name``, act in series, each on the output of the one before.
+
+        Effects on an input or an output are parts of one signal chain; forces on a rate add up.
+
+        Example:
+            >>> Port(("u",), "V", kind="input").in_series("input u"), Port(("v",), "m/s²").in_series("rate of v")
+            (True, False)
+        """
+        return (self.kind or name) in ("input", "output", "outputs")
+
     def at(self, values: Float[Tensor, N * rest]) -> Float[Tensor, G * rest]:
         """Values of the samples, at the moments of this port's signal."""
         return values if self.clock is None else self.clock.at(values)

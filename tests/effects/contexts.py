@@ -3,6 +3,7 @@
 import torch
 
 from mkc_torch.effects import DYNAMICS, PAIRED, Context
+from mkc_torch.effects.paired.alike import SEVERAL
 from mkc_torch.simulation.outputs import ALL, output_ports
 from mkc_torch.simulation.protocol import Sizes
 
@@ -61,17 +62,21 @@ def oscillating(N, count):
 def paired_context(effect, N=120):
     """What the effect sees of an output in V that is compared with a simulated one."""
     time = torch.arange(N, dtype=torch.float64) / 10.0
-    signal = (2.0 * torch.sin(1.3 * time) + 0.2).unsqueeze(-1)
-    port = output_ports(("y",), {"y": "V"}, "V", signal, ("y",))[ALL if effect.port == "outputs" else "output y"]
+    names = ("y", "z") if SEVERAL in effect.needs else ("y",)
+    signal = torch.stack([2.0 * torch.sin((1.3 + 0.4 * k) * time) + 0.2 for k, _ in enumerate(names)], -1)
+    unit = "rad" if "angle" in effect.needs else "V"
+    ports = output_ports(names, dict.fromkeys(names, unit), unit, signal, names)
+    port = ports[ALL if effect.port == "outputs" else "output y"]
+    assert set(effect.needs) <= set(port.parts)
     drivers = torch.cos(0.7 * time).unsqueeze(-1) if effect.roles else time.new_zeros(N, 0)
-    return Context(time, drivers, ("A",) if effect.roles else (), signal, "V", ("y",), (), port.parts, port.part_units)
+    return Context(time, drivers, ("A",) if effect.roles else (), signal, unit, names, (), port.parts, port.part_units)
 
 
 def contexts_of(effect):
     """Every kind of context that an effect of the catalogue, or a sensor effect of a user's own, can be in."""
     if effect.port == "heading":
         return (heading_context(),)
-    if effect in PAIRED:
+    if effect in PAIRED or any(type(one.simpler) is type(effect) for one in PAIRED if one.simpler):
         return (paired_context(effect),)
     if effect in DYNAMICS or any(type(one.simpler) is type(effect) for one in DYNAMICS if one.simpler):
         return (dynamic_context(effect), *([dynamic_context(effect, driven=True)] if effect.roles else []))

@@ -98,16 +98,20 @@ def test_ids_are_the_contract():
     )  # fmt: skip
     assert tuple(effect.id for effect in ATTITUDE) == ("heading_reset",)
     assert tuple(effect.id for effect in PAIRED) == (
-        "gain", "offset", "delay", "clock_drift", "output_saturation", "driver_linear", "driver_quadratic",
+        "gain", "offset", "delay", "clock_drift", "backlash", "output_saturation", "gravity_sag", "offset", "delay",
+        "backlash", "gravity_sag", "driver_linear", "driver_quadratic",
     )  # fmt: skip
     assert {effect.id for effect in DYNAMICS} >= {
         "constant_force", "linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction",
         "load_dependent_friction", "cubic_stiffness", "position_periodic_force", "coupling", "hard_stop", "overflow",
         "thermal_loss", "input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "bouc_wen_hysteresis",
-        "added_mass", "magnus_lift", "buoyancy", "hidden_lag", "hidden_mode", "power_law",
+        "added_mass", "magnus_lift", "buoyancy", "hidden_lag", "hidden_mode", "power_law", "input_lag", "input_square",
     }  # fmt: skip
     assert (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED) == CATALOGUE
-    several = ("unknown", "field_gradient", "power_law", "linear_drag", "thermal_loss")
+    several = (
+        "unknown", "field_gradient", "power_law", "linear_drag", "thermal_loss", "backlash", "delay", "offset",
+        "gravity_sag",
+    )  # fmt: skip
     named = [effect.id for effect in CATALOGUE if effect.id not in several]
     assert len(set(named)) == len(named)
 
@@ -117,10 +121,10 @@ def test_what_effects_can_do_beside():
     assert {e.id for e in CATALOGUE if type(e).anchored is not Effect.anchored} == {"unknown"}
     assert {type(e) for e in CATALOGUE if e.has_basis} == {FieldGradient, MagneticPole}
     assert {e.id for e in CATALOGUE if e.has_code} == {e.id for e in DYNAMICS} | {"output_saturation"}
-    assert {e.id for e in CATALOGUE if e.simpler} == {"coupling", "sensor_lag"}
+    assert {e.id for e in CATALOGUE if e.simpler} == {"coupling", "sensor_lag", "delay"}
     assert {e.id: e.reduces_to.id for e in CATALOGUE if e.reduces_to} == {"stribeck_friction": "coulomb_friction"}
     assert {e.id for e in CATALOGUE if e.is_curve} == {"unknown"}
-    assert {e.id for e in CATALOGUE if e.general} == {"power_law", "hidden_lag", "hidden_mode"}
+    assert {e.id for e in CATALOGUE if e.general} == {"power_law", "hidden_lag", "hidden_mode", "gravity_sag"}
     assert {e.id for e in SENSOR if e.continuous} == {"hard_iron_step", "offset_drift", "temperature_offset"}
     assert {e.id for e in CATALOGUE if not e.has_course} & {"hard_iron_step", "linear_drag", "gain"} == set()
 

@@ -5,8 +5,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from mkc_torch.effects.courses import lagged
-from mkc_torch.effects.dynamics.backlash import played
+from mkc_torch.effects.courses import lagged, played
 from mkc_torch.effects.dynamics.bouc_wen_hysteresis import hysteretic_path
 from mkc_torch.effects.paired.between import shifted
 from mkc_torch.effects.runs import passed_on, passed_on_within

@@ -38,7 +38,7 @@ class Known:
 DRAG = "quadratic_drag"
 CURVE = "unknown"
 HIDDEN_STORE = "hidden_lag"
-LATE = ("input_delay", "hidden_lag", "sensor_lag")
+LATE = ("input_delay", "input_lag", "hidden_lag", "sensor_lag")
 USEFUL = ("explained", "unexplained")
 
 
@@ -47,10 +47,11 @@ def real() -> Iterator[Known]:
     hidden_mass = Expected(((HIDDEN_STORE,),), verdicts=USEFUL)
     for number in (1, 2):
         yield _known(REAL, "house", f"house_{number}.csv", "House", hidden_mass)
-    pan = Expected((("backlash",), ("input_delay", "delay", "sensor_lag")), residual={"pan": 1.2 * 0.0024})
+    pan = Expected((("backlash",), ("input_delay", "input_lag", "delay", "sensor_lag")), residual={"pan": 1.2 * 0.0024})
     yield _known(REAL, "so101", "pan.csv", "Servo", pan)
     play = Expected(
-        (("backlash",), ("delay", "input_delay", "sensor_lag"), ("offset",)), residual={"pan": 1.2 * 0.0024}
+        (("backlash",), ("delay", "input_delay", "sensor_lag"), ("offset", "gravity_sag")),
+        residual={"pan": 1.2 * 0.0024},
     )
     yield Known("real so101 recording", REAL / "so101" / "recording.csv", str(REAL / "so101" / "command.csv"), play)
     drag = Expected(((DRAG,),), sizes=(Size(DRAG, "drag", 9.2e-5, within=0.1),), residual={"altitude": 1.2 * 2.2})
@@ -71,7 +72,7 @@ def cases() -> Iterator[Known]:
     stiff = Expected(mode, sizes=[Size("hidden_mode", name, value, errors=2.0) for name, value in sizes.items()])
     yield _known(CASES, "two_mass", "stiff_240.csv", "Drive", stiff)
     yield _known(CASES, "two_mass", "resonant_600.csv", "Drive", Expected(mode))
-    arm = Expected((("dead_zone", "power_law", CURVE), LATE), residual={"angle": 0.045})
+    arm = Expected((("input_square", "dead_zone", "power_law", CURVE), LATE), residual={"angle": 0.045})
     yield _known(CASES, "propeller_arm", "run.csv", "Arm", arm, between={"voltage": "held"})
     overflow = Expected((("overflow", CURVE),), places=("level1",), residual={"level2": 1.2 * 0.41})
     yield _known(CASES, "tanks", "fit.csv", "Tanks", overflow)

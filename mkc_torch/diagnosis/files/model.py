@@ -16,7 +16,7 @@ from mkc_torch.diagnosis.correcting_model import CorrectingModel
 from mkc_torch.diagnosis.files.python_source import SourceError, python_source
 from mkc_torch.diagnosis.linearised.estimate import Estimate
 from mkc_torch.diagnosis.model.drivers import Driver
-from mkc_torch.diagnosis.model.joint import summed
+from mkc_torch.diagnosis.model.joint import in_order_of_the_chain, summed
 from mkc_torch.diagnosis.model.term import Term, context_at
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
@@ -95,12 +95,15 @@ class DiagnosedModel(CorrectingModel):
         correction = correction_of(self.simulation, self.state, recording, self.source)
         changes: dict[str, Change] = {}
         notes = []
-        for term, gamma in zip(self.terms, self.gammas, strict=True):
+        for number in in_order_of_the_chain(self.terms, range(len(self.terms))):
+            term, gamma = self.terms[number], self.gammas[number]
             port = term.port
             if port not in correction.ports:
                 notes.append(f"{term.effect.id} belongs to the place of the diagnosed recording and is left out.")
                 continue
-            changes[port] = summed(changes.get(port), self._change(term, gamma, correction, recording))
+            series = correction.ports[port].in_series(port)
+            change = self._change(term, gamma, correction, recording)
+            changes[port] = summed(changes.get(port), change, series=series)
             if term.effect.lasts:
                 notes.append(
                     f"{term.effect.id} is bound to the time of the diagnosed recording: its offset at the end is taken "
@@ -260,7 +263,13 @@ def _effect(entry: Mapping[str, Any], known: Sequence[Effect]) -> Effect:
         )
     numbers = set(entry["shape"])
     of_shape = [one for one in same if set(one.relative) <= numbers]
-    effect = max(of_shape or same, key=lambda one: (-len(set(one.choices) - numbers), len(set(one.choices) & numbers)))
+
+    def fitting(one: Effect) -> tuple[int, int, int, bool]:
+        own, at = {*one.fitted_shape, *one.relative}, str(entry.get("port", "")).partition(" ")[0]
+        choices = set(one.choices)
+        return -len(choices - numbers), len(choices & numbers), len(own & numbers), one.port == at
+
+    effect = max(of_shape or same, key=fitting)
     lost = sorted({*effect.fitted_shape, *effect.relative} - numbers)
     if lost:
         raise ModelFileError(

@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mkc_torch.diagnosis.model.joint import in_order_of_the_chain
+from mkc_torch.effects.kinds import zero_of
 from mkc_torch.recording.recording import DEFAULT_UNITS
 from mkc_torch.simulation.dynamics.definition import Dynamics
 from mkc_torch.simulation.dynamics.ports import memory_at
@@ -66,9 +68,12 @@ def python_source(
     memories = {name: like for term in terms for name, like in _memories(term).items()}
     inputs: list[str] = []
     outputs: list[str] = []
-    for term, gamma in zip(terms, gammas, strict=True):
+    for number in in_order_of_the_chain(terms, range(len(terms))):
+        term, gamma = terms[number], gammas[number]
         lines = _lines(term, [_rounded(float(one)) for one in gamma], system, measured)
         place = outputs if term.port == "output" else inputs if term.port.startswith("input ") else rates
+        if place is outputs and outputs:
+            place.append("y = dict(shown)")  # the next one acts on what this one shows
         place += [f"# {term.effect.id}: {term.effect.equation}", *lines]
     told = ", ".join(term.effect.words for term in terms) or "nothing more"
     body = [
@@ -209,7 +214,7 @@ def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Seque
         names = {"own": f"x.{one}", "other": f"x.{other}"}
     elif term.port.startswith("input "):
         name = term.port.removeprefix("input ")
-        targets, names = [f"acting.{name}"], {"own": f"u.{name}"}
+        targets, names = [f"acting.{name}"], {"own": f"acting.{name}"}
     else:
         targets, names = [f'shown["{name}"]' for name in measured], {name: f'y["{name}"]' for name in measured}
     added = term.effect.code(gamma, shape, names)
@@ -225,14 +230,14 @@ def _parts(state: str, system: Dynamics) -> dict[str, str]:
     """Expressions of what an effect on the rate of a state refers to."""
     known = {name: one if isinstance(one, Parameter) else Parameter(one) for name, one in system.parameters.items()}
     position = next((name for name, rate in kinematic(system, known).items() if rate == state), state)
-    celsius = system.units.get(state, DEFAULT_UNITS.get(state, "")) == "°C"
+    zero = zero_of(system.units.get(state, DEFAULT_UNITS.get(state, "")))
     return {
         "own": f"x.{state}",
         **dict.fromkeys(("position", "angle", "deflection"), f"x.{position}"),
         "surroundings": f"u.{surroundings(system).get(state, '')}",
         "load": "load",
         "rate": f'self.plain_rates(time, x, u, p)["{state}"]',
-        "zero": "273.15" if celsius else "0.0",
+        "zero": repr(zero),
     }
 
 

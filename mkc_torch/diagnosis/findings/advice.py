@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from mkc_torch._support.unit_text import tidy
 from mkc_torch.diagnosis.findings.following import follows_all
@@ -10,6 +10,7 @@ from mkc_torch.diagnosis.findings.worth import carries_over, change, worth_corre
 from mkc_torch.diagnosis.result import Alternative, Diagnosis, Finding
 from mkc_torch.diagnosis.world import Push
 from mkc_torch.effects import is_curve
+from mkc_torch.effects.kinds import MOTION
 
 __all__ = ["advice_of", "nothing_shows"]
 
@@ -86,7 +87,7 @@ def _of(finding: Finding, d: Diagnosis) -> Iterator[str]:
         return
     if not worth_correcting(f):
         yield _hold_back(f, d)
-    elif not f.plausible:
+    elif not f.plausible and not f.cannot_be:
         yield f"The size of {_called(f, d)} is not plausible: look for another cause before correcting it."
     if near:
         yield _tell_apart(f, near)
@@ -121,6 +122,11 @@ def _hold_back(finding: Finding, d: Diagnosis) -> str:
         return (
             f"Leave {_called(f, d)} alone, unless means over many samples matter: it makes the residual of a sample "
             f"smaller by {max(100.0 * change(f.held_out), 0.0):.1f} % only."
+        )
+    if f.cannot_be:
+        return (
+            f"Do not correct for {_called(f, d)}: {_small_letter(f.plausibility)} Look for other physics that acts at the "
+            "same place."
         )
     wider = f", with {', '.join(f.drivers)} over a wider range," if f.drivers else ","
     return (
@@ -164,4 +170,15 @@ def _how(finding: Finding, near: Sequence[Alternative]) -> str:
     clauses = list(dict.fromkeys(one.again for one in every if one.again and not one.drivers))
     if columns:
         clauses.append(f"what follows {', '.join(columns)} goes along with it, so let that change at other times")
-    return f": {'; '.join(clauses)}" if clauses else " at other speeds, loads and amplitudes"
+    return f": {'; '.join(clauses)}" if clauses else _OTHERWISE.get(finding.kind, " with other inputs and amplitudes")
+
+
+_OTHERWISE: Mapping[str, str] = {
+    **dict.fromkeys(MOTION, " at other speeds, loads and amplitudes"),
+    "temperature": " from another temperature, with other heating and cooling",
+    "level": " from another level, with other flows in and out",
+    "pressure": " from another pressure, with other flows in and out",
+    "voltage": " at other voltages and loads",
+    "current": " at other voltages and loads",
+}
+"""How to record again, by the kind of quantity that a finding acts on."""

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mkc_torch._support.unit_text import ratio, tidy
 from mkc_torch.diagnosis.evidence.base import gain_of
+from mkc_torch.diagnosis.findings.doubts import far_from_plausible, shape_at_ends
 from mkc_torch.diagnosis.findings.formula import formulas
 from mkc_torch.diagnosis.findings.regions import attributed, map_of, region_of, shares_of_runs
 from mkc_torch.diagnosis.findings.what_to_record import SAME, told_by
@@ -21,6 +22,7 @@ from mkc_torch.diagnosis.result import Alternative, Finding, Number, Parameter, 
 from mkc_torch.diagnosis.search.locate import Located
 from mkc_torch.diagnosis.world import Curve
 from mkc_torch.effects.context import Context
+from mkc_torch.effects.kinds import kind_at
 from mkc_torch.nonlinear import beside
 
 if TYPE_CHECKING:
@@ -59,6 +61,7 @@ def finding_of(located: Located, final: Estimate, number: int, *, quick: bool = 
     context = _context(final, term)
     channels = places_of(term, context.channels)
     plausible, told = _plausibility(term, gamma, context)
+    cannot_be = far_from_plausible(term, gamma, context)
     where = attributed(final.fit, number)
     curve = _curve(term, gamma, covariance, context)
     shape = _shape_parameters(term, context, final.shape_errors[number])
@@ -72,21 +75,24 @@ def finding_of(located: Located, final: Estimate, number: int, *, quick: bool = 
         intervals=intervals_of(gain_of(final, number), final.fit.model.prepared.time),
         onset=moments[0] if moments else term.shape.get("onset"),
         equation="; ".join([term.effect.equation_of(term.shape, context), *told_as]),
-        explanation=term.effect.explanation,
+        explanation=term.effect.explained(gamma.tolist(), term.shape, context),
         parameters=(*parameters_of(term, gamma, covariance, context), *shape),
         p_value=None if quick else located.p_value,
         alternatives=_alternatives(located, term),
-        plausible=plausible,
-        plausibility=told,
+        plausible=plausible and not cannot_be,
+        plausibility=cannot_be or told,
+        cannot_be=bool(cannot_be),
+        doubts=shape_at_ends(term, final.fit.model.prepared, context),
         curve=curve,
         region=None if where is None else region_of(where),
         experiments=() if where is None else shares_of_runs(where),
         map=None if where is None else map_of(where),
         moments=moments,
         references=_references(term),
-        advice=term.effect.advice,
+        advice=term.effect.advised(gamma.tolist(), term.shape, context),
         again=term.effect.again,
         placed=term.effect.placed,
+        kind=kind_at(context),
     )
 
 

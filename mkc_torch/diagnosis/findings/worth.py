@@ -58,9 +58,9 @@ def confirmed(finding: Finding) -> bool:
     """Whether unseen blocks surely confirm it; of an event that cannot be held out the search alone has to.
 
     One without a size is none, whatever the blocks show: something that came with it, such as another noise, made the
-    difference.
+    difference. One of a size that cannot be stands in for something else.
     """
-    if sizeless(finding):
+    if sizeless(finding) or finding.cannot_be:
         return False
     held = finding.held_out
     if held is None:

@@ -71,7 +71,7 @@ class Candidates(Sequence[Tensor]):
         if not self._terms:
             return
         model = model.around(parameters)
-        self._signals = model.signals(parameters)
+        self._signals = model.signals_before(parameters, {term.key for term in self._terms})
         for name, known in self._pointwise.items():
             members = [number for number, term in enumerate(self._terms) if term.port == name]
             if known is None and members:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch._support.forward_mode import forward_jacobian
-from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.courses import combined, gained
 from mkc_torch.nonlinear import GaussianPrior, beside
@@ -23,7 +23,7 @@ from mkc_torch.simulation.protocol import Answer, Change, FreeChange, Nearby, Pr
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["JointModel", "directions", "port_jacobian", "summed", "through_port"]
+__all__ = ["JointModel", "directions", "in_order_of_the_chain", "port_jacobian", "summed", "through_port"]
 
 _CHUNK = 64
 """Courses whose effect on the residual is computed together."""
@@ -83,11 +83,17 @@ class JointModel:
 
     def changes(self, parameters: Float[Tensor, " p"]) -> dict[str, Change]:
         """What the effects add at each port."""
+        return self._changes_of(range(len(self.terms)), parameters)
+
+    def _changes_of(self, numbers: Sequence[int], parameters: Tensor) -> dict[str, Change]:
+        """What some of the effects add at each port."""
         total: dict[str, Change] = {}
-        known = zip(self.terms, self.gammas(parameters), self._follow, self._courses, strict=True)
-        for term, gamma, follows, courses in known:
-            change = self._change(term, gamma) if courses is None else _constant(courses(gamma))
-            total[term.port] = summed(total.get(term.port), change if follows else FreeChange(change))
+        gammas, ports = self.gammas(parameters), self.prepared.ports
+        for number in in_order_of_the_chain(self.terms, numbers):
+            term, courses = self.terms[number], self._courses[number]
+            change = self._change(term, gammas[number]) if courses is None else _constant(courses(gammas[number]))
+            free = change if self._follow[number] else FreeChange(change)
+            total[term.port] = summed(total.get(term.port), free, series=ports[term.port].in_series(term.port))
         return total
 
     def _change(self, term: Term, gamma: Tensor) -> Change:
@@ -107,6 +113,20 @@ class JointModel:
     def signals(self, parameters: Float[Tensor, " p"]) -> Mapping[str, Tensor]:
         """What passes through each port, with the effects in it."""
         return self.prepared.signals(parameters[: self.base], self.changes(parameters), self.near)
+
+    def signals_before(self, parameters: Float[Tensor, " p"], keys: Collection[Key]) -> Mapping[str, Tensor]:
+        """What passes through each port where the next effect would act: behind the effects in series there.
+
+        Args:
+            parameters: of the model.
+            keys: of candidates, which count as not yet there.
+        """
+        signals = dict(self.signals(parameters))
+        ahead = [k for k, t in enumerate(self.terms) if t.key not in keys and t.port in signals]
+        ahead = [k for k in ahead if self.prepared.ports[self.terms[k].port].in_series(self.terms[k].port)]
+        for port, change in self._changes_of(ahead, parameters).items():
+            signals[port] = signals[port] + change(signals[port])
+        return signals
 
     def residual(self, parameters: Float[Tensor, " p"]) -> Float[Tensor, "N m"]:
         """Recording less prediction."""
@@ -197,14 +217,23 @@ def _constant(added: Float[Tensor, "N c"]) -> Change:
     return lambda _: added
 
 
-def summed(one: Change | None, other: Change) -> Change:
-    """Two changes at one port."""
+def in_order_of_the_chain(terms: Sequence[Term], numbers: Iterable[int]) -> list[int]:
+    """Numbers of terms in the order in which effects in series act: those with memory before those without.
+
+    A motor's lag comes before the square by which its propeller pulls; delays, lags and play commute.
+    """
+    return sorted(numbers, key=lambda number: not terms[number].effect.remembers)
+
+
+def summed(one: Change | None, other: Change, *, series: bool = False) -> Change:
+    """Two changes at one port: side by side, or in ``series``, the second of the signal that the first one changed."""
     if one is None:
         return other
     first = one
 
     def both(signal: Tensor) -> Tensor:
-        added, more = first(signal), other(signal)
+        added = first(signal)
+        more = other(signal + added if series else signal)
         # the rate of a memory, where only one of them has it, comes last
         width = max(added.shape[1], more.shape[1])
         return _widened(added, width) + _widened(more, width)

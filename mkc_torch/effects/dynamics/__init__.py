@@ -16,7 +16,9 @@ from mkc_torch.effects.dynamics.hard_stop import HardStop
 from mkc_torch.effects.dynamics.hidden_lag import HiddenLag
 from mkc_torch.effects.dynamics.hidden_mode import HiddenMode
 from mkc_torch.effects.dynamics.input_delay import InputDelay
+from mkc_torch.effects.dynamics.input_lag import InputLag
 from mkc_torch.effects.dynamics.input_saturation import InputSaturation
+from mkc_torch.effects.dynamics.input_square import InputSquare
 from mkc_torch.effects.dynamics.linear_drag import LinearDrag
 from mkc_torch.effects.dynamics.load_dependent_friction import LoadDependentFriction
 from mkc_torch.effects.dynamics.magnus_lift import MagnusLift
@@ -43,6 +45,7 @@ DYNAMICS: tuple[Effect, ...] = (
     CubicStiffness(),
     PositionPeriodicForce(),
     PowerLaw("difference"),
+    PowerLaw("excess"),
     PowerLaw("position"),
     PowerLaw(),
     BoucWenHysteresis(),
@@ -57,6 +60,8 @@ DYNAMICS: tuple[Effect, ...] = (
     ThermalLoss(beside=True),
     ThermalLoss(),
     InputDelay(),
+    InputLag(),
+    InputSquare(),
     InputSaturation(),
     DeadZone(),
     Backlash(),

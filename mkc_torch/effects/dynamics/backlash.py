@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
 from mkc_torch.effects.context import Context, Shape
-from mkc_torch.effects.runs import first_of_runs, passed_on_within, run_numbers
+from mkc_torch.effects.courses import played
 from mkc_torch.effects.share import ShareEffect
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Float
 
-__all__ = ["Backlash", "played"]
+__all__ = ["Backlash"]
 
 GAPS = (0.03, 0.06, 0.1, 0.2, 0.3)
 """Half the width of the gap, as shares of the largest input."""
@@ -37,6 +36,7 @@ class Backlash(ShareEffect):
     """
 
     id = "backlash"
+    remembers = True
     relative: Mapping[str, tuple[str, str]] = {"half_gap": ("own", "largest")}
     fitted_shape: Mapping[str, tuple[float, float]] = {"half_gap": (0.01, 0.5)}
     equation = "δu = γ (y − u),  y = max(u − c, min(u + c, y before))"
@@ -54,24 +54,3 @@ class Backlash(ShareEffect):
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
         own = names["own"]
         return (f"{gamma[0]!r} * (played({own}, time, {shape['half_gap']!r}, run) - {own})",)
-
-
-def played(
-    values: Float[Tensor, " N"], time: Float[Tensor, " N"], half_gap: float, run: Int[Tensor, " N"] | None = None
-) -> Float[Tensor, " N"]:
-    """Values behind play, in the middle of the gap at the first sample of each run.
-
-    Args:
-        values: of the drive, at the samples.
-        time: of the samples in s.
-        half_gap: half the width of the gap, in the values' unit; at least 0.
-        run: of each sample's run; None where a run begins when time goes back, and only there.
-
-    Example:
-        >>> there_and_back = torch.tensor([0.0, 1.0, 3.0, 2.0, 1.0, 0.0])
-        >>> played(there_and_back, torch.arange(6.0), 1.0)
-        tensor([0., 0., 2., 2., 2., 1.])
-    """
-    first = first_of_runs(run_numbers(time) if run is None else run)
-    gap = torch.where(first, torch.zeros_like(values), half_gap)
-    return passed_on_within(values - gap, values + gap)

@@ -33,6 +33,26 @@ class ConstantForce(RateEffect):
     equation = "δẋ = γ"
     explanation = "Something pushes all the time."
     advice = "Look for a bias of the actuator, a tilted base, an unbalanced weight or buoyancy."
+    by_kind: Mapping[str, tuple[str, str]] = {
+        "temperature": (
+            "Heat is added, or taken off, all the time.",
+            "Look for a source or a loss of heat that is always there, or for an error of a temperature that the "
+            "simulation takes as known.",
+        ),
+        "level": (
+            "Something flows in, or out, all the time.",
+            "Look for a leak, an inflow that is not recorded, or a sensor's zero.",
+        ),
+        "voltage": (
+            "A constant current charges, or discharges, all the time.",
+            "Look for a bias current, a leak or a sensor's zero.",
+        ),
+        "current": ("A constant voltage drives all the time.", "Look for an offset voltage or a sensor's zero."),
+        "pressure": (
+            "Something flows in, or out, all the time.",
+            "Look for a leak, an inflow that is not recorded, or a sensor's zero.",
+        ),
+    }
     source = "Newton's second law"
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002

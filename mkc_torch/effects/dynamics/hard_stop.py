@@ -35,6 +35,7 @@ class HardStop(RateEffect):
     id = "hard_stop"
     relative: Mapping[str, tuple[str, str]] = {"place": ("position", "largest")}
     fitted_shape: Mapping[str, tuple[float, float]] = {"place": (0.4, 0.98), "exponent": (1.0, 3.0)}
+    natural_ends: Mapping[str, tuple[str, ...]] = {"exponent": ("least",)}
     needs = ("position",)
     gain = "stiffness"
     along = "position"

@@ -8,15 +8,37 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.unit_text import duration, sized
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.courses import lagged
 from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.kinds import MOTION, kind_at
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 SHARES = (0.005, 0.015, 0.05, 0.15)
 """Time constants that are searched, as shares of the longest run."""
+
+
+_EXAMPLES = {
+    "temperature": ": a wall, furniture, a housing, the vessel itself",
+    "speed": ": a load on a slipping coupling, a liquid carried along",
+    "rotation": ": a load on a slipping coupling, a liquid carried along",
+}
+"""What the second store may be."""
+
+
+def _share(gamma: float) -> str:
+    """A share in percent, or as so many times where it is more.
+
+    Example:
+        >>> _share(0.382), _share(3.14)
+        ('38 %', '3.1 times the size')
+    """
+    percent = gamma < 2.0
+    told = sized(float(f"{100.0 * gamma if percent else gamma:.2g}"))
+    return f"{told} %" if percent else f"{told} times the size"
 
 
 class HiddenLag(RateEffect):
@@ -42,7 +64,29 @@ class HiddenLag(RateEffect):
     equation = "δẋ = γ (z − x) / τ,  τ ż = x − z"
     explanation = "The state exchanges with something that is not in the equations and follows it late."
     advice = "Add a second store with this time constant, such as a wall behind a resistance."
+    stores: Mapping[str, str] = {
+        "temperature": "a second store of heat",
+        "level": "a side tank",
+        "pressure": "a second volume behind a throttle",
+        "voltage": "a second capacitor behind a resistor",
+        "current": "a second coil beside a resistor",
+        "speed": "a mass dragged along by a damper",
+        "rotation": "a flywheel dragged along by a damper",
+    }
     source = "two-node thermal networks; Bacher & Madsen, Energy and Buildings 43 (2011)"
+
+    def store(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
+        """The store with its size and its time, as a person says them."""
+        known = self.stores.get(kind_at(context), "a second store")
+        evens_out = "catching up" if kind_at(context) in MOTION else "exchanging"
+        time = duration(float(shape["time_constant"]))
+        return f"{known}, {_share(float(gamma[0]))} of the first, {evens_out} in {time}"
+
+    def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
+        return f"There is {self.store(gamma, shape, context)}, that is not in the equations."
+
+    def advised(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
+        return f"Add {self.store(gamma, shape, context)}{_EXAMPLES.get(kind_at(context), '')}."
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         length = float(time.max() - time.min())

@@ -58,6 +58,24 @@ class HiddenMode(RateEffect):
     equation = "δv̇ = γ (ω² s + 2 ζ ω ṡ),  ṡ = w − v,  ẇ = −ω² s − 2 ζ ω ṡ,  ω = 2π / period"
     explanation = "Something swings along that is not in the equations, with a period of its own."
     advice = "Add a second mass on a spring of this period, as of a flexible joint or of a liquid that sloshes."
+    by_kind: Mapping[str, tuple[str, str]] = {
+        "level": (
+            "The level swings with a second surface, by a period of its own.",
+            "Add a second surface behind a column of liquid with inertia, as in a pipe between two vessels.",
+        ),
+        "pressure": (
+            "The pressure swings with a second volume, by a period of its own.",
+            "Add a second volume behind a column with inertia, as in a long line.",
+        ),
+        "voltage": (
+            "The voltage rings, with a period of its own.",
+            "Add a coil and a second capacitor that ring with this period.",
+        ),
+        "current": (
+            "The current rings, with a period of its own.",
+            "Add a capacitor and a second coil that ring with this period.",
+        ),
+    }
     source = (
         "Den Hartog, Mechanical Vibrations (1956), 3.2; Spong (1987), for flexible joints; Dodge (2000), for sloshing"
     )

@@ -29,11 +29,13 @@ class InputDelay(ShareEffect):
     """
 
     id = "input_delay"
+    remembers = True
     continuous: Mapping[str, tuple[float, float]] = {"delay": (0.0005, 0.1)}
     fitted_shape: Mapping[str, tuple[float, float]] = {"delay": (0.0005, 0.1)}
     equation = "δu = γ (u(t − τ) − u(t))"
     explanation = "The system answers to its input late."
     advice = "Delay the input by this time."
+    again = "a delay shifts fast changes of its input and leaves their size"
     source = "transport delays; Åström & Murray, Feedback Systems (2008), 3.4"
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:

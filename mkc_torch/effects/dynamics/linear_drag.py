@@ -33,6 +33,25 @@ class LinearDrag(RateEffect):
     equation = "δẋ = −γ x"
     explanation = "The motion is damped in proportion to its speed, as by a viscous fluid."
     advice = "Add viscous drag with this coefficient."
+    by_kind: Mapping[str, tuple[str, str]] = {
+        "temperature": (
+            "Heat is lost in proportion to the temperature.",
+            "Add a loss of heat with this coefficient, and check the temperature that losses are counted from.",
+        ),
+        "level": ("The level falls in proportion to itself, as by a leak.", "Add a leak with this coefficient."),
+        "voltage": (
+            "The charge leaks in proportion to the voltage.",
+            "Add a resistor in parallel with this coefficient, 1 / (R C).",
+        ),
+        "current": (
+            "The current dies away in proportion to itself.",
+            "Add a resistance with this coefficient, R / L.",
+        ),
+        "pressure": (
+            "The pressure falls in proportion to itself, as by a leak.",
+            "Add a leak with this coefficient.",
+        ),
+    }
     source = "Stokes' law at small Reynolds numbers; viscous friction of bearings"
 
     def __init__(self, *, beside: bool = False) -> None:
@@ -41,6 +60,7 @@ class LinearDrag(RateEffect):
             self.equation = "δẋ = −γ (x − u)"
             self.explanation = "The state evens out with its surroundings, in proportion to its difference to them."
             self.advice = "Add a loss to the surroundings with this coefficient."
+            self.by_kind = {}
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return (dict.fromkeys(self.choices, 1.0),)

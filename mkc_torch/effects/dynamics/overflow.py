@@ -32,6 +32,7 @@ class Overflow(RateEffect):
     id = "overflow"
     relative: Mapping[str, tuple[str, str]] = {"rim": ("own", "largest")}
     fitted_shape: Mapping[str, tuple[float, float]] = {"rim": (0.4, 0.98), "exponent": (1.0, 3.0)}
+    natural_ends: Mapping[str, tuple[str, ...]] = {"exponent": ("least",)}
     needs = ("level",)
     gain = "loss"
     power = 1.0

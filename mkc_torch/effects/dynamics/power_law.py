@@ -21,7 +21,16 @@ EXPONENTS = (0.5, 1.25, 1.5, 1.75, 2.5, 3.0)
 ROUNDED = 1e-3
 """Share of the scale within which the curve is straight, so that its slope at 0 is finite."""
 
-_OF = {"own": "x", "difference": "x − u", "position": "x"}
+_OF = {"own": "x", "difference": "x − u", "position": "x", "excess": "x − x₀"}
+
+
+_LOWEST, _HIGHEST = "lowest_of_own", "highest_of_own"
+
+_SPRING = (
+    "Something drives the position back by a power of the deflection, as a spring that hardens does.",
+    "Add a spring with this exponent: 1 is linear, 1.5 a ball on a plate, 3 a beam at large deflections.",
+)
+"""Explanation and advice for a power of a position."""
 
 
 class PowerLaw(RateEffect):
@@ -32,7 +41,8 @@ class PowerLaw(RateEffect):
     between 1 and 2. What drag, dry friction or a cubic spring explains as well is theirs.
 
     Simulation: adds ``−γ |y/c|ᵖ sign y`` to the rate of a state, y the state itself, its difference to an input that is
-        its surroundings, or the position whose speed it is; within a thousandth of c about 0 the curve is straight.
+        its surroundings, the excess of a temperature over the lowest one of the recording where no input tells its
+        surroundings, or the position whose speed it is; within a thousandth of c about 0 the curve is straight.
     Drivers: none but the state and its surroundings.
     Units: γ in the state's unit per s, what there is of it at y = c; the scale c, the largest y, in that of y; the
         exponent p is a number.
@@ -41,14 +51,36 @@ class PowerLaw(RateEffect):
         Torricelli's law; Clift, Grace & Weber, "Bubbles, Drops, and Particles" (1978), of drag.
 
     Args:
-        of: what it is a power of, ``own``, ``difference`` or ``position``.
+        of: what it is a power of, ``own``, ``difference``, ``excess`` or ``position``.
     """
 
     id = "power_law"
     general = True
     fitted_shape: Mapping[str, tuple[float, float]] = {"exponent": (0.3, 6.0)}
     explanation = "Something drives the state back by a power of its size, as natural convection or an orifice does."
-    advice = "Add a term with this exponent; it tells what kind of flow or spring it is."
+    advice = "Add a term with this exponent, and look for physics that has it."
+    by_kind: Mapping[str, tuple[str, str]] = {
+        "temperature": (
+            "Heat is lost by a power of the excess temperature, as by convection, radiation or evaporation.",
+            "Add a loss of heat by this power of the excess temperature: 1.2 to 1.5 is natural convection, more than 2 "
+            "evaporation or radiation.",
+        ),
+        "level": (
+            "The level falls by a power of itself, as an orifice or a weir lets out.",
+            "Add an outflow with this exponent: 0.5 is an orifice, 1.5 a weir.",
+        ),
+        "pressure": (
+            "The pressure falls by a power of itself, as an orifice lets out.",
+            "Add an outflow with this exponent: 0.5 is an orifice, 1 a narrow pipe.",
+        ),
+        **dict.fromkeys(
+            ("speed", "rotation"),
+            (
+                "Something brakes the motion by a power of its speed.",
+                "Add a drag with this exponent: 1 is viscous, 2 that of air or water at speed.",
+            ),
+        ),
+    }
     source = "Churchill & Chu (1975), of natural convection; Torricelli's law; Clift, Grace & Weber (1978), of drag"
 
     def __init__(self, of: str = "own") -> None:
@@ -56,32 +88,63 @@ class PowerLaw(RateEffect):
         part = SURROUNDINGS if of == "difference" else of
         self.along = "position" if of == "position" else "own"
         # of a temperature in °C a power is no physics
-        self.needs = {"own": ("own", "flowing"), "position": ("position", "deflection")}.get(of, ("own", part))
+        needs = {"own": ("own", "flowing"), "position": ("position", "deflection"), "excess": ("own", "temperature")}
+        self.needs = needs.get(of, ("own", part))
         self.least = -math.inf if of == "position" else 0.0
         self.gain = "stiffness" if of == "position" else "loss"
         self._scale = f"scale_of_{of}"
-        self.choices = (self._scale,)
         self.relative: Mapping[str, tuple[str, str]] = {self._scale: (part, "largest")}
+        if of == "excess":
+            self.excludes = (SURROUNDINGS,)  # the difference to them is what counts where they are known
+            self.relative = {_LOWEST: ("own", "lowest"), _HIGHEST: ("own", "highest")}
+        elif of == "position":
+            self.by_kind, self.explanation, self.advice = {}, _SPRING[0], _SPRING[1]
+        self.choices = tuple(self.relative)
         self.equation = f"δ{'v̇' if of == 'position' else 'ẋ'} = −γ |({_OF[of]})/c|ᵖ sign({_OF[of]})"
 
     def equation_of(self, shape: Shape, context: Context) -> str:
+        if self.of == "excess":
+            low, high = float(shape[_LOWEST]), float(shape[_HIGHEST])
+            lowest = sized(low, context.unit_of("own"))
+            return f"{self.equation},  x₀ = {lowest}, the lowest of the recording,  c = {sized(high - low, 'K')}"
         scale = sized(float(shape[self._scale]), context.unit_of(self.along))
         beside = f",  u = {context.parts[SURROUNDINGS]}" if self.of == "difference" else ""
         return f"{self.equation},  c = {scale}, the largest of the recording{beside}"
 
+    def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
+        return f"{super().explained(gamma, shape, context)}{self._counted_from(shape, context)}"
+
+    def advised(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
+        return f"{super().advised(gamma, shape, context)}{self._counted_from(shape, context)}"
+
+    def _counted_from(self, shape: Shape, context: Context) -> str:
+        """A sentence on what a difference or an excess is counted from; empty of the state itself."""
+        if self.of == "excess":
+            lowest = sized(float(shape[_LOWEST]), context.unit_of("own"))
+            return f" The excess is counted from {lowest}, the lowest of the recording."
+        return f" It is counted from {context.parts[SURROUNDINGS]}." if self.of == "difference" else ""
+
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
-        return tuple({self._scale: 1.0, "exponent": exponent} for exponent in EXPONENTS)
+        return tuple({**dict.fromkeys(self.relative, 1.0), "exponent": exponent} for exponent in EXPONENTS)
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         y = context.part(self.along)
         if self.of == "difference":
             y = y - context.part(SURROUNDINGS)
-        t = y / shape[self._scale]
+        t = (y - shape[_LOWEST]) / self._reach(shape) if self.of == "excess" else y / shape[self._scale]
         return -t * (t.square() + ROUNDED**2) ** (0.5 * (shape["exponent"] - 1.0))
+
+    def _reach(self, shape: Shape) -> float:
+        """The largest excess; of one where the temperature stays the same."""
+        return (shape[_HIGHEST] - shape[_LOWEST]) or 1.0
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
         y = names[self.along]
         if self.of == "difference":
             y = f"({y} - {names[SURROUNDINGS]})"
-        t, raised = f"({y} / {shape[self._scale]!r})", round(0.5 * (shape["exponent"] - 1.0), 12)
+        raised = round(0.5 * (shape["exponent"] - 1.0), 12)
+        if self.of == "excess":
+            t = f"(({y} - {shape[_LOWEST]!r}) / {float(self._reach(shape))!r})"
+        else:
+            t = f"({y} / {shape[self._scale]!r})"
         return (f"-({gamma[0]!r}) * {t} * ({t} ** 2 + {ROUNDED**2!r}) ** {raised!r}",)

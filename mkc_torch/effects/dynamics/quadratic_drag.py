@@ -31,6 +31,24 @@ class QuadraticDrag(RateEffect):
     equation = "δv̇ = −γ v |v|"
     explanation = "The motion is slowed by the square of its speed, as by air."
     advice = "Add air drag with this coefficient, ½ ρ c_d A / m."
+    by_kind: Mapping[str, tuple[str, str]] = {
+        "level": (
+            "The level falls in proportion to its square.",
+            "Add an outflow that grows with the square of the level, as over a weir or where a vessel narrows.",
+        ),
+        "voltage": (
+            "The charge leaks in proportion to the square of the voltage.",
+            "Look for a transistor or a diode in parallel.",
+        ),
+        "current": (
+            "The current is braked by its square.",
+            "Look for a resistance that grows with the current, as of a filament, or for a core that saturates.",
+        ),
+        "pressure": (
+            "The pressure falls in proportion to its square.",
+            "Add an outflow that grows with the square of the pressure.",
+        ),
+    }
     source = "Rayleigh's drag equation"
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002

@@ -32,6 +32,7 @@ class SensorLag(ShareEffect):
     """
 
     id = "sensor_lag"
+    remembers = True
     port = "output"
     needs = ()
     continuous: Mapping[str, tuple[float, float]] = {"lag": (0.0005, 0.2)}

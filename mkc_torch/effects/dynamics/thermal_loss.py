@@ -9,12 +9,14 @@ from torch import Tensor
 
 from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.dynamics.rate import SURROUNDINGS, RateEffect
+from mkc_torch.effects.kinds import zero_of
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-ZERO, ROOM = 273.15, 293.15
+ROOM = 293.15
+"""In K."""
 
 
 class ThermalLoss(RateEffect):
@@ -53,7 +55,7 @@ class ThermalLoss(RateEffect):
         return "1/s"
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
-        offset = ZERO if context.unit_of("own") == "°C" else 0.0
+        offset = zero_of(context.unit_of("own"))
         around = (context.part(SURROUNDINGS) + offset).pow(4) if SURROUNDINGS in shape else ROOM**4
         return -((context.part("own") + offset).pow(4) - around) / (4.0 * ROOM**3)
 

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.paired.clock_drift import ClockDrift
-from mkc_torch.effects.paired.delay import Delay
+from mkc_torch.effects.paired.delay import Delay, SeveralDelays
 from mkc_torch.effects.paired.driver_linear import DriverLinear
 from mkc_torch.effects.paired.driver_quadratic import DriverQuadratic
 from mkc_torch.effects.paired.gain import Gain
-from mkc_torch.effects.paired.offset import Offset
+from mkc_torch.effects.paired.gravity_sag import GravitySag, SeveralSag
+from mkc_torch.effects.paired.offset import Offset, SeveralOffsets
+from mkc_torch.effects.paired.output_backlash import OutputBacklash, SeveralBacklash
 from mkc_torch.effects.paired.output_saturation import OutputSaturation
 
 __all__ = ["PAIRED"]
@@ -23,7 +25,13 @@ PAIRED: tuple[Effect, ...] = (
     Offset(),
     Delay(),
     ClockDrift(),
+    OutputBacklash(),
     OutputSaturation(),
+    GravitySag(),
+    SeveralOffsets(),
+    SeveralDelays(),
+    SeveralBacklash(),
+    SeveralSag(),
     DriverLinear(),
     DriverQuadratic(),
 )

@@ -29,6 +29,7 @@ class ClockDrift(Effect):
     id = "clock_drift"
     port = "outputs"
     follows_signal = True
+    remembers = True
     plausible = 0.01
     equation = "δy = y(t + γ (t − t₀)) − y(t)"
     explanation = "The recording's clock and the simulator's run at different rates."

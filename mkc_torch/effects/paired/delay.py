@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
+from mkc_torch.effects.paired.alike import SEVERAL
 from mkc_torch.effects.paired.between import shifted
 
 if TYPE_CHECKING:
@@ -27,8 +29,9 @@ class Delay(Effect):
 
     id = "delay"
     port = "output"
-    needs = ("own", "compared")
+    needs: tuple[str, ...] = ("own", "compared")
     follows_signal = True
+    remembers = True
     equation = "δy = y(t − γ) − y(t)"
     explanation = "What is measured comes later than what is simulated, or earlier."
     advice = "Look for filters and transport on the way to the recording, and for how its clock was set."
@@ -38,6 +41,35 @@ class Delay(Effect):
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity("delay", 1, "s"),)
 
-    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:  # noqa: ARG002
-        own = context.part("own")
-        return (shifted(own, context.time, -gamma[0].expand(len(own)), context.runs) - own).unsqueeze(-1)
+    def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:  # noqa: ARG002
+        pairs = zip(context.signal.unbind(-1), gamma.expand(context.signal.shape[-1]).unbind(), strict=True)
+        columns = [shifted(own, context.time, -one.expand(len(own)), context.runs) - own for own, one in pairs]
+        return torch.stack(columns, -1)
+
+
+class SeveralDelays(Delay):
+    """The same at all outputs, each late by a time of its own; one for all if that does as well.
+
+    Simulation: adds ``y(t − γ) − y(t)``, for each output.
+    Drivers: none but the outputs.
+    Units: γ in s.
+    Plausible: any size.
+    Source: that of :class:`Delay`.
+    """
+
+    port = "outputs"
+    needs = (SEVERAL,)
+
+    @property
+    def simpler(self) -> Effect:
+        return CommonDelay()
+
+    def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
+        return (Quantity("delay", len(context.channels), "s"),)
+
+
+class CommonDelay(Delay):
+    """All outputs late by the same time."""
+
+    port = "outputs"
+    needs = (SEVERAL,)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from mkc_torch.effects.base import GainEffect
 from mkc_torch.effects.context import Context, Shape
+from mkc_torch.effects.paired.alike import SEVERAL
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -26,13 +28,34 @@ class Offset(GainEffect):
 
     id = "offset"
     port = "output"
-    needs = ("own", "compared")
+    needs: tuple[str, ...] = ("own", "compared")
     gain = "offset"
     equation = "δy = γ"
     explanation = "What is measured lies beside what is simulated by a constant."
     advice = "Check the sensor's zero, and where the simulator has its own."
+    by_kind: Mapping[str, tuple[str, str]] = {
+        "angle": (
+            "What is measured lies beside what is simulated by a constant, as a wrong zero or a load does.",
+            "Check the joint's zero. Where it carries a load, gravity pulls a servo aside like this: compare with the "
+            "load's torque over the joint's stiffness.",
+        ),
+    }
     again = "an offset is there without a signal too"
     source = "Doebelin, Measurement Systems (2003), 3.2"
 
     def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
         return torch.ones_like(context.time)
+
+
+class SeveralOffsets(Offset):
+    """The same at all outputs, each beside what is simulated by a constant of its own.
+
+    Simulation: adds γ, for each output.
+    Drivers: none but the outputs.
+    Units: γ in the outputs' unit.
+    Plausible: any size.
+    Source: that of :class:`Offset`.
+    """
+
+    port = "outputs"
+    needs = (SEVERAL,)

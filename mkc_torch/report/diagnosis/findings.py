@@ -229,6 +229,8 @@ def grade(finding: Finding) -> str:
         >>> grade(Finding("offset_drift", (), (), (), None, "", "", (), 0.01, (), True, "", grade="real but small"))
         'real, but small beside the noise'
     """
+    if finding.grade == "not confirmed" and finding.cannot_be:
+        return term("grade.cannot_be")
     return term(_GRADES[finding.grade])
 
 

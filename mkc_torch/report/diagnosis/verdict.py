@@ -63,7 +63,7 @@ def headline(diagnosis: Diagnosis) -> str:
 
 def _found(findings: Sequence[Finding]) -> str:
     told = []
-    for kind in (_LEFT_OUT, _NEAREST, _SMALL, _UNCONFIRMED, _BOTH):
+    for kind in (_LEFT_OUT, _NEAREST, _SMALL, _UNCONFIRMED, _BOTH, _CANNOT_BE):
         of_it = [f for f in findings if _kind(f) == kind]
         if of_it:
             told.append(term(kind, findings="; ".join(_named(f, alone=len(findings) == 1) for f in of_it)))
@@ -71,11 +71,14 @@ def _found(findings: Sequence[Finding]) -> str:
 
 
 _LEFT_OUT, _NEAREST = "verdict.left_out", "verdict.nearest"
+_CANNOT_BE = "verdict.cannot_be"
 _SMALL, _UNCONFIRMED, _BOTH = "verdict.small", "verdict.unconfirmed", "verdict.unconfirmed_and_small"
 
 
 def _kind(finding: Finding) -> str:
     """The sentence that a finding belongs to."""
+    if finding.grade == "not confirmed" and finding.cannot_be:
+        return _CANNOT_BE
     if finding.grade == "not confirmed":
         return _BOTH if small(finding) else _UNCONFIRMED
     return {"left out": _LEFT_OUT, "real but small": _SMALL}.get(finding.grade, _NEAREST)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from mkc_torch.effects.kinds import CELSIUS, kind_of
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.surroundings import surroundings
@@ -119,9 +120,9 @@ class Places:
             parts["reversing"] = state
         if state in self._surroundings:
             parts["surroundings"] = self._surroundings[state]
-        if self._unit_of(state) in ("°C", "K"):
+        if (unit := self._unit_of(state)) in (*CELSIUS, "K"):
             parts["temperature"] = state
-        else:
+        elif kind_of(unit, state) != "temperature":
             parts["flowing"] = state
             if not positions:
                 parts["level"] = state

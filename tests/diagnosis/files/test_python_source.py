@@ -75,7 +75,9 @@ PLACES = {
     "load_dependent_friction": ("loaded rate of speed", {"width": 0.05}),
     "buoyancy": ("rate of speed", {"surface": 0.1, "draught": 0.3}),
     "magnus_lift": ("exchange of speed and drift", {}),
+    "input_square": ("input push", {"scale_of_input": 2.5}),
     "input_delay": ("input push", {"delay": 0.23}),
+    "input_lag": ("input push", {"lag": 0.2}),
     "sensor_lag": ("output", {"lag": 0.17}),
 }
 

@@ -127,12 +127,20 @@ def test_two_columns_are_told_apart_by_changing_one(rival, how):
     assert advice_of(dataclasses.replace(made, findings=(current,)))[0].endswith(how)
 
 
-def test_forces_are_told_apart_at_other_speeds():
+@pytest.mark.parametrize(
+    ("kind", "how"),
+    [
+        ("speed", "at other speeds, loads and amplitudes"),
+        ("temperature", "from another temperature, with other heating and cooling"),
+        ("", "with other inputs and amplitudes"),
+    ],
+)
+def test_rivals_are_told_apart_by_what_the_kind_of_state_can_do(kind, how):
     made = make_diagnosis(1, samples=50)
     rival = Alternative("stribeck_friction", (), 0.4, False, "rate of speed")
-    first = dataclasses.replace(made.findings[0], effect="coulomb_friction", again="", alternatives=(rival,))
+    first = dataclasses.replace(made.findings[0], effect="coulomb_friction", again="", alternatives=(rival,), kind=kind)
     assert advice_of(dataclasses.replace(made, findings=(first,)))[0] == (
-        "To tell coulomb_friction from stribeck_friction, record again at other speeds, loads and amplitudes."
+        f"To tell coulomb_friction from stribeck_friction, record again {how}."
     )
 
 

@@ -18,12 +18,14 @@ IDS = (
     "constant_force", "linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction",
     "load_dependent_friction", "cubic_stiffness", "position_periodic_force", "coupling", "hard_stop", "overflow",
     "thermal_loss", "input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "bouc_wen_hysteresis",
-    "added_mass", "magnus_lift", "buoyancy", "hidden_lag", "hidden_mode", "power_law",
+    "added_mass", "magnus_lift", "buoyancy", "hidden_lag", "hidden_mode", "power_law", "input_lag", "input_square",
 )  # fmt: skip
 
 LOSSES = ("linear_drag", "quadratic_drag", "coulomb_friction", "stribeck_friction", "load_dependent_friction")
 EITHER_SIGN = ("constant_force", "cubic_stiffness", "position_periodic_force", "magnus_lift", "power_law")
-SHARES = ("input_delay", "input_saturation", "dead_zone", "sensor_lag", "backlash", "added_mass")
+SHARES = (
+    "input_delay", "input_lag", "input_square", "input_saturation", "dead_zone", "sensor_lag", "backlash", "added_mass",
+)  # fmt: skip
 
 N = 80
 
@@ -191,7 +193,7 @@ def test_a_delay_does_not_reach_into_another_run():
     torch.testing.assert_close(delayed[40:], 1.0 + (time[40:] - 0.3).clamp(min=0.0))
 
 
-@pytest.mark.parametrize("name", ["input_delay", "sensor_lag", "backlash"])
+@pytest.mark.parametrize("name", ["input_delay", "input_lag", "sensor_lag", "backlash"])
 def test_runs_are_told_apart_by_their_number_whatever_their_clocks_do(name):
     """On one clock that goes on, and on clocks that begin anew, what is remembered of a run ends with it."""
     effect = OF[name]
@@ -205,6 +207,27 @@ def test_runs_are_told_apart_by_their_number_whatever_their_clocks_do(name):
         for part, time in ((slice(0, 40), one), (slice(40, 80), later)):
             alone = replace(both, time=time, signal=course[part], run=None)
             torch.testing.assert_close(together[part], change(effect, [1.0], shape, alone))
+
+
+def test_an_actuator_lags_by_its_time_constant():
+    effect = OF["input_lag"]
+    time = torch.linspace(0.0, 5.0, N, dtype=torch.float64)
+    ramp = 3.0 * time.unsqueeze(-1)
+    context = replace(dynamic_context(effect), time=time, signal=ramp)
+    acting = (ramp + change(effect, [1.0], {"lag": 0.8}, context))[:, 0]
+    torch.testing.assert_close(acting, 3.0 * (time - 0.8 * (1.0 - torch.exp(-time / 0.8))))
+    assert effect.within_a_sample({"lag": 0.1}, 0.1)
+    assert not effect.within_a_sample({"lag": 0.2}, 0.1)
+
+
+def test_a_square_input_is_itself_at_its_largest_and_a_quarter_at_half():
+    effect = OF["input_square"]
+    context = dynamic_context(effect)
+    signal = torch.linspace(-4.0, 4.0, 5, dtype=torch.float64).unsqueeze(-1)
+    context = replace(context, time=context.time[:5], drivers=context.drivers[:5], signal=signal)
+    acting = (signal + change(effect, [1.0], {"scale_of_input": 4.0}, context))[:, 0]
+    assert acting.tolist() == [-4.0, -1.0, 0.0, 1.0, 4.0]
+    assert "c = 4 N, the largest input" in effect.equation_of({"scale_of_input": 4.0}, context)
 
 
 def test_a_sensor_lags_by_its_time_constant():
@@ -315,7 +338,9 @@ class TestNeeds:
     def test_of_a_drive(self):
         places = tried(prepared(Motor, angle=torch.cos(3.0 * TIME), torque=torch.sin(TIME)))
         assert "load_dependent_friction" in set().union(*places.values())
-        assert places["input torque"] == {"input_delay", "input_saturation", "dead_zone", "backlash"}
+        assert places["input torque"] == {
+            "input_delay", "input_lag", "input_square", "input_saturation", "dead_zone", "backlash",
+        }  # fmt: skip
 
     def test_of_a_fall_that_does_not_reverse(self):
         places = tried(prepared(Fall, height=100.0 - 0.5 * TIME**2))
@@ -370,8 +395,9 @@ class TestNeeds:
         assert room.ports["rate of wall"].parts["surroundings"] == "outside"
         assert room.ports["rate of wall"].part_units["surroundings"] == "°C"
         assert room.ports["rate of wall"].sizes["surroundings"].highest == pytest.approx(15.0 + 0.9 * 5.95)
-        forms = {t.effect.of for t in candidate_terms(room, (), DYNAMICS) if t.effect.id == "power_law"}
-        assert forms == {"difference"}  # a power of degrees Celsius is no physics
+        forms = {(t.port, t.effect.of) for t in candidate_terms(room, (), DYNAMICS) if t.effect.id == "power_law"}
+        # a power of degrees Celsius is no physics
+        assert forms == {("rate of wall", "difference"), ("rate of inner", "excess")}
         falling = prepared(Wind, height=100.0 - 0.5 * TIME**2, wind=TIME, push=TIME)
         assert falling.ports["rate of speed"].parts["surroundings"] == "wind"
         forms = {t.effect.of for t in candidate_terms(falling, (), DYNAMICS) if t.effect.id == "power_law"}
@@ -390,7 +416,7 @@ class TestNeeds:
         # heat is stored elsewhere too, and has no inertia to swing with
         assert places["lagged rate of inner"] == {"hidden_lag"}
         assert "resonant rate of inner" not in places
-        assert places["rate of inner"] & set(IDS) == {"constant_force", "linear_drag", "thermal_loss"}
+        assert places["rate of inner"] & set(IDS) == {"constant_force", "linear_drag", "thermal_loss", "power_law"}
 
     def test_every_need_is_a_part_that_some_port_has(self):
         known = {

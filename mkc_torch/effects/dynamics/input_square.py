@@ -1,0 +1,62 @@
+"""An actuator that acts by the square of its command."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mkc_torch._support.unit_text import sized
+from mkc_torch.effects.context import Context, Shape
+from mkc_torch.effects.share import ShareEffect
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["InputSquare"]
+
+_SCALE = "scale_of_input"
+
+
+class InputSquare(ShareEffect):
+    """The system is driven by the square of its input: thrust of a propeller, heat of a resistor, pull of a coil.
+
+    A simulation that is linear in such an input is right at one amplitude alone: small commands do less than it says.
+    At the largest input of the recording the effect changes nothing, so that the simulation's own gain is what it is
+    there.
+
+    Simulation: adds ``γ (u |u| / c − u)`` to an input, c its largest size in the recording; a γ of one is the square,
+        one between the two a line and a square together.
+    Drivers: none but the input.
+    Units: γ is a share; c in the input's unit.
+    Plausible: γ from 0 to 1.
+    Source: thrust and torque of a propeller, Leishman, "Principles of Helicopter Aerodynamics" (2006), 2.3; Joule's
+        law; static input nonlinearities, Ljung, "System Identification" (1999), 5.1 (Hammerstein models).
+    """
+
+    id = "input_square"
+    choices = (_SCALE,)
+    relative: Mapping[str, tuple[str, str]] = {_SCALE: ("own", "largest")}
+    along = "own"
+    equation = "δu = γ (u |u| / c − u)"
+    explanation = "The input acts by its square, as a voltage does on a propeller's thrust or on a heater."
+    advice = "Replace the input by its square, u |u|, and fit its gain again."
+    again = "an input that acts by its square does little while it is small"
+    source = (
+        "Leishman, Principles of Helicopter Aerodynamics (2006), 2.3; Joule's law; Ljung, System Identification, 5.1"
+    )
+
+    def equation_of(self, shape: Shape, context: Context) -> str:
+        return f"{self.equation},  c = {sized(float(shape[_SCALE]), context.unit_of('own'))}, the largest input"
+
+    def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
+        return ({_SCALE: 1.0},)
+
+    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+        own = context.part("own")
+        return own * own.abs() / shape[_SCALE] - own
+
+    def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
+        own = names["own"]
+        return (f"{gamma[0]!r} * ({own} * {own}.abs() / {shape[_SCALE]!r} - {own})",)

@@ -1,0 +1,84 @@
+"""What kind of quantity a state, an input or an output is, as far as its unit and its name tell."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from mkc_torch.effects.context import Context
+
+__all__ = ["CELSIUS", "MOTION", "Kind", "kind_at", "kind_of", "zero_of"]
+
+Kind = Literal["temperature", "angle", "rotation", "position", "speed", "level", "voltage", "current", "pressure", ""]
+"""Empty where it is not known."""
+
+MOTION: tuple[Kind, ...] = ("angle", "rotation", "position", "speed")
+"""The kinds of which mechanics speaks: with speeds, loads and springs."""
+
+CELSIUS = ("°C", "degC", "deg_C", "celsius", "Celsius")
+"""Ways to write degrees Celsius."""
+
+_JOINTS = "angle base elbow flex hip joint knee lift pan pitch roll shoulder tilt wrist yaw"
+"""Words of which the names of joints' angles are made."""
+
+_UNITS: dict[str, Kind] = {
+    **dict.fromkeys((*CELSIUS, "K", "degK", "kelvin", "°F", "degF"), "temperature"),
+    **dict.fromkeys(("rad", "°", "deg"), "angle"),
+    **dict.fromkeys(("rad/s", "°/s", "deg/s", "rpm", "1/min"), "rotation"),
+    **dict.fromkeys(("m", "mm", "cm", "km", "µm"), "position"),
+    **dict.fromkeys(("m/s", "mm/s", "cm/s", "km/h"), "speed"),
+    **dict.fromkeys(("V", "mV"), "voltage"),
+    **dict.fromkeys(("A", "mA"), "current"),
+    **dict.fromkeys(("Pa", "hPa", "kPa", "MPa", "bar", "mbar"), "pressure"),
+}
+
+_NAMES: dict[str, Kind] = {
+    **dict.fromkeys(("temp", "temperature", "indoor", "outdoor", "ambient"), "temperature"),
+    **dict.fromkeys(("level", "tank"), "level"),
+    **dict.fromkeys(("speed", "velocity"), "speed"),
+    **dict.fromkeys(_JOINTS.split(), "angle"),
+    **dict.fromkeys(("voltage", "volt", "volts"), "voltage"),
+    "current": "current",
+    "pressure": "pressure",
+}
+
+_LEVELS: tuple[Kind, ...] = ("position", "voltage", "current", "")
+"""Kinds of units that the sensor of a level has; its name decides."""
+
+
+def kind_of(unit: str, name: str = "") -> Kind:
+    """The kind of a quantity by its unit; by its name where the unit tells nothing, or where it is called a level.
+
+    Args:
+        unit: as the recording or the simulation has it.
+        name: of the column or the state.
+
+    Example:
+        >>> kind_of("degC"), kind_of("", "temp_2"), kind_of("V", "level1"), kind_of("V"), kind_of("", "x")
+        ('temperature', 'temperature', 'level', 'voltage', '')
+    """
+    known = _UNITS.get(unit, "")
+    words = [word.rstrip("0123456789") for word in name.lower().split("_")]
+    named: list[Kind] = [_NAMES[word] for word in words if word in _NAMES]
+    if "level" in named and known in _LEVELS:
+        return "level"
+    return known or (named[0] if named and not unit else "")
+
+
+def kind_at(context: Context) -> Kind:
+    """The kind of what an effect acts on: of a state without a speed a length is a level.
+
+    At the rate of a state it is the state's, at an input or an output its own.
+    """
+    name = context.parts.get("own", context.channels[0] if context.channels else "")
+    kind = kind_of(context.part_units.get("own", context.signal_unit), name)
+    return "level" if kind == "position" and "level" in context.parts else kind
+
+
+def zero_of(unit: str) -> float:
+    """What makes a temperature in this unit absolute, in K.
+
+    Example:
+        >>> zero_of("°C"), zero_of("degC"), zero_of("K")
+        (273.15, 273.15, 0.0)
+    """
+    return 273.15 if unit in CELSIUS else 0.0

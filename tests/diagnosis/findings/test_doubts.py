@@ -1,0 +1,97 @@
+"""Estimates at the end of a range, or far from what is plausible, are said to be."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from mkc_torch.diagnosis.findings.advice import advice_of
+from mkc_torch.diagnosis.findings.doubts import far_from_plausible, shape_at_ends, times_plausible
+from mkc_torch.diagnosis.findings.worth import grade_of
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.effects import DYNAMICS
+from mkc_torch.effects.dynamics.hidden_lag import HiddenLag
+from mkc_torch.recording import Recording
+from mkc_torch.report.diagnosis.findings import grade
+from mkc_torch.report.diagnosis.verdict import headline
+from mkc_torch.simulation import Dynamics
+from tests.diagnosis.factory import make_diagnosis
+
+TIME = torch.arange(200, dtype=torch.float64) / 10.0
+
+
+class Tank(Dynamics):
+    states, inputs = ("level",), ("pump",)
+    parameters = {"drain": 0.3}  # noqa: RUF012
+    units = {"level": "cm", "pump": "V"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"level": u.pump - p.drain * x.level}
+
+
+@pytest.fixture(scope="module")
+def tank():
+    return Tank().prepare(
+        Recording({"time": TIME, "pump": 2.0 + torch.sin(TIME), "level": 5.0 + torch.sin(0.7 * TIME)})
+    )
+
+
+EFFECTS = {effect.id: effect for effect in DYNAMICS}
+PLACES = {"overflow": "rate of level", "hidden_lag": "lagged rate of level", "dead_zone": "input pump"}
+
+
+def doubted(tank, name, **shape):
+    term = Term(EFFECTS[name], None, shape, PLACES[name])
+    return shape_at_ends(term, tank, term.context(tank, None))
+
+
+def test_a_number_at_the_end_of_its_range_is_told(tank):
+    largest = tank.ports["rate of level"].sizes["own"].largest
+    (told,) = doubted(tank, "overflow", rim=0.98 * largest, exponent=1.7)
+    assert told.startswith("overflow: its rim ended at ")
+    assert "cm, the greatest that is tried" in told
+    (told,) = doubted(tank, "hidden_lag", time_constant=0.4 * 19.9)
+    assert "its time constant ended at 7.96 s, the greatest that is tried" in told
+    assert doubted(tank, "hidden_lag", time_constant=3.0) == ()
+
+
+def test_an_end_that_is_a_value_like_any_other_is_not(tank):
+    largest = tank.ports["rate of level"].sizes["own"].largest
+    assert doubted(tank, "overflow", rim=0.8 * largest, exponent=1.0) == ()
+    assert len(doubted(tank, "overflow", rim=0.8 * largest, exponent=3.0)) == 1
+    assert doubted(tank, "dead_zone", width=0.5, softness=0.02) == ()
+
+
+def test_an_amplitude_at_its_end_or_ten_times_what_is_plausible_cannot_be(tank):
+    def told(effect, gamma, place):
+        term = Term(effect, None, effect.shapes(tank.time)[0], place)
+        return far_from_plausible(term, torch.tensor([gamma]).double(), term.context(tank, None))
+
+    assert (
+        told(HiddenLag(), 30.0, "lagged rate of level")
+        == "Its share ended at 30, the most that is tried: nothing holds it."
+    )
+    assert told(HiddenLag(), 29.0, "lagged rate of level") == ""
+    assert told(EFFECTS["dead_zone"], 1.0, "input pump") == ""  # all of a dead zone
+
+    class Known(HiddenLag):
+        plausible = 0.1
+
+    term = Term(Known(), None, Known().shapes(tank.time)[0], "lagged rate of level")
+    assert times_plausible(term, torch.tensor([2.0]).double(), term.context(tank, None)) == pytest.approx(20.0)
+    assert told(Known(), 2.0, "lagged rate of level").startswith("Its share is 20 times the largest that is plausible")
+    assert told(Known(), 0.9, "lagged rate of level") == ""
+
+
+def test_what_cannot_be_is_not_confirmed_and_says_why():
+    made = make_diagnosis(1, samples=50)
+    why = "Its share ended at 30, the most that is tried: nothing holds it."
+    odd = dataclasses.replace(made.findings[0], cannot_be=True, plausible=False, plausibility=why, alternatives=())
+    odd = dataclasses.replace(odd, grade=grade_of(odd))
+    assert (made.findings[0].grade, odd.grade) == ("left out", "not confirmed")
+    diagnosis = dataclasses.replace(made, findings=(odd,))
+    assert grade(odd) == "not confirmed, as its size cannot be right"
+    assert headline(diagnosis).startswith("Found, but of a size that cannot be right: hard-iron step")
+    (only, *_) = advice_of(diagnosis)
+    assert only.startswith("Do not correct for hard_iron_step: its share ended at 30")
+    assert "unseen" not in only

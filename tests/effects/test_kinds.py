@@ -1,0 +1,131 @@
+"""Words suit the kind of quantity that an effect acts on."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mkc_torch._support.unit_text import duration
+from mkc_torch.diagnosis.model.grid import candidate_terms
+from mkc_torch.effects import DYNAMICS, kind_of
+from mkc_torch.effects.dynamics.constant_force import ConstantForce
+from mkc_torch.effects.dynamics.hidden_lag import HiddenLag
+from mkc_torch.effects.dynamics.power_law import PowerLaw
+from mkc_torch.effects.kinds import MOTION, kind_at, zero_of
+from mkc_torch.recording import Recording
+from mkc_torch.simulation import Dynamics
+from tests.effects.contexts import dynamic_context
+
+MECHANICAL = ("speed", "load", "spring", "mass", "drag", "friction", "force", "motion")
+STORE = {"time_constant": 7560.0}
+
+
+def at_state(effect, unit, name="x"):
+    """The context of an effect at the rate of a state in this unit."""
+    context = dynamic_context(effect)
+    carries = tuple(name if one == "speed" else one for one in context.carries)
+    parts = {part: name if of == "speed" else of for part, of in context.parts.items() if part != "level"}
+    units = {**context.part_units, "own": unit}
+    return replace(context, carries=carries, channels=(name,), parts=parts, part_units=units)
+
+
+@pytest.mark.parametrize(
+    ("unit", "name", "kind"),
+    [
+        ("degC", "x", "temperature"), ("K", "x", "temperature"), ("", "temp", "temperature"),
+        ("rad/s", "x", "rotation"),
+        ("cm", "level_2", "level"), ("V", "level1", "level"), ("V", "u", "voltage"),
+        ("m/s", "temp", "speed"), ("", "x", ""),
+    ],
+)  # fmt: skip
+def test_units_tell_the_kind_and_names_where_there_are_none(unit, name, kind):
+    assert kind_of(unit, name) == kind
+    assert kind_at(at_state(ConstantForce(), unit, name)) == kind
+
+
+def test_a_length_without_a_speed_is_a_level():
+    context = at_state(ConstantForce(), "m")
+    assert kind_at(context) == "position"
+    assert kind_at(replace(context, parts={**context.parts, "level": "x"})) == "level"
+
+
+@pytest.mark.parametrize("kind", ["°C", "V", "A", "bar"])
+def test_what_does_not_move_has_no_speeds_and_loads(kind):
+    at_all = [
+        e for e in DYNAMICS if e.port in ("rate", "lagged rate") and {*e.needs} <= {"own", "temperature", "flowing"}
+    ]
+    assert len(at_all) > 5
+    for effect in at_all:
+        if "flowing" in effect.needs and kind == "°C":
+            continue  # no physics of a temperature
+        context = at_state(effect, kind)
+        shape = {**effect.shapes(context.time)[0], **dict.fromkeys(effect.relative, 1.0)}
+        for told in (effect.explained([0.4], shape, context), effect.advised([0.4], shape, context)):
+            assert not any(word in told.lower() for word in MECHANICAL), (effect.id, told)
+            assert told.endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("unit", "gamma", "told"),
+    [
+        ("°C", 0.382, "There is a second store of heat, 38 % of the first, exchanging in 2.1 h, that is"),
+        (
+            "m/s",
+            3.14,
+            "There is a mass dragged along by a damper, 3.1 times the size of the first, catching up in",
+        ),
+        ("V", 0.05, "There is a second capacitor behind a resistor, 5 % of the first, exchanging in 2.1 h"),
+    ],
+)
+def test_a_second_store_is_told_with_its_size_and_its_time(unit, gamma, told):
+    effect = HiddenLag()
+    assert effect.explained([gamma], STORE, at_state(effect, unit)).startswith(told)
+
+
+def test_a_second_store_of_a_level_is_a_side_tank():
+    context = at_state(HiddenLag(), "cm", "level")
+    assert "a side tank, 38 % of the first" in HiddenLag().advised([0.38], STORE, context)
+
+
+def test_an_excess_says_what_it_is_counted_from():
+    effect = PowerLaw("excess")
+    context = at_state(effect, "degC")
+    shape = {"lowest_of_own": 25.84, "highest_of_own": 98.2, "exponent": 3.0}
+    assert "x₀ = 25.84 degC, the lowest of the recording" in effect.equation_of(shape, context)
+    assert "counted from 25.84 degC" in effect.advised([1.0], shape, context)
+    assert "natural convection" in effect.advised([1.0], shape, context)
+    largest = context.part("own").new_full((len(context.time),), 98.2)
+    signal = context.signal.clone()
+    signal[:, context.carries.index("x")] = largest
+    torch.testing.assert_close(
+        effect.course(shape, replace(context, signal=signal)), -torch.ones_like(largest), rtol=1e-5, atol=0
+    )
+
+
+class Cup(Dynamics):
+    states = ("temp",)
+    parameters = {"loss": 0.1}  # noqa: RUF012
+    units = {"temp": "degC"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"temp": -p.loss * (x.temp - 20.0)}
+
+
+@pytest.mark.parametrize("unit", ["degC", "°C", ""])
+def test_a_temperature_does_not_run_over_or_swing_however_it_is_written(unit):
+    time = torch.linspace(0.0, 30.0, 100, dtype=torch.float64)
+
+    class Written(Cup):
+        units = {"temp": unit} if unit else {}
+
+    prepared = Written().prepare(Recording({"time": time, "temp": 20.0 + 60.0 * torch.exp(-0.1 * time)}))
+    tried = {t.effect.id for t in candidate_terms(prepared, (), DYNAMICS)}
+    assert not tried & {"overflow", "hidden_mode", "quadratic_drag", "coulomb_friction"}
+    # where the unit is not known nothing tells what absolute zero is
+    assert ("thermal_loss" in tried) == ("power_law" in tried) == bool(unit)
+
+
+def test_times_are_told_in_the_unit_that_a_person_reads():
+    assert [duration(one) for one in (0.5, 119.0, 121.0, 7300.0, 4e5)] == ["0.5 s", "120 s", "2 min", "2 h", "4.6 d"]
+    assert (zero_of("degC"), zero_of("K")) == (273.15, 0.0)
+    assert "speed" in MOTION
