@@ -25,10 +25,10 @@ from mkc_torch.diagnosis.cut_short import cut_short, nothing_known
 from mkc_torch.diagnosis.evidence.after_the_search import parts_ahead
 from mkc_torch.diagnosis.follows import misses
 from mkc_torch.diagnosis.joined import joined
+from mkc_torch.diagnosis.linearised.smaller_step import with_smaller_step
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.in_the_world import at_liberty, between_samples, simulation_in_the_world
-from mkc_torch.diagnosis.model.step import with_smaller_step
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.rounds import Asked, begun, continued
 from mkc_torch.diagnosis.settings import Settings, quick_settings

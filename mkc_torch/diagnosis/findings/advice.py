@@ -125,8 +125,8 @@ def _hold_back(finding: Finding, d: Diagnosis) -> str:
         )
     if f.cannot_be:
         return (
-            f"Do not correct for {_called(f, d)}: {_small_letter(f.plausibility)} Look for other physics that acts at the "
-            "same place."
+            f"Do not correct for {_called(f, d)}: {_small_letter(f.plausibility)} Look for other physics that acts at "
+            "the same place."
         )
     wider = f", with {', '.join(f.drivers)} over a wider range," if f.drivers else ","
     return (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -12,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch._support.torch_internals import is_wrapped
-from mkc_torch.nonlinear import GaussianPrior, NoFitError, fit, load_forward_mode
+from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.continuation import Meaning, is_plain
 from mkc_torch.simulation.dynamics.between_samples import inputs_between
@@ -23,11 +21,13 @@ from mkc_torch.simulation.dynamics.compiled.faithful import is_faithful
 from mkc_torch.simulation.dynamics.compiled.residual import CompiledDynamics, compiled_dynamics
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.first_guess import despiked, first_guess
+from mkc_torch.simulation.dynamics.first_parameters import first_parameters
 from mkc_torch.simulation.dynamics.observer import Observer
 from mkc_torch.simulation.dynamics.ports import RATES, Places, common_unit
+from mkc_torch.simulation.dynamics.refinement import FINEST, enough_parts
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
 from mkc_torch.simulation.dynamics.settings import HORIZON
-from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, defect, marched, solve, stations
+from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, marched, solve, stations
 from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
 from mkc_torch.simulation.dynamics.watched import Watched
 from mkc_torch.simulation.names import Names
@@ -41,14 +41,9 @@ if TYPE_CHECKING:
 
 __all__ = ["PreparedDynamics"]
 
-_FINEST = 8
-"""Steps of integration between two samples at most."""
-
 _PATIENT = 2
 """Moments at a time of a march that has to find its way."""
 
-_ROUGH = 0.02
-_WINDOW = 4
 _NOUGHT = 1e-3
 
 
@@ -136,7 +131,7 @@ class PreparedDynamics(Watched):
 
     def finer(self) -> PreparedDynamics | None:
         """The same with half the step of integration; None where the user set the step, or it is the smallest."""
-        if self.system.step is not None or 2 * self.parts > _FINEST:
+        if self.system.step is not None or 2 * self.parts > FINEST:
             return None
         other = copy.copy(self)
         other._lay_out(2 * self.parts)
@@ -185,24 +180,14 @@ class PreparedDynamics(Watched):
 
     @cached_property
     def _start(self) -> Float[Tensor, " p"]:
-        """The user's values, or those with which the measured states obey the equations, whichever simulates better."""
-        values, begin = self.given[: self._p], self.given[self._p :]
-        starts = [self.given]
-        if self._p:
-            step = self.grid.step.unsqueeze(-1)
-            typical = self.guess.abs().median(0).values.clamp(min=1e-12)
+        def rate(theta: Tensor) -> Callable[[Tensor], Tensor]:
+            return self.rate(theta, {})
 
-            def lacking(values: Tensor) -> Tensor:
-                left = defect(self.rate(torch.cat([values, begin]), {}), self.guess, step) / typical
-                total = torch.cat([torch.zeros_like(left[:1]), left.cumsum(0)])
-                return total[_WINDOW:] - total[:-_WINDOW]
+        def residual(theta: Tensor) -> Tensor:
+            return self.residual(theta, {})
 
-            low, high = (bound[: self._p] for bound in self.bounds)
-            with suppress(NoFitError):  # the equations cannot be looked at there
-                found = fit(lacking, values, lower=low, upper=high, covariance=None, max_iter=60).theta
-                starts.append(torch.cat([found, begin]))
-        spread = [robust_scale(self.residual(one, {}).nan_to_num(torch.inf, torch.inf, torch.inf)) for one in starts]
-        return starts[0] if bool((spread[0] <= spread[-1]).all()) else starts[-1]
+        step = self.grid.step.unsqueeze(-1)
+        return first_parameters(self.given, self.bounds, self._p, rate, self.guess, step, residual)
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
@@ -454,15 +439,11 @@ class PreparedDynamics(Watched):
             inside = self.time.diff()[~self.begins[1:]]
             self._lay_out(max(1, int(torch.ceil(inside.max() / self.system.step - 1e-9))))
             return
-        parts = 1
         theta = self.start()
-        before = self.simulated(theta, {})
-        spread = (self.measured - self.measured.median(0).values).abs().median(0).values.clamp(min=1e-300)
-        while parts < _FINEST:
-            self._lay_out(2 * parts)
-            after = self.simulated(theta, {})
-            # no trajectory, NaN, may be one of too long steps
-            if bool(((after - before).abs().amax(0) <= _ROUGH * spread).all()):
-                break
-            parts, before = 2 * parts, after
-        self._lay_out(parts if bool(before.isfinite().all()) else 1)
+
+        def simulated(parts: int) -> Tensor:
+            if parts > 1:
+                self._lay_out(parts)
+            return self.simulated(theta, {})
+
+        self._lay_out(enough_parts(simulated, self.measured))

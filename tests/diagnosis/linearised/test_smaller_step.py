@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
+from mkc_torch.diagnosis.linearised.smaller_step import with_smaller_step
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.model.step import with_smaller_step
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects.dynamics import HiddenMode

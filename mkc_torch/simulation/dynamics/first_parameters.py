@@ -1,0 +1,60 @@
+"""Parameters that a fit begins with: the user's, or those with which the measured states obey the equations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.nonlinear import NoFitError, fit
+from mkc_torch.simulation.dynamics.trajectory import defect
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["first_parameters"]
+
+_WINDOW = 4
+"""Intervals over which defects are summed: noise of the states mostly cancels."""
+
+
+def first_parameters(
+    given: Float[Tensor, " p"],
+    bounds: tuple[Float[Tensor, " p"], Float[Tensor, " p"]],
+    own: int,
+    rate: Callable[[Float[Tensor, " p"]], Callable[[Tensor], Tensor]],
+    guess: Float[Tensor, "G n"],
+    step: Float[Tensor, "G-1 1"],
+    residual: Callable[[Float[Tensor, " p"]], Float[Tensor, "N m"]],
+) -> Float[Tensor, " p"]:
+    """The user's values, or those with which the measured states obey the equations, whichever simulates better.
+
+    Args:
+        given: the user's values, and a first guess of the first states.
+        bounds: of all parameters.
+        own: number of parameters before the first states.
+        rate: of change of the states, by the parameters.
+        guess: of the states at all moments.
+        step: length of each interval in s.
+        residual: recording less simulation, by the parameters.
+    """
+    starts = [given]
+    if own:
+        values, begin = given[:own], given[own:]
+        typical = guess.abs().median(0).values.clamp(min=1e-12)
+
+        def lacking(values: Tensor) -> Tensor:
+            left = defect(rate(torch.cat([values, begin])), guess, step) / typical
+            total = torch.cat([torch.zeros_like(left[:1]), left.cumsum(0)])
+            return total[_WINDOW:] - total[:-_WINDOW]
+
+        low, high = (bound[:own] for bound in bounds)
+        with suppress(NoFitError):  # the equations cannot be looked at there
+            found = fit(lacking, values, lower=low, upper=high, covariance=None, max_iter=60).theta
+            starts.append(torch.cat([found, begin]))
+    spread = [robust_scale(residual(one).nan_to_num(torch.inf, torch.inf, torch.inf)) for one in starts]
+    return starts[0] if bool((spread[0] <= spread[-1]).all()) else starts[-1]
