@@ -36,6 +36,18 @@ from mkc_torch.challenge.verdict import CLAIMS
 COLUMNS = ("recording", "left out", "told", "located", "size", "bias", "open loop", "bound", "CPU, s")
 
 
+NOTHING: Mapping[str, Any] = {
+    "verdict": "",
+    "findings": [],
+    "residual_before": {},
+    "residual_after": {},
+    "parameters": {},
+    "sentences": [],
+    "cpu_seconds": None,
+}
+"""The row of a diagnosis that failed."""
+
+
 def recordings(shared: Path, only: str) -> Iterator[Known]:
     """Known recordings with this text in their name; what is absent is printed by its file's name."""
     for one in (*real(shared), *cases(shared), *data(shared)):
@@ -57,7 +69,10 @@ def diagnosed(task: tuple[Known, Path, float]) -> tuple[str, dict[str, Any]]:
         from row import write_row
 
         folder.mkdir(parents=True, exist_ok=True)
-        write_row(one.recording, replace(one.request, time_limit=limit_s), folder)
+        try:
+            write_row(one.recording, replace(one.request, time_limit=limit_s), folder)
+        except Exception as error:  # a fault of a recording costs its row, not the table
+            return one.name, {**NOTHING, "failed": f"{type(error).__name__}: {error}"}
     found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     return one.name, found
 

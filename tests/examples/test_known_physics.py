@@ -97,6 +97,14 @@ def test_a_row_that_is_there_is_kept(load, tmp_path):
     assert load("real").diagnosed((one, tmp_path, 300.0)) == (ROCKET, row())
 
 
+def test_a_diagnosis_that_fails_costs_its_row_alone(load, tmp_path):
+    one = next(one for one in load("known").real(tmp_path) if one.name == ROCKET)  # there is no such file
+    name, failed = load("real").diagnosed((one, tmp_path / "out", 300.0))
+    assert name == ROCKET
+    assert failed["failed"]
+    assert cells(load, failed)["told"] == "no answer (wrong)"
+
+
 @pytest.mark.e2e
 def test_a_mug_that_cools_is_diagnosed(load, tmp_path, capsys):
     recording = ROOT.parent / "real" / "mug" / "run.csv"

@@ -89,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         found.append(one)
         least = one.good[one.best].aicc
         seconds = time.process_time() - clock
-        above = least - criterion
+        above = round(least - criterion, 2) + 0.0  # not -0.00
         print(f"| {len(start)} | {one.stepwise.aicc:.2f} | {least:.2f} | {above:.2f} | {one.fits} | {seconds:.0f} |")
     good = pooled(found)
     (first, fit), *_ = good.items()
