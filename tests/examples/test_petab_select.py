@@ -67,3 +67,9 @@ def test_good_models_of_several_searches_are_counted_once(load):
     good = module.pooled([first, other])
     assert {selection: fit.aicc for selection, fit in good.items()} == {a: -5.0, b: -4.5}
     assert module.shares(good) == [(module.REACTIONS[1], 1.0), (module.REACTIONS[0], 0.5)]
+
+
+@pytest.mark.e2e
+def test_the_diagnosis_claims_the_one_rate_that_all_good_models_have(load):
+    logs = load("acetylation").measured(FOLDER / "data" / "measurements.tsv")
+    assert load("petab_select_0009").claimed(logs) == {"a_k05_k05k12": pytest.approx(27.8, abs=0.5)}

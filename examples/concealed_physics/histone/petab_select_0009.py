@@ -11,6 +11,7 @@ It needs the package petab-select (extra `examples`). The data lie beside this f
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -18,9 +19,12 @@ from pathlib import Path
 
 import torch
 import yaml
-from acetylation import REACTIONS, measured
+from acetylation import EFFECTS, REACTIONS, HistoneAcetylation, measured, recording
 from calibration import Calibration, Fit, Selection
 from selection import CLOSE, EFFECT_COUNT, Found, Search
+from torch import Tensor
+
+from mkc_torch import diagnose
 
 DATA = Path(__file__).resolve().parent / "data"
 STARTS = 10
@@ -58,6 +62,12 @@ def shares(good: Mapping[Selection, Fit]) -> list[tuple[str, float]]:
     return [(REACTIONS[number], count / len(good)) for number, count in counts.most_common()]
 
 
+def claimed(logs: Mapping[str, Tensor]) -> dict[str, float]:
+    """The factors that `diagnose` claims, by reaction; it learns the noise, and asks for evidence instead of AICc."""
+    diagnosis = diagnose(HistoneAcetylation(), recording(logs), effects=EFFECTS)
+    return {finding.effect: math.exp(float(finding.parameters[0].value)) for finding in diagnosis.findings}
+
+
 def named(selection: Selection) -> str:
     return ", ".join(REACTIONS[number] for number in sorted(selection))
 
@@ -69,7 +79,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     begin = time.process_time()
-    calibration = Calibration(measured(DATA / "measurements.tsv"))
+    logs = measured(DATA / "measurements.tsv")
+    calibration = Calibration(logs)
     best, criterion = published()
     direct, effects = calibration.fitted([best])[best].aicc, calibration.by_effects(best).aicc
     print(f"published model: AICc {criterion:.4f}, fitted here {direct:.4f}, with effects {effects:.4f}")
@@ -80,6 +91,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         search = Search(calibration, start)
         end = search.fits[search.step(forward=forward, backward=not forward)]
         print(f"{words} alone: {end.aicc:.2f}")
+    factors = ", ".join(f"{reaction}, factor {factor:.1f}" for reaction, factor in claimed(logs).items())
+    print(f"claimed by diagnose: {factors or 'nothing'}")
     print("\n| rates at the start | forward and backward | best | above the published | fits | CPU s |")
     print("|---:|---:|---:|---:|---:|---:|")
     found = []
