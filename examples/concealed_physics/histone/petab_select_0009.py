@@ -11,7 +11,6 @@ It needs the package petab-select (extra `examples`). The data lie beside this f
 from __future__ import annotations
 
 import argparse
-import math
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -65,7 +64,7 @@ def shares(good: Mapping[Selection, Fit]) -> list[tuple[str, float]]:
 def claimed(logs: Mapping[str, Tensor]) -> dict[str, float]:
     """The factors that `diagnose` claims, by reaction; it learns the noise, and asks for evidence instead of AICc."""
     diagnosis = diagnose(HistoneAcetylation(), recording(logs), effects=EFFECTS)
-    return {finding.effect: math.exp(float(finding.parameters[0].value)) for finding in diagnosis.findings}
+    return {finding.effect: float(torch.as_tensor(finding.parameters[0].value).exp()) for finding in diagnosis.findings}
 
 
 def named(selection: Selection) -> str:
