@@ -151,9 +151,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * (len(COLUMNS) - 1)}---:|")
     for name, one in chosen.items():
         print(f"| {' | '.join(line(one, rows[name], BY_HAND.get(name, ByHand())))} |")
-    right = sum(judged(rows[name], one.expected)["right"] for name, one in chosen.items())
+    wrong = {name: judged(rows[name], one.expected)["wrong"] for name, one in chosen.items()}
     seconds = sum(row["cpu_seconds"] or 0.0 for row in rows.values())
-    print(f"\n{right} of {len(rows)} right, {seconds:.0f} CPU seconds")
+    print(f"\n{sum(not faults for faults in wrong.values())} of {len(rows)} right, {seconds:.0f} CPU seconds")
+    for name, faults in wrong.items():
+        if faults:
+            print(f"  not right: {name}: {'; '.join(faults)}")
 
 
 if __name__ == "__main__":
