@@ -8,11 +8,12 @@ import pytest
 
 pytest.importorskip("polars")
 
+from examples.concealed_physics import known
+from examples.concealed_physics.judge import judged
 from mkc_torch.cli.diagnosis_request import Request
 from tests.gate import __main__ as gate
-from tests.gate import drawn, known
+from tests.gate import drawn
 from tests.gate.compare import differences
-from tests.gate.judge import judged
 from tests.gate.tables import compared_lines, count_lines, wrong_lines
 from tests.gate.work import Job, diagnosed
 

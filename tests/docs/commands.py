@@ -81,6 +81,8 @@ TESTED = {
     "examples/concealed_physics/magnetometer/real_recordings.py": "test_real_recordings.py",
     "examples/concealed_physics/dynamics/falling_balls.py": "test_concealed_dynamics.py",
     "examples/concealed_physics/dynamics/baselines.py": "test_dynamics_baselines.py",
+    "examples/concealed_physics/real.py": "test_known_physics.py",
+    "examples/concealed_physics/histone/petab_select_0009.py": "test_petab_select.py",
 }
 """Scripts that tests/examples runs at a small size: here only their options are looked at."""
 

@@ -24,9 +24,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.gate import drawn, known
+from examples.concealed_physics import known
+from examples.concealed_physics.judge import judged
+from tests.gate import drawn
 from tests.gate.compare import differences
-from tests.gate.judge import judged
 from tests.gate.tables import compared_lines, count_lines, wrong_lines
 from tests.gate.work import Job, diagnosed
 

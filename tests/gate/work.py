@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-import resource
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -78,30 +77,6 @@ def _row_of(folder: Path, failed: str, wall_seconds: float) -> dict[str, Any]:
 
 def diagnose_job(job: Job, folder: Path) -> None:
     """Diagnose in this process and write ``row.json``, beside ``diagnosis.json`` and ``model.json``."""
-    from mkc_torch._parallel.pool import allow_copies
-    from mkc_torch._parallel.processes import keep_memory, one_thread
-    from mkc_torch.cli.console import Look
-    from mkc_torch.cli.diagnosis_files import diagnose_file
-    from tests.gate.row import row
+    from examples.concealed_physics.row import write_row
 
-    one_thread()
-    keep_memory()
-    allow_copies(0)
-    for old in ("diagnosis.json", "model.json"):
-        (folder / old).unlink(missing_ok=True)
-    cpu, wall = _cpu_seconds(), time.perf_counter()
-    outcomes = diagnose_file(job.recording, folder, job.request, Look(terminal=False, width=100))
-    seconds = {
-        "cpu_seconds": round(_cpu_seconds() - cpu, 2),
-        "wall_seconds": round(time.perf_counter() - wall, 2),
-        "memory_gib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
-    }
-    failed = "; ".join(outcome.text for outcome in outcomes if outcome.failed)
-    found = row(folder, job.recording, job.request) | ({"failed": failed} if failed else {}) | seconds
-    (folder / "row.json").write_text(json.dumps(found), encoding="utf-8")
-
-
-def _cpu_seconds() -> float:
-    """User and system time of this process and of its children that have ended."""
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(part.ru_utime + part.ru_stime for part in used)
+    write_row(job.recording, job.request, folder)

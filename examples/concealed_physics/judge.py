@@ -1,61 +1,29 @@
-"""The right answer for a recording, and whether a row of the gate gives it."""
+"""The right answer for a recording, and whether a row gives it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mkc_torch.challenge.verdict import Answer, Candidate, answer
 
-
-@dataclass(frozen=True)
-class Size:
-    """A parameter's right value: ``within`` is the relative tolerance, ``errors`` the number of standard errors."""
-
-    effect: str
-    parameter: str
-    value: float
-    within: float = 0.0
-    errors: float = 0.0
-
-
-@dataclass(frozen=True)
-class Expected:
-    """The accepted answers for a recording.
-
-    Attributes:
-        names: groups of accepted effects; each group needs a claimed effect, or an alternative that the diagnosis says
-            it cannot rule out. None stands for a recording in which no effect may be claimed.
-        places: substrings, one of which has to be in a channel of the claimed effect; empty for any place.
-        refused: effects that may not be claimed.
-        verdicts: accepted verdicts; empty for any.
-        sizes: right values of parameters.
-        residual: output to the largest accepted root mean square of recording less open-loop simulation, in its unit.
-        words: phrases of an advice or warning, all of which together are accepted in place of a claim.
-    """
-
-    names: Sequence[Sequence[str]] = ()
-    places: Sequence[str] = ()
-    refused: Sequence[str] = ()
-    verdicts: Sequence[str] = ()
-    sizes: Sequence[Size] = ()
-    residual: Mapping[str, float] = field(default_factory=dict)
-    words: Sequence[str] = ()
+if TYPE_CHECKING:
+    from known import Expected, Size
 
 
 def judged(row: Mapping[str, Any], expected: Expected) -> dict[str, Any]:
     """Whether a row is right, by name, verdict, sizes and residual, and what is wrong with it.
 
     Args:
-        row: of the gate, as :func:`tests.gate.row.row` gives it.
+        row: of a diagnosis, as `row.row` gives it.
         expected: the right answer.
 
     Returns:
         ``right`` and, in ``wrong``, a sentence for each fault.
 
     Example:
+        >>> from known import Expected
         >>> row = {"verdict": "unfit", "findings": [], "residual_after": {}, "sentences": []}
         >>> judged(row, Expected(verdicts=("adequate",)))
         {'right': False, 'wrong': ['the verdict is unfit, not adequate']}

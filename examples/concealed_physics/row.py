@@ -1,8 +1,11 @@
-"""One row of the gate: what a diagnosis says, in the few numbers that are judged and compared."""
+"""A diagnosis as a row: what it says, in the few numbers that are judged and compared, and what it took."""
 
 from __future__ import annotations
 
+import json
 import math
+import resource
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +16,7 @@ from mkc_torch.cli.diagnosis_files import simulation_of
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Request
 from mkc_torch.recording.recording import Recording
 
-_FINDING = ("effect", "grade", "drivers", "channels", "p_value")
+_FINDING = ("effect", "grade", "drivers", "channels", "p_value", "region")
 _ALTERNATIVE = ("effect", "drivers", "separable")
 
 
@@ -33,6 +36,7 @@ def row(folder: Path, recording: Path, request: Request) -> dict[str, Any]:
         "findings": [finding(entry) for entry in content.get("findings") or ()],
         "residual_before": {output: numbers.get("residual") for output, numbers in follows.items()},
         "residual_after": _open_loop(folder / "model.json", recording, request) if content else {},
+        "parameters": _parameters(folder / "model.json", request) if content else {},
         "sentences": [*content.get("advice", ()), *content.get("warnings", ())],
     }
 
@@ -49,6 +53,15 @@ def finding(entry: Mapping[str, Any]) -> dict[str, Any]:
         "alternatives": [{key: other.get(key) for key in _ALTERNATIVE} for other in entry.get("alternatives") or ()],
         "parameters": [{key: p.get(key) for key in numbers} for p in entry.get("parameters") or ()],
     }
+
+
+def _parameters(model: Path, request: Request) -> dict[str, float]:
+    """The simulation's own parameters as fitted with the findings, by name."""
+    if not model.is_file() or request.simulated is not None or request.simulation == MAGNETOMETER:
+        return {}
+    values = json.loads(model.read_text(encoding="utf-8"))["parameters"]
+    names = getattr(simulation_of(request), "parameters", {})
+    return dict(zip(names, values, strict=False))  # first states follow
 
 
 def _open_loop(model: Path, recording: Path, request: Request) -> dict[str, float | None]:
@@ -70,3 +83,37 @@ def _open_loop(model: Path, recording: Path, request: Request) -> dict[str, floa
         rms = float((simulated[name] - table[name]).square().nanmean().sqrt()) if same_rows else math.nan
         found[name] = rms if math.isfinite(rms) else None
     return found
+
+
+def write_row(recording: Path, request: Request, folder: Path) -> None:
+    """Diagnose in this process, one thread, and write ``row.json`` beside ``diagnosis.json`` and ``model.json``.
+
+    The row also has CPU and wall seconds and the greatest memory of the process; ``failed`` says why there is no
+    diagnosis.
+    """
+    from mkc_torch._parallel.pool import allow_copies
+    from mkc_torch._parallel.processes import keep_memory, one_thread
+    from mkc_torch.cli.console import Look
+    from mkc_torch.cli.diagnosis_files import diagnose_file
+
+    one_thread()
+    keep_memory()
+    allow_copies(0)
+    for old in ("diagnosis.json", "model.json"):
+        (folder / old).unlink(missing_ok=True)
+    cpu, wall = _cpu_seconds(), time.perf_counter()
+    outcomes = diagnose_file(recording, folder, request, Look(terminal=False, width=100))
+    seconds = {
+        "cpu_seconds": round(_cpu_seconds() - cpu, 2),
+        "wall_seconds": round(time.perf_counter() - wall, 2),
+        "memory_gib": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
+    }
+    failed = "; ".join(outcome.text for outcome in outcomes if outcome.failed)
+    found = row(folder, recording, request) | ({"failed": failed} if failed else {}) | seconds
+    (folder / "row.json").write_text(json.dumps(found), encoding="utf-8")
+
+
+def _cpu_seconds() -> float:
+    """User and system time of this process and of its children that have ended."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(part.ru_utime + part.ru_stime for part in used)

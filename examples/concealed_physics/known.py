@@ -1,0 +1,164 @@
+"""The recordings whose missing physics is known, and their right answers by the tables beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Request
+
+SHARED = Path(__file__).resolve().parents[3] / "shared"
+"""Folder of the recordings, beside the project's."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """A parameter's right value: ``within`` is the relative tolerance, ``errors`` the number of standard errors."""
+
+    effect: str
+    parameter: str
+    value: float
+    within: float = 0.0
+    errors: float = 0.0
+
+
+@dataclass(frozen=True)
+class Expected:
+    """The accepted answers for a recording.
+
+    Attributes:
+        names: groups of accepted effects; each group needs a claimed effect, or an alternative that the diagnosis says
+            it cannot rule out. None stands for a recording in which no effect may be claimed.
+        places: substrings, one of which has to be in a channel of the claimed effect; empty for any place.
+        refused: effects that may not be claimed.
+        verdicts: accepted verdicts; empty for any.
+        sizes: right values of parameters.
+        residual: output to the largest accepted root mean square of recording less open-loop simulation, in its unit.
+        words: phrases of an advice or warning, all of which together are accepted in place of a claim.
+    """
+
+    names: Sequence[Sequence[str]] = ()
+    places: Sequence[str] = ()
+    refused: Sequence[str] = ()
+    verdicts: Sequence[str] = ()
+    sizes: Sequence[Size] = ()
+    residual: Mapping[str, float] = field(default_factory=dict)
+    words: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Known:
+    """A recording, its simulation as ``FILE.py:CLASS`` or the file of a simulator's output, and the right answer."""
+
+    name: str
+    recording: Path
+    simulation: str
+    expected: Expected
+    between: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def file(self) -> Path:
+        """The simulation's file; the recording's own for a simulation of the library."""
+        if self.simulation == MAGNETOMETER:
+            return self.recording
+        return Path(self.simulation.rpartition(":")[0] or self.simulation)
+
+    @property
+    def request(self) -> Request:
+        if self.simulation.endswith(".csv"):
+            return Request(simulation="", simulated=self.file, force=True, report=False)
+        return Request(simulation=self.simulation, between=self.between, force=True, report=False)
+
+
+DRAG = "quadratic_drag"
+CURVE = "unknown"
+HIDDEN_STORE = "hidden_lag"
+LATE = ("input_delay", "input_lag", "hidden_lag", "sensor_lag")
+USEFUL = ("explained", "unexplained")
+
+
+def real(shared: Path = SHARED) -> Iterator[Known]:
+    """The real recordings in a folder like :data:`SHARED`."""
+    folder = shared / "real"
+    hidden_mass = Expected(((HIDDEN_STORE,),), verdicts=USEFUL)
+    for number in (1, 2):
+        yield _known(folder, "house", f"house_{number}.csv", "House", hidden_mass)
+    pan = Expected((("backlash",), ("input_delay", "input_lag", "delay", "sensor_lag")), residual={"pan": 1.2 * 0.0024})
+    yield _known(folder, "so101", "pan.csv", "Servo", pan)
+    play = Expected(
+        (("backlash",), ("delay", "input_delay", "sensor_lag"), ("offset", "gravity_sag")),
+        residual={"pan": 1.2 * 0.0024},
+    )
+    yield Known("real so101 recording", folder / "so101" / "recording.csv", str(folder / "so101" / "command.csv"), play)
+    drag = Expected(((DRAG,),), sizes=(Size(DRAG, "drag", 9.2e-5, within=0.1),), residual={"altitude": 1.2 * 2.2})
+    yield _known(folder, "rocket", "juno.csv", "Rocket", drag)
+    friction = Expected((("coulomb_friction", DRAG),), refused=("stribeck_friction",), residual={"angle": 1.2 * 0.0061})
+    yield _known(folder, "pendulum_encoder", "run.csv", "Pendulum", friction)
+    loss = Expected((("power_law",),), refused=("overflow",), residual={"temp": 1.2 * 0.22})
+    yield _known(folder, "mug", "run.csv", "Cooling", loss)
+
+
+def cases(shared: Path = SHARED) -> Iterator[Known]:
+    """The kept cases, most of them simulated, in a folder like :data:`SHARED`."""
+    folder = shared / "cases"
+    drag = Expected(((DRAG,),), sizes=(Size(DRAG, "drag", 9.24e-5, errors=2.0),))
+    for name in ("white", "w2", "c05", "c2s", "coloured", "c2f"):
+        yield _known(folder, "coloured_sensor", f"{name}.csv", "Rocket", drag)
+    mode = (("hidden_mode",),)
+    sizes = {"share": 0.833, "period": 0.1405, "damping": 0.0224}
+    stiff = Expected(mode, sizes=[Size("hidden_mode", name, value, errors=2.0) for name, value in sizes.items()])
+    yield _known(folder, "two_mass", "stiff_240.csv", "Drive", stiff)
+    yield _known(folder, "two_mass", "resonant_600.csv", "Drive", Expected(mode))
+    arm = Expected((("input_square", "dead_zone", "power_law", CURVE), LATE), residual={"angle": 0.045})
+    yield _known(folder, "propeller_arm", "run.csv", "Arm", arm, between={"voltage": "held"})
+    overflow = Expected((("overflow", CURVE),), places=("level1",), residual={"level2": 1.2 * 0.41})
+    yield _known(folder, "tanks", "fit.csv", "Tanks", overflow)
+    air = Expected(
+        ((DRAG,),), sizes=(Size(DRAG, "drag", 0.00047, within=0.32),), words=("quadratic_drag", "would explain")
+    )
+    yield _known(folder, "coastdown", "runs.csv", "Coast", air)
+    yield _known(folder, "ball_beam", "run.csv", "Ball", Expected(verdicts=("unfit",)))
+    ground = Expected(((CURVE,),), places=("climb", "height"), residual={"height": 0.02})
+    yield _known(folder, "altitude", "runs.csv", "Altitude", ground)
+    convection = Expected((("power_law", CURVE),), refused=("thermal_loss",), verdicts=USEFUL)
+    yield _known(folder, "heater", "runs.csv", "Heater", convection)
+    friction = Expected((("coulomb_friction", "stribeck_friction"),))
+    yield _known(folder, "gear_motor", "runs.csv", "GearMotor", friction)
+    yield from _simulated(folder)
+
+
+def _simulated(folder: Path) -> Iterator[Known]:
+    """Six runs of a driven pendulum: nothing missing, driven by an unrecorded disturbance, or not to be followed."""
+    adequate, pushed, unfit = Expected(verdicts=("adequate",)), Expected(verdicts=("unexplained",)), ("unfit",)
+    for name in ("held_input", "linear_input"):
+        yield _known(folder, f"simulated/{name}", "run.csv", "Pendulum", adequate)
+    for name in ("pushed_slowly", "pushed_white", "gusts"):
+        yield _known(folder, f"simulated/{name}", "run.csv", "Pendulum", pushed)
+    yield _known(folder, "simulated/unrelated", "run.csv", "Pendulum", Expected(verdicts=unfit))
+    yield _known(folder, "simulated/held_input", "run.csv", "UpsideDown", Expected(verdicts=unfit))
+
+
+def data(shared: Path = SHARED) -> Iterator[Known]:
+    """Public recordings with known missing physics that are read as they are, in a folder like :data:`SHARED`."""
+    folder = shared / "data"
+    systems = Path(__file__).resolve().parent / "dynamics" / "systems.py"
+    coupled = Expected((("coupling",), LATE), refused=("thermal_loss",))
+    yield Known(
+        "data heaters run_1s Heaters", folder / "dynamics" / "heaters" / "run_1s.csv", f"{systems}:Heaters", coupled
+    )
+    step = Expected((("hard_iron_step",),))
+    for name in ("broad_34_attached_magnet_3cm", "broad_36_attached_magnet_5cm"):
+        yield Known(f"data {name}", folder / "magnetometer" / f"{name}.csv", MAGNETOMETER, step)
+    current = Expected((("current_field",),))
+    name = "quadrotor_compass3"
+    yield Known(f"data {name}", folder / "magnetometer" / f"{name}.csv", MAGNETOMETER, current)
+
+
+def _known(
+    place: Path, folder: str, file: str, name: str, expected: Expected, between: Mapping[str, str] | None = None
+) -> Known:
+    recording = place / folder / file
+    own = recording.parent / "naive.py"
+    simulation = f"{own if own.is_file() else recording.parent.parent / 'naive.py'}:{name}"
+    return Known(f"{place.name} {folder} {recording.stem} {name}", recording, simulation, expected, between or {})

@@ -1,0 +1,117 @@
+"""The table of recordings whose missing physics is known: its cells, what it skips, and one whole diagnosis."""
+
+import importlib
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("polars")
+
+from tests.shared_data import ROOT
+
+FOLDER = Path(__file__).resolve().parents[2] / "examples" / "concealed_physics"
+ROCKET = "real rocket juno Rocket"
+
+
+@pytest.fixture
+def load(monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    for name in ("real", "known", "by_hand", "judge", "row"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    return importlib.import_module
+
+
+def row(**changes):
+    region = {"state": "altitude", "unit": "m", "kind": "below", "bound": 2138.6}
+    drag = {
+        "effect": "quadratic_drag",
+        "grade": "left out",
+        "drivers": [],
+        "channels": ["rate of speed"],
+        "region": region | {"share_of_gain": 0.892, "share_of_time": 0.3},
+        "alternatives": [],
+        "parameters": [{"name": "drag", "value": 9.3e-5, "standard_error": 1e-6, "unit": "1/m"}],
+    }
+    return {
+        "verdict": "explained",
+        "findings": [drag],
+        "residual_before": {"altitude": 24.17},
+        "residual_after": {"altitude": 1.946},
+        "parameters": {"gravity": 9.7119},
+        "sentences": [],
+        "cpu_seconds": 36.06,
+    } | changes
+
+
+def cells(load, found):
+    module = load("real")
+    one = next(one for one in load("known").real() if one.name == ROCKET)
+    return dict(zip(module.COLUMNS, module.line(one, found, load("by_hand").BY_HAND[ROCKET]), strict=True))
+
+
+def test_a_right_diagnosis_stands_beside_the_fit_by_hand(load):
+    assert cells(load, row()) == {
+        "recording": ROCKET,
+        "left out": "quadratic drag",
+        "told": "quadratic drag (right)",
+        "located": "89% in 30%: altitude below 2.14e+03 (right)",
+        "size": "drag 9.3e-05 ± 1e-06, by hand 9.2e-05",
+        "bias": "gravity -1.0%",
+        "open loop": "altitude 24.2 → 1.95",
+        "bound": "altitude 2.2",
+        "CPU, s": "36",
+    }
+
+
+def test_a_diagnosis_that_names_nothing_is_wrong_and_has_no_size(load):
+    found = cells(load, row(verdict="unexplained", findings=[], residual_after={}))
+    assert found["told"] == "unexplained (wrong)"
+    assert found["located"] == "-"
+    assert found["size"] == "drag -, by hand 9.2e-05"
+    assert found["open loop"] == "altitude 24.2"
+
+
+def test_each_recording_with_missing_physics_has_its_words(load):
+    known, by_hand = load("known"), load("by_hand").BY_HAND
+    names = {one.name for part in (known.real, known.cases, known.data) for one in part()}
+    assert set(by_hand) <= names
+    adequate = {f"cases simulated/{name} run Pendulum" for name in ("held_input", "linear_input")}
+    assert names - set(by_hand) == adequate
+
+
+def test_absent_recordings_are_named_and_left_out(load, tmp_path, capsys):
+    load("real").main(["--data", str(tmp_path), "--only", "mug", "--output", str(tmp_path / "out")])
+    printed = capsys.readouterr()
+    assert f"left out: {tmp_path / 'real' / 'mug' / 'run.csv'}, " in printed.err
+    assert "0 of 0 right, 0 CPU seconds" in printed.out
+
+
+def test_a_row_that_is_there_is_kept(load, tmp_path):
+    one = next(one for one in load("known").real() if one.name == ROCKET)
+    folder = tmp_path / re.sub(r"\W", "_", ROCKET)
+    folder.mkdir()
+    (folder / "row.json").write_text(json.dumps(row()), encoding="utf-8")
+    assert load("real").diagnosed((one, tmp_path, 300.0)) == (ROCKET, row())
+
+
+def test_a_diagnosis_that_fails_costs_its_row_alone(load, tmp_path):
+    one = next(one for one in load("known").real(tmp_path) if one.name == ROCKET)  # there is no such file
+    name, failed = load("real").diagnosed((one, tmp_path / "out", 300.0))
+    assert name == ROCKET
+    assert failed["failed"]
+    assert cells(load, failed)["told"] == "no answer (wrong)"
+
+
+@pytest.mark.e2e
+def test_a_mug_that_cools_is_diagnosed(load, tmp_path, capsys):
+    recording = ROOT.parent / "real" / "mug" / "run.csv"
+    if not recording.exists():
+        pytest.skip(f"no data file {recording}")
+    load("real").main(["--only", "mug", "--output", str(tmp_path)])
+    printed = capsys.readouterr().out
+    assert "| power law (right) |" in printed
+    assert "1 of 1 right" in printed
+    assert json.loads((tmp_path / "real_mug_run_Cooling" / "row.json").read_text(encoding="utf-8"))["parameters"]
