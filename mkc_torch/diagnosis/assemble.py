@@ -45,6 +45,10 @@ _HINTED = 0.15
 """p-value up to which the strongest candidate is told, though it does not count."""
 
 
+_DROPPED = ("not confirmed", "nearest in the catalogue")
+"""Grades of findings that are left out where their size is 0 within its standard error."""
+
+
 @dataclass(frozen=True)
 class Whole:
     """All that a diagnosis is assembled from beside the answers of the tests.
@@ -87,7 +91,7 @@ def assembled(whole: Whole, answers: Answers) -> Diagnosis:
     known = _around(whole)
     unfit = known.unfit(settings.evidence)
     tried = [] if unfit else [_finding(case.found, number, final, whole, answers) for number in range(len(case.found))]
-    without_size = [one for one in tried if one.grade == "not confirmed" and sizeless(one)]
+    without_size = [one for one in tried if one.grade in _DROPPED and sizeless(one)]
     findings = tuple(one for one in tried if one not in without_size)
     diagnosis = Diagnosis(
         recording=prepared.recording.name,
