@@ -14,6 +14,15 @@ from mkc_torch._parallel.deadline import Stopped, check_deadline, is_limited, li
 from mkc_torch._parallel.pool import allow_copies, meanwhile, shared
 from tests.started import started
 
+
+@pytest.fixture(autouse=True)
+def usual_interrupts():
+    """A background shell may ignore interrupts."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 linux = pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked elsewhere")
 posix = pytest.mark.skipif(os.name == "nt", reason="signals are another thing there")
 

@@ -108,7 +108,7 @@ def test_files_and_summary(stepped):
     validate(content)
     assert (content["recording"], content["simulation"], content["verdict"]) == (path.stem, "magnetometer", "explained")
     search = {"candidates": content["search"]["candidates"], "surrogates": 19, "seed": 5}
-    assert content["search"] == search | {"starts": content["search"]["starts"]}
+    assert content["search"] == search | {"quick": False, "stopped": None, "starts": content["search"]["starts"]}
     first = content["findings"][0]
     assert first["effect"] == "hard_iron_step"
     assert first["onset"] == pytest.approx(9.0, abs=0.2)

@@ -49,7 +49,7 @@ def test_one_recording_has_its_name_and_the_time(tmp_path):
     code, seen = on_a_terminal("calibrate", path, "--output", tmp_path / "out")
     assert code == 0
     plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", seen)
-    assert re.search(r"calibrating good\.csv 0:00:0\d", plain)
+    assert re.search(r"calibrating good\.csv +\S* *0:\d\d:\d\d", plain)
     assert " 0/1 " not in plain
     assert seen.count("\x1b[?25l") == seen.count("\x1b[?25h")  # the cursor is shown again
     assert "report.html" in plain

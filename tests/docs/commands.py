@@ -121,7 +121,14 @@ def run(words: list[str], folder: Path) -> None:
         case ["python", script, *arguments] if script.startswith("examples/"):
             run_example(script, arguments, folder)
         case ["python", "-m", module, *_] if module.startswith(
-            ("tests.benchmarks", "tests.device", "tests.fuzz", "tests.mutation", "tests.wheel")
+            (
+                "tests.benchmarks",
+                "tests.device",
+                "tests.fuzz",
+                "tests.gate.null_p_values",
+                "tests.mutation",
+                "tests.wheel",
+            )
         ):
             # minutes each: here only whether it is there
             name = f"{module}.__main__" if module in ("tests.benchmarks", "tests.device") else module

@@ -546,7 +546,7 @@ def test_a_simulation_that_sticks_is_gone_through_moment_by_moment(monkeypatch):
     theta = correction.prepared.start()
     assert not correction.prepared.trajectory(theta, {}).converged
     with monkeypatch.context() as without:
-        without.setattr(prepared_dynamics, "marched", lambda *_, **__: None)
+        without.setattr(prepared_dynamics.PreparedDynamics, "_marched", lambda *_: None)
         with pytest.raises(SimulationError, match=r"no trajectory was found.*`step`"):
             correction.corrected(theta, {})
     # the first states as they are measured
