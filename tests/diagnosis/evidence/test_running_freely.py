@@ -79,9 +79,10 @@ def test_where_the_simulation_alone_loses_the_recording_all_is_told_under_pushes
     as_it_is(running_freely(base, None, found, (KEPT, KEPT), BLOCKS), base, found)
 
 
-@pytest.mark.parametrize("lost", ["_judged"])
+@pytest.mark.parametrize("lost", [("freed", "_from_alone"), ("_judged",)])
 def test_where_a_finding_loses_the_recording_or_an_unseen_block_all_is_told_under_pushes(monkeypatch, lost):
     base, one = under_pushes()
     alone, found = freed(base), (one,)
-    monkeypatch.setattr(module, lost, lambda *_: None)
+    for name in lost:
+        monkeypatch.setattr(module, name, lambda *_: None)
     as_it_is(running_freely(base, alone, found, (KEPT, KEPT), BLOCKS), base, found)
