@@ -280,8 +280,9 @@ def _plain(
     """Whether a candidate's fit is so much likelier than the simulation under any noise that no draws are needed.
 
     A likelihood ratio exceeds k with a probability of at most 1/k without the effect (Markov's inequality; Wasserman,
-    Ramdas & Balakrishnan, PNAS 117 (2020), 16880); what the fit of its numbers and the choice among the candidates gain
-    is taken off.
+    Ramdas & Balakrishnan, PNAS 117 (2020), 16880), where the simulation alone has its likeliest noise too: that which
+    its own fit leads to, or that which is found beside the effect. What the fit of the effect's numbers and the choice
+    among the candidates gain is taken off.
     """
     if not runs:
         return False
@@ -289,10 +290,28 @@ def _plain(
     works += [partial(_under_own_noise, fit, base, declared, settings) for fit in runs]
     alone, *others = at_once(works, base.model.prepared, [fit.model.terms[-1] for fit in runs])
     samples, kinds = int(alone.residual.numel()), len({term.key for term in terms})
-    return any(
-        priced(fit, settings) - priced(alone, settings) > _DOUBT + price(_numbers(fit), samples, kinds)
-        for fit in others
-    )
+    for fit in others:
+        least = _DOUBT + price(_numbers(fit), samples, kinds)
+        if priced(fit, settings) - priced(alone, settings) > least:
+            over = _over_same_noise(base, fit, declared, settings)
+            if over is not None and over > least:
+                return True
+    return False
+
+
+def _over_same_noise(
+    base: FittedModel, fit: FittedModel, declared: Mapping[str, float], settings: Settings
+) -> float | None:
+    """Gain of a candidate's fit over the simulation without it, begun with the noise that is found beside it.
+
+    None where the simulation has no fit under that noise.
+    """
+    model = JointModel(fit.model.prepared, base.model.terms, base.model.near)
+    try:
+        without = fitted(model, fit.parameters[: base.model.size], base.bound, graduate=False)
+    except NoFitError:
+        return None
+    return priced(fit, settings) - priced(with_own_noise(without, declared, settings), settings)
 
 
 def _needless(base: FittedModel, best: FittedModel, declared: Mapping[str, float], settings: Settings) -> bool:
@@ -300,18 +319,10 @@ def _needless(base: FittedModel, best: FittedModel, declared: Mapping[str, float
 
     A candidate that only led to a likelier noise is no finding: its size is nothing, or anything.
     """
-    prepared, own = best.model.prepared, base.model.size
     if not pushed(best):
         return False
-    assert isinstance(prepared, PreparedDynamics)
-    model = JointModel(prepared, base.model.terms, base.model.near)
-    try:
-        without = fitted(model, best.parameters[:own], base.bound, graduate=False)
-    except NoFitError:
-        return False
-    bare = with_own_noise(without, declared, settings)
-    price = 0.5 * (best.model.size - own) * math.log(len(base.residual))
-    return priced(best, settings) - priced(bare, settings) < price
+    gained = _over_same_noise(base, best, declared, settings)
+    return gained is not None and gained < 0.5 * _numbers(best) * math.log(len(base.residual))
 
 
 def _by_free_run(
