@@ -110,6 +110,7 @@ def write_row(recording: Path, request: Request, folder: Path) -> None:
     }
     failed = "; ".join(outcome.text for outcome in outcomes if outcome.failed)
     found = row(folder, recording, request) | ({"failed": failed} if failed else {}) | seconds
+    folder.mkdir(parents=True, exist_ok=True)  # a diagnosis that fails leaves no empty folder
     (folder / "row.json").write_text(json.dumps(found), encoding="utf-8")
 
 

@@ -28,9 +28,10 @@ from mkc_torch.diagnosis.joined import joined
 from mkc_torch.diagnosis.linearised.smaller_step import with_smaller_step
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.in_the_world import at_liberty, between_samples, simulation_in_the_world
+from mkc_torch.diagnosis.model.in_the_world import at_liberty, between_samples, noise_around, simulation_in_the_world
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.rounds import Asked, begun, continued
+from mkc_torch.diagnosis.search.own_noise import noise_of_fit
 from mkc_torch.diagnosis.settings import Settings, quick_settings
 from mkc_torch.diagnosis.under_way import UnderWay
 from mkc_torch.diagnosis.verdict import alone, lost_from_the_start
@@ -183,7 +184,17 @@ def _diagnosed(
         known.asked = asked = replace(asked, max_findings=min(asked.max_findings, 1))
     hopeless = lost_from_the_start(world)
     progress(f"trying {len(terms)} effects")
-    search = begun(base, () if hopeless else terms, asked, generator, world.free, known.keep_search)
+    terms = () if hopeless else terms
+    search = begun(base, terms, asked, generator, world.free, known.keep_search)
+    likelier = None if search.first is None else search.first.alone
+    noise = (
+        None if likelier is None else noise_around(likelier, declared, settings.noise, noise_of_fit(likelier, declared))
+    )
+    if likelier is not None and noise is not None and noise.observer is not None:
+        progress(f"trying {len(terms)} effects under a likelier noise")
+        known.world = world = replace(world, fit=likelier, noise=noise)
+        base = likelier
+        search = begun(base, terms, asked, generator, world.free, known.keep_search)
     finer = with_smaller_step(search.found[-1].fit, settings.noise) if search.found else None
     if finer is not None:
         return _diagnosed(known.anew(), finer, where, progress)

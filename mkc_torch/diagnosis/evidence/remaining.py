@@ -15,6 +15,9 @@ from mkc_torch.diagnosis.settings import EvidenceSettings
 
 __all__ = ["nameless", "remaining", "remaining_warning", "said", "test", "within_reach"]
 
+_RUNS_AWAY = 100.0
+"""Half-widths of the domain of residuals beyond which a simulation is lost."""
+
 
 def within_reach(case: Case) -> tuple[Ceiling, tuple[str, ...]]:
     """The ceiling of any fit, and the columns along which something smooth remains."""
@@ -41,9 +44,9 @@ def nameless(fit: FittedModel) -> bool:
 
 
 def _answerable(base: FittedModel, final: FittedModel) -> FittedModel:
-    """The final fit; that of the simulation alone, if it has no answer at the other's parameters."""
+    """The final fit; that of the simulation alone, if it has no answer at the other's parameters, or runs away there."""
     alone = base.model.residual(final.parameters[: base.model.size])
-    return final if bool(alone.isfinite().all()) else base
+    return final if bool((alone.abs() < _RUNS_AWAY * final.bound).all()) else base
 
 
 def remaining(

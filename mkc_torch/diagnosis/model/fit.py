@@ -80,7 +80,7 @@ def fitted(
         rows: weights of the samples; 0 leaves one out.
         graduate: False for a start near the answer.
     """
-    found = _fit(model, _usable(model, start), bound, rows, graduate=graduate)
+    found = _fit(*_begun(model, start), bound, rows, graduate=graduate)
     for _ in range(_NARROWER):
         seen = found.residual if rows is None else found.residual[rows > 0]
         if not bool((found.d > _WIDE * robust_scale(seen)).any()):
@@ -153,15 +153,20 @@ def without_term(fit: FittedModel, number: int) -> FittedModel:
     return replace(fit, model=left, parameters=parameters)
 
 
-def _usable(model: JointModel, start: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
-    """The start, its effects made smaller where the simulation with them has no finite answer."""
-    if not model.terms:
-        return start
-    for share in _SHARES:
+def _begun(model: JointModel, start: Float[Tensor, " p"]) -> tuple[JointModel, Float[Tensor, " p"]]:
+    """A model and a start at which it has a finite answer, where there are any.
+
+    Where there is none near the trajectory that the model knows, which may be of another noise, one is searched without
+    it; then with smaller effects.
+    """
+    if not model.terms and model.near is None:
+        return model, start
+    for share in _SHARES if model.terms else (1.0,):
         smaller = torch.cat([start[: model.base], share * start[model.base :]])
-        if bool(model.residual(smaller).isfinite().all()):
-            return smaller
-    return start
+        for one in (model, model.begun_with(None)) if share == 1.0 and model.near is not None else (model,):
+            if bool(one.residual(smaller).isfinite().all()):
+                return one, smaller
+    return model, start
 
 
 def clipped_residual(residual: Float[Tensor, "N m"]) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"]]:

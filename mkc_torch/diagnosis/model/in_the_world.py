@@ -246,7 +246,7 @@ def beside_effects(
 ) -> FittedModel:
     """A joint model under the pushes that are left beside its effects, or, where it is as likely, running freely."""
     found = _under_noise(fit, noise_around(fit, declared, settings, around), declared, settings)
-    best = fit if found is None else found[0]
+    best = fit if found is None or found[0].log_likelihood < fit.log_likelihood else found[0]
     free = freed(best)
     if free is None:
         return best

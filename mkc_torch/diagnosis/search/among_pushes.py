@@ -143,7 +143,9 @@ def located_among_pushes(
         best, ranking = _by_free_run(best, ranking, fits, terms, settings)
         best = beside_effects(best, noise_of_fit(best, declared), declared, settings.noise)
         best = best if quick else between_beside_effects(best, declared, fixed, settings.noise)
-    needless = bool(fits) and _needless(base, best, declared, settings)
+    bare = _without(base, best, declared, settings) if fits and pushed(best) else None
+    likelier = bare is not None and priced(bare, settings) > priced(base, settings) + settings.noise.pushed
+    needless = bare is not None and _needless(best, bare, settings, drawn=not likelier)
     return replace(
         located,
         term=best.model.terms[-1],
@@ -151,6 +153,7 @@ def located_among_pushes(
         p_value=1.0 if needless else p_value,
         ranking=ranking,
         compared=fits,
+        alone=bare if needless and likelier else None,
     )
 
 
@@ -293,36 +296,33 @@ def _plain(
     for fit in others:
         least = _DOUBT + price(_numbers(fit), samples, kinds)
         if priced(fit, settings) - priced(alone, settings) > least:
-            over = _over_same_noise(base, fit, declared, settings)
-            if over is not None and over > least:
+            bare = _without(base, fit, declared, settings)
+            if bare is not None and priced(fit, settings) - priced(bare, settings) > least:
                 return True
     return False
 
 
-def _over_same_noise(
+def _without(
     base: FittedModel, fit: FittedModel, declared: Mapping[str, float], settings: Settings
-) -> float | None:
-    """Gain of a candidate's fit over the simulation without it, begun with the noise that is found beside it.
-
-    None where the simulation has no fit under that noise.
-    """
+) -> FittedModel | None:
+    """The simulation without a candidate, begun with the noise that is found beside it; None where it has no fit."""
     model = JointModel(fit.model.prepared, base.model.terms, base.model.near)
     try:
         without = fitted(model, fit.parameters[: base.model.size], base.bound, graduate=False)
     except NoFitError:
         return None
-    return priced(fit, settings) - priced(with_own_noise(without, declared, settings), settings)
+    return with_own_noise(without, declared, settings)
 
 
-def _needless(base: FittedModel, best: FittedModel, declared: Mapping[str, float], settings: Settings) -> bool:
+def _needless(best: FittedModel, bare: FittedModel, settings: Settings, *, drawn: bool) -> bool:
     """Whether the noise that was found beside an effect does as much without it.
 
-    A candidate that only led to a likelier noise is no finding: its size is nothing, or anything.
+    A candidate that only led to a likelier noise is no finding: its size is nothing, or anything. Its numbers are
+    priced as by Schwarz; as by Akaike where the draws were of that noise, for then the p-value counts the search.
     """
-    if not pushed(best):
-        return False
-    gained = _over_same_noise(base, best, declared, settings)
-    return gained is not None and gained < 0.5 * _numbers(best) * math.log(len(base.residual))
+    numbers = best.model.size - bare.model.size + len(best.model.terms[-1].effect.fitted_shape)
+    price_of_one = 1.0 if drawn else 0.5 * math.log(len(best.residual))
+    return priced(best, settings) - priced(bare, settings) < numbers * price_of_one
 
 
 def _by_free_run(

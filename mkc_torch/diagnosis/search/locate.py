@@ -58,6 +58,8 @@ class Located:
             under the same.
         longer: times as long a recording that would show it has to be, if it is there; infinite where nobody knows.
         with_noise: whether noise and physics were chosen together.
+        alone: the simulation without the candidate, where noise that was found beside the candidate makes both as
+            likely, and likelier than any noise that the simulation had; None elsewhere.
     """
 
     term: Term
@@ -72,6 +74,7 @@ class Located:
     compared: Sequence[FittedModel] = ()
     longer: float = math.inf
     with_noise: bool = False
+    alone: FittedModel | None = None
 
     @property
     def scene(self) -> Scene:
