@@ -188,6 +188,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "`--to mavlink`": ("export", DONE, "--to", "mavlink", "--output", "@out.params"),
     "a simulation that is not there": ("diagnose", "@rec.csv", "--simulation", "@sim.py", "--output", "@out"),
     "`--time-limit 0`": (*DIAGNOSE, "--time-limit", "0"),
+    "`--time-limit soon`": (*DIAGNOSE, "--time-limit", "soon"),
     "`--quick --surrogates 99`": (*DIAGNOSE, "--quick", "--surrogates", "99"),
     "a simulation of no kind": ("diagnose", "@rec.csv", "--simulation", "@none.json", "--output", "@out"),
 }  # fmt: skip

@@ -93,7 +93,7 @@ def diagnose(
         typer.Option("--quick", help="A first look in less time: no p-values, false alarms not controlled."),
     ] = False,
     time_limit: Annotated[
-        float | None,
+        str | None,
         typer.Option(metavar="SECONDS", help="Stop after so long, for each REC, and write what is known then."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace existing results.")] = False,
@@ -276,10 +276,16 @@ def _level(level: float) -> float:
     return level
 
 
-def _time_limit(seconds: float | None) -> float | None:
-    if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
+def _time_limit(text: str | None) -> float | None:
+    if text is None:
+        return None
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not (math.isfinite(seconds) and seconds > 0.0):
         raise typer.BadParameter(
-            f"--time-limit must be a number of seconds above 0 but is {seconds:g}; leave it out for no limit."
+            f"--time-limit must be a number of seconds above 0 but is {text}; leave it out for no limit."
         )
     return seconds
 

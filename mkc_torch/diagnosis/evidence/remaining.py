@@ -44,7 +44,7 @@ def nameless(fit: FittedModel) -> bool:
 
 
 def _answerable(base: FittedModel, final: FittedModel) -> FittedModel:
-    """The final fit; that of the simulation alone, if it has no answer at the other's parameters, or runs away there."""
+    """The final fit; that of the simulation alone, if it has none at the other's parameters, or runs away."""
     alone = base.model.residual(final.parameters[: base.model.size])
     return final if bool((alone.abs() < _RUNS_AWAY * final.bound).all()) else base
 
