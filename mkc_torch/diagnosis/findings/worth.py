@@ -72,11 +72,18 @@ def confirmed(finding: Finding) -> bool:
 def vetoed(held_out: HeldOut) -> bool:
     """Whether unseen blocks speak against a finding: the free run is farther off, or it is less likely for no gain.
 
+    Of several outputs the mean of the logarithms of their residuals counts: what mends one may spoil another.
+
     Example:
+        >>> from mkc_torch.diagnosis.result import Sizes
+        >>> each = {"angle": Sizes(2.0, 1.8, "rad"), "speed": Sizes(2.0, 3.0, "rad/s")}
+        >>> vetoed(HeldOut(0.0, (-0.1, 0.1), 2.0, 1.8, "", each))
+        True
         >>> vetoed(HeldOut(0.0, (-0.1, 0.1), 2.0, 1.0, "m")), vetoed(HeldOut(0.0, (-0.1, 0.1), 2.0, 2.2, "m"))
         (False, True)
     """
-    less = change(held_out)
+    ratios = [_ratio(*pair) for pair in _sizes(held_out)]
+    less = 1.0 - math.exp(sum(map(math.log, ratios)) / len(ratios))
     worse = confirmation(held_out.log_likelihood_gain, held_out.confidence_interval) == "worse"
     return less < -SMALL or (worse and less < SMALL)
 
@@ -102,12 +109,18 @@ def change(held_out: HeldOut) -> float:
         >>> change(HeldOut(0.3, (0.2, 0.4), 3.0, 3.0, "", each))
         0.5
     """
+    return 1.0 - min(_ratio(*pair) for pair in _sizes(held_out))
+
+
+def _sizes(held_out: HeldOut) -> list[tuple[float, float]]:
+    """Residuals before and after, of each output."""
     each = [(one.before, one.after) for one in held_out.outputs.values()]
-    return max(_less(*pair) for pair in each or [(held_out.rmse_before, held_out.rmse_after)])
+    return each or [(held_out.rmse_before, held_out.rmse_after)]
 
 
-def _less(before: float, after: float) -> float:
-    return 1.0 - after / before if before > 0.0 and math.isfinite(after / before) else 0.0
+def _ratio(before: float, after: float) -> float:
+    """Of residuals after and before; 1 where it is not known."""
+    return after / before if before > 0.0 and 0.0 < after / before < math.inf else 1.0
 
 
 def small(finding: Finding) -> bool:
