@@ -225,6 +225,12 @@ def test_a_mug_loses_heat_by_a_high_power_of_its_temperature():
 
 
 @slow
+def test_a_house_has_a_second_mass_even_where_its_first_noise_was_not_the_likeliest():
+    diagnosis = real("house/house_2.csv", "house/naive.py:House")
+    assert first(diagnosis, "hidden_lag", "rate of indoor").grade == AS_WRITTEN
+
+
+@slow
 def test_a_pendulum_on_a_shaft_is_stopped_by_dry_friction():
     diagnosis = real("pendulum_encoder/run.csv", "pendulum_encoder/naive.py:Pendulum")
     found = first(diagnosis, "coulomb_friction", "rate of speed")

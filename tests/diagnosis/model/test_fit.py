@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from mkc_torch import Recording
-from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.fit import _begun, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.simulation import Dynamics, Parameter
 
@@ -34,3 +34,24 @@ def test_a_scale_is_that_of_the_residuals_where_a_fit_ends():
     assert 0.5 * NOISE < float(found.d) < 1.5 * NOISE
     again = fitted(model, found.parameters, bound)
     assert abs(again.log_likelihood - found.log_likelihood) < 1.0
+
+
+def test_a_fit_begins_without_a_trajectory_nearby_from_which_none_is_found(monkeypatch):
+    """As one of another noise can be: its states stand for other things."""
+    time = np.arange(100) * 0.05
+    level = np.exp(-0.7 * time)
+    prepared = Decay().prepare(Recording({"time": torch.from_numpy(time), "level": torch.from_numpy(level)}))
+    start = torch.tensor([0.7, 1.0], dtype=torch.float64)
+    near, whole = prepared.answer(start, {}).nearby, JointModel.residual
+
+    def lost_nearby(model, parameters):
+        found = whole(model, parameters)
+        return found if model.near is None else torch.full_like(found, torch.nan)
+
+    monkeypatch.setattr(JointModel, "residual", lost_nearby)
+    begun, same = _begun(JointModel(prepared, (), near), start)
+    assert begun.near is None
+    assert torch.equal(same, start)
+    # with an answer nearby it is kept
+    monkeypatch.setattr(JointModel, "residual", whole)
+    assert _begun(JointModel(prepared, (), near), start)[0].near is near

@@ -1,16 +1,19 @@
 """The search beside pushes: what is left out has its name, in a fit of its own under the pushes that it leaves."""
 
 import dataclasses
+import importlib
+import types
 
 import pytest
 import torch
 
-from mkc_torch.diagnosis.search.among_pushes import _within_reach, located_among_pushes
+from mkc_torch.diagnosis.search.among_pushes import _needless, _plain, _within_reach, located_among_pushes
 from mkc_torch.diagnosis.settings import SearchSettings, Settings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.nonlinear import NoFitError
-from tests.diagnosis.pushed import at_the_truth, candidates, swung_in_the_world
+from tests.diagnosis.pushed import Pendulum, at_the_truth, candidates, swung, swung_in_the_world
 
+of_diagnosis = importlib.import_module("mkc_torch.diagnosis.diagnose")
 FEW = Settings(search=dataclasses.replace(SearchSettings(), own_noise=2))
 
 
@@ -81,3 +84,51 @@ def test_the_one_that_is_left_out_is_still_in_the_ranking():
     assert len(found.compared) == 1
     assert len({one.number for one in found.ranking}) > 4
     assert found.ranking[0].gap == 0.0 <= min(one.gap for one in found.ranking[1:])
+
+
+def of_likelihood(value, size, shape=()):
+    """What prices of a fit ask of it: a free run of 400 samples."""
+    effect = types.SimpleNamespace(fitted_shape=shape)
+    term = types.SimpleNamespace(effect=effect, key=("drag", (), "rate"))
+    model = types.SimpleNamespace(size=size, sizes=[1], terms=[term], prepared=None)
+    return types.SimpleNamespace(log_likelihood=value, model=model, residual=torch.zeros(400, 1), value=value)
+
+
+def test_an_effect_that_gains_no_more_than_its_numbers_over_the_same_noise_is_needless():
+    bare = of_likelihood(1000.0, 3)
+    # two numbers: six nats by Schwarz, two by Akaike where the draws were of that noise
+    for gain, drawn, needless in ((5.9, False, True), (6.1, False, False), (1.9, True, True), (2.1, True, False)):
+        assert _needless(of_likelihood(1000.0 + gain, 4, ("period",)), bare, FEW, drawn=drawn) is needless
+
+
+@pytest.mark.parametrize(("bare", "counts"), [(1000.0, True), (1095.0, False), (None, False)])
+def test_without_draws_a_free_run_has_to_be_likelier_than_the_simulation_under_the_noise_beside_it_too(
+    bare, counts, monkeypatch
+):
+    base, run = of_likelihood(1000.0, 3), of_likelihood(1100.0, 4)
+    module = "mkc_torch.diagnosis.search.among_pushes"
+    monkeypatch.setattr(f"{module}.with_own_noise", lambda fit, *_: fit)
+    monkeypatch.setattr(f"{module}._under_own_noise", lambda fit, *_: fit)
+    monkeypatch.setattr(f"{module}.at_once", lambda works, *_: [work() for work in works])
+    monkeypatch.setattr(f"{module}.priced", lambda fit, _: fit.value)
+    monkeypatch.setattr(f"{module}._without", lambda *_: None if bare is None else of_likelihood(bare, 3))
+    assert _plain(base, [run], run.model.terms, {}, FEW) is counts
+
+
+@pytest.mark.e2e
+def test_the_search_is_done_again_with_the_simulation_under_a_likelier_noise(monkeypatch):
+    bases, once = [], of_diagnosis.begun
+
+    def begun(base, terms, *rest):
+        bases.append(base)
+        found = once(base, terms, *rest)
+        likelier = dataclasses.replace(base) if len(bases) == 1 else None
+        return dataclasses.replace(found, first=dataclasses.replace(found.first, alone=likelier))
+
+    monkeypatch.setattr(of_diagnosis, "begun", begun)
+    told = []
+    found = of_diagnosis.diagnose(Pendulum(), swung("white", 2, 200)[0], surrogates=19, progress=told.append)
+    assert sum("under a likelier noise" in line for line in told) == 1
+    assert len(bases) == 2
+    assert bases[1] is not bases[0]
+    assert found.verdict == "unexplained"
