@@ -1,5 +1,6 @@
 """How far a smooth correction by all columns comes on blocks that it has not seen."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy import stats
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.evidence.ceiling import Ceiling, ceiling
 from mkc_torch.diagnosis.evidence.held_out import Evidence, blocks_of, gain_interval, held_out
-from mkc_torch.diagnosis.evidence.remaining import remaining
+from mkc_torch.diagnosis.evidence.remaining import _answerable, remaining
 from mkc_torch.diagnosis.evidence.smooth_curves import curves_of, legendre, smooth_tangents
 from mkc_torch.diagnosis.model.drivers import Driver, find_drivers
 from mkc_torch.diagnosis.model.fit import fitted
@@ -243,3 +244,11 @@ def test_what_remains_gains_enough_and_more_than_time(monkeypatch, gain, by_time
         )
         == told
     )
+
+
+@pytest.mark.parametrize(("residual", "usable"), [(5.0, True), (2e38, False), (math.nan, False)])
+def test_no_curve_is_sought_around_a_simulation_that_runs_away_at_the_final_parameters(residual, usable):
+    model = SimpleNamespace(size=1, residual=lambda _: torch.tensor([[0.1], [residual]]))
+    base = SimpleNamespace(model=model)
+    final = SimpleNamespace(parameters=torch.tensor([1.0, 2.0]), bound=torch.tensor([1.0]))
+    assert _answerable(base, final) is (final if usable else base)
