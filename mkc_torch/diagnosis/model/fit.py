@@ -156,14 +156,16 @@ def without_term(fit: FittedModel, number: int) -> FittedModel:
 def _begun(model: JointModel, start: Float[Tensor, " p"]) -> tuple[JointModel, Float[Tensor, " p"]]:
     """A model and a start at which it has a finite answer, where there are any.
 
-    Where there is none near the trajectory that the model knows, which may be of another noise, one is searched without
-    it; then with smaller effects.
+    Under process noise the trajectory that a model knows may be of another noise; where there is no answer near it, one
+    is searched without it. Then effects are made smaller.
     """
-    if not model.terms and model.near is None:
+    prepared = model.prepared
+    elsewhere = model.near is not None and isinstance(prepared, PreparedDynamics) and prepared.observer is not None
+    if not model.terms and not elsewhere:
         return model, start
     for share in _SHARES if model.terms else (1.0,):
         smaller = torch.cat([start[: model.base], share * start[model.base :]])
-        for one in (model, model.begun_with(None)) if share == 1.0 and model.near is not None else (model,):
+        for one in (model, model.begun_with(None)) if share == 1.0 and elsewhere else (model,):
             if bool(one.residual(smaller).isfinite().all()):
                 return one, smaller
     return model, start
