@@ -308,7 +308,7 @@ def _without(
     """The simulation without a candidate, begun with the noise that is found beside it; None where it has no fit."""
     model = JointModel(fit.model.prepared, base.model.terms, base.model.near)
     try:
-        without = fitted(model, fit.parameters[: base.model.size], base.bound, graduate=False)
+        without = fitted(model, base.parameters, base.bound, graduate=False)
     except NoFitError:
         return None
     return with_own_noise(without, declared, settings)
