@@ -269,7 +269,7 @@ if hasattr(os, "register_at_fork"):
 
 _EVERY = 0.2  # s
 
-_LINE_EVERY = 5.0
+_LINE_EVERY = 10.0
 """Seconds between lines on standard error where it is no terminal."""
 
 _NOTED_EVERY = 60.0
@@ -285,7 +285,7 @@ def progress(total: int, folder: Path | None = None, *, lines: bool = False) -> 
     Args:
         total: how many things are done one after the other.
         folder: for ``progress.txt``.
-        lines: where standard error is no terminal, write the stage to it every five seconds; nothing otherwise.
+        lines: where standard error is no terminal, write the stage to it every ten seconds; nothing otherwise.
     """
     begin = monotonic()
     with _shown(total) as steps, ExitStack() as threads:

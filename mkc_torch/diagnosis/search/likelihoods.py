@@ -8,7 +8,7 @@ the parameters in the log det of their tangents (Harville, Journal of the Americ
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -33,6 +33,9 @@ PRICE = 6.0
 
 _CELLS = 1 << 17
 """Numbers of whitened tangents that are worked on at once: 1 MB, which stays in a processor's cache."""
+
+_COVARIANCES = 8_000_000
+"""Numbers of the filters' covariances that are held at once: 64 MB, a few times over."""
 
 _DEPENDENT = 1e-10
 """Share of the largest singular value of the parameters' tangents below which a direction of them counts as absent."""
@@ -111,14 +114,13 @@ def log_likelihoods(
         thing: name of what a model of the noise is to the user, where progress counts them.
     """
     B, C, Y = len(models), len(columns.sizes), series.count
-    gains = gains_of(flow, filter_models(flow, models))
     used = flow.counts > 0
     without, beside = np.full((B, Y), -np.inf), np.full((B, C, Y), -np.inf)
     sizes, scale, rank = np.zeros((B, sum(columns.sizes))), np.ones((B, C)), np.zeros(C)
     groups = _by_size(columns.sizes)
     own, candidates = _split(columns, groups)
     free = not any(models[0].known)
-    for number, values in counted(whitened(flow, gains, joined(series, own)), B, thing):
+    for number, gains, place, values in counted(_under_each(flow, models, joined(series, own)), B, thing):
         check_deadline()
         rows = values[used]
         if not np.isfinite(rows).all():
@@ -126,11 +128,11 @@ def log_likelihoods(
         y, moved = np.split(rows, [Y], 1)
         basis, log_det = _basis(moved)
         left = y - basis @ (basis.T @ y)
-        products = _products(flow, gains, number, candidates, basis, left, groups)
+        products = _products(flow, gains, place, candidates, basis, left, groups)
         if products is None:
             continue
         n = len(rows) - basis.shape[1]
-        level = -gains.log_spread[number] - log_det - PRICE * len(models[number].pushes)
+        level = -gains.log_spread[place] - log_det - PRICE * len(models[number].pushes)
         power = np.square(left).sum(0)
         reach = _reach(models[number], largest)
         without[number] = np.where(_scale(power, n, free) <= reach, level + _log_likelihood(power, n, free), -np.inf)
@@ -143,6 +145,18 @@ def log_likelihoods(
             rank[members] = np.maximum(rank[members], found)
             scale[number, members] = size[:, 0]
     return LogLikelihoods(tuple(models), without, beside, sizes, rank, scale)
+
+
+def _under_each(
+    flow: Flow, models: Sequence[NoiseModel], series: SeriesAlong
+) -> Iterator[tuple[int, Gains, int, Float[np.ndarray, "N m K"]]]:
+    """The whitened series under each model: its number, gains of some models, its number among these, the series."""
+    states = flow.carried.shape[1] + max(len(one.pushes) for one in models)
+    block = max(1, _COVARIANCES // (len(flow.new) * states**2))
+    for first in range(0, len(models), block):
+        gains = gains_of(flow, filter_models(flow, models[first : first + block]))
+        for number, values in whitened(flow, gains, series):
+            yield first + number, gains, number, values
 
 
 def _by_size(sizes: Sequence[int]) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -61,11 +61,12 @@ def test_a_candidate_of_one_sign_gains_by_that_sign_only(sign):
     assert sign < 0 or gain == 0.0
 
 
-def test_blocks_of_samples_change_nothing(monkeypatch):
+def test_blocks_of_samples_and_of_models_change_nothing(monkeypatch):
     pushed = NoiseModel((0.5,), ((0, 0.7, 1.0),), (False,))
     flow, y, _, _, columns = scene(sizes=(1, 3, 1, 2), one_sided=(False, False, True, False))
     whole = log_likelihoods(flow, [WHITE, pushed], series(y), columns)
     monkeypatch.setattr(likelihoods, "_CELLS", 1)  # the least, 16 samples
+    monkeypatch.setattr(likelihoods, "_COVARIANCES", 1)  # a model at a time
     blocks = log_likelihoods(flow, [WHITE, pushed], series(y), columns)
     for name in ("without", "beside", "sizes", "rank", "scale"):
         np.testing.assert_allclose(getattr(blocks, name), getattr(whole, name), rtol=1e-10, atol=1e-12)
