@@ -9,7 +9,7 @@ pytest.importorskip("polars")
 pytest.importorskip("matplotlib")
 
 from mkc_torch import Recording
-from tests.benchmarks import diagnosis, sizes
+from tests.benchmarks import diagnosis, samples, sizes
 
 
 def test_quaternions_turn_as_their_matrices_do():
@@ -54,3 +54,27 @@ def test_the_picture_has_a_panel_for_each_size(tmp_path):
         [*curves, sizes.Curve("by the clock", "ranks of one thread", [1.0, 2.0], [2.0, 1.0])], tmp_path / "a.png"
     )
     assert (tmp_path / "a.png").stat().st_size > 10_000
+
+
+def test_samples_end_before_the_point_that_would_take_too_long_and_are_drawn_with_their_exponent(tmp_path):
+    counted = []
+
+    def cpu_seconds(recording, simulation):
+        counted.append(len(Recording.read(recording)))
+        assert simulation == f"{tmp_path / 'rotor.py'}:Rotor"
+        return counted[-1] / 100.0
+
+    sizes_, seconds = samples.measure(tmp_path, 25.0, cpu_seconds, sizes=(1000, 2000, 4000))
+    assert counted == sizes_ == [1000, 2000]
+    assert samples.slope(sizes_, seconds) == pytest.approx(1.0)
+    samples.draw(tmp_path / "samples.png", sizes_, seconds)
+    assert (tmp_path / "samples.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_rotor_is_slower_than_its_simulation_by_quadratic_drag(tmp_path):
+    recording = Recording.read(samples.rotor(tmp_path / "rotor.csv", 3000))
+    torque, speed = recording["torque"], recording["speed"]
+    slope = (speed[20:] - speed[:-20]) / (20 * samples.STEP)
+    lost = (torque[10:-10] - 0.5 * speed[10:-10] - slope)[:2980]
+    drag = speed[10:-10] * speed[10:-10].abs()
+    assert float((lost * drag).sum() / drag.square().sum()) == pytest.approx(0.4, abs=0.03)

@@ -12,7 +12,7 @@ from torch import Tensor
 from mkc_torch._support.torch_internals import forward_mode_is_active, is_wrapped
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 
 def order_statistic(
@@ -28,11 +28,25 @@ def order_statistic(
     if weight is None:
         rank = math.ceil(h)
         return _selected(values, rank) if _is_plain(values) else values.kthvalue(rank, dim=-2).values
+    kept = _kept(weight) if _is_plain(values) else None
+    if kept is not None:
+        count = int(kept.sum())
+        rank = max(1, math.ceil(h / values.shape[-2] * count * (1 - 1e-12)))
+        return _selected(values if count == len(kept) else values[..., kept, :], rank)
     ordered, index = values.sort(dim=-2)
     cumulated = weight.expand_as(values).gather(-2, index).cumsum(-2)
     share = h / values.shape[-2] * cumulated[..., -1:, :]
     position = (cumulated < share * (1 - 1e-12)).sum(-2, keepdim=True)
     return ordered.gather(-2, position).squeeze(-2)
+
+
+def _kept(weight: Float[Tensor, "*batch N m"]) -> Bool[Tensor, " N"] | None:
+    """The samples of weight 1 where all others have weight 0 and all channels and problems share them, or None."""
+    if weight.numel() != weight.shape[-2] or weight.requires_grad or is_wrapped(weight):
+        return None
+    shared = weight.detach().reshape(-1)
+    kept = shared == 1
+    return kept if bool(kept.any()) and bool((kept | (shared == 0)).all()) else None
 
 
 def _is_plain(values: Tensor) -> bool:

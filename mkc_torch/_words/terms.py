@@ -409,6 +409,7 @@ TERMS: dict[str, str] = {
     # what a command says besides
     "command.failed": "mkc: {sentence}",
     "command.interrupted": "mkc: interrupted; {left}",
+    "command.progress": "mkc: after {seconds} s: {stage}",
     "command.part": "{thing} {number} of {total}",
     "command.part_and_time": "{thing} {number} of {total}, about {seconds} s",
     "command.stopped": "what was known until then was written for {recordings}",

@@ -13,7 +13,7 @@ from mkc_torch.recording.recording import Recording
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["CLIPPED", "clipped_entries", "without_clipped"]
+__all__ = ["CLIPPED", "clipped_entries", "distinct_rows", "without_clipped"]
 
 CLIPPED = "clipped samples"
 
@@ -60,11 +60,31 @@ def without_clipped(recording: Recording, *names: str) -> Recording:
 
 def clipped_entries(values: Float[Tensor, "N k"]) -> Bool[Tensor, "N k"]:
     """Which values stand at an end at which their column is cut off."""
-    different = values.unique(dim=0)
     clipped = torch.zeros_like(values, dtype=torch.bool)
+    at_an_end = torch.maximum((values == values.amin(0)).sum(0), (values == values.amax(0)).sum(0))
+    if int(at_an_end.max()) < _LEAST:
+        return clipped  # before repeats are found, which takes a hundred times as long
+    different = distinct_rows(values)
     for k, column in enumerate(different.unbind(-1)):
         for sign in (1.0, -1.0):
             levels, counts = (sign * column).unique(return_counts=True)
             if len(levels) > _NEXT and int(counts[-1]) >= max(_LEAST, _TIMES * int(counts[-1 - _NEXT : -1].max())):
                 clipped[:, k] |= sign * values[:, k] == levels[-1]
     return clipped
+
+
+def distinct_rows(values: Float[Tensor, "N k"]) -> Float[Tensor, "M k"]:
+    """The different rows in lexicographic order, as ``values.unique(dim=0)`` has them, in a tenth of its time.
+
+    Example:
+        >>> distinct_rows(torch.tensor([[2.0, 1.0], [1.0, 3.0], [2.0, 1.0]]))
+        tensor([[1., 3.],
+                [2., 1.]])
+    """
+    number = torch.zeros(len(values), dtype=torch.int64)
+    for column in values.unbind(-1):
+        levels, place = column.unique(return_inverse=True)
+        number = (number * len(levels) + place).unique(return_inverse=True)[1]
+    first = torch.zeros(int(number.max()) + 1, dtype=torch.int64)
+    first[number] = torch.arange(len(values))
+    return values[first]

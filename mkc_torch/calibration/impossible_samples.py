@@ -51,7 +51,10 @@ def without_impossible(recording: Recording, *names: str) -> Recording:
     middle = points.median(0).values
     # the largest component, for the square of a number can be none
     away = (points - middle).abs()
-    limit = max(_limit(away.amax(-1), thin_at_rest(points)), _TURNED * float(middle.abs().max()))
+    near = _TURNED * float(middle.abs().max())
+    if float(away.max()) <= near:
+        return recording
+    limit = max(_limit(away.amax(-1), thin_at_rest(points)), near)
     kept = away.amax(-1) <= limit
     if bool(kept.all()):
         return recording

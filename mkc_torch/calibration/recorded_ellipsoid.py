@@ -5,10 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from mkc_torch.calibration.clipped_samples import distinct_rows
 from mkc_torch.calibration.coverage import Coverage
 from mkc_torch.calibration.ellipsoid_fit import MAX_SCATTER, MAX_STANDARD_ERROR, EllipsoidFit
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
-from mkc_torch.calibration.runs import apart, in_each_run, run_slices
+from mkc_torch.calibration.runs import apart, run_slices
 from mkc_torch.calibration.turning import refuse_at_rest, thin_at_rest, turning, way
 from mkc_torch.linear import MKCRegression
 from mkc_torch.recording.recording import Recording
@@ -40,17 +41,20 @@ def recorded_ellipsoid(recording: Recording, seed: int = 0) -> EllipsoidFit:
         tensor([12., -8., 21.], dtype=torch.float64)
     """
     points, runs = recording.magnetometer(), run_slices(recording)
-    estimator, taken = MKCRegression(covariance="hac", seed=seed), in_each_run(points, runs, thin_at_rest)
-    assert taken is not None
+    turns = [turning(points[run]) for run in runs]
+    taken = torch.cat([thin_at_rest(points[run], found) for run, found in zip(runs, turns, strict=True)])
+    estimator = MKCRegression(covariance="hac", seed=seed)
     series, weight = apart(runs, points, taken)
     try:
         fit = EllipsoidFit(estimator).fit(series, weight)
         _refuse_lattice(fit, points)
     except NotIdentifiableError:
-        refuse_at_rest(points, turning(points), recording.units["mag_x"])  # says it better
+        # a sensor at rest is the better reason
+        refuse_at_rest(points, turns[0] if len(runs) == 1 else turning(points), recording.units["mag_x"])
         raise
-    went = in_each_run(points, runs, way)
-    if went is not None:
+    ways = [way(points[run], found) for run, found in zip(runs, turns, strict=True)]
+    if all(went is not None for went in ways):
+        went = torch.cat([went for went in ways if went is not None])
         series, weight = (part[:: max(1, len(part) // _MOST_ALONG)] for part in apart(runs, went, taken))
         _refuse_other(fit, _along(EllipsoidFit(estimator), series, weight), series)
     return fit
@@ -65,7 +69,7 @@ def _refuse_lattice(fit: EllipsoidFit, points: Tensor) -> None:
     steps = [column.unique().diff() for column in points.unbind(-1)]
     share = max(float(step.min()) for step in steps if len(step) > 0) / float(fit.semi_axes_[0])
     # few points can be as far apart without any steps, but hardly two of them are equal then
-    if share > MAX_SCATTER and 2 * len(points.unique(dim=0)) <= len(points):
+    if share > MAX_SCATTER and 2 * len(distinct_rows(points)) <= len(points):
         raise NotIdentifiableError(
             f"Not identifiable: the measurements come in steps of {100.0 * share:.0f} % of the ellipsoid's shortest "
             f"semi-axis, more than {100.0 * MAX_SCATTER:.0f} %, as those of a sensor that hardly turns do. Turn the "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
@@ -74,11 +74,14 @@ def turning(points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"] | None:
     return None if bool(noise > _ORDERED * _reach(points)) and int(found.sum()) < _FEWEST else found
 
 
-def thin_at_rest(points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+def thin_at_rest(
+    points: Float[Tensor, "N 3"], turns: Bool[Tensor, " N"] | Literal["find"] | None = "find"
+) -> Bool[Tensor, " N"]:
     """Which samples to take, so that a stretch of rest counts as one window of turning does: of it so many, evenly.
 
     Args:
         points: measurements in the order of time, in any unit.
+        turns: what :func:`turning` returns for them; "find" calls it.
 
     Returns:
         All of them where too few would be left.
@@ -90,7 +93,7 @@ def thin_at_rest(points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
         >>> int(taken[:290].sum()) < 10, bool(taken[310:].all())
         (True, True)
     """
-    found = turning(points)
+    found = turning(points) if isinstance(turns, str) else turns
     if found is None or not bool(found.any()):
         return torch.ones_like(points[:, 0], dtype=torch.bool)
     _, run, length = torch.unique_consecutive(found, return_inverse=True, return_counts=True)
@@ -100,11 +103,14 @@ def thin_at_rest(points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
     return taken if int(taken.sum()) >= _FEWEST else torch.ones_like(taken)
 
 
-def way(points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"] | None:
+def way(
+    points: Float[Tensor, "N 3"], turns: Bool[Tensor, " N"] | Literal["find"] | None = "find"
+) -> Float[Tensor, "N 3"] | None:
     """Where the sensor went: a running median of seven samples, which single ones that stand apart do not move.
 
     Args:
         points: measurements in the order of time, in any unit.
+        turns: what :func:`turning` returns for them; "find" calls it.
 
     Returns:
         None where samples are few, show no order, or are too rare: the sensor turns too far from one to the next.
@@ -118,7 +124,7 @@ def way(points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"] | None:
         >>> way(field[::20]) is None
         True
     """
-    turns = turning(points)
+    turns = turning(points) if isinstance(turns, str) else turns
     if turns is None:
         return None
     middle = _running_median(points, _SINGLE, _SINGLE)

@@ -110,7 +110,7 @@ def calibrate(
         earth=earth,
     )
     console, total, failed, left = out(), 0, 0, list(recordings)
-    with progress(len(recordings), output) as step, interrupts_told(lambda: not_written(left, output)):
+    with progress(len(recordings), output, lines=True) as step, interrupts_told(lambda: not_written(left, output)):
         for path in recordings:
             for subject, outcome in calibrations_of(path, output / path.stem, asked, force=force, step=step):
                 total += 1

@@ -9,7 +9,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -226,6 +226,11 @@ class Steps:
             self._bar.update(self._timed, completed=done)
 
     @property
+    def on_a_terminal(self) -> bool:
+        """Whether a bar shows it."""
+        return self._bar is not None
+
+    @property
     def part_done(self) -> str:
         """The thing that is being done, of how many, and how long the rest takes at the rate so far."""
         if self._part is None or self._part[1] >= self._part[2]:
@@ -264,33 +269,51 @@ if hasattr(os, "register_at_fork"):
 
 _EVERY = 0.2  # s
 
+_LINE_EVERY = 10.0
+"""Seconds between lines on standard error where it is no terminal."""
+
 _NOTED_EVERY = 60.0
 """Seconds after which a line on long work is added to a file."""
 
 
 @contextmanager
-def progress(total: int, folder: Path | None = None) -> Iterator[Steps]:
-    """What is being done and for how long, on a terminal, with a bar over several things; nothing in a pipe.
+def progress(total: int, folder: Path | None = None, *, lines: bool = False) -> Iterator[Steps]:
+    """What is being done and for how long, on a terminal, with a bar over several things.
 
     Work of more than a minute adds a line a minute to ``progress.txt`` in the folder, if there is one to write into.
+
+    Args:
+        total: how many things are done one after the other.
+        folder: for ``progress.txt``.
+        lines: where standard error is no terminal, write the stage to it every ten seconds; nothing otherwise.
     """
-    with _shown(total) as steps:
-        if folder is None:
-            yield steps
-            return
-        begin = monotonic()
-        with _repeated(lambda: _note(steps, folder, monotonic() - begin), _NOTED_EVERY):
-            yield steps
+    begin = monotonic()
+    with _shown(total) as steps, ExitStack() as threads:
+        if folder is not None:
+            threads.enter_context(_repeated(lambda: _note(steps, folder, monotonic() - begin), _NOTED_EVERY))
+        if lines and not steps.on_a_terminal:
+            threads.enter_context(_repeated(lambda: _write_line(steps, monotonic() - begin), _LINE_EVERY))
+        yield steps
+
+
+def _write_line(steps: Steps, elapsed: float) -> None:
+    """Write the stage and the seconds so far to standard error."""
+    text = term("command.progress", seconds=f"{elapsed:.0f}", stage=_stage(steps))
+    err().print(text, soft_wrap=True)
+
+
+def _stage(steps: Steps) -> str:
+    """How many things are done, of several, and what is being done."""
+    count = f"{steps.done} of {steps.total} done, " if steps.total > 1 else ""
+    return count + "; ".join(filter(None, [steps.name, steps.part_done]))
 
 
 def _note(steps: Steps, folder: Path, elapsed: float) -> None:
     """Add a line on what is being done."""
-    count = f"{steps.done} of {steps.total} done, " if steps.total > 1 else ""
     with suppress(OSError):  # no place for it is no reason to end the work
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "progress.txt").open("a", encoding="utf-8") as file:
-            doing = "; ".join(filter(None, [steps.name, steps.part_done]))
-            file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}  after {elapsed / 60:.0f} min: {count}{doing}\n")
+            file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}  after {elapsed / 60:.0f} min: {_stage(steps)}\n")
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -31,19 +31,77 @@ def first_of_runs(run: Int[Tensor, " N"]) -> Bool[Tensor, " N"]:
 def passed_on(factor: Float[Tensor, " N"], level: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
     """``y[k] = factor[k] y[k-1] + level[k]``, from ``y[-1] = 0``: affine maps composed by doubling.
 
-    A factor of 0 begins anew. Blelloch, "Prefix sums and their applications" (1990).
+    A factor of 0 begins anew. Its derivatives are recurrences of the same factors, so that none of them differentiates
+    the composition. Blelloch, "Prefix sums and their applications" (1990).
 
     Example:
         >>> passed_on(torch.tensor([0.0, 0.5, 0.5]), torch.tensor([4.0, 0.0, 1.0]))
         tensor([4., 2., 2.])
     """
-    shift = 1
-    while shift < len(level):
-        tail_level = factor[shift:] * level[:-shift] + level[shift:]
-        tail_factor = factor[shift:] * factor[:-shift]
-        factor, level = torch.cat([factor[:shift], tail_factor]), torch.cat([level[:shift], tail_level])
+    found: Tensor = _PassedOn.apply(factor, level)  # type: ignore[no-untyped-call]
+    return found
+
+
+def _composed(factor: Float[Tensor, "*#b N"], level: Float[Tensor, "*#b N"]) -> Float[Tensor, "*b N"]:
+    """The recurrence along the last dimension."""
+    shift, length = 1, level.shape[-1]
+    level = level.expand(torch.broadcast_shapes(factor.shape, level.shape))
+    while shift < length:
+        tail = factor[..., shift:] * level[..., :-shift] + level[..., shift:]
+        level = torch.cat([level[..., :shift], tail], -1)
+        if 2 * shift < length:
+            factor = torch.cat([factor[..., :shift], factor[..., shift:] * factor[..., :-shift]], -1)
         shift *= 2
-    return level
+    return level.clone()
+
+
+def _before(values: Float[Tensor, "*b N"]) -> Float[Tensor, "*b N"]:
+    """Each value's predecessor; 0 before the first."""
+    return torch.cat([torch.zeros_like(values[..., :1]), values[..., :-1]], -1)
+
+
+class _PassedOn(torch.autograd.Function):
+    """:func:`passed_on` along the last dimension, with its derivatives in forward and reverse mode and over a batch."""
+
+    @staticmethod
+    def forward(factor: Tensor, level: Tensor) -> Tensor:
+        return _composed(factor, level)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(inputs[0], output)
+        ctx.save_for_forward(inputs[0], output)
+        ctx.level_shape = inputs[1].shape
+        ctx.set_materialize_grads(False)
+
+    @staticmethod
+    def jvp(ctx: Any, factor_tangent: Tensor | None, level_tangent: Tensor | None) -> Tensor:
+        factor, found = ctx.saved_tensors
+        moved = torch.zeros_like(found) if level_tangent is None else level_tangent
+        if factor_tangent is not None:
+            moved = moved + factor_tangent * _before(found)
+        return passed_on(factor, moved)
+
+    @staticmethod
+    def backward(ctx: Any, slope: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+        if slope is None:
+            return None, None
+        factor, found = ctx.saved_tensors
+        # the transposed recurrence runs from the last sample to the first
+        back = torch.cat([torch.zeros_like(factor[..., :1]), factor[..., 1:].flip(-1)], -1).conj()
+        to_level = passed_on(back, slope.flip(-1)).flip(-1)
+        to_factor = to_level * _before(found).conj()
+        if not factor.is_complex():
+            to_factor = torch.real(to_factor)
+        return to_factor.sum_to_size(factor.shape), to_level.sum_to_size(ctx.level_shape)
+
+    @staticmethod
+    def vmap(_info: Any, places: tuple[int | None, int | None], factor: Tensor, level: Tensor) -> tuple[Tensor, int]:
+        if places[0] is not None:
+            factor = factor.movedim(places[0], 0)
+        if places[1] is not None:
+            level = level.movedim(places[1], 0)
+        return passed_on(factor, level), 0
 
 
 def passed_on_within(low: Float[Tensor, " N"], high: Float[Tensor, " N"]) -> Float[Tensor, " N"]:

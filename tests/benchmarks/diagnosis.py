@@ -1,7 +1,8 @@
 """Wall and CPU seconds and memory of `mkc diagnose` from the shell: `python -m tests.benchmarks.diagnosis`.
 
 Each row is one command, with its start and its reports. Rows whose recordings lie outside of this repository are left
-out, with the file's name, where that is absent; `--only` takes rows whose name begins so.
+out, with the file's name, where that is absent; `--only` takes rows whose name begins so. `--samples PICTURE` draws CPU
+seconds over the samples of a recording instead.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from torch import Tensor
 
 from mkc_torch.recording import demonstration
 from mkc_torch.recording.recording import write_table
+from tests.benchmarks import samples
 
 CASES = Path(__file__).resolve().parents[3] / "shared" / "cases"
 SYSTEMS = {
@@ -88,10 +90,10 @@ def quaternions(rotation: Tensor) -> Tensor:
     return torch.cat([vector[:, 3:], vector[:, :3]], -1)
 
 
-def cart(path: Path, samples: int) -> Path:
+def cart(path: Path, count: int) -> Path:
     """A motor drives a cart with quadratic drag that the simulation leaves out, at 50 Hz."""
     h = 0.02
-    time_ = h * torch.arange(samples, dtype=torch.float64)
+    time_ = h * torch.arange(count, dtype=torch.float64)
     voltage = torch.sin(1.3 * time_) + torch.sin(0.31 * time_) + torch.sign(torch.sin(0.17 * time_))
     place = speed = motor = 0.0
     found = []
@@ -101,7 +103,7 @@ def cart(path: Path, samples: int) -> Path:
             place += 0.25 * h * speed
             speed += 0.25 * h * (motor - 0.5 * speed - 0.4 * speed * abs(speed))
             motor += 0.25 * h * (u - motor) / 0.2
-    noise = torch.randn(samples, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    noise = torch.randn(count, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     seen = torch.tensor(found, dtype=torch.float64) + 0.005 * noise
     write_table(path, {"time": time_, "voltage": voltage, "place": seen[:, 0], "speed": seen[:, 1]})
     return path
@@ -159,11 +161,30 @@ def measured(row: Row, output: Path) -> tuple[float, float, float]:
     return wall, cpu, after.ru_maxrss / 2**20
 
 
+def over_samples(picture: Path, most: float) -> None:
+    """Print CPU seconds over samples with their exponent, and draw them."""
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder) / "reports"
+
+        def cpu_seconds(recording: Path, simulation: str) -> float:
+            return measured(Row(recording.stem, (recording,), simulation, most), output)[1]
+
+        sizes, seconds = samples.measure(Path(folder), most, cpu_seconds)
+    print(f"exponent {samples.slope(sizes, seconds):.2f}")
+    samples.draw(picture, sizes, seconds)
+
+
 def main() -> None:
-    """Print the table."""
+    """Print the table, or draw the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="rows whose name begins so")
-    only = parser.parse_args().only
+    parser.add_argument("--samples", type=Path, metavar="PICTURE", help="CPU seconds over samples, as a PNG, instead")
+    parser.add_argument("--seconds", type=float, default=600.0, help="CPU seconds of a point of --samples at most")
+    asked = parser.parse_args()
+    if asked.samples is not None:
+        over_samples(asked.samples, asked.seconds)
+        return
+    only = asked.only
     print(f"{'':<32}{'wall':>9}{'asked':>8}{'CPU':>9}{'GiB so far':>12}")
     with tempfile.TemporaryDirectory() as folder:
         for row in rows(Path(folder), only):

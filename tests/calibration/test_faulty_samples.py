@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from mkc_torch import Recording
 from mkc_torch.calibration import NotIdentifiableError, calibrate
 from mkc_torch.calibration.calibrate import prepared
-from mkc_torch.calibration.clipped_samples import CLIPPED
+from mkc_torch.calibration.clipped_samples import CLIPPED, distinct_rows
 from mkc_torch.calibration.frozen_samples import FROZEN
 from tests.shared_data import shared_case, shared_data
 
@@ -161,3 +161,9 @@ def test_standard_errors_do_not_reach_from_one_run_to_the_next():
     joined, other = calibrate(recorded(points)), calibrate(recorded(points[swapped]))
     assert joined.center_se != pytest.approx(other.center_se, rel=1e-4)
     assert forward.samples == 1200
+
+
+@given(st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=1, max_size=60))
+def test_distinct_rows_are_those_of_torch(rows):
+    values = torch.tensor(rows, dtype=torch.float64)
+    assert torch.equal(distinct_rows(values), values.unique(dim=0))

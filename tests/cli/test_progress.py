@@ -1,4 +1,4 @@
-"""A run shows on a terminal what it is doing and for how long, beside forked copies, and nothing in a pipe."""
+"""A run shows on a terminal what it does and for how long, beside forked copies, and little or nothing in a pipe."""
 
 import os
 import re
@@ -114,6 +114,28 @@ def test_long_work_adds_a_line_on_what_it_does_to_a_file(tmp_path, monkeypatch):
     with progress(1, folder) as step:
         step("calibrating c.csv")
         assert wait_for(folder / "progress.txt", len(lines) + 1)[-1].endswith("min: calibrating c.csv")
+
+
+def test_in_a_pipe_calibrate_writes_its_stage_from_time_to_time(capfd, monkeypatch):
+    monkeypatch.setattr(console, "_LINE_EVERY", 0.02)
+    with progress(2, lines=True) as step:
+        step("calibrating log.bin, sensor MAG (1 of 3)")
+        seen = ""
+        for _ in range(500):
+            seen += capfd.readouterr().err
+            if seen.count("\n") >= 2:
+                break
+            threading.Event().wait(0.02)
+    line = r"mkc: after 0 s: 0 of 2 done, calibrating log\.bin, sensor MAG \(1 of 3\)\n"
+    assert re.fullmatch(f"({line}){{2,}}", seen)
+
+
+def test_in_a_pipe_nothing_is_written_without_lines(capfd, monkeypatch):
+    monkeypatch.setattr(console, "_LINE_EVERY", 0.02)
+    with progress(2) as step:
+        step("diagnosing log.bin")
+        threading.Event().wait(0.2)
+    assert capfd.readouterr().err == ""
 
 
 def wait_for(file, lines):

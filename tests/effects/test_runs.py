@@ -14,6 +14,35 @@ RANDOM = np.random.default_rng(11)
 TIME = torch.arange(60, dtype=torch.float64)
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.complex128])
+def test_what_is_passed_on_has_the_derivatives_of_a_loop(dtype):
+    generator = torch.Generator().manual_seed(0)
+    factor, level = (0.5 * torch.randn(9, dtype=dtype, generator=generator) for _ in range(2))
+    factor[4] = 0.0
+    inputs = (factor.requires_grad_(), level.requires_grad_())
+    assert torch.autograd.gradcheck(passed_on, inputs, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(passed_on, inputs)
+    assert torch.autograd.gradcheck(lambda one: passed_on(factor.detach(), one), inputs[1], check_forward_ad=True)
+
+
+def test_what_is_passed_on_has_tangents_along_many_directions_at_once():
+    generator = torch.Generator().manual_seed(0)
+    factor, level = (0.5 * torch.randn(9, 4, dtype=torch.float64, generator=generator) for _ in range(2))
+
+    def moved(theta):
+        return passed_on(torch.tanh(factor @ theta), torch.sin(level @ theta))
+
+    theta = torch.randn(4, dtype=torch.float64, generator=generator)
+    forward, reverse = torch.func.jacfwd(moved)(theta), torch.func.jacrev(moved)(theta)
+    torch.testing.assert_close(forward, reverse)
+    step = 1e-6 * torch.eye(4, dtype=torch.float64)
+    differences = [(moved(theta + one) - moved(theta - one)) / 2e-6 for one in step]
+    torch.testing.assert_close(forward, torch.stack(differences, -1), rtol=1e-6, atol=1e-8)
+    torch.testing.assert_close(
+        torch.func.vmap(passed_on, 1, 1)(factor, level)[:, 2], passed_on(factor[:, 2], level[:, 2])
+    )
+
+
 @pytest.mark.parametrize("N", [1, 2, 3, 64, 65, 300])
 def test_scans_are_loops(N):
     factor, level = torch.from_numpy(RANDOM.uniform(-1.0, 1.0, (2, N)))

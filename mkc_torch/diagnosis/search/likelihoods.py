@@ -8,7 +8,7 @@ the parameters in the log det of their tangents (Harville, Journal of the Americ
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,7 @@ from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch._parallel.progress import counted
 from mkc_torch.simulation.dynamics.disturbances import NoiseModel, filter_models
 from mkc_torch.simulation.dynamics.kalman import Flow
-from mkc_torch.simulation.dynamics.whitening import SeriesAlong, gains_of, joined, whitened
+from mkc_torch.simulation.dynamics.whitening import Gains, SeriesAlong, gains_of, joined, whitened, whitened_in_blocks
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -30,6 +30,12 @@ _SINGULAR = 1e-9
 
 PRICE = 6.0
 """Nats that a disturbance has to gain to be in the noise, as those of the baseline."""
+
+_CELLS = 1 << 17
+"""Numbers of whitened tangents that are worked on at once: 1 MB, which stays in a processor's cache."""
+
+_COVARIANCES = 8_000_000
+"""Numbers of the filters' covariances that are held at once: 64 MB, a few times over."""
 
 _DEPENDENT = 1e-10
 """Share of the largest singular value of the parameters' tangents below which a direction of them counts as absent."""
@@ -108,38 +114,49 @@ def log_likelihoods(
         thing: name of what a model of the noise is to the user, where progress counts them.
     """
     B, C, Y = len(models), len(columns.sizes), series.count
-    gains = gains_of(flow, filter_models(flow, models))
     used = flow.counts > 0
     without, beside = np.full((B, Y), -np.inf), np.full((B, C, Y), -np.inf)
     sizes, scale, rank = np.zeros((B, sum(columns.sizes))), np.ones((B, C)), np.zeros(C)
     groups = _by_size(columns.sizes)
+    own, candidates = _split(columns, groups)
     free = not any(models[0].known)
-    for number, values in counted(whitened(flow, gains, joined(series, columns.series)), B, thing):
+    for number, gains, place, values in counted(_under_each(flow, models, joined(series, own)), B, thing):
         check_deadline()
         rows = values[used]
         if not np.isfinite(rows).all():
             continue
-        y, own, candidates = np.split(rows, [Y, Y + columns.parameters], 1)
-        basis, log_det = _basis(own)
-        n = len(rows) - basis.shape[1]
-        level = -gains.log_spread[number] - log_det - PRICE * len(models[number].pushes)
+        y, moved = np.split(rows, [Y], 1)
+        basis, log_det = _basis(moved)
         left = y - basis @ (basis.T @ y)
-        rest = candidates - basis @ (basis.T @ candidates)
-        norm = np.maximum(np.linalg.norm(candidates, axis=0), 1e-300)
-        rest /= norm
+        products = _products(flow, gains, place, candidates, basis, left, groups)
+        if products is None:
+            continue
+        n = len(rows) - basis.shape[1]
+        level = -gains.log_spread[place] - log_det - PRICE * len(models[number].pushes)
         power = np.square(left).sum(0)
         reach = _reach(models[number], largest)
         without[number] = np.where(_scale(power, n, free) <= reach, level + _log_likelihood(power, n, free), -np.inf)
-        inner = rest.T @ left
-        for members, index in groups:
-            explained, solved, found = _explained(rest, inner, members, index, columns.one_sided)
+        for (members, index), (gram, inner, norm) in zip(groups, products, strict=True):
+            explained, solved, found = _explained(gram, inner, members, columns.one_sided)
             remains = np.maximum(power - explained, 1e-12 * power)
             size = _scale(remains, n, free)
             beside[number, members] = np.where(size <= reach, level + _log_likelihood(remains, n, free), -np.inf)
-            sizes[number, index] = solved / norm[index]
+            sizes[number, index] = solved / norm
             rank[members] = np.maximum(rank[members], found)
             scale[number, members] = size[:, 0]
     return LogLikelihoods(tuple(models), without, beside, sizes, rank, scale)
+
+
+def _under_each(
+    flow: Flow, models: Sequence[NoiseModel], series: SeriesAlong
+) -> Iterator[tuple[int, Gains, int, Float[np.ndarray, "N m K"]]]:
+    """The whitened series under each model: its number, gains of some models, its number among these, the series."""
+    states = flow.carried.shape[1] + max(len(one.pushes) for one in models)
+    block = max(1, _COVARIANCES // (len(flow.new) * states**2))
+    for first in range(0, len(models), block):
+        gains = gains_of(flow, filter_models(flow, models[first : first + block]))
+        for number, values in whitened(flow, gains, series):
+            yield first + number, gains, number, values
 
 
 def _by_size(sizes: Sequence[int]) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -180,21 +197,72 @@ def _reach(model: NoiseModel, largest: Float[np.ndarray, " p+m"] | None) -> floa
     return min((float(largest[place]) / size for place, size, _ in model.pushes if size > 0.0), default=np.inf)
 
 
+def _split(columns: Columns, groups: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[SeriesAlong, SeriesAlong]:
+    """The parameters' tangents, and those of the candidates: group after group, of a group number after number."""
+    new, shift, p = columns.series.new, columns.series.shift, columns.parameters
+    order = np.concatenate([p + index.T.ravel() for _, index in groups] or [np.zeros(0, dtype=int)])
+    own = SeriesAlong(new[..., :p], shift[..., :p])
+    return own, SeriesAlong(np.ascontiguousarray(new[..., order]), np.ascontiguousarray(shift[..., order]))
+
+
+def _products(
+    flow: Flow,
+    gains: Gains,
+    number: int,
+    candidates: SeriesAlong,
+    basis: Float[np.ndarray, "M k"],
+    left: Float[np.ndarray, "M Y"],
+    groups: Sequence[tuple[np.ndarray, np.ndarray]],
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]] | None:
+    """Products of the candidates' whitened tangents, summed over blocks of samples that stay in the cache.
+
+    Returns:
+        For each group of c candidates of q numbers: the products (c, q, q) of what the parameters leave of the
+        tangents, over their norms; their products (c, q, Y) with the series, likewise; the norms (c, q). None where
+        some are not finite.
+    """
+    m, K = candidates.new.shape[1:]
+    used = flow.counts > 0
+    first = np.concatenate([[0], np.cumsum(used.sum(1))])
+    known = np.concatenate([basis, left], 1).T
+    crossed = np.zeros((len(known), K))
+    pairs = [np.zeros((*index.shape[1:], *index.shape[::-1])) for _, index in groups]
+    places = np.cumsum([0, *(index.size for _, index in groups)])
+    for rows, values in whitened_in_blocks(flow, gains, number, candidates, max(_CELLS // max(m * K, 1), 16)):
+        counts = used[rows]
+        block = values.reshape(-1, K) if counts.all() else values[counts]
+        crossed += known[:, first[rows.start] : first[rows.stop]] @ block
+        for pair, place in zip(pairs, places, strict=False):
+            q, _, c = pair.shape
+            parts = [block[:, place + a * c : place + (a + 1) * c] for a in range(q)]
+            for a in range(q):
+                for b in range(a + 1):
+                    pair[a, b] += np.einsum("nc,nc->c", parts[a], parts[b])
+    found = []
+    for pair, place in zip(pairs, places, strict=False):
+        q, _, c = pair.shape
+        here = crossed[:, place : place + q * c].reshape(-1, q, c)
+        along, inner = here[: basis.shape[1]], here[basis.shape[1] :]
+        norm = np.maximum(np.sqrt(np.einsum("aac->ac", pair)), 1e-300)
+        lower = np.tril(np.ones((q, q)), -1)[..., None] * pair
+        whole = pair + lower.swapaxes(0, 1)
+        rest = (whole - np.einsum("kac,kbc->abc", along, along)) / norm[:, None] / norm
+        if not (np.isfinite(rest).all() and np.isfinite(inner).all()):
+            return None
+        found.append((rest.transpose(2, 0, 1), (inner / norm).transpose(2, 1, 0), norm.T))
+    return found
+
+
 def _explained(
-    rest: Float[np.ndarray, "M Q"],
-    inner: Float[np.ndarray, "Q Y"],
+    gram: Float[np.ndarray, "c q q"],
+    own: Float[np.ndarray, "c q Y"],
     members: np.ndarray,
-    index: np.ndarray,
     one_sided: Sequence[bool],
 ) -> tuple[Float[np.ndarray, "c Y"], Float[np.ndarray, "c q"], Float[np.ndarray, " c"]]:
     """Squares that candidates of one size explain, minus the first series' estimates, and the candidates' ranks."""
-    q = index.shape[1]
-    flat = rest[:, index.ravel()].reshape(len(rest), len(members), q)
-    gram = np.einsum("nca,ncb->cab", flat, flat)
     values, vectors = np.linalg.eigh(gram)
     kept = values > np.maximum(_SINGULAR, _SINGULAR * values[:, -1:])
     inverse = (vectors * np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)[:, None]) @ vectors.swapaxes(1, 2)
-    own = inner[index]
     solved = inverse @ own
     # the residual falls by what an effect adds: a negative slope is a positive size
     barred = np.array([one_sided[c] for c in members])[:, None] & (solved >= 0).all(1)

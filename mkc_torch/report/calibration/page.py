@@ -57,8 +57,9 @@ def calibration_report(
         >>> calibration_report(calibrate(recording), recording).startswith("<!doctype html>")
         True
     """
-    table = as_magnetometer(recording) if calibration.sensor == "accel" else recording
-    usable = prepared(numbered(table))
+    usable = calibration.used
+    if usable is None:
+        usable = prepared(numbered(as_magnetometer(recording) if calibration.sensor == "accel" else recording))
     points = usable.magnetometer()
     in_use = calibration.corrected(points)[calibration.weight(points) >= 0.5]
     return render(

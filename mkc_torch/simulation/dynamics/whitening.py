@@ -22,7 +22,7 @@ from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Gains", "SeriesAlong", "gains_of", "joined", "relative_to", "whitened"]
+__all__ = ["Gains", "SeriesAlong", "gains_of", "joined", "relative_to", "whitened", "whitened_in_blocks"]
 
 _CELLS = 24_000_000
 """Numbers of whitened series that are held at once: 192 MB."""
@@ -99,9 +99,20 @@ def gains_of(flow: Flow, models: Models) -> Gains:
     cross = cross * used[:, None, None, :]
     gain = np.linalg.solve(S, cross.swapaxes(-1, -2)).swapaxes(-1, -2)
     L = np.linalg.cholesky(S)
-    white = np.linalg.inv(L) * used[:, None, :, None]
+    white = _lower_inverse(L) * used[:, None, :, None]
     spread = np.log(np.diagonal(L, axis1=-2, axis2=-1)) * used[:, None]
     return Gains(models, gain, white, spread.sum((0, 2)))
+
+
+def _lower_inverse(L: Float[np.ndarray, "*b m m"]) -> Float[np.ndarray, "*b m m"]:
+    """Inverses of lower triangular matrices by forward substitution, over all of them at once."""
+    inverse = np.zeros_like(L)
+    for row in range(L.shape[-1]):
+        known = (L[..., row, :row, None] * inverse[..., :row, :]).sum(-2)
+        inverse[..., row, :] = -known
+        inverse[..., row, row] += 1.0
+        inverse[..., row, :] /= L[..., row, row, None]
+    return inverse
 
 
 def whitened(flow: Flow, gains: Gains, series: SeriesAlong) -> Iterator[tuple[int, Float[np.ndarray, "N m K"]]]:
@@ -120,6 +131,43 @@ def whitened(flow: Flow, gains: Gains, series: SeriesAlong) -> Iterator[tuple[in
         found = _filtered(flow, gains, part, series)
         for number in range(found.shape[1]):
             yield first + number, found[:, number]
+
+
+def whitened_in_blocks(
+    flow: Flow, gains: Gains, number: int, series: SeriesAlong, length: int
+) -> Iterator[tuple[slice, Float[np.ndarray, "L m K"]]]:
+    """The series under one model of the noise, some samples at a time: which samples, and their innovations.
+
+    The innovations of a block are overwritten by those of the next one.
+
+    Args:
+        flow: of the trajectory.
+        gains: of the models.
+        number: of the model.
+        series: K series.
+        length: samples of a block.
+    """
+    N, m, K = series.new.shape
+    blocks = [slice(first, min(first + length, N)) for first in range(0, N, length)]
+    part = slice(number, number + 1)
+    compiled = machine_code(whiten_samples)
+    if compiled is None:
+        whole = _filtered(flow, gains, part, series)[:, 0]
+        yield from ((rows, whole[rows]) for rows in blocks)
+        return
+    models = gains.models.part(part)
+    phi = _stays(flow, models)
+    gain, white = np.ascontiguousarray(gains.gain[:, part]), np.ascontiguousarray(gains.white[:, part])
+    start = np.zeros((1, gain.shape[2], K))
+    out = np.empty((1, min(length, N), m, K))
+    for rows in blocks:
+        on = slice(rows.start, min(rows.stop, N - 1))
+        here = out[:, : rows.stop - rows.start]
+        compiled(
+            flow.carried[on], flow.pushed[on], phi[on], models.place, flow.seen[rows], gain[rows], white[rows],
+            series.new[rows], series.shift[on], start, here,
+        )  # fmt: skip
+        yield rows, here[0]
 
 
 def relative_to(
@@ -193,15 +241,21 @@ def _by_machine_code(
     compiled: Callable[..., object], flow: Flow, gains: Gains, part: slice, series: SeriesAlong
 ) -> Float[np.ndarray, "N B m K"]:
     models, (N, m, K) = gains.models.part(part), series.new.shape
-    step = flow.step[:, None, None]
-    phi = np.where(step > 0, np.exp(-step / models.lasting), 0.0)
     out = np.empty((len(models), N, m, K))
+    start = np.zeros((len(models), gains.gain.shape[2], K))
     whole = [
-        flow.carried, flow.pushed, phi, models.place, flow.seen, gains.gain[:, part], gains.white[:, part],
-        series.new, series.shift,
+        flow.carried, flow.pushed, _stays(flow, models), models.place, flow.seen, gains.gain[:, part],
+        gains.white[:, part], series.new, series.shift,
     ]  # fmt: skip
-    compiled(*[np.ascontiguousarray(one) for one in whole], out)
+    compiled(*[np.ascontiguousarray(one) for one in whole], start, out)
     return out.swapaxes(0, 1)
+
+
+def _stays(flow: Flow, models: Models) -> Float[np.ndarray, "N-1 B D"]:
+    """The share of each lasting disturbance that stays until the next sample."""
+    step = flow.step[:, None, None]
+    share: np.ndarray = np.where(step > 0, np.exp(-step / models.lasting), 0.0)
+    return share
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from mkc_torch.diagnosis.search import likelihoods
 from mkc_torch.diagnosis.search.likelihoods import PRICE, Columns, log_likelihoods
 from mkc_torch.simulation.dynamics.disturbances import NoiseModel
 from mkc_torch.simulation.dynamics.whitening import SeriesAlong
@@ -58,6 +59,25 @@ def test_a_candidate_of_one_sign_gains_by_that_sign_only(sign):
     gain = found.beside[0, 0, 0] - found.without[0, 0]
     assert (gain > 10.0) == (sign < 0)
     assert sign < 0 or gain == 0.0
+
+
+def test_blocks_of_samples_and_of_models_change_nothing(monkeypatch):
+    pushed = NoiseModel((0.5,), ((0, 0.7, 1.0),), (False,))
+    flow, y, _, _, columns = scene(sizes=(1, 3, 1, 2), one_sided=(False, False, True, False))
+    whole = log_likelihoods(flow, [WHITE, pushed], series(y), columns)
+    monkeypatch.setattr(likelihoods, "_CELLS", 1)  # the least, 16 samples
+    monkeypatch.setattr(likelihoods, "_COVARIANCES", 1)  # a model at a time
+    blocks = log_likelihoods(flow, [WHITE, pushed], series(y), columns)
+    for name in ("without", "beside", "sizes", "rank", "scale"):
+        np.testing.assert_allclose(getattr(blocks, name), getattr(whole, name), rtol=1e-10, atol=1e-12)
+
+
+def test_a_candidate_that_changes_nothing_gains_nothing():
+    flow, y, own, candidates, _ = scene()
+    columns = Columns(series(np.concatenate([own, 0.0 * candidates], 1)), 2, (1, 2), (False, False))
+    found = log_likelihoods(flow, [WHITE], series(y), columns)
+    np.testing.assert_array_equal(found.rank, [0, 0])
+    np.testing.assert_allclose(found.beside[0], found.without[0][None].repeat(2, 0))
 
 
 def test_each_disturbance_has_its_price():

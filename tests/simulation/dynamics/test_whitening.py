@@ -5,7 +5,14 @@ import pytest
 
 from mkc_torch.simulation.dynamics import whitening
 from mkc_torch.simulation.dynamics.kalman import Flow, Models
-from mkc_torch.simulation.dynamics.whitening import SeriesAlong, gains_of, joined, relative_to, whitened
+from mkc_torch.simulation.dynamics.whitening import (
+    SeriesAlong,
+    gains_of,
+    joined,
+    relative_to,
+    whitened,
+    whitened_in_blocks,
+)
 
 STEP = 0.1
 MODELS = Models(
@@ -102,3 +109,23 @@ def test_series_are_whitened_alike_alone_and_beside_others():
     alone, both = dict(whitened(flow, gains, one)), dict(whitened(flow, gains, joined(one, other)))
     for number, values in alone.items():
         np.testing.assert_allclose(both[number][..., :2], values, atol=1e-12)
+
+
+@pytest.mark.parametrize("way", ["machine code", "NumPy"])
+@pytest.mark.parametrize("length", [1, 33, 120, 500])
+def test_blocks_of_samples_give_what_one_pass_gives(length, way, monkeypatch):
+    if way == "NumPy":
+        monkeypatch.setattr(whitening, "machine_code", lambda _: None)
+    flow = oscillator(N=120, runs=2)
+    gains = gains_of(flow, MODELS)
+    random = np.random.default_rng(1)
+    series = SeriesAlong(random.normal(size=(120, 1, 5)), 0.1 * random.normal(size=(119, 2, 5)))
+    for number, whole in whitened(flow, gains, series):
+        blocks = [values.copy() for _, values in whitened_in_blocks(flow, gains, number, series, length)]
+        assert len(blocks) == -(-120 // length)
+        np.testing.assert_array_equal(np.concatenate(blocks), whole)
+
+
+def test_inverses_of_triangular_matrices_are_those_of_numpy():
+    L = np.tril(np.random.default_rng(2).normal(size=(50, 3, 3))) + 4.0 * np.eye(3)
+    np.testing.assert_allclose(whitening._lower_inverse(L), np.linalg.inv(L), rtol=0, atol=1e-14)

@@ -19,17 +19,19 @@ def whiten_samples(
     white: Any,
     new: Any,
     shift: Any,
+    start: Any,
     out: Any,
 ) -> None:
-    """Whiten K series of N samples under B models of the noise; writes into ``out``.
+    """Whiten K series of N samples under B models of the noise; writes into ``start`` and ``out``.
 
     Args:
-        carried, pushed: (N-1, n, n) and (N-1, n, p), of the flow.
-        phi: (N-1, B, D), share of a lasting disturbance that stays until the next sample.
+        carried, pushed: (M, n, n) and (M, n, p), of the flow; M is N where more samples follow, and N-1 otherwise.
+        phi: (M, B, D), share of a lasting disturbance that stays until the next sample.
         place: (B, D), what a lasting disturbance acts on.
         seen: (N, m, n), outputs by states.
         gain, white: (N, B, k, m) and (N, B, m, m), of the filters.
-        new, shift: (N, m, K) and (N-1, n, K), of the series.
+        new, shift: (N, m, K) and (M, n, K), of the series.
+        start: (B, k, K), states and lasting disturbances before the first sample; at the end, before the next one.
         out: (B, N, m, K), the innovations.
     """
     N, m, K = new.shape
@@ -38,7 +40,7 @@ def whiten_samples(
     k = n + D
     state, moved, left = np.empty((k, K)), np.empty((k, K)), np.empty((m, K))
     for b in range(B):
-        state[:] = 0.0
+        state[:] = start[b]
         for row in range(N):
             for output in range(m):
                 for s in range(K):
@@ -59,7 +61,7 @@ def whiten_samples(
                     w = white[row, b, output, other]
                     for s in range(K):
                         out[b, row, output, s] += w * left[other, s]
-            if row == N - 1:
+            if row == len(carried):
                 break
             for i in range(k):
                 for output in range(m):
@@ -85,3 +87,4 @@ def whiten_samples(
                 for s in range(K):
                     moved[n + d, s] = w * state[n + d, s]
             state, moved = moved, state
+        start[b] = state
