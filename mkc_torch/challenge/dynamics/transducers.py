@@ -103,3 +103,58 @@ def soft_gap(largest: float) -> SignalChange:
         return values - width * np.tanh(values / width)
 
     return change
+
+
+def follower(values: Array, step: float, size: float) -> Array:
+    """An actuator that follows its command: a lag of ``size`` s, and its electronics with one of a twelfth."""
+    return lagged(lagged(values, step, size), step, size / 12.0)
+
+
+def squared(largest: float, power: float) -> SignalChange:
+    """An actuator that acts by about the square of its command; ``size`` of it does, and it is right at the largest."""
+
+    def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+        ratio = values / largest
+        return values + size * (largest * np.sign(ratio) * np.abs(ratio) ** power - values)
+
+    return change
+
+
+def worn_gear(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+    """A gear whose teeth are worn unevenly: its mean half gap is ``size``."""
+    return np.mean([play(values, share * size) for share in (0.7, 1.0, 1.3)], axis=0)
+
+
+def warming_zero(constant: float, share: float) -> SignalChange:
+    """A zero that is off by ``size``, and loses a share of it within ``constant`` s as the sensor warms up."""
+
+    def change(values: Array, step: float, size: float) -> Array:
+        time = np.arange(values.shape[1])[None, :, None] * step
+        return values + size * (1.0 - share * (1.0 - np.exp(-time / constant)))
+
+    return change
+
+
+def sagging(level: float) -> SignalChange:
+    """A joint held by a spring of a controller: its load pulls it aside at the angle where it then is, in rad.
+
+    Args:
+        level: angle at which the link is level; there it sags by ``size``.
+    """
+
+    def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+        angle = values
+        for _ in range(30):
+            angle = values + size * np.cos(angle - level)
+        return angle
+
+    return change
+
+
+def shaken(omega: float) -> SignalChange:
+    """A sensor on a machine that shakes, by ``size``, at omega in rad/s."""
+
+    def change(values: Array, step: float, size: float) -> Array:
+        return values + size * np.sin(omega * np.arange(values.shape[1]) * step)[None, :, None]
+
+    return change
