@@ -62,12 +62,10 @@ def _hiding(effect: str, system: System, stream: Callable[[str], Generator]) -> 
     """The system with nothing else to hide; None where it does not have the effect, or does not show it."""
     setting = system.draw(stream("setting"))
     scene = Scene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
-    known = names(scene)
-    having = []
-    for draw in system.inside:
-        hidden = draw(stream("effect"), scene)
-        if hidden.effect == effect and can_be_named(hidden, known):
-            having.append(draw)
+    having = [draw for draw in system.inside if draw(stream("effect"), scene).effect == effect]
+    if having:
+        known = names(scene)
+        having = [draw for draw in having if can_be_named(draw(stream("effect"), scene), known)]
     if not having:
         return None
     return replace(system, inside=(draws.choose(stream("which"), having),))

@@ -74,8 +74,9 @@ def tangents(scene: Scene, errors: Whitening, *, rivals: bool) -> Tangents:
     """
     plant, trial, x, u = scene.plant, scene.trial, scene.course.states, scene.course.inputs
     if plant.reads is not None:
-        told = [(one, errors.whitened(one.outputs)) for one in readings(scene) if one.outputs is not None]
-        return Tangents(errors.whitened(_readings_by_parameters(plant, u)), told if rivals else [])
+        read = readings(scene) if rivals else []
+        told = [(one, errors.whitened(one.outputs)) for one in read if one.outputs is not None]
+        return Tangents(errors.whitened(_readings_by_parameters(plant, u)), told)
     n, p, runs = len(plant.states), len(plant.parameters), trial.runs
     found = accounts(scene, _by_inputs(plant, x, u)) if rivals else []
     forced = [account.forcing for account in found if account.forcing is not None]

@@ -9,7 +9,7 @@ import numpy as np
 from mkc_torch.challenge.dynamics.plant import Array
 from mkc_torch.challenge.dynamics.rivals import SHIFTS, Account, input_forms
 from mkc_torch.challenge.dynamics.scene import Scene
-from mkc_torch.challenge.dynamics.transducers import lagged, play, transport
+from mkc_torch.challenge.dynamics.transducers import lagged_each, play, transport
 
 
 def readings(scene: Scene) -> list[Account]:
@@ -42,7 +42,8 @@ def output_forms(y: Array, step: float, length: float) -> Iterator[tuple[str, Ar
     yield "clock_drift", ((time - time.mean()) * np.gradient(own, step, axis=0))[..., None], False
     for share in SHIFTS:
         yield "delay", (transport(y, step, share * length) - y)[0][..., None], True
-        yield "sensor_lag", (lagged(y, step, share * length) - y)[0][..., None], True
+    for behind in np.moveaxis(lagged_each(y, step, np.array(SHIFTS) * length), -1, 0):
+        yield "sensor_lag", (behind - y)[0][..., None], True
     for share in (0.01, 0.02, 0.04, 0.08, 0.15, 0.3):
         yield "backlash", (play(y, share * largest) - y)[0][..., None], True
     for share in (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9):

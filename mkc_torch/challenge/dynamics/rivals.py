@@ -15,7 +15,7 @@ from mkc_torch.challenge.dynamics.hidden import rate_of
 from mkc_torch.challenge.dynamics.plant import Array
 from mkc_torch.challenge.dynamics.scene import Scene
 from mkc_torch.challenge.dynamics.stores import swung
-from mkc_torch.challenge.dynamics.transducers import lagged, play, transport
+from mkc_torch.challenge.dynamics.transducers import lagged_each, play, transport
 
 _REVERSED = 0.05
 """Share of the time in either direction from which a state counts as one that reverses."""
@@ -111,8 +111,9 @@ def powers(y: Array) -> Iterator[Array]:
 
 def _memories(v: Array, step: float, length: float, *, swings: bool) -> Iterator[tuple[str, Array, bool]]:
     """A second store that follows a state, and a mass that swings along."""
-    for constant in length * np.array([0.005, 0.015, 0.03, 0.05, 0.08, 0.15]):
-        yield "hidden_lag", ((lagged(v[None], step, constant)[0] - v) / constant)[..., None], True
+    constants = length * np.array([0.005, 0.015, 0.03, 0.05, 0.08, 0.15])
+    for constant, behind in zip(constants, np.moveaxis(lagged_each(v[None], step, constants)[0], -1, 0), strict=True):
+        yield "hidden_lag", ((behind - v) / constant)[..., None], True
     if swings:
         omegas = 2.0 * np.pi / (length * np.geomspace(0.01, 0.25, 20))
         for damping in (0.03, 0.1):
@@ -177,7 +178,8 @@ def input_forms(u: Array, step: float, length: float) -> Iterator[tuple[str, Arr
     largest = float(np.abs(u).max())
     for share in SHIFTS:
         yield "input_delay", (transport(u, step, share * length) - u)[0]
-        yield "input_lag", (lagged(u, step, share * length) - u)[0]
+    for behind in np.moveaxis(lagged_each(u, step, np.array(SHIFTS) * length), -1, 0):
+        yield "input_lag", (behind - u)[0]
     yield "input_square", (u * np.abs(u) / largest - u)[0]
     for share in (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9):
         yield "input_saturation", (np.clip(u, -share * largest, share * largest) - u)[0]
@@ -210,8 +212,8 @@ def _lags(scene: Scene) -> list[Account]:
     plant, step = scene.plant, scene.trial.step / scene.plant.fine
     measured = scene.course.states[[plant.row(name) for name in plant.outputs]]
     found = []
-    for share in SHIFTS:
-        behind = (lagged(measured, step, share * scene.length) - measured)[:, :: plant.fine]
+    for late in np.moveaxis(lagged_each(measured, step, np.array(SHIFTS) * scene.length), -1, 0):
+        behind = (late - measured)[:, :: plant.fine]
         traces = np.zeros((*behind.shape, len(behind)))
         for k, one in enumerate(behind):
             traces[k, ..., k] = one

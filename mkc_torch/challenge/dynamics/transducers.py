@@ -51,14 +51,24 @@ def lagged(values: Array, step: float, constant: float) -> Array:
     """
     if constant <= 1e-9 * step:
         return values
-    ratio = step / constant
+    return lagged_each(values, step, np.array([constant]))[..., 0]
+
+
+def lagged_each(values: Array, step: float, constants: Array) -> Array:
+    """The same with each of several constants (q,), all of them longer than 0.
+
+    Returns:
+        (channels, moments, R, q).
+    """
+    ratio = step / constants
     keep = np.exp(-ratio)
     late = (1.0 - keep) / ratio
-    out = np.empty_like(values)
-    out[:, 0] = y = values[:, 0]
+    wide = values[..., None]
+    drive = (late - keep) * wide[:, :-1] + (1.0 - late) * wide[:, 1:]
+    out = np.empty((*values.shape, len(constants)))
+    out[:, 0] = y = np.broadcast_to(wide[:, 0], out[:, 0].shape)
     for k in range(1, values.shape[1]):
-        before, now = values[:, k - 1], values[:, k]
-        out[:, k] = y = keep * y + (late - keep) * before + (1.0 - late) * now
+        out[:, k] = y = keep * y + drive[:, k - 1]
     return out
 
 
