@@ -17,6 +17,9 @@ from mkc_torch.challenge.dynamics.signals import excitation, moments, runs_of
 STEP = 0.02
 """s."""
 
+PLANNED = 0.08
+"""Time constant in s by which the planner rounds a jump, twice: behind one, a delay would show in a sample alone."""
+
 AT = ("angle",)
 
 
@@ -42,10 +45,12 @@ def draw(g: Generator) -> Setting:
 
 
 def trial(g: Generator, runs: int, samples: int) -> Trial:
-    """Commands of either sign in rad."""
+    """Commands of either sign in rad, as a planner sends them, without jumps."""
     time = moments(STEP, samples)
-    commands = [uniform(g, 0.7, 1.4) * excitation(g, time, uniform(g, 0.8, 2.0)) for _ in range(runs)]
-    return Trial(STEP, runs_of(commands), np.zeros((0, runs)))
+    wanted = runs_of([uniform(g, 0.7, 1.4) * excitation(g, time, uniform(g, 0.8, 2.0)) for _ in range(runs)])
+    return Trial(
+        STEP, transducers.lagged(transducers.lagged(wanted, STEP, PLANNED), STEP, PLANNED), np.zeros((0, runs))
+    )
 
 
 def late(g: Generator, scene: Scene) -> Hidden:
@@ -62,10 +67,10 @@ def worn(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature 
     return Hidden("backlash", "uneven teeth", (*AT, "input command"), large, outputs=transducers.worn_gear)
 
 
-def wrong_zero(g: Generator, scene: Scene) -> Hidden:
-    """A horn that sits a tooth off, on a sensor that warms up."""
-    change = transducers.warming_zero(uniform(g, 0.1, 0.5) * scene.length, uniform(g, 0.0, 0.1))
-    return Hidden("offset", "zero that warms up", AT, 0.2, outputs=change)
+def wrong_zero(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+    """A horn that sits a tooth off, on a shaft that is not quite round."""
+    change = transducers.wrong_zero(uniform(g, 0.0, 0.1), uniform(g, 0.0, 2.0 * math.pi))
+    return Hidden("offset", "zero of an eccentric shaft", AT, 0.2, outputs=change)
 
 
 def load(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all

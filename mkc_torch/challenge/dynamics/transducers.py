@@ -135,12 +135,11 @@ def worn_gear(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
     return np.mean([play(values, share * size) for share in (0.7, 1.0, 1.3)], axis=0)
 
 
-def warming_zero(constant: float, share: float) -> SignalChange:
-    """A zero that is off by ``size``, and loses a share of it within ``constant`` s as the sensor warms up."""
+def wrong_zero(share: float, phase: float) -> SignalChange:
+    """A zero that is off by ``size``, and by a share more or less about three times a turn of an angle in rad."""
 
-    def change(values: Array, step: float, size: float) -> Array:
-        time = np.arange(values.shape[1])[None, :, None] * step
-        return values + size * (1.0 - share * (1.0 - np.exp(-time / constant)))
+    def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+        return values + size * (1.0 + share * np.sin(3.0 * values + phase))
 
     return change
 

@@ -232,10 +232,11 @@ def test_a_joint_sags_at_the_angle_where_it_then_is(command, size, level):
     assert angle == pytest.approx(command + size * np.cos(angle - level), abs=1e-9)
 
 
-def test_a_zero_loses_a_share_as_it_warms_up():
-    off = transducers.warming_zero(1.0, 0.1)(np.zeros((1, 2000, 1)), 0.01, 2.0)[0, :, 0]
-    assert off[0] == pytest.approx(2.0)
-    assert off[-1] == pytest.approx(1.8)
+def test_a_wrong_zero_is_off_by_its_size_but_for_a_share():
+    angles = np.linspace(-2.0, 2.0, 300)[None, :, None]
+    off = transducers.wrong_zero(0.1, 0.5)(angles, 0.01, 0.2) - angles
+    assert 0.179 < off.min() < 0.185
+    assert 0.215 < off.max() < 0.221
 
 
 def test_water_evaporates_and_air_rises_where_it_is_warmer_than_the_room():
