@@ -125,6 +125,7 @@ def run(words: list[str], folder: Path) -> None:
                 "tests.benchmarks",
                 "tests.device",
                 "tests.fuzz",
+                "tests.gate.each_effect",
                 "tests.gate.null_p_values",
                 "tests.mutation",
                 "tests.wheel",

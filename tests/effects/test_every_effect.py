@@ -124,7 +124,9 @@ def test_what_effects_can_do_beside():
     assert {e.id for e in CATALOGUE if e.simpler} == {"coupling", "sensor_lag", "delay"}
     assert {e.id: e.reduces_to.id for e in CATALOGUE if e.reduces_to} == {"stribeck_friction": "coulomb_friction"}
     assert {e.id for e in CATALOGUE if e.is_curve} == {"unknown"}
-    assert {e.id for e in CATALOGUE if e.general} == {"power_law", "hidden_lag", "hidden_mode", "gravity_sag"}
+    assert {e.id for e in CATALOGUE if e.general} == {
+        "power_law", "hidden_lag", "hidden_mode", "gravity_sag", "driver_linear", "driver_quadratic",
+    }  # fmt: skip
     assert {e.id for e in SENSOR if e.continuous} == {"hard_iron_step", "offset_drift", "temperature_offset"}
     assert {e.id for e in CATALOGUE if not e.has_course} & {"hard_iron_step", "linear_drag", "gain"} == set()
 

@@ -49,6 +49,31 @@ def test_what_drives_an_output_is_found(simulation):
     assert float((columns["voltage"] - table["voltage"]).abs().median()) < 0.012
 
 
+class Joint(Static):
+    inputs = ("command",)
+    outputs = ("angle",)
+    parameters = {"scale": 1.0}  # noqa: RUF012
+    units = {"command": "rad", "angle": "rad"}  # noqa: RUF012
+
+    def output(self, time, u, p):  # noqa: ARG002
+        return {"angle": p.scale * u.command}
+
+
+def test_a_wrong_zero_is_an_offset_though_a_column_follows_it_a_little_better_by_chance():
+    """By three standard errors of the slope: more than another number costs, and less than a special case does."""
+    count = 300
+    g = torch.Generator().manual_seed(4)
+    time = 0.02 * torch.arange(count, dtype=torch.float64)
+    command, trend = torch.sin(2.0 * time) + 0.4 * torch.sin(5.0 * time), time - time.mean()
+    noise = 0.01 * torch.randn(count, generator=g, dtype=torch.float64)
+    trend = trend / torch.linalg.vector_norm(trend)
+    noise = noise - (noise @ trend) * trend + 3.0 * 0.01 * trend
+    columns = {"time": time, "command": command, "angle": command + 0.05 + noise, "temperature": 22.0 + 3.0 * trend}
+    found = diagnose(Joint(), Recording(columns), surrogates=19, max_findings=1)
+    assert [(one.effect, one.drivers) for one in found.findings] == [("offset", ())]
+    assert found.findings[0].parameters[0].value == pytest.approx(0.05, abs=0.003)
+
+
 def test_nothing_is_missing_from_a_right_one():
     assert diagnose(Thermistor(), recording(), surrogates=19).verdict == "adequate"
 

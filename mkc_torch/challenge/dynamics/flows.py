@@ -52,6 +52,40 @@ def tap(row: int, head: float) -> RateChange:
     return added(row, lambda x, _: np.sqrt(np.maximum(1.0 - x[row] / head, 0.0)))
 
 
+def slot(row: int, top: float, power: float, throat: float) -> RateChange:
+    """A slot from the bottom up: flow by 1.5 or 2.5 powers of the level over ``top``, that narrows with the level."""
+    return added(row, lambda x, _: -((np.maximum(x[row], 0.0) / top) ** power) * (1.0 - throat * x[row] / top))
+
+
+def evaporation(row: int, room: float, wet: float) -> RateChange:
+    """Water that evaporates into air at ``room`` °C: by the difference of the pressures of its vapour.
+
+    Args:
+        row: of the temperature.
+        room: °C.
+        wet: temperature in °C at which the loss is ``size`` K/s.
+
+    References:
+        Magnus' formula with the numbers of Sonntag (1990); Dalton's law of evaporation.
+    """
+
+    def pressure(temperature: Array) -> Array:
+        return np.exp(17.62 * temperature / (243.12 + temperature))
+
+    dry = pressure(np.asarray(room))
+    return added(row, lambda x, _: -(pressure(x[row]) - dry) / (pressure(np.asarray(wet)) - dry))
+
+
+def natural_convection(row: int, room: float, hot: float, power: float) -> RateChange:
+    """Heat that rising air carries off, by a power of the excess over ``room`` °C; ``size`` K/s at ``hot`` °C."""
+
+    def force(x: Array, _: Array) -> Array:
+        away = (x[row] - room) / (hot - room)
+        return -np.sign(away) * np.abs(away) ** power
+
+    return added(row, force)
+
+
 def radiation(row: int, room: float, slope: float) -> RateChange:
     """Radiation to walls at ``room`` °C, with an emissivity that changes by ``slope`` a K; in K/s near room."""
 

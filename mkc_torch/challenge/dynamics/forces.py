@@ -80,6 +80,14 @@ def hardening(row: int, position: int, reach: float) -> RateChange:
     return added(row, lambda x, _: -6.0 * reach**3 * (np.sinh(x[position] / reach) - x[position] / reach))
 
 
+def felt(row: int, position: int, reach: float, power: float) -> RateChange:
+    """A spring of felt: its force grows by a power of the deflection, and evenly below a tenth of ``reach``."""
+    return added(
+        row,
+        lambda x, _: -x[position] / reach * ((x[position] / reach) ** 2 + 0.01) ** (0.5 * (power - 1.0)),
+    )
+
+
 def contact(row: int, position: int, place: float, ways: tuple[float, ...], loss: float = 0.2) -> RateChange:
     """A bumper beyond a place, on the sides ``ways`` (1, -1): Hertz's contact that loses energy.
 

@@ -11,7 +11,7 @@ import torch
 from torch import Generator, Tensor
 
 from mkc_torch.challenge import draws
-from mkc_torch.challenge.dynamics import cart_pole, motor, pendulum, projectile, tanks, thermal
+from mkc_torch.challenge.dynamics import cart_pole, motor, pendulum, projectile, servo, tanks, thermal
 from mkc_torch.challenge.dynamics.errors import OUTLIERS, Errors, Whitening, draw_errors, sample, spoil
 from mkc_torch.challenge.dynamics.hidden import Draw
 from mkc_torch.challenge.dynamics.integrate import Course, simulate
@@ -50,6 +50,7 @@ SYSTEMS: Mapping[str, System] = MappingProxyType(
         "motor": System(motor.draw, motor.INSIDE, motor.OUTSIDE),
         "projectile": System(projectile.draw, projectile.INSIDE, projectile.OUTSIDE),
         "thermal": System(thermal.draw, thermal.INSIDE, thermal.OUTSIDE),
+        "servo": System(servo.draw, servo.INSIDE, servo.OUTSIDE),
     }
 )
 
@@ -76,14 +77,34 @@ def draw(seed: int, index: int, *, empty: bool = False) -> Case:
         return draws.generator(seed, index, "dynamics", what)
 
     system = draws.choose(stream("system"), tuple(SYSTEMS))
-    setting = SYSTEMS[system].draw(stream("setting"))
-    plant, name = setting.plant, f"{system}_{index:05d}"
+    return case_of(stream, f"{system}_{index:05d}", SYSTEMS[system], empty=empty)
+
+
+def case_of(
+    stream: Callable[[str], Generator],
+    name: str,
+    system: System,
+    *,
+    empty: bool = False,
+    outside_share: float = OUTSIDE_SHARE,
+) -> Case:
+    """A case of one system.
+
+    Args:
+        stream: generators by what they are for.
+        name: of the recording.
+        system: whose runs it is of.
+        empty: hide nothing.
+        outside_share: of effects that no diagnosis with the catalogue can name.
+    """
+    setting = system.draw(stream("setting"))
+    plant = setting.plant
     scene = Scene(plant, setting.trial, simulate(plant, setting.trial))
     errors = draw_errors(stream("noise"), scene.course.outputs)
     if empty:
         measured = measured_by(stream, "", plant, setting.trial, scene.course, errors)
         return Case(Recording(measured.columns, name=name), None, key_of(name, "empty", plant, errors, measured))
-    kind, hidden, size, seen = hide(stream, SYSTEMS[system], scene, errors)
+    kind, hidden, size, seen = hide(stream, system, scene, errors, outside_share)
     measured = measured_by(stream, "", plant, setting.trial, simulate(plant, setting.trial, hidden, size), errors)
     later = simulate(plant, setting.later, hidden, size)
     again = measured_by(stream, "later ", plant, setting.later, later, errors)

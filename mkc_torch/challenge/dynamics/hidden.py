@@ -5,15 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 from torch import Generator
 
 from mkc_torch.challenge.draws import choose, happens, log_uniform, uniform
-from mkc_torch.challenge.dynamics import flows, forces, transducers
+from mkc_torch.challenge.dynamics import flows, forces, stores, transducers
 from mkc_torch.challenge.dynamics.friction import bristles, rubber
-from mkc_torch.challenge.dynamics.plant import Hidden
+from mkc_torch.challenge.dynamics.plant import Array, Hidden
 from mkc_torch.challenge.dynamics.scene import Scene
 
 Draw = Callable[[Generator, Scene], Hidden]
+
+Exchange = Callable[[Generator, float], Callable[[Array], Array]]
+"""From a difference that is typical, a function of differences of at least 0, in the same unit."""
 
 
 def rate_of(state: str) -> str:
@@ -127,6 +131,33 @@ def late_actuator(name: str) -> Draw:
     return draw
 
 
+def slow_actuator(name: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+        return Hidden(
+            "input_lag",
+            "two lags, of which one is short",
+            (f"input {name}",),
+            0.05 * scene.length,
+            inputs=transducers.only(scene.plant.inputs.index(name), transducers.follower),
+        )
+
+    return draw
+
+
+def squared_actuator(name: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        change = transducers.squared(scene.largest_input(name), uniform(g, 1.8, 2.2))
+        return Hidden(
+            "input_square",
+            "power near the square",
+            (f"input {name}",),
+            1.0,
+            inputs=transducers.only(scene.plant.inputs.index(name), change),
+        )
+
+    return draw
+
+
 def weak_actuator(name: str) -> Draw:
     def draw(g: Generator, scene: Scene) -> Hidden:
         change = transducers.soft_limit(scene.largest_input(name), uniform(g, 4.0, 10.0))
@@ -175,6 +206,47 @@ def bushing(speed: str, position: str) -> Draw:
         form = rubber(scene.plant.row(speed), tuple(reach * uniform(g, 0.1, 0.5) for _ in range(3)))
         large = 2.0 * scene.pace(speed) / reach
         return Hidden("bouc_wen_hysteresis", "elements with several yields", (rate_of(speed),), large, form, own=3)
+
+    return draw
+
+
+def felt_spring(speed: str, position: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        form = forces.felt(
+            scene.plant.row(speed), scene.plant.row(position), scene.largest(position), uniform(g, 1.8, 2.4)
+        )
+        return Hidden("power_law", "spring of felt", (rate_of(speed),), 2.0 * scene.pace(speed), form)
+
+    return draw
+
+
+def second_store(state: str, exchange: Exchange, name: str) -> Draw:
+    """A store that takes up what a state gives off, later.
+
+    Args:
+        state: it is beside.
+        exchange: draws what drives the flow between them, from a difference that is typical.
+        name: of what it is.
+    """
+
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        constant = log_uniform(g, 0.02, 0.1) * scene.length
+        row, x = scene.plant.row(state), scene.state(state)
+        away = x - transducers.lagged(x[None], scene.trial.step / scene.plant.fine, constant)[0]
+        head = exchange(g, float(np.abs(away).mean()))
+        form = stores.second_store(row, lambda there: head(there) / constant)
+        return Hidden("hidden_lag", name, (rate_of(state),), 2.0, form, own=1, begin=stores.like(row))
+
+    return draw
+
+
+def second_mass(speed: str, name: str) -> Draw:
+    def draw(g: Generator, scene: Scene) -> Hidden:
+        row = scene.plant.row(speed)
+        omega = 2.0 * math.pi / (log_uniform(g, 0.06, 0.25) * scene.length)
+        reach = scene.pace(speed) / omega**2
+        form = stores.second_mass(row, omega, log_uniform(g, 0.02, 0.1), uniform(g, 0.005, 0.02) / reach**2)
+        return Hidden("hidden_mode", name, (rate_of(speed),), 2.0, form, own=2, begin=stores.unstretched(row))
 
     return draw
 

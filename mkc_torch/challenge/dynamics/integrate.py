@@ -57,7 +57,7 @@ def simulate(
     half = _sent(plant, trial)
     sent = half if hidden is None else hidden.inputs(half, 0.5 * h, size)
     states = _states(plant, h, sent, trial, hidden, np.full(trial.runs, size), push)
-    return Course(states, half[:, ::2], _measured(plant, states, h, hidden, size))
+    return Course(states, half[:, ::2], _measured(plant, states, sent[:, ::2], h, hidden, size))
 
 
 def outputs_of_sizes(plant: Plant, trial: Trial, hidden: Hidden, sizes: Array) -> list[Array]:
@@ -67,8 +67,8 @@ def outputs_of_sizes(plant: Plant, trial: Trial, hidden: Hidden, sizes: Array) -
     sent = np.concatenate([hidden.inputs(half, 0.5 * h, size) for size in sizes], -1)
     many = replace(trial, begin=np.tile(trial.begin, len(sizes)))
     states = _states(plant, h, sent, many, hidden, np.repeat(sizes, trial.runs))
-    parts = np.split(states, len(sizes), -1)
-    return [_measured(plant, part, h, hidden, size) for part, size in zip(parts, sizes, strict=True)]
+    parts = zip(np.split(states, len(sizes), -1), np.split(sent[:, ::2], len(sizes), -1), sizes, strict=True)
+    return [_measured(plant, part, inputs, h, hidden, size) for part, inputs, size in parts]
 
 
 def _sent(plant: Plant, trial: Trial) -> Array:
@@ -97,7 +97,10 @@ def _states(
             known = known + pushed
         return np.concatenate([known, inner]) if own else known
 
-    x = np.concatenate([trial.begin, np.zeros((own, trial.begin.shape[1]))])
+    inner = np.zeros((own, trial.begin.shape[1]))
+    if hidden is not None and hidden.begin is not None:
+        inner = hidden.begin(trial.begin)
+    x = np.concatenate([trial.begin, inner])
     path = np.empty((sent.shape[1] // 2 + 1, *x.shape))
     path[0] = x
     for k in range(len(path) - 1):
@@ -113,9 +116,9 @@ def _states(
     return path.transpose(1, 0, 2)[:n]
 
 
-def _measured(plant: Plant, states: Array, h: float, hidden: Hidden | None, size: float) -> Array:
-    """Outputs (m, T, R) of states (n, F, R)."""
-    found = states[[plant.row(name) for name in plant.outputs]]
+def _measured(plant: Plant, states: Array, inputs: Array, h: float, hidden: Hidden | None, size: float) -> Array:
+    """Outputs (m, T, R) of states (n, F, R) and inputs (k, F, R)."""
+    found = plant.read(states, inputs)
     return (found if hidden is None else hidden.outputs(found, h, size))[:, :: plant.fine]
 
 

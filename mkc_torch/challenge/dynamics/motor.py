@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from torch import Generator
 
@@ -58,6 +60,12 @@ def gear_teeth(g: Generator, scene: Scene) -> Hidden:
     return Hidden("load_dependent_friction", "teeth by bristles", (hidden.rate_of("speed"),), large, form, own=1)
 
 
+def oil(g: Generator, typical: float) -> Callable[[Array], Array]:
+    """A coupling by oil, that grips a little more the faster it slips."""
+    share = uniform(g, 0.0, 0.1)
+    return lambda slip: slip * (1.0 + share * slip / typical)
+
+
 def hot_windings(g: Generator, scene: Scene) -> Hidden:
     """Torque that fades as the windings heat up."""
     heat = scene.typical("current") ** 2
@@ -72,7 +80,10 @@ INSIDE = (
     hidden.blunt_drag("speed"),
     hidden.magnets("speed", "angle", (2, 3, 4, 6)),
     hidden.warm_bias("speed"),
+    hidden.second_mass("speed", "soft shaft"),
+    hidden.second_store("speed", oil, "flywheel in oil"),
     hidden.late_actuator("voltage"),
+    hidden.slow_actuator("voltage"),
     hidden.weak_actuator("voltage"),
     hidden.lapped_valve("voltage"),
     hidden.slow_sensor(),

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mkc_torch.simulation import Dynamics, Parameter
+from mkc_torch.simulation import Dynamics, Parameter, Static
 
 
 class Pendulum(Dynamics):
@@ -115,3 +115,13 @@ class Thermal(Dynamics):
             "temperature_1": p.gain_1 * u.heater_1 - p.loss_1 * (x.temperature_1 - p.room),
             "temperature_2": p.gain_2 * u.heater_2 - p.loss_2 * (x.temperature_2 - p.room),
         }
+
+
+class Servo(Static):
+    inputs = ("command",)
+    outputs = ("angle",)
+    units = {"command": "rad", "angle": "rad"}
+    parameters = {"scale": 1.0}
+
+    def output(self, time: Tensor, u: Any, p: Any) -> Mapping[str, Tensor]:
+        return {"angle": p.scale * u.command}

@@ -19,6 +19,7 @@ import numpy as np
 from mkc_torch.challenge.dynamics.errors import OUTLIERS, Whitening
 from mkc_torch.challenge.dynamics.integrate import simulate, variation
 from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Trial
+from mkc_torch.challenge.dynamics.readings import readings
 from mkc_torch.challenge.dynamics.rivals import SUPERSETS, Account, accounts
 from mkc_torch.challenge.dynamics.scene import Scene
 
@@ -72,6 +73,10 @@ def tangents(scene: Scene, errors: Whitening, *, rivals: bool) -> Tangents:
         rivals: all accounts too, or the known parameters alone.
     """
     plant, trial, x, u = scene.plant, scene.trial, scene.course.states, scene.course.inputs
+    if plant.reads is not None:
+        read = readings(scene) if rivals else []
+        told = [(one, errors.whitened(one.outputs)) for one in read if one.outputs is not None]
+        return Tangents(errors.whitened(_readings_by_parameters(plant, u)), told)
     n, p, runs = len(plant.states), len(plant.parameters), trial.runs
     found = accounts(scene, _by_inputs(plant, x, u)) if rivals else []
     forced = [account.forcing for account in found if account.forcing is not None]
@@ -130,6 +135,17 @@ def _by_parameters(plant: Plant, x: Array, u: Array) -> Array:
     return np.stack(columns, -1) if columns else np.zeros((*x.shape, 0))
 
 
+def _readings_by_parameters(plant: Plant, u: Array) -> Array:
+    """(m, T, R, p) of a system without states, by central differences."""
+    assert plant.reads is not None
+    p, columns = plant.values, []
+    for k in range(len(p)):
+        away = np.zeros_like(p)
+        away[k] = 1e-6 * (abs(p[k]) + 1e-9)
+        columns.append((plant.reads(u, p + away) - plant.reads(u, p - away)) / (2.0 * away[k]))
+    return np.stack(columns, -1)[:, :: plant.fine]
+
+
 def power(plant: Plant, trial: Trial, hidden: Hidden, size: float, errors: Whitening) -> Power:
     """Of an effect at its size, about the parameters and first states that follow it best without it."""
     truth = simulate(plant, trial, hidden, size).outputs
@@ -178,10 +194,11 @@ class Judge:
         told = [
             Rival(*key, _KEPT * math.sqrt(max(value - own, 0.0)))
             for key, value in missed.items()
-            if not _is_own(key, hidden) and not _contains(key, hidden)
+            if not _is_own(key, hidden) and not _contains(key, hidden) and key[0] not in hidden.twins
         ]
         told.sort(key=lambda rival: rival.z_sep)
         larger = [Rival(*key, 0.0) for key in missed if _contains(key, hidden) and own - missed[key] > _CLEARLY]
+        larger += [Rival(*key, 0.0) for key in missed if key[0] in hidden.twins]
         z = _KEPT * math.sqrt(total)
         return Power(z, min([z, *(r.z_sep for r in told)]), _KEPT * math.sqrt(own), tuple(told), tuple(larger))
 
@@ -192,7 +209,10 @@ Key = tuple[str, tuple[str, ...]]
 
 def names(scene: Scene) -> frozenset[Key]:
     """All that a diagnosis could say: dry friction, say, it could not at speeds that never reverse."""
-    found = accounts(scene, _by_inputs(scene.plant, scene.course.states, scene.course.inputs))
+    if scene.plant.reads is not None:
+        found = readings(scene)
+    else:
+        found = accounts(scene, _by_inputs(scene.plant, scene.course.states, scene.course.inputs))
     return frozenset((account.effect, account.at) for account in found)
 
 

@@ -26,6 +26,7 @@ class Plant:
         speeds: position to the state that is its speed.
         parameters: name to true value, in the order of ``rate``.
         fine: even number of steps of the integration between two samples.
+        reads: of a system without states, its outputs (m, *) from inputs (k, *) and parameters (p,).
     """
 
     name: str
@@ -37,6 +38,7 @@ class Plant:
     parameters: Mapping[str, float]
     rate: Rate
     fine: int
+    reads: Callable[[Array, Array], Array] | None = None
 
     def row(self, state: str) -> int:
         return self.states.index(state)
@@ -45,6 +47,12 @@ class Plant:
     def values(self) -> Array:
         """(p,) of the parameters."""
         return np.array(list(self.parameters.values()))
+
+    def read(self, states: Array, inputs: Array) -> Array:
+        """Outputs (m, F, R) at states (n, F, R) and inputs (k, F, R)."""
+        if self.reads is not None:
+            return self.reads(inputs, self.values)
+        return states[[self.row(name) for name in self.outputs]]
 
 
 @dataclass(frozen=True)
@@ -91,8 +99,10 @@ class Hidden:
         at: where a diagnosis may say that it acts, one place of several being enough.
         large: a size that nobody could overlook.
         rate: what it makes of the rates; None if it leaves them alone.
-        own: number of states of its own, at 0 when a run begins.
+        own: number of states of its own.
         inputs, outputs: what it makes of inputs and of what is measured.
+        begin: from first states (n, R) its own ones (e, R); None where they begin at 0.
+        twins: names of the same thing at another place, from which no data tells it.
     """
 
     effect: str
@@ -103,6 +113,8 @@ class Hidden:
     own: int = 0
     inputs: SignalChange = field(default=_unchanged)
     outputs: SignalChange = field(default=_unchanged)
+    begin: Callable[[Array], Array] | None = None
+    twins: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

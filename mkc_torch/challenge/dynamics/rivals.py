@@ -14,16 +14,20 @@ import numpy as np
 from mkc_torch.challenge.dynamics.hidden import rate_of
 from mkc_torch.challenge.dynamics.plant import Array
 from mkc_torch.challenge.dynamics.scene import Scene
-from mkc_torch.challenge.dynamics.transducers import lagged, play, transport
+from mkc_torch.challenge.dynamics.stores import swung
+from mkc_torch.challenge.dynamics.transducers import lagged_each, play, transport
 
 _REVERSED = 0.05
 """Share of the time in either direction from which a state counts as one that reverses."""
 
-_SHIFTS = tuple(float(s) for s in np.geomspace(0.0007, 0.1, 12))
+SHIFTS = tuple(float(s) for s in np.geomspace(0.0007, 0.1, 24))
 """Delays and lags, as shares of a run."""
 
 SUPERSETS = {
-    "coulomb_friction": ("stribeck_friction", "load_dependent_friction"),
+    "coulomb_friction": ("stribeck_friction", "load_dependent_friction", "power_law"),
+    "linear_drag": ("power_law",),
+    "quadratic_drag": ("power_law",),
+    "cubic_stiffness": ("power_law",),
 }
 """Effects that contain another: not its rivals, for they can always follow it."""
 
@@ -71,10 +75,14 @@ def accounts(scene: Scene, gains: Array) -> list[Account]:
 def rate_forms(scene: Scene, state: str) -> Iterator[tuple[str, Array, bool]]:
     """Forms on the rate of one state: effect, columns (F, R, q), and whether amplitudes are positive."""
     plant, v = scene.plant, scene.state(state)
+    heat, step = plant.units[state] == "°C", scene.trial.step / plant.fine
     position = next((name for name, speed in plant.speeds.items() if speed == state), None)
     yield "constant_force", np.ones_like(v)[..., None], False
     yield "linear_drag", -v[..., None], True
     yield "quadratic_drag", -(v * np.abs(v))[..., None], True
+    for column in powers((v - v.min()) / np.ptp(v) if heat else v / np.abs(v).max()):
+        yield "power_law", column, True
+    yield from _memories(v, step, scene.length, swings=not heat)
     if _reverses(v):
         yield from _frictions(v, scene.typical(state), _load(scene, state, position))
     if position is not None:
@@ -84,11 +92,33 @@ def rate_forms(scene: Scene, state: str) -> Iterator[tuple[str, Array, bool]]:
         if _reverses(v):
             for share in (0.05, 0.1, 0.2, 0.4, 0.8):
                 yield "bouc_wen_hysteresis", -wound_up(scene.state(position), share)[..., None], True
-    elif plant.units[state] == "°C":
+    elif heat:
         yield "thermal_loss", -(((v + 273.15) / 293.15) ** 4 - 1.0)[..., None] * 293.15 / 4.0, True
     else:
         for share in (0.45, 0.55, 0.65, 0.75, 0.85, 0.93):
             yield "overflow", -np.maximum(v - share * v.max(), 0.0)[..., None], True
+
+
+EXPONENTS = (0.5, 1.25, 1.5, 1.75, 2.5, 3.0)
+"""Of a power law, beside those of linear and quadratic drag."""
+
+
+def powers(y: Array) -> Iterator[Array]:
+    """What drives back by a power of y (F, R), whose largest value is 1: a column (F, R, 1) each."""
+    for exponent in EXPONENTS:
+        yield -(np.sign(y) * np.abs(y) ** exponent)[..., None]
+
+
+def _memories(v: Array, step: float, length: float, *, swings: bool) -> Iterator[tuple[str, Array, bool]]:
+    """A second store that follows a state, and a mass that swings along."""
+    constants = length * np.array([0.005, 0.015, 0.03, 0.05, 0.08, 0.15])
+    for constant, behind in zip(constants, np.moveaxis(lagged_each(v[None], step, constants)[0], -1, 0), strict=True):
+        yield "hidden_lag", ((behind - v) / constant)[..., None], True
+    if swings:
+        omegas = 2.0 * np.pi / (length * np.geomspace(0.01, 0.25, 20))
+        for damping in (0.03, 0.1):
+            for pull in np.moveaxis(swung(v, step, omegas, np.full_like(omegas, damping)), -1, 0):
+                yield "hidden_mode", pull[..., None], True
 
 
 def _load(scene: Scene, state: str, position: str | None) -> Array | None:
@@ -128,6 +158,8 @@ def wound_up(x: Array, share: float) -> Array:
 def _position_forms(x: Array, unit: str, *, named_height: bool) -> Iterator[tuple[str, Array, bool]]:
     if _reverses(x):
         yield "cubic_stiffness", -(x[..., None] ** 3), False
+        for column in powers(x / np.abs(x).max()):
+            yield "power_law", column, False
     for share in (0.45, 0.55, 0.65, 0.75, 0.85, 0.93):
         place = share * np.abs(x).max()
         yield "hard_stop", np.stack([-np.maximum(x - place, 0.0), np.maximum(-place - x, 0.0)], -1), True
@@ -144,8 +176,11 @@ def _position_forms(x: Array, unit: str, *, named_height: bool) -> Iterator[tupl
 def input_forms(u: Array, step: float, length: float) -> Iterator[tuple[str, Array]]:
     """Forms of one input (1, F, R): effect and what it adds (F, R)."""
     largest = float(np.abs(u).max())
-    for share in _SHIFTS:
+    for share in SHIFTS:
         yield "input_delay", (transport(u, step, share * length) - u)[0]
+    for behind in np.moveaxis(lagged_each(u, step, np.array(SHIFTS) * length), -1, 0):
+        yield "input_lag", (behind - u)[0]
+    yield "input_square", (u * np.abs(u) / largest - u)[0]
     for share in (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9):
         yield "input_saturation", (np.clip(u, -share * largest, share * largest) - u)[0]
     for share in (0.03, 0.06, 0.1, 0.2, 0.3):
@@ -177,8 +212,8 @@ def _lags(scene: Scene) -> list[Account]:
     plant, step = scene.plant, scene.trial.step / scene.plant.fine
     measured = scene.course.states[[plant.row(name) for name in plant.outputs]]
     found = []
-    for share in _SHIFTS:
-        behind = (lagged(measured, step, share * scene.length) - measured)[:, :: plant.fine]
+    for late in np.moveaxis(lagged_each(measured, step, np.array(SHIFTS) * scene.length), -1, 0):
+        behind = (late - measured)[:, :: plant.fine]
         traces = np.zeros((*behind.shape, len(behind)))
         for k, one in enumerate(behind):
             traces[k, ..., k] = one

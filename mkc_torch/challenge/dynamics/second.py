@@ -40,12 +40,14 @@ def oracle_rms(
         begin[state, runs * (state + 1) : runs * (state + 2)] += reach[state]
     copies = replace(trial, inputs=np.tile(trial.inputs, n + 1), begin=begin)
     truth, *moved = np.split(simulate(plant, copies, hidden, size).outputs, n + 1, -1)
-    columns = []
+    columns: list[Array] = []
+    rest = (left / scale)[good]
+    if not moved:  # a system without states has nothing to begin with
+        return float(np.sqrt(np.square(rest).mean()))
     for state, there in enumerate(moved):
         change = (there - truth) / scale / reach[state]
         columns += [np.where(np.arange(runs) == run, change, 0.0)[good] for run in range(runs)]
     tangent = np.stack(columns, -1)
-    rest = (left / scale)[good]
     rest = rest - tangent @ least_squares(tangent, rest)
     return float(np.sqrt(np.square(rest).mean()))
 

@@ -11,7 +11,7 @@ from mkc_torch.challenge.subject import Case, Subject
 
 
 def dynamics() -> Subject:
-    """Recordings of six systems, each to be compared with a simulation as a user would write it."""
+    """Recordings of seven systems, each to be compared with a simulation as a user would write it."""
     return Subject(
         name="dynamics",
         cases=100,

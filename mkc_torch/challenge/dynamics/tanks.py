@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from torch import Generator
 
-from mkc_torch.challenge.draws import uniform, whole
+from mkc_torch.challenge.draws import choose, uniform, whole
 from mkc_torch.challenge.dynamics import flows, forces, hidden
 from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Setting, Trial
 from mkc_torch.challenge.dynamics.scene import Scene
@@ -72,6 +74,20 @@ def dripping_tap(level: str) -> hidden.Draw:
     return draw_tap
 
 
+def gravel(g: Generator, typical: float) -> Callable[[Array], Array]:
+    """A wall of gravel to a side basin, by Darcy and Forchheimer."""
+    bend = uniform(g, 0.0, 0.3) / typical
+    return lambda head: flows.forchheimer(head, bend)
+
+
+def crack(level: str) -> hidden.Draw:
+    def draw_crack(g: Generator, scene: Scene) -> Hidden:
+        form = flows.slot(scene.plant.row(level), scene.largest(level), choose(g, (1.5, 2.5)), uniform(g, 0.0, 0.1))
+        return Hidden("power_law", "slot in the wall", (hidden.rate_of(level),), 3.0 * scene.pace(level), form)
+
+    return draw_crack
+
+
 def wavy_inflow(g: Generator, scene: Scene) -> Hidden:
     """Rain that comes and goes."""
     form = forces.hum(0, uniform(g, 3.0, 15.0) / scene.length)
@@ -85,7 +101,10 @@ INSIDE = (
     hidden.gravel_leak("level_1"),
     dripping_tap("level_1"),
     dripping_tap("level_2"),
+    crack("level_1"),
+    hidden.second_store("level_2", gravel, "side basin"),
     hidden.late_actuator("pump_1"),
+    hidden.slow_actuator("pump_2"),
     hidden.weak_actuator("pump_2"),
     hidden.lapped_valve("pump_1"),
     hidden.worn_drive("pump_2"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from torch import Generator
 
@@ -74,6 +76,34 @@ def air_gap(g: Generator, scene: Scene) -> Hidden:
     return Hidden("coupling", "convection", places, scene.pace("temperature_1") / typical, form)
 
 
+def damp(state: str) -> hidden.Draw:
+    """Water that evaporates from a wet body."""
+
+    def draw_damp(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+        room = scene.plant.parameters["room"]
+        form = flows.evaporation(scene.plant.row(state), room, scene.largest(state))
+        return Hidden("power_law", "evaporation", (hidden.rate_of(state),), 5.0 * scene.pace(state), form)
+
+    return draw_damp
+
+
+def rising_air(state: str) -> hidden.Draw:
+    """Natural convection along a plate, laminar or turbulent."""
+
+    def draw_air(g: Generator, scene: Scene) -> Hidden:
+        room, power = scene.plant.parameters["room"], uniform(g, 1.25, 1.4)
+        form = flows.natural_convection(scene.plant.row(state), room, scene.largest(state), power)
+        return Hidden("power_law", "natural convection", (hidden.rate_of(state),), 5.0 * scene.pace(state), form)
+
+    return draw_air
+
+
+def plaster(g: Generator, typical: float) -> Callable[[Array], Array]:
+    """A wall that takes up heat, by conduction and a little by air that rises."""
+    power = uniform(g, 1.0, 1.1)
+    return lambda away: away * (away / typical) ** (power - 1.0)
+
+
 def wax(g: Generator, scene: Scene) -> Hidden:
     """Wax that melts somewhere in the middle of the temperatures."""
     place = float(np.quantile(scene.state("temperature_1"), uniform(g, 0.3, 0.7)))
@@ -85,7 +115,13 @@ INSIDE = (
     glow("temperature_1"),
     glow("temperature_2"),
     air_gap,
+    damp("temperature_1"),
+    rising_air("temperature_2"),
+    hidden.second_store("temperature_1", plaster, "wall of plaster"),
+    hidden.second_store("temperature_2", plaster, "wall of plaster"),
     hidden.late_actuator("heater_1"),
+    hidden.slow_actuator("heater_2"),
+    hidden.squared_actuator("heater_1"),
     hidden.weak_actuator("heater_2"),
     hidden.lapped_valve("heater_1"),
     hidden.slow_sensor(),

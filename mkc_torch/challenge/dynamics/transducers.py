@@ -51,14 +51,24 @@ def lagged(values: Array, step: float, constant: float) -> Array:
     """
     if constant <= 1e-9 * step:
         return values
-    ratio = step / constant
+    return lagged_each(values, step, np.array([constant]))[..., 0]
+
+
+def lagged_each(values: Array, step: float, constants: Array) -> Array:
+    """The same with each of several constants (q,), all of them longer than 0.
+
+    Returns:
+        (channels, moments, R, q).
+    """
+    ratio = step / constants
     keep = np.exp(-ratio)
     late = (1.0 - keep) / ratio
-    out = np.empty_like(values)
-    out[:, 0] = y = values[:, 0]
+    wide = values[..., None]
+    drive = (late - keep) * wide[:, :-1] + (1.0 - late) * wide[:, 1:]
+    out = np.empty((*values.shape, len(constants)))
+    out[:, 0] = y = np.broadcast_to(wide[:, 0], out[:, 0].shape)
     for k in range(1, values.shape[1]):
-        before, now = values[:, k - 1], values[:, k]
-        out[:, k] = y = keep * y + (late - keep) * before + (1.0 - late) * now
+        out[:, k] = y = keep * y + drive[:, k - 1]
     return out
 
 
@@ -101,5 +111,59 @@ def soft_gap(largest: float) -> SignalChange:
     def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
         width = max(size * largest, 1e-12)
         return values - width * np.tanh(values / width)
+
+    return change
+
+
+def follower(values: Array, step: float, size: float) -> Array:
+    """An actuator that follows its command: a lag of ``size`` s, and its electronics with one of a twelfth."""
+    return lagged(lagged(values, step, size), step, size / 12.0)
+
+
+def squared(largest: float, power: float) -> SignalChange:
+    """An actuator that acts by about the square of its command; ``size`` of it does, and it is right at the largest."""
+
+    def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+        ratio = values / largest
+        return values + size * (largest * np.sign(ratio) * np.abs(ratio) ** power - values)
+
+    return change
+
+
+def worn_gear(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+    """A gear whose teeth are worn unevenly: its mean half gap is ``size``."""
+    return np.mean([play(values, share * size) for share in (0.7, 1.0, 1.3)], axis=0)
+
+
+def wrong_zero(share: float, phase: float) -> SignalChange:
+    """A zero that is off by ``size``, and by a share more or less about three times a turn of an angle in rad."""
+
+    def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+        return values + size * (1.0 + share * np.sin(3.0 * values + phase))
+
+    return change
+
+
+def sagging(level: float) -> SignalChange:
+    """A joint held by a spring of a controller: its load pulls it aside at the angle where it then is, in rad.
+
+    Args:
+        level: angle at which the link is level; there it sags by ``size``.
+    """
+
+    def change(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
+        angle = values
+        for _ in range(30):
+            angle = values + size * np.cos(angle - level)
+        return angle
+
+    return change
+
+
+def shaken(omega: float) -> SignalChange:
+    """A sensor on a machine that shakes, by ``size``, at omega in rad/s."""
+
+    def change(values: Array, step: float, size: float) -> Array:
+        return values + size * np.sin(omega * np.arange(values.shape[1]) * step)[None, :, None]
 
     return change

@@ -33,6 +33,7 @@ class DriverLinear(GainEffect):
     words = "linear dependence"
     port = "output"
     needs = ("own", "compared")
+    general = True  # with a zero of its own it has a plain offset as special case
     roles: tuple[str, ...] = ("any", "temperature", "current")
     equation = "δy = b + k (x − x̄)"
     explanation = "What is measured follows this column in a straight line."

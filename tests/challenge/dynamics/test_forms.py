@@ -13,7 +13,7 @@ from mkc_torch.challenge.dynamics.integrate import outputs_of_sizes, simulate
 from mkc_torch.challenge.dynamics.oracle import can_be_named, names
 from mkc_torch.challenge.dynamics.plant import Trial
 from mkc_torch.challenge.dynamics.scene import Scene
-from mkc_torch.effects import DYNAMICS
+from mkc_torch.effects import DYNAMICS, PAIRED
 
 
 @pytest.fixture(scope="module", params=SYSTEMS)
@@ -41,7 +41,7 @@ def straight(form, low, high, row=0, basis=()):
 
 def test_effects_have_the_names_of_the_catalogue(case):
     system, scene = case
-    known = {effect.id for effect in DYNAMICS}
+    known = {effect.id for effect in (*DYNAMICS, *PAIRED)}
     for k, draw in enumerate(system.inside):
         assert draw(generator(k), scene).effect in known
     assert all(draw(generator(0), scene).effect not in known for draw in system.outside)
@@ -55,6 +55,29 @@ def test_effects_can_be_named_unless_the_scene_does_not_show_them(case):
     assert unseen <= {"coulomb_friction", "stribeck_friction", "load_dependent_friction", "cubic_stiffness",
                       "bouc_wen_hysteresis"}  # fmt: skip
     assert not any(can_be_named(draw(generator(0), scene), known) for draw in system.outside)
+
+
+UNSEEN = {
+    "added_mass": "every plant's own parameters scale all its forces, or there is none but gravity",
+    "buoyancy": "no plant has a height of either sign",
+    "gain": "the joint's scale is fitted",
+    "clock_drift": "no plant has a clock of its own",
+    "driver_linear": "no plant has a driver that is recorded and is no input",
+    "driver_quadratic": "as for the linear one",
+}
+"""Effects of the catalogue that no plant could show, and why."""
+
+
+def test_all_of_the_catalogue_is_hidden_that_a_plant_can_show():
+    hidden = set()
+    for name, system in SYSTEMS.items():
+        setting = system.draw(generator(2, name))
+        trial = Trial(setting.trial.step, setting.trial.inputs[:, :20], setting.trial.begin)
+        scene = Scene(setting.plant, trial, simulate(setting.plant, trial))
+        hidden |= {draw(generator(0), scene).effect for draw in system.inside}
+    known = {effect.id for effect in (*DYNAMICS, *PAIRED) if not effect.is_curve}
+    assert known - hidden == set(UNSEEN)
+    assert hidden <= known
 
 
 def test_each_effect_moves_the_outputs_more_the_larger_it_is(case):
@@ -176,3 +199,66 @@ def test_one_channel_alone_is_changed():
     found = transducers.only(1, transducers.soft_gap(1.0))(values, 0.1, 0.5)
     np.testing.assert_array_equal(found[0], values[0])
     assert (found[1] < 1.0).all()
+
+
+def test_an_actuator_that_follows_is_behind_a_ramp_by_its_lag():
+    ramp = (np.arange(1000) * 0.01)[None, :, None]
+    behind = ramp - transducers.follower(ramp, 0.01, 0.12)
+    assert behind[0, -1, 0] == pytest.approx(0.13, abs=1e-6)
+
+
+@given(st.floats(-5, 5))
+def test_an_actuator_by_the_square_is_odd_and_right_at_the_largest(u):
+    change = transducers.squared(5.0, 2.0)
+    values = np.array([[[u], [5.0]]])
+    found = change(values, 0.1, 1.0)
+    assert found[0, 0, 0] == pytest.approx(u * abs(u) / 5.0)
+    assert found[0, 1, 0] == pytest.approx(5.0)
+    np.testing.assert_allclose(change(-values, 0.1, 1.0), -found)
+    np.testing.assert_allclose(change(values, 0.1, 0.0), values)
+
+
+def test_a_worn_gear_stands_still_after_a_reversal_and_then_lags_by_its_gap():
+    there = np.concatenate([np.linspace(0, 10, 101), np.linspace(10, 0, 101)])[None, :, None]
+    found = transducers.worn_gear(there, 0.1, 1.0)[0, :, 0]
+    assert found[80] == pytest.approx(there[0, 80, 0] - 1.0)
+    assert found[105] == pytest.approx(found[100])
+    assert found[180] == pytest.approx(there[0, 180, 0] + 1.0)
+
+
+@given(st.floats(-2, 2), st.floats(0, 0.3), st.floats(-0.5, 0.5))
+def test_a_joint_sags_at_the_angle_where_it_then_is(command, size, level):
+    angle = transducers.sagging(level)(np.array([[[command]]]), 0.1, size).item()
+    assert angle == pytest.approx(command + size * np.cos(angle - level), abs=1e-9)
+
+
+def test_a_wrong_zero_is_off_by_its_size_but_for_a_share():
+    angles = np.linspace(-2.0, 2.0, 300)[None, :, None]
+    off = transducers.wrong_zero(0.1, 0.5)(angles, 0.01, 0.2) - angles
+    assert 0.179 < off.min() < 0.185
+    assert 0.215 < off.max() < 0.221
+
+
+def test_water_evaporates_and_air_rises_where_it_is_warmer_than_the_room():
+    for form in (flows.evaporation(0, 20.0, 90.0), flows.natural_convection(0, 20.0, 90.0, 1.3)):
+        assert added(form, [20.0])[0] == pytest.approx(0.0)
+        assert added(form, [90.0])[0] == pytest.approx(-1.0)
+        assert added(form, [10.0])[0] > 0.0
+    warm, hot = (added(flows.evaporation(0, 20.0, 90.0), [t])[0] for t in (40.0, 80.0))
+    assert hot < 4.0 * warm  # faster than by the excess
+
+
+def test_a_slot_lets_out_by_a_power_of_the_level():
+    form = flows.slot(0, 2.0, 2.5, 0.0)
+    assert added(form, [2.0])[0] == pytest.approx(-1.0)
+    assert added(form, [1.0])[0] == pytest.approx(-(0.5**2.5))
+    assert added(form, [-1.0])[0] == 0.0
+
+
+@given(st.floats(-3, 3))
+def test_a_spring_of_felt_is_odd_and_drives_back(x):
+    form = forces.felt(1, 0, 1.0, 2.0)
+    pull = added(form, [x, 0.0])[1]
+    assert pull * x <= 0.0
+    assert added(form, [-x, 0.0])[1] == pytest.approx(-pull)
+    assert abs(pull) <= x * x + 0.1 * abs(x) + 1e-12

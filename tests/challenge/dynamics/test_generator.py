@@ -10,10 +10,10 @@ from mkc_torch.challenge.dynamics.generator import SYSTEMS, draw
 from mkc_torch.challenge.dynamics.second import ratio_to_oracle
 from mkc_torch.challenge.dynamics.subject import dynamics, simulation_class
 from mkc_torch.challenge.key import canonical, key_from
-from mkc_torch.simulation import Dynamics
+from mkc_torch.simulation import Dynamics, Static
 from mkc_torch.simulation.load import load_simulation
 
-FIRST_OF_EACH = {"pendulum": 0, "tanks": 2, "projectile": 4}
+FIRST_OF_EACH = {"pendulum": 0, "servo": 1, "tanks": 2, "projectile": 4}
 
 
 @pytest.fixture(scope="module")
@@ -69,10 +69,10 @@ def test_a_user_could_have_written_the_simulation(system, tmp_path):
     plant = setting.plant
     name = simulation_class(tmp_path / f"{system}_00001.csv")
     simulation = load_simulation(f"{dynamics().simulations}:{name}")
-    assert isinstance(simulation, Dynamics)
-    assert (simulation.states, simulation.inputs) == (plant.states, plant.inputs)
+    assert isinstance(simulation, Static if system == "servo" else Dynamics)
+    assert simulation.inputs == plant.inputs
     assert simulation.outputs in ((), plant.outputs)
-    assert {state: simulation.units[state] for state in plant.states} == dict(plant.units)
+    assert {state: simulation.units[state] for state in plant.units} == dict(plant.units)
     x = 0.5 + torch.rand(len(plant.states), 7, generator=generator(1), dtype=torch.float64)
     u = torch.rand(len(plant.inputs), 7, generator=generator(2), dtype=torch.float64)
 
@@ -80,12 +80,16 @@ def test_a_user_could_have_written_the_simulation(system, tmp_path):
         def __init__(self, names, values):
             self.__dict__.update(zip(names, values, strict=True))
 
-    values = [torch.tensor(v, dtype=torch.float64) for v in plant.values]
-    rates = simulation.derivative(
-        torch.zeros(7), Names(plant.states, x), Names(plant.inputs, u), Names(simulation.parameters, values)
-    )
-    expected = plant.rate(x.numpy(), u.numpy(), plant.values)
-    found = np.stack([(rates[state] + torch.zeros(7)).numpy() for state in plant.states])
+    values = Names(simulation.parameters, [torch.tensor(v, dtype=torch.float64) for v in plant.values])
+    inputs = Names(plant.inputs, u)
+    if system == "servo":
+        expected = plant.read(x.numpy(), u.numpy())
+        computed, rows = simulation.output(torch.zeros(7), inputs, values), plant.outputs
+    else:
+        assert simulation.states == plant.states
+        expected = plant.rate(x.numpy(), u.numpy(), plant.values)
+        computed, rows = simulation.derivative(torch.zeros(7), Names(plant.states, x), inputs, values), plant.states
+    found = np.stack([(computed[name] + torch.zeros(7)).numpy() for name in rows])
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 

@@ -70,7 +70,7 @@ def test_recordings_do_not_tell_what_is_hidden(quiet):
     stems = sorted(path.stem for path in (output / "recordings").iterdir())
     assert len(stems) == 5
     assert {stem.rpartition("_")[0] for stem in stems} <= {
-        "pendulum", "cart_pole", "tanks", "motor", "projectile", "thermal",
+        "pendulum", "cart_pole", "tanks", "motor", "projectile", "thermal", "servo",
     }  # fmt: skip
 
 

@@ -14,7 +14,7 @@ __all__ = ["dynamics_worlds"]
 
 
 def dynamics_worlds() -> Worlds:
-    """Six systems, each in twelve worlds; in all but ``coloured`` and ``slow_sensor`` the sensors' noise is white.
+    """The systems with states, each in twelve worlds; noise is white in all but ``coloured`` and ``slow_sensor``.
 
     Example:
         >>> [world.name for world in dynamics_worlds().worlds][:3]

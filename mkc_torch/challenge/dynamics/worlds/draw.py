@@ -140,8 +140,8 @@ def _followed(stream: Callable[[str], Generator], guess: Guess, trial: Trial, ou
 
 
 def _setting(stream: Callable[[str], Generator], world: str) -> tuple[str, Setting]:
-    """A system and its runs; a throw has neither inputs to hold nor parameters to start far from."""
-    without = {"projectile"} if world in ("held", "far_starts") else set()
+    """A system with states and its runs; a throw has neither inputs to hold nor parameters to start far from."""
+    without = {"servo", "projectile"} if world in ("held", "far_starts") else {"servo"}
     system = draws.choose(stream("system"), [name for name in SYSTEMS if name not in without])
     return system, SYSTEMS[system].draw(stream("setting"))
 

@@ -1,0 +1,129 @@
+"""How often each effect is named where it is hidden alone and well to be seen.
+
+``python -m tests.gate.each_effect --effects input_lag input_square --per-effect 6 --output DIR`` draws recordings of
+the proof of differential equations until so many of each effect have z and z_sep of at least ten, has them diagnosed,
+and prints what was named. What a folder has already is not diagnosed again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from torch import Generator
+
+from mkc_torch._support.files import write_atomically
+from mkc_torch.challenge import draws
+from mkc_torch.challenge.dynamics.generator import SYSTEMS, System, case_of
+from mkc_torch.challenge.dynamics.integrate import simulate
+from mkc_torch.challenge.dynamics.oracle import can_be_named, names
+from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.subject import dynamics
+from mkc_torch.challenge.key import Key
+from mkc_torch.challenge.pool import content_of
+from mkc_torch.challenge.run import SIMULATIONS
+from mkc_torch.challenge.subject import Case
+from mkc_torch.challenge.thresholds import STRONG_Z
+from mkc_torch.challenge.verdict import answer, named_right
+from mkc_torch.cli.challenge_jobs import diagnose_dynamics
+from mkc_torch.recording.recording import write_table
+
+SEED = 11
+
+
+def strong_cases(effect: str, seed: int, most: int) -> Iterator[Case]:
+    """Recordings with that effect hidden, each with z and z_sep of at least ten.
+
+    Args:
+        effect: its id.
+        seed: of all that is drawn.
+        most: settings that are tried.
+    """
+    for index in range(most):
+
+        def stream(what: str, index: int = index) -> Generator:
+            return draws.generator(seed, "each effect", effect, index, what)
+
+        name = draws.choose(stream("system"), tuple(SYSTEMS))
+        alone = _hiding(effect, SYSTEMS[name], stream)
+        if alone is None:
+            continue
+        case = case_of(stream, f"{name}_{index:05d}", alone, outside_share=0.0)
+        (truth,) = case.key.effects
+        if min(truth.z, truth.z_sep) >= STRONG_Z:
+            yield case
+
+
+def _hiding(effect: str, system: System, stream: Callable[[str], Generator]) -> System | None:
+    """The system with nothing else to hide; None where it does not have the effect, or does not show it."""
+    setting = system.draw(stream("setting"))
+    scene = Scene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
+    having = [draw for draw in system.inside if draw(stream("effect"), scene).effect == effect]
+    if having:
+        known = names(scene)
+        having = [draw for draw in having if can_be_named(draw(stream("effect"), scene), known)]
+    if not having:
+        return None
+    return replace(system, inside=(draws.choose(stream("which"), having),))
+
+
+def said_of(key: Key, folder: Path) -> tuple[bool, str]:
+    """Whether it was named right, and what was said: claims with their alternatives, or the verdict."""
+    (truth,) = key.effects
+    said = answer(content_of(folder / key.name / "diagnosis.json"))
+    claims = [
+        " or ".join([one.named.effect, *(other.effect for other in one.others)]) + f" at {', '.join(one.named.at)}"
+        for one in said.claims
+    ]
+    nearest = [f"nearest {one.named.effect}" for one in said.nearest]
+    right = bool(said.claims) and named_right(said.claims[0].named, truth)
+    return right, f"{said.verdict}: {'; '.join([*claims, *nearest]) or 'no name'}"
+
+
+def measure(effects: Sequence[str], per_effect: int, seed: int, output: Path, most: int) -> None:
+    """Draw, diagnose, and print a line for each recording and each effect."""
+    totals: dict[str, Counter[bool]] = {}
+    for effect in effects:
+        place = output / effect
+        recordings, diagnoses = place / "recordings", place / "diagnoses"
+        for folder in (recordings, diagnoses):
+            folder.mkdir(parents=True, exist_ok=True)
+        source = dynamics().simulations
+        assert source is not None
+        write_atomically(place / SIMULATIONS, source.read_text(encoding="utf-8"), overwrite=True)
+        totals[effect] = Counter()
+        for _, case in zip(range(per_effect), strong_cases(effect, seed, most), strict=False):
+            path = recordings / f"{case.key.name}.csv"
+            if not (diagnoses / case.key.name / "diagnosis.json").is_file():
+                write_table(path, case.recording.columns, overwrite=True)
+                (diagnoses / case.key.name).mkdir(exist_ok=True)
+                diagnose_dynamics([path], diagnoses)
+            right, text = said_of(case.key, diagnoses)
+            totals[effect][right] += 1
+            (truth,) = case.key.effects
+            seen = f"z {truth.z:.0f}, z_sep {truth.z_sep:.0f}, size {truth.size:.3g}"
+            mark = "right" if right else "WRONG"
+            print(f"{effect} | {case.key.name} | {truth.form} | {seen} | {mark} | {text}", flush=True)
+    print("\n| effect | named right |\n|---|---:|")
+    for effect, found in totals.items():
+        print(f"| {effect} | {found[True]} of {sum(found.values())} |")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--effects", nargs="+", required=True, metavar="ID", help="which effects")
+    parser.add_argument("--per-effect", type=int, default=30, help="recordings of each (default: 30)")
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--most", type=int, default=2000, help="settings tried for each (default: 2000)")
+    parser.add_argument("--output", type=Path, required=True, help="folder for recordings and diagnoses")
+    options = parser.parse_args(arguments)
+    measure(options.effects, options.per_effect, options.seed, options.output, options.most)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
