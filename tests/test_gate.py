@@ -88,12 +88,15 @@ def test_drag_under_coloured_noise_counts_by_its_standard_error(name):
     assert not judged(row(drag(9.0e-5, None)), CASES[name])["right"]
 
 
-def test_a_second_effect_that_is_needed_too():
-    late = finding("input_delay", at=("input command",))
-    pan = {"pan": 0.0025}
-    assert judged(row(finding("backlash"), late, after=pan), REAL["real so101 pan Servo"])["right"]
-    told = judged(row(finding("backlash"), after=pan), REAL["real so101 pan Servo"])["wrong"]
-    assert told == ["input_delay or input_lag or delay or sensor_lag is not claimed but backlash"]
+def test_other_effects_that_are_needed_too():
+    found, after, servo = (
+        [finding(name) for name in ("backlash", "delay", "offset")],
+        {"pan": 0.0025},
+        "real so101 recording",
+    )
+    assert judged(row(*found, after=after), REAL[servo])["right"]
+    told = judged(row(*found[:2], after=after), REAL[servo])["wrong"]
+    assert told == ["offset or gravity_sag is not claimed but backlash, delay"]
 
 
 def test_a_claim_in_the_wrong_place_is_wrong():
