@@ -143,7 +143,10 @@ def begun(
     keep(begun)
     if first is None:
         return begun
-    taken = _taken_up(begun, base, first, asked)
+    try:
+        taken = _taken_up(begun, base, first, asked)
+    except NoFitError:  # a fit to a part of the recording is lost
+        taken = replace(begun, left=(), unconfirmed=first)
     keep(taken)
     if taken.found:
         return _in_two_steps(begun, taken, asked, generator)

@@ -67,6 +67,7 @@ def fitted(
     *,
     rows: Float[Tensor, " N"] | None = None,
     graduate: bool = True,
+    anew: bool = False,
 ) -> FittedModel:
     """The most likely parameters of a joint model.
 
@@ -79,8 +80,10 @@ def fitted(
         bound: half-width of the density's domain; None for the rule of :func:`mkc_torch.nonlinear.fit`.
         rows: weights of the samples; 0 leaves one out.
         graduate: False for a start near the answer.
+        anew: True to search a trajectory without the one that the model knows, where there is no answer near that one:
+            it may be of another noise. That takes long.
     """
-    found = _fit(*_begun(model, start), bound, rows, graduate=graduate)
+    found = _fit(*_begun(model, start, anew=anew), bound, rows, graduate=graduate)
     for _ in range(_NARROWER):
         seen = found.residual if rows is None else found.residual[rows > 0]
         if not bool((found.d > _WIDE * robust_scale(seen)).any()):
@@ -153,19 +156,14 @@ def without_term(fit: FittedModel, number: int) -> FittedModel:
     return replace(fit, model=left, parameters=parameters)
 
 
-def _begun(model: JointModel, start: Float[Tensor, " p"]) -> tuple[JointModel, Float[Tensor, " p"]]:
-    """A model and a start at which it has a finite answer, where there are any.
-
-    Under process noise the trajectory that a model knows may be of another noise; where there is no answer near it, one
-    is searched without it. Then effects are made smaller.
-    """
-    prepared = model.prepared
-    elsewhere = model.near is not None and isinstance(prepared, PreparedDynamics) and prepared.observer is not None
-    if not model.terms and not elsewhere:
+def _begun(model: JointModel, start: Float[Tensor, " p"], *, anew: bool) -> tuple[JointModel, Float[Tensor, " p"]]:
+    """A model and a start at which it has a finite answer, where there are any; effects are made smaller for that."""
+    anew = anew and model.near is not None
+    if not model.terms and not anew:
         return model, start
     for share in _SHARES if model.terms else (1.0,):
         smaller = torch.cat([start[: model.base], share * start[model.base :]])
-        for one in (model, model.begun_with(None)) if share == 1.0 and elsewhere else (model,):
+        for one in (model, model.begun_with(None)) if anew and share == 1.0 else (model,):
             if bool(one.residual(smaller).isfinite().all()):
                 return one, smaller
     return model, start

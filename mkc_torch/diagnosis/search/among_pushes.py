@@ -267,7 +267,7 @@ def _under_own_noise(
         assert isinstance(prepared, PreparedDynamics)
         observed = JointModel(prepared.observed(noise.observer), running.model.terms, running.model.near)
         try:
-            running = fitted(observed, running.parameters, base.bound, graduate=False)
+            running = fitted(observed, running.parameters, base.bound, graduate=False, anew=True)
         except NoFitError:
             return running
     return with_own_noise(running, declared, settings)
@@ -308,7 +308,7 @@ def _without(
     """The simulation without a candidate, begun with the noise that is found beside it; None where it has no fit."""
     model = JointModel(fit.model.prepared, base.model.terms, base.model.near)
     try:
-        without = fitted(model, base.parameters, base.bound, graduate=False)
+        without = fitted(model, base.parameters, base.bound, graduate=False, anew=True)
     except NoFitError:
         return None
     return with_own_noise(without, declared, settings)

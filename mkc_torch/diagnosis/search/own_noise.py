@@ -24,7 +24,7 @@ def with_own_noise(fit: FittedModel, declared: Mapping[str, float], settings: Se
         return shape_fitted(fit)
     model = JointModel(prepared.observed(noise.observer), fit.model.terms, fit.model.near)
     try:
-        again = fitted(model, fit.parameters, fit.bound, graduate=False)
+        again = fitted(model, fit.parameters, fit.bound, graduate=False, anew=True)
     except NoFitError:
         return shape_fitted(fit)
     return shape_fitted(again if priced(again, settings) > priced(fit, settings) else fit)

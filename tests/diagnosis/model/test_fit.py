@@ -7,7 +7,6 @@ from mkc_torch import Recording
 from mkc_torch.diagnosis.model.fit import _begun, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.simulation import Dynamics, Parameter
-from mkc_torch.simulation.dynamics.first_fit import strongly_observed
 
 NOISE = 0.002
 
@@ -44,18 +43,16 @@ def test_a_fit_begins_without_a_trajectory_nearby_from_which_none_is_found(monke
     prepared = Decay().prepare(Recording({"time": torch.from_numpy(time), "level": torch.from_numpy(level)}))
     start = torch.tensor([0.7, 1.0], dtype=torch.float64)
     near, whole = prepared.answer(start, {}).nearby, JointModel.residual
-    observed = strongly_observed(prepared, start, 1.0)
 
     def lost_nearby(model, parameters):
         found = whole(model, parameters)
         return found if model.near is None else torch.full_like(found, torch.nan)
 
     monkeypatch.setattr(JointModel, "residual", lost_nearby)
-    begun, same = _begun(JointModel(observed, (), near), start)
+    begun, same = _begun(JointModel(prepared, (), near), start, anew=True)
     assert begun.near is None
     assert torch.equal(same, start)
-    # running freely there is no other noise
-    assert _begun(JointModel(prepared, (), near), start)[0].near is near
+    assert _begun(JointModel(prepared, (), near), start, anew=False)[0].near is near
     # with an answer nearby it is kept
     monkeypatch.setattr(JointModel, "residual", whole)
-    assert _begun(JointModel(observed, (), near), start)[0].near is near
+    assert _begun(JointModel(prepared, (), near), start, anew=True)[0].near is near
