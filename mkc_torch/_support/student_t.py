@@ -6,6 +6,8 @@ are in float64 and without a gradient.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -13,6 +15,9 @@ __all__ = ["fisher_tail", "incomplete_beta", "student_quantile", "student_tails"
 
 _STEPS = 2000
 """Of the continued fraction: about twice the root of the larger parameter are enough."""
+
+_HALVINGS = 100
+"""Of an interval that a quantile lies in: far out in the tail it is next to 0."""
 
 _FREEDOM = 1e6
 """Degrees of freedom beyond this are taken for so many: quantiles are within 1e-6 of a Gaussian's."""
@@ -87,13 +92,20 @@ def student_quantile(level: float, freedom: Tensor) -> Tensor:
         tensor([2.2281, 1.9600], dtype=torch.float64)
     """
     freedom = freedom.detach().double()
-    # bisection in the argument of the beta function, where the whole range is an interval
-    low, high = torch.zeros_like(freedom), torch.ones_like(freedom)
     half = torch.full_like(freedom, 0.5)
     a = 0.5 * freedom.clamp(max=_FREEDOM)
-    for _ in range(60):
+    inside = _bisected(lambda x: incomplete_beta(half, a, x) > level, freedom)
+    # far out the rest is a small number, which one less the share would lose
+    outside = _bisected(lambda x: incomplete_beta(a, half, x) > 1.0 - level, freedom)
+    near, far = inside / (1.0 - inside), (1.0 - outside) / outside
+    return torch.sqrt(2.0 * a * torch.where(inside > 0.5, far, near))
+
+
+def _bisected(above: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
+    """Where a rising function passes a level, between 0 and 1."""
+    low, high = torch.zeros_like(like), torch.ones_like(like)
+    for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        above = incomplete_beta(half, a, middle) > level
-        low, high = torch.where(above, low, middle), torch.where(above, middle, high)
-    share = 0.5 * (low + high)
-    return torch.sqrt(2.0 * a * share / (1.0 - share))
+        over = above(middle)
+        low, high = torch.where(over, low, middle), torch.where(over, middle, high)
+    return 0.5 * (low + high)

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from mkc_torch import Recording
@@ -113,6 +113,9 @@ def test_a_freeze_of_all_axes_or_of_one_is_named_with_its_place(axis, length, be
     if coarse:
         points = digits(points, 0.15)
     columns = [0, 1, 2] if axis is None else [axis]
+    # what stays at the end of an axis's range looks like clipping as well
+    low, high = points.amin(0), points.amax(0)
+    assume(bool(((points[begin] > low + 3.0) & (points[begin] < high - 3.0))[columns].all()))
     for k in columns:
         points[begin : begin + length, k] = points[begin, k]
     (told,) = faults(recorded(points))

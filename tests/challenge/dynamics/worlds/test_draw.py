@@ -206,7 +206,7 @@ def test_a_draw_of_which_any_fit_follows_an_output_is_drawn_again(monkeypatch):
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize("system", sorted({*SYSTEMS} - {"servo"}))
 def test_the_right_simulation_can_follow(system):
     """So that a small share means a useless simulation and not a poor fit."""
     setting = SYSTEMS[system].draw(generator(5, system))
