@@ -125,15 +125,15 @@ def run(words: list[str], folder: Path) -> None:
                 "tests.benchmarks",
                 "tests.device",
                 "tests.fuzz",
-                "tests.gate.each_effect",
-                "tests.gate.null_p_values",
+                "tests.gate",
                 "tests.mutation",
                 "tests.wheel",
             )
         ):
             # minutes each: here only whether it is there
-            name = f"{module}.__main__" if module in ("tests.benchmarks", "tests.device") else module
-            assert callable(importlib.import_module(name).main)
+            is_package = hasattr(importlib.import_module(module), "__path__")
+            entry = importlib.import_module(f"{module}.__main__" if is_package else module)
+            assert callable(entry.main)
         case ["torchrun", *arguments]:
             words = [sys.executable, "-m", "torch.distributed.run", *arguments]
             done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
