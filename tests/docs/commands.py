@@ -24,6 +24,10 @@ BUILD = ("--config-file", ".zensical.toml")
 """What the site is built with, beside that nothing may be amiss."""
 
 SMALL = {
+    "mkc challenge --worlds --family dynamics --only slow_sensor --only lasting_push --only lasting_push_runs "
+    "--only useless --per-world 6 --hidden-per-world 6 --seed 6161 --workers 1 --output newer": (
+        "--per-world 1 --hidden-per-world 0"
+    ),
     "mkc challenge --output proof": "--cases 1 --empty 1 --duration 10 --workers 1",
     "mkc challenge --family dynamics --output proof_of_dynamics": "--cases 0 --empty 1 --workers 1",
     "mkc challenge --worlds --output worlds": (
