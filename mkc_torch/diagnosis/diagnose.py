@@ -24,7 +24,7 @@ from mkc_torch.diagnosis.arguments import (
 from mkc_torch.diagnosis.cut_short import cut_short, nothing_known
 from mkc_torch.diagnosis.evidence.after_the_search import parts_ahead
 from mkc_torch.diagnosis.follows import misses
-from mkc_torch.diagnosis.joined import joined
+from mkc_torch.diagnosis.joined import joined, with_own_offsets
 from mkc_torch.diagnosis.linearised.smaller_step import with_smaller_step
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel
@@ -124,6 +124,7 @@ def diagnose(
     """
     begin = monotonic()
     refuse_no_simulation(simulation)
+    several = () if isinstance(recording, Recording) else tuple(recording)
     recording, names = joined(simulation, recording)
     effects = checked_effects(effects)
     check_numbers(level, surrogates, max_findings, seed)
@@ -142,6 +143,7 @@ def diagnose(
         raise ValueError(
             f"{where}{len(prepared.time)} usable samples are too few for a diagnosis; it needs {fewest} at least."
         )
+    prepared = with_own_offsets(prepared, several)
     declared = checked_noise(noise, prepared.channels)
     fixed = checked_between(between, tuple(getattr(prepared, "between", ())))
     asked = Asked(level, surrogates, max_findings, seed, settings, declared, fixed, quick)
