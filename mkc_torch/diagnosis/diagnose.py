@@ -24,7 +24,7 @@ from mkc_torch.diagnosis.arguments import (
 from mkc_torch.diagnosis.cut_short import cut_short, nothing_known
 from mkc_torch.diagnosis.evidence.after_the_search import parts_ahead
 from mkc_torch.diagnosis.follows import misses
-from mkc_torch.diagnosis.joined import joined, with_own_offsets
+from mkc_torch.diagnosis.joined import joined, run_counts, with_own_offsets
 from mkc_torch.diagnosis.linearised.smaller_step import with_smaller_step
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel
@@ -147,7 +147,7 @@ def diagnose(
     declared = checked_noise(noise, prepared.channels)
     fixed = checked_between(between, tuple(getattr(prepared, "between", ())))
     asked = Asked(level, surrogates, max_findings, seed, settings, declared, fixed, quick)
-    known = UnderWay(simulation, effects, names, asked)
+    known = UnderWay(simulation, effects, names, asked, run_counts(several) if names else ())
     limit = math.inf if time_limit is None else time_limit
     with limited(limit, begin=begin) as deadline, counting(progress):
         try:

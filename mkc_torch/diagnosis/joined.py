@@ -16,7 +16,7 @@ from mkc_torch.simulation.paired import Paired
 from mkc_torch.simulation.protocol import PreparedSimulation, Simulation, refuse_no_recording
 from mkc_torch.simulation.static import PreparedStatic
 
-__all__ = ["joined", "with_own_offsets"]
+__all__ = ["joined", "run_counts", "with_own_offsets"]
 
 
 def joined(simulation: Simulation, recording: Recording | Sequence[Recording]) -> tuple[Recording, tuple[str, ...]]:
@@ -36,6 +36,11 @@ def joined(simulation: Simulation, recording: Recording | Sequence[Recording]) -
     return whole, recording_names(recording) if len(recording) > 1 else ()
 
 
+def run_counts(recordings: Sequence[Recording]) -> tuple[int, ...]:
+    """How many runs each of the recordings holds."""
+    return tuple(len(one.experiments()) for one in recordings)
+
+
 def with_own_offsets(prepared: PreparedSimulation, recordings: Sequence[Recording]) -> PreparedSimulation:
     """A simulation of several recordings with offsets of its outputs that each recording has of its own.
 
@@ -44,7 +49,7 @@ def with_own_offsets(prepared: PreparedSimulation, recordings: Sequence[Recordin
     whole = prepared.recording
     if len(recordings) < 2 or EXPERIMENT not in whole:
         return prepared
-    counts = torch.tensor([len(one.experiments()) for one in recordings])
+    counts = torch.tensor(run_counts(recordings))
     of_experiment = torch.arange(len(recordings)).repeat_interleave(counts)
     recording, names = of_experiment[whole[EXPERIMENT].long()], recording_names(recordings)
     if isinstance(prepared, PreparedDynamics):
