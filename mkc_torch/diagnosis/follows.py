@@ -74,6 +74,9 @@ def follows_of(
         recorded = torch.linalg.vector_norm(known, dim=-1, keepdim=True)
     elif known.shape[1] == len(prepared.channels):
         variation, recorded = size_of(known - _middle(known)), known
+        if _in_other_axes(prepared):
+            # no column is of one axis of these: each varies by what the vector varies by
+            variation = variation.square().mean().sqrt().expand_as(variation)
     else:
         return ()
     lost = residual is None or not bool(residual.isfinite().all())
@@ -81,6 +84,7 @@ def follows_of(
     steps = _steps(recorded)
     estimated = _new(recorded if residual is None or lost else residual) if floor is None else left.new_tensor(floor)
     last = size_of(recorded[1:] - recorded[:-1])
+    last = last.square().mean().sqrt().expand_as(last) if _in_other_axes(prepared) else last
     units = units_of(prepared)
     found = []
     for k, name in enumerate(prepared.channels):
@@ -98,6 +102,12 @@ def follows_of(
             Follows(name, units[k], float(left[k]), whole, share, size, source, whole, float(last[k]))  # type: ignore[arg-type]
         )
     return tuple(found)
+
+
+def _in_other_axes(prepared: PreparedSimulation) -> bool:
+    """Whether a vector is compared in axes that turn with it, those of the world say, and not column by column."""
+    recording = getattr(prepared, "recording", None)
+    return len(prepared.channels) > 1 and recording is not None and not set(prepared.channels) & set(recording.names)
 
 
 def misses(follows: Sequence[Follows], least: float) -> tuple[Follows, ...]:
