@@ -78,8 +78,9 @@ def diagnose(
     recorded.
 
     Several recordings of one system are diagnosed together: one set of parameters and of findings for all of them, and
-    states at the start for each. Physics repeats from run to run, slow noise and disturbances do not. Of a simulation
-    without states the recordings follow one another on one clock.
+    states at the start for each, and offsets of the outputs, as far as they are determined. Physics repeats from run to
+    run, slow noise and disturbances do not. Of a simulation without states the recordings follow one another on one
+    clock; a magnetometer has one offset in all of them.
 
     Args:
         simulation: of the recording, such as :class:`mkc_torch.simulation.Magnetometer`.
