@@ -171,7 +171,7 @@ def offset_sentences(world: World) -> list[str]:
     Example:
         >>> from mkc_torch.diagnosis.world import Offset
         >>> offset_sentences(World(offsets=(Offset("speed", "m/s", 1, "a.csv", 0.3, 0.001),)))
-        ['Offset of `speed` in each recording: recording 1 (a.csv): 0.3000 ± 0.0010 m/s.']
+        ['Offset of speed in each recording: recording 1 (a.csv): 0.3000 ± 0.0010 m/s.']
     """
     told: dict[str, list[str]] = {}
     for one in world.offsets:
