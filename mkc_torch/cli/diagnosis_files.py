@@ -56,7 +56,7 @@ def diagnose_file(
     with folder_written(folder):
         parts, outcomes = list(_parts(recording, simulation, folder)), []
         for number, (label, part, place) in enumerate(parts, start=1):
-            which = f", experiment {label} ({number} of {len(parts)})" if len(parts) > 1 else ""
+            which = f", run {label} ({number} of {len(parts)})" if len(parts) > 1 else ""
             told = Told(step, f"diagnosing {path.name}{which}")
             outcomes.append(_outcome(path, label, simulation, part, place, request, look, told))
             if outcomes[-1].interrupted:
@@ -245,7 +245,7 @@ def simulation_of(request: Request) -> Simulation:
 
 
 def _failed(path: Path, label: str, error: Exception) -> Outcome:
-    subject = f"{path}, experiment {label}" if label else str(path)
+    subject = f"{path}, run {label}" if label else str(path)
     sentence = sentence_of(error) if isinstance(error, FAILURES) else _unexpected(error)
     sentence = sentence.removeprefix(f"{path.stem}/{label}: " if label else f"{path.stem}: ")  # the path says it
     return Outcome(sentence if sentence.startswith(subject) else f"{subject}: {sentence}", failed=True)

@@ -87,7 +87,7 @@ def _of_finding(finding: Finding, diagnosis: Diagnosis, *, first: bool) -> Itera
     if f.region is not None:
         yield term("label.mostly"), say.region(f.region)
     if f.experiments:
-        yield term("label.in"), say.experiments(f.experiments)
+        yield term("label.in"), say.shares_of_runs(f.experiments, diagnosis.world.runs)
     yield term("label.driven_by"), say.driven_by(f)
     evidence = numbers.evidence(f.p_value, diagnosis.surrogates)
     sure = evidence if f.p_value is None else term("evidence.after_the_search", evidence=evidence)

@@ -24,7 +24,7 @@ from mkc_torch.diagnosis.arguments import (
 from mkc_torch.diagnosis.cut_short import cut_short, nothing_known
 from mkc_torch.diagnosis.evidence.after_the_search import parts_ahead
 from mkc_torch.diagnosis.follows import misses
-from mkc_torch.diagnosis.joined import joined
+from mkc_torch.diagnosis.joined import joined, run_counts, with_own_offsets
 from mkc_torch.diagnosis.linearised.smaller_step import with_smaller_step
 from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel
@@ -78,8 +78,9 @@ def diagnose(
     recorded.
 
     Several recordings of one system are diagnosed together: one set of parameters and of findings for all of them, and
-    states at the start for each. Physics repeats from run to run, slow noise and disturbances do not. Of a simulation
-    without states the recordings follow one another on one clock.
+    states at the start for each, and offsets of the outputs, as far as they are determined. Physics repeats from run to
+    run, slow noise and disturbances do not. Of a simulation without states the recordings follow one another on one
+    clock; a magnetometer has one offset in all of them.
 
     Args:
         simulation: of the recording, such as :class:`mkc_torch.simulation.Magnetometer`.
@@ -124,6 +125,7 @@ def diagnose(
     """
     begin = monotonic()
     refuse_no_simulation(simulation)
+    several = () if isinstance(recording, Recording) else tuple(recording)
     recording, names = joined(simulation, recording)
     effects = checked_effects(effects)
     check_numbers(level, surrogates, max_findings, seed)
@@ -142,10 +144,11 @@ def diagnose(
         raise ValueError(
             f"{where}{len(prepared.time)} usable samples are too few for a diagnosis; it needs {fewest} at least."
         )
+    prepared = with_own_offsets(prepared, several)
     declared = checked_noise(noise, prepared.channels)
     fixed = checked_between(between, tuple(getattr(prepared, "between", ())))
     asked = Asked(level, surrogates, max_findings, seed, settings, declared, fixed, quick)
-    known = UnderWay(simulation, effects, names, asked)
+    known = UnderWay(simulation, effects, names, asked, run_counts(several) if names else ())
     limit = math.inf if time_limit is None else time_limit
     with limited(limit, begin=begin) as deadline, counting(progress):
         try:

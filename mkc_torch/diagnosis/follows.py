@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch._support.quantum import rounding_of
 from mkc_torch.diagnosis.world import Follows
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -20,12 +21,6 @@ __all__ = ["follows_of", "misses", "pooled", "size_of", "units_of"]
 
 _SLOWER = 1e-4
 """Share of an output's variation below which a floor that was estimated from samples tells nothing."""
-
-_DECIMALS = 7
-"""Decimals up to which the numbers of a file are taken for rounded ones."""
-
-_ROUNDED = 1e-12
-"""Of a number: by so much a rounded one may be off."""
 
 _FAR = 5.0
 """Robust standard deviations from the median at which a value ends, for a mean that outliers do not move."""
@@ -74,17 +69,21 @@ def follows_of(
         recorded = torch.linalg.vector_norm(known, dim=-1, keepdim=True)
     elif known.shape[1] == len(prepared.channels):
         variation, recorded = size_of(known - _middle(known)), known
+        if _in_other_axes(prepared):
+            # no column is of one axis of these: each varies by what the vector varies by
+            variation = variation.square().mean().sqrt().expand_as(variation)
     else:
         return ()
     lost = residual is None or not bool(residual.isfinite().all())
     left = variation.clone() if lost or residual is None else size_of(residual)
-    steps = _steps(recorded)
+    rounding = rounding_of(recorded)
     estimated = _new(recorded if residual is None or lost else residual) if floor is None else left.new_tensor(floor)
     last = size_of(recorded[1:] - recorded[:-1])
+    last = last.square().mean().sqrt().expand_as(last) if _in_other_axes(prepared) else last
     units = units_of(prepared)
     found = []
     for k, name in enumerate(prepared.channels):
-        of_steps = max(float(steps[k]), _resolution(recorded[:, k])) / 12.0**0.5
+        of_steps = float(rounding[k])
         size, source = float(estimated[k]), "samples"
         if name in declared:
             size, source = declared[name], "declared"
@@ -100,23 +99,15 @@ def follows_of(
     return tuple(found)
 
 
+def _in_other_axes(prepared: PreparedSimulation) -> bool:
+    """Whether a vector is compared in axes that turn with it, those of the world say, and not column by column."""
+    recording = getattr(prepared, "recording", None)
+    return len(prepared.channels) > 1 and recording is not None and not set(prepared.channels) & set(recording.names)
+
+
 def misses(follows: Sequence[Follows], least: float) -> tuple[Follows, ...]:
     """The outputs that the simulation does not follow: less than this share of their variation is explained."""
     return tuple(one for one in follows if not one.explained >= least)
-
-
-def _resolution(values: Float[Tensor, " N"]) -> float:
-    """The quantum of numbers that a file has with a few decimals; 0 where they have more than a few.
-
-    Example:
-        >>> _resolution(torch.tensor([98.2, 94.4, 91.4], dtype=torch.float64))
-        0.1
-    """
-    for decimals in range(_DECIMALS):
-        scaled = values * 10.0**decimals
-        if bool(((scaled - scaled.round()).abs() <= _ROUNDED * scaled.abs().clamp(min=1.0)).all()):
-            return float(10.0**-decimals)
-    return 0.0
 
 
 def pooled(follows: Sequence[Follows]) -> float:
@@ -139,16 +130,6 @@ def _new(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
     """White noise by third differences."""
     third = values[3:] - 3.0 * values[2:-1] + 3.0 * values[1:-2] - values[:-3]
     return robust_scale(third) / 20.0**0.5
-
-
-def _steps(values: Float[Tensor, "N m"]) -> Float[Tensor, " m"]:
-    """Smallest step between two numbers that a column has; 0 where nearly all numbers are different."""
-    steps = []
-    for column in values.unbind(-1):
-        numbers = column.unique()
-        few = len(numbers) < len(column) // 4 and len(numbers) > 1
-        steps.append(float(numbers.diff().min()) if few else 0.0)
-    return values.new_tensor(steps)
 
 
 def units_of(prepared: PreparedSimulation) -> tuple[str, ...]:

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
+
 from mkc_torch._support.arrays import is_frame
+from mkc_torch.recording.given_columns import EXPERIMENT
 from mkc_torch.recording.recording import Recording
 from mkc_torch.recording.together import Clock, join_recordings, recording_names
+from mkc_torch.simulation.dynamics.own_offsets import with_own_offsets as with_offsets_of_sensors
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.paired import Paired
-from mkc_torch.simulation.protocol import Simulation, refuse_no_recording
+from mkc_torch.simulation.protocol import PreparedSimulation, Simulation, refuse_no_recording
+from mkc_torch.simulation.static import PreparedStatic
 
-__all__ = ["joined"]
+__all__ = ["joined", "run_counts", "with_own_offsets"]
 
 
 def joined(simulation: Simulation, recording: Recording | Sequence[Recording]) -> tuple[Recording, tuple[str, ...]]:
@@ -28,6 +34,27 @@ def joined(simulation: Simulation, recording: Recording | Sequence[Recording]) -
         refuse_no_recording(f"recording[{number}]", one)
     whole = join_recordings(recording, _clock(simulation))
     return whole, recording_names(recording) if len(recording) > 1 else ()
+
+
+def run_counts(recordings: Sequence[Recording]) -> tuple[int, ...]:
+    """How many runs each of the recordings holds."""
+    return tuple(len(one.experiments()) for one in recordings)
+
+
+def with_own_offsets(prepared: PreparedSimulation, recordings: Sequence[Recording]) -> PreparedSimulation:
+    """A simulation of several recordings with offsets of its outputs that each recording has of its own.
+
+    Of a simulation that knows of none, such as the magnetometer's, it is as it was.
+    """
+    whole = prepared.recording
+    if len(recordings) < 2 or EXPERIMENT not in whole:
+        return prepared
+    counts = torch.tensor(run_counts(recordings))
+    of_experiment = torch.arange(len(recordings)).repeat_interleave(counts)
+    recording, names = of_experiment[whole[EXPERIMENT].long()], recording_names(recordings)
+    if isinstance(prepared, PreparedDynamics):
+        return with_offsets_of_sensors(prepared, recording, names)
+    return prepared.with_own_offsets(recording, names) if isinstance(prepared, PreparedStatic) else prepared
 
 
 def _clock(simulation: Simulation) -> Clock:

@@ -13,6 +13,7 @@ from mkc_torch.diagnosis.evidence.base import Case, EvidenceTest
 from mkc_torch.diagnosis.evidence.held_out import Evidence
 from mkc_torch.diagnosis.evidence.in_short import in_short
 from mkc_torch.diagnosis.evidence.running_freely import RunningFreely, running_freely, running_unjudged
+from mkc_torch.diagnosis.findings.recordings import offsets_of, runs_of
 from mkc_torch.diagnosis.model.drivers import Drivers, find_drivers
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.grid import candidate_terms
@@ -33,6 +34,7 @@ class UnderWay:
 
     Attributes:
         simulation, effects, recordings, asked: what was asked, the names of recordings that are diagnosed together.
+        run_counts: runs that each of these recordings holds.
         world: the fit of the simulation alone; at first before its noise is known.
         fitted: whether the noise is known too.
         search: what was found.
@@ -42,6 +44,7 @@ class UnderWay:
     effects: tuple[Effect, ...]
     recordings: tuple[str, ...]
     asked: Asked
+    run_counts: tuple[int, ...] = ()
     world: InTheWorld | None = None
     fitted: bool = False
     search: Search | None = None
@@ -122,5 +125,8 @@ class UnderWay:
         final = search.found[-1].fit if search.found else self.base
         drivers, terms = self.candidates
         whole = Whole(self.simulation, drivers, terms, self.alone, final, self.asked, search.cut, stop)
-        told = with_rest(assembled(whole, answers_of(case, done, tests)), search)
-        return replace(told, recordings=self.recordings)
+        answers = answers_of(case, done, tests)
+        told = with_rest(assembled(whole, answers), search)
+        offsets = offsets_of(answers.case.final, self.recordings) if self.recordings else ()
+        runs = runs_of(self.base.model.prepared, self.recordings, self.run_counts)
+        return replace(told, recordings=self.recordings, world=replace(told.world, offsets=offsets, runs=runs))

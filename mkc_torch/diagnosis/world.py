@@ -11,7 +11,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Curve", "Follows", "Forcing", "Grade", "Push", "Shape", "Verdict", "World"]
+__all__ = ["Curve", "Follows", "Forcing", "Grade", "Offset", "Push", "Run", "Shape", "Verdict", "World"]
 
 Verdict = Literal["unfit", "adequate", "explained", "unexplained"]
 
@@ -120,6 +120,39 @@ class Shape:
 
 
 @dataclass(frozen=True)
+class Offset:
+    """The offset of an output in one of several recordings.
+
+    Attributes:
+        output, unit: of which output.
+        recording, name: number of the recording, from 1, and its name.
+        value, standard_error: in the unit; NaN for the error of an offset that is left at 0, which the others are
+            counted from, or which the first states or another parameter stand for.
+    """
+
+    output: str
+    unit: str
+    recording: int
+    name: str
+    value: float
+    standard_error: float
+
+
+@dataclass(frozen=True)
+class Run:
+    """One of several runs.
+
+    Attributes:
+        recording, name: number, from 1, and name of the recording that it is of; 0 and empty for a single recording.
+        number: of the run within its recording, from 1; 0 where that recording holds no other.
+    """
+
+    recording: int
+    name: str
+    number: int
+
+
+@dataclass(frozen=True)
 class World:
     """What stands beside the findings: whether the simulation follows, and the noise of the world.
 
@@ -130,6 +163,8 @@ class World:
         between: what each input does between two samples, "held", "linear" or "smooth", whichever is likelier.
         forcing: of each push at a rate.
         starts: from which the first fit was tried.
+        offsets: of the outputs in each of several recordings, where they are fitted.
+        runs: in the order in which findings give their shares; empty for a single one.
     """
 
     follows: tuple[Follows, ...] = ()
@@ -138,3 +173,5 @@ class World:
     between: Mapping[str, str] = field(default_factory=dict)
     forcing: tuple[Forcing, ...] = ()
     starts: int = 1
+    offsets: tuple[Offset, ...] = ()
+    runs: tuple[Run, ...] = ()

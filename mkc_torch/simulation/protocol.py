@@ -259,7 +259,7 @@ class PreparedSimulation(Protocol):
 
 @runtime_checkable
 class Beginning(Protocol):
-    """A prepared simulation whose last parameters are the states that its runs begin in.
+    """A prepared simulation whose last parameters are the states that its runs begin in, behind recordings' offsets.
 
     Attributes:
         beginnings: how many.

@@ -14,12 +14,13 @@ from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
+from mkc_torch.simulation.own_offsets import OwnOffset, determined_offsets
 from mkc_torch.simulation.parameter import Parameter, SimulationError, known_parameters
 from mkc_torch.simulation.protocol import Changes, ClosedForm, Nearby, Port, Sizes, refuse_no_recording
 from mkc_torch.simulation.undetermined import undetermined
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
 __all__ = ["PreparedStatic", "Static", "StaticCorrection"]
 
@@ -200,8 +201,15 @@ class PreparedStatic(ClosedForm):
 
     prior: GaussianPrior | None = None
 
-    def __init__(self, system: Static, recording: Recording) -> None:
+    def __init__(
+        self,
+        system: Static,
+        recording: Recording,
+        own_offsets: tuple[OwnOffset, ...] = (),
+        of_recording: Int[Tensor, " N"] | None = None,
+    ) -> None:
         self.system, self.recording = system, recording
+        self.own_offsets, self._of_recording = own_offsets, of_recording
         self.name, self.channels = system.name, system.outputs
         self.time = torch.arange(len(recording)).double() if recording.time is None else recording.time
         self.inputs = _inputs(system, recording)
@@ -210,6 +218,7 @@ class PreparedStatic(ClosedForm):
         own = {units[name] for name in system.outputs}
         self.unit = own.pop() if len(own) == 1 else ""
         self.known = known_parameters(system.name, system.parameters)
+        self.known |= {one.name: Parameter(0.0, unit=units[one.output]) for one in own_offsets}
         self.parameter_names = tuple(self.known)
         low = [one.lower for one in self.known.values()]
         high = [one.upper for one in self.known.values()]
@@ -239,7 +248,28 @@ class PreparedStatic(ClosedForm):
         return inputs | output_signals(self._outputs(theta, changes), self.channels, changes)
 
     def _outputs(self, theta: Tensor, changes: Changes) -> Tensor:
-        return self.system.computed(self.time, _changed_inputs(self.system, self.inputs, changes), theta)
+        inputs, own = _changed_inputs(self.system, self.inputs, changes), len(theta) - len(self.own_offsets)
+        outputs = self.system.computed(self.time, inputs, theta[:own])
+        return outputs if self._of_recording is None else outputs + self._offsets(theta[own:], self._of_recording)
+
+    def _offsets(self, values: Float[Tensor, " q"], recording: Int[Tensor, " N"]) -> Float[Tensor, "N m"]:
+        """Of each output in the recording that a sample is of."""
+        added = [torch.zeros_like(self.time) for _ in self.channels]
+        for one, value in zip(self.own_offsets, values.unbind(), strict=True):
+            column = self.channels.index(one.output)
+            added[column] = added[column] + value * (recording == one.recording).to(self.time.dtype)
+        return torch.stack(added, -1)
+
+    def with_own_offsets(self, recording: Int[Tensor, " N"], names: Sequence[str]) -> PreparedStatic:
+        """The same with an offset of each output in each recording, as far as they are determined.
+
+        Args:
+            recording: number of the recording that each sample is of.
+            names: of the recordings.
+        """
+        tangents = torch.func.jacfwd(lambda theta: self.residual(theta, {}))(self.start())
+        found = determined_offsets(tangents, self.channels, recording, names)
+        return PreparedStatic(self.system, self.recording, found, recording) if found else self
 
     def _refuse_not_finite(self) -> None:
         outputs = self._outputs(self.start(), {})

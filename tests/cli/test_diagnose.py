@@ -288,7 +288,7 @@ def test_experiments_are_diagnosed_each_on_its_own(tmp_path):
     labels = ["run", *["flight/1"] * 500, *["2"] * 20]
     path.write_text("\n".join(f"{a},{b}" for a, b in zip(text, labels, strict=True)), encoding="utf-8")
     result = diagnosed(path, "--output", tmp_path / "out", "--experiments", "run")
-    refused(result, f"{path}, experiment 2: 20 samples are too few", "1 of 2 recordings", lines=2)
+    refused(result, f"{path}, run 2: 20 samples are too few", "1 of 2 recordings", lines=2)
     assert [p.name for p in (tmp_path / "out" / "a").iterdir()] == ["flight_1"]
     assert content_of(tmp_path / "out" / "a" / "flight_1")["recording"] == "a/flight/1"
 

@@ -65,7 +65,7 @@ def test_where_in_the_states_a_finding_lies():
     finding = dataclasses.replace(made.findings[0], region=region, experiments=(0.9, 0.1))
     text = flat(shown(dataclasses.replace(made, findings=(finding,))))
     assert "mostly 82 % of the gain where speed is within ±0.310 rad/s, 20 % of the time" in text
-    assert "in experiment 1: 90 %, experiment 2: 10 %" in text
+    assert "in run 1: 90 %, run 2: 10 %" in text
 
 
 def test_nothing_found():

@@ -66,7 +66,7 @@ def test_experiments_are_counted_while_copies_work(tmp_path):
     code, seen = on_a_terminal(*command)
     assert code == 0, seen
     for number, label in ((1, 0), (2, 1)):
-        assert f"diagnosing runs.csv, experiment {label} ({number} of 2)" in seen
+        assert f"diagnosing runs.csv, run {label} ({number} of 2)" in seen
     assert len(set(re.findall("[⠋⠙⠹⠸⠼⠴⠦⠧⠇⠏]", seen))) > 3
     done = subprocess.run(
         [sys.executable, "-m", "mkc_torch.cli", *map(str, command), "--force"],

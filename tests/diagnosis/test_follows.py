@@ -6,7 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.follows import follows_of, misses, pooled, size_of
+from mkc_torch.simulation import Magnetometer, Static
 from mkc_torch.simulation.protocol import Port
 from tests.diagnosis.factory import make_follows
 
@@ -160,3 +162,62 @@ def test_sizes_pool_each_by_its_own_variation_and_worse_than_the_mean_is_nothing
     known = (make_follows(explained=0.8), make_follows(explained=0.4), make_follows(explained=-3.0))
     assert pooled(known) == pytest.approx(0.4)
     assert pooled(()) == 0.0
+
+
+QUATERNION = ("q_w", "q_x", "q_y", "q_z")
+
+
+def smooth(count, seed):
+    g = torch.Generator().manual_seed(seed)
+    rate, phase = 0.3 + 2.0 * torch.rand(4, count, generator=g), 6.0 * torch.rand(4, count, generator=g)
+    return torch.sin(TIME[:600, None, None] * 2.5 * rate + phase).sum(1)
+
+
+def turning_sensor(*, yaw=False, field=None):
+    """A recorded attitude, and a field of 50 µT that it turns; or another field."""
+    attitude = smooth(4, 1)
+    if yaw:
+        turns = TIME[:600]
+        tilts = 0.02 * torch.sin(3.0 * turns), 0.02 * torch.cos(2.3 * turns)
+        attitude = torch.stack([torch.cos(turns), *tilts, torch.sin(turns)], -1)
+    attitude = attitude / attitude.norm(dim=-1, keepdim=True)
+    w, v = attitude[:, :1], -attitude[:, 1:]
+    ambient = torch.tensor([20.0, 5.0, -43.0]).double().expand(600, 3)
+    seen = ambient + 2.0 * torch.linalg.cross(v, torch.linalg.cross(v, ambient) + w * ambient)
+    seen = (seen if field is None else field) + 0.3 * randn(600, 3)
+    columns = {"time": 2.5 * TIME[:600]} | dict(zip(("mag_x", "mag_y", "mag_z"), seen.unbind(-1), strict=True))
+    return columns, dict(zip(QUATERNION, attitude.unbind(-1), strict=True))
+
+
+def verdict_of(simulation, columns):
+    return diagnose(simulation, Recording(columns), effects=(), surrogates=19)
+
+
+def test_a_field_that_has_nothing_to_do_with_the_attitude_is_not_followed():
+    columns, attitude = turning_sensor(field=20.0 * smooth(3, 5))
+    result = verdict_of(Magnetometer(), columns | attitude)
+    assert pooled(result.world.follows) < 0.35
+    assert result.verdict == "unfit"
+
+
+def test_a_sensor_that_hardly_tilts_follows_in_all_axes():
+    columns, attitude = turning_sensor(yaw=True)
+    result = verdict_of(Magnetometer(), columns | attitude)
+    assert {one.variation for one in result.world.follows} == {result.world.follows[0].variation}
+    assert all(one.explained > 0.99 for one in result.world.follows)
+    assert result.verdict == "adequate"
+
+
+@pytest.mark.parametrize(("useful", "said"), [(True, "adequate"), (False, "unfit")])
+def test_a_vector_without_states_is_followed_or_not(useful, said):
+    class Vector(Static):
+        inputs, outputs, parameters = ("a",), ("x", "y", "z"), {"k": 1.0}
+
+        def output(self, time, u, p):  # noqa: ARG002
+            return {"x": p.k * u.a, "y": -p.k * u.a, "z": p.k * u.a**2}
+
+    a = smooth(1, 3)
+    seen = torch.cat([2.0 * a, -2.0 * a, 2.0 * a**2], -1) if useful else smooth(3, 8)
+    seen = seen + 0.05 * randn(600, 3)
+    columns = {"time": 2.5 * TIME[:600], "a": a[:, 0]} | dict(zip("xyz", seen.unbind(-1), strict=True))
+    assert verdict_of(Vector(), columns).verdict == said

@@ -1,15 +1,20 @@
 """Several recordings diagnosed together: one simulation, one set of findings, own states at the start of each."""
 
 import json
+import re
 
 import pytest
 import torch
 
 from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
-from mkc_torch.diagnosis.joined import joined
+from mkc_torch.diagnosis.findings.recordings import runs_of
+from mkc_torch.diagnosis.joined import joined, with_own_offsets
+from mkc_torch.diagnosis.world import Run
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.recording.recording import RecordingError
+from mkc_torch.report.diagnosis.findings import shares_of_runs
+from mkc_torch.report.diagnosis.world import output_lines
 from mkc_torch.simulation import Dynamics, Magnetometer, Paired, Static
 from tests.simulation.tumbling import tumbling
 
@@ -51,8 +56,9 @@ def test_two_recordings_are_one_table_with_a_column_of_experiments():
     both = diagnose(Decay(), [a, b], effects=(), surrogates=19)
     one = diagnose(Decay(), table, effects=(), surrogates=19)
     assert both.samples == one.samples == 120
-    assert (both.verdict, both.noise, both.baseline) == (one.verdict, one.noise, one.baseline)
-    torch.testing.assert_close(both.traces.before, one.traces.before)
+    assert both.verdict == one.verdict == "adequate"
+    # the offsets of two recordings are fitted as well
+    torch.testing.assert_close(both.traces.before, one.traces.before, rtol=0.0, atol=0.01)
     assert both.recordings == ("a", "b")
     assert one.recordings == ()
     assert json.loads(diagnosis_to_json(both))["recording"] == ["a", "b"]
@@ -65,6 +71,95 @@ def test_each_recording_has_a_start_of_its_own_and_parameters_are_shared():
     assert names == ("a", "b")
     assert prepared.parameter_names == ("rate", "level at the start of a", "level at the start of b")
     assert prepared.start()[1:].tolist() == pytest.approx([1.0, 3.0], abs=0.1)
+
+
+def moved(recording, column, by):
+    return Recording({**recording.columns, column: recording[column] + by}, name=recording.name)
+
+
+def told_offsets(result):
+    return [(one.output, one.name, round(one.value, 1)) for one in result.world.offsets]
+
+
+class Coast(Dynamics):
+    states, inputs, parameters = ("speed",), ("force",), {"gain": 1.0}
+    units = {"speed": "m/s"}  # noqa: RUF012
+
+    def derivative(self, time, x, u, p):  # noqa: ARG002
+        return {"speed": p.gain * u.force - 0.1 * x.speed}
+
+
+def coast(seed, name, offset, count=200, parts=100):
+    """A body of quadratic drag that the simulation lacks, its speed read off by an offset."""
+    time = torch.arange(count * parts, dtype=torch.float64) * 0.05 / parts
+    force = 2.0 * torch.sin(0.7 * time + seed) + 1.5 * torch.sin(2.1 * time) + 1.0
+    speed, now = torch.empty_like(time), 1.0 + seed
+    for k, push in enumerate(force.tolist()):
+        speed[k] = now
+        now += 0.05 / parts * (push - 0.1 * now - 0.05 * abs(now) * now)
+    noise = 0.01 * torch.randn(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    columns = {"time": time, "force": force, "speed": speed}
+    return Recording({key: values[::parts] for key, values in columns.items()}, name=name), offset + noise
+
+
+@pytest.mark.e2e
+def test_a_sensor_s_offset_is_each_recording_s_own_and_physics_is_all_of_theirs():
+    parts = [coast(seed, name, offset) for seed, name, offset in ((0, "a", 0.3), (1, "b", -0.2), (2, "c", 0.0))]
+    recordings = [moved(one, "speed", added) for one, added in parts]
+    drag = tuple(effect for effect in CATALOGUE if effect.id == "quadratic_drag")
+    result = diagnose(Coast(), recordings, effects=drag, quick=True)
+    assert [finding.effect for finding in result.findings] == ["quadratic_drag"]
+    assert result.findings[0].parameters[0].value == pytest.approx(0.05, rel=0.02)
+    assert told_offsets(result) == [("speed", "a", 0.3), ("speed", "b", -0.2), ("speed", "c", 0.0)]
+    assert all(0.0 < one.standard_error < 0.01 and one.unit == "m/s" for one in result.world.offsets)
+    content = json.loads(diagnosis_to_json(result))
+    assert [one["recording"] for one in content["offsets"]] == [1, 2, 3]
+    assert [one["name"] for one in content["runs"]] == ["a", "b", "c"]
+    assert re.search(r"recording 1 \(a\): 0\.(30|29)\d* ± 0\.0", " ".join(output_lines(result)))
+    told = shares_of_runs(result.findings[0].experiments, result.world.runs)
+    assert "recording 2 (b): " in told
+    assert "experiment" not in told
+    assert len(result.model.theta) == 4  # a gain and three first states
+
+
+def test_an_offset_that_the_first_state_stands_for_is_not_fitted():
+    class Way(Coast):
+        states, outputs = ("way", "speed"), ("way",)
+
+        def derivative(self, time, x, u, p):
+            return {"way": x.speed, **super().derivative(time, x, u, p)}
+
+    recordings = [coast(seed, name, 0.0)[0] for seed, name in ((0, "a"), (1, "b"))]
+    recordings = [Recording({**one.columns, "way": one["speed"].cumsum(0) / 20.0}, name=one.name) for one in recordings]
+    prepared = Way().prepare(joined(Way(), recordings)[0])
+    assert with_own_offsets(prepared, recordings) is prepared
+
+
+def test_offsets_of_recordings_with_several_runs_are_the_recordings():
+    first, second = decay(0, "a", 1.0), decay(1, "b", 3.0)
+    table = {name: torch.cat([first[name], second[name]]) for name in first.names}
+    both = [Recording({**table, "experiment": torch.arange(2.0).repeat_interleave(60)}, name="a"), decay(2, "b", 2.0)]
+    prepared = with_own_offsets(Decay().prepare(joined(Decay(), both)[0]), both)
+    assert [one.name for one in prepared.own_offsets] == ["offset of level in a", "offset of level in b"]
+    theta = prepared.start()
+    apart = torch.zeros_like(theta)
+    apart[prepared.parameter_names.index("offset of level in a")] = 1.0
+    difference = prepared.residual(theta, {}) - prepared.residual(theta + apart, {})
+    torch.testing.assert_close(difference[:, 0], (torch.arange(180) < 120).double())
+    assert runs_of(prepared, ("a", "b"), (2, 1)) == (Run(1, "a", 1), Run(1, "a", 2), Run(2, "b", 0))
+
+
+def test_a_simulation_without_states_has_offsets_of_each_recording_too():
+    recordings = [moved(line(0, "a"), "voltage", 0.3), moved(line(1, "b"), "voltage", -0.2)]
+    result = diagnose(Line(), recordings, effects=(), surrogates=19)
+    assert told_offsets(result) == [("voltage", "a", 0.3), ("voltage", "b", -0.2)]
+    assert result.verdict == "adequate"
+    assert len(result.model.theta) == 1
+
+
+def test_a_single_recording_has_no_offsets():
+    result = diagnose(Line(), [line(0, "a")], effects=(), surrogates=19)
+    assert (result.world.offsets, result.world.runs) == ((), ())
 
 
 def test_a_simulation_without_states_has_one_clock():

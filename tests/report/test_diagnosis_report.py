@@ -475,7 +475,7 @@ def test_where_in_the_states_and_in_which_experiment_is_told_and_drawn():
     )
     text = text_of(page)
     assert "91 % of the gain where angle is beyond ±0.800 rad, 20 % of the time" in text
-    assert "experiment 2: 75 %, experiment 1: 25 %" in text
+    assert "run 2: 75 %, run 1: 25 %" in text
     assert page.count("<svg ") == page_of(1, samples=240).count("<svg ") + 1
     assert "speed (rad/s)" in page
     assert "Gain of finding 1 over the states" in page

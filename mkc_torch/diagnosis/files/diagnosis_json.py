@@ -14,7 +14,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from mkc_torch.diagnosis.files.world_json import follows_of, forcing_of, noise_of, remaining_of
+from mkc_torch.diagnosis.files.world_json import follows_of, forcing_of, noise_of, of_recordings, remaining_of
 from mkc_torch.diagnosis.result import Diagnosis, Finding, HeldOut, Noise, Number, Parameter, Spread, Told
 from mkc_torch.diagnosis.world import Shape
 
@@ -54,6 +54,7 @@ def diagnosis_to_json(diagnosis: Diagnosis) -> str:
         "verdict": d.verdict,
         "follows": follows_of(d.world),
         "reasons": d.world.reasons,
+        **of_recordings(d.world),
         "noise": _noise(d.noise) | noise_of(d.world),
         "search": {
             "candidates": d.candidates_tried,

@@ -218,10 +218,12 @@ def model_of(final: Estimate, simulation: Simulation) -> DiagnosedModel:
         context = term.context(model.prepared, signals.get(term.port))
         terms.append(replace(term, shape=term.effect.anchored(term.shape, context)))
     parameters = final.fit.parameters
+    of_recordings = {one.name for one in getattr(model.prepared, "own_offsets", ())}
+    own = [k for k, name in enumerate(model.prepared.parameter_names) if name not in of_recordings]
     return DiagnosedModel(
         model.prepared.name,
         model.prepared.state,
-        parameters[: model.base],
+        parameters[own],
         terms,
         model.gammas(parameters),
         simulation,

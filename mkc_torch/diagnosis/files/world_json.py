@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from typing import Any
 
 from torch import Tensor
@@ -11,7 +12,7 @@ from torch import Tensor
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.world import Forcing, Push, World
 
-__all__ = ["follows_of", "forcing_of", "noise_of", "remaining_of"]
+__all__ = ["follows_of", "forcing_of", "noise_of", "of_recordings", "remaining_of"]
 
 _MOST_POINTS = 500
 """Of a course that are written."""
@@ -71,6 +72,19 @@ def _by_place(pushes: Iterable[Push]) -> dict[str, Any]:
         else:
             found[push.place] = told
     return found
+
+
+def of_recordings(world: World) -> dict[str, Any]:
+    """The runs that shares are of, and the offsets of outputs in each of several recordings; neither where none is.
+
+    Example:
+        >>> from mkc_torch.diagnosis.world import Offset
+        >>> of_recordings(World(offsets=(Offset("speed", "m/s", 2, "b.csv", -0.2, 0.001),)))
+        {'offsets': [{'output': 'speed', 'unit': 'm/s', 'recording': 2, 'name': 'b.csv', 'value': -0.2, ...}]}
+    """
+    offsets = [{**asdict(one), "standard_error": _finite(one.standard_error)} for one in world.offsets]
+    runs = [asdict(one) for one in world.runs]
+    return {**({"runs": runs} if runs else {}), **({"offsets": offsets} if offsets else {})}
 
 
 def forcing_of(world: World) -> list[dict[str, Any]]:

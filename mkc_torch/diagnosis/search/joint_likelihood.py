@@ -15,15 +15,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch._support.quantum import rounding_of
 from mkc_torch.diagnosis.linearised.tangents import Tangents
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.likelihoods import Columns, LogLikelihoods, log_likelihoods
 from mkc_torch.diagnosis.search.quick import COUNTS, COUNTS_NOT, price
-from mkc_torch.simulation.dynamics.disturbances import NoiseModel, filter_models, observer_of
+from mkc_torch.simulation.dynamics.disturbances import filter_models, observer_of
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid, key_of
+from mkc_torch.simulation.dynamics.noise_model import NoiseModel
 from mkc_torch.simulation.dynamics.observer import Observable, Observer, clipped_slope
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.dynamics.whitening import SeriesAlong, gains_of, joined, relative_to, whitened
@@ -135,7 +137,7 @@ class _Scene:
     def start(self, number: int, model: NoiseModel) -> Start:
         left, gamma, shift = self.residual(number, model)
         used = self.counted.counts > 0
-        scale = 1.0 if any(model.known) else float(np.sqrt(np.square(left[used]).mean()))
+        scale = 1.0 if any(model.known) else max(float(np.sqrt(np.square(left[used]).mean())), model.least_scale)
         names, channels = self.prepared.pushable, self.prepared.channels
         like = self.prepared.measured
         disturbances = model.disturbances(names, channels, scale)
@@ -177,9 +179,13 @@ def joint_likelihood(
     names, channels = prepared.pushable, prepared.channels
     size = base.residual.square().mul(counts).sum(0).div(counts.sum(0).clamp(min=1.0)).sqrt()
     sensor = (size if observer is None else observer.sensor).tolist()
-    white = NoiseModel(tuple(max(one, 1e-300) for one in sensor), (), tuple(declared) or (False,) * len(channels))
+    told = tuple(declared) or (False,) * len(channels)
+    rounding = [0.0 if one else step for one, step in zip(told, rounding_of(prepared.measured).tolist(), strict=True)]
+    sensor = [max(one, step, 1e-300) for one, step in zip(sensor, rounding, strict=True)]
+    white = NoiseModel(tuple(sensor), (), told, tuple(rounding))
     grid = NoiseGrid(scene.counted, white)
-    known = [] if observer is None else [NoiseModel.of(observer.disturbances, sensor, names, channels, white.known)]
+    pushes = () if observer is None else observer.disturbances
+    known = [NoiseModel.of(pushes, sensor, names, channels, told, rounding)] if pushes else []
     keys = [term.key for term in terms]
     found = _refined(scene, grid, [one for one in known if grid.plausible(one)], keys)
     without = found.without[:, 0]

@@ -16,8 +16,9 @@ import numpy as np
 
 from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch._parallel.progress import counted
-from mkc_torch.simulation.dynamics.disturbances import NoiseModel, filter_models
+from mkc_torch.simulation.dynamics.disturbances import filter_models
 from mkc_torch.simulation.dynamics.kalman import Flow
+from mkc_torch.simulation.dynamics.noise_model import NoiseModel
 from mkc_torch.simulation.dynamics.whitening import Gains, SeriesAlong, gains_of, joined, whitened, whitened_in_blocks
 
 if TYPE_CHECKING:
@@ -135,12 +136,15 @@ def log_likelihoods(
         level = -gains.log_spread[place] - log_det - PRICE * len(models[number].pushes)
         power = np.square(left).sum(0)
         reach = _reach(models[number], largest)
-        without[number] = np.where(_scale(power, n, free) <= reach, level + _log_likelihood(power, n, free), -np.inf)
+        least = models[number].least_scale
+        size = _scale(power, n, free, least)
+        without[number] = np.where(size <= reach, level + _log_likelihood(power, n if free else 0, size), -np.inf)
         for (members, index), (gram, inner, norm) in zip(groups, products, strict=True):
             explained, solved, found = _explained(gram, inner, members, columns.one_sided)
             remains = np.maximum(power - explained, 1e-12 * power)
-            size = _scale(remains, n, free)
-            beside[number, members] = np.where(size <= reach, level + _log_likelihood(remains, n, free), -np.inf)
+            size = _scale(remains, n, free, least)
+            gained = level + _log_likelihood(remains, n if free else 0, size)
+            beside[number, members] = np.where(size <= reach, gained, -np.inf)
             sizes[number, index] = solved / norm
             rank[members] = np.maximum(rank[members], found)
             scale[number, members] = size[:, 0]
@@ -178,16 +182,18 @@ def _basis(own: Float[np.ndarray, "M p"]) -> tuple[Float[np.ndarray, "M k"], flo
     return basis[:, kept], float(np.log(values[kept]).sum())
 
 
-def _log_likelihood(power: Float[np.ndarray, "*c Y"], n: int, free: bool) -> Float[np.ndarray, "*c Y"]:
-    if not free:
-        return -0.5 * power
-    result: np.ndarray = -0.5 * n * np.log(np.maximum(power, 1e-300) / max(n, 1))
+def _log_likelihood(
+    power: Float[np.ndarray, "*c Y"], n: int, scale: Float[np.ndarray, "*c Y"]
+) -> Float[np.ndarray, "*c Y"]:
+    """Of n numbers by white noise of that scale, up to a constant; n is 0 where the scale is known."""
+    square = np.maximum(np.square(scale), 1e-300)
+    result: np.ndarray = -0.5 * (n * np.log(square) + power / square - n)
     return result
 
 
-def _scale(power: Float[np.ndarray, "*c Y"], n: int, free: bool) -> Float[np.ndarray, "*c Y"]:
-    """Of the noise, over that of its model."""
-    return np.sqrt(power / max(n, 1)) if free else np.ones_like(power)
+def _scale(power: Float[np.ndarray, "*c Y"], n: int, free: bool, least: float) -> Float[np.ndarray, "*c Y"]:
+    """Of the noise, over that of its model: the likeliest, but no less than that which the recording's steps leave."""
+    return np.maximum(np.sqrt(power / max(n, 1)), least) if free else np.ones_like(power)
 
 
 def _reach(model: NoiseModel, largest: Float[np.ndarray, " p+m"] | None) -> float:

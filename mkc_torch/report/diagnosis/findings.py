@@ -9,17 +9,17 @@ from collections.abc import Collection, Sequence
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain, several, typeset
 from mkc_torch.diagnosis.result import Alternative, Candidate, Finding, Region
-from mkc_torch.diagnosis.world import Grade
+from mkc_torch.diagnosis.world import Grade, Run
 from mkc_torch.effects import is_curve, words_of
 from mkc_torch.report.diagnosis.evidence import of_driver
 from mkc_torch.report.diagnosis.numbers import Clock, probability
+from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
 
 __all__ = [
     "acts_on",
     "counted_from",
     "driven_by",
-    "experiments",
     "finding_name",
     "grade",
     "inseparable",
@@ -28,13 +28,14 @@ __all__ = [
     "rivals",
     "role",
     "shape",
+    "shares_of_runs",
     "unrecorded",
     "where",
     "with_drivers",
     "with_names",
 ]
 
-_MOST_EXPERIMENTS = 6
+_MOST_RUNS = 6
 _AXES: dict[tuple[str, ...], str] = {
     ("x", "y", "z"): "finding.acts_on_axes",
     ("east", "north", "up"): "finding.acts_on_world",
@@ -206,20 +207,34 @@ def region(found: Region) -> str:
     return term("where.region", gain=gain, state=plain(found.state), bounds=bounds, time=time)
 
 
-def experiments(shares: Sequence[float]) -> str:
-    """Each experiment's share of the gain, the largest first.
+def shares_of_runs(shares: Sequence[float], runs: Sequence[Run] = ()) -> str:
+    """Each run's share of the gain, the largest first.
 
     Example:
-        >>> experiments((0.1, 0.7, 0.2))
-        'experiment 2: 70 %, experiment 3: 20 %, experiment 1: 10 %'
+        >>> shares_of_runs((0.1, 0.7, 0.2))
+        'run 2: 70 %, run 3: 20 %, run 1: 10 %'
+        >>> shares_of_runs((0.4, 0.6), (Run(1, "a.csv", 0), Run(2, "b.csv", 0)))
+        'recording 2 (b.csv): 60 %, recording 1 (a.csv): 40 %'
     """
+    known = runs if len(runs) == len(shares) else [Run(0, "", k + 1) for k in range(len(shares))]
     order = sorted(range(len(shares)), key=lambda k: -shares[k])
-    told = [
-        term("where.experiment", number=k + 1, share=number(100.0 * shares[k], 0)) for k in order[:_MOST_EXPERIMENTS]
-    ]
+    told = [term("where.share", run=_run(known[k]), share=number(100.0 * shares[k], 0)) for k in order[:_MOST_RUNS]]
     more = len(shares) - len(told)
     each = ", ".join(told)
-    return term("where.more_experiments", experiments=each, count=more) if more else each
+    return term("where.more_runs", runs=each, count=more) if more else each
+
+
+def _run(run: Run) -> str:
+    """A run by its recording and its number in it, as far as there are others.
+
+    Example:
+        >>> _run(Run(2, "b.csv", 3)), _run(Run(0, "", 3))
+        ('run 3 of recording 2 (b.csv)', 'run 3')
+    """
+    if not run.recording:
+        return term("where.run", number=run.number)
+    recording = recording_called(run.recording, run.name)
+    return term("where.run_of", number=run.number, recording=recording) if run.number else recording
 
 
 def grade(finding: Finding) -> str:

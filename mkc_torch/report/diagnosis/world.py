@@ -10,6 +10,7 @@ from mkc_torch._words.typesetting import plain
 from mkc_torch.diagnosis.result import Diagnosis, Table
 from mkc_torch.diagnosis.world import Follows, Push, World
 from mkc_torch.report.diagnosis.numbers import measured
+from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "explained",
     "follows_table",
     "noise_lines",
+    "offset_sentences",
     "output_lines",
     "push_sentence",
     "pushes_table",
@@ -45,11 +47,12 @@ def explained(value: float) -> str:
 
 
 def output_lines(diagnosis: Diagnosis) -> list[str]:
-    """A line an output: how the simulation follows it, in its own unit, beside the noise floor."""
+    """A line an output: how the simulation follows it, in its own unit, beside the noise floor; and its offsets."""
     each = diagnosis.world.follows
     told = [_followed(one, lost=diagnosis.verdict == "unfit") for one in each[:_MOST_OUTPUTS]]
     more = len(each) - len(told)
-    return [*told, term("world.more_outputs", count=more)] if more else told
+    beside = [] if diagnosis.verdict == "unfit" else offset_sentences(diagnosis.world)
+    return [*told, *([term("world.more_outputs", count=more)] if more else []), *beside]
 
 
 def _followed(one: Follows, *, lost: bool) -> str:
@@ -160,6 +163,21 @@ def between_sentence(world: World) -> str:
     """
     each = [term(_BETWEEN[how], input=plain(name)) for name, how in world.between.items()]
     return term("world.between", inputs=", ".join(each)) if each else ""
+
+
+def offset_sentences(world: World) -> list[str]:
+    """The offsets of each output in several recordings.
+
+    Example:
+        >>> from mkc_torch.diagnosis.world import Offset
+        >>> offset_sentences(World(offsets=(Offset("speed", "m/s", 1, "a.csv", 0.3, 0.001),)))
+        ['Offset of speed in each recording: recording 1 (a.csv): 0.3000 ± 0.0010 m/s.']
+    """
+    told: dict[str, list[str]] = {}
+    for one in world.offsets:
+        size = measured(one.value, one.standard_error, tidy(one.unit))[0] if math.isfinite(one.standard_error) else "0"
+        told.setdefault(one.output, []).append(f"{recording_called(one.recording, one.name)}: {size}")
+    return [term("world.offset", output=plain(name), offsets=", ".join(each)) for name, each in told.items()]
 
 
 def remainder(diagnosis: Diagnosis) -> str:

@@ -48,7 +48,7 @@ class DynamicsCorrection:
         if not found.converged:
             raise SimulationError(
                 f"{prepared.name}: with the parameters and effects of this model no trajectory was found that begins "
-                "as this recording does. Give a smaller `step`, or split the recording into shorter experiments."
+                "as this recording does. Give a smaller `step`, or split the recording into shorter runs."
             )
         begin = first
         near: Nearby | None = found

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch.simulation.dynamics.kalman import Flow, Models, Parts, filtered, robust_likelihood
+from mkc_torch.simulation.dynamics.noise_model import NoiseModel, place_of
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer
 from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
 
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Disturbed",
-    "NoiseModel",
     "disturbed",
     "filter_models",
     "longest_run",
@@ -77,41 +77,6 @@ class Disturbed:
     declared: tuple[bool, ...]
 
 
-@dataclass(frozen=True)
-class NoiseModel:
-    """A model of the noise.
-
-    Attributes:
-        sensor: standard deviation of each output's white noise, in its unit.
-        pushes: disturbances: the number of the rate, or of an output after all rates; the standard deviation in the
-            unit of that rate or output; the time constant in s, 0 for one that is new at each sample.
-        known: of each output whether its white noise is declared.
-    """
-
-    sensor: tuple[float, ...]
-    pushes: tuple[tuple[int, float, float], ...] = ()
-    known: tuple[bool, ...] = ()
-
-    def disturbances(self, rates: Sequence[str], outputs: Sequence[str], scale: float = 1.0) -> tuple[Disturbance, ...]:
-        """The disturbances by the names of rates and outputs, their sizes times a scale."""
-        names, p = (*rates, *outputs), len(rates)
-        return tuple(Disturbance(names[a], a < p, lasting, scale * size) for a, size, lasting in self.pushes)
-
-    @classmethod
-    def of(
-        cls,
-        disturbances: Sequence[Disturbance],
-        sensor: Sequence[float],
-        rates: Sequence[str],
-        outputs: Sequence[str],
-        known: Sequence[bool] = (),
-    ) -> NoiseModel:
-        """The model with these disturbances."""
-        places = (*rates, *outputs)
-        pushes = tuple((_place(places, one, len(rates)), one.size, one.lasting) for one in disturbances)
-        return cls(tuple(sensor), pushes, tuple(known) or (False,) * len(outputs))
-
-
 def disturbed(
     flow: Flow,
     names: Sequence[str],
@@ -121,6 +86,7 @@ def disturbed(
     least: float,
     most: int,
     largest: Float[np.ndarray, " p+m"] | None = None,
+    rounding: Sequence[float] = (),
 ) -> Disturbed:
     """The likeliest noise along a flow: one disturbance after the other is taken up, whichever gains most.
 
@@ -133,9 +99,10 @@ def disturbed(
         least: nats that a disturbance has to gain.
         most: disturbances at most.
         largest: plausible size of a disturbance of each rate and each output, in their units; None for any.
+        rounding: least size of each output's white noise, unless it is known; none for any.
     """
     p, m = flow.rates, len(channels)
-    best = NoiseModel(tuple(floor.tolist()), (), tuple(known))
+    best = NoiseModel(tuple(floor.tolist()), (), tuple(known), tuple(rounding))
     best, value = _white(flow, best)
     gains: list[float] = []
     for _ in range(most):
@@ -158,7 +125,7 @@ def disturbed(
     if len(gains) < 2:
         return found
     # one may have stood for another that was found later
-    fewer = resized(flow, names, channels, found, least, largest)
+    fewer = resized(flow, names, channels, found, least, largest, rounding)
     return fewer if len(fewer.disturbances) < len(gains) else found
 
 
@@ -169,6 +136,7 @@ def resized(
     known: Disturbed,
     least: float,
     largest: Float[np.ndarray, " p+m"] | None = None,
+    rounding: Sequence[float] = (),
 ) -> Disturbed:
     """The same disturbances at the sizes that they have along another flow, without those that are needless there.
 
@@ -177,11 +145,12 @@ def resized(
         names, channels: as of :func:`disturbed`.
         known: the disturbances.
         least: nats that each has to gain.
-        largest: as of :func:`disturbed`.
+        largest, rounding: as of :func:`disturbed`.
     """
     places = [*names, *channels]
-    pushes = tuple((_place(places, one, len(names)), one.size, one.lasting) for one in known.disturbances)
-    noise = NoiseModel(tuple(known.sensor.tolist()), pushes, known.declared)
+    pushes = tuple((place_of(places, one, len(names)), one.size, one.lasting) for one in known.disturbances)
+    noise = NoiseModel(tuple(known.sensor.tolist()), pushes, known.declared, tuple(rounding))
+    noise = noise.no_lower()
     tried = [replace(noise, pushes=tuple((a, share * s, t) for a, s, t in pushes)) for share in _SHARES]
     number, scale = _likeliest(flow, tried, largest)
     best = _finer(flow, _scaled(tried[number], scale), largest)
@@ -292,7 +261,8 @@ def _likelihoods(flow: Flow, noises: Sequence[NoiseModel]) -> tuple[np.ndarray, 
     check_deadline()
     parts = _parts(flow)
     found = filtered(parts, filter_models(flow, noises))
-    return robust_likelihood(found, parts.mine, flow.reach, free=not any(noises[0].known))
+    least = np.array([noise.least_scale for noise in noises])
+    return robust_likelihood(found, parts.mine, flow.reach, free=not any(noises[0].known), least=least)
 
 
 def _likeliest(
@@ -314,7 +284,8 @@ def _likeliest(
 def _exactly(flow: Flow, noise: NoiseModel) -> tuple[float, float]:
     """The same of one, in one stretch: without a push there is nothing that corrects a filter which begins inside."""
     found = filtered_whole(flow, filter_models(flow, [noise]))
-    values, scales = robust_likelihood(found, flow.counts[:, None], flow.reach, free=not any(noise.known))
+    free, least = not any(noise.known), noise.least_scale
+    values, scales = robust_likelihood(found, flow.counts[:, None], flow.reach, free=free, least=least)
     return float(values[0]), float(scales[0])
 
 
@@ -336,7 +307,8 @@ def _white(flow: Flow, noise: NoiseModel) -> tuple[NoiseModel, float]:
             float(np.median(np.abs(one[used > 0])) / 0.6745) for one, used in zip(new.T, flow.counts.T, strict=True)
         ]
         typical = [max(size, 1e-300) for size in sizes]
-        noise = min((noise, replace(noise, sensor=tuple(typical))), key=lambda one: -_exactly(flow, one)[0])
+        other = replace(noise, sensor=tuple(typical)).no_lower()
+        noise = min((noise, other), key=lambda one: -_exactly(flow, one)[0])
     value, scale = _exactly(flow, noise)
     return _scaled(noise, scale), value
 
@@ -359,6 +331,7 @@ def _finer(flow: Flow, noise: NoiseModel, largest: Float[np.ndarray, " p+m"] | N
                 others += [(place, size, f**power * lasting) for f in _FINER if f != 1.0]
                 others += [(place, f ** (0.5 * power) * size, lasting / f**power) for f in _FINER if f != 1.0]
             tried += [replace(noise, pushes=(*noise.pushes[:d], one, *noise.pushes[d + 1 :])) for one in others]
+        tried = [one.no_lower() for one in tried]
         number, scale = _likeliest(flow, tried, largest)
         noise = _scaled(tried[number], scale)
         if number == 0:
@@ -427,10 +400,5 @@ def models_of(
     channels: Sequence[str],
 ) -> Models:
     places = [*names, *channels]
-    pushes = tuple((_place(places, one, len(names)), one.size, one.lasting) for one in disturbances)
+    pushes = tuple((place_of(places, one, len(names)), one.size, one.lasting) for one in disturbances)
     return filter_models(flow, [NoiseModel(tuple(sensor.tolist()), pushes, (False,) * len(channels))])
-
-
-def _place(places: Sequence[str], one: Disturbance, rates: int) -> int:
-    """Number of a disturbance's place; a state and an output may have one name."""
-    return places.index(one.place) if one.at_rate else rates + places[rates:].index(one.place)

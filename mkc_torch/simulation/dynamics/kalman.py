@@ -344,6 +344,7 @@ def robust_likelihood(
     reach: Float[np.ndarray, " m"],
     *,
     free: bool = True,
+    least: Float[np.ndarray, " B"] | float = 0.0,
 ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"]]:
     """Log-likelihood of each model with a few outliers among the innovations, and its scale: profiled out, or one.
 
@@ -355,6 +356,7 @@ def robust_likelihood(
         counts: which innovations count.
         reach: how far from what is predicted an outlier may be.
         free: whether the scale is profiled out.
+        least: scale of each model at least, where it is.
     """
     B = found.standard.shape[2]
     used = counts > 0
@@ -370,6 +372,7 @@ def robust_likelihood(
         before, scale = scale, np.sqrt(np.maximum((inner * square).sum(-1) / inner.sum(-1), 1e-300))
         if np.abs(scale / before - 1.0).max() < _SETTLED:
             break
+    scale = np.maximum(scale, least) if free else scale
     log = np.log(scale)[:, None]
     normal = -0.5 * square / scale[:, None] ** 2 - log - spread
     return np.logaddexp(normal, odds - spread).sum(-1), scale

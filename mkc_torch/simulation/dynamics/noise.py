@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mkc_torch._support.quantum import rounding_of
 from mkc_torch.simulation.dynamics.disturbances import Disturbed, disturbed, models_of, observer_of, resized
 from mkc_torch.simulation.dynamics.first_fit import floor_of, without_noise
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
@@ -45,6 +46,8 @@ def likeliest_noise(
 ) -> NoiseOfTheWorld | None:
     """The likeliest noise along a simulation's trajectory; None where there is no trajectory.
 
+    White noise that is not declared is nowhere smaller than what the recording's steps add.
+
     Args:
         prepared: the simulation, free or observed.
         theta, changes, near: of its trajectory.
@@ -57,17 +60,17 @@ def likeliest_noise(
         return None
     names, channels = prepared.pushable, prepared.channels
     largest = plausible_sizes(prepared, theta, changes, near)
+    rounding = rounding_of(prepared.measured).tolist()
     if known is not None and known.disturbances:
-        found = resized(flow, names, channels, known, least, largest)
+        found = resized(flow, names, channels, known, least, largest, rounding)
         return NoiseOfTheWorld(found, observer_of(flow, found.disturbances, found.sensor, names, channels))
     floor = floor_of(prepared)
     if without_noise(floor):
         return None
     given = [name in declared for name in prepared.channels]
-    sensor = floor.new_tensor(
-        [declared.get(name, float(one)) for name, one in zip(prepared.channels, floor, strict=True)]
-    )
-    found = disturbed(flow, names, channels, sensor, given, least, most, largest)
+    white = [max(size, step) for size, step in zip(floor.tolist(), rounding, strict=True)]
+    sensor = floor.new_tensor([declared.get(name, one) for name, one in zip(channels, white, strict=True)])
+    found = disturbed(flow, names, channels, sensor, given, least, most, largest, rounding)
     return NoiseOfTheWorld(found, observer_of(flow, found.disturbances, found.sensor, names, channels))
 
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mkc_torch.simulation.dynamics.disturbances import NoiseModel, longest_run, usual_size
+from mkc_torch.simulation.dynamics.disturbances import longest_run, usual_size
 from mkc_torch.simulation.dynamics.kalman import Flow
+from mkc_torch.simulation.dynamics.noise_model import NoiseModel
 
 __all__ = ["NoiseGrid", "key_of"]
 
@@ -86,6 +87,7 @@ class NoiseGrid:
                 found += [
                     replace(model, sensor=(*model.sensor[:j], f * model.sensor[j], *model.sensor[j + 1 :]))
                     for f in (factor, 1.0 / factor)
+                    if not model.floor or f * model.sensor[j] >= model.floor[j]
                 ]
         return [one for one in found if self.plausible(one)]
 

@@ -166,8 +166,8 @@ class PreparedDynamics(Watched):
 
     @property
     def beginnings(self) -> int:
-        """Number of the parameters that are states at the start of a run; they come last."""
-        return len(self.parameter_names) - self._p
+        """Number of the parameters that are of a run or a recording: its offsets, its first states; they come last."""
+        return len(self.parameter_names) - self._p + len(self.own_offsets)
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
         return self.observed(None)._start.clone()

@@ -12,6 +12,7 @@ from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.observer import Correcting, Disturbance, Observer
 from mkc_torch.simulation.dynamics.user_functions import namespace
 from mkc_torch.simulation.names import Names
+from mkc_torch.simulation.own_offsets import OwnOffset
 from mkc_torch.simulation.protocol import Changes
 
 if TYPE_CHECKING:
@@ -48,6 +49,12 @@ class Watched:
     def remembering(self, changes: Changes) -> dict[str, Mapping[str, str]]:
         """Ports at which an effect brings internal states, with these: one that adds their rates when it sees them."""
         raise NotImplementedError
+
+    @property
+    def own_offsets(self) -> tuple[OwnOffset, ...]:
+        """Offsets of outputs that each recording has of its own; the last ones of the equations' parameters."""
+        found: tuple[OwnOffset, ...] = getattr(self.system, "own_offsets", ())
+        return found
 
     @property
     def pushable(self) -> tuple[str, ...]:

@@ -1,11 +1,13 @@
 """Restricted log-likelihoods with and without candidates, against regressions written out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mkc_torch.diagnosis.search import likelihoods
 from mkc_torch.diagnosis.search.likelihoods import PRICE, Columns, log_likelihoods
-from mkc_torch.simulation.dynamics.disturbances import NoiseModel
+from mkc_torch.simulation.dynamics.noise_model import NoiseModel
 from mkc_torch.simulation.dynamics.whitening import SeriesAlong
 from tests.simulation.dynamics.test_whitening import oscillator
 
@@ -96,3 +98,14 @@ def test_a_declared_noise_has_no_free_scale():
     free = log_likelihoods(flow, [WHITE], series(y), columns).without
     assert ((one - other) > 20.0).all()
     assert (free > one).all()
+
+
+def test_the_scale_is_no_smaller_than_the_floor_of_the_noise_model():
+    flow, y, _, _, columns = scene()
+    free = log_likelihoods(flow, [WHITE], series(y), columns)
+    held = log_likelihoods(flow, [replace(WHITE, floor=(2.0,))], series(y), columns)
+    assert free.scale.max() < 4.0
+    np.testing.assert_array_equal(held.scale, np.full_like(held.scale, 4.0))
+    assert (held.without < free.without).all()
+    loose = log_likelihoods(flow, [replace(WHITE, floor=(1e-6,))], series(y), columns)
+    np.testing.assert_array_equal(loose.without, free.without)

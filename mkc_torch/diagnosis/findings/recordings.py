@@ -1,0 +1,59 @@
+"""What is told of each of several recordings: its runs, and the offsets of its outputs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from mkc_torch.diagnosis.follows import units_of
+from mkc_torch.diagnosis.linearised.estimate import Estimate
+from mkc_torch.diagnosis.world import Offset, Run
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+from mkc_torch.simulation.own_offsets import OwnOffset
+from mkc_torch.simulation.protocol import PreparedSimulation
+
+__all__ = ["offsets_of", "runs_of"]
+
+
+def offsets_of(final: Estimate, names: Sequence[str]) -> tuple[Offset, ...]:
+    """The offsets of each output in each recording; none of an output that no recording has a fitted one of.
+
+    Args:
+        final: the fit with all findings.
+        names: of the recordings.
+    """
+    prepared = final.fit.model.prepared
+    own: tuple[OwnOffset, ...] = getattr(prepared, "own_offsets", ())
+    units, error = dict(zip(prepared.channels, units_of(prepared), strict=True)), final.standard_error
+    row = {name: k for k, name in enumerate(prepared.parameter_names)}
+    fitted = {(one.output, one.recording): row[one.name] for one in own}
+    told = []
+    for output in dict.fromkeys(one.output for one in own):
+        for number, name in enumerate(names):
+            at = fitted.get((output, number))
+            value = 0.0 if at is None else float(final.fit.parameters[at])
+            told.append(
+                Offset(output, units[output], number + 1, name, value, math.nan if at is None else float(error[at]))
+            )
+    return tuple(told)
+
+
+def runs_of(prepared: PreparedSimulation, names: Sequence[str], counts: Sequence[int]) -> tuple[Run, ...]:
+    """The runs that findings give shares of, in their order; none of a single one, or where runs are not known.
+
+    Args:
+        prepared: the simulation.
+        names: of the recordings; none for a single one.
+        counts: how many runs each recording holds; none for a single one.
+    """
+    if not isinstance(prepared, PreparedDynamics) or int(prepared.run.max()) < 1:
+        return ()
+    if not names:
+        return tuple(Run(0, "", number + 1) for number in range(int(prepared.run.max()) + 1))
+    each = [
+        Run(number, name, run + 1 if count > 1 else 0)
+        for number, (name, count) in enumerate(zip(names, counts, strict=True), start=1)
+        for run in range(count)
+    ]
+    first = (prepared.run.diff(prepend=prepared.run[:1] - 1) != 0).nonzero().flatten()
+    return tuple(each[int(one)] for one in prepared.recording["experiment"][first])
