@@ -72,6 +72,8 @@ class Effect(ABC):
         unrecorded: whether it is a course along time that stands for a cause in no column; default False.
         remembers: whether its change at a moment depends on the signal at other moments; of effects in series on an
             input or an output those act first. Default False.
+        settles: parts of the clocks, "offset" or "rate", that it is the same as where it acts on all outputs: beside it
+            the simulation's own are held. Default none.
 
     Of its amplitude and its shape:
 
@@ -133,6 +135,7 @@ class Effect(ABC):
     general: bool = False
     unrecorded: bool = False
     remembers: bool = False
+    settles: tuple[str, ...] = ()
 
     least: float = -math.inf
     most: float = math.inf
