@@ -13,6 +13,8 @@ from torch import Tensor
 
 from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch.simulation.dynamics.kalman import Flow, Models, Parts, filtered, robust_likelihood
+from mkc_torch.simulation.dynamics.likeliest_sizes import likeliest_sizes
+from mkc_torch.simulation.dynamics.noise_model import NoiseModel, filter_models, longest_run, place_of
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer
 from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
 
@@ -21,10 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Disturbed",
-    "NoiseModel",
     "disturbed",
-    "filter_models",
-    "longest_run",
     "models_of",
     "observer_of",
     "resized",
@@ -77,41 +76,6 @@ class Disturbed:
     declared: tuple[bool, ...]
 
 
-@dataclass(frozen=True)
-class NoiseModel:
-    """A model of the noise.
-
-    Attributes:
-        sensor: standard deviation of each output's white noise, in its unit.
-        pushes: disturbances: the number of the rate, or of an output after all rates; the standard deviation in the
-            unit of that rate or output; the time constant in s, 0 for one that is new at each sample.
-        known: of each output whether its white noise is declared.
-    """
-
-    sensor: tuple[float, ...]
-    pushes: tuple[tuple[int, float, float], ...] = ()
-    known: tuple[bool, ...] = ()
-
-    def disturbances(self, rates: Sequence[str], outputs: Sequence[str], scale: float = 1.0) -> tuple[Disturbance, ...]:
-        """The disturbances by the names of rates and outputs, their sizes times a scale."""
-        names, p = (*rates, *outputs), len(rates)
-        return tuple(Disturbance(names[a], a < p, lasting, scale * size) for a, size, lasting in self.pushes)
-
-    @classmethod
-    def of(
-        cls,
-        disturbances: Sequence[Disturbance],
-        sensor: Sequence[float],
-        rates: Sequence[str],
-        outputs: Sequence[str],
-        known: Sequence[bool] = (),
-    ) -> NoiseModel:
-        """The model with these disturbances."""
-        places = (*rates, *outputs)
-        pushes = tuple((_place(places, one, len(rates)), one.size, one.lasting) for one in disturbances)
-        return cls(tuple(sensor), pushes, tuple(known) or (False,) * len(outputs))
-
-
 def disturbed(
     flow: Flow,
     names: Sequence[str],
@@ -154,7 +118,7 @@ def disturbed(
             break
         gains.append(more - value)
         best, value = _scaled(other, scale), more
-    found = _told(best, gains, flow, names, channels, floor, value)
+    found = _told(best, gains, flow, names, channels, floor, value, largest)
     if len(gains) < 2:
         return found
     # one may have stood for another that was found later
@@ -180,7 +144,7 @@ def resized(
         largest: as of :func:`disturbed`.
     """
     places = [*names, *channels]
-    pushes = tuple((_place(places, one, len(names)), one.size, one.lasting) for one in known.disturbances)
+    pushes = tuple((place_of(places, one, len(names)), one.size, one.lasting) for one in known.disturbances)
     noise = NoiseModel(tuple(known.sensor.tolist()), pushes, known.declared)
     tried = [replace(noise, pushes=tuple((a, share * s, t) for a, s, t in pushes)) for share in _SHARES]
     number, scale = _likeliest(flow, tried, largest)
@@ -197,7 +161,7 @@ def resized(
             break
         best, value = less[weakest][0], less[weakest][1]
         gains = []
-    return _told(best, gains, flow, names, channels, known.sensor, value)
+    return _told(best, gains, flow, names, channels, known.sensor, value, largest)
 
 
 def _told(
@@ -208,11 +172,15 @@ def _told(
     channels: Sequence[str],
     like: Float[Tensor, " m"],
     value: float,
+    largest: Float[np.ndarray, " p+m"] | None,
 ) -> Disturbed:
+    """What was found, at the likeliest sizes."""
     places, p = (*names, *channels), flow.rates
+    noise, errors = likeliest_sizes(flow, noise, largest)
+    value = _exactly(flow, noise)[0] if errors else value
     found = tuple(Disturbance(places[place], place < p, lasting, size) for place, size, lasting in noise.pushes)
     sensor = like.new_tensor(noise.sensor)
-    return Disturbed(found, _errors(flow, noise), tuple(gains), sensor, value, noise.known)
+    return Disturbed(found, errors, tuple(gains), sensor, value, noise.known)
 
 
 def _candidates(flow: Flow, known: NoiseModel, places: int) -> list[tuple[int, float, float]]:
@@ -233,13 +201,6 @@ def _candidates(flow: Flow, known: NoiseModel, places: int) -> list[tuple[int, f
             if not any(one[0] == place and one[2] == time for one in known.pushes):
                 found += [(place, size * unit, time) for size in _SIZES if math.isfinite(size * unit)]
     return found
-
-
-def longest_run(flow: Flow) -> float:
-    """Length of the longest run in s."""
-    ends = np.flatnonzero(np.concatenate([flow.step <= 0, [True]]))
-    total = np.concatenate([[0.0], flow.step.cumsum()])
-    return float(np.diff(np.concatenate([[0.0], total[ends]])).max())
 
 
 _REACH = 400
@@ -268,23 +229,6 @@ def usual_size(flow: Flow, place: int, lasting: float, sensor: Float[np.ndarray,
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             most = max(most, float((np.sqrt(power) / sensor).max()))
     return 1.0 / most if 0.0 < most < math.inf else math.inf
-
-
-def filter_models(flow: Flow, noises: Sequence[NoiseModel]) -> Models:
-    p = flow.rates
-    D = max(sum(1 for one in noise.pushes if one[2] > 0) for noise in noises)
-    B = len(noises)
-    white, place = np.zeros((B, p)), np.zeros((B, D), dtype=int)
-    size, lasting = np.zeros((B, D)), np.ones((B, D))
-    for row, noise in enumerate(noises):
-        slot = 0
-        for at, one, time in noise.pushes:
-            if time > 0:
-                place[row, slot], size[row, slot], lasting[row, slot] = at, one, time
-                slot += 1
-            else:
-                white[row, at] = one
-    return Models(white, place, size, lasting, np.array([noise.sensor for noise in noises]))
 
 
 def _likelihoods(flow: Flow, noises: Sequence[NoiseModel]) -> tuple[np.ndarray, np.ndarray]:
@@ -366,20 +310,6 @@ def _finer(flow: Flow, noise: NoiseModel, largest: Float[np.ndarray, " p+m"] | N
     return noise
 
 
-def _errors(flow: Flow, noise: NoiseModel) -> tuple[float, ...]:
-    """Of the logarithm of each size, by the curvature of the likelihood."""
-    if not noise.pushes:
-        return ()
-    away, tried = 0.3, []
-    for d, (place, size, lasting) in enumerate(noise.pushes):
-        for sign in (-1.0, 1.0):
-            one = (place, size * math.exp(sign * away), lasting)
-            tried.append(replace(noise, pushes=(*noise.pushes[:d], one, *noise.pushes[d + 1 :])))
-    (value, *values), _ = _likelihoods(flow, [noise, *tried])
-    curves = [(2.0 * value - values[2 * d] - values[2 * d + 1]) / away**2 for d in range(len(noise.pushes))]
-    return tuple(1.0 / math.sqrt(curve) if curve > 0 else math.inf for curve in curves)
-
-
 def observer_of(
     flow: Flow,
     disturbances: tuple[Disturbance, ...],
@@ -427,10 +357,5 @@ def models_of(
     channels: Sequence[str],
 ) -> Models:
     places = [*names, *channels]
-    pushes = tuple((_place(places, one, len(names)), one.size, one.lasting) for one in disturbances)
+    pushes = tuple((place_of(places, one, len(names)), one.size, one.lasting) for one in disturbances)
     return filter_models(flow, [NoiseModel(tuple(sensor.tolist()), pushes, (False,) * len(channels))])
-
-
-def _place(places: Sequence[str], one: Disturbance, rates: int) -> int:
-    """Number of a disturbance's place; a state and an output may have one name."""
-    return places.index(one.place) if one.at_rate else rates + places[rates:].index(one.place)

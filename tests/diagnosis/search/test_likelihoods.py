@@ -5,7 +5,7 @@ import pytest
 
 from mkc_torch.diagnosis.search import likelihoods
 from mkc_torch.diagnosis.search.likelihoods import PRICE, Columns, log_likelihoods
-from mkc_torch.simulation.dynamics.disturbances import NoiseModel
+from mkc_torch.simulation.dynamics.noise_model import NoiseModel
 from mkc_torch.simulation.dynamics.whitening import SeriesAlong
 from tests.simulation.dynamics.test_whitening import oscillator
 
