@@ -38,6 +38,8 @@ def _coast(noise: float) -> ByHand:
 
 
 _MODE = {("hidden_mode", "share"): 0.833, ("hidden_mode", "period"): 0.1405, ("hidden_mode", "damping"): 0.0224}
+_LIGHT = ("Baseball", "Blue_Basketball", "Green_Basketball", "Orange_Whiffle_Ball", "Yellow_Whiffle_Ball")
+_LIGHTER = ("Tennis_Ball", "Volleyball", "Whiffle_Ball_1", "Whiffle_Ball_2")
 _PUSH = "no physics: an unrecorded push"
 
 BY_HAND: Mapping[str, ByHand] = {
@@ -80,9 +82,14 @@ BY_HAND: Mapping[str, ByHand] = {
     "cases simulated/gusts run Pendulum": ByHand(_PUSH),
     "cases simulated/unrelated run Pendulum": ByHand("all: the output is unrelated"),
     "cases simulated/held_input run UpsideDown": ByHand("gravity's sign is wrong"),
+    **{f"data falling_balls {name} Ball": ByHand("air drag") for name in (*_LIGHT, *_LIGHTER)},
     "data heaters run_1s Heaters": ByHand("exchange between the heaters, a sensor's lag"),
     "data broad_34_attached_magnet_3cm": ByHand("a magnet that is taken off"),
     "data broad_36_attached_magnet_5cm": ByHand("a magnet that is taken off"),
+    "data silverbox Silverbox": ByHand("a cubic spring", residual={"output": 0.000355}),
+    "data servo Servo": ByHand("dry friction that grows with load"),
+    "data broad_21_undisturbed_fast": ByHand("the room's field varies"),
+    "data quadrotor_compass1": ByHand("the recorded heading jumps"),
     "data quadrotor_compass3": ByHand("the current's field"),
 }
 """By the recording's name; a recording that is not here has nothing left out."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import runpy
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Request
 
@@ -49,13 +52,22 @@ class Expected:
 
 @dataclass(frozen=True)
 class Known:
-    """A recording, its simulation as ``FILE.py:CLASS`` or the file of a simulator's output, and the right answer."""
+    """A recording, its simulation as ``FILE.py:CLASS`` or the file of a simulator's output, and the right answer.
+
+    Attributes:
+        name: what the table calls it.
+        recording: its file, or the file or folder that ``cut`` makes it of.
+        simulation, expected: as above.
+        between: what inputs do between samples, where it is not left to the diagnosis.
+        cut: the columns to diagnose, of ``recording``; None for all of it as it is.
+    """
 
     name: str
     recording: Path
     simulation: str
     expected: Expected
     between: Mapping[str, str] = field(default_factory=dict)
+    cut: Callable[[Path], Mapping[str, Any]] | None = None
 
     @property
     def file(self) -> Path:
@@ -64,12 +76,31 @@ class Known:
             return self.recording
         return Path(self.simulation.rpartition(":")[0] or self.simulation)
 
+    def file_in(self, folder: Path) -> Path:
+        """The file to diagnose; what is cut is written into a folder."""
+        if self.cut is None:
+            return self.recording
+        from mkc_torch.recording.recording import write_table
+
+        file = folder / "recording.csv"
+        write_table(file, self.cut(self.recording), overwrite=True)
+        return file
+
     @property
     def request(self) -> Request:
         if self.simulation.endswith(".csv"):
             return Request(simulation="", simulated=self.file, force=True, report=False)
         return Request(simulation=self.simulation, between=self.between, force=True, report=False)
 
+
+SYSTEMS = Path(__file__).resolve().parent / "dynamics" / "systems.py"
+"""Simulations of the recordings in ``data``."""
+
+_COLOURED = ("Blue_Basketball", "Green_Basketball", "Orange_Whiffle_Ball", "Yellow_Whiffle_Ball")
+HEAVY = ("Bowling_Ball", "Golf_Ball")
+"""Balls whose drag is too small to be seen in a drop."""
+
+BALLS = ("Baseball", *_COLOURED, "Tennis_Ball", "Volleyball", "Whiffle_Ball_1", "Whiffle_Ball_2", *HEAVY)
 
 DRAG = "quadratic_drag"
 CURVE = "unknown"
@@ -145,17 +176,44 @@ def _simulated(folder: Path) -> Iterator[Known]:
 def data(shared: Path = SHARED) -> Iterator[Known]:
     """Public recordings with known missing physics that are read as they are, in a folder like :data:`SHARED`."""
     folder = shared / "data"
-    systems = Path(__file__).resolve().parent / "dynamics" / "systems.py"
+    dynamics = folder / "dynamics"
     coupled = Expected((("coupling",), LATE), refused=("thermal_loss",))
-    yield Known(
-        "data heaters run_1s Heaters", folder / "dynamics" / "heaters" / "run_1s.csv", f"{systems}:Heaters", coupled
-    )
+    yield Known("data heaters run_1s Heaters", dynamics / "heaters" / "run_1s.csv", f"{SYSTEMS}:Heaters", coupled)
+    drops = dynamics / "falling_balls" / "ball_drops.csv"
+    for name in BALLS:
+        drag = Expected() if name in HEAVY else Expected(((DRAG, "linear_drag"),))
+        yield Known(f"data falling_balls {name} Ball", drops, f"{SYSTEMS}:Ball", drag, cut=partial(first_drop, name))
+    spring = Expected((("cubic_stiffness",),))
+    resonator = dynamics / "silverbox" / "silverbox.csv"
+    yield Known("data silverbox Silverbox", resonator, f"{SYSTEMS}:Silverbox", spring, cut=multisine)
+    friction = Expected((("coulomb_friction", "load_dependent_friction", "stribeck_friction"),))
+    yield Known("data servo Servo", dynamics / "servo", f"{SYSTEMS}:Servo", friction, cut=driven_servo)
     step = Expected((("hard_iron_step",),))
     for name in ("broad_34_attached_magnet_3cm", "broad_36_attached_magnet_5cm"):
         yield Known(f"data {name}", folder / "magnetometer" / f"{name}.csv", MAGNETOMETER, step)
-    current = Expected((("current_field",),))
-    name = "quadrotor_compass3"
-    yield Known(f"data {name}", folder / "magnetometer" / f"{name}.csv", MAGNETOMETER, current)
+    others = {"broad_21_undisturbed_fast": "field_gradient", "quadrotor_compass1": "heading_reset"}
+    for name, effect in (others | {"quadrotor_compass3": "current_field"}).items():
+        yield Known(f"data {name}", folder / "magnetometer" / f"{name}.csv", MAGNETOMETER, Expected(((effect,),)))
+
+
+def first_drop(ball: str, drops: Path) -> Mapping[str, Any]:
+    """A ball's first drop of two."""
+    from mkc_torch import Recording
+
+    drop = Recording.read(drops).experiments()[f"{ball}/1"]
+    return {"time": drop["time"], "height": drop["height"]}
+
+
+def multisine(table: Path) -> Mapping[str, Any]:
+    """The part of a multisine that the Silverbox is learned from."""
+    found: Mapping[str, Any] = runpy.run_path(str(SYSTEMS))["silverbox"](table.parents[1]).train.columns
+    return found
+
+
+def driven_servo(folder: Path) -> Mapping[str, Any]:
+    """The servo's runs at two gains of its controller, in one table."""
+    found: Mapping[str, Any] = runpy.run_path(str(SYSTEMS))["servo"](folder.parent).train.columns
+    return found
 
 
 def _known(

@@ -11,7 +11,8 @@ The recordings, real and simulated, lie beside the project; one that is absent i
     bound      that of the fit by hand
     CPU        seconds of the diagnosis
 
-Balls, the Silverbox and the servo of `shared/data` have commands of their own in the folder `dynamics`.
+A search that runs into `--limit` is stopped; its row has what was known then and says so. What the balls, the heaters,
+the Silverbox and the servo of `shared/data` predict of runs that are not diagnosed here, the folder `dynamics` shows.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def diagnosed(task: tuple[Known, Path, float]) -> tuple[str, dict[str, Any]]:
 
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            write_row(one.recording, replace(one.request, time_limit=limit_s), folder)
+            write_row(one.file_in(folder), replace(one.request, time_limit=limit_s), folder)
         except Exception as error:  # a fault of a recording costs its row, not the table
             return one.name, {**NOTHING, "failed": f"{type(error).__name__}: {error}"}
     found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
@@ -85,7 +86,7 @@ def line(one: Known, row: Mapping[str, Any], hand: ByHand) -> list[str]:
     return [
         one.name,
         hand.left_out,
-        f"{names} ({'right' if right else 'wrong'})",
+        f"{names} ({'right' if right else 'wrong'}){stopped(row)}",
         located(claimed, hand),
         sizes(row, hand),
         "; ".join(bias(row["parameters"], hand)) or "-",
@@ -93,6 +94,12 @@ def line(one: Known, row: Mapping[str, Any], hand: ByHand) -> list[str]:
         "; ".join(f"{output} {value:.3g}" for output, value in hand.residual.items()) or "-",
         "-" if row["cpu_seconds"] is None else f"{row['cpu_seconds']:.0f}",
     ]
+
+
+def stopped(row: Mapping[str, Any]) -> str:
+    """That the search was stopped, and after how long."""
+    told = row.get("stopped")
+    return f", search stopped after {told['seconds']:.0f} s" if told else ""
 
 
 def located(claimed: Sequence[Mapping[str, Any]], hand: ByHand) -> str:
@@ -138,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, default=SHARED, help="folder with real, cases and data")
     parser.add_argument("--only", default="", help="recordings whose name has this text in it")
     parser.add_argument("--output", type=Path, default=Path("known"), help="folder; rows that are there are kept")
-    parser.add_argument("--limit", type=float, default=300.0, help="wall seconds after which a search is stopped")
+    parser.add_argument("--limit", type=float, default=300.0, help="seconds after which each search is stopped")
     options = parser.parse_args(arguments)
     os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that begin below
     chosen = {one.name: one for one in recordings(options.data, options.only)}

@@ -38,6 +38,7 @@ def row(folder: Path, recording: Path, request: Request) -> dict[str, Any]:
         "residual_after": _open_loop(folder / "model.json", recording, request) if content else {},
         "parameters": _parameters(folder / "model.json", request) if content else {},
         "sentences": [*content.get("advice", ()), *content.get("warnings", ())],
+        "stopped": (content.get("search") or {}).get("stopped"),
     }
 
 

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 
-__all__ = ["duration", "quotient", "ratio", "sized", "tidy"]
+__all__ = ["duration", "quotient", "ratio", "share_of", "sized", "tidy"]
 
 _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -53,6 +53,18 @@ def duration(seconds: float) -> str:
 _DAY = 86400.0
 _TIMES = (120.0, 1.0, "s"), (7200.0, 60.0, "min"), (2.0 * _DAY, 3600.0, "h")
 """Below how many seconds a time is told in a unit, the unit's seconds, and the unit."""
+
+
+def share_of(value: float) -> str:
+    """A share in percent, or as so many times where it is more.
+
+    Example:
+        >>> share_of(0.382), share_of(3.14)
+        ('38 %', '3.1 times the size')
+    """
+    percent = value < 2.0
+    told = sized(float(f"{100.0 * value if percent else value:.2g}"))
+    return f"{told} %" if percent else f"{told} times the size"
 
 
 def tidy(unit: str) -> str:

@@ -38,7 +38,7 @@ def as_html(
     first = term(_VERDICTS[verdict]) if stop is None else term("verdict.unfinished")
     below = [first, *(typeset(one) for one in sentences)]
     for finding in findings:
-        below = [one.replace(finding.effect, words_of(finding.effect)) for one in below]
+        below = [one.replace(finding.effect, words_of(finding.effect, finding.kind)) for one in below]
     return html_table(names, heads, rows, below)
 
 
@@ -46,4 +46,4 @@ def _row(f: Finding) -> tuple[str, ...]:
     drivers = f" ({', '.join(plain(name) for name in f.drivers)})" if f.drivers else ""
     held = f.held_out
     change = "" if held is None else f"{held.rmse_before:.3g} → {held.rmse_after:.3g} {plain(held.unit)}".rstrip()
-    return words_of(f.effect) + drivers, f.grade, "" if f.p_value is None else f"{f.p_value:.2g}", change
+    return words_of(f.effect, f.kind) + drivers, f.grade, "" if f.p_value is None else f"{f.p_value:.2g}", change

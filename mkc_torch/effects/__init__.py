@@ -74,17 +74,24 @@ CATALOGUE: tuple[Effect, ...] = (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED)
 """All effects; each is tried where a simulation has its port."""
 
 _WORDS = {effect.id: effect.words for effect in CATALOGUE}
+_WORDS_BY_KIND = {(effect.id, kind): name for effect in CATALOGUE for kind, name in effect.words_by_kind.items()}
 _CURVES = frozenset(effect.id for effect in CATALOGUE if effect.is_curve)
 
 
-def words_of(effect_id: str) -> str:
+def words_of(effect_id: str, kind: str = "") -> str:
     """The name of an effect in words, as a report tells it; of a user's own, its id in words.
 
+    Args:
+        effect_id: its id.
+        kind: of the quantity that it acts on, such as "temperature", see :func:`kind_of`; empty if not known.
+
     Example:
+        >>> words_of("linear_drag"), words_of("linear_drag", "temperature")
+        ('linear drag', 'loss of heat')
         >>> words_of("hard_iron_step"), words_of("coulomb_friction"), words_of("unknown"), words_of("supply_offset")
         ('hard-iron step', 'Coulomb friction', 'an effect outside the catalogue', 'supply offset')
     """
-    return _WORDS.get(effect_id) or in_words(effect_id)
+    return _WORDS_BY_KIND.get((effect_id, kind)) or _WORDS.get(effect_id) or in_words(effect_id)
 
 
 def is_curve(effect_id: str) -> bool:

@@ -43,6 +43,8 @@ class Effect(ABC):
         id: its name in ``diagnosis.json`` and ``model.json``; every effect needs one.
         words: its name in a sentence; default the id in words, see :func:`in_words`. A report knows the id alone, and
             tells an effect that is not in the catalogue by its id in words.
+        words_by_kind: that name by the kind of quantity that it acts on, where the plain one does not suit it; default
+            none.
         equation: what it adds, in symbols; :meth:`equation_of` where the shape chooses its form.
         explanation: a sentence on what happens.
         advice: a sentence on what to do about it.
@@ -72,6 +74,8 @@ class Effect(ABC):
         unrecorded: whether it is a course along time that stands for a cause in no column; default False.
         remembers: whether its change at a moment depends on the signal at other moments; of effects in series on an
             input or an output those act first. Default False.
+        settles: parts of the clocks, "offset" or "rate", that it is the same as where it acts on all outputs: beside it
+            the simulation's own are held. Default none.
 
     Of its amplitude and its shape:
 
@@ -116,6 +120,7 @@ class Effect(ABC):
     explanation: str = ""
     advice: str = ""
     by_kind: Mapping[str, tuple[str, str]] = {}
+    words_by_kind: Mapping[str, str] = {}
     again: str = ""
     source: str = ""
     plausible: float = math.inf
@@ -133,6 +138,7 @@ class Effect(ABC):
     general: bool = False
     unrecorded: bool = False
     remembers: bool = False
+    settles: tuple[str, ...] = ()
 
     least: float = -math.inf
     most: float = math.inf

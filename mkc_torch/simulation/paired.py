@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -30,14 +30,19 @@ _FREE = 2.0
 _SAME = 1e-9
 _FEWEST = 2
 
+_HELD = 1e8
+"""Precision of what is held, over that of a clock."""
+
 
 class Paired:
     """What a simulator wrote, compared with a recording in all columns that both have, at the recording's times.
 
     Between the simulator's moments its columns go along cubic polynomials. The two clocks may differ: by an offset, of
     each run, with a standard deviation of half a sampling interval, and by a rate of 50 ppm. Both are fitted, to twice
-    that at most; what is more is no matter of clocks and is found as ``delay`` or ``clock_drift``. A column that is the
-    same in both is an input of the simulator and not compared, but can drive effects.
+    that at most; what is more is no matter of clocks and is found as ``delay`` or ``clock_drift``. Beside a delay of
+    all outputs the clocks' offset is 0, in the mean of all runs, and beside a drift their rate, so that what is found
+    is all of it and holds in another recording. A column that is the same in both is an input of the simulator and not
+    compared, but can drive effects.
 
     Args:
         simulated: with ``time``; a column ``experiment`` tells runs apart by the same labels as the recording's.
@@ -106,7 +111,7 @@ class Paired:
 
     def correction(self, state: Mapping[str, Any], recording: Recording) -> PairedCorrection:
         """What was simulated for a new recording; see :class:`mkc_torch.simulation.Correction`."""
-        return PairedCorrection(self, state["channels"], recording)
+        return PairedCorrection(self, state, recording)
 
     def _shared(self, recording: Recording) -> tuple[str, ...]:
         recording["time"]
@@ -152,17 +157,16 @@ class PreparedPaired(ClosedForm):
         units = set(self._units.values())
         self.unit = units.pop() if len(units) == 1 else ""
         self.independent = (True,) * len(self.channels)
-        self.state: Mapping[str, object] = {"channels": list(self.channels)}
         interval = _interval(self.time, curve.run)
         width = interval / 2.0 if system.offset is None else system.offset
         spread = [width] * len(curve.runs) + [system.rate]
-        first = self.time.new_full((len(curve.runs),), torch.inf).scatter_reduce(0, curve.run, self.time, "amin")
-        self._since = self.time - first[curve.run]
+        self._since = _since_begin(self.time, curve)
         offsets = [f"clock offset of {one}" if one else "clock offset" for one in curve.runs]
         self.parameter_names = (*offsets, "clock rate")
-        sizes = self.time.new_tensor(spread)
+        self._spread = sizes = self.time.new_tensor(spread)
         self.prior: GaussianPrior | None = GaussianPrior(torch.zeros_like(sizes), sizes.square().reciprocal())
         self._most = _FREE * sizes
+        self.state: Mapping[str, object] = {"channels": list(self.channels), "clocks": self._most.tolist()}
         self.bounds = torch.full_like(sizes, -torch.inf), torch.full_like(sizes, torch.inf)
         run = successive_runs(curve.run, self.time)
         self.ports = output_ports(self.channels, self._units, self.unit, self.measured, self.channels, run)
@@ -170,6 +174,17 @@ class PreparedPaired(ClosedForm):
             f"Column `{name}` is the same in both tables: it counts as an input of the simulator and is not compared."
             for name in same
         )
+
+    def prior_beside(self, settled: Collection[str]) -> GaussianPrior:
+        """What is known of the clocks beside effects that settle their mean ``"offset"`` or their ``"rate"``."""
+        runs = len(self.curve.runs)
+        known = self._spread.square().reciprocal()
+        precision = torch.diag(known)
+        if "offset" in settled:
+            precision[:runs, :runs] += _HELD * known[0] / runs
+        if "rate" in settled:
+            precision[runs, runs] *= _HELD
+        return GaussianPrior(torch.zeros_like(known), precision)
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Float[Tensor, " p"]:  # noqa: ARG002
         return self.time.new_zeros(len(self.parameter_names))
@@ -186,17 +201,17 @@ class PreparedPaired(ClosedForm):
         return output_signals(self._outputs(theta), self.channels, changes)
 
     def _outputs(self, theta: Tensor) -> Float[Tensor, "N m"]:
-        # by a curve that levels off: at a hard bound the fit of what goes the same way would get stuck
-        clock = self._most * torch.tanh(theta / self._most)
+        clock = _clocks(theta, self._most)
         return self.curve.at(self.time + clock[:-1][self.curve.run] + clock[-1] * self._since)
 
 
 class PairedCorrection:
-    """A simulator's columns for a new recording, with the effects in them; the clocks count as one.
+    """A simulator's columns for a new recording, with the effects in them, by the clocks that were fitted.
 
     Args:
         system: what the simulator wrote for the new recording.
-        channels: the columns that were compared.
+        state: of the fitted one: ``channels``, the columns that were compared, and ``clocks``, the most that each clock
+            may be off; without that, as in older files, the clocks count as one.
         recording: with its times and drivers; the compared columns need not be there.
 
     Raises:
@@ -204,8 +219,9 @@ class PairedCorrection:
         SimulationError: no run in common, or times that were not simulated.
     """
 
-    def __init__(self, system: Paired, channels: Sequence[str], recording: Recording) -> None:
-        self.channels = tuple(channels)
+    def __init__(self, system: Paired, state: Mapping[str, Any], recording: Recording) -> None:
+        self.channels = tuple(state["channels"])
+        self._most = torch.tensor(state.get("clocks", ()), dtype=torch.float64)
         self.time = recording["time"]
         inside, self._curve = _found(system.simulated.finite(*self.channels), recording, self.channels)
         if not bool(inside.all()):
@@ -217,9 +233,13 @@ class PairedCorrection:
         run = successive_runs(self._curve.run, self.time)
         self.ports = output_ports(self.channels, units, "", self._curve.at(self.time), self.channels, run)
 
-    def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:  # noqa: ARG002
-        """The simulated columns with the effects."""
-        outputs = changed_outputs(self._curve.at(self.time), self.channels, changes)
+    def corrected(self, theta: Float[Tensor, " p"], changes: Changes) -> dict[str, Float[Tensor, " N"]]:
+        """The simulated columns with the effects; the clocks' offset is the mean of that of the fitted runs."""
+        at = self.time
+        if len(self._most):
+            clock = _clocks(theta, self._most)
+            at = at + clock[:-1].mean() + clock[-1] * _since_begin(self.time, self._curve)
+        outputs = changed_outputs(self._curve.at(at), self.channels, changes)
         return {"time": self.time} | dict(zip(self.channels, outputs.unbind(-1), strict=True))
 
 
@@ -265,6 +285,17 @@ class _Curve:
     def columns(self, kept: Sequence[int]) -> _Curve:
         """Some of the columns."""
         return replace(self, values=self.values[:, kept], slopes=self.slopes[:, kept])
+
+
+def _clocks(theta: Float[Tensor, " p"], most: Float[Tensor, " p"]) -> Float[Tensor, " p"]:
+    """Offsets and rate, by a curve that levels off: at a hard bound a fit of what goes the same way would get stuck."""
+    return most * torch.tanh(theta / most)
+
+
+def _since_begin(time: Float[Tensor, " N"], curve: _Curve) -> Float[Tensor, " N"]:
+    """Time since the first sample of each one's run."""
+    first = time.new_full((len(curve.runs),), torch.inf).scatter_reduce(0, curve.run, time, "amin")
+    return time - first[curve.run]
 
 
 def _met(simulated: Recording, recording: Recording, names: tuple[str, ...]) -> tuple[Recording, _Curve]:

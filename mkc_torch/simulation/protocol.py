@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
@@ -25,6 +25,7 @@ __all__ = [
     "Change",
     "Changes",
     "Clock",
+    "Clocked",
     "ClosedForm",
     "Correcting",
     "Correction",
@@ -254,6 +255,19 @@ class PreparedSimulation(Protocol):
         self, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None = None
     ) -> Mapping[str, Float[Tensor, "G k"]]:
         """What passes through each port: what an effect that depends on the signal is a function of."""
+        ...
+
+
+@runtime_checkable
+class Clocked(Protocol):
+    """A prepared simulation with clocks of its own among its parameters, where an effect can be the same thing."""
+
+    def prior_beside(self, settled: Collection[str]) -> GaussianPrior:
+        """What is known of the parameters beside effects that settle a part of the clocks.
+
+        Args:
+            settled: "offset", "rate" or both; it is held, so that the effect has all of it.
+        """
         ...
 
 

@@ -7,12 +7,15 @@ import torch
 
 from mkc_torch._support.unit_text import duration
 from mkc_torch.diagnosis.model.grid import candidate_terms
-from mkc_torch.effects import DYNAMICS, kind_of
+from mkc_torch.diagnosis.parts import Alternative, Finding
+from mkc_torch.effects import DYNAMICS, kind_of, words_of
 from mkc_torch.effects.dynamics.constant_force import ConstantForce
 from mkc_torch.effects.dynamics.hidden_lag import HiddenLag
+from mkc_torch.effects.dynamics.hidden_mode import HiddenMode
 from mkc_torch.effects.dynamics.power_law import PowerLaw
 from mkc_torch.effects.kinds import MOTION, kind_at, zero_of
 from mkc_torch.recording import Recording
+from mkc_torch.report.diagnosis import findings as say
 from mkc_torch.simulation import Dynamics
 from tests.effects.contexts import dynamic_context
 
@@ -82,6 +85,30 @@ def test_a_second_store_is_told_with_its_size_and_its_time(unit, gamma, told):
     assert effect.explained([gamma], STORE, at_state(effect, unit)).startswith(told)
 
 
+MODE = {"period": 0.1408, "damping": 0.0224}
+
+
+@pytest.mark.parametrize(
+    ("unit", "gamma", "shape", "told"),
+    [
+        ("m/s", 0.213, MODE, "a second mass, 21 % of the moving one, on a spring: 7.1 Hz, damping ratio 0.02"),
+        (
+            "rad/s",
+            0.213,
+            MODE,
+            "a second inertia, 21 % of the turning one, on a flexible shaft: 7.1 Hz, damping ratio 0.02",
+        ),
+        ("V", 3.14, MODE, "a second capacitor, 3.1 times the size of the first, behind a coil: 7.1 Hz, damping"),
+        ("bar", 0.5, MODE | {"period": 420.0}, "a second volume, 50 % of the first, behind a column with inertia: "),
+    ],
+)  # fmt: skip
+def test_what_swings_along_is_told_with_its_size_its_frequency_and_its_damping(unit, gamma, shape, told):
+    effect = HiddenMode()
+    context = at_state(effect, unit)
+    assert effect.explained([gamma], shape, context).startswith(f"Not in the equations is {told}")
+    assert effect.advised([gamma], shape, context).startswith(f"Add {told}")
+
+
 def test_a_second_store_of_a_level_is_a_side_tank():
     context = at_state(HiddenLag(), "cm", "level")
     assert "a side tank, 38 % of the first" in HiddenLag().advised([0.38], STORE, context)
@@ -129,3 +156,27 @@ def test_times_are_told_in_the_unit_that_a_person_reads():
     assert [duration(one) for one in (0.5, 119.0, 121.0, 7300.0, 4e5)] == ["0.5 s", "120 s", "2 min", "2 h", "4.6 d"]
     assert (zero_of("degC"), zero_of("K")) == (273.15, 0.0)
     assert "speed" in MOTION
+
+
+@pytest.mark.parametrize("unit", ["°C", "V", "A", "bar"])
+def test_names_suit_what_does_not_move(unit):
+    kind = kind_of(unit)
+    for effect in DYNAMICS:
+        if effect.port in ("rate", "lagged rate") and {*effect.needs} <= {"own", "temperature"}:
+            told = words_of(effect.id, kind)
+            assert not any(word in told.lower() for word in (*MECHANICAL, "overflow")), told
+    assert words_of("linear_drag") == "linear drag"
+
+
+def test_a_finding_at_a_temperature_and_its_rivals_have_the_names_of_heat():
+    rivals = (
+        Alternative("constant_force", (), 0.1, False, "rate of room"),
+        Alternative("linear_drag", (), 0.2, False, "rate of speed"),
+    )
+    found = Finding(
+        "linear_drag", (), ("rate of room",), (), None, "", "", (), 0.01, rivals, True, "", kind="temperature"
+    )
+    assert say.finding_name(found) == "loss of heat"
+    assert say.rivals(found) == "constant heat flow, linear drag on the rate of speed"
+    told = say.with_names("Do not correct for linear_drag yet.", {"linear_drag"}, {"linear_drag": "temperature"})
+    assert told == "Do not correct for loss of heat yet."

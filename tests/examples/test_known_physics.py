@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("polars")
 
+from mkc_torch import Recording
 from tests.shared_data import ROOT
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "concealed_physics"
@@ -79,7 +80,40 @@ def test_each_recording_with_missing_physics_has_its_words(load):
     names = {one.name for part in (known.real, known.cases, known.data) for one in part()}
     assert set(by_hand) <= names
     adequate = {f"cases simulated/{name} run Pendulum" for name in ("held_input", "linear_input")}
-    assert names - set(by_hand) == adequate
+    heavy = {f"data falling_balls {name} Ball" for name in load("known").HEAVY}
+    assert names - set(by_hand) == adequate | heavy
+
+
+def test_a_search_that_was_stopped_says_so_in_its_row(load):
+    found = cells(load, row(stopped={"reason": "time limit", "seconds": 30.2, "not_done": []}))
+    assert found["told"] == "quadratic drag (right), search stopped after 30 s"
+
+
+@pytest.mark.parametrize(
+    ("name", "columns", "rows"),
+    [
+        ("data falling_balls Tennis_Ball Ball", {"time", "height"}, 46),
+        ("data silverbox Silverbox", {"time", "input", "output"}, 8192),
+        ("data servo Servo", {"time", "position", "goal_position", "torque_enable", "kp", "experiment"}, None),
+    ],
+)
+def test_what_is_cut_of_a_recording_is_diagnosed(load, tmp_path, name, columns, rows):
+    one = next(one for one in load("known").data() if one.name == name)
+    if not one.recording.exists():
+        pytest.skip(f"no data file {one.recording}")
+    table = Recording.read(one.file_in(tmp_path), recognise=False)
+    assert set(table.names) == columns
+    assert rows is None or len(table) == rows
+
+
+def test_a_limit_that_is_over_at_once_is_a_row(load, tmp_path):
+    one = next(one for one in load("known").real() if one.name == ROCKET)
+    if not one.recording.exists():
+        pytest.skip(f"no data file {one.recording}")
+    name, found = load("real").diagnosed((one, tmp_path, 0.01))
+    assert name == ROCKET
+    assert "0.01 s" in found["failed"]
+    assert cells(load, found)["told"] == "no answer (wrong)"
 
 
 def test_absent_recordings_are_named_and_left_out(load, tmp_path, capsys):

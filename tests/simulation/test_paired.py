@@ -3,6 +3,11 @@ import torch
 
 from mkc_torch import Recording, diagnose
 from mkc_torch.diagnosis import DiagnosedModel
+from mkc_torch.diagnosis.model.fit import fitted
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.term import Term
+from mkc_torch.effects.paired.clock_drift import ClockDrift
+from mkc_torch.effects.paired.delay import CommonDelay, Delay
 from mkc_torch.nonlinear import load_forward_mode
 from mkc_torch.recording.recording import MissingColumnError
 from mkc_torch.simulation import Paired, SimulationError
@@ -72,6 +77,65 @@ def test_clocks_that_differ_by_less_than_a_sample_are_no_finding():
     found = diagnose(Paired(simulator()), recorded(signal(times() + 0.02)), surrogates=19)
     assert found.verdict == "adequate"
     assert float(found.model.theta[0]) == pytest.approx(0.02, abs=0.006)
+
+
+def late(prepared, effect, port="output y"):
+    """A joint model with one effect."""
+    return JointModel(prepared, (Term(effect, None, {}, port),))
+
+
+def test_a_delay_is_told_in_full_and_no_clock_takes_part_of_it():
+    prepared = Paired(simulator()).prepare(recorded(signal(times() - 0.2)))
+    model = late(prepared, Delay())
+    start = torch.tensor([-0.06, 0.0, 0.155], dtype=torch.float64)  # a clock that is late by most of what it may be
+    found = fitted(model, start, graduate=False)
+    assert abs(float(found.parameters[0])) < 1e-6
+    assert float(found.parameters[2]) == pytest.approx(0.2, abs=0.005)
+    gammas, source = [found.parameters[2:]], Paired(simulator())
+    saved = DiagnosedModel("simulated", prepared.state, found.parameters[:2], model.terms, gammas, source)
+    corrected = saved(Recording({"time": times()}))["y"]
+    assert torch.allclose(prepared.measured[:, 0] - corrected, found.residual[:, 0], atol=1e-9)
+
+
+def test_a_delay_of_one_output_of_two_leaves_the_clock_free():
+    both = Recording({"time": simulator()["time"], "y": simulator()["y"], "z": simulator()["y"].square()})
+    recording = recorded(signal(times()), z=signal(times()).square() + 0.01)
+    prepared = Paired(both).prepare(recording)
+    alone, together = late(prepared, Delay()).prior.precision, late(prepared, CommonDelay(), "all outputs").prior
+    assert torch.equal(alone[:2], prepared.prior.precision)
+    assert float(together.precision[0, 0] / prepared.prior.precision[0]) > 1e6
+    apart = JointModel(prepared, tuple(Term(Delay(), None, {}, f"output {name}") for name in "yz"))
+    assert float(apart.prior.precision[0, 0] / prepared.prior.precision[0]) > 1e6
+
+
+def test_of_several_runs_the_clocks_differ_beside_a_delay_and_their_mean_is_held():
+    def twice(table):
+        columns = {name: torch.cat([values, values]) for name, values in table.columns.items()}
+        return Recording(columns | {"experiment": torch.arange(2.0).double().repeat_interleave(len(table))})
+
+    prepared = Paired(twice(simulator())).prepare(twice(recorded(signal(times()))))
+    precision = late(prepared, Delay()).prior.precision
+    known = float(prepared.prior.precision[0])
+    apart, mean = (precision.new_tensor(one) for one in ([1.0, -1.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0]))
+    assert float(apart @ precision @ apart) == pytest.approx(2.0 * known, rel=1e-6)
+    assert float(mean @ precision @ mean) > 1e6 * known
+    assert float(precision[2, 2]) == pytest.approx(float(prepared.prior.precision[2]))
+
+
+def test_a_drift_is_told_in_full_and_the_clocks_rate_is_held():
+    prepared = Paired(simulator()).prepare(recorded(signal(1.002 * times())))
+    found = fitted(late(prepared, ClockDrift(), "all outputs"), torch.tensor([0.0, 5e-5, 0.0019]).double())
+    assert abs(float(found.parameters[1])) < 1e-8
+
+
+def test_the_clocks_that_were_fitted_go_into_the_correction():
+    prepared = Paired(simulator()).prepare(recorded(signal(1.0001 * times() + 0.03)))
+    theta = torch.tensor([0.04, 9e-5], dtype=torch.float64)
+    corrected = DiagnosedModel("simulated", prepared.state, theta, (), (), Paired(simulator()))
+    residual = prepared.measured[:, 0] - corrected(Recording({"time": times()}))["y"]
+    assert torch.allclose(residual, prepared.residual(theta, {})[:, 0], atol=1e-12)
+    older = DiagnosedModel("simulated", {"channels": ["y"]}, theta, (), (), Paired(simulator()))
+    assert torch.allclose(older(Recording({"time": times()}))["y"], signal(times()), atol=1e-3)
 
 
 def test_interpolation_meets_a_smooth_signal_and_its_slope():

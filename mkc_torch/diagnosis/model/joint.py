@@ -18,7 +18,7 @@ from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.courses import combined, gained
 from mkc_torch.nonlinear import GaussianPrior, beside
 from mkc_torch.simulation.continuation import CompiledResidual, Continuation, compiled_residual, is_plain
-from mkc_torch.simulation.protocol import Answer, Change, FreeChange, Nearby, PreparedSimulation
+from mkc_torch.simulation.protocol import Answer, Change, Clocked, FreeChange, Nearby, PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -54,7 +54,9 @@ class JointModel:
     @property
     def prior(self) -> GaussianPrior | None:
         """The simulation's own, padded: nothing is known of effects beforehand."""
-        known = self.prepared.prior
+        settled = self._settled
+        prepared = self.prepared
+        known = prepared.prior_beside(settled) if settled and isinstance(prepared, Clocked) else prepared.prior
         if known is None or not self.terms:
             return known
         more = known.mean.new_zeros(self.size - self.base)
@@ -62,6 +64,15 @@ class JointModel:
         if precision.dim() == 1:
             return GaussianPrior(torch.cat([known.mean, more]), torch.cat([precision, more]))
         return GaussianPrior(torch.cat([known.mean, more]), torch.block_diag(precision, torch.diag(more)))
+
+    @property
+    def _settled(self) -> frozenset[str]:
+        """Parts of the clocks that effects settle: each that those which act on all channels have together."""
+        parts: dict[str, set[str]] = {}
+        for term in self.terms:
+            for part in term.effect.settles:
+                parts.setdefault(part, set()).update(self.prepared.ports[term.port].channels)
+        return frozenset(part for part, channels in parts.items() if channels >= set(self.prepared.channels))
 
     def gammas(self, parameters: Float[Tensor, " p"]) -> tuple[Tensor, ...]:
         """Of the effects, in their order."""

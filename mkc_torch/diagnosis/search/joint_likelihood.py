@@ -21,11 +21,11 @@ from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.likelihoods import Columns, LogLikelihoods, log_likelihoods
 from mkc_torch.diagnosis.search.quick import COUNTS, COUNTS_NOT, price
-from mkc_torch.simulation.dynamics.disturbances import filter_models, observer_of
+from mkc_torch.simulation.dynamics.disturbances import observer_of
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid, key_of
-from mkc_torch.simulation.dynamics.noise_model import NoiseModel
+from mkc_torch.simulation.dynamics.noise_model import NoiseModel, filter_models
 from mkc_torch.simulation.dynamics.observer import Observable, Observer, clipped_slope
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.dynamics.whitening import SeriesAlong, gains_of, joined, relative_to, whitened

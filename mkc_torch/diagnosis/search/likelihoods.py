@@ -16,9 +16,8 @@ import numpy as np
 
 from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch._parallel.progress import counted
-from mkc_torch.simulation.dynamics.disturbances import filter_models
 from mkc_torch.simulation.dynamics.kalman import Flow
-from mkc_torch.simulation.dynamics.noise_model import NoiseModel
+from mkc_torch.simulation.dynamics.noise_model import NoiseModel, filter_models
 from mkc_torch.simulation.dynamics.whitening import Gains, SeriesAlong, gains_of, joined, whitened, whitened_in_blocks
 
 if TYPE_CHECKING:

@@ -33,6 +33,13 @@ class ConstantForce(RateEffect):
     equation = "δẋ = γ"
     explanation = "Something pushes all the time."
     advice = "Look for a bias of the actuator, a tilted base, an unbalanced weight or buoyancy."
+    words_by_kind: Mapping[str, str] = {
+        "temperature": "constant heat flow",
+        "level": "constant inflow",
+        "pressure": "constant inflow",
+        "voltage": "constant current",
+        "current": "constant voltage",
+    }
     by_kind: Mapping[str, tuple[str, str]] = {
         "temperature": (
             "Heat is added, or taken off, all the time.",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch._support.unit_text import duration, sized
+from mkc_torch._support.unit_text import duration, share_of
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.courses import lagged
 from mkc_torch.effects.dynamics.rate import RateEffect
@@ -27,18 +27,6 @@ _EXAMPLES = {
     "rotation": ": a load on a slipping coupling, a liquid carried along",
 }
 """What the second store may be."""
-
-
-def _share(gamma: float) -> str:
-    """A share in percent, or as so many times where it is more.
-
-    Example:
-        >>> _share(0.382), _share(3.14)
-        ('38 %', '3.1 times the size')
-    """
-    percent = gamma < 2.0
-    told = sized(float(f"{100.0 * gamma if percent else gamma:.2g}"))
-    return f"{told} %" if percent else f"{told} times the size"
 
 
 class HiddenLag(RateEffect):
@@ -64,6 +52,13 @@ class HiddenLag(RateEffect):
     equation = "δẋ = γ (z − x) / τ,  τ ż = x − z"
     explanation = "The state exchanges with something that is not in the equations and follows it late."
     advice = "Add a second store with this time constant, such as a wall behind a resistance."
+    words_by_kind: Mapping[str, str] = {
+        "temperature": "second store of heat",
+        "level": "side tank",
+        "pressure": "second volume",
+        "voltage": "second capacitor",
+        "current": "second coil",
+    }
     stores: Mapping[str, str] = {
         "temperature": "a second store of heat",
         "level": "a side tank",
@@ -80,7 +75,7 @@ class HiddenLag(RateEffect):
         known = self.stores.get(kind_at(context), "a second store")
         evens_out = "catching up" if kind_at(context) in MOTION else "exchanging"
         time = duration(float(shape["time_constant"]))
-        return f"{known}, {_share(float(gamma[0]))} of the first, {evens_out} in {time}"
+        return f"{known}, {share_of(float(gamma[0]))} of the first, {evens_out} in {time}"
 
     def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
         return f"There is {self.store(gamma, shape, context)}, that is not in the equations."

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch._support.unit_text import duration, share_of, sized
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.dynamics.rate import RateEffect
+from mkc_torch.effects.kinds import MOTION, kind_at
 from mkc_torch.effects.runs import first_of_runs, passed_on
 
 if TYPE_CHECKING:
@@ -28,6 +30,32 @@ DAMPING = 0.1
 """Share of critical damping that is searched: a resonance as wide as the periods are apart."""
 
 _LEAST = 1e-12
+
+_SOMETHING = ("a second store", "of the first", "that swings with it")
+"""Of a quantity that is of no known kind."""
+
+_EXAMPLES = {
+    "position": "; a flexible joint, a load on a rope, a liquid that sloshes",
+    "speed": "; a flexible joint, a load on a rope, a liquid that sloshes",
+    "rotation": "; a flexible joint or belt, a load behind it",
+    "angle": "; a flexible joint or belt, a load behind it",
+    "level": "; a pipe between two vessels",
+    "pressure": "; a long line",
+}
+"""What swings along may be."""
+
+_SLOW = 10.0
+"""Period in s from which on it is told in place of a frequency."""
+
+
+def _frequency(period: float) -> str:
+    """A frequency in Hz, or the period where it is long.
+
+    Example:
+        >>> _frequency(0.1408), _frequency(420.0)
+        ('7.1 Hz', 'a period of 7 min')
+    """
+    return sized(float(f"{1.0 / period:.2g}"), "Hz") if period < _SLOW else f"a period of {duration(period)}"
 
 
 class HiddenMode(RateEffect):
@@ -58,27 +86,33 @@ class HiddenMode(RateEffect):
     equation = "δv̇ = γ (ω² s + 2 ζ ω ṡ),  ṡ = w − v,  ẇ = −ω² s − 2 ζ ω ṡ,  ω = 2π / period"
     explanation = "Something swings along that is not in the equations, with a period of its own."
     advice = "Add a second mass on a spring of this period, as of a flexible joint or of a liquid that sloshes."
-    by_kind: Mapping[str, tuple[str, str]] = {
-        "level": (
-            "The level swings with a second surface, by a period of its own.",
-            "Add a second surface behind a column of liquid with inertia, as in a pipe between two vessels.",
-        ),
-        "pressure": (
-            "The pressure swings with a second volume, by a period of its own.",
-            "Add a second volume behind a column with inertia, as in a long line.",
-        ),
-        "voltage": (
-            "The voltage rings, with a period of its own.",
-            "Add a coil and a second capacitor that ring with this period.",
-        ),
-        "current": (
-            "The current rings, with a period of its own.",
-            "Add a capacitor and a second coil that ring with this period.",
-        ),
+    seconds: Mapping[str, tuple[str, str, str]] = {
+        "rotation": ("a second inertia", "of the turning one", "on a flexible shaft"),
+        "angle": ("a second inertia", "of the turning one", "on a flexible shaft"),
+        "level": ("a second surface", "of the first", "behind a column of liquid with inertia"),
+        "pressure": ("a second volume", "of the first", "behind a column with inertia"),
+        "voltage": ("a second capacitor", "of the first", "behind a coil"),
+        "current": ("a second coil", "of the first", "behind a capacitor"),
     }
+    """What swings along, what its share is of, and what it hangs on, by the kind of quantity."""
     source = (
         "Den Hartog, Mechanical Vibrations (1956), 3.2; Spong (1987), for flexible joints; Dodge (2000), for sloshing"
     )
+
+    def second(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
+        """What swings along with its size, its frequency and its damping, as a person says them."""
+        kind = kind_at(context)
+        plain = ("a second mass", "of the moving one", "on a spring") if kind in MOTION else _SOMETHING
+        what, of_what, behind = self.seconds.get(kind, plain)
+        times, damping = _frequency(float(shape["period"])), float(f"{float(shape['damping']):.1g}")
+        share = share_of(float(gamma[0]))
+        return f"{what}, {share} {of_what}, {behind}: {times}, damping ratio {sized(damping)}"
+
+    def explained(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
+        return f"Not in the equations is {self.second(gamma, shape, context)}."
+
+    def advised(self, gamma: Sequence[float], shape: Shape, context: Context) -> str:
+        return f"Add {self.second(gamma, shape, context)}{_EXAMPLES.get(kind_at(context), '')}."
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
         length = float(time.max() - time.min())

@@ -33,6 +33,13 @@ class LinearDrag(RateEffect):
     equation = "δẋ = −γ x"
     explanation = "The motion is damped in proportion to its speed, as by a viscous fluid."
     advice = "Add viscous drag with this coefficient."
+    words_by_kind: Mapping[str, str] = {
+        "temperature": "loss of heat",
+        "level": "leak",
+        "pressure": "leak",
+        "voltage": "leak of charge",
+        "current": "resistance",
+    }
     by_kind: Mapping[str, tuple[str, str]] = {
         "temperature": (
             "Heat is lost in proportion to the temperature.",

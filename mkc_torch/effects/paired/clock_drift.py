@@ -30,6 +30,7 @@ class ClockDrift(Effect):
     port = "outputs"
     follows_signal = True
     remembers = True
+    settles = ("rate",)
     plausible = 0.01
     equation = "δy = y(t + γ (t − t₀)) − y(t)"
     explanation = "The recording's clock and the simulator's run at different rates."

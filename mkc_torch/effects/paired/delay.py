@@ -32,6 +32,7 @@ class Delay(Effect):
     needs: tuple[str, ...] = ("own", "compared")
     follows_signal = True
     remembers = True
+    settles = ("offset",)
     equation = "δy = y(t − γ) − y(t)"
     explanation = "What is measured comes later than what is simulated, or earlier."
     advice = "Look for filters and transport on the way to the recording, and for how its clock was set."

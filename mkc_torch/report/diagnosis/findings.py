@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain, several, typeset
@@ -54,20 +54,22 @@ _BOUNDS = {
 }
 
 
-def with_drivers(effect: str, drivers: Sequence[str], at: str = "") -> str:
-    """An effect with what drives it, and where it acts.
+def with_drivers(effect: str, drivers: Sequence[str], at: str = "", kind: str = "") -> str:
+    """An effect with what drives it, and where it acts; by the name that it has for a kind of quantity.
 
     Example:
         >>> with_drivers("current_field", ["battery_A"]), with_drivers("offset_drift", [])
         ('current field (battery_A)', 'offset drift')
         >>> with_drivers("linear_drag", [], "rate of speed")
         'linear drag on the rate of speed'
+        >>> with_drivers("linear_drag", [], "rate of room", "temperature")
+        'loss of heat on the rate of room'
         >>> with_drivers("clock_drift", [], "all outputs")
         'clock drift on all outputs'
         >>> with_drivers("field_gradient", ["position_x", "position_y", "position_z"])
         'field gradient (position)'
     """
-    driven = words_of(effect) + (f" ({_together(drivers)})" if drivers else "")
+    driven = words_of(effect, kind) + (f" ({_together(drivers)})" if drivers else "")
     if not at:
         return driven
     key = "finding.on" if at.startswith("all ") else "finding.on_the"
@@ -84,7 +86,7 @@ def finding_name(finding: Finding) -> str:
     """A finding by its effect and what drives it; one that goes along time alone and has no name is told as a cause."""
     if unrecorded(finding):
         return term("finding.unrecorded")
-    told = with_drivers(finding.effect, finding.drivers)
+    told = with_drivers(finding.effect, finding.drivers, kind=finding.kind)
     return term("finding.comes_and_goes", finding=told) if finding.comes_and_goes else told
 
 
@@ -274,9 +276,15 @@ def inseparable(finding: Finding) -> tuple[Alternative, ...]:
 
 def rivals(finding: Finding, most: int = 3) -> str:
     """The names of those, one after the other; empty where there are none."""
-    each = list(dict.fromkeys(with_drivers(a.effect, a.drivers, _elsewhere(a, finding)) for a in inseparable(finding)))
+    each = list(dict.fromkeys(_rival(a, finding) for a in inseparable(finding)))
     told = ", ".join(each[:most])
     return term("number.and_more", first=told, count=len(each) - most) if len(each) > most else told
+
+
+def _rival(alternative: Alternative, finding: Finding) -> str:
+    """The name of an alternative; by the kind of quantity that the finding acts on, where it acts there too."""
+    at = _elsewhere(alternative, finding)
+    return with_drivers(alternative.effect, alternative.drivers, at, "" if at else finding.kind)
 
 
 def _elsewhere(alternative: Alternative, finding: Finding) -> str:
@@ -304,14 +312,22 @@ def role(candidate: Candidate, findings: Sequence[Finding]) -> str:
     return ""
 
 
-def with_names(sentence: str, ids: Collection[str]) -> str:
+def with_names(sentence: str, ids: Collection[str], kinds: Mapping[str, str] | None = None) -> str:
     """A sentence with effects by their names instead of their ids, its numbers as they are printed.
+
+    Args:
+        sentence: to be told.
+        ids: of effects.
+        kinds: of the quantity that each acts on, where that is known.
 
     Example:
         >>> with_names("hard_iron_step: p = 4e-05, by -6.1 µT.", {"hard_iron_step"})
         'hard-iron step: p = 4 × 10⁻⁵, by −6.1 µT.'
     """
-    named = re.sub(r"[a-z]\w*", lambda word: words_of(word[0]) if word[0] in ids else word[0], sentence)
+    known = kinds or {}
+    named = re.sub(
+        r"[a-z]\w*", lambda word: words_of(word[0], known.get(word[0], "")) if word[0] in ids else word[0], sentence
+    )
     return typeset(named)
 
 

@@ -149,7 +149,7 @@ def reasons(diagnosis: Diagnosis) -> list[str]:
 def to_do(diagnosis: Diagnosis) -> list[str]:
     """What to do next, as the diagnosis advises it."""
     ids = _ids(diagnosis)
-    return [capital(with_names(sentence, ids)) for sentence in diagnosis.advice]
+    return [capital(with_names(sentence, ids, _kinds(diagnosis))) for sentence in diagnosis.advice]
 
 
 def warned(diagnosis: Diagnosis) -> list[str]:
@@ -164,7 +164,12 @@ def warned(diagnosis: Diagnosis) -> list[str]:
         [one for one in d.warnings if one not in first],
         key=lambda sentence: doubted.isdisjoint(re.findall(r"\w+", sentence)),
     )
-    return [capital(with_names(sentence, ids)) for sentence in ordered]
+    return [capital(with_names(sentence, ids, _kinds(d))) for sentence in ordered]
+
+
+def _kinds(diagnosis: Diagnosis) -> dict[str, str]:
+    """Of what quantity each effect that was found acts on."""
+    return {finding.effect: finding.kind for finding in diagnosis.findings}
 
 
 def said_first(diagnosis: Diagnosis) -> tuple[str, ...]:

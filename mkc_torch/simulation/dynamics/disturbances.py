@@ -13,7 +13,8 @@ from torch import Tensor
 
 from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch.simulation.dynamics.kalman import Flow, Models, Parts, filtered, robust_likelihood
-from mkc_torch.simulation.dynamics.noise_model import NoiseModel, place_of
+from mkc_torch.simulation.dynamics.likeliest_sizes import likeliest_sizes
+from mkc_torch.simulation.dynamics.noise_model import NoiseModel, filter_models, longest_run, place_of
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observer
 from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
 
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 __all__ = [
     "Disturbed",
     "disturbed",
-    "filter_models",
-    "longest_run",
     "models_of",
     "observer_of",
     "resized",
@@ -121,7 +120,7 @@ def disturbed(
             break
         gains.append(more - value)
         best, value = _scaled(other, scale), more
-    found = _told(best, gains, flow, names, channels, floor, value)
+    found = _told(best, gains, flow, names, channels, floor, value, largest)
     if len(gains) < 2:
         return found
     # one may have stood for another that was found later
@@ -166,7 +165,7 @@ def resized(
             break
         best, value = less[weakest][0], less[weakest][1]
         gains = []
-    return _told(best, gains, flow, names, channels, known.sensor, value)
+    return _told(best, gains, flow, names, channels, known.sensor, value, largest)
 
 
 def _told(
@@ -177,11 +176,15 @@ def _told(
     channels: Sequence[str],
     like: Float[Tensor, " m"],
     value: float,
+    largest: Float[np.ndarray, " p+m"] | None,
 ) -> Disturbed:
+    """What was found, at the likeliest sizes."""
     places, p = (*names, *channels), flow.rates
+    noise, errors = likeliest_sizes(flow, noise, largest)
+    value = _exactly(flow, noise)[0] if errors else value
     found = tuple(Disturbance(places[place], place < p, lasting, size) for place, size, lasting in noise.pushes)
     sensor = like.new_tensor(noise.sensor)
-    return Disturbed(found, _errors(flow, noise), tuple(gains), sensor, value, noise.known)
+    return Disturbed(found, errors, tuple(gains), sensor, value, noise.known)
 
 
 def _candidates(flow: Flow, known: NoiseModel, places: int) -> list[tuple[int, float, float]]:
@@ -202,13 +205,6 @@ def _candidates(flow: Flow, known: NoiseModel, places: int) -> list[tuple[int, f
             if not any(one[0] == place and one[2] == time for one in known.pushes):
                 found += [(place, size * unit, time) for size in _SIZES if math.isfinite(size * unit)]
     return found
-
-
-def longest_run(flow: Flow) -> float:
-    """Length of the longest run in s."""
-    ends = np.flatnonzero(np.concatenate([flow.step <= 0, [True]]))
-    total = np.concatenate([[0.0], flow.step.cumsum()])
-    return float(np.diff(np.concatenate([[0.0], total[ends]])).max())
 
 
 _REACH = 400
@@ -237,23 +233,6 @@ def usual_size(flow: Flow, place: int, lasting: float, sensor: Float[np.ndarray,
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             most = max(most, float((np.sqrt(power) / sensor).max()))
     return 1.0 / most if 0.0 < most < math.inf else math.inf
-
-
-def filter_models(flow: Flow, noises: Sequence[NoiseModel]) -> Models:
-    p = flow.rates
-    D = max(sum(1 for one in noise.pushes if one[2] > 0) for noise in noises)
-    B = len(noises)
-    white, place = np.zeros((B, p)), np.zeros((B, D), dtype=int)
-    size, lasting = np.zeros((B, D)), np.ones((B, D))
-    for row, noise in enumerate(noises):
-        slot = 0
-        for at, one, time in noise.pushes:
-            if time > 0:
-                place[row, slot], size[row, slot], lasting[row, slot] = at, one, time
-                slot += 1
-            else:
-                white[row, at] = one
-    return Models(white, place, size, lasting, np.array([noise.sensor for noise in noises]))
 
 
 def _likelihoods(flow: Flow, noises: Sequence[NoiseModel]) -> tuple[np.ndarray, np.ndarray]:
@@ -337,20 +316,6 @@ def _finer(flow: Flow, noise: NoiseModel, largest: Float[np.ndarray, " p+m"] | N
         if number == 0:
             power *= 0.4
     return noise
-
-
-def _errors(flow: Flow, noise: NoiseModel) -> tuple[float, ...]:
-    """Of the logarithm of each size, by the curvature of the likelihood."""
-    if not noise.pushes:
-        return ()
-    away, tried = 0.3, []
-    for d, (place, size, lasting) in enumerate(noise.pushes):
-        for sign in (-1.0, 1.0):
-            one = (place, size * math.exp(sign * away), lasting)
-            tried.append(replace(noise, pushes=(*noise.pushes[:d], one, *noise.pushes[d + 1 :])))
-    (value, *values), _ = _likelihoods(flow, [noise, *tried])
-    curves = [(2.0 * value - values[2 * d] - values[2 * d + 1]) / away**2 for d in range(len(noise.pushes))]
-    return tuple(1.0 / math.sqrt(curve) if curve > 0 else math.inf for curve in curves)
 
 
 def observer_of(

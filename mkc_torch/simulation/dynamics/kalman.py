@@ -35,6 +35,8 @@ __all__ = [
 ]
 
 _CLIP = 4.0
+"""Standard deviations beyond which an innovation moves the states no further; one within moves them as it is, so that
+of normal noise the likeliest size is the true one."""
 _OUTLIERS = 0.05
 """Share of the innovations that may be anywhere."""
 
@@ -327,7 +329,7 @@ def _sample_by_sample(
             z = (flow.new[row, :, j, None] - (c * state).sum(-1)) / root
             found.standard[row, :, :, j], found.log_spread[row, :, :, j] = z, root
             used = flow.counts[row, :, j, None]
-            pulled = used * _CLIP * np.tanh(z / _CLIP) / root
+            pulled = used * np.clip(z, -_CLIP, _CLIP) / root
             state = state + Pc * pulled[..., None]
             gain = (used / S)[..., None] * Pc
             P = P - gain[..., None] * Pc[..., None, :]

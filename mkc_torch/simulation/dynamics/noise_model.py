@@ -1,13 +1,16 @@
-"""A model of the noise of the world: sensors' white noise, and what pushes rates or is added to outputs beside it."""
+"""A model of the noise: what pushes rates and outputs, by numbers; and the filter of many of them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from mkc_torch.simulation.dynamics.kalman import Flow, Models
 from mkc_torch.simulation.dynamics.observer import Disturbance
 
-__all__ = ["NoiseModel", "place_of"]
+__all__ = ["NoiseModel", "filter_models", "longest_run", "place_of"]
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,31 @@ class NoiseModel:
         places = (*rates, *outputs)
         pushes = tuple((place_of(places, one, len(rates)), one.size, one.lasting) for one in disturbances)
         return cls(tuple(sensor), pushes, tuple(known) or (False,) * len(outputs), tuple(floor))
+
+
+def filter_models(flow: Flow, noises: Sequence[NoiseModel]) -> Models:
+    """The filter of some of them."""
+    p = flow.rates
+    D = max(sum(1 for one in noise.pushes if one[2] > 0) for noise in noises)
+    B = len(noises)
+    white, place = np.zeros((B, p)), np.zeros((B, D), dtype=int)
+    size, lasting = np.zeros((B, D)), np.ones((B, D))
+    for row, noise in enumerate(noises):
+        slot = 0
+        for at, one, time in noise.pushes:
+            if time > 0:
+                place[row, slot], size[row, slot], lasting[row, slot] = at, one, time
+                slot += 1
+            else:
+                white[row, at] = one
+    return Models(white, place, size, lasting, np.array([noise.sensor for noise in noises]))
+
+
+def longest_run(flow: Flow) -> float:
+    """Length of the longest run in s."""
+    ends = np.flatnonzero(np.concatenate([flow.step <= 0, [True]]))
+    total = np.concatenate([[0.0], flow.step.cumsum()])
+    return float(np.diff(np.concatenate([[0.0], total[ends]])).max())
 
 
 def place_of(places: Sequence[str], one: Disturbance, rates: int) -> int:

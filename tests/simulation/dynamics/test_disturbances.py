@@ -7,16 +7,10 @@ import pytest
 import torch
 from scipy.linalg import solve_discrete_are
 
-from mkc_torch.simulation.dynamics.disturbances import (
-    Disturbed,
-    disturbed,
-    models_of,
-    observer_of,
-    resized,
-    usual_size,
-)
+from mkc_torch.simulation.dynamics.disturbances import Disturbed, disturbed, models_of, observer_of, resized, usual_size
 from mkc_torch.simulation.dynamics.kalman import filtered, robust_likelihood
 from mkc_torch.simulation.dynamics.observer import Disturbance
+from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
 from tests.simulation.dynamics.oscillating import STEP, answering, course, flow, pushed
 
 NOISE, PUSH, WANDER, LASTING = 0.01, 1.0, 0.05, 0.6
@@ -55,6 +49,12 @@ def known(*disturbances, declared=False):
     return Disturbed(disturbances, (), (), tensor(NOISE), 0.0, (declared,))
 
 
+def value_of(along, disturbance, sensor):
+    """Log-likelihood by all samples."""
+    kept = filtered_whole(along, models_of(along, (disturbance,), sensor, RATES, OUTPUTS))
+    return float(robust_likelihood(kept, along.counts[:, None], along.reach, free=False)[0][0])
+
+
 class TestSought:
     """What is found where nothing is known."""
 
@@ -71,16 +71,33 @@ class TestSought:
         if truth.lasting:
             assert LASTING / 3.0 < one.lasting < 3.0 * LASTING
 
-    def test_of_a_long_recording_stretches_tell_what_all_of_it_is_weighed_by(self):
-        along = world(WHITE, count=6000)
-        found = sought(along, most=1)
+    def test_a_long_recording_tells_a_size_as_exactly_as_all_of_its_samples_do(self):
+        found = sought(world(WHITE, count=6000), most=1)
         (one,), (error,), (gain,) = found.disturbances, found.errors, found.gains
-        # a grid is closed in on three times, whatever the samples
-        assert abs(np.log(one.size / PUSH)) < 0.2
-        # as exact as the stretches are, and as sure as all samples make it
+        assert abs(np.log(one.size / PUSH)) < 3.0 * error < 0.1
         short = sought(world(WHITE, count=3000), most=1)
-        assert 0.7 * short.errors[0] < error < short.errors[0]
+        assert error == pytest.approx(short.errors[0] / np.sqrt(2.0), rel=0.05)
         assert gain > 1.5 * short.gains[0]
+
+    @pytest.mark.parametrize("truth", [WHITE, SLOW], ids=["white push", "slow push"])
+    def test_a_size_is_where_a_dense_scan_has_the_likeliest(self, truth):
+        along = world(truth, count=6000, seed=1)
+        found = sought(along, most=1)
+        (one,) = found.disturbances
+        away = np.linspace(-0.1, 0.1, 81)
+        scanned = [replace(one, size=one.size * np.exp(by)) for by in away]
+        parts = [models_of(along, (other,), found.sensor, RATES, OUTPUTS) for other in scanned]
+        values = [
+            float(robust_likelihood(filtered_whole(along, each), along.counts[:, None], along.reach, free=False)[0][0])
+            for each in parts
+        ]
+        assert abs(away[int(np.argmax(values))]) < 0.2 * found.errors[0]
+        assert values[40] == pytest.approx(found.log_likelihood, abs=0.1)
+
+    def test_sizes_in_the_mean_of_draws_are_the_true_ones(self):
+        sizes = [sought(world(WHITE, count=3000, seed=seed), most=1) for seed in range(8)]
+        away = np.mean([np.log(found.disturbances[0].size / PUSH) for found in sizes])
+        assert abs(away) < 3.0 * sizes[0].errors[0] / np.sqrt(8)
 
     def test_the_white_noise_beside_a_push_is_that_of_the_sensor(self):
         assert sought(world(WHITE, count=500)).sensor.item() == pytest.approx(NOISE, rel=0.15)

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch.simulation.dynamics.compiled.affine import Affine, inverted, multiplied
 from mkc_torch.simulation.dynamics.compiled.expressions import Array
 from mkc_torch.simulation.dynamics.settings import (
@@ -214,6 +215,7 @@ def marched(functions: Functions, grid: ArrayGrid, guess: Array, stride: int = H
     first = np.maximum.accumulate(np.where(grid.begins, index, 0))
     place, states, horizon, growth = index - first, guess, 0, stride
     while horizon < grid.longest:
+        check_deadline()
         # beyond what is solved the last state stays
         held = states[:, np.minimum(index, first + horizon)]
         tried, settled = _solved_to(functions, grid, held, place <= horizon + growth)

@@ -136,7 +136,7 @@ def filter_samples(
                     used = counts[row, g, output]
                     if used == 0.0:
                         continue
-                    pulled = used * clip * np.tanh(z / clip) / root
+                    pulled = used * min(max(z, -clip), clip) / root
                     if through:
                         for j in range(k):
                             total = 0.0
