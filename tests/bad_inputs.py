@@ -174,7 +174,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "`--field-strength nan`": ("calibrate", "@rec.csv", "--output", "@out", "--field-strength", "nan"),
     "`--place` without `--date`": ("calibrate", "@rec.csv", "--output", "@out", "--place", "48,11"),
     "`--export mavlink`": ("calibrate", "@rec.csv", "--output", "@out", "--export", "mavlink"),
-    "`--against` that is no calibration": ("calibrate", "@rec.csv", "--output", "@out", "--against", "@none.json"),
+    "`--compare-with` that is no calibration": ("calibrate", "@rec.csv", "--output", "@out", "--compare-with", "@none.json"),
     "a calibration that is cut": ("apply", "@cut.json", "@rec.csv", "--output", "@out.csv"),
     "a calibration that is none": ("apply", "@none.json", "@rec.csv", "--output", "@out.csv"),
     "a calibration that is not there": ("apply", "@other.json", "@rec.csv", "--output", "@out.csv"),

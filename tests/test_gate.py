@@ -142,7 +142,7 @@ def test_recordings_have_names_of_their_own_and_files_that_are_asked_for():
     everything = [*known.real(), *known.cases()]
     assert len({one.name for one in everything}) == len(everything) == 29
     arm = next(one for one in everything if "propeller_arm" in one.name)
-    assert arm.request.between == {"voltage": "held"}
+    assert arm.request.input_hold == {"voltage": "held"}
     assert arm.request.simulation.endswith("propeller_arm/naive.py:Arm")
     commanded = next(one for one in everything if one.name == "real so101 recording")
     assert (commanded.request.simulation, commanded.request.simulated) == ("", commanded.file)

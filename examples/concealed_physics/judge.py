@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from mkc_torch.challenge.verdict import Answer, Candidate, answer
+from mkc_torch.challenge.verdict import StatedCandidate, StatedDiagnosis, answer
 
 if TYPE_CHECKING:
     from known import Expected, Size
@@ -34,7 +34,7 @@ def judged(row: Mapping[str, Any], expected: Expected) -> dict[str, Any]:
         wrong.append(f"the verdict is {said.verdict}, not {' or '.join(expected.verdicts)}")
     if said.verdict == "failed":
         wrong = [f"no diagnosis: {row.get('failed') or 'no reason given'}"]
-    elif not (expected.words and _says(row, expected.words)):
+    elif not (expected.display_name and _says(row, expected.display_name)):
         wrong += _wrong_names(said, expected) + _wrong_sizes(row, expected.sizes)
         wrong += _wrong_residuals(row["residual_after"], expected.residual)
     return {"right": not wrong, "wrong": wrong}
@@ -44,7 +44,7 @@ def _says(row: Mapping[str, Any], words: Sequence[str]) -> bool:
     return any(all(word in sentence for word in words) for sentence in row["sentences"])
 
 
-def _wrong_names(said: Answer, expected: Expected) -> list[str]:
+def _wrong_names(said: StatedDiagnosis, expected: Expected) -> list[str]:
     claimed = [finding.named.effect for finding in said.claims]
     if not expected.names:
         return [f"{', '.join(claimed)} claimed where nothing is to be named"] if claimed else []
@@ -62,12 +62,12 @@ def _wrong_names(said: Answer, expected: Expected) -> list[str]:
     return wrong
 
 
-def _is_named(said: Answer, group: Sequence[str]) -> bool:
+def _is_named(said: StatedDiagnosis, group: Sequence[str]) -> bool:
     """Claimed, or rightly undecided: among the alternatives of a claim that the recording cannot rule out."""
     return any(candidate.effect in group for finding in said.claims for candidate in (finding.named, *finding.others))
 
 
-def _is_at(named: Candidate, places: Sequence[str]) -> bool:
+def _is_at(named: StatedCandidate, places: Sequence[str]) -> bool:
     return any(place in channel for place in places for channel in named.at)
 
 

@@ -38,7 +38,7 @@ class Expected:
         verdicts: accepted verdicts; empty for any.
         sizes: right values of parameters.
         residual: output to the largest accepted root mean square of recording less open-loop simulation, in its unit.
-        words: phrases of an advice or warning, all of which together are accepted in place of a claim.
+        display_name: phrases of an advice or warning, all of which together are accepted in place of a claim.
     """
 
     names: Sequence[Sequence[str]] = ()
@@ -47,7 +47,7 @@ class Expected:
     verdicts: Sequence[str] = ()
     sizes: Sequence[Size] = ()
     residual: Mapping[str, float] = field(default_factory=dict)
-    words: Sequence[str] = ()
+    display_name: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Known:
         name: what the table calls it.
         recording: its file, or the file or folder that ``cut`` makes it of.
         simulation, expected: as above.
-        between: what inputs do between samples, where it is not left to the diagnosis.
+        input_hold: what inputs do between samples, where it is not left to the diagnosis.
         cut: the columns to diagnose, of ``recording``; None for all of it as it is.
     """
 
@@ -66,7 +66,7 @@ class Known:
     recording: Path
     simulation: str
     expected: Expected
-    between: Mapping[str, str] = field(default_factory=dict)
+    input_hold: Mapping[str, str] = field(default_factory=dict)
     cut: Callable[[Path], Mapping[str, Any]] | None = None
 
     @property
@@ -90,7 +90,7 @@ class Known:
     def request(self) -> Request:
         if self.simulation.endswith(".csv"):
             return Request(simulation="", simulated=self.file, force=True, report=False)
-        return Request(simulation=self.simulation, between=self.between, force=True, report=False)
+        return Request(simulation=self.simulation, input_hold=self.input_hold, force=True, report=False)
 
 
 SYSTEMS = Path(__file__).resolve().parent / "dynamics" / "systems.py"
@@ -149,7 +149,7 @@ def cases(shared: Path = SHARED) -> Iterator[Known]:
     overflow = Expected((("overflow", CURVE),), places=("level1",), residual={"level2": 1.2 * 0.41})
     yield _known(folder, "tanks", "fit.csv", "Tanks", overflow)
     air = Expected(
-        ((DRAG,),), sizes=(Size(DRAG, "drag", 0.00047, within=0.32),), words=("quadratic_drag", "would explain")
+        ((DRAG,),), sizes=(Size(DRAG, "drag", 0.00047, within=0.32),), display_name=("quadratic_drag", "would explain")
     )
     yield _known(folder, "coastdown", "runs.csv", "Coast", air)
     yield _known(folder, "ball_beam", "run.csv", "Ball", Expected(verdicts=("unfit",)))

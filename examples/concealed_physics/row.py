@@ -94,7 +94,7 @@ def write_row(recording: Path, request: Request, folder: Path) -> None:
     """
     from mkc_torch._parallel.pool import allow_copies
     from mkc_torch._parallel.processes import keep_memory, one_thread
-    from mkc_torch.cli.console import Look
+    from mkc_torch.cli.console import ConsoleStyle
     from mkc_torch.cli.diagnosis_files import diagnose_file
 
     one_thread()
@@ -103,7 +103,7 @@ def write_row(recording: Path, request: Request, folder: Path) -> None:
     for old in ("diagnosis.json", "model.json"):
         (folder / old).unlink(missing_ok=True)
     cpu, wall = _cpu_seconds(), time.perf_counter()
-    outcomes = diagnose_file(recording, folder, request, Look(terminal=False, width=100))
+    outcomes = diagnose_file(recording, folder, request, ConsoleStyle(terminal=False, width=100))
     seconds = {
         "cpu_seconds": round(_cpu_seconds() - cpu, 2),
         "wall_seconds": round(time.perf_counter() - wall, 2),

@@ -23,7 +23,7 @@ from mkc_torch._parallel.deadline import check_deadline, is_limited
 from mkc_torch._parallel.processes import cores
 from mkc_torch._parallel.progress import count, counted, silently
 
-__all__ = ["Parcels", "allow_copies", "meanwhile", "shared"]
+__all__ = ["Serializer", "allow_copies", "shared", "speculative"]
 
 T = TypeVar("T")
 
@@ -76,7 +76,7 @@ def shared(works: Sequence[Callable[[], T]], known: Iterable[object] = (), thing
 
 
 @contextmanager
-def meanwhile(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) -> Iterator[Callable[[], list[T]]]:
+def speculative(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) -> Iterator[Callable[[], list[T]]]:
     """What copies begin with while this process goes on, the last one first; ``known`` as of :func:`shared`.
 
     Gives a function for all results, which takes part in what nobody has begun, and waits for the rest; where there is
@@ -87,7 +87,7 @@ def meanwhile(works: Sequence[Callable[[], T]], known: Iterable[object] = ()) ->
         yield results
 
 
-class Parcels:
+class Serializer:
     """Results as bytes: with the numbers of objects that both sides know, and of a tensor what it shows.
 
     Whoever has worked at it, what is unpacked lies in memory alike, so that what follows rounds alike.
@@ -137,7 +137,7 @@ def _begun(
     works: Sequence[Callable[[], T]], copies: int, known: Iterable[object], *, ahead: bool = False, thing: str = ""
 ) -> Iterator[Callable[[], list[T]]]:
     """Works that copies have begun with, as a function for all results; no copy is left in the end."""
-    parcels = Parcels(known)
+    parcels = Serializer(known)
     if copies < 1:
         yield lambda: [_done(work, parcels, thing) for work in counted(works, len(works), thing)]
         return
@@ -185,7 +185,7 @@ def _uninterrupted() -> Iterator[None]:
 
 def _results(
     works: Sequence[Callable[[], T]],
-    parcels: Parcels,
+    parcels: Serializer,
     todo: int,
     copies: list[Future[dict[int, bytes]]],
     thing: str,
@@ -215,7 +215,7 @@ def _taken(todo: int) -> Iterator[int]:
         yield int.from_bytes(taken, "big")
 
 
-def _done(work: Callable[[], T], parcels: Parcels, thing: str = "") -> T:
+def _done(work: Callable[[], T], parcels: Serializer, thing: str = "") -> T:
     """As a copy would send it; a work that is counted counts nothing itself."""
     check_deadline()
     with silently() if thing else nullcontext():
@@ -226,11 +226,11 @@ def _done(work: Callable[[], T], parcels: Parcels, thing: str = "") -> T:
         return result
 
 
-_task: tuple[Sequence[Callable[[], object]], int, Parcels] = ((), 0, Parcels())
+_task: tuple[Sequence[Callable[[], object]], int, Serializer] = ((), 0, Serializer())
 """What a copy works at, where it takes a number from, and how it sends results."""
 
 
-def _begin(works: Sequence[Callable[[], object]], todo: int, parcels: Parcels, niceness: int) -> None:
+def _begin(works: Sequence[Callable[[], object]], todo: int, parcels: Serializer, niceness: int) -> None:
     global _task
     _task = works, todo, parcels
     allow_copies(0)

@@ -25,6 +25,7 @@ __all__ = [
     "checked_number",
     "checked_whole",
     "first_of",
+    "format_value",
     "refuse_bad_batch",
     "refuse_bad_weight",
     "refuse_complex",
@@ -36,7 +37,6 @@ __all__ = [
     "refuse_out_of_range",
     "refuse_text",
     "seems_finite",
-    "told",
 ]
 
 
@@ -44,7 +44,7 @@ DIVERGED = "The network has diverged, or what it was given holds NaN: lower the 
 """What to do about predictions that are not finite."""
 
 
-def told(value: object) -> str:
+def format_value(value: object) -> str:
     """What a value is, as an error tells it: shortened, or by name if it is a class or has no text of one line."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
@@ -70,7 +70,7 @@ def refuse_other_type(name: str, value: object, kind: type, what: str, advice: s
     if not isinstance(value, kind):
         if isinstance(value, type) and issubclass(value, kind):
             advice = f"make one, {value.__name__}(...)"
-        raise TypeError(f"Expected argument `{name}` to be {what} but got {told(value)}; {advice}.")
+        raise TypeError(f"Expected argument `{name}` to be {what} but got {format_value(value)}; {advice}.")
 
 
 def refuse_no_tensor(name: str, value: object, kind: str) -> None:
@@ -128,7 +128,7 @@ def as_numbers(
             return torch.as_tensor(value, dtype=dtype or torch.get_default_dtype(), device=device)
         except (TypeError, ValueError, RuntimeError, OverflowError):
             raise TypeError(
-                f"Expected argument `{name}` to be a number, or a tensor of them, but got {told(value)}."
+                f"Expected argument `{name}` to be a number, or a tensor of them, but got {format_value(value)}."
             ) from None
     refuse_complex(name, value)
     return value
@@ -181,7 +181,7 @@ def checked_number(
     """
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise TypeError(
-            f"Expected argument `{name}` to be a number {_range(low, high, ends)} but got {told(value)}{_then(advice)}."
+            f"Expected argument `{name}` to be a number {_range(low, high, ends)} but got {format_value(value)}{_then(advice)}."
         )
     try:
         number = float(value)
@@ -201,7 +201,7 @@ def checked_whole(name: str, value: object, least: int | None = None, advice: st
     if number is None or (least is not None and number < least):
         limit = "" if least is None else f" of at least {least}"
         raise ValueError(
-            f"Expected argument `{name}` to be a whole number{limit} but got {told(value)}{_then(advice)}."
+            f"Expected argument `{name}` to be a whole number{limit} but got {format_value(value)}{_then(advice)}."
         )
     return number
 
@@ -215,7 +215,7 @@ def refuse_text(name: str, value: object, what: str) -> None:
     if isinstance(value, str):
         raise TypeError(f"Expected argument `{name}` to be {what} but got {value!r}; write ({value!r},).")
     if not isinstance(value, (tuple, list)) or not all(isinstance(one, str) for one in value):
-        raise TypeError(f"Expected argument `{name}` to be {what} but got {told(value)}.")
+        raise TypeError(f"Expected argument `{name}` to be {what} but got {format_value(value)}.")
 
 
 def refuse_bad_weight(weight: object, name: str = "weight") -> None:
@@ -301,7 +301,7 @@ def _float(name: str, value: float) -> float:
         return float(value)
     except OverflowError:
         raise ValueError(
-            f"Expected argument `{name}` to be a number that a float holds but got {told(value)}."
+            f"Expected argument `{name}` to be a number that a float holds but got {format_value(value)}."
         ) from None
 
 

@@ -15,11 +15,11 @@ from mkc_torch._support.torch_internals import is_wrapped
 
 __all__ = [
     "Residual",
-    "beside",
     "directions_at_once",
     "forward_jacobian",
     "forward_tangents",
     "load_forward_mode",
+    "make_dual",
     "reverse_tangents",
     "twice_reverse_tangents",
 ]
@@ -36,7 +36,7 @@ def load_forward_mode() -> None:
         torch.func.jvp(torch.sin, (one,), (one,))
 
 
-def beside(constant: Tensor, moving: Tensor) -> Tensor:
+def make_dual(constant: Tensor, moving: Tensor) -> Tensor:
     """A constant, with a tangent of zeros where one number, ``moving``, has a tangent.
 
     What has none is added and multiplied by reference functions written in Python, half a millisecond each and a second
@@ -85,7 +85,7 @@ def forward_jacobian(function: Residual, theta: Tensor, values: int) -> Tensor:
 def twice_reverse_tangents(function: Residual) -> Residual:
     """The tangents as slopes of what reverse mode makes of weights of the values, which is linear in these.
 
-    Forward mode does in Python what torch does here in C++, unless a constant has a tangent too (:func:`beside`). It is
+    Forward mode does in Python what torch does here in C++, unless a constant has a tangent too (:func:`make_dual`). It is
     used where reverse mode has no finite answer, as beside an infinite slope that ``torch.where`` leaves out, and where
     there is no second derivative. Torch takes that for 0, so a function's first answer is compared along one direction.
     """

@@ -22,7 +22,7 @@ from mkc_torch.calibration.impossible_samples import without_impossible
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.calibration.other_sensors import GRAVITY, accelerometer, rest_bias
 from mkc_torch.calibration.places import disturbed_places, numbered
-from mkc_torch.calibration.plain_values import Spread, matrix_of, spread_of, vector_of
+from mkc_torch.calibration.plain_values import ResidualSpread, matrix_of, spread_of, vector_of
 from mkc_torch.calibration.recorded_ellipsoid import recorded_ellipsoid
 from mkc_torch.calibration.result import Calibration
 from mkc_torch.calibration.runs import in_each_run, run_slices
@@ -33,7 +33,7 @@ from mkc_torch.linear import MKCRegression
 from mkc_torch.recording.recording import Recording, RecordingError
 from mkc_torch.recording.unit_warnings import RECORDED, converted_from, field_warning, time_warning
 
-__all__ = ["Calibration", "Matrix", "Spread", "Vector", "calibrate", "prepared"]
+__all__ = ["Calibration", "Matrix", "ResidualSpread", "Vector", "calibrate", "prepared"]
 
 REJECTED_BELOW = 0.5
 """A sample of less than this weight counts as rejected."""

@@ -20,14 +20,14 @@ from mkc_torch.calibration.ellipsoid import monomials, sampson_distance
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Bias", "Moments", "algebraic_rows", "bias_by_noise", "distance_rows", "moments_of"]
+__all__ = ["Bias", "NoisyMoments", "algebraic_rows", "bias_by_noise", "distance_rows", "moments_of"]
 
 _STEP = 0.25
 """Step of the differences, in standard deviations of the noise: small beside what the rows curve over, and their
 rounding is 16 times that of the moments."""
 
 
-class Moments(NamedTuple):
+class NoisyMoments(NamedTuple):
     """Weighted means of the products of rows, and the part of them that noise has lent, each (B, k, k)."""
 
     found: Float[Tensor, "B k k"]
@@ -46,7 +46,7 @@ def moments_of(
     points: Float[Tensor, "B N 3"],
     weight: Float[Tensor, "B N"],
     noise: Float[Tensor, " B"],
-) -> Moments:
+) -> NoisyMoments:
     """Moments of rows that are made of points.
 
     Args:
@@ -73,10 +73,10 @@ def moments_of(
     for axis in torch.eye(3, dtype=points.dtype, device=points.device):
         aside = (_STEP * noise)[:, None, None] * axis
         lent = lent + (at(points + aside) - found) + (at(points - aside) - found)
-    return Moments(found, lent / (2.0 * _STEP**2))
+    return NoisyMoments(found, lent / (2.0 * _STEP**2))
 
 
-def bias_by_noise(moments: Moments) -> Bias:
+def bias_by_noise(moments: NoisyMoments) -> Bias:
     """Of parameters at which the rows' mean product with the residual, their last element, is 0.
 
     Args:

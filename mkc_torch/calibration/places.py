@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.recording.disturbance import Interval, disturbed_intervals
+from mkc_torch.recording.disturbance import RejectedInterval, disturbed_intervals
 from mkc_torch.recording.recording import Recording
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def places(recording: Recording) -> Float[Tensor, " N"]:
     return torch.arange(1.0, len(recording) + 1.0, dtype=torch.float64)
 
 
-def disturbed_places(recording: Recording, rejected: Bool[Tensor, " N"]) -> tuple[Interval, ...]:
+def disturbed_places(recording: Recording, rejected: Bool[Tensor, " N"]) -> tuple[RejectedInterval, ...]:
     """:func:`mkc_torch.recording.disturbance.disturbed_intervals`, in rows where there is no time.
 
     Example:
@@ -62,4 +62,4 @@ def disturbed_places(recording: Recording, rejected: Bool[Tensor, " N"]) -> tupl
     if recording.time is not None:
         return disturbed_intervals(recording.time, rejected)
     found = disturbed_intervals(places(recording) / _ROWS_A_SECOND, rejected)
-    return tuple(Interval(*(float(round(end * _ROWS_A_SECOND)) for end in one)) for one in found)
+    return tuple(RejectedInterval(*(float(round(end * _ROWS_A_SECOND)) for end in one)) for one in found)

@@ -11,17 +11,17 @@ from mkc_torch.calibration.file import Matrix, Vector
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Spread", "matrix_of", "spread_of", "vector_of"]
+__all__ = ["ResidualSpread", "matrix_of", "spread_of", "vector_of"]
 
 
-class Spread(NamedTuple):
+class ResidualSpread(NamedTuple):
     """The size of residuals: 1.4826 times their median absolute value, and their root mean square."""
 
     robust: float
     rms: float
 
 
-def spread_of(residual: Float[Tensor, " N"]) -> Spread:
+def spread_of(residual: Float[Tensor, " N"]) -> ResidualSpread:
     """The size of residuals.
 
     Example:
@@ -29,7 +29,7 @@ def spread_of(residual: Float[Tensor, " N"]) -> Spread:
         >>> spread_of(torch.tensor([4.0, -2.0, 2.0, -4.0, 1.0, 0.0, 2.0, 2.0])).robust
         2.9652
     """
-    return Spread(1.4826 * float(residual.abs().median()), float(residual.square().mean().sqrt()))
+    return ResidualSpread(1.4826 * float(residual.abs().median()), float(residual.square().mean().sqrt()))
 
 
 def vector_of(values: Float[Tensor, " 3"]) -> Vector:

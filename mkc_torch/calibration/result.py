@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.html_table import html_table, with_error
-from mkc_torch.calibration.aid import Aid, aid_from_json, aid_to_json
+from mkc_torch.calibration.aided_result import AidedResult, aid_from_json, aid_to_json
 from mkc_torch.calibration.coverage import Coverage, Gap, nearest_axis
 from mkc_torch.calibration.file import (
     CalibrationFileError,
@@ -22,17 +22,17 @@ from mkc_torch.calibration.file import (
     finite_or_none,
     refuse_constant,
 )
-from mkc_torch.calibration.plain_values import Spread
+from mkc_torch.calibration.plain_values import ResidualSpread
 from mkc_torch.calibration.plot import CalibrationPlot
 from mkc_torch.density.tails import ChannelTails
 from mkc_torch.functional import mkc_weight
-from mkc_torch.recording.disturbance import Interval
+from mkc_torch.recording.disturbance import RejectedInterval
 from mkc_torch.recording.recording import Recording
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["SCHEMA", "Calibration", "RestBias", "Spread", "calibration_from_json", "calibration_to_json"]
+__all__ = ["SCHEMA", "Calibration", "ResidualSpread", "RestBias", "calibration_from_json", "calibration_to_json"]
 
 SCHEMA = "mkc-calibration/1"
 
@@ -95,15 +95,15 @@ class Calibration:
     sigma: float
     d: float
     bound: float
-    before: Spread
-    after: Spread
+    before: ResidualSpread
+    after: ResidualSpread
     rejected: int
-    disturbed: tuple[Interval, ...]
+    disturbed: tuple[RejectedInterval, ...]
     coverage: Coverage
     warnings: tuple[str, ...]
     name: str = ""
     disturbed_unit: str = "s"
-    aid: Aid | None = None
+    aid: AidedResult | None = None
     sensor: str = "mag"
     rest_bias: RestBias | None = None
     tails: ChannelTails | None = None
@@ -284,11 +284,11 @@ def calibration_from_json(text: str) -> Calibration:
         sigma=c.sigma(),
         d=c.positive("noise", "d"),
         bound=c.positive("noise", "bound"),
-        before=Spread(c.number("residual", "before", "robust"), c.number("residual", "before", "rms")),
-        after=Spread(c.number("residual", "after", "robust"), c.number("residual", "after", "rms")),
+        before=ResidualSpread(c.number("residual", "before", "robust"), c.number("residual", "before", "rms")),
+        after=ResidualSpread(c.number("residual", "after", "robust"), c.number("residual", "after", "rms")),
         rejected=c.count("rejected", "count"),
         disturbed=tuple(
-            Interval(*c.numbers("rejected", "intervals", i, length=2)) for i in c.each("rejected", "intervals")
+            RejectedInterval(*c.numbers("rejected", "intervals", i, length=2)) for i in c.each("rejected", "intervals")
         ),
         coverage=Coverage(
             fraction=c.number("coverage", "fraction"),

@@ -9,7 +9,7 @@ from typing import Any
 
 from mkc_torch.challenge.binomial import Share
 from mkc_torch.challenge.key import Key
-from mkc_torch.challenge.score import Measured, Score
+from mkc_torch.challenge.score import MeasuredThreshold, Score
 from mkc_torch.challenge.verdict import ADEQUATE, UNEXPLAINED, UNFIT
 
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -128,12 +128,15 @@ def number_text(value: float) -> str:
     return "not measured" if math.isnan(value) else f"{value:.4g}"
 
 
-def measured_text(measured: Measured) -> str:
+def measured_text(measured: MeasuredThreshold) -> str:
     """What was measured, in per cent where that was asked for.
 
     Example:
         >>> from mkc_torch.challenge.thresholds import THRESHOLDS
-        >>> measured_text(Measured(THRESHOLDS[1], 0.0625)), measured_text(Measured(THRESHOLDS[-1], 1.007))
+        >>> (
+        ...     measured_text(MeasuredThreshold(THRESHOLDS[1], 0.0625)),
+        ...     measured_text(MeasuredThreshold(THRESHOLDS[-1], 1.007)),
+        ... )
         ('6.2 %', '1.007')
     """
     value = measured.value

@@ -18,7 +18,7 @@ from mkc_torch.challenge.verdict import (
     FAILED,
     NOTHING,
     VERDICTS,
-    Answer,
+    StatedDiagnosis,
     answer,
     covered,
     driver_right,
@@ -46,7 +46,7 @@ class Bin:
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredThreshold:
     """One threshold and what was measured."""
 
     threshold: Threshold
@@ -92,7 +92,7 @@ class Score:
     ratios: tuple[float, ...]
     doubles: Mapping[int, int]
     failed: tuple[str, ...]
-    measured: tuple[Measured, ...]
+    measured: tuple[MeasuredThreshold, ...]
 
     def numbers(self) -> dict[str, Any]:
         """As JSON has it; infinite and undefined numbers become null."""
@@ -104,7 +104,7 @@ class _Single:
     """A recording with one hidden effect of the catalogue, and what was said about it."""
 
     truth: KeyEffect
-    said: Answer
+    said: StatedDiagnosis
 
     @property
     def strong(self) -> bool:
@@ -175,7 +175,7 @@ def score(
     return Score(**results, measured=_measured(results, thresholds))
 
 
-def confusion(keys: Sequence[Key], said: Mapping[str, Answer]) -> dict[str, dict[str, int]]:
+def confusion(keys: Sequence[Key], said: Mapping[str, StatedDiagnosis]) -> dict[str, dict[str, int]]:
     """What was hidden, to what was named first, to how often; two at once are left out."""
     counts: dict[str, Counter[str]] = {}
     for key in keys:
@@ -242,7 +242,7 @@ def power(cases: Sequence[_Single], measure: Callable[[KeyEffect], float]) -> tu
     return tuple(bins)
 
 
-def doubles(keys: Sequence[Key], said: Mapping[str, Answer]) -> dict[int, int]:
+def doubles(keys: Sequence[Key], said: Mapping[str, StatedDiagnosis]) -> dict[int, int]:
     """How many of two hidden effects were named, to how often."""
     counts = {0: 0, 1: 0, 2: 0}
     for key in keys:
@@ -258,7 +258,7 @@ def doubles(keys: Sequence[Key], said: Mapping[str, Answer]) -> dict[int, int]:
     return counts
 
 
-def _measured(results: Mapping[str, Any], thresholds: Sequence[Threshold]) -> tuple[Measured, ...]:
+def _measured(results: Mapping[str, Any], thresholds: Sequence[Threshold]) -> tuple[MeasuredThreshold, ...]:
     onsets, ratios = results["onset_errors"], results["ratios"]
     values = {
         "empty_cases": float(results["false_alarms"].total),
@@ -274,7 +274,7 @@ def _measured(results: Mapping[str, Any], thresholds: Sequence[Threshold]) -> tu
         "coverage": results["coverage"].value,
         "second_ratio": float(torch.tensor(ratios, dtype=torch.float64).median()) if ratios else math.nan,
     }
-    return tuple(Measured(threshold, values[threshold.measure]) for threshold in thresholds)
+    return tuple(MeasuredThreshold(threshold, values[threshold.measure]) for threshold in thresholds)
 
 
 def share_of(cases: Sequence[T], holds: Callable[[T], bool]) -> Share:

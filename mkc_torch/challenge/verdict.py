@@ -28,7 +28,7 @@ _NO_DRIVERS = frozenset(("time", "field", "mag_x", "mag_y", "mag_z"))
 
 
 @dataclass(frozen=True)
-class Candidate:
+class StatedCandidate:
     """``at`` is where it acts: the channels of a finding."""
 
     effect: str
@@ -37,11 +37,11 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Finding:
+class StatedFinding:
     """``others`` are the alternatives that the diagnosis says its data cannot rule out; ``grade`` is "" without one."""
 
-    named: Candidate
-    others: tuple[Candidate, ...]
+    named: StatedCandidate
+    others: tuple[StatedCandidate, ...]
     onset: float | None
     onset_interval: tuple[float, float] | None
     parameters: tuple[Mapping[str, Any], ...]
@@ -54,7 +54,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Answer:
+class StatedDiagnosis:
     """A diagnosis; ``verdict`` is ``failed`` where there is none.
 
     Example:
@@ -65,15 +65,15 @@ class Answer:
 
     verdict: str
     p_value: float | None
-    findings: tuple[Finding, ...]
+    findings: tuple[StatedFinding, ...]
 
     @property
-    def claims(self) -> tuple[Finding, ...]:
+    def claims(self) -> tuple[StatedFinding, ...]:
         """What it says is missing, strongest first."""
         return tuple(finding for finding in self.findings if finding.claimed)
 
     @property
-    def nearest(self) -> tuple[Finding, ...]:
+    def nearest(self) -> tuple[StatedFinding, ...]:
         """What it says is only the nearest that the catalogue has."""
         return tuple(finding for finding in self.findings if finding.grade == NEAREST)
 
@@ -95,18 +95,18 @@ class Answer:
         return {ADEQUATE: NOTHING, FAILED: FAILED, UNFIT: UNFIT}.get(self.verdict, UNKNOWN)
 
 
-def answer(diagnosis: Mapping[str, Any] | None) -> Answer:
+def answer(diagnosis: Mapping[str, Any] | None) -> StatedDiagnosis:
     """From the content of ``diagnosis.json``; None for a diagnosis that failed."""
     if diagnosis is None:
-        return Answer(FAILED, None, ())
+        return StatedDiagnosis(FAILED, None, ())
     p_value = diagnosis.get("p_value")
     findings = tuple(_finding(numbers) for numbers in diagnosis.get("findings", ()))
-    return Answer(diagnosis["verdict"], None if p_value is None else float(p_value), findings)
+    return StatedDiagnosis(diagnosis["verdict"], None if p_value is None else float(p_value), findings)
 
 
-def _finding(numbers: Mapping[str, Any]) -> Finding:
+def _finding(numbers: Mapping[str, Any]) -> StatedFinding:
     others = [other for other in numbers.get("alternatives") or () if not other.get("separable", True)]
-    return Finding(
+    return StatedFinding(
         _candidate(numbers),
         tuple(_candidate(other) for other in others),
         numbers.get("onset"),
@@ -116,22 +116,22 @@ def _finding(numbers: Mapping[str, Any]) -> Finding:
     )
 
 
-def _candidate(numbers: Mapping[str, Any]) -> Candidate:
-    return Candidate(
+def _candidate(numbers: Mapping[str, Any]) -> StatedCandidate:
+    return StatedCandidate(
         numbers["effect"],
         frozenset(numbers.get("drivers") or ()) - _NO_DRIVERS,
         frozenset(numbers.get("channels") or ()),
     )
 
 
-def named_right(named: Candidate, truth: KeyEffect) -> bool:
+def named_right(named: StatedCandidate, truth: KeyEffect) -> bool:
     """It is the hidden effect, or a rival that the data cannot tell from it."""
     if truth.withheld:
         return named.effect in _WITHHELD or _is_inseparable(named, truth)
     return named.effect == truth.effect or _is_inseparable(named, truth)
 
 
-def driver_right(named: Candidate, truth: KeyEffect) -> bool:
+def driver_right(named: StatedCandidate, truth: KeyEffect) -> bool:
     """Its drivers are those of the hidden effect, or of a rival that the data cannot tell from it."""
     if truth.effect == "field_gradient" and truth.drivers:
         own = bool(named.drivers) and named.drivers <= frozenset(POSITION)
@@ -140,12 +140,12 @@ def driver_right(named: Candidate, truth: KeyEffect) -> bool:
     return own or any(named.drivers == frozenset(rival.drivers) for rival in truth.inseparable)
 
 
-def located_right(named: Candidate, truth: KeyEffect) -> bool:
+def located_right(named: StatedCandidate, truth: KeyEffect) -> bool:
     """It acts at one of the places of the hidden effect, or of a rival that the data cannot tell from it."""
     return bool(named.at & set(truth.at)) or any(named.at & set(rival.at) for rival in truth.inseparable)
 
 
-def _is_inseparable(named: Candidate, truth: KeyEffect) -> bool:
+def _is_inseparable(named: StatedCandidate, truth: KeyEffect) -> bool:
     return any(
         (rival.effect, frozenset(rival.drivers)) == (named.effect, named.drivers)
         and (not rival.at or bool(named.at & set(rival.at)))
@@ -153,7 +153,7 @@ def _is_inseparable(named: Candidate, truth: KeyEffect) -> bool:
     )
 
 
-def covered(finding: Finding, truth: KeyParameter) -> list[bool] | None:
+def covered(finding: StatedFinding, truth: KeyParameter) -> list[bool] | None:
     """For each number of the parameter, whether the 90 % interval covers it; None where the diagnosis has no such one.
 
     A parameter of the diagnosis answers to the key's if it has its unit and shape.

@@ -47,7 +47,9 @@ def apply(
     """
     names, units = parsed_columns(columns), parsed_units(unit or [])
     if simulation is not None and simulated is not None:
-        raise typer.BadParameter("--simulation and --simulated exclude each other; give the one that was diagnosed.")
+        raise typer.BadParameter(
+            "--simulation and --simulator-output exclude each other; give the one that was diagnosed."
+        )
     with loading():
         from mkc_torch.cli.correction import correct, read_correction, show_correction, unit_of, write_correction
         from mkc_torch.cli.diagnosis_files import named_simulation, paired_simulation

@@ -83,7 +83,7 @@ def calibrate(
         from mkc_torch._parallel.processes import keep_memory
         from mkc_torch.calibration.aided.place import earth_field, parsed_date, parsed_place
         from mkc_torch.calibration.exports import Destination
-        from mkc_torch.cli.calibration_files import Asked, calibrations_of, read_calibration
+        from mkc_torch.cli.calibration_files import CalibrationRequest, calibrations_of, read_calibration
         from mkc_torch.cli.calibration_summary import show
     keep_memory()
     earth = None
@@ -97,7 +97,7 @@ def calibrate(
     except FAILURES as error:
         complain(str(against), error)
         raise typer.Exit(1) from None
-    asked = Asked(
+    asked = CalibrationRequest(
         columns=names,
         units=units,
         sensor=sensor,

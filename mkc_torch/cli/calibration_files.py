@@ -21,7 +21,7 @@ from mkc_torch.cli.exported import exports_of, left_from_before
 from mkc_torch.cli.recorded import read_accelerometer, read_magnetometer, refuse_likely_size, sensor_names
 from mkc_torch.recording.formats import Topic, read_topics
 
-__all__ = ["Asked", "Found", "calibrations_of", "read_calibration"]
+__all__ = ["CalibrationOutcome", "CalibrationRequest", "calibrations_of", "read_calibration"]
 
 
 ACCELEROMETER = "accel"
@@ -31,7 +31,7 @@ Step = Callable[[str], None]
 """Takes the name of a stage of the work."""
 
 
-class Asked(NamedTuple):
+class CalibrationRequest(NamedTuple):
     """What a user asked for, of all recordings.
 
     Attributes:
@@ -57,7 +57,7 @@ class Asked(NamedTuple):
     earth: Field | None = None
 
 
-class Found(NamedTuple):
+class CalibrationOutcome(NamedTuple):
     """A calibration and what came of it.
 
     Attributes:
@@ -89,8 +89,8 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def calibrations_of(
-    path: Path, folder: Path, asked: Asked, *, force: bool, step: Step | None = None
-) -> Iterator[tuple[str, Found | Exception]]:
+    path: Path, folder: Path, asked: CalibrationRequest, *, force: bool, step: Step | None = None
+) -> Iterator[tuple[str, CalibrationOutcome | Exception]]:
     """Calibrate each magnetometer of a file: one alone into the folder, several into folders of their names in it.
 
     Args:
@@ -128,9 +128,9 @@ def calibrations_of(
     remove_if_empty(folder)
 
 
-def _refuse_for_one(path: Path, asked: Asked, names: list[str]) -> None:
+def _refuse_for_one(path: Path, asked: CalibrationRequest, names: list[str]) -> None:
     """Refuse what is of one sensor where there are several."""
-    for option, given in (("--name", asked.name), ("--against", asked.old)):
+    for option, given in (("--name", asked.name), ("--compare-with", asked.old)):
         if given is not None:
             raise ValueError(
                 f"{path}: the file holds {len(names)} magnetometers, {', '.join(names)}, and {option} is of one; give "
@@ -139,8 +139,14 @@ def _refuse_for_one(path: Path, asked: Asked, names: list[str]) -> None:
 
 
 def _calibrate(
-    path: Path, folder: Path, asked: Asked, topics: Sequence[Topic], drawing: Callable[[], None], *, force: bool
-) -> Found:
+    path: Path,
+    folder: Path,
+    asked: CalibrationRequest,
+    topics: Sequence[Topic],
+    drawing: Callable[[], None],
+    *,
+    force: bool,
+) -> CalibrationOutcome:
     """Write calibration.json and report.html of a recording; where it is refused, the report alone says why.
 
     ``topics`` are the tables of the file; ``drawing`` is called before the report is drawn.
@@ -185,7 +191,7 @@ def _calibrate(
             write_atomically(folder / name, text, overwrite=force)
         notes += left_from_before(folder, list(texts))
     written = [result, report, *(folder / name for name in texts)]
-    return Found(calibration, written, beside, notes, [*refused, *not_exported])
+    return CalibrationOutcome(calibration, written, beside, notes, [*refused, *not_exported])
 
 
 def _beside(calibration: Calibration, old: Calibration | None) -> tuple[Differences | None, list[ValueError]]:

@@ -13,8 +13,8 @@ from mkc_torch.cli.console import FAILURES, complain, interrupts_told, progress
 from mkc_torch.cli.loading import loading
 
 if TYPE_CHECKING:
+    from mkc_torch.challenge.scenario import Scenarios
     from mkc_torch.challenge.subject import Subject
-    from mkc_torch.challenge.world import Worlds
 
 
 class Family(str, Enum):
@@ -140,7 +140,7 @@ def _in_worlds(
 ) -> None:
     from mkc_torch._parallel.pool import allow_copies
     from mkc_torch._parallel.processes import cores, keep_memory, one_thread
-    from mkc_torch.challenge.worlds import run
+    from mkc_torch.challenge.scenarios import run
     from mkc_torch.cli.challenge_jobs import diagnose_in_world
     from mkc_torch.cli.worlds_summary import show_worlds
 
@@ -167,9 +167,9 @@ def _in_worlds(
     show_worlds(score, total, output)
 
 
-def _worlds(family: Family, duration: float | None) -> Worlds:
-    from mkc_torch.challenge.dynamics.worlds import dynamics_worlds
-    from mkc_torch.challenge.magnetometer.worlds import magnetometer_worlds
+def _worlds(family: Family, duration: float | None) -> Scenarios:
+    from mkc_torch.challenge.dynamics.scenarios import dynamics_worlds
+    from mkc_torch.challenge.magnetometer.scenarios import magnetometer_worlds
 
     if family is Family.magnetometer:
         return magnetometer_worlds() if duration is None else magnetometer_worlds(duration)

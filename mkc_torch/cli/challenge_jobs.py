@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mkc_torch.cli.console import Look
+from mkc_torch.cli.console import ConsoleStyle
 from mkc_torch.cli.correction import correct, read_correction
 from mkc_torch.cli.diagnosis_files import diagnose_file, named_simulation
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Request
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["JOBS", "correct_dynamics", "correct_unseen", "diagnose_dynamics", "diagnose_in_world", "diagnose_unseen"]
 
-_QUIET = Look(terminal=False, width=100)
+_QUIET = ConsoleStyle(terminal=False, width=100)
 
 
 def diagnose_unseen(paths: list[Path], folder: Path) -> None:
@@ -35,7 +35,7 @@ def diagnose_dynamics(paths: list[Path], folder: Path) -> None:
 def diagnose_in_world(paths: list[Path], folder: Path) -> None:
     """The same with ``--simulation``, of the file that lies ready for a recording, if there is one."""
     from mkc_torch.challenge.dynamics.subject import simulation_class
-    from mkc_torch.challenge.worlds.run import SIMULATIONS
+    from mkc_torch.challenge.scenarios.run import SIMULATIONS
 
     for path in paths:
         file = folder.parent / SIMULATIONS / f"{path.stem}.py"

@@ -9,18 +9,18 @@ from rich.table import Table
 from rich.text import Text
 
 from mkc_torch.challenge.page import measured_text, share_text
-from mkc_torch.challenge.score import Measured, Score
+from mkc_torch.challenge.score import MeasuredThreshold, Score
 from mkc_torch.cli.console import out
 
 __all__ = ["show_challenge"]
 
 
-def _counts(measured: Measured) -> bool:
+def _counts(measured: MeasuredThreshold) -> bool:
     """Whether it is a number of recordings."""
     return math.isinf(measured.threshold.high)
 
 
-def _not(measured: Measured) -> str:
+def _not(measured: MeasuredThreshold) -> str:
     return "too few" if _counts(measured) else "no"
 
 

@@ -40,14 +40,14 @@ _WIDTH_IN_A_PIPE = 100
 
 
 @dataclass(frozen=True)
-class Look:
+class ConsoleStyle:
     """How text is set for where it goes; another process can set it too, and this one print it."""
 
     terminal: bool
     width: int
 
     @classmethod
-    def of(cls, console: Console) -> Look:
+    def of(cls, console: Console) -> ConsoleStyle:
         return cls(console.is_terminal, console.width)
 
     def set(self, show: Callable[[Console], None]) -> str:

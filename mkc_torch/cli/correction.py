@@ -14,9 +14,9 @@ from mkc_torch.calibration import result as calibration_file
 from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.cli.console import out
 from mkc_torch.diagnosis import DiagnosedModel
-from mkc_torch.diagnosis.files import diagnosis_json as diagnosis_file
-from mkc_torch.diagnosis.files import model as diagnosed_model
-from mkc_torch.diagnosis.files.model import refuse_unknown
+from mkc_torch.diagnosis.io import diagnosis_json as diagnosis_file
+from mkc_torch.diagnosis.io import model as diagnosed_model
+from mkc_torch.diagnosis.io.model import refuse_unknown
 from mkc_torch.recording.kept_columns import write_beside
 from mkc_torch.recording.recording import Recording, write_table
 from mkc_torch.report.words.numbers import size

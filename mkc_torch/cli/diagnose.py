@@ -13,7 +13,7 @@ import typer
 
 from mkc_torch.cli.console import (
     FAILURES,
-    Look,
+    ConsoleStyle,
     Steps,
     complain,
     err,
@@ -112,7 +112,7 @@ def diagnose(
         units=_units(texts, simulation),
         sensor=_sensor(sensor, simulation),
         noise=_noise(noise or []),
-        between=_between(between or []),
+        input_hold=_between(between or []),
         level=_level(level),
         surrogates=_surrogates(surrogates, level, quick=quick),
         seed=seed,
@@ -129,7 +129,7 @@ def diagnose(
         _refuse_unusable(request, simulation_of)
     one_thread()
     keep_memory()
-    look = Look.of(out())
+    look = ConsoleStyle.of(out())
     if together:
         raise typer.Exit(_all_together(output, request, look, recordings))
     with (
@@ -155,13 +155,13 @@ def diagnose(
     raise typer.Exit(1 if failed else 0)
 
 
-def _diagnosed(output: Path, request: Request, look: Look, step: Steps | None, path: Path) -> list[Outcome]:
+def _diagnosed(output: Path, request: Request, look: ConsoleStyle, step: Steps | None, path: Path) -> list[Outcome]:
     from mkc_torch.cli.diagnosis_files import diagnose_file
 
     return diagnose_file(path, output / path.stem, request, look, step)
 
 
-def _all_together(output: Path, request: Request, look: Look, paths: list[Path]) -> int:
+def _all_together(output: Path, request: Request, look: ConsoleStyle, paths: list[Path]) -> int:
     """Diagnoses the recordings as one; returns the exit code."""
     from mkc_torch.cli.diagnosis_files import diagnose_together
 
@@ -196,7 +196,7 @@ def _tell(outcomes: list[Outcome], step: Steps) -> None:
 def _known(simulation: str | None, simulated: Path | None) -> str:
     if simulation is not None and simulated is not None:
         raise typer.BadParameter(
-            "give one of --simulation and --simulated: a simulation's name, or the table that one wrote."
+            "give one of --simulation and --simulator-output: a simulation's name, or the table that one wrote."
         )
     if simulation is not None and simulation not in SIMULATIONS and not is_file_of_a_simulation(simulation):
         raise typer.BadParameter(
@@ -222,9 +222,9 @@ def _columns(columns: str | None, experiments: str | None) -> dict[str, str]:
     if experiments is None:
         return names
     if not experiments.strip():
-        raise typer.BadParameter("--experiments is empty; name the column that separates the runs.")
+        raise typer.BadParameter("--run-column is empty; name the column that separates the runs.")
     if names.setdefault("experiment", experiments.strip()) != experiments.strip():
-        raise typer.BadParameter("--columns and --experiments name different columns for experiment; leave one out.")
+        raise typer.BadParameter("--columns and --run-column name different columns for experiment; leave one out.")
     return names
 
 
@@ -263,10 +263,10 @@ def _noise(texts: list[str]) -> dict[str, float]:
 
 
 def _between(texts: list[str]) -> dict[str, str]:
-    pairs = parsed_pairs("--between", texts, "torque=held")
+    pairs = parsed_pairs("--input-hold", texts, "torque=held")
     for name, how in pairs.items():
         if how not in BETWEEN:
-            raise typer.BadParameter(f'--between {name}="{how}" is not known; known: {", ".join(BETWEEN)}.')
+            raise typer.BadParameter(f'--input-hold {name}="{how}" is not known; known: {", ".join(BETWEEN)}.')
     return pairs
 
 

@@ -11,12 +11,20 @@ from typing import TYPE_CHECKING
 
 from mkc_torch._parallel.deadline import stopped_by_interrupt
 from mkc_torch._support.files import claim_folder, write_atomically
-from mkc_torch.cli.console import FAILURES, Look, Steps, folder_names, folder_written, remove_if_empty, sentence_of
+from mkc_torch.cli.console import (
+    FAILURES,
+    ConsoleStyle,
+    Steps,
+    folder_names,
+    folder_written,
+    remove_if_empty,
+    sentence_of,
+)
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Outcome, Request, is_file_of_a_simulation
 from mkc_torch.cli.diagnosis_summary import show
 from mkc_torch.cli.recorded import read_magnetometer, read_table, refuse_no_magnetometer
 from mkc_torch.diagnosis import Diagnosis, diagnose
-from mkc_torch.diagnosis.files.python_source import SourceError
+from mkc_torch.diagnosis.io.python_source import SourceError
 from mkc_torch.recording.recording import Recording, RecordingError
 from mkc_torch.recording.together import joint_name
 from mkc_torch.simulation.load import load_simulation, raised_in
@@ -39,7 +47,7 @@ WRITTEN = ("diagnosis.json", "model.json", "corrected.py", "report.html")
 
 
 def diagnose_file(
-    path: Path, folder: Path, request: Request, look: Look, step: Callable[[str], None] | None = None
+    path: Path, folder: Path, request: Request, look: ConsoleStyle, step: Callable[[str], None] | None = None
 ) -> list[Outcome]:
     """Diagnose a file into a folder.
 
@@ -57,7 +65,7 @@ def diagnose_file(
         parts, outcomes = list(_parts(recording, simulation, folder)), []
         for number, (label, part, place) in enumerate(parts, start=1):
             which = f", run {label} ({number} of {len(parts)})" if len(parts) > 1 else ""
-            told = Told(step, f"diagnosing {path.name}{which}")
+            told = StageProgress(step, f"diagnosing {path.name}{which}")
             outcomes.append(_outcome(path, label, simulation, part, place, request, look, told))
             if outcomes[-1].interrupted:
                 break
@@ -67,7 +75,7 @@ def diagnose_file(
 
 
 def diagnose_together(
-    paths: Sequence[Path], folder: Path, request: Request, look: Look, step: Callable[[str], None] | None = None
+    paths: Sequence[Path], folder: Path, request: Request, look: ConsoleStyle, step: Callable[[str], None] | None = None
 ) -> list[Outcome]:
     """Diagnose files as one: one simulation and one set of findings for all of them, into one folder.
 
@@ -89,7 +97,7 @@ def diagnose_together(
     except Exception as error:
         return [_failed(subject, "", error)]
     with folder_written(folder):
-        told = Told(step, f"diagnosing {subject}")
+        told = StageProgress(step, f"diagnosing {subject}")
         outcome = _outcome(subject, "", simulation, recordings, folder, own, look, told)
         if outcome.failed:
             remove_if_empty(folder)
@@ -104,7 +112,7 @@ def _decided(path: Path, request: Request) -> tuple[Request, str]:
         refuse_no_magnetometer(path, request.columns, request.sensor)
     except RecordingError as error:
         raise RecordingError(
-            "give one of --simulation and --simulated: without them a recording is compared with the magnetometer, and "
+            "give one of --simulation and --simulator-output: without them a recording is compared with the magnetometer, and "
             f"this one is of none. {error}"
         ) from None
     note = f"no --simulation is given; the recording is of a magnetometer, so it is `--simulation {MAGNETOMETER}`."
@@ -117,7 +125,7 @@ def _read(path: Path, request: Request) -> Recording:
     return read_table(path, request.columns, request.units)
 
 
-class Told:
+class StageProgress:
     """What is being done with a subject, and how much of it is, told to the steps of a command; to nobody without.
 
     Args:
@@ -146,7 +154,7 @@ def write_diagnosis(
 
     Of differential equations also corrected.py, the simulation with what was found. ``note`` is said in the report.
     """
-    from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
+    from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
     from mkc_torch.report import diagnosis_report
 
     texts = {"diagnosis.json": diagnosis_to_json(diagnosis)}
@@ -180,8 +188,8 @@ def _outcome(
     recording: Recording | Sequence[Recording],
     folder: Path,
     request: Request,
-    look: Look,
-    progress: Told,
+    look: ConsoleStyle,
+    progress: StageProgress,
 ) -> Outcome:
     try:
         # the whole folder was claimed before
@@ -195,7 +203,7 @@ def _outcome(
                     surrogates=request.surrogates,
                     seed=request.seed,
                     noise=request.noise,
-                    between=request.between,
+                    between=request.input_hold,
                     quick=request.quick,
                     time_limit=request.time_limit,
                     progress=progress,

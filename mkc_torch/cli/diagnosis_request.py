@@ -44,7 +44,7 @@ class Request:
     units: Mapping[str, str] = field(default_factory=dict)
     sensor: str | None = None
     noise: Mapping[str, float] = field(default_factory=dict)
-    between: Mapping[str, str] = field(default_factory=dict)
+    input_hold: Mapping[str, str] = field(default_factory=dict)
     level: float = LEVEL
     surrogates: int = SURROGATES
     seed: int = 0

@@ -9,7 +9,7 @@ from pathlib import Path
 from mkc_torch.calibration.calibrate import Calibration
 from mkc_torch.calibration.exports import EXPORTS, Destination, ExportError, SensorCorrection
 from mkc_torch.diagnosis import DiagnosedModel
-from mkc_torch.diagnosis.files.sensor_correction import sensor_correction
+from mkc_torch.diagnosis.io.sensor_correction import sensor_correction
 
 __all__ = ["correction_of", "exports_of", "left_from_before"]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from mkc_torch.recording.choice import sensors_in, which_columns
 from mkc_torch.recording.formats import read_topics
 from mkc_torch.recording.formats.base import RecordingError, Topic
-from mkc_torch.recording.reading import ASKED, Reading, read_file
+from mkc_torch.recording.reading import ASKED, LoadedTable, read_file
 from mkc_torch.recording.recognise import recognised
 from mkc_torch.recording.recording import Recording
 from mkc_torch.recording.row_sensors import with_row_sensors
@@ -60,7 +60,7 @@ def read_magnetometer(
     units: Mapping[str, str],
     sensor: str | None,
     topics: Sequence[Topic] | None = None,
-) -> tuple[Recording, Reading]:
+) -> tuple[Recording, LoadedTable]:
     """Read a recording of a magnetometer; ``topics`` are the file's tables, where they have been read already.
 
     Raises:
@@ -146,6 +146,6 @@ def refuse_likely_size(path: Path, size: float) -> None:
         )
 
 
-def _recording(path: Path, found: Reading) -> Recording:
+def _recording(path: Path, found: LoadedTable) -> Recording:
     name = f"{path.stem}/{found.sensor}" if found.sensor else path.stem
     return Recording(found.columns, name=name, units=found.units, warnings=found.warnings, labels=found.labels)

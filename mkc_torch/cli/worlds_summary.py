@@ -8,14 +8,14 @@ from rich.table import Table
 from rich.text import Text
 
 from mkc_torch.challenge.page import measured_text, share_text
-from mkc_torch.challenge.worlds.page import NOT_HELD, TOO_FEW, held
-from mkc_torch.challenge.worlds.score import WorldScore, WorldsScore
+from mkc_torch.challenge.scenarios.page import NOT_HELD, TOO_FEW, held
+from mkc_torch.challenge.scenarios.score import ScenarioScore, ScenariosScore
 from mkc_torch.cli.console import out
 
 __all__ = ["show_worlds"]
 
 
-def show_worlds(score: WorldsScore, total: int, output: Path) -> None:
+def show_worlds(score: ScenariosScore, total: int, output: Path) -> None:
     """Print the score of each world, with its aims beside it."""
     console = out()
     console.print()
@@ -46,7 +46,7 @@ def show_worlds(score: WorldsScore, total: int, output: Path) -> None:
         console.print(Text.assemble(f"{'written':<15}", (str(output / name), "cyan")), soft_wrap=True)
 
 
-def _facts(world: WorldScore) -> list[tuple[str, str]]:
+def _facts(world: ScenarioScore) -> list[tuple[str, str]]:
     """Labels and numbers, but for what there were no recordings of."""
     said = ", ".join(f"{verdict} {count}" for verdict, count in world.verdicts.items())
     facts = [(f"said of {world.empty}", said), ("false alarms", share_text(world.false_alarms))]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import checked_number, checked_whole, told
+from mkc_torch._support.arguments import checked_number, checked_whole, format_value
 from mkc_torch.covariance._chi_square import chi_square_quantile
 from mkc_torch.covariance._concentration import Support, concentrate
 from mkc_torch.covariance._corrections import consistency_factor, small_sample_factor
@@ -118,7 +118,9 @@ class MinimumCovarianceDeterminant(Fitted):
         if not isinstance(reweight, bool):
             raise TypeError(f"Expected argument `reweight` to be True or False but got {reweight!r}.")
         if consistency not in ("share", "cutoff"):
-            raise ValueError(f"Expected argument `consistency` to be 'share' or 'cutoff' but got {told(consistency)}.")
+            raise ValueError(
+                f"Expected argument `consistency` to be 'share' or 'cutoff' but got {format_value(consistency)}."
+            )
         self.support_fraction = support_fraction
         self.h = None if h is None else checked_whole("h", h, 1, "it counts samples; None takes the default")
         self.reweight = reweight

@@ -12,10 +12,10 @@ from torch.distributions import Distribution, constraints
 from mkc_torch._support.arguments import (
     as_numbers,
     first_of,
+    format_value,
     refuse_complex,
     refuse_no_tensor,
     refuse_other_shapes,
-    told,
 )
 from mkc_torch.density.energy import as_computed, energy, inverse_square
 from mkc_torch.density.head import head_rule, tail_density
@@ -212,7 +212,7 @@ class MKCDistribution(Distribution):
 def _refuse_no_shape(name: str, shape: object) -> None:
     if not isinstance(shape, (tuple, list)) or not all(isinstance(size, (int, torch.SymInt)) for size in shape):
         raise TypeError(
-            f"Expected argument `{name}` to be a shape but got {told(shape)}; write (1000,) for a thousand."
+            f"Expected argument `{name}` to be a shape but got {format_value(shape)}; write (1000,) for a thousand."
         )
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _KAPPA_OFFSET = 0.02
 
 
-class Estimate(NamedTuple):
+class ChannelEstimate(NamedTuple):
     """κ = 1/σ² and d of each channel, and where the domain is too narrow for the residuals, each (m,)."""
 
     kappa: Float[Tensor, " m"]
@@ -32,7 +32,7 @@ def expectation_step(
     bound: Float[Tensor, " m"],
     d_min: Float[Tensor, " m"],
     share: float = 1.0,
-) -> Estimate:
+) -> ChannelEstimate:
     """σ and d that are likeliest for weighted residuals, Algorithm 2 of Li et al. (2023).
 
     A domain of less than two robust scales has no room for the density's head, as may happen while a network is
@@ -64,7 +64,7 @@ def expectation_step(
         if share < 1.0:
             fit = fit_density(e, weight=w, bound=a, d_min=floor, sigma=fit.sigma / share**0.5)
         kappa[roomy], d[roomy] = fit.sigma.pow(-2), fit.d
-    return Estimate(kappa.clamp(max=KAPPA_MAX), torch.maximum(d, d_min), narrow)
+    return ChannelEstimate(kappa.clamp(max=KAPPA_MAX), torch.maximum(d, d_min), narrow)
 
 
 def damped(before: Float[Tensor, " m"], after: Float[Tensor, " m"], keep: Tensor | float) -> Float[Tensor, " m"]:

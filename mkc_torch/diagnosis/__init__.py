@@ -1,7 +1,7 @@
 """Diagnosis: where simulation and recording differ, what physics was left out, and how much better it fits with it."""
 
 from mkc_torch.diagnosis.diagnose import diagnose
-from mkc_torch.diagnosis.files.model import DiagnosedModel
+from mkc_torch.diagnosis.io.model import DiagnosedModel
 from mkc_torch.diagnosis.plot.accessor import DiagnosisPlot
 from mkc_torch.diagnosis.result import Diagnosis
 from mkc_torch.diagnosis.settings import Settings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
-from mkc_torch._support.arguments import checked_number, checked_whole, refuse_other_type, told
+from mkc_torch._support.arguments import checked_number, checked_whole, format_value, refuse_other_type
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.recording import Recording
@@ -21,13 +21,13 @@ def refuse_no_simulation(simulation: object) -> None:
         mend = "it comes first, diagnose(simulation, recording)"
     elif isinstance(simulation, str):
         mend += f", or name it on the command line, mkc diagnose REC.csv --simulation {simulation} --output DIR"
-    raise TypeError(f"Expected argument `simulation` to be a Simulation but got {told(simulation)}; {mend}.")
+    raise TypeError(f"Expected argument `simulation` to be a Simulation but got {format_value(simulation)}; {mend}.")
 
 
 def checked_effects(effects: object) -> tuple[Effect, ...]:
     if isinstance(effects, str) or not isinstance(effects, Iterable):
         raise TypeError(
-            f"Expected argument `effects` to be a sequence of Effects but got {told(effects)}; it is a tuple such as "
+            f"Expected argument `effects` to be a sequence of Effects but got {format_value(effects)}; it is a tuple such as "
             "mkc_torch.effects.CATALOGUE, which holds all, and () for none."
         )
     # an iterator would be empty when it is asked again
@@ -51,7 +51,7 @@ def _refuse_no_effect(effect: object) -> None:
         mend = f"its roles are names, ({roles!r},)"
     else:
         return
-    raise TypeError(f"Expected argument `effects` to hold Effects but got {told(effect)}; {mend}.")
+    raise TypeError(f"Expected argument `effects` to hold Effects but got {format_value(effect)}; {mend}.")
 
 
 def refuse_no_settings(settings: object) -> None:
@@ -111,7 +111,7 @@ def checked_between(between: object, inputs: Sequence[str]) -> dict[str, str]:
     for name, told_as in _of_known("between", between, inputs, "inputs in the equations", '{"torque": "held"}').items():
         if not isinstance(told_as, str) or told_as not in BETWEEN:
             raise ValueError(
-                f"Expected argument `between` to say one of {', '.join(BETWEEN)} of `{name}` but got {told_as!r}."
+                f"Expected argument `input_hold` to say one of {', '.join(BETWEEN)} of `{name}` but got {told_as!r}."
             )
         found[name] = told_as
     return found
@@ -122,7 +122,7 @@ def _of_known(argument: str, given: object, names: Sequence[str], what: str, exa
     if given is None:
         return {}
     if not isinstance(given, Mapping):
-        raise TypeError(f"Expected argument `{argument}` to be a dict such as {example} but got {told(given)}.")
+        raise TypeError(f"Expected argument `{argument}` to be a dict such as {example} but got {format_value(given)}.")
     for name in given:
         if name not in names:
             known = f"they are {', '.join(f'`{one}`' for one in names)}" if names else "it has none"

@@ -10,7 +10,7 @@ from time import monotonic
 import torch
 
 from mkc_torch._parallel.deadline import Stopped, limited
-from mkc_torch._parallel.pool import meanwhile, shared
+from mkc_torch._parallel.pool import shared, speculative
 from mkc_torch._parallel.progress import counting
 from mkc_torch.diagnosis.arguments import (
     check_limits,
@@ -21,20 +21,20 @@ from mkc_torch.diagnosis.arguments import (
     refuse_no_settings,
     refuse_no_simulation,
 )
-from mkc_torch.diagnosis.cut_short import cut_short, nothing_known
-from mkc_torch.diagnosis.evidence.after_the_search import parts_ahead
-from mkc_torch.diagnosis.follows import misses
+from mkc_torch.diagnosis.evidence.run import precompute
+from mkc_torch.diagnosis.goodness_of_fit import poor_fits
 from mkc_torch.diagnosis.joined import joined, run_counts, with_own_offsets
 from mkc_torch.diagnosis.linearised.smaller_step import with_smaller_step
-from mkc_torch.diagnosis.model.at_once import common_parts
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.in_the_world import at_liberty, between_samples, noise_around, simulation_in_the_world
+from mkc_torch.diagnosis.model.parallel import common_parts
+from mkc_torch.diagnosis.model.process_noise import choose_input_hold, estimate_noise, fit_baseline, open_loop
+from mkc_torch.diagnosis.partial_diagnosis import cut_short, nothing_known
+from mkc_torch.diagnosis.partial_result import PartialResult
 from mkc_torch.diagnosis.result import Diagnosis
-from mkc_torch.diagnosis.rounds import Asked, begun, continued
 from mkc_torch.diagnosis.search.own_noise import noise_of_fit
 from mkc_torch.diagnosis.settings import Settings, quick_settings
-from mkc_torch.diagnosis.under_way import UnderWay
-from mkc_torch.diagnosis.verdict import alone, lost_from_the_start
+from mkc_torch.diagnosis.stepwise import SearchOptions, first_step, next_step
+from mkc_torch.diagnosis.verdict import assess_baseline, lost_from_the_start
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.effects.base import Effect
 from mkc_torch.recording.recording import Recording
@@ -147,8 +147,8 @@ def diagnose(
     prepared = with_own_offsets(prepared, several)
     declared = checked_noise(noise, prepared.channels)
     fixed = checked_between(between, tuple(getattr(prepared, "between", ())))
-    asked = Asked(level, surrogates, max_findings, seed, settings, declared, fixed, quick)
-    known = UnderWay(simulation, effects, names, asked, run_counts(several) if names else ())
+    asked = SearchOptions(level, surrogates, max_findings, seed, settings, declared, fixed, quick)
+    known = PartialResult(simulation, effects, names, asked, run_counts(several) if names else ())
     limit = math.inf if time_limit is None else time_limit
     with limited(limit, begin=begin) as deadline, counting(progress):
         try:
@@ -162,7 +162,7 @@ def diagnose(
 
 
 def _diagnosed(
-    known: UnderWay, prepared: PreparedSimulation, where: str, progress: Callable[[str], object]
+    known: PartialResult, prepared: PreparedSimulation, where: str, progress: Callable[[str], object]
 ) -> Diagnosis:
     """The diagnosis, unless it is stopped; ``known`` has what is known then."""
     asked = known.asked
@@ -173,8 +173,8 @@ def _diagnosed(
         if asked.quick:
             known.asked = asked = replace(asked, max_findings=min(asked.max_findings, 1), judged=False)
     progress("fitting the simulation alone")
-    world = simulation_in_the_world(prepared, declared, settings.noise, known.keep_world)
-    known.world = world = between_samples(world, declared, fixed, settings.noise)
+    world = fit_baseline(prepared, declared, settings.noise, known.keep_world)
+    known.world = world = choose_input_hold(world, declared, fixed, settings.noise)
     known.fitted = True
     base = world.fit
     _refuse_no_noise(base, where)
@@ -182,40 +182,42 @@ def _diagnosed(
     if finer is not None:
         return _diagnosed(known.anew(), finer, where, progress)
     terms = known.candidates[1]
-    if misses(alone(world, declared), settings.evidence.followed):
+    if poor_fits(assess_baseline(world, declared), settings.evidence.followed):
         # one effect may be what it lacks to follow; what it lacks beside that is told once it follows
         known.asked = asked = replace(asked, max_findings=min(asked.max_findings, 1))
     hopeless = lost_from_the_start(world)
     progress(f"trying {len(terms)} effects")
     terms = () if hopeless else terms
-    search = begun(base, terms, asked, generator, world.free, known.keep_search)
+    search = first_step(base, terms, asked, generator, world.free, known.keep_search)
     likelier = None if search.first is None else search.first.alone
     noise = (
-        None if likelier is None else noise_around(likelier, declared, settings.noise, noise_of_fit(likelier, declared))
+        None
+        if likelier is None
+        else estimate_noise(likelier, declared, settings.noise, noise_of_fit(likelier, declared))
     )
     if likelier is not None and noise is not None and noise.observer is not None:
         progress(f"trying {len(terms)} effects under a likelier noise")
         known.world = world = replace(world, fit=likelier, noise=noise)
         base = likelier
-        search = begun(base, terms, asked, generator, world.free, known.keep_search)
+        search = first_step(base, terms, asked, generator, world.free, known.keep_search)
     finer = with_smaller_step(search.found[-1].fit, settings.noise) if search.found else None
     if finer is not None:
         return _diagnosed(known.anew(), finer, where, progress)
     known.search, tests = search, known.tests
-    common = [known.simulation, base, base.model, *common_parts(at_liberty(base.model.prepared), terms)]
+    common = [known.simulation, base, base.model, *common_parts(open_loop(base.model.prepared), terms)]
     while search.left:
         case = known.case(search)
         # most often there is nothing more
-        with meanwhile(parts_ahead(case, tests), [*common, *search.parts]) as done:
+        with speculative(precompute(case, tests), [*common, *search.parts]) as done:
             progress(f"trying {len(search.left)} effects beside {len(search.found)} found")
-            after = continued(search, asked, generator, known.keep_search)
+            after = next_step(search, asked, generator, known.keep_search)
             if after.found == search.found:
                 known.search = after
                 return known.diagnosis(after, case, done(), tests)
         known.search = search = after
     case = known.case(search)
     progress("checking what was found")
-    done_ahead = shared(parts_ahead(case, tests), [*common, *search.parts], "test of evidence")
+    done_ahead = shared(precompute(case, tests), [*common, *search.parts], "test of evidence")
     return known.diagnosis(search, case, done_ahead, tests)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from torch import Tensor
 
 from mkc_torch.density.tails import ChannelTails
-from mkc_torch.diagnosis.world import Curve, Grade, Shape
+from mkc_torch.diagnosis.environment import Curve, Grade, ShapeCheck
 from mkc_torch.effects.kinds import Kind
 
 if TYPE_CHECKING:
@@ -17,24 +17,24 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Alternative",
-    "Candidate",
+    "CandidateScore",
     "DensityCheck",
     "DriverShift",
+    "EffectParameter",
+    "EvidenceResult",
     "Extrapolation",
     "Finding",
     "HeldOut",
-    "Noise",
-    "Parameter",
+    "HeldOutScore",
+    "NoiseSummary",
     "Reference",
     "Region",
+    "ResidualSizes",
     "Row",
     "Separability",
-    "Sizes",
     "SmoothCorrection",
-    "Spread",
     "StateMap",
     "Table",
-    "Told",
     "Traces",
     "value_of",
 ]
@@ -62,7 +62,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Told:
+class EvidenceResult:
     """What a test of evidence says of a finding or of the whole diagnosis: report, terminal and JSON loop over it.
 
     Its texts have effects by their ids, and numbers as Python prints them.
@@ -87,13 +87,13 @@ class Told:
     table: Table | None = None
 
 
-def value_of(evidence: Sequence[Told], test: str, default: Any = None) -> Any:
+def value_of(evidence: Sequence[EvidenceResult], test: str, default: Any = None) -> Any:
     """The result of a test; the default where it was not asked."""
     return next((said.value for said in evidence if said.test == test), default)
 
 
 @dataclass(frozen=True)
-class Parameter:
+class EffectParameter:
     """A parameter of an effect; ``standard_error`` has the shape of ``value`` and None where it is not known.
 
     ``components`` says what each number of a list is, in their order; empty for a single number.
@@ -116,7 +116,7 @@ class Reference:
 
 
 @dataclass(frozen=True)
-class Sizes:
+class ResidualSizes:
     """Residuals of one output before and after, in its own unit."""
 
     before: float
@@ -138,7 +138,7 @@ class HeldOut:
     rmse_before: float
     rmse_after: float
     unit: str
-    outputs: Mapping[str, Sizes] = field(default_factory=dict)
+    outputs: Mapping[str, ResidualSizes] = field(default_factory=dict)
     left: str = ""
     decides: bool = True
 
@@ -164,8 +164,8 @@ class DriverShift:
 class Alternative:
     """Another candidate for a finding: how much less likely it is, in nats, and whether the data tell them apart.
 
-    ``at`` is where it acts, of several places that a simulation has for it; ``again`` what becomes of it in another
-    recording; ``told_by`` what to record to tell it from the finding, where the data do not.
+    ``at`` is where it acts, of several places that a simulation has for it; ``recurrence`` what becomes of it in another
+    recording; ``distinguishing_state`` what to record to tell it from the finding, where the data do not.
     """
 
     effect: str
@@ -173,8 +173,8 @@ class Alternative:
     log_likelihood_gap: float
     separable: bool
     at: str = ""
-    again: str = ""
-    told_by: str = ""
+    recurrence: str = ""
+    distinguishing_state: str = ""
 
 
 @dataclass(frozen=True)
@@ -210,8 +210,8 @@ class Finding:
     is None where the gain arises all over the states, or where the simulation has none; ``experiments`` has each run's
     share of the gain, and is empty for a single run.
     ``moments`` are those at which an effect sets in that does so several times, the first of them its onset.
-    ``references`` are what the equation counts its drivers from, ``advice`` what to do about it, ``again`` what becomes
-    of it in another recording; one that is ``placed`` belongs to the place or the attitude of this recording.
+    ``references`` are what the equation counts its drivers from, ``advice`` what to do about it, ``recurrence`` what becomes
+    of it in another recording; one that is ``location_specific`` belongs to the place or the attitude of this recording.
     ``kind`` is what kind of quantity it acts on, such as "temperature"; empty where that is not known.
     ``cannot_be`` says that its size cannot be right, see ``plausibility``; ``doubts`` are sentences on numbers of its
     shape at the ends of their ranges.
@@ -227,7 +227,7 @@ class Finding:
     onset: float | None
     equation: str
     explanation: str
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[EffectParameter, ...]
     p_value: float | None
     alternatives: tuple[Alternative, ...]
     plausible: bool
@@ -239,14 +239,14 @@ class Finding:
     moments: tuple[float, ...] = ()
     references: tuple[Reference, ...] = ()
     advice: str = ""
-    again: str = ""
-    placed: bool = False
+    recurrence: str = ""
+    location_specific: bool = False
     kind: Kind = ""
     cannot_be: bool = False
     doubts: tuple[str, ...] = ()
     grade: Grade = "left out"
-    shape: Shape | None = None
-    evidence: tuple[Told, ...] = ()
+    shape: ShapeCheck | None = None
+    evidence: tuple[EvidenceResult, ...] = ()
 
     @property
     def held_out(self) -> HeldOut | None:
@@ -296,7 +296,7 @@ class DensityCheck:
 
 
 @dataclass(frozen=True)
-class Noise:
+class NoiseSummary:
     """The noise that structure was tested against.
 
     ``model`` is one of "white", "ar" and "random_walk"; ``parameters`` names its numbers, ``units`` those that have
@@ -317,7 +317,7 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Spread:
+class HeldOutScore:
     """A model on held-out blocks: log-likelihood in nats per sample, root mean square over the common inliers."""
 
     log_likelihood: float
@@ -333,12 +333,12 @@ class SmoothCorrection:
     The correction is by all columns and by time, instead of the findings; a step, say, goes beyond it.
     """
 
-    reached: Spread
+    reached: HeldOutScore
     columns: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Candidate:
+class CandidateScore:
     """One candidate of the search at its best shape, for the first finding.
 
     ``log_likelihood_gain`` is that of the linearised model in nats; ``z`` the root of twice that, roughly the number

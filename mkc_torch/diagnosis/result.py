@@ -5,58 +5,58 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from mkc_torch.diagnosis.correcting_model import CorrectingModel
-from mkc_torch.diagnosis.in_a_notebook import as_html
+from mkc_torch.diagnosis.environment import NoiseEnvironment, Verdict
+from mkc_torch.diagnosis.notebook import as_html
 from mkc_torch.diagnosis.parts import (
     Alternative,
-    Candidate,
+    CandidateScore,
     DensityCheck,
     DriverShift,
+    EffectParameter,
+    EvidenceResult,
     Extrapolation,
     Finding,
     HeldOut,
-    Noise,
+    HeldOutScore,
+    NoiseSummary,
     Number,
-    Parameter,
     Reference,
     Region,
+    ResidualSizes,
     Row,
     Separability,
-    Sizes,
     SmoothCorrection,
-    Spread,
     StateMap,
     Table,
-    Told,
     Traces,
     value_of,
 )
 from mkc_torch.diagnosis.plot.accessor import DiagnosisPlot
 from mkc_torch.diagnosis.stop import Stop
-from mkc_torch.diagnosis.world import Verdict, World
 
 __all__ = [
     "Alternative",
-    "Candidate",
+    "CandidateScore",
     "DensityCheck",
     "Diagnosis",
     "DriverShift",
+    "EffectParameter",
+    "EvidenceResult",
     "Extrapolation",
     "Finding",
     "HeldOut",
-    "Noise",
+    "HeldOutScore",
+    "NoiseSummary",
     "Number",
-    "Parameter",
     "Reference",
     "Region",
+    "ResidualSizes",
     "Row",
     "Separability",
-    "Sizes",
     "SmoothCorrection",
-    "Spread",
     "StateMap",
     "Stop",
     "Table",
-    "Told",
     "Traces",
 ]
 
@@ -104,23 +104,23 @@ class Diagnosis:
     simulation: str
     samples: int
     level: float
-    noise: Noise
+    noise: NoiseSummary
     candidates_tried: int
     surrogates: int
     seed: int
     p_value: float | None
     verdict: Verdict
     findings: tuple[Finding, ...]
-    baseline: Spread
-    corrected: Spread
+    baseline: HeldOutScore
+    corrected: HeldOutScore
     advice: tuple[str, ...]
     warnings: tuple[str, ...]
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[CandidateScore, ...]
     separability: Separability
     traces: Traces
     model: CorrectingModel | None = field(default=None, repr=False, compare=False)
-    evidence: tuple[Told, ...] = ()
-    world: World = field(default_factory=World)
+    evidence: tuple[EvidenceResult, ...] = ()
+    world: NoiseEnvironment = field(default_factory=NoiseEnvironment)
     recordings: tuple[str, ...] = ()
     quick: bool = False
     stop: Stop | None = None
@@ -139,7 +139,7 @@ class Diagnosis:
         return DiagnosisPlot(self.traces, self.findings, self.candidates, self.separability, self.world)
 
     @property
-    def ceiling(self) -> Spread | None:
+    def ceiling(self) -> HeldOutScore | None:
         """What a smooth correction reaches instead of the findings, for comparison; None where it was not asked for."""
         smooth: SmoothCorrection | None = value_of(self.evidence, "remaining")
         return None if smooth is None else smooth.reached

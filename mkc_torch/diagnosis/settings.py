@@ -172,7 +172,7 @@ class NamingSettings(_Stage):
         nameless: nats that a curve without a name gives: it can follow any named effect a little better.
         over_driver: share of its gain that such a curve gives over a driver.
         over_motion: the same over the motion itself, of which all forces are functions, and which repeats itself.
-        general: nats that a form gives which has named ones as special cases, as a power law has drags: it can follow
+        is_generalisation: nats that a form gives which has named ones as special cases, as a power law has drags: it can follow
             any of them a little better.
         roleless: share of its gain that a column of unknown role gives: it may be a consequence of a known driver.
         follower: the same where it goes along with a known driver.
@@ -189,7 +189,7 @@ class NamingSettings(_Stage):
     nameless: float = 10.0
     over_driver: float = 0.25
     over_motion: float = 0.5
-    general: float = 5.0
+    is_generalisation: float = 5.0
     roleless: float = 0.3
     follower: float = 0.95
     alike_columns: float = 0.9

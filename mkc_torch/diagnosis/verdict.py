@@ -5,56 +5,58 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from mkc_torch.diagnosis.findings.pushes import forcing_of, pushes_of
+from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, Verdict
+from mkc_torch.diagnosis.findings.disturbances import forcing_of, pushes_of
 from mkc_torch.diagnosis.findings.reasons import reasons_of, wrong_turns
-from mkc_torch.diagnosis.follows import follows_of, misses, pooled
+from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled, poor_fits
 from mkc_torch.diagnosis.model.fit import FittedModel
-from mkc_torch.diagnosis.model.in_the_world import InTheWorld, freed, noise_around
+from mkc_torch.diagnosis.model.process_noise import ProcessNoiseFit, estimate_noise, refit_open_loop
 from mkc_torch.diagnosis.result import Finding
 from mkc_torch.diagnosis.settings import EvidenceSettings, NoiseSettings
-from mkc_torch.diagnosis.world import Follows, Verdict, World
-from mkc_torch.simulation.dynamics.noise import NoiseOfTheWorld
+from mkc_torch.simulation.dynamics.noise import StateSpaceNoise
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
-__all__ = ["Around", "alone", "around", "lost_from_the_start", "verdict_of", "world_of"]
+__all__ = ["FitAssessment", "assess", "assess_baseline", "lost_from_the_start", "noise_environment", "verdict_of"]
 
 
 @dataclass(frozen=True)
-class Around:
+class FitAssessment:
     """What stands around a simulation's fits: how it follows alone and corrected, and the noise that is left.
 
     ``lost`` says that no finding can make it follow: its recorded turns are wrong.
     """
 
-    follows: tuple[Follows, ...]
-    corrected: tuple[Follows, ...]
-    noise: NoiseOfTheWorld | None
+    follows: tuple[GoodnessOfFit, ...]
+    corrected: tuple[GoodnessOfFit, ...]
+    noise: StateSpaceNoise | None
     lost: bool = False
 
     def unfit(self, settings: EvidenceSettings) -> bool:
         """Whether neither the simulation nor it with its findings explains what the recording varies by."""
         if self.lost:
             return True
-        if not misses(self.follows, settings.followed):
+        if not poor_fits(self.follows, settings.followed):
             return False
         shares = [pooled(one) for one in (self.follows, self.corrected) if one]
         return not shares or max(shares) < settings.useful
 
 
-def alone(base: InTheWorld, declared: Mapping[str, float]) -> tuple[Follows, ...]:
+def assess_baseline(base: ProcessNoiseFit, declared: Mapping[str, float]) -> tuple[GoodnessOfFit, ...]:
     """How the simulation alone follows each output."""
     free = base.free
     prepared = base.fit.model.prepared if free is None else free.model.prepared
     floor = None if base.noise is None else base.noise.disturbed.sensor.tolist()
-    return follows_of(prepared, None if free is None else free.residual, declared, floor)
+    return goodness_of_fit(prepared, None if free is None else free.residual, declared, floor)
 
 
-def lost_from_the_start(base: InTheWorld) -> bool:
+def lost_from_the_start(base: ProcessNoiseFit) -> bool:
     """Whether nothing is to be searched: its recorded turns are what they cannot be."""
     return bool(wrong_turns(base.fit.model.prepared))
 
 
-def around(base: InTheWorld, final: FittedModel, declared: Mapping[str, float], noise: NoiseSettings) -> Around:
+def assess(
+    base: ProcessNoiseFit, final: FittedModel, declared: Mapping[str, float], noise: NoiseSettings
+) -> FitAssessment:
     """What stands around the simulation alone and with what was found.
 
     Args:
@@ -63,17 +65,19 @@ def around(base: InTheWorld, final: FittedModel, declared: Mapping[str, float], 
         declared: standard deviation of the white noise of outputs that it is known of.
         noise: settings.
     """
-    follows = alone(base, declared)
-    left = base.noise if not final.model.terms else noise_around(final, declared, noise)
-    corrected: tuple[Follows, ...] = ()
+    follows = assess_baseline(base, declared)
+    left = base.noise if not final.model.terms else estimate_noise(final, declared, noise)
+    corrected: tuple[GoodnessOfFit, ...] = ()
     if final.model.terms:
-        free = freed(final)
+        free = refit_open_loop(final)
         floor = [one.noise_floor for one in follows]
-        corrected = () if free is None else follows_of(free.model.prepared, free.residual, declared, floor)
-    return Around(follows, corrected, left, bool(wrong_turns(final.model.prepared)))
+        corrected = () if free is None else goodness_of_fit(free.model.prepared, free.residual, declared, floor)
+    return FitAssessment(follows, corrected, left, bool(wrong_turns(final.model.prepared)))
 
 
-def world_of(base: InTheWorld, final: FittedModel, known: Around, *, unfit: bool) -> World:
+def noise_environment(
+    base: ProcessNoiseFit, final: FittedModel, known: FitAssessment, *, unfit: bool
+) -> NoiseEnvironment:
     """What is told of the world around."""
     prepared = final.model.prepared
     reasons: tuple[str, ...] = ()
@@ -81,19 +85,19 @@ def world_of(base: InTheWorld, final: FittedModel, known: Around, *, unfit: bool
         fits = [base.fit] if base.free is None else [base.fit, base.free]
         reasons = reasons_of(fits, known.follows)
     if not isinstance(prepared, PreparedDynamics) or known.noise is None:
-        return World(known.follows, reasons, starts=base.starts)
-    return World(
+        return NoiseEnvironment(known.follows, reasons, starts=base.starts)
+    return NoiseEnvironment(
         known.follows,
         reasons,
         pushes_of(prepared, known.noise),
-        dict(prepared.between),
+        dict(prepared.input_hold),
         () if unfit else forcing_of(final, known.noise),
         base.starts,
     )
 
 
 def verdict_of(
-    known: Around,
+    known: FitAssessment,
     findings: Sequence[Finding],
     *,
     structure: bool,
@@ -121,7 +125,7 @@ def verdict_of(
     ]
     clean = white and not pushed and not structure and not above
     if not findings:
-        follows = not misses(known.follows, settings.followed)
+        follows = not poor_fits(known.follows, settings.followed)
         return "adequate" if clean and follows else "unexplained"
     named = all(one.grade in ("left out", "real but small") for one in findings)
     return "explained" if named and clean else "unexplained"

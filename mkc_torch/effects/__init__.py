@@ -73,7 +73,7 @@ SignalEffect = Effect
 CATALOGUE: tuple[Effect, ...] = (*SENSOR, *ATTITUDE, *DYNAMICS, *PAIRED)
 """All effects; each is tried where a simulation has its port."""
 
-_WORDS = {effect.id: effect.words for effect in CATALOGUE}
+_WORDS = {effect.id: effect.display_name for effect in CATALOGUE}
 _WORDS_BY_KIND = {(effect.id, kind): name for effect in CATALOGUE for kind, name in effect.words_by_kind.items()}
 _CURVES = frozenset(effect.id for effect in CATALOGUE if effect.is_curve)
 

@@ -41,7 +41,7 @@ class Effect(ABC):
 
     Attributes:
         id: its name in ``diagnosis.json`` and ``model.json``; every effect needs one.
-        words: its name in a sentence; default the id in words, see :func:`in_words`. A report knows the id alone, and
+        display_name: its name in a sentence; default the id in words, see :func:`in_words`. A report knows the id alone, and
             tells an effect that is not in the catalogue by its id in words.
         words_by_kind: that name by the kind of quantity that it acts on, where the plain one does not suit it; default
             none.
@@ -50,7 +50,7 @@ class Effect(ABC):
         advice: a sentence on what to do about it.
         by_kind: explanation and advice by the kind of quantity that it acts on, such as "temperature", see
             :mod:`mkc_torch.effects.kinds`, where the plain ones do not suit it; default none.
-        again: what becomes of it in another recording, a clause such as "a warm-up comes again after a cold start";
+        recurrence: what becomes of it in another recording, a clause such as "a warm-up comes again after a cold start";
             default empty, nothing is said of it.
         source: where the physics and its size are from.
         plausible: largest plausible size of each number of the first quantity of γ; default infinite, nothing is known.
@@ -66,10 +66,10 @@ class Effect(ABC):
             follows time or the signal alone.
         driver_optional: whether one with roles is tried without a driver too; default False.
         follows_signal: whether its change depends on the signal at its port; default False.
-        placed: whether it is of the place or the attitude of its recording, which another one does not have; default
+        location_specific: whether it is of the place or the attitude of its recording, which another one does not have; default
             False.
         is_curve: whether it is a curve that follows the data and no physics; default False. Named physics goes first.
-        general: whether it has named ones as special cases, such as drags or an added mass; these go first where they
+        is_generalisation: whether it has named ones as special cases, such as drags or an added mass; these go first where they
             do as well. Default False.
         unrecorded: whether it is a course along time that stands for a cause in no column; default False.
         remembers: whether its change at a moment depends on the signal at other moments; of effects in series on an
@@ -91,10 +91,10 @@ class Effect(ABC):
             positive is fitted as its logarithm.
         natural_ends: of numbers that are fitted, which end of the range, "least" or "greatest", is a value like any
             other; at another end a number is to be doubted. Default none.
-        choices: names of the numbers that choose a form and are not measured; the equation tells them.
+        form_parameters: names of the numbers that choose a form and are not measured; the equation tells them.
         shape_units: name of a number of the shape to its unit, of those that have one whatever is recorded; default
             times that are called onset, lag, delay or time_constant.
-        along: the part of the signal that it mainly follows, along which its curve is drawn; default none.
+        plot_axis: the part of the signal that it mainly follows, along which its curve is drawn; default none.
         reduces_to: another effect that this one is with fewer numbers, its shape among this one's; default None.
         simpler: the same physics with fewer numbers in γ, each of which stands for several of this one's, one after
             the other; its shapes are the same. It is taken where it predicts unseen blocks as well. Default None.
@@ -111,7 +111,7 @@ class Effect(ABC):
         ...
         ...     def change(self, gamma, shape, context):
         ...         return gamma * context.signal.square()
-        >>> Square().words, Square().port, Square().shapes(torch.arange(3.0)), Square().lasts
+        >>> Square().display_name, Square().port, Square().shapes(torch.arange(3.0)), Square().persistent_change
         ('squared response', 'sensor', ({},), False)
     """
 
@@ -121,7 +121,7 @@ class Effect(ABC):
     advice: str = ""
     by_kind: Mapping[str, tuple[str, str]] = {}
     words_by_kind: Mapping[str, str] = {}
-    again: str = ""
+    recurrence: str = ""
     source: str = ""
     plausible: float = math.inf
     plausible_unit: str = ""
@@ -133,22 +133,22 @@ class Effect(ABC):
     roles: tuple[str, ...] = ()
     driver_optional: bool = False
     follows_signal: bool = False
-    placed: bool = False
+    location_specific: bool = False
     is_curve: bool = False
-    general: bool = False
+    is_generalisation: bool = False
     unrecorded: bool = False
     remembers: bool = False
     settles: tuple[str, ...] = ()
 
-    least: float = -math.inf
-    most: float = math.inf
+    lower: float = -math.inf
+    upper: float = math.inf
     relative: Mapping[str, tuple[str, str]] = {}
     continuous: Mapping[str, tuple[float, float]] = {}
     fitted_shape: Mapping[str, tuple[float, float]] = {}
     natural_ends: Mapping[str, tuple[str, ...]] = {}
-    choices: tuple[str, ...] = ()
+    form_parameters: tuple[str, ...] = ()
     shape_units: Mapping[str, str] = dict.fromkeys(("onset", "lag", "delay", "time_constant"), "s")
-    along: str = ""
+    plot_axis: str = ""
 
     @abstractmethod
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:
@@ -163,7 +163,7 @@ class Effect(ABC):
         return ({},)
 
     @property
-    def words(self) -> str:
+    def display_name(self) -> str:
         return in_words(self.id)
 
     @property
@@ -173,7 +173,7 @@ class Effect(ABC):
     @property
     def one_sided(self) -> bool:
         """Whether no number of γ can be negative."""
-        return self.least >= 0.0
+        return self.lower >= 0.0
 
     def within_a_sample(self, shape: Shape, step: float) -> bool:  # noqa: ARG002
         """Whether this shape says no more than what an input does between two samples, ``step`` s apart."""
@@ -181,7 +181,7 @@ class Effect(ABC):
 
     def reports(self, name: str) -> bool:
         """Whether a number of the shape is told as a parameter; default all that choose no form."""
-        return name not in self.choices
+        return name not in self.form_parameters
 
     def unit_of_shape(self, name: str, context: Context) -> str:
         """The unit of a number of the shape; empty where it has none.
@@ -213,7 +213,7 @@ class Effect(ABC):
         """When it sets in, in s and ascending, where that is several moments known beforehand; default none."""
         return ()
 
-    def anchored(self, shape: Shape, context: Context) -> Shape:  # noqa: ARG002
+    def bind(self, shape: Shape, context: Context) -> Shape:  # noqa: ARG002
         """The shape with what it needs to know of this recording to act on another one; default as it is."""
         return shape
 
@@ -221,12 +221,12 @@ class Effect(ABC):
         """Of an effect that is ``basis @ γ``: many of its shapes are tried in no time. Ask ``has_basis`` before."""
         self._refuse("basis")
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
-        """Of an effect that is ``gain ⊗ course``: the course at a gain of one. Ask ``has_course`` before."""
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+        """Of an effect that is ``gain ⊗ waveform``: the waveform at a gain of one. Ask ``has_course`` before."""
         self._refuse("course")
 
     def lasting(self, gamma: Float[Tensor, " q"], context: Context) -> Float[Tensor, "N c"]:  # noqa: ARG002
-        """Of an effect that is bound to the time of its recording: what a later one has of it. Ask ``lasts`` before."""
+        """Of an effect that is bound to the time of its recording: what a later one has of it. Ask ``persistent_change`` before."""
         self._refuse("lasting")
 
     def code(self, gamma: Sequence[float], shape: Shape, names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002
@@ -247,11 +247,11 @@ class Effect(ABC):
 
     @property
     def has_course(self) -> bool:
-        """Whether its change is a gain per channel times its :meth:`course`."""
+        """Whether its change is a gain per channel times its :meth:`waveform`."""
         return type(self).change is GainEffect.change
 
     @property
-    def lasts(self) -> bool:
+    def persistent_change(self) -> bool:
         """Whether it says what is :meth:`lasting`."""
         return type(self).lasting is not Effect.lasting
 
@@ -265,7 +265,7 @@ class Effect(ABC):
 
 
 class GainEffect(Effect):
-    """An effect that adds a gain per channel times one course: ``gain ⊗ course``. Give it a ``course``.
+    """An effect that adds a gain per channel times one course: ``gain ⊗ waveform``. Give it a ``waveform``.
 
     Attributes:
         gain: what a user reads the gain as.
@@ -281,7 +281,7 @@ class GainEffect(Effect):
         ...     plausible = 1.0
         ...     source = "our bench, 2024"
         ...
-        ...     def course(self, shape, context):
+        ...     def waveform(self, shape, context):
         ...         return context.drivers[:, 0]
         >>> SupplyOffset().port
         'sensor'
@@ -297,7 +297,7 @@ class GainEffect(Effect):
         return (Quantity(self.gain, len(context.channels), self.unit(context)),)
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N c"]:
-        return gained(self.course(shape, context), gamma)
+        return gained(self.waveform(shape, context), gamma)
 
 
 def in_words(effect_id: str) -> str:

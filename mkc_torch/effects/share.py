@@ -24,7 +24,7 @@ SOFTNESS = 0.02, 2.0
 
 
 class ShareEffect(GainEffect):
-    """An effect that is there to a share between 0 and 1, on an input or an output. Give it a ``course``."""
+    """An effect that is there to a share between 0 and 1, on an input or an output. Give it a ``waveform``."""
 
     port = "input"
     follows_signal = True
@@ -43,14 +43,14 @@ class Saturation(ShareEffect):
 
     relative: Mapping[str, tuple[str, str]] = {"limit": ("own", "largest")}
     fitted_shape: Mapping[str, tuple[float, float]] = {"limit": (0.2, 0.99)}
-    along = "own"
+    plot_axis = "own"
     limits: tuple[float, ...]
     source = "Khalil, Nonlinear Systems (2002), 1.2.7"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return tuple({"limit": limit} for limit in self.limits)
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         own, limit = context.part("own"), shape["limit"]
         return own.clamp(-limit, limit) - own
 

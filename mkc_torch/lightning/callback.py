@@ -12,7 +12,7 @@ from lightning.pytorch.utilities import CombinedLoader
 from torch import Tensor, nn
 from typing_extensions import override
 
-from mkc_torch._support.arguments import checked_number, refuse_other_type, told
+from mkc_torch._support.arguments import checked_number, format_value, refuse_other_type
 from mkc_torch.density.expectation_step import damped, damped_kappa, expectation_step
 from mkc_torch.functional import mkc_nll
 from mkc_torch.lightning._owned import SIGMA_CAP, OwnedLoss
@@ -134,7 +134,7 @@ class MKCExpectationMaximization(Callback):
         if residuals is not None and not callable(residuals):
             raise TypeError(
                 f"Expected argument `residuals` to be a function (pl_module, batch) -> (input, target) but got "
-                f"{told(residuals)}; None takes those of the training steps."
+                f"{format_value(residuals)}; None takes those of the training steps."
             )
         self.loss = loss
         self.every_n_steps = every_n_steps

@@ -58,7 +58,7 @@ class Sums(NamedTuple):
         return Sums(*(a + b for a, b in zip(self, other, strict=True)))
 
 
-class Bends(NamedTuple):
+class CurvatureSums(NamedTuple):
     """What changes little from step to step: curvature by the coefficients, and more that is wanted but once.
 
     ``curvature`` is the Hessian of the summed energy, ``spread`` the products of each sample's score with itself,
@@ -71,18 +71,18 @@ class Bends(NamedTuple):
     moment: Float64[Tensor, "m n"]
     square: Float64[Tensor, " m"]
 
-    def plus(self, other: Bends) -> Bends:
-        return Bends(*(a + b for a, b in zip(self, other, strict=True)))
+    def plus(self, other: CurvatureSums) -> CurvatureSums:
+        return CurvatureSums(*(a + b for a, b in zip(self, other, strict=True)))
 
 
-class Range(NamedTuple):
+class ResidualRange(NamedTuple):
     """Least and largest residual of each channel among the samples in use."""
 
     low: Float64[Tensor, " m"]
     high: Float64[Tensor, " m"]
 
-    def plus(self, other: Range) -> Range:
-        return Range(torch.minimum(self.low, other.low), torch.maximum(self.high, other.high))
+    def plus(self, other: ResidualRange) -> ResidualRange:
+        return ResidualRange(torch.minimum(self.low, other.low), torch.maximum(self.high, other.high))
 
 
 def blocks(
@@ -110,12 +110,12 @@ def residual(block: Block, coef: Float64[Tensor, " n"]) -> Float64[Tensor, "b m"
     return block.y - torch.matmul(block.rows, coef)
 
 
-def residual_range(block: Block, coef: Float64[Tensor, " n"]) -> Range:
+def residual_range(block: Block, coef: Float64[Tensor, " n"]) -> ResidualRange:
     error = residual(block, coef)
     if block.weight is None:
-        return Range(*torch.aminmax(error, dim=0))
+        return ResidualRange(*torch.aminmax(error, dim=0))
     used = block.weight > 0
-    return Range(torch.where(used, error, torch.inf).amin(0), torch.where(used, error, -torch.inf).amax(0))
+    return ResidualRange(torch.where(used, error, torch.inf).amin(0), torch.where(used, error, -torch.inf).amax(0))
 
 
 def kernel(error: Float64[Tensor, "b m"], density: Density) -> tuple[Float64[Tensor, "b m"], Float64[Tensor, "b m"]]:
@@ -172,7 +172,7 @@ def _products(
     return torch.from_numpy(total)
 
 
-def bends(block: Block, error: Tensor, q: Tensor, w: Tensor, density: Density) -> Bends:
+def bends(block: Block, error: Tensor, q: Tensor, w: Tensor, density: Density) -> CurvatureSums:
     """Those of a block at its residual and :func:`kernel`."""
     weighted, plain = (w, error) if block.weight is None else (w * block.weight, error * block.weight)
     precision = density.d.pow(-2)
@@ -184,7 +184,7 @@ def bends(block: Block, error: Tensor, q: Tensor, w: Tensor, density: Density) -
     else:
         scored = torch.matmul(score.unsqueeze(1), block.rows).squeeze(1)
         spread = torch.matmul(scored.mT, scored)
-    return Bends(
+    return CurvatureSums(
         curvature=_products(flat, flat, bend.flatten()),
         spread=spread,
         tilt=_moments(q * weighted * error, block),

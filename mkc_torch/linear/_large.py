@@ -17,10 +17,10 @@ from torch import Tensor
 from mkc_torch.density.domain import WIDE
 from mkc_torch.density.likelihood import DensityState
 from mkc_torch.density.normalizer import log_partition_value
-from mkc_torch.linear._blocks import Bends, Density, Sums
-from mkc_torch.linear._implicit.at_rest import Rest
-from mkc_torch.linear._maximum import TIGHT, Known, least_d, rough_fit
-from mkc_torch.linear._passes import End, Rows, Slopes, descend
+from mkc_torch.linear._blocks import CurvatureSums, Density, Sums
+from mkc_torch.linear._implicit.stationary import StationaryPoint
+from mkc_torch.linear._maximum import TIGHT, FixedParameters, least_d, rough_fit
+from mkc_torch.linear._passes import DescentEnd, PassDerivatives, Rows, descend
 from mkc_torch.linear._pilot import drawn_rows, pilot_problem, rows_at
 from mkc_torch.linear._problem import MAX_IMPLIED_CHANNELS, CanonicalShapes, LinearProblem
 from mkc_torch.linear._robust_start import RobustStart, robust_start
@@ -98,7 +98,7 @@ class LargeMaximum:
     """The maximum of the likelihood of all rows, in the columns of X; ``rest`` is a batch of it, the others are not."""
 
     coef: Float64[Tensor, " n"]
-    rest: Rest
+    rest: StationaryPoint
     weights: Float[Tensor, "N m"]
     log_likelihood: Float64[Tensor, ""]
     covariance: Float64[Tensor, "n n"]
@@ -106,7 +106,7 @@ class LargeMaximum:
     history: Float64[Tensor, " k"]
 
 
-def large_maximum(values: CanonicalShapes, known: Known, *, max_iter: int, seed: int) -> LargeMaximum | None:
+def large_maximum(values: CanonicalShapes, known: FixedParameters, *, max_iter: int, seed: int) -> LargeMaximum | None:
     """The maximum of the likelihood of one problem of many rows.
 
     None where the values are not finite, where no pilot stands for all rows or its rough fit finds no head, where most
@@ -152,14 +152,14 @@ class _Pilot:
     alike: bool
     begin: RobustStart
     frame: Float64[Tensor, "n n"] | None
-    rest: Rest
+    rest: StationaryPoint
 
     def in_basis(self, beta: Float64[Tensor, "1 n"]) -> Float64[Tensor, "1 n"]:
         """Coefficients in the basis of the pilot's problem."""
         return beta if self.frame is not None else torch.linalg.solve(self.problem.to_coef[0], beta.mT).mT
 
 
-def _pilot(values: CanonicalShapes, known: Known, max_iter: int, seed: int) -> _Pilot | None:
+def _pilot(values: CanonicalShapes, known: FixedParameters, max_iter: int, seed: int) -> _Pilot | None:
     drawn = pilot_problem(values, seed)
     if drawn is None:
         return None
@@ -177,8 +177,8 @@ def _pilot(values: CanonicalShapes, known: Known, max_iter: int, seed: int) -> _
 
 
 def _on_its_domain(
-    rows: Rows, pilot: _Pilot, known: Known, rough: Rest, first: Sums | None
-) -> tuple[Rest, Sums | None]:
+    rows: Rows, pilot: _Pilot, known: FixedParameters, rough: StationaryPoint, first: Sums | None
+) -> tuple[StationaryPoint, Sums | None]:
     """Where to begin on the domain of the rule, with the sums there where they are those of the rough fit."""
     d = torch.exp(rough.log_d)
     bound = _half_width(rows, rough.beta, WIDE * d)
@@ -207,7 +207,7 @@ def _half_width(rows: Rows, beta: Float64[Tensor, "1 n"], least: Float64[Tensor,
     return torch.maximum(0.5 * (high - low), least)
 
 
-def _moved(rest: Rest, end: End) -> Rest:
+def _moved(rest: StationaryPoint, end: DescentEnd) -> StationaryPoint:
     point = end.place.point
     return replace(rest, beta=point.beta, kappa=point.kappa, log_d=point.log_d)
 
@@ -229,7 +229,7 @@ def _sound(rows: Rows) -> bool:
     return 1.0 / limit <= max(-low, high) <= limit and all(math.isfinite(float(v)) for v in torch.aminmax(rows.X))
 
 
-def _pinned(end: End, rest: Rest) -> bool:
+def _pinned(end: DescentEnd, rest: StationaryPoint) -> bool:
     """Whether d ended at its least, which is that of the pilot's rows."""
     assert rest.log_d_min is not None
     return rest.free_d and bool((end.place.point.log_d <= rest.log_d_min).any())
@@ -245,8 +245,8 @@ def _frame(problem: LinearProblem) -> Float64[Tensor, "n n"] | None:
     return None if float(singular[0]) <= _CONDITION * float(singular[-1]) else problem.to_coef[0]
 
 
-def _at(beta: Float64[Tensor, "1 n"], state: DensityState) -> Rest:
-    return Rest(
+def _at(beta: Float64[Tensor, "1 n"], state: DensityState) -> StationaryPoint:
+    return StationaryPoint(
         beta=beta,
         kappa=state.kappa,
         log_d=state.log_d,
@@ -258,15 +258,15 @@ def _at(beta: Float64[Tensor, "1 n"], state: DensityState) -> Rest:
     )
 
 
-def _slopes(rows: Rows, rest: Rest) -> Slopes:
+def _slopes(rows: Rows, rest: StationaryPoint) -> PassDerivatives:
     total, found = rows.look(rest.beta[0], Density(rest.kappa[0], torch.exp(rest.log_d[0])), bend=True)
     assert found is not None
     everything = total.weight.sum()
     grams = torch.stack([_gram(rows, rest, channel) for channel in range(rows.Y.shape[-1])])
-    return Slopes(found.curvature / everything, found.tilt / everything, grams / everything)
+    return PassDerivatives(found.curvature / everything, found.tilt / everything, grams / everything)
 
 
-def _gram(rows: Rows, rest: Rest, channel: int) -> Float64[Tensor, "n n"]:
+def _gram(rows: Rows, rest: StationaryPoint, channel: int) -> Float64[Tensor, "n n"]:
     """Sum of ``x xᵀ`` of a channel: the curvature of a Gaussian with d = 1."""
     part = slice(channel, channel + 1)
     weight = None if rows.weight is None else rows.weight[:, part]
@@ -277,7 +277,7 @@ def _gram(rows: Rows, rest: Rest, channel: int) -> Float64[Tensor, "n n"]:
     return found.curvature
 
 
-def _gaussian_is_likelier(rows: Rows, rest: Rest, end: End, grams: Float64[Tensor, "m n n"]) -> bool:
+def _gaussian_is_likelier(rows: Rows, rest: StationaryPoint, end: DescentEnd, grams: Float64[Tensor, "m n n"]) -> bool:
     """Whether a Gaussian at least squares is likelier than the maximum found, of several channels whether it may be."""
     if not (rest.free_kappa and rest.free_d) or not bool((end.place.point.kappa > 0).any()):
         return False
@@ -289,7 +289,7 @@ def _gaussian_is_likelier(rows: Rows, rest: Rest, end: End, grams: Float64[Tenso
     return _gaussian_value(rest, end, _gram(rows, rest, 0).unsqueeze(0), 1.0) < value
 
 
-def _gaussian_value(rest: Rest, end: End, grams: Float64[Tensor, "m n n"], slack: float) -> float:
+def _gaussian_value(rest: StationaryPoint, end: DescentEnd, grams: Float64[Tensor, "m n n"], slack: float) -> float:
     """Mean negative log-likelihood of a Gaussian at the least squares of each channel.
 
     Least squares lowers a channel's sum of squares by ``gᵀ G⁻¹ g``, g being the sum of ``e x`` and G that of ``x xᵀ``.
@@ -307,7 +307,9 @@ def _gaussian_value(rest: Rest, end: End, grams: Float64[Tensor, "m n n"], slack
     return float((torch.log(d) + 0.5 * variance / d.square() + norm).sum())
 
 
-def _told(rows: Rows, rest: Rest, end: End, found: Bends, weights: Float[Tensor, "N m"]) -> LargeMaximum:
+def _told(
+    rows: Rows, rest: StationaryPoint, end: DescentEnd, found: CurvatureSums, weights: Float[Tensor, "N m"]
+) -> LargeMaximum:
     point = end.place.point
     used = rows.Y.numel() if rows.weight is None else int((rows.weight > 0).sum())
     left = used - point.beta.shape[-1]
@@ -325,7 +327,7 @@ def _told(rows: Rows, rest: Rest, end: End, found: Bends, weights: Float[Tensor,
     )
 
 
-def _sandwich(found: Bends, used: int, left: int) -> Float64[Tensor, "n n"]:
+def _sandwich(found: CurvatureSums, used: int, left: int) -> Float64[Tensor, "n n"]:
     root = found.curvature.diagonal().rsqrt()
     outer = root.unsqueeze(-1) * root
     inverse = outer * torch.linalg.pinv(outer * found.curvature, hermitian=True)

@@ -15,7 +15,7 @@ from mkc_torch.linear._mkc import channel_parameter, fixed_point_step
 from mkc_torch.linear._problem import LinearProblem
 from mkc_torch.linear._robust_start import RobustStart, Start, robust_start
 
-__all__ = ["TIGHT", "Known", "Maximum", "given_bound", "least_d", "maximise", "rough_fit"]
+__all__ = ["TIGHT", "FixedParameters", "LikelihoodMaximum", "given_bound", "least_d", "maximise", "rough_fit"]
 
 _FLOOR = 0.3
 """Least d in robust scales: a scale is at most doubled by outliers, and a fit that interpolates ends far below."""
@@ -28,7 +28,7 @@ TIGHT = 5.0
 
 
 @dataclass(frozen=True)
-class Maximum:
+class LikelihoodMaximum:
     beta: Tensor
     state: DensityState
     value: Tensor
@@ -38,7 +38,7 @@ class Maximum:
 
 def _alternate(
     problem: LinearProblem, beta: Tensor, state: DensityState, *, max_iter: int, tol: float, patience: int = 2
-) -> Maximum:
+) -> LikelihoodMaximum:
     """E-steps and M-steps in turn; a problem leaves the batch after ``patience`` of them without progress."""
     size = beta.shape[0]
     index = torch.arange(size, device=beta.device)
@@ -74,10 +74,12 @@ def _alternate(
             index, beta, quiet = index[keep], beta[keep], quiet[keep]
             state, problem = state.select(keep), problem.select(keep)
             weight = None if weight is None else weight[keep]
-    return Maximum(out_beta, out_state, history[-1], converged, history)
+    return LikelihoodMaximum(out_beta, out_state, history[-1], converged, history)
 
 
-def _gaussian_candidate(problem: LinearProblem, maximum: Maximum, *, max_iter: int, tol: float) -> Maximum:
+def _gaussian_candidate(
+    problem: LinearProblem, maximum: LikelihoodMaximum, *, max_iter: int, tol: float
+) -> LikelihoodMaximum:
     """Where a Gaussian density at weighted least squares is likelier than what was found, go on from there instead."""
     state = maximum.state
     beta = problem.weighted_fit(torch.ones_like(problem.Y))
@@ -97,7 +99,7 @@ def _gaussian_candidate(problem: LinearProblem, maximum: Maximum, *, max_iter: i
         now = maximum.history[min(i, len(maximum.history) - 1)].clone()
         now[better] = again.history[min(i, len(again.history) - 1)]
         history.append(now)
-    return Maximum(
+    return LikelihoodMaximum(
         beta=maximum.beta.index_copy(0, better, again.beta),
         state=written(state, better, again.state),
         value=maximum.value.index_copy(0, better, again.value),
@@ -107,7 +109,7 @@ def _gaussian_candidate(problem: LinearProblem, maximum: Maximum, *, max_iter: i
 
 
 @dataclass(frozen=True)
-class Known:
+class FixedParameters:
     """What a fit is given beside the data, as it was given."""
 
     sigma: float | Tensor | None
@@ -115,7 +117,7 @@ class Known:
     bound: float | Tensor | None
     start: Start | Tensor
 
-    def in_basis_of(self, problem: LinearProblem) -> Known:
+    def in_basis_of(self, problem: LinearProblem) -> FixedParameters:
         """The same for a problem whose X is the basis of this one."""
         if not isinstance(self.start, Tensor):
             return self
@@ -148,8 +150,8 @@ class Known:
 
 
 def maximise(
-    problem: LinearProblem, known: Known, *, max_iter: int, tol: float, seed: int
-) -> tuple[RobustStart, Maximum]:
+    problem: LinearProblem, known: FixedParameters, *, max_iter: int, tol: float, seed: int
+) -> tuple[RobustStart, LikelihoodMaximum]:
     """The robust start of a fit and where it ends.
 
     Args:
@@ -179,7 +181,7 @@ def least_d(begin: RobustStart) -> Tensor:
     return _FLOOR * begin.scale
 
 
-def given_bound(problem: LinearProblem, known: Known, begin: RobustStart) -> Tensor:
+def given_bound(problem: LinearProblem, known: FixedParameters, begin: RobustStart) -> Tensor:
     """The domain that is given, of every channel; a clear error where the head does not fit in."""
     assert known.bound is not None
     bound = channel_parameter("bound", known.bound, problem)
@@ -189,12 +191,12 @@ def given_bound(problem: LinearProblem, known: Known, begin: RobustStart) -> Ten
 
 def rough_fit(
     problem: LinearProblem,
-    known: Known,
+    known: FixedParameters,
     begin: RobustStart,
     *,
     max_iter: int,
     tails: Sequence[float] = TAILS,
-) -> Maximum:
+) -> LikelihoodMaximum:
     """A fit that says which domain the rule gives, and is near to the one there.
 
     A robust start's scale is up to twice that of the head when outliers are many and on one side, so the rough fit

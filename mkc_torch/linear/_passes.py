@@ -18,10 +18,10 @@ from torch import Tensor
 from mkc_torch.density.energy import KAPPA_MAX
 from mkc_torch.density.likelihood import DensityState, Derivatives, likelihood_derivatives, newton_proposal
 from mkc_torch.linear._blocks import (
-    Bends,
     Block,
+    CurvatureSums,
     Density,
-    Range,
+    ResidualRange,
     Sums,
     bends,
     blocks,
@@ -31,7 +31,13 @@ from mkc_torch.linear._blocks import (
     residual_range,
     sums,
 )
-from mkc_torch.linear._implicit.at_rest import Point, Rest, free_unknowns, inverse_where, moved
+from mkc_torch.linear._implicit.stationary import (
+    FlatStationaryPoint,
+    StationaryPoint,
+    free_unknowns,
+    inverse_where,
+    moved,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -54,8 +60,8 @@ class Rows:
     def blocks(self) -> Iterator[Block]:
         return blocks(self.X, self.Y, self.weight, self.frame)
 
-    def range_at(self, coef: Float64[Tensor, " n"]) -> Range:
-        total: Range | None = None
+    def range_at(self, coef: Float64[Tensor, " n"]) -> ResidualRange:
+        total: ResidualRange | None = None
         for block in self.blocks():
             part = residual_range(block, coef)
             total = part if total is None else total.plus(part)
@@ -69,10 +75,10 @@ class Rows:
         *,
         bend: bool = False,
         weights: Float[Tensor, "N m"] | None = None,
-    ) -> tuple[Sums, Bends | None]:
+    ) -> tuple[Sums, CurvatureSums | None]:
         """One pass: sums, bends where asked for, and the kernel's weights into ``weights``."""
         total: Sums | None = None
-        more: Bends | None = None
+        more: CurvatureSums | None = None
         first = 0
         for block in self.blocks():
             error = residual(block, beta)
@@ -89,12 +95,12 @@ class Rows:
         return total, more
 
 
-def density_of(point: Point) -> Density:
+def density_of(point: FlatStationaryPoint) -> Density:
     return Density(point.kappa[0], torch.exp(point.log_d[0]))
 
 
 @dataclass(frozen=True)
-class Slopes:
+class PassDerivatives:
     """What a step goes by beside the sums of a pass, per unit of weight: curvature, tilt, products of each channel."""
 
     curvature: Float64[Tensor, "n n"]
@@ -102,10 +108,10 @@ class Slopes:
     grams: Float64[Tensor, "m n n"]
 
 
-class Place(NamedTuple):
+class EvaluatedPoint(NamedTuple):
     """Mean negative log-likelihood at a point, with its derivatives; coefficients in units of the least d."""
 
-    point: Point
+    point: FlatStationaryPoint
     value: float
     per_sample: Float64[Tensor, ""]
     gradient: Float64[Tensor, "1 p"]
@@ -113,16 +119,16 @@ class Place(NamedTuple):
     by_channel: Derivatives
 
 
-class End(NamedTuple):
+class DescentEnd(NamedTuple):
     """Where a descent ended; ``bends`` are those of the last pass but one or two, if any was to have them."""
 
-    place: Place
+    place: EvaluatedPoint
     sums: Sums
-    bends: Bends | None
+    bends: CurvatureSums | None
     history: list[Float64[Tensor, ""]]
 
 
-def _state(rest: Rest, point: Point) -> DensityState:
+def _state(rest: StationaryPoint, point: FlatStationaryPoint) -> DensityState:
     assert rest.log_bound is not None
     assert rest.log_d_min is not None
     kappa, log_d = point.kappa[0], point.log_d[0]
@@ -132,7 +138,9 @@ def _state(rest: Rest, point: Point) -> DensityState:
     )
 
 
-def _place(rest: Rest, point: Point, total: Sums, slopes: Slopes, unit: Tensor) -> Place:
+def _place(
+    rest: StationaryPoint, point: FlatStationaryPoint, total: Sums, slopes: PassDerivatives, unit: Tensor
+) -> EvaluatedPoint:
     kappa = point.kappa[0].unsqueeze(-1)
     everything = total.weight.sum()
     share = total.weight / everything
@@ -151,12 +159,12 @@ def _place(rest: Rest, point: Point, total: Sums, slopes: Slopes, unit: Tensor) 
     )
     gradient = torch.cat([-score.sum(0), share * by_channel.kappa, share * by_channel.log_d])
     value = by_channel.value
-    return Place(
+    return EvaluatedPoint(
         point, float((share * value).sum()), value.sum(), gradient.unsqueeze(0), hessian.unsqueeze(0), by_channel
     )
 
 
-def _newton_move(rest: Rest, at: Place) -> Float64[Tensor, "1 p"] | None:
+def _newton_move(rest: StationaryPoint, at: EvaluatedPoint) -> Float64[Tensor, "1 p"] | None:
     """Newton's step; what would cross a limit ends there, and the others step accordingly. None at no convex place."""
     assert rest.log_bound is not None
     assert rest.log_d_min is not None
@@ -179,13 +187,15 @@ def _newton_move(rest: Rest, at: Place) -> Float64[Tensor, "1 p"] | None:
         keep = keep & ~beyond
 
 
-def _represented(point: Point, slopes: Slopes, everything: Tensor) -> float:
+def _represented(point: FlatStationaryPoint, slopes: PassDerivatives, everything: Tensor) -> float:
     """Length in standard errors of a change of every coefficient by four units in its last place."""
     spread = (slopes.curvature.diagonal().clamp(min=0.0) * point.beta[0].square()).sum()
     return 4.0 * torch.finfo(torch.float64).eps * math.sqrt(float(everything * spread))
 
 
-def _plain_move(rest: Rest, at: Place, slopes: Slopes, unit: Tensor) -> Float64[Tensor, "1 p"]:
+def _plain_move(
+    rest: StationaryPoint, at: EvaluatedPoint, slopes: PassDerivatives, unit: Tensor
+) -> Float64[Tensor, "1 p"]:
     """An M-step with weights of 1, which is no longer than one with the kernel's, and a damped step in κ and log d."""
     precision = torch.exp(-2.0 * at.point.log_d[0])[:, None, None]
     gram = (slopes.grams * precision).sum(0) * unit.square()
@@ -202,8 +212,8 @@ def _slack(value: float, rounding: float, everything: Tensor) -> float:
 
 def descend(
     rows: Rows,
-    rest: Rest,
-    slopes: Slopes,
+    rest: StationaryPoint,
+    slopes: PassDerivatives,
     *,
     near: float,
     stop: float,
@@ -211,7 +221,7 @@ def descend(
     weights: Float[Tensor, "N m"] | None = None,
     first: Sums | None = None,
     alike: bool = True,
-) -> End | None:
+) -> DescentEnd | None:
     """To where Newton's step with the curvature of these rows is short; None where that takes too many passes.
 
     Args:
@@ -225,11 +235,11 @@ def descend(
         first: the sums where it begins, if they are known.
         alike: whether the slopes' rows are like these; otherwise the first pass, too, adds up their curvature.
     """
-    point = Point(rest.beta, rest.kappa, rest.log_d)
+    point = FlatStationaryPoint(rest.beta, rest.kappa, rest.log_d)
     unit = torch.exp(rest.log_d.amin())
     m = point.kappa.shape[-1]
-    best: Place | None = None
-    found: Bends | None = None
+    best: EvaluatedPoint | None = None
+    found: CurvatureSums | None = None
     history: list[Tensor] = []
     before, left, plain = math.inf, math.inf, False
     move = torch.zeros_like(point.beta)
@@ -243,7 +253,7 @@ def descend(
         everything = total.weight.sum()
         if more is not None:
             alike, found = True, more if close else None
-            slopes = Slopes(more.curvature / everything, more.tilt / everything, slopes.grams)
+            slopes = PassDerivatives(more.curvature / everything, more.tilt / everything, slopes.grams)
         here = _place(rest, point, total, slopes, unit)
         rounding = _represented(point, slopes, everything)
         if best is not None and not here.value <= best.value + _slack(best.value, rounding, everything):
@@ -261,7 +271,7 @@ def descend(
             move = newton
             length = math.sqrt(max(0.0, -float((move * here.gradient).sum() * everything)))
             if (found is not None or near == 0.0) and length <= max(stop, rounding):
-                return End(here, total, found, history)
+                return DescentEnd(here, total, found, history)
             left = length * (_FIRST_RATE if math.isinf(before) else min(1.0, length / before))
             before = length
         point = moved(rest, point, move, unit, m)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import refuse_complex, seems_finite, told
+from mkc_torch._support.arguments import format_value, refuse_complex, seems_finite
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._problem import LinearProblem
-from mkc_torch.linear._scale_search import SCREENED, Search, minimise_scale
+from mkc_torch.linear._scale_search import SCREENED, ScaleSearch, minimise_scale
 from mkc_torch.linear.least_trimmed_squares import QuantileScale, TrimmedScale, default_coverage
 from mkc_torch.linear.s_regression import minimise_m_scale
 
@@ -48,13 +48,13 @@ def checked_start(start: T, names: tuple[str, ...] = get_args(Start), others: st
         refuse_complex("start", start)
         if start.dim() == 0 or not seems_finite(start):
             raise ValueError(
-                f"Expected argument `start` to be finite coefficients, (n,) or (*, n), but got {told(start.tolist())}."
+                f"Expected argument `start` to be finite coefficients, (n,) or (*, n), but got {format_value(start.tolist())}."
             )
     elif not isinstance(start, str) or start not in names:
         array = isinstance(start, (list, tuple)) or hasattr(start, "__array__")
         raise ValueError(
             f"Expected argument `start` to be {', '.join(map(repr, names))} or coefficients{others} but got "
-            f"{told(start)}{'; make a tensor of it, torch.as_tensor(start)' if array else ''}."
+            f"{format_value(start)}{'; make a tensor of it, torch.as_tensor(start)' if array else ''}."
         )
     return start
 
@@ -89,7 +89,7 @@ def _trimmed_start(problem: LinearProblem, seed: int, pilot: bool) -> Float[Tens
     fraction = default_coverage(problem) / problem.num_samples
     # fits through up to three values are good enough to be ranked as they are
     steps = 0 if problem.num_coefficients <= 3 else 2
-    search = Search(
+    search = ScaleSearch(
         TrimmedScale(fraction) if steps else QuantileScale(fraction),
         TrimmedScale(fraction),
         starts=elemental_count(problem.num_coefficients),

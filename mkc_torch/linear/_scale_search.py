@@ -104,7 +104,7 @@ def rounding_scale(problem: LinearProblem) -> Float[Tensor, "B m"]:
 
 
 @dataclass(frozen=True)
-class Search:
+class ScaleSearch:
     """How the minimum is looked for.
 
     ``starts`` elemental sets, least squares being one more, make ``screening_steps`` steps each on ``screened`` samples
@@ -152,7 +152,7 @@ def _best(
 
 
 @dataclass(frozen=True)
-class _Found:
+class _Candidates:
     """Candidates with their scales, where these are known, and whether and when they came to rest."""
 
     beta: Float[Tensor, "B S n"]
@@ -160,22 +160,22 @@ class _Found:
     rest: Float[Tensor, "B S"]
     n_iter: int = 0
 
-    def of_starts(self, index: Tensor) -> _Found:
+    def of_starts(self, index: Tensor) -> _Candidates:
         scale = None if self.scale is None else _of_starts(self.scale, index)
         return replace(self, beta=_of_starts(self.beta, index), scale=scale, rest=self.rest.gather(1, index))
 
-    def select(self, index: Tensor) -> _Found:
+    def select(self, index: Tensor) -> _Candidates:
         scale = None if self.scale is None else self.scale[index]
         return replace(self, beta=self.beta[index], scale=scale, rest=self.rest[index])
 
-    def narrowed(self, count: int) -> _Found:
+    def narrowed(self, count: int) -> _Candidates:
         """The ``count`` candidates of the smallest scales."""
         if self.scale is None or count >= self.beta.shape[1]:
             return self
         return self.of_starts(_log_product(self.scale).topk(count, dim=1, largest=False).indices)
 
 
-def _in_parts(problem: LinearProblem, values: int, work: Callable[[LinearProblem, Tensor], _Found]) -> _Found:
+def _in_parts(problem: LinearProblem, values: int, work: Callable[[LinearProblem, Tensor], _Candidates]) -> _Candidates:
     """``work`` on so many problems at once that ``values`` of each stay in the cache."""
     every = torch.arange(problem.Y.shape[0], device=problem.Y.device)
     parts = every.split(max(1, _BATCH // values))
@@ -183,7 +183,7 @@ def _in_parts(problem: LinearProblem, values: int, work: Callable[[LinearProblem
         return work(problem, every)
     found = [work(problem.select(part), part) for part in parts]
     scales = [f.scale for f in found if f.scale is not None]
-    return _Found(
+    return _Candidates(
         beta=torch.cat([f.beta for f in found]),
         scale=torch.cat(scales) if scales else None,
         rest=torch.cat([f.rest for f in found]),
@@ -191,7 +191,7 @@ def _in_parts(problem: LinearProblem, values: int, work: Callable[[LinearProblem
     )
 
 
-def minimise_scale(problem: LinearProblem, search: Search) -> ScaleMinimum:
+def minimise_scale(problem: LinearProblem, search: ScaleSearch) -> ScaleMinimum:
     """A few steps from every start on some of the samples, then the best candidates to rest on all of them."""
     size = problem.num_samples * problem.num_channels
     screened = min(size, search.screened * problem.num_channels) * (search.starts + 1)
@@ -213,30 +213,30 @@ def minimise_scale(problem: LinearProblem, search: Search) -> ScaleMinimum:
     return _ended(problem, _descended(problem, found, search), search)
 
 
-def descend(problem: LinearProblem, beta: Float[Tensor, "B n"], search: Search) -> ScaleMinimum:
+def descend(problem: LinearProblem, beta: Float[Tensor, "B n"], search: ScaleSearch) -> ScaleMinimum:
     """Steps from coefficients to rest."""
     alone = beta.unsqueeze(1)
-    found = _Found(alone, None, torch.zeros(alone.shape[:2], dtype=torch.bool, device=beta.device))
+    found = _Candidates(alone, None, torch.zeros(alone.shape[:2], dtype=torch.bool, device=beta.device))
     return _ended(problem, _descended(problem, found, search), search)
 
 
-def _ended(problem: LinearProblem, found: _Found, search: Search) -> ScaleMinimum:
+def _ended(problem: LinearProblem, found: _Candidates, search: ScaleSearch) -> ScaleMinimum:
     best = found.narrowed(1)
     scale, weight = search.final.weighed(problem, problem.residual(best.beta), best.scale)
     return ScaleMinimum(best.beta[:, 0], scale[:, 0], weight[:, 0], found.n_iter, best.rest[:, 0])
 
 
-def _screened(problem: LinearProblem, drawn: Tensor, search: Search) -> _Found:
+def _screened(problem: LinearProblem, drawn: Tensor, search: ScaleSearch) -> _Candidates:
     """The candidates; the starts of a large problem are worked on so many at once that they stay in the cache."""
     beta = _fits_through(problem, drawn)
     at_once = max(search.candidates, _CHUNK // (problem.num_samples * problem.num_channels))
     found = [_screened_part(problem, part, search) for part in beta.split(at_once, dim=1)]
     beta, scale = (torch.cat(parts, dim=1) for parts in zip(*found, strict=True))
     rest = torch.zeros(beta.shape[:2], dtype=torch.bool, device=beta.device)
-    return _Found(beta, scale, rest).narrowed(search.candidates)
+    return _Candidates(beta, scale, rest).narrowed(search.candidates)
 
 
-def _screened_part(problem: LinearProblem, beta: Float[Tensor, "B S n"], search: Search) -> tuple[Tensor, Tensor]:
+def _screened_part(problem: LinearProblem, beta: Float[Tensor, "B S n"], search: ScaleSearch) -> tuple[Tensor, Tensor]:
     """The best of some starts, and their scales."""
     near: Tensor | None = None
     if search.ranking is not None:
@@ -248,13 +248,13 @@ def _screened_part(problem: LinearProblem, beta: Float[Tensor, "B S n"], search:
     return _best(problem, beta, near, search.screening, search.candidates)
 
 
-def _descended(problem: LinearProblem, found: _Found, search: Search) -> _Found:
+def _descended(problem: LinearProblem, found: _Candidates, search: ScaleSearch) -> _Candidates:
     """Steps from every candidate that is not at rest."""
     values = problem.num_samples * problem.num_channels * found.beta.shape[1]
     return _in_parts(problem, values, lambda some, part: _descend(some, found.select(part), search))
 
 
-def _descend(problem: LinearProblem, found: _Found, search: Search) -> _Found:
+def _descend(problem: LinearProblem, found: _Candidates, search: ScaleSearch) -> _Candidates:
     """As :func:`_descended`, of one part; problems whose candidates are all at rest leave it."""
     tolerance = max(search.tolerance, 1e2 * torch.finfo(found.beta.dtype).eps)
     beta, near, moving = found.beta.clone(), found.scale, ~found.rest
@@ -286,4 +286,4 @@ def _descend(problem: LinearProblem, found: _Found, search: Search) -> _Found:
     if n_iter and bool(moving.any()):
         # of the last step's coefficients
         scale = search.final.scale(problem, problem.residual(beta), scale)
-    return _Found(beta, scale, ~moving, found.n_iter + n_iter)
+    return _Candidates(beta, scale, ~moving, found.n_iter + n_iter)

@@ -13,11 +13,11 @@ from mkc_torch._support.arrays import Data
 from mkc_torch.density.em import normalised
 from mkc_torch.density.energy import SIGMA_LEAST
 from mkc_torch.density.likelihood import negative_log_likelihood
-from mkc_torch.linear._implicit.at_rest import Rest
 from mkc_torch.linear._implicit.layer import Given, fit_layer, wanted
+from mkc_torch.linear._implicit.stationary import StationaryPoint
 from mkc_torch.linear._inference import Inference
 from mkc_torch.linear._large import LargeMaximum, in_its_basis, is_large, large_maximum
-from mkc_torch.linear._maximum import Known, Maximum, maximise
+from mkc_torch.linear._maximum import FixedParameters, LikelihoodMaximum, maximise
 from mkc_torch.linear._mkc import coefficient_covariance, kernel_weight, values_left
 from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, laid_out, linear_problem
 from mkc_torch.linear._robust_start import RobustStart, Start, checked_start
@@ -148,7 +148,7 @@ class MKCRegression(Inference):
             return self._fit_as_layer(X, Y, sample_weight)
         self.__dict__.pop("differentiable_", None)
         with torch.no_grad():
-            values, known = laid_out(X, Y, sample_weight), Known(self.sigma, self.d, self.bound, self.start)
+            values, known = laid_out(X, Y, sample_weight), FixedParameters(self.sigma, self.d, self.bound, self.start)
             # scores of a time series are of use in their order alone
             found = self._large_maximum(values, known) if self.covariance == "sandwich" else None
             if found is not None:
@@ -158,17 +158,19 @@ class MKCRegression(Inference):
             self._keep(problem, *self._maximise(problem, known))
         return self
 
-    def _large_maximum(self, values: CanonicalShapes, known: Known) -> LargeMaximum | None:
+    def _large_maximum(self, values: CanonicalShapes, known: FixedParameters) -> LargeMaximum | None:
         if not is_large(values):
             return None
         return large_maximum(values, known, max_iter=self.max_iter, seed=self.seed)
 
-    def _maximise(self, problem: LinearProblem, known: Known) -> tuple[RobustStart, Maximum]:
+    def _maximise(self, problem: LinearProblem, known: FixedParameters) -> tuple[RobustStart, LikelihoodMaximum]:
         return maximise(problem, known, max_iter=self.max_iter, tol=self.tol, seed=self.seed)
 
     def _fit_as_layer(self, X: Tensor, Y: Tensor, sample_weight: Tensor | None) -> MKCRegression:
-        def solve(problem: LinearProblem, given: Given) -> Rest:
-            known = Known(given.sigma, given.d, given.bound, self.start if given.start is None else given.start)
+        def solve(problem: LinearProblem, given: Given) -> StationaryPoint:
+            known = FixedParameters(
+                given.sigma, given.d, given.bound, self.start if given.start is None else given.start
+            )
             found = self._large_maximum(in_its_basis(problem), known.in_basis_of(problem))
             if found is not None:
                 self.n_iter_ = len(found.history) - 1
@@ -177,7 +179,7 @@ class MKCRegression(Inference):
             begin, maximum = self._maximise(problem, known)
             self.n_iter_ = len(maximum.history) - 1
             state = maximum.state
-            return Rest(
+            return StationaryPoint(
                 beta=maximum.beta,
                 kappa=state.kappa,
                 log_d=state.log_d,
@@ -228,7 +230,7 @@ class MKCRegression(Inference):
         flag = torch.ones(values.batch, dtype=torch.bool, device=values.Y.device)
         self.converged_, self.exact_fit_ = flag, ~flag
 
-    def _keep(self, problem: LinearProblem, begin: RobustStart, maximum: Maximum) -> None:
+    def _keep(self, problem: LinearProblem, begin: RobustStart, maximum: LikelihoodMaximum) -> None:
         kappa, d = maximum.state.kappa, torch.exp(maximum.state.log_d)
         residual = problem.residual(maximum.beta)
         self._set_common(problem, maximum.beta, kernel_weight(residual, kappa, d))

@@ -11,16 +11,16 @@ from torch import Tensor
 from mkc_torch._support.arguments import (
     checked_number,
     checked_whole,
+    format_value,
     refuse_complex,
     refuse_no_tensor,
     refuse_not_real,
     refuse_out_of_range,
-    told,
 )
 from mkc_torch._support.arrays import Data
 from mkc_torch._support.torch_internals import functorch_is_active
-from mkc_torch.linear._implicit.at_rest import Rest
 from mkc_torch.linear._implicit.layer import Given, fit_layer, wanted
+from mkc_torch.linear._implicit.stationary import StationaryPoint
 from mkc_torch.linear._inference import Inference
 from mkc_torch.linear._mkc import (
     channel_parameter,
@@ -67,7 +67,7 @@ def _cholesky_factor(covariance: Float[Tensor, "m m"]) -> Float[Tensor, "m m"]:
     if int(info) != 0 or not torch.allclose(covariance, covariance.mT, rtol=1e-5, atol=0.0):
         raise ValueError(
             "Expected argument `noise_covariance` to be symmetric and positive definite but got "
-            f"{told(covariance.tolist())}; variances alone are `d` squared."
+            f"{format_value(covariance.tolist())}; variances alone are `d` squared."
         )
     return factor
 
@@ -237,12 +237,14 @@ class FixedPointLinear(Inference):
         if self.noise_covariance is not None:
             X, Y = whitened(X, Y, self.noise_covariance)
 
-        def solve(problem: LinearProblem, given: Given) -> Rest:
+        def solve(problem: LinearProblem, given: Given) -> StationaryPoint:
             assert given.sigma is not None
             assert given.d is not None
             end = self._solve(problem, given.sigma, given.d, self.start if given.start is None else given.start)
             self.n_iter_ = len(end.history) - 1
-            return Rest(end.beta, end.kappa, torch.log(end.d), end.converged, extras=(torch.stack(end.history, -1),))
+            return StationaryPoint(
+                end.beta, end.kappa, torch.log(end.d), end.converged, extras=(torch.stack(end.history, -1),)
+            )
 
         layer = fit_layer(
             X,

@@ -17,7 +17,7 @@ from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.linear._inference import RobustInference
 from mkc_torch.linear._influence import Scores, coefficients_a_value
 from mkc_torch.linear._problem import LinearProblem, linear_problem
-from mkc_torch.linear._scale_search import Search, minimise_scale, relative_precision, rounding_scale
+from mkc_torch.linear._scale_search import ScaleSearch, minimise_scale, relative_precision, rounding_scale
 from mkc_torch.linear.covariance import RobustCovarianceKind
 
 if TYPE_CHECKING:
@@ -266,7 +266,7 @@ class LeastTrimmedSquares(RobustInference):
         N = problem.num_samples
         # a small sample has more local minima than a rank after two steps tells apart
         candidates = 200 if N <= _EXCHANGE_SAMPLES else 10
-        search = Search(rule, rule, starts=self.starts, candidates=candidates, seed=self.seed)
+        search = ScaleSearch(rule, rule, starts=self.starts, candidates=candidates, seed=self.seed)
         found = minimise_scale(problem, search)
         beta = found.beta
         if _plain(problem) and h < N <= _EXCHANGE_SAMPLES:

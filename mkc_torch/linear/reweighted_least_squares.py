@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import checked_number, checked_whole, told
+from mkc_torch._support.arguments import checked_number, checked_whole, format_value
 from mkc_torch._support.arrays import Data
 from mkc_torch.linear._estimator import LinearEstimator
 from mkc_torch.linear._inference import RobustInference
@@ -94,7 +94,7 @@ class ReweightedLeastSquares(RobustInference):
         if not (isinstance(start, LinearEstimator) or (isinstance(start, str) and start in _STARTS)):
             mend = f"; make one, {start.__name__}()" if isinstance(start, type) else ""
             raise ValueError(
-                f"Expected argument `start` to be 'lts', 'lms', 's' or an estimator but got {told(start)}{mend}."
+                f"Expected argument `start` to be 'lts', 'lms', 's' or an estimator but got {format_value(start)}{mend}."
             )
         checked_number("threshold", threshold, 1.0, math.inf, "[)", "it counts scales, and 2.5 is usual")
         if starts is not None:

@@ -23,7 +23,7 @@ from mkc_torch.linear._influence import (
 )
 from mkc_torch.linear._problem import LinearProblem, linear_problem
 from mkc_torch.linear._psi import BISQUARE_50, Psi, bisquare_for_breakdown, bisquare_rho, bisquare_weight
-from mkc_torch.linear._scale_search import ScaleMinimum, Search, descend, minimise_scale, rounding_scale
+from mkc_torch.linear._scale_search import ScaleMinimum, ScaleSearch, descend, minimise_scale, rounding_scale
 from mkc_torch.linear.covariance import RobustCovarianceKind
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def minimise_m_scale(
     c = bisquare_of(breakdown)
     final = MScale(_EXACT, c, breakdown)
     ranked = problem.num_coefficients <= _RANKED
-    search = Search(
+    search = ScaleSearch(
         MScale(_SCREENING_RANKED if ranked else _SCREENING, c, breakdown),
         final,
         starts=starts_worth_drawing(starts, problem.num_coefficients),
@@ -146,7 +146,7 @@ def minimise_m_scale(
     return replace(found, beta=beta, scale=scale.squeeze(1), weight=weight.squeeze(1))
 
 
-def _brought_to_rest(problem: LinearProblem, found: ScaleMinimum, search: Search) -> ScaleMinimum:
+def _brought_to_rest(problem: LinearProblem, found: ScaleMinimum, search: ScaleSearch) -> ScaleMinimum:
     """Newton's steps, and where they do not end at rest, more of the search to the last digit and Newton's again."""
     rule = search.final
     assert isinstance(rule, MScale)

@@ -172,7 +172,7 @@ class ChannelDensity(nn.Module):
         d = self._per_channel("d", as_numbers("d", value, self._dtype), low=0.0).to(bound)
         if self.raw_d is not None and not bool(((d > d_min) & (d < bound)).all()):
             raise ValueError(
-                f"Expected `d` between `d_min` {d_min.tolist()} and `bound` {bound.tolist()} but got {value}."
+                f"Expected `d` input_hold `d_min` {d_min.tolist()} and `bound` {bound.tolist()} but got {value}."
             )
         self._set_d(d)
 

@@ -13,10 +13,10 @@ __all__ = [
     "Reduction",
     "checked_axis",
     "checked_weight",
+    "format_channels",
     "refuse_no_dimension",
     "refuse_other_reduction",
     "refuse_other_shapes",
-    "shortly",
 ]
 
 Reduction = Literal["none", "mean", "sum"]
@@ -82,7 +82,7 @@ def checked_weight(weight: Tensor, input: Tensor, axis: int, *, cast: bool = Tru
     return weight.to(input.dtype), counts
 
 
-def shortly(values: Tensor) -> str:
+def format_channels(values: Tensor) -> str:
     """A number where all are alike, or the first few."""
     numbers = [f"{value:.4g}" for value in values.tolist()]
     if len(set(numbers)) == 1:

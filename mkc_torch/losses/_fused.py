@@ -18,7 +18,7 @@ from mkc_torch._support.torch_internals import is_wrapped
 from mkc_torch.density.closed_form import element_energy
 from mkc_torch.losses._initial_loss import initial_influence, initial_loss
 from mkc_torch.losses._parameters import ChannelState, ChannelTable, channel_table
-from mkc_torch.losses._terms import Batch, Settings, loss_value
+from mkc_torch.losses._terms import Batch, LossSettings, loss_value
 from mkc_torch.losses.residual_scale import SMALL_STATE, numpy_may_read
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class ChannelSums(NamedTuple):
     by_d: Any
 
 
-def fused_loss(batch: Batch, raw_kappa: Tensor | None, raw_d: Tensor | None, settings: Settings) -> Tensor:
+def fused_loss(batch: Batch, raw_kappa: Tensor | None, raw_d: Tensor | None, settings: LossSettings) -> Tensor:
     """The sum of the terms, reduced to a number, of plain tensors: no transforms, no gradient by the weight."""
     value: Tensor = _Fused.apply(batch.input, batch.target, raw_kappa, raw_d, batch, settings)  # type: ignore[no-untyped-call]
     return value
@@ -75,7 +75,7 @@ class _Fused(torch.autograd.Function):
         raw_kappa: Tensor | None,
         raw_d: Tensor | None,
         batch: Batch,
-        settings: Settings,
+        settings: LossSettings,
     ) -> Tensor:
         wants = ctx.needs_input_grad
         found = reduced_loss(batch, raw_kappa, raw_d, settings, wants_input=wants[0] or wants[1])
@@ -124,7 +124,7 @@ def _by_formulas(ctx: Any, grad: Tensor) -> list[Tensor | None]:
 
 
 def reduced_loss(
-    batch: Batch, raw_kappa: Tensor | None, raw_d: Tensor | None, settings: Settings, *, wants_input: bool
+    batch: Batch, raw_kappa: Tensor | None, raw_d: Tensor | None, settings: LossSettings, *, wants_input: bool
 ) -> ReducedLoss:
     """Value and gradients of the reduced loss in closed form."""
     dtype = batch.input.dtype
@@ -192,7 +192,7 @@ def _array(xp: Any, value: Tensor | None) -> Any:
     return value.numpy() if xp is np else value
 
 
-def _divisor(xp: Any, batch: Elements, settings: Settings) -> Any:
+def _divisor(xp: Any, batch: Elements, settings: LossSettings) -> Any:
     """What the sums are divided by: the weight of all elements for a mean, else 1."""
     if settings.reduction == "sum":
         return 1.0

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from mkc_torch.density.tails import Tails, assess_tails
-from mkc_torch.losses._checks import checked_weight, shortly
+from mkc_torch.losses._checks import checked_weight, format_channels
 
 __all__ = ["tails_of", "what_goes_wrong"]
 
@@ -30,7 +30,7 @@ def what_goes_wrong(
     low = [int(k) for k in (d < NEAR_FLOOR * d_min).nonzero().flatten()] if loss.raw_d is not None else []
     if low:
         found.append(
-            f"The scale d of channel {_listed(low)} is {shortly(d[low])}, next to its floor {shortly(d_min[low])}. The "
+            f"The scale d of channel {_listed(low)} is {format_channels(d[low])}, next to its floor {format_channels(d_min[low])}. The "
             "network may fit every point, noise included, and the likelihood grows without limit as d -> 0: watch a "
             "validation set, regularise, or raise `d_min` to the precision of the targets."
         )
@@ -41,7 +41,7 @@ def what_goes_wrong(
         if far:
             shares = ", ".join(f"{100.0 * float(beyond[k]):.2g} %" for k in far)
             found.append(
-                f"{shares} of the errors of channel {_listed(far)} lie beyond the bound {shortly(bound[far])}: the "
+                f"{shares} of the errors of channel {_listed(far)} lie beyond the bound {format_channels(bound[far])}: the "
                 "likelihood does not allow them. Give the largest possible error as `bound`, in the unit of the "
                 "targets, or leave `d` and `bound` out: they are then taken from the residuals."
             )

@@ -21,7 +21,7 @@ from mkc_torch.losses._parameters import ChannelState, annealed_kappa, logistic,
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Batch", "LossTerms", "Settings", "loss_terms", "loss_value"]
+__all__ = ["Batch", "LossSettings", "LossTerms", "loss_terms", "loss_value"]
 
 
 class Batch(NamedTuple):
@@ -40,7 +40,7 @@ class Batch(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Settings:
+class LossSettings:
     """The fixed numbers, the state and the options that a loss is computed with."""
 
     fixed_kappa: Tensor | None
@@ -58,7 +58,7 @@ class LossTerms(NamedTuple):
     density: Tensor
 
 
-def loss_terms(batch: Batch, raw_kappa: Tensor | None, raw_d: Tensor | None, settings: Settings) -> LossTerms:
+def loss_terms(batch: Batch, raw_kappa: Tensor | None, raw_d: Tensor | None, settings: LossSettings) -> LossTerms:
     """Both terms, reduced, differentiable to any order, under forward mode, ``vmap`` and ``torch.compile``."""
     state, dtype = settings.state, batch.input.dtype
     kappa = settings.fixed_kappa if raw_kappa is None else KAPPA_MAX * logistic(raw_kappa)
@@ -86,7 +86,7 @@ def loss_terms(batch: Batch, raw_kappa: Tensor | None, raw_d: Tensor | None, set
     return LossTerms(*(_reduced(term, batch.weight, settings.reduction) for term in (network, density)))
 
 
-def loss_value(batch: Batch, raw_kappa: Tensor | None, raw_d: Tensor | None, settings: Settings) -> Tensor:
+def loss_value(batch: Batch, raw_kappa: Tensor | None, raw_d: Tensor | None, settings: LossSettings) -> Tensor:
     """The sum of the terms."""
     network, density = loss_terms(batch, raw_kappa, raw_d, settings)
     return network + density if settings.state.is_robust else density

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from mkc_torch._support.arguments import (
     checked_number,
     checked_whole,
+    format_value,
     refuse_bad_batch,
     refuse_bad_weight,
     refuse_complex,
@@ -29,7 +30,6 @@ from mkc_torch._support.arguments import (
     refuse_not_finite,
     refuse_not_real,
     seems_finite,
-    told,
 )
 from mkc_torch._support.trust_region import Quadratic, minimise
 from mkc_torch.density.energy import as_computed
@@ -131,7 +131,7 @@ def _refuse_no_dimension(dim: object) -> None:
     dims = dim if isinstance(dim, (tuple, list)) else () if dim is None else (dim,)
     if not all(isinstance(d, int) for d in dims):
         raise TypeError(
-            f"Expected argument `dim` to be a dimension, several, or None but got {told(dim)}; 0 is that of samples."
+            f"Expected argument `dim` to be a dimension, several, or None but got {format_value(dim)}; 0 is that of samples."
         )
 
 

@@ -272,7 +272,7 @@ class MKCHead(_WideBuffers):
         self.register_buffer("d_min", values["d_min"])
         if not bool(((values["d_min"] < values["d_init"]) & (values["d_init"] < values["bound"])).all()):
             raise ValueError(
-                f"Expected argument `d_init` between `d_min` {self.d_min.tolist()} and `bound` {self.bound.tolist()} "
+                f"Expected argument `d_init` input_hold `d_min` {self.d_min.tolist()} and `bound` {self.bound.tolist()} "
                 f"but got {d_init}; a robust scale of the targets is a good start."
             )
         kappa = inverse_square(values["sigma_init"].double())

@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor, nn
 
-from mkc_torch._support.arguments import refuse_bad_batch, told
+from mkc_torch._support.arguments import format_value, refuse_bad_batch
 from mkc_torch._support.torch_internals import in_backward, is_transformed
 from mkc_torch.losses._channel_density import ChannelDensity, Objective, is_auto
 from mkc_torch.losses._checks import (
     Reduction,
     checked_axis,
     checked_weight,
+    format_channels,
     refuse_no_dimension,
     refuse_other_reduction,
     refuse_other_shapes,
-    shortly,
 )
 from mkc_torch.losses._curves import ChannelCurves
 from mkc_torch.losses._fused import fused_loss
 from mkc_torch.losses._implementation import Implementation, checked_implementation, runs_kernels
 from mkc_torch.losses._inspection import tails_of, what_goes_wrong
-from mkc_torch.losses._terms import Batch, LossTerms, Settings, loss_terms, loss_value
+from mkc_torch.losses._terms import Batch, LossSettings, LossTerms, loss_terms, loss_value
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -145,7 +145,7 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         self.reduction = reduction
         self.impl = checked_implementation(impl)
 
-    def _settings(self, batch: Batch, *, robust: bool, updated: bool) -> Settings:
+    def _settings(self, batch: Batch, *, robust: bool, updated: bool) -> LossSettings:
         running = self._running()[0] if robust else self.residual_scale
         fresh = not (updated or running is None or torch.compiler.is_compiling())
         if (
@@ -156,7 +156,7 @@ class MKCLoss(ChannelCurves, ChannelDensity):
         ):
             fresh = bool((running.batches == 0).any())
         state = self._state(batch if fresh else None, robust=robust)
-        return Settings(self.fixed_kappa, self.fixed_d, state, self._follows, self.normalize, self.reduction)
+        return LossSettings(self.fixed_kappa, self.fixed_d, state, self._follows, self.normalize, self.reduction)
 
     def forward(
         self,
@@ -334,7 +334,7 @@ class MKCLoss(ChannelCurves, ChannelDensity):
     def __repr__(self) -> str:
         learned = [n for n, p in (("sigma", self.raw_kappa), ("d", self.raw_d)) if p is not None]
         with torch.no_grad():
-            sigma, d, bound = (shortly(values) for values in (self.sigma, self.d, self.bound))
+            sigma, d, bound = (format_channels(values) for values in (self.sigma, self.d, self.bound))
         if self._follows:
             d, bound = f"auto: {d}", bound if self.fixed_bound is not None else f"auto: {bound}"
         return (
@@ -358,7 +358,7 @@ def checked_loss(loss: nn.Module) -> MKCLoss:
     """The MKCLoss itself, taken out of a compiled one."""
     own = getattr(loss, "_orig_mod", loss)
     if not isinstance(own, MKCLoss):
-        got = told(loss) if isinstance(loss, type) else type(loss).__name__
+        got = format_value(loss) if isinstance(loss, type) else type(loss).__name__
         raise TypeError(
             f"Expected argument `loss` to be an MKCLoss but got {got}; pass the loss that is trained with. "
             "MKCDistribution and mkc_torch.functional take σ and d of each sample."

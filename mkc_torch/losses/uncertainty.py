@@ -17,7 +17,7 @@ from mkc_torch.losses.mkc import MKCLoss, checked_loss
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-__all__ = ["BeyondBound", "Interval", "beyond_bound", "inlier_weight", "outliers", "predictive_interval"]
+__all__ = ["BeyondBound", "PredictiveInterval", "beyond_bound", "inlier_weight", "outliers", "predictive_interval"]
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class BeyondBound:
     share: Float[Tensor, " m"]
 
 
-class Interval(NamedTuple):
+class PredictiveInterval(NamedTuple):
     """Ends of an interval about each prediction, of its shape and unit."""
 
     low: Float[Tensor, "*shape"]
@@ -151,7 +151,7 @@ def beyond_bound(
 
 
 @torch.no_grad()
-def predictive_interval(loss: MKCLoss, input: Float[Tensor, "*shape"], level: float = 0.9) -> Interval:
+def predictive_interval(loss: MKCLoss, input: Float[Tensor, "*shape"], level: float = 0.9) -> PredictiveInterval:
     """The equal-tailed interval in which the density induced by the loss expects a target.
 
     It is made of the noise alone: that the prediction itself is uncertain does not widen it. σ and d must have been
@@ -191,7 +191,7 @@ def predictive_interval(loss: MKCLoss, input: Float[Tensor, "*shape"], level: fl
     half = density.icdf(torch.tensor(0.5 + 0.5 * level, dtype=torch.float64))
     centre = input.to(at_least_float32(input))
     half = _along(half.to(centre), input, axis)
-    return Interval(centre - half, centre + half)
+    return PredictiveInterval(centre - half, centre + half)
 
 
 def _refuse_missing(error: Tensor) -> None:

@@ -4,10 +4,19 @@
 of each channel too. Both take a prior, bounds, equalities and inequalities, and a batch of problems at once.
 """
 
-from mkc_torch._support.forward_mode import beside, load_forward_mode
+from mkc_torch._support.forward_mode import load_forward_mode, make_dual
 from mkc_torch.nonlinear._arguments import NoFitError
 from mkc_torch.nonlinear.energy import Solution, minimise
 from mkc_torch.nonlinear.likelihood import NonlinearFit, fit
 from mkc_torch.nonlinear.prior import GaussianPrior
 
-__all__ = ["GaussianPrior", "NoFitError", "NonlinearFit", "Solution", "beside", "fit", "load_forward_mode", "minimise"]
+__all__ = [
+    "GaussianPrior",
+    "NoFitError",
+    "NonlinearFit",
+    "Solution",
+    "fit",
+    "load_forward_mode",
+    "make_dual",
+    "minimise",
+]

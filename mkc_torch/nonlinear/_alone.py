@@ -9,14 +9,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mkc_torch.nonlinear._problem import NONLINEAR, TRUST, Descent, Point, Problem
+from mkc_torch.nonlinear._problem import NONLINEAR, TRUST, Descent, Problem, ProblemPoint
 
 __all__ = ["descended_alone", "is_alone"]
 
 Array = NDArray[np.float64]
 
 
-def is_alone(problem: Problem, point: Point) -> bool:
+def is_alone(problem: Problem, point: ProblemPoint) -> bool:
     """Whether there is one problem, without constraints, in double precision on the CPU."""
     theta = point.theta
     return (
@@ -30,7 +30,7 @@ def is_alone(problem: Problem, point: Point) -> bool:
 
 def descended_alone(
     problem: Problem,
-    point: Point,
+    point: ProblemPoint,
     kappa: Tensor,
     d: Tensor,
     *,
@@ -118,7 +118,7 @@ class _At:
     tangents: Array
 
     @classmethod
-    def of(cls, point: Point) -> _At:
+    def of(cls, point: ProblemPoint) -> _At:
         return cls(point.theta[0].numpy(), point.residual[0].numpy(), point.tangents[0].numpy())
 
 
@@ -134,7 +134,7 @@ def _within(box: tuple[Array, ...] | None, theta: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class _Quadratic:
+class _LocalModel:
     """The objective about a point: its value, gradient (p,), and the curvatures (p, p) of it and of its majoriser."""
 
     value: float
@@ -168,7 +168,7 @@ class _Objective:
         energy = np.where(x > 0, -np.expm1(-x) / divisor, q)
         return float((energy if self.weight is None else self.weight * energy).sum()) + self._prior(theta)
 
-    def quadratic(self, theta: Array, residual: Array, tangents: Array, value: float | None) -> _Quadratic:
+    def quadratic(self, theta: Array, residual: Array, tangents: Array, value: float | None) -> _LocalModel:
         """The quadratic model with tangents (p, N m); ``value`` is the objective where it is known."""
         precision = self.d**-2.0
         x = np.square(residual) * (precision * self.kappa)
@@ -183,7 +183,7 @@ class _Objective:
         if self._mean is not None and self._precision is not None:
             gradient = gradient + (theta - self._mean) @ self._precision
             majoriser, curvature = majoriser + self._precision, curvature + self._precision
-        return _Quadratic(self.value(theta, residual) if value is None else value, gradient, curvature, majoriser)
+        return _LocalModel(self.value(theta, residual) if value is None else value, gradient, curvature, majoriser)
 
     def _prior(self, theta: Array) -> float:
         if self._mean is None or self._precision is None:
@@ -192,7 +192,7 @@ class _Objective:
         return float(0.5 * away @ self._precision @ away)
 
 
-def _model_curvature(quadratic: _Quadratic) -> Array:
+def _model_curvature(quadratic: _LocalModel) -> Array:
     """The objective's own curvature where it is safely positive, and that of the majoriser elsewhere."""
     majoriser = quadratic.majoriser
     scale = 1.0 / np.sqrt(_positive(majoriser.diagonal()))
@@ -215,7 +215,7 @@ def _positive(diagonal: Array) -> Array:
 
 
 def _damped_step(
-    box: tuple[Array, ...] | None, theta: Array, quadratic: _Quadratic, model: Array, scaling: Array, damping: float
+    box: tuple[Array, ...] | None, theta: Array, quadratic: _LocalModel, model: Array, scaling: Array, damping: float
 ) -> tuple[Array, float, bool]:
     """The damped step within the box, the decrease that the model predicts for it, and whether it could be solved."""
     damped = model + np.diag(damping * scaling)

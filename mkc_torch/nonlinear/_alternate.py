@@ -11,10 +11,10 @@ from mkc_torch.density.em import gaussian_state, normalised, spread, written
 from mkc_torch.density.likelihood import DensityState, conclusive, newton_step
 from mkc_torch.nonlinear._constraints import constrained
 from mkc_torch.nonlinear._descent import damped_step
-from mkc_torch.nonlinear._problem import Point, Problem
+from mkc_torch.nonlinear._problem import Problem, ProblemPoint
 from mkc_torch.nonlinear._quadratic import Penalty, positive, prior_value, quadratic_about
 
-__all__ = ["Maximum", "alternated", "gaussian_candidate", "likelihood_of"]
+__all__ = ["AlternatingMaximum", "alternated", "gaussian_candidate", "likelihood_of"]
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ def likelihood_of(problem: Problem, residual: Tensor) -> _Likelihood:
 
 
 @dataclass(frozen=True)
-class Maximum:
-    point: Point
+class AlternatingMaximum:
+    point: ProblemPoint
     state: DensityState
     value: Tensor  # mean negative log-likelihood and prior, in nats per sample
     converged: Tensor
@@ -49,14 +49,14 @@ class Maximum:
 def alternated(
     problem: Problem,
     likelihood: _Likelihood,
-    point: Point,
+    point: ProblemPoint,
     state: DensityState,
     *,
     max_iter: int,
     tol: float,
     exact: bool = True,
     penalty: Penalty | None = None,
-) -> Maximum:
+) -> AlternatingMaximum:
     """E-steps on (σ, d) and damped steps on θ in turn, until they bring less than ``tol`` nats and promise no more."""
     eps = torch.finfo(point.theta.dtype).eps
     share = likelihood.total / likelihood.total.mean(-1, keepdim=True)
@@ -97,12 +97,12 @@ def alternated(
         damping, stepped, point = found.damping, found.quiet, found.point
         if found.tired:
             point = problem.refreshed(point)
-    return Maximum(point, state, previous, done, n_iter, penalty)
+    return AlternatingMaximum(point, state, previous, done, n_iter, penalty)
 
 
 def gaussian_candidate(
-    problem: Problem, likelihood: _Likelihood, maximum: Maximum, *, max_iter: int, tol: float
-) -> Maximum:
+    problem: Problem, likelihood: _Likelihood, maximum: AlternatingMaximum, *, max_iter: int, tol: float
+) -> AlternatingMaximum:
     """Where a Gaussian density at weighted least squares is likelier than what was found, go on from there instead."""
     state = maximum.state
     point = problem.refreshed(maximum.point)
@@ -149,7 +149,7 @@ def gaussian_candidate(
             penalty.multiplier.index_copy(0, index, again.penalty.multiplier[won]),
             penalty.rho.index_copy(0, index, again.penalty.rho[won]),
         )
-    return Maximum(
+    return AlternatingMaximum(
         point=point.write(index, winner),
         state=written(state, index, again.state.select(won)),
         value=maximum.value.index_copy(0, index, again.value[won]),

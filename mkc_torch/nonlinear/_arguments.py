@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 
-from mkc_torch._support.arguments import as_numbers, refuse_not_real, refuse_other_type, told
+from mkc_torch._support.arguments import as_numbers, format_value, refuse_not_real, refuse_other_type
 from mkc_torch._support.forward_mode import Residual
 from mkc_torch.nonlinear._descent import within
-from mkc_torch.nonlinear._problem import TANGENTS, Constraint, Point, Problem
+from mkc_torch.nonlinear._problem import TANGENTS, Constraint, Problem, ProblemPoint
 from mkc_torch.nonlinear.prior import GaussianPrior
 
 __all__ = ["per_channel", "prepared", "refuse_out_of_reach"]
@@ -56,12 +56,12 @@ def prepared(
     equality: Constraint | None,
     inequality: Constraint | None,
     jacobian: str,
-) -> tuple[Problem, Point]:
+) -> tuple[Problem, ProblemPoint]:
     """The checked problem and its start."""
     for name, function in (("residual", residual), ("equality", equality), ("inequality", inequality)):
         if not callable(function) and (name == "residual" or function is not None):
             raise TypeError(
-                f"Expected argument `{name}` to be a function of the parameters but got {told(function)}; write "
+                f"Expected argument `{name}` to be a function of the parameters but got {format_value(function)}; write "
                 "lambda theta: ..."
             )
     refuse_not_real("start", start)

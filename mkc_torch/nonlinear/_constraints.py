@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.nonlinear._descent import Descent, descended
-from mkc_torch.nonlinear._problem import Point, Problem
+from mkc_torch.nonlinear._problem import Problem, ProblemPoint
 from mkc_torch.nonlinear._quadratic import Penalty, positive, quadratic_about
 
 __all__ = ["constrained"]
@@ -22,7 +22,7 @@ _STIFFNESS = 100.0
 
 def constrained(
     problem: Problem,
-    point: Point,
+    point: ProblemPoint,
     kappa: Tensor,
     d: Tensor,
     *,
@@ -93,7 +93,7 @@ def constrained(
     return replace(found, n_iter=n_iter, quiet=found.quiet & holds), penalty
 
 
-def _first_penalty(problem: Problem, point: Point, kappa: Tensor, d: Tensor) -> Penalty | None:
+def _first_penalty(problem: Problem, point: ProblemPoint, kappa: Tensor, d: Tensor) -> Penalty | None:
     """Multipliers 0 and a ρ that is stiff against the objective along each constraint."""
     if point.constraint is None or point.normals is None:
         return None

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.linear.covariance import CovarianceKind, sandwich
-from mkc_torch.nonlinear._problem import Point, Problem, kernel_weights
+from mkc_torch.nonlinear._problem import Problem, ProblemPoint, kernel_weights
 from mkc_torch.nonlinear._quadratic import Penalty, positive, quadratic_about
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ __all__ = ["parameter_covariance"]
 
 def parameter_covariance(
     problem: Problem,
-    point: Point,
+    point: ProblemPoint,
     kappa: Tensor,
     d: Tensor,
     penalty: Penalty | None,
@@ -62,7 +62,7 @@ def parameter_covariance(
     return torch.where(lost.unsqueeze(-1) | lost.unsqueeze(-2), torch.inf, covariance)
 
 
-def _active_normals(problem: Problem, point: Point, gradient: Tensor, penalty: Penalty | None) -> Tensor:
+def _active_normals(problem: Problem, point: ProblemPoint, gradient: Tensor, penalty: Penalty | None) -> Tensor:
     """Normals (B, k, p) of the bounds and constraints that hold the parameters; 0 for those that do not."""
     B, p = point.theta.shape
     rows = [torch.zeros(B, 1, p, dtype=gradient.dtype, device=gradient.device)]

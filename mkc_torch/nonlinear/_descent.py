@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.nonlinear._alone import descended_alone, is_alone
-from mkc_torch.nonlinear._problem import NONLINEAR, Descent, Point, Problem
+from mkc_torch.nonlinear._problem import NONLINEAR, Descent, Problem, ProblemPoint
 from mkc_torch.nonlinear._quadratic import Penalty, model_curvature, objective, positive, quadratic_about
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def damped_step(
 
 def descended(
     problem: Problem,
-    point: Point,
+    point: ProblemPoint,
     kappa: Tensor,
     d: Tensor,
     penalty: Penalty | None,
@@ -134,7 +134,7 @@ def descended(
     return Descent(point, quadratic.value, done, tired, taken, damping, n_iter)
 
 
-def _unforeseen(point: Point, step: Tensor, residual: Tensor, constraint: Tensor | None) -> Float[Tensor, " B"]:
+def _unforeseen(point: ProblemPoint, step: Tensor, residual: Tensor, constraint: Tensor | None) -> Float[Tensor, " B"]:
     """The share of a step's effect on residuals and constraints that the derivatives at hand did not predict."""
     linear = torch.matmul(step.unsqueeze(-2), point.tangents).squeeze(-2)
     change = (residual - point.residual).flatten(1)

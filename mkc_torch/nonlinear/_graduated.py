@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mkc_torch._support.order_statistic import order_statistic
 from mkc_torch.nonlinear._constraints import constrained
-from mkc_torch.nonlinear._problem import Point, Problem
+from mkc_torch.nonlinear._problem import Problem, ProblemPoint
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -24,7 +24,7 @@ _KERNELS = (10.0, 4.0, 1.6, 0.7)
 """Widths of the kernel in robust scales, in turn: wide ones have few local minima, narrow ones no pull by outliers."""
 
 
-def residual_scale(problem: Problem, point: Point) -> Float[Tensor, "B m"]:
+def residual_scale(problem: Problem, point: ProblemPoint) -> Float[Tensor, "B m"]:
     """Robust scale of each channel, no less than the rounding error of the residual.
 
     From the h-th smallest absolute residual, h = (N + p + 1) // 2 with p parameters a channel, since a narrow kernel
@@ -42,7 +42,7 @@ def residual_scale(problem: Problem, point: Point) -> Float[Tensor, "B m"]:
     return torch.maximum(scale, 1e3 * eps * torch.where(magnitude > 0, magnitude, 1.0))
 
 
-def graduated(problem: Problem, point: Point, max_iter: int) -> tuple[Point, int]:
+def graduated(problem: Problem, point: ProblemPoint, max_iter: int) -> tuple[ProblemPoint, int]:
     """Fits with a kernel of many robust scales first and of less than one at last, again while the scale shrinks."""
     n_iter = 0
     last: Tensor | None = None

@@ -22,8 +22,8 @@ __all__ = [
     "TRUST",
     "Constraint",
     "Descent",
-    "Point",
     "Problem",
+    "ProblemPoint",
     "kernel_weights",
     "shaped_jacobian",
 ]
@@ -107,12 +107,12 @@ class Problem:
             return None
         return replace(self, data=None)._over_batch(torch.func.jacrev(self._constraints), theta)
 
-    def at(self, theta: Float[Tensor, "B p"]) -> Point:
+    def at(self, theta: Float[Tensor, "B p"]) -> ProblemPoint:
         residual = self.residual(theta)
         tangents = self.tangents(theta, residual.numel())
-        return Point(theta, residual, tangents, self.constraints(theta), self.normals(theta))
+        return ProblemPoint(theta, residual, tangents, self.constraints(theta), self.normals(theta))
 
-    def refreshed(self, point: Point) -> Point:
+    def refreshed(self, point: ProblemPoint) -> ProblemPoint:
         """The point with derivatives taken at its own parameters."""
         if not point.stale:
             return point
@@ -135,7 +135,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Point:
+class ProblemPoint:
     theta: Float[Tensor, "B p"]
     residual: Float[Tensor, "B N m"]
     tangents: Float[Tensor, "B p N*m"]
@@ -143,7 +143,7 @@ class Point:
     normals: Float[Tensor, "B k p"] | None = None
     stale: bool = False  # the derivatives are those of a point nearby
 
-    def moved(self, accept: Tensor, theta: Tensor, residual: Tensor, constraint: Tensor | None) -> Point:
+    def moved(self, accept: Tensor, theta: Tensor, residual: Tensor, constraint: Tensor | None) -> ProblemPoint:
         return replace(
             self,
             theta=torch.where(accept[:, None], theta, self.theta),
@@ -154,8 +154,8 @@ class Point:
             stale=True,
         )
 
-    def select(self, index: Tensor) -> Point:
-        return Point(
+    def select(self, index: Tensor) -> ProblemPoint:
+        return ProblemPoint(
             self.theta[index],
             self.residual[index],
             self.tangents[index],
@@ -164,11 +164,11 @@ class Point:
             self.stale,
         )
 
-    def write(self, index: Tensor, part: Point) -> Point:
+    def write(self, index: Tensor, part: ProblemPoint) -> ProblemPoint:
         def merged(whole: Tensor | None, some: Tensor | None) -> Tensor | None:
             return None if whole is None or some is None else whole.index_copy(0, index, some)
 
-        return Point(
+        return ProblemPoint(
             self.theta.index_copy(0, index, part.theta),
             self.residual.index_copy(0, index, part.residual),
             self.tangents.index_copy(0, index, part.tangents),
@@ -182,7 +182,7 @@ class Point:
 class Descent:
     """Where damped steps at fixed σ and d ended."""
 
-    point: Point
+    point: ProblemPoint
     value: Tensor
     quiet: Tensor  # at rest: neither the step nor the model, of fresh derivatives, promises more than the limit
     tired: bool  # the derivatives are too old to go on with
@@ -195,5 +195,5 @@ def kernel_weights(residual: Tensor, kappa: Tensor, d: Tensor) -> Tensor:
     return torch.exp((-0.5 * kappa / d.square()).unsqueeze(-2) * residual.square())
 
 
-def shaped_jacobian(problem: Problem, point: Point) -> Tensor:
+def shaped_jacobian(problem: Problem, point: ProblemPoint) -> Tensor:
     return problem.restore(point.tangents.unflatten(-1, point.residual.shape[1:]).movedim(1, -1))

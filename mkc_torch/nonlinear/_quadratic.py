@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.density.energy import energy_value
-from mkc_torch.nonlinear._problem import TRUST, Point, Problem
+from mkc_torch.nonlinear._problem import TRUST, Problem, ProblemPoint
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -69,7 +69,12 @@ def _gram(tangents: Float[Tensor, "B p K"], weight: Float[Tensor, "B K"]) -> Flo
 
 
 def quadratic_about(
-    problem: Problem, point: Point, kappa: Tensor, d: Tensor, penalty: Penalty | None, value: Tensor | None = None
+    problem: Problem,
+    point: ProblemPoint,
+    kappa: Tensor,
+    d: Tensor,
+    penalty: Penalty | None,
+    value: Tensor | None = None,
 ) -> _Quadratic:
     """Gradient and curvatures of the objective: of its majoriser with weights w, and its own with w (1 - κ z²)."""
     k = kappa.unsqueeze(-2)

@@ -12,7 +12,7 @@ from torch.utils._pytree import tree_map
 
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.density.fit import fit_density
-from mkc_torch.nonlinear._problem import Point, Problem
+from mkc_torch.nonlinear._problem import Problem, ProblemPoint
 from mkc_torch.nonlinear._quadratic import prior_value
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def drawn(problem: Problem, theta: Float[Tensor, "B p"], starts: int, seed: int)
     return torch.where(fit_for_a_start, found, theta.unsqueeze(1))
 
 
-def at_each(problem: Problem, starts: Float[Tensor, "B S p"]) -> tuple[Problem, Point]:
+def at_each(problem: Problem, starts: Float[Tensor, "B S p"]) -> tuple[Problem, ProblemPoint]:
     """The problem once for each start, B S problems in all, and their starts."""
     count = starts.shape[1]
 

@@ -15,12 +15,12 @@ from mkc_torch.density.domain import domain_rule
 from mkc_torch.density.energy import SIGMA_LEAST
 from mkc_torch.density.likelihood import DensityState, initial_state
 from mkc_torch.linear.covariance import CovarianceKind, checked_bandwidth, checked_kind
-from mkc_torch.nonlinear._alternate import Maximum, alternated, gaussian_candidate, likelihood_of
+from mkc_torch.nonlinear._alternate import AlternatingMaximum, alternated, gaussian_candidate, likelihood_of
 from mkc_torch.nonlinear._arguments import per_channel, prepared, refuse_out_of_reach
 from mkc_torch.nonlinear._covariance import parameter_covariance
 from mkc_torch.nonlinear._explained import explained
 from mkc_torch.nonlinear._graduated import LEAST_SCALE, graduated, residual_scale
-from mkc_torch.nonlinear._problem import Constraint, Point, Problem, kernel_weights, shaped_jacobian
+from mkc_torch.nonlinear._problem import Constraint, Problem, ProblemPoint, kernel_weights, shaped_jacobian
 from mkc_torch.nonlinear._starts import at_each, drawn, likeliest
 from mkc_torch.nonlinear.prior import GaussianPrior
 
@@ -158,7 +158,7 @@ def fit(
             objective's, without the residual's second derivatives; the scores of a sample's channels are summed.
         bandwidth: whole lags of "hac", in samples; default by Andrews' rule.
         starts: where a residual has many minima, fits from so many starts at once, of which the likeliest is kept, all
-            judged on one domain: ``start`` and others drawn evenly between ``lower`` and ``upper``, or over the prior
+            judged on one domain: ``start`` and others drawn evenly input_hold ``lower`` and ``upper``, or over the prior
             where a bound is missing. The result says how many agree. It takes as many times the memory.
         seed: of the starts.
 
@@ -230,7 +230,9 @@ class _Given(NamedTuple):
         return _Given(*(None if one is None else one.repeat_interleave(starts, 0) for one in self))
 
 
-def _from_start(problem: Problem, point: Point, given: _Given, *, graduate: bool, max_iter: int, tol: float) -> Maximum:
+def _from_start(
+    problem: Problem, point: ProblemPoint, given: _Given, *, graduate: bool, max_iter: int, tol: float
+) -> AlternatingMaximum:
     """The maximum that a start leads to, with the steps of the whole way."""
     fixed_sigma, fixed_d, fixed_bound = given
     steps = 0
@@ -240,7 +242,7 @@ def _from_start(problem: Problem, point: Point, given: _Given, *, graduate: bool
     scale = residual_scale(problem, point)
     d_min = LEAST_SCALE * scale if fixed_d is None else torch.minimum(fixed_d, LEAST_SCALE * scale)
 
-    def begun(at: Point, size: Tensor, domain: Tensor, tails: Sequence[float | Tensor]) -> DensityState:
+    def begun(at: ProblemPoint, size: Tensor, domain: Tensor, tails: Sequence[float | Tensor]) -> DensityState:
         return initial_state(
             at.residual,
             likelihood.weight,
@@ -279,7 +281,9 @@ def _from_start(problem: Problem, point: Point, given: _Given, *, graduate: bool
     return replace(maximum, n_iter=steps + maximum.n_iter)
 
 
-def _told(problem: Problem, maximum: Maximum, kind: CovarianceKind | None, bandwidth: float | None) -> NonlinearFit:
+def _told(
+    problem: Problem, maximum: AlternatingMaximum, kind: CovarianceKind | None, bandwidth: float | None
+) -> NonlinearFit:
     point = problem.refreshed(maximum.point)
     kappa, scale = maximum.state.kappa, torch.exp(maximum.state.log_d)
     found = None

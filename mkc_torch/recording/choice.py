@@ -8,14 +8,14 @@ from typing import NamedTuple
 
 from mkc_torch.recording.column_names import meaning
 from mkc_torch.recording.formats.base import MissingColumnError, RecordingError, Topic, listed
-from mkc_torch.recording.recognise import Found, Sensor, candidates, recognised, time_column
+from mkc_torch.recording.recognise import RecognisedColumns, SensorColumns, candidates, recognised, time_column
 
-__all__ = ["Choice", "choose", "columns_option", "sensors_in", "which_columns"]
+__all__ = ["ColumnChoice", "choose", "columns_option", "sensors_in", "which_columns"]
 
 _MAG = ("mag_x", "mag_y", "mag_z")
 
 
-class Choice(NamedTuple):
+class ColumnChoice(NamedTuple):
     """What is read of a file.
 
     Attributes:
@@ -31,13 +31,13 @@ class Choice(NamedTuple):
     columns: dict[str, str]
     found: dict[str, str]
     units: dict[str, str]
-    sensor: Sensor | None
+    sensor: SensorColumns | None
     warnings: tuple[str, ...]
 
 
 def choose(
     path: Path, topics: Sequence[Topic], columns: Mapping[str, str], sensor: str | None, *, recognise: bool
-) -> Choice:
+) -> ColumnChoice:
     """Choose.
 
     Args:
@@ -68,7 +68,7 @@ def choose(
         and old not in said.values()
         and (new == old or new in _MAG or new not in topic.table.names)  # the sensor that was chosen wins
     }
-    return Choice(
+    return ColumnChoice(
         chosen.topic,
         said | mine,
         {new: old for new, old in mine.items() if new != old},
@@ -129,7 +129,7 @@ def columns_option(columns: Mapping[str, str]) -> str:
     return f"--columns {text}" if all(one.isalnum() or one in "_=,.-/:" for one in text) else f'--columns "{text}"'
 
 
-def _chosen(path: Path, topics: Sequence[Topic], found: Found, sensor: str | None) -> Sensor | None:
+def _chosen(path: Path, topics: Sequence[Topic], found: RecognisedColumns, sensor: str | None) -> SensorColumns | None:
     names = [one.name for one in found.sensors]
     if sensor is not None:
         same = [one for one in found.sensors if sensor.strip().strip("/").casefold() == one.name.casefold()]
@@ -152,14 +152,14 @@ def _chosen(path: Path, topics: Sequence[Topic], found: Found, sensor: str | Non
     )
 
 
-def _ambiguous(path: Path, found: Found) -> RecordingError:
+def _ambiguous(path: Path, found: RecognisedColumns) -> RecordingError:
     options = " or ".join(f"`{columns_option(sensor.columns)}`" for sensor in found.sensors)
     return RecordingError(
         f"{path}: {len(found.sensors)} triples of columns may be the magnetometer; say which: {options}."
     )
 
 
-def _as_said(path: Path, topics: Sequence[Topic], columns: Mapping[str, str]) -> Choice:
+def _as_said(path: Path, topics: Sequence[Topic], columns: Mapping[str, str]) -> ColumnChoice:
     """The topic that has the caller's columns, and its time."""
     number = _topic_of(path, topics, columns)
     topic = topics[number]
@@ -170,7 +170,7 @@ def _as_said(path: Path, topics: Sequence[Topic], columns: Mapping[str, str]) ->
         mine, units = {"time": time[0]}, {"time": time[1]} if time[1] else {}
     elif time is not None and said.get("time", "time") == time[0] and time[1]:
         units = {"time": time[1]}
-    return Choice(number, said | mine, mine, units, None, ())
+    return ColumnChoice(number, said | mine, mine, units, None, ())
 
 
 def _topic_of(path: Path, topics: Sequence[Topic], columns: Mapping[str, str]) -> int:

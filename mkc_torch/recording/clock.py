@@ -13,7 +13,7 @@ from mkc_torch.recording.formats.text_cells import is_stamp
 from mkc_torch.recording.stamps import as_iso
 from mkc_torch.recording.unit_words import conversion
 
-__all__ = ["Clock", "ClockError", "clock_of"]
+__all__ = ["ClockError", "TimeAxis", "clock_of"]
 
 _NANO = 10**9
 _DAY = 86_400
@@ -47,7 +47,7 @@ class ClockError(ValueError):
         self.row = row
 
 
-class Clock(NamedTuple):
+class TimeAxis(NamedTuple):
     """The times of a table.
 
     Attributes:
@@ -60,7 +60,7 @@ class Clock(NamedTuple):
     seconds: np.ndarray
     told: str
 
-    def spread(self, seconds: np.ndarray) -> Clock:
+    def spread(self, seconds: np.ndarray) -> TimeAxis:
         """The clock with other times, in s, that differ by parts of a step of its own."""
         if self.ticks is None:
             return self._replace(seconds=seconds)
@@ -75,7 +75,7 @@ class Clock(NamedTuple):
         return np.where(np.isnan(self.seconds), np.nan, passed)
 
 
-def clock_of(series: Any, unit: str = "") -> Clock:
+def clock_of(series: Any, unit: str = "") -> TimeAxis:
     """The times that a column holds: ISO 8601 stamps, times of the day, counts since 1970, or numbers of a unit.
 
     A count since 1970 is known by its size: in one unit alone it lies between 2001 and 2099 and its samples lie a
@@ -108,7 +108,7 @@ def clock_of(series: Any, unit: str = "") -> Clock:
     return _of_numbers(series, unit)
 
 
-def _of_type(series: Any) -> Clock:
+def _of_type(series: Any) -> TimeAxis:
     package = polars()
     if series.dtype == package.Date:
         series = series.cast(package.Datetime("ns"))
@@ -120,13 +120,13 @@ def _of_type(series: Any) -> Clock:
     return _exact(ticks, "stamps")
 
 
-def _exact(ticks: Any, told: str) -> Clock:
+def _exact(ticks: Any, told: str) -> TimeAxis:
     none = ticks.is_null().to_numpy()
     whole = ticks.fill_null(0).to_numpy().astype(np.int64)
-    return Clock(whole, np.where(none, np.nan, whole / _NANO), told)
+    return TimeAxis(whole, np.where(none, np.nan, whole / _NANO), told)
 
 
-def _of_stamps(text: Any, minutes: bool) -> Clock:
+def _of_stamps(text: Any, minutes: bool) -> TimeAxis:
     package = polars()
     if ":" in next(one for one in text if one is not None)[:3]:
         return _of_days(text, 3600 if minutes else _DAY)
@@ -155,7 +155,7 @@ def _dates_exist(year: Any, month: Any, day: Any) -> bool:
     return bool(year.is_not_null().all() and months.is_between(1, 12).all() and days.is_between(1, 28).all())
 
 
-def _of_days(text: Any, turn: int) -> Clock:
+def _of_days(text: Any, turn: int) -> TimeAxis:
     """Times of the day, or of the hour; a fall of more than half of it is midnight, or the next hour."""
     hour, minute, second, digits = text.str.extract_groups(_OF_DAY).struct.unnest().get_columns()
     bad = text.is_not_null() & (hour.is_null() | (_whole(hour) > 24) | (_whole(minute) > 59) | (_whole(second) > 60))
@@ -180,7 +180,7 @@ def _fraction(digits: Any) -> Any:
     return _whole(digits.fill_null("0").str.slice(0, 9).str.pad_end(9, "0"))
 
 
-def _of_numbers(series: Any, unit: str) -> Clock:
+def _of_numbers(series: Any, unit: str) -> TimeAxis:
     clock, size = _counted(series, unit)
     raw = clock.seconds / size if clock.ticks is None else clock.ticks / (size * _NANO)
     added, end = turned_over(np.where(np.isnan(clock.seconds), np.nan, raw), size)
@@ -188,10 +188,10 @@ def _of_numbers(series: Any, unit: str) -> Clock:
         return clock
     ticks = None if clock.ticks is None else clock.ticks + np.rint(added * size * _NANO).astype(np.int64)
     told = f"{clock.told or 's'}, whose counter turned over at {end} and is counted on"
-    return Clock(ticks, clock.seconds + added * size, told)
+    return TimeAxis(ticks, clock.seconds + added * size, told)
 
 
-def _counted(series: Any, unit: str) -> tuple[Clock, float]:
+def _counted(series: Any, unit: str) -> tuple[TimeAxis, float]:
     """The times of a column of numbers, and the seconds that one of them is."""
     package = polars()
     values = series.cast(package.Float64, strict=False)
@@ -202,19 +202,19 @@ def _counted(series: Any, unit: str) -> tuple[Clock, float]:
     known = conversion("time", unit)
     if known is None and epoch is None:
         if _are_days(seconds):
-            return Clock(None, seconds * _DAY, "days, as spreadsheets count them"), float(_DAY)
-        return Clock(None, seconds, ""), 1.0
+            return TimeAxis(None, seconds * _DAY, "days, as spreadsheets count them"), float(_DAY)
+        return TimeAxis(None, seconds, ""), 1.0
     if known is not None and known.unit == "s" and epoch != "s":
-        return Clock(None, seconds, ""), 1.0
+        return TimeAxis(None, seconds, ""), 1.0
     if known is not None and known.unit in _LONG:
-        return Clock(None, seconds * _LONG[known.unit], known.unit), _LONG[known.unit]
+        return TimeAxis(None, seconds * _LONG[known.unit], known.unit), _LONG[known.unit]
     name = known.unit if known is not None else str(epoch)
     told = f"{name} since 1970" if epoch == name else name
     digits = {"s": 9, "ms": 6, "µs": 3, "ns": 0}[name]
     exact = _ticks(series, digits)
     if exact is not None:
         return _exact(exact, told), 10.0**digits / _NANO
-    return Clock(None, seconds * 10.0**digits / _NANO, told), 10.0**digits / _NANO
+    return TimeAxis(None, seconds * 10.0**digits / _NANO, told), 10.0**digits / _NANO
 
 
 def _are_days(values: np.ndarray) -> bool:

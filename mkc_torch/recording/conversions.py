@@ -11,7 +11,7 @@ from mkc_torch.recording.formats.base import MissingColumnError, RecordingError,
 from mkc_torch.recording.unit_words import CANONICAL, Conversion, conversion, is_unit, known_units
 
 if TYPE_CHECKING:
-    from mkc_torch.recording.choice import Choice
+    from mkc_torch.recording.choice import ColumnChoice
 
 __all__ = ["DEFAULT_UNITS", "Units", "converted", "in_units", "quantity_of", "said_units", "units_told"]
 
@@ -57,7 +57,7 @@ def quantity_of(column: str) -> str | None:
     return column.split("_")[0] if column in DEFAULT_UNITS else None
 
 
-def said_units(choice: Choice, topic: Topic, names: Iterable[str]) -> dict[str, str]:
+def said_units(choice: ColumnChoice, topic: Topic, names: Iterable[str]) -> dict[str, str]:
     """The units that a file says of columns: by its format, a row of units, or brackets behind a name."""
     told = {}
     for name in names:

@@ -10,21 +10,21 @@ from torch import Tensor
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Interval", "disturbed_intervals"]
+__all__ = ["RejectedInterval", "disturbed_intervals"]
 
 _WINDOW_SECONDS = 0.25
 _JOIN_SECONDS = 1.0
 _FEWEST = 5  # samples of a window, at least
 
 
-class Interval(NamedTuple):
+class RejectedInterval(NamedTuple):
     """From the first to the last rejected sample, in s."""
 
     start: float
     end: float
 
 
-def disturbed_intervals(time: Float[Tensor, " N"], rejected: Bool[Tensor, " N"]) -> tuple[Interval, ...]:
+def disturbed_intervals(time: Float[Tensor, " N"], rejected: Bool[Tensor, " N"]) -> tuple[RejectedInterval, ...]:
     """Where at least half of the samples within a quarter of a second (five samples at least) are rejected.
 
     Intervals less than a second apart are one. Scattered rejected samples, as heavy-tailed noise has them, belong
@@ -46,23 +46,23 @@ def disturbed_intervals(time: Float[Tensor, " N"], rejected: Bool[Tensor, " N"])
         return ()
     half = int((0.5 * _WINDOW_SECONDS / forward.median()).round().clamp(_FEWEST // 2, 500))
     join = max(_JOIN_SECONDS, (2 * half + 1) * float(forward.median()))
-    found: list[Interval] = []
+    found: list[RejectedInterval] = []
     for begin, end in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
         found += _in_one_run(time[begin:end], rejected[begin:end], half, join)
     return tuple(found)
 
 
-def _in_one_run(time: Tensor, rejected: Tensor, half: int, join: float) -> list[Interval]:
+def _in_one_run(time: Tensor, rejected: Tensor, half: int, join: float) -> list[RejectedInterval]:
     count = torch.cat([torch.zeros(1, dtype=torch.int64), rejected.long().cumsum(0)])
     index = torch.arange(len(time))
     low, high = (index - half).clamp(min=0), (index + half + 1).clamp(max=len(time))
     # windows at the ends are compared with their full width, so that one sample there is no disturbance
     dense = (count[high] - count[low]) >= half + 1
     hits = (dense & rejected).nonzero().squeeze(-1)
-    found: list[Interval] = []
+    found: list[RejectedInterval] = []
     for t in time[hits].tolist():
         if found and t - found[-1].end <= join:
-            found[-1] = Interval(found[-1].start, t)
+            found[-1] = RejectedInterval(found[-1].start, t)
         else:
-            found.append(Interval(t, t))
+            found.append(RejectedInterval(t, t))
     return found

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import told
+from mkc_torch._support.arguments import format_value
 from mkc_torch._support.arrays import Data, absent, is_array, is_frame, numbers_of, series_of
 from mkc_torch.recording.formats.base import RecordingError, Table, listed, polars
 from mkc_torch.recording.formats.cells import renamed
@@ -101,7 +101,9 @@ def table_of_frame(frame: Any, name: str) -> Table:
 
 def _table(frame: Any, where: str) -> Table:
     if not is_frame(frame):
-        raise RecordingError(f"{where}expected a DataFrame but got {told(frame)}; columns are Recording({{...}}).")
+        raise RecordingError(
+            f"{where}expected a DataFrame but got {format_value(frame)}; columns are Recording({{...}})."
+        )
     found = _with_index(frame)
     if nameless := [label for label, _ in found if not isinstance(label, str)]:
         raise RecordingError(f"{where}the columns of a frame need names of text but one is {nameless[0]!r}; rename it.")

@@ -11,9 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mkc_torch.recording.beside import beside_columns
-from mkc_torch.recording.choice import Choice, choose
-from mkc_torch.recording.clock import Clock, ClockError, clock_of
+from mkc_torch.recording.choice import ColumnChoice, choose
+from mkc_torch.recording.clock import ClockError, TimeAxis, clock_of
 from mkc_torch.recording.clock_faults import interleaved, spread
 from mkc_torch.recording.conversions import DEFAULT_UNITS, Units, converted, in_units, said_units, units_told
 from mkc_torch.recording.formats import read_topics
@@ -21,11 +20,12 @@ from mkc_torch.recording.formats.base import RecordingError, Table, Topic, count
 from mkc_torch.recording.formats.cells import as_numbers, missing_warning, numbered, renamed, text_error
 from mkc_torch.recording.formats.text_cells import SEPARATORS
 from mkc_torch.recording.given_columns import EXPERIMENT
+from mkc_torch.recording.join_topics import join_topics
 from mkc_torch.recording.joined_times import with_joined_times
 from mkc_torch.recording.row_sensors import with_row_sensors
 from mkc_torch.recording.runs import restarts
 
-__all__ = ["ASKED", "Reading", "read_file", "reading_of"]
+__all__ = ["ASKED", "LoadedTable", "read_file", "reading_of"]
 
 ASKED = frozenset({*DEFAULT_UNITS, EXPERIMENT})
 """Columns that are wanted wherever they are, so that text in them is an error."""
@@ -36,7 +36,7 @@ _SHOWN = 5
 """Runs whose first rows a sentence names."""
 
 
-class Reading(NamedTuple):
+class LoadedTable(NamedTuple):
     """What a file holds of a recording.
 
     Attributes:
@@ -67,7 +67,7 @@ def read_file(
     sensor: str | None = None,
     recognise: bool = True,
     topics: Sequence[Topic] | None = None,
-) -> Reading:
+) -> LoadedTable:
     """Read a file.
 
     Args:
@@ -95,7 +95,7 @@ def reading_of(
     sensor: str | None = None,
     recognise: bool = True,
     what: str = "file",
-) -> Reading:
+) -> LoadedTable:
     """Read the tables of a file, or of a data frame.
 
     Args:
@@ -164,16 +164,16 @@ def reading_of(
     warnings += _taken_told(choice, taken)
     warnings += units_told(known, values)
     if choice.sensor is not None and clock is not None and len(topics) > 1:
-        more = beside_columns(topics, choice.topic, clock, set(values))
+        more = join_topics(topics, choice.topic, clock, set(values))
         values |= {name: torch.tensor(column) for name, column in more.columns.items()}
         warnings += more.warnings
     warnings += _add_runs(values, table, topic.restarts, clock)
     own = {name: unit for name, unit in known.labels.items() if name in values}
     which = "" if choice.sensor is None else choice.sensor.name
-    return Reading(values, own, labels, warnings, choice.topic, which, known.said & set(values))
+    return LoadedTable(values, own, labels, warnings, choice.topic, which, known.said & set(values))
 
 
-def _clock(path: Path, table: Table, series: Any, known: Units) -> Clock | None:
+def _clock(path: Path, table: Table, series: Any, known: Units) -> TimeAxis | None:
     """The time of a table; None where it is to be read as any other column."""
     if known.labels.get("time"):
         return None
@@ -183,7 +183,7 @@ def _clock(path: Path, table: Table, series: Any, known: Units) -> Clock | None:
         raise text_error(path, table, "time", series, error.row, str(error)) from None
 
 
-def _taken_told(choice: Choice, taken: Mapping[str, Any]) -> list[str]:
+def _taken_told(choice: ColumnChoice, taken: Mapping[str, Any]) -> list[str]:
     """Sentences about columns that were recognised under other names."""
     told = []
     for quantity in dict.fromkeys(name.split("_")[0] for name in choice.found):
@@ -195,7 +195,7 @@ def _taken_told(choice: Choice, taken: Mapping[str, Any]) -> list[str]:
     return told
 
 
-def _add_runs(values: dict[str, Tensor], table: Table, again: Sequence[int], clock: Clock | None) -> list[str]:
+def _add_runs(values: dict[str, Tensor], table: Table, again: Sequence[int], clock: TimeAxis | None) -> list[str]:
     """Number the runs where the time starts again, or the header stands again where there is no time; and tell it.
 
     A time that was converted is counted from the first sample of its run.
@@ -220,11 +220,11 @@ def _add_runs(values: dict[str, Tensor], table: Table, again: Sequence[int], clo
     return told
 
 
-def _clock_told(clock: Clock) -> str:
+def _clock_told(clock: TimeAxis) -> str:
     return f"The times are {clock.told}; they are counted in seconds from the first sample on."
 
 
-def _count_from_first(values: dict[str, Tensor], clock: Clock | None, begins: Sequence[int]) -> None:
+def _count_from_first(values: dict[str, Tensor], clock: TimeAxis | None, begins: Sequence[int]) -> None:
     if clock is None or not clock.told:
         return
     seconds = clock.seconds.copy()

@@ -11,7 +11,7 @@ from mkc_torch.recording.formats.base import Topic
 from mkc_torch.recording.px4 import PX4_UNITS, is_px4_magnetometer, is_px4_message
 from mkc_torch.recording.unit_words import conversion
 
-__all__ = ["Found", "Sensor", "candidates", "recognised", "recorded_beside", "time_column"]
+__all__ = ["RecognisedColumns", "SensorColumns", "candidates", "recognised", "recorded_beside", "time_column"]
 
 _MAG = ("mag_x", "mag_y", "mag_z")
 _SIZES = {"mag": "xyz", "gyro": "xyz", "accel": "xyz", "q": "wxyz"}
@@ -22,7 +22,7 @@ _DERIVED = {"vehicle_magnetometer": "sensor_mag", "sensor_combined": "sensor_mag
 """PX4's topics that repeat a sensor's own."""
 
 
-class Sensor(NamedTuple):
+class SensorColumns(NamedTuple):
     """A magnetometer in a file, and what was recorded beside it.
 
     Attributes:
@@ -38,7 +38,7 @@ class Sensor(NamedTuple):
     units: Mapping[str, str]
 
 
-class Found(NamedTuple):
+class RecognisedColumns(NamedTuple):
     """What was recognised in a file.
 
     Attributes:
@@ -48,7 +48,7 @@ class Found(NamedTuple):
         left_out: sentences about topics that only repeat others.
     """
 
-    sensors: tuple[Sensor, ...]
+    sensors: tuple[SensorColumns, ...]
     several: bool
     left_out: tuple[str, ...] = ()
 
@@ -62,7 +62,7 @@ class _Group(NamedTuple):
     sure: bool
 
 
-def recognised(topics: Sequence[Topic], file: str = "") -> Found:
+def recognised(topics: Sequence[Topic], file: str = "") -> RecognisedColumns:
     """The magnetometers in a file's topics, by the names of columns and topics, and of the file.
 
     A column that has a name of a recording's own is what it says. Columns x, y, z are a magnetometer's where the topic,
@@ -94,7 +94,7 @@ def recognised(topics: Sequence[Topic], file: str = "") -> Found:
         _sensor(topics, number, group, name if len(found) > 1 else "")
         for (number, group), name in zip(found, names, strict=True)
     ]
-    return Found(tuple(sensors), several, left_out)
+    return RecognisedColumns(tuple(sensors), several, left_out)
 
 
 def candidates(topic: Topic) -> list[dict[str, str]]:
@@ -293,7 +293,7 @@ def _names(topics: Sequence[Topic], found: Sequence[tuple[int, _Group]]) -> list
     return names
 
 
-def _sensor(topics: Sequence[Topic], number: int, group: _Group, name: str) -> Sensor:
+def _sensor(topics: Sequence[Topic], number: int, group: _Group, name: str) -> SensorColumns:
     topic = topics[number]
     columns = {f"mag_{axis}": group.columns[axis] for axis in "xyz"}
     units = {f"mag_{axis}": group.units[axis] for axis in "xyz" if group.units[axis]}
@@ -303,7 +303,7 @@ def _sensor(topics: Sequence[Topic], number: int, group: _Group, name: str) -> S
     for beside in _beside(_groups(topic), group.sensor, set(columns.values())):
         columns |= beside[0]
         units |= beside[1]
-    return Sensor(name, number, columns, units)
+    return SensorColumns(name, number, columns, units)
 
 
 def _beside(

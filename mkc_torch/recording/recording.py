@@ -20,7 +20,7 @@ from mkc_torch.recording.formats.base import MissingColumnError, RecordingError,
 from mkc_torch.recording.given_columns import EXPERIMENT, checked_columns, columns_of_frame, table_of_frame
 from mkc_torch.recording.reading import ASKED, read_file, reading_of
 from mkc_torch.recording.row_sensors import with_row_sensors
-from mkc_torch.recording.shown import Shown
+from mkc_torch.recording.shown import TablePreview
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -30,7 +30,7 @@ __all__ = ["DEFAULT_UNITS", "MissingColumnError", "Recording", "RecordingError",
 _GAP = 10.0  # in median intervals
 
 
-class Recording(Shown):
+class Recording(TablePreview):
     """A table of named columns of equal length: what a sensor, or a simulator, wrote down.
 
     It does not change: each operation gives a new recording, and says in ``warnings`` what it dropped.

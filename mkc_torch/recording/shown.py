@@ -8,12 +8,12 @@ from torch import Tensor
 
 from mkc_torch._support.html_table import html_table
 
-__all__ = ["Shown"]
+__all__ = ["TablePreview"]
 
 _MOST_COLUMNS, _MOST_WARNINGS = 30, 6
 
 
-class Shown:
+class TablePreview:
     """How a table of named columns shows itself."""
 
     __slots__ = ()

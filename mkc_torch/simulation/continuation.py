@@ -15,7 +15,7 @@ from mkc_torch.simulation.protocol import Answer, Changes, Nearby, PreparedSimul
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["CompiledResidual", "Continuation", "Meaning", "Tangents", "compiled_residual", "is_plain"]
+__all__ = ["CompiledResidual", "Continuation", "Meaning", "ResidualTangents", "compiled_residual", "is_plain"]
 
 Meaning = Callable[[Tensor], tuple[Tensor, Changes]]
 """The simulation's own parameters and the changes at its ports, by the parameters of a fit."""
@@ -24,7 +24,7 @@ _MOST_KEPT = 64
 """Answers of a way that are kept: a fit comes back to one of its last ones."""
 
 
-class Tangents(NamedTuple):
+class ResidualTangents(NamedTuple):
     """Derivatives of a residual by the parameters of a fit, and what an answer nearby begins with."""
 
     rows: Float[Tensor, "p N m"]
@@ -38,7 +38,7 @@ class CompiledResidual(Protocol):
         """As :meth:`PreparedSimulation.answer`."""
         ...
 
-    def tangents(self, parameters: Float[Tensor, " p"], near: Nearby) -> Tangents | None:
+    def tangents(self, parameters: Float[Tensor, " p"], near: Nearby) -> ResidualTangents | None:
         """Derivatives where the answer is ``near``; None where the simulation itself has to be differentiated."""
         ...
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mkc_torch.effects.kinds import kind_of
 from mkc_torch.effects.paired.alike import SEVERAL
-from mkc_torch.simulation.protocol import Changes, Port, Sizes
+from mkc_torch.simulation.protocol import Changes, Port, SignalSizes
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -59,7 +59,7 @@ def output_ports(
             kind="output",
             parts=parts,
             part_units=dict.fromkeys(parts, units[name]),
-            sizes={"own": Sizes.of(measured[:, k])},
+            sizes={"own": SignalSizes.of(measured[:, k])},
             run=run,
         )
     return ports

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from mkc_torch._support.arguments import checked_number, refuse_other_type, told
+from mkc_torch._support.arguments import checked_number, format_value, refuse_other_type
 
 __all__ = ["Parameter", "SimulationError", "known_parameters"]
 
@@ -46,7 +46,7 @@ class Parameter:
             checked_number(name, bound, -math.inf, math.inf, "[]", "it is infinite for no bound")
         if self.lower > self.upper:
             raise ValueError(
-                f"Expected argument `lower` to be at most `upper` but got {self.lower} and {self.upper}; swap them."
+                f"Expected argument `lower` to be at upper `upper` but got {self.lower} and {self.upper}; swap them."
             )
         if not self.lower <= self.value <= self.upper:
             raise ValueError(
@@ -64,7 +64,7 @@ def known_parameters(name: str, parameters: Mapping[str, float | Parameter]) -> 
     """
     if not isinstance(parameters, Mapping):
         raise SimulationError(
-            f"{name}: `parameters` should be names with their values, {{'gain': 1.0}}, but is {told(parameters)}."
+            f"{name}: `parameters` should be names with their values, {{'gain': 1.0}}, but is {format_value(parameters)}."
         )
     return {key: one if isinstance(one, Parameter) else _made(name, key, one) for key, one in parameters.items()}
 
@@ -74,5 +74,5 @@ def _made(name: str, key: str, value: float) -> Parameter:
         return Parameter(float(value))
     except (TypeError, ValueError) as error:
         raise SimulationError(
-            f"{name}: its parameter `{key}` should be a finite number or a Parameter but is {told(value)}."
+            f"{name}: its parameter `{key}` should be a finite number or a Parameter but is {format_value(value)}."
         ) from error

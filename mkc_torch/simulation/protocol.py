@@ -24,17 +24,17 @@ __all__ = [
     "Beginning",
     "Change",
     "Changes",
-    "Clock",
     "Clocked",
     "ClosedForm",
-    "Correcting",
+    "CorrectableSimulation",
     "Correction",
     "FreeChange",
     "Nearby",
     "Port",
     "PreparedSimulation",
+    "SignalSizes",
+    "SignalTimes",
     "Simulation",
-    "Sizes",
     "refuse_no_recording",
 ]
 
@@ -59,7 +59,7 @@ class FreeChange:
 
 
 @dataclass(frozen=True)
-class Clock:
+class SignalTimes:
     """The moments at which a port's signal is simulated, G of them, where they are not the recording's samples.
 
     Attributes:
@@ -79,11 +79,11 @@ class Clock:
         return torch.lerp(values[self.before], values[self.after], share)
 
 
-class Sizes(NamedTuple):
+class SignalSizes(NamedTuple):
     """How large values are: a typical and the largest absolute one, and the lowest and the highest.
 
     Example:
-        >>> Sizes.of(torch.tensor([-3.0, 1.0, 2.0]))
+        >>> SignalSizes.of(torch.tensor([-3.0, 1.0, 2.0]))
         Sizes(typical=2.0, largest=3.0, lowest=-3.0, highest=2.0)
     """
 
@@ -93,7 +93,7 @@ class Sizes(NamedTuple):
     highest: float
 
     @classmethod
-    def of(cls, values: Float[Tensor, " N"]) -> Sizes:
+    def of(cls, values: Float[Tensor, " N"]) -> SignalSizes:
         """Of these values; the typical one is the median."""
         size = values.abs()
         return cls(*(float(one) for one in (size.median(), size.amax(), values.amin(), values.amax())))
@@ -131,8 +131,8 @@ class Port:
     carries: tuple[str, ...] = ()
     parts: Mapping[str, str] = field(default_factory=dict)
     part_units: Mapping[str, str] = field(default_factory=dict)
-    sizes: Mapping[str, Sizes] = field(default_factory=dict)
-    clock: Clock | None = None
+    sizes: Mapping[str, SignalSizes] = field(default_factory=dict)
+    clock: SignalTimes | None = None
     run: Int[Tensor, " G"] | None = None
     memory: Mapping[str, str] = field(default_factory=dict)
 
@@ -302,7 +302,7 @@ class Correction(Protocol):
 
 
 @runtime_checkable
-class Correcting(Protocol):
+class CorrectableSimulation(Protocol):
     """A simulation whose effects can be taken off new recordings."""
 
     def correction(self, state: Mapping[str, Any], recording: Recording) -> Correction:

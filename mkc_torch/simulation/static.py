@@ -16,7 +16,7 @@ from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.outputs import changed_outputs, output_ports, output_signals
 from mkc_torch.simulation.own_offsets import OwnOffset, determined_offsets
 from mkc_torch.simulation.parameter import Parameter, SimulationError, known_parameters
-from mkc_torch.simulation.protocol import Changes, ClosedForm, Nearby, Port, Sizes, refuse_no_recording
+from mkc_torch.simulation.protocol import Changes, ClosedForm, Nearby, Port, SignalSizes, refuse_no_recording
 from mkc_torch.simulation.undetermined import undetermined
 
 if TYPE_CHECKING:
@@ -343,7 +343,7 @@ def _ports(
             kind="input",
             parts={"own": name},
             part_units={"own": units[name]},
-            sizes={"own": Sizes.of(inputs[:, k])},
+            sizes={"own": SignalSizes.of(inputs[:, k])},
         )
     return ports | output_ports(system.outputs, units, unit, measured, fixed)
 

@@ -11,7 +11,7 @@ import time
 import pytest
 
 from mkc_torch._parallel.deadline import Stopped, check_deadline, is_limited, limited, stopped_by_interrupt, within
-from mkc_torch._parallel.pool import allow_copies, meanwhile, shared
+from mkc_torch._parallel.pool import allow_copies, shared, speculative
 from tests.started import started
 
 
@@ -118,7 +118,7 @@ def test_no_work_is_begun_once_it_is_time(copies):
 @linux
 @pytest.mark.usefixtures("a_copy")
 def test_a_copy_that_is_waited_for_is_ended():
-    with limited(0.3), meanwhile([signal.pause]) as answer:
+    with limited(0.3), speculative([signal.pause]) as answer:
         time.sleep(0.2)  # the copy has the only work
         with pytest.raises(Stopped):
             answer()

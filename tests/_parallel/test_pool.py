@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from mkc_torch._parallel import pool as _pool
-from mkc_torch._parallel.pool import Parcels, allow_copies, meanwhile, shared
+from mkc_torch._parallel.pool import Serializer, allow_copies, shared, speculative
 from tests.started import started
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="copies are forked on Linux alone")
@@ -67,7 +67,7 @@ def test_results_come_in_order_and_copies_take_part():
 def test_without_copies_all_is_done_here():
     allow_copies(0)
     assert shared([os.getpid, os.getpid]) == [HERE, HERE]
-    with meanwhile([os.getpid]) as answer:
+    with speculative([os.getpid]) as answer:
         assert answer() == [HERE]
 
 
@@ -86,10 +86,10 @@ def test_a_copy_shares_nothing_further():
 
     def work():
         time.sleep(0.05)
-        with meanwhile([os.getpid]) as answer:
+        with speculative([os.getpid]) as answer:
             return {os.getpid(), *shared([os.getpid, os.getpid]), *answer()}
 
-    with meanwhile([signal.pause]):
+    with speculative([signal.pause]):
         assert all(len(processes) == 1 for processes in shared([work] * 6) if HERE not in processes)
 
 
@@ -106,7 +106,7 @@ def test_what_a_copy_left_undone_is_done_here():
         return os.getpid()
 
     assert shared([dies] * 5) == [HERE] * 5
-    with meanwhile([dies] * 5) as answer:
+    with speculative([dies] * 5) as answer:
         assert answer() == [HERE] * 5
 
 
@@ -116,7 +116,7 @@ def test_without_memory_for_a_copy_all_is_done_here(monkeypatch):
 
     monkeypatch.setattr(os, "fork", fails)
     assert shared([os.getpid] * 3) == [HERE] * 3
-    with meanwhile([os.getpid]) as answer:
+    with speculative([os.getpid]) as answer:
         assert answer() == [HERE]
 
 
@@ -150,15 +150,15 @@ def test_whoever_works_results_lie_in_memory_alike(most):
 def test_a_parcel_holds_the_number_of_what_is_known():
     local = type("Local", (), {})  # no module holds it by its name
     known = [local(), local()]
-    parcel = Parcels(known).packed({"one": known[1], "none": None})
-    assert Parcels(["other", "another"]).unpacked(parcel) == {"one": "another", "none": None}
+    parcel = Serializer(known).packed({"one": known[1], "none": None})
+    assert Serializer(["other", "another"]).unpacked(parcel) == {"one": "another", "none": None}
     with pytest.raises(pickle.PicklingError, match="Local"):
-        Parcels().packed(known[1])
+        Serializer().packed(known[1])
 
 
 def test_a_copy_works_meanwhile():
     known = object()
-    with begun(lambda: (os.getpid(), known)) as (work, wait), meanwhile([work], [known]) as answer:
+    with begun(lambda: (os.getpid(), known)) as (work, wait), speculative([work], [known]) as answer:
         wait()
         [(process, same)] = answer()
     assert process != HERE
@@ -166,7 +166,7 @@ def test_a_copy_works_meanwhile():
 
 
 def test_what_goes_on_meanwhile_is_shared_all_the_same_and_goes_before():
-    with begun(lambda: os.nice(0)) as (work, wait), meanwhile([work]) as answer:
+    with begun(lambda: os.nice(0)) as (work, wait), speculative([work]) as answer:
         wait()
         results = shared([elsewhere(k) for k in range(9)])
         assert len({process for _, process in results}) == 3
@@ -175,13 +175,13 @@ def test_what_goes_on_meanwhile_is_shared_all_the_same_and_goes_before():
 
 def test_without_a_free_core_what_could_go_on_meanwhile_is_done_by_who_asks():
     allow_copies(1)
-    with meanwhile([signal.pause]), meanwhile([os.getpid]) as answer:
+    with speculative([signal.pause]), speculative([os.getpid]) as answer:
         assert answer() == [HERE]
-    with meanwhile([os.getpid]) as first:
+    with speculative([os.getpid]) as first:
         first()  # its core is free from here on
         while not all(copy.done() for copy in _pool._ahead):
             time.sleep(0.01)
-        with begun(os.getpid) as (work, wait), meanwhile([work]) as answer:
+        with begun(os.getpid) as (work, wait), speculative([work]) as answer:
             wait()
             assert answer() != [HERE]
 
@@ -191,7 +191,7 @@ def test_what_nobody_has_begun_is_done_by_who_asks():
     allow_copies(1)
     with (
         begun(lambda: (time.sleep(0.5), os.getpid())) as (last, wait),
-        meanwhile([*(elsewhere(k) for k in range(5)), last]) as answer,
+        speculative([*(elsewhere(k) for k in range(5)), last]) as answer,
     ):
         wait()
         *others, (_, process) = answer()
@@ -201,12 +201,12 @@ def test_what_nobody_has_begun_is_done_by_who_asks():
 
 
 def test_meanwhile_a_work_that_fails_fails_here():
-    with meanwhile([lambda: 1 / 0]) as answer, pytest.raises(ZeroDivisionError):
+    with speculative([lambda: 1 / 0]) as answer, pytest.raises(ZeroDivisionError):
         answer()
 
 
 def test_a_copy_that_is_not_waited_for_is_ended():
-    with meanwhile([signal.pause]):
+    with speculative([signal.pause]):
         pass
     assert multiprocessing.active_children() == []
 
@@ -248,7 +248,7 @@ CODE = """
     from mkc_torch._parallel.pool import allow_copies
     from mkc_torch._parallel.processes import one_thread
     from mkc_torch.recording.demonstration import simulated_recording
-    from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
+    from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
     from mkc_torch.simulation import Dynamics, Magnetometer
 
     one_thread()

@@ -10,13 +10,13 @@ from mkc_torch._support.arguments import (
     as_numbers,
     checked_number,
     checked_whole,
+    format_value,
     refuse_bad_batch,
     refuse_bad_weight,
     refuse_not_real,
     refuse_other_type,
     refuse_out_of_range,
     refuse_text,
-    told,
 )
 
 INF, NAN = math.inf, math.nan
@@ -155,8 +155,8 @@ def test_weights_may_be_counts_and_masks_but_no_lists_and_not_complex():
 
 
 def test_values_are_told_in_short():
-    assert told(torch.nn.Linear) == "the class Linear"
-    assert told("a") == "'a'"
-    assert told(told) == "a function"
-    assert told(object()) == "an object"
-    assert len(told(list(range(1000)))) < 60
+    assert format_value(torch.nn.Linear) == "the class Linear"
+    assert format_value("a") == "'a'"
+    assert format_value(format_value) == "a function"
+    assert format_value(object()) == "an object"
+    assert len(format_value(list(range(1000)))) < 60

@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 
 from mkc_torch import Diagnosis, diagnose
-from mkc_torch.challenge.dynamics import generator, naive
+from mkc_torch.challenge.dynamics import generator, nominal_models
 from mkc_torch.simulation import Dynamics, Parameter, Simulation, load_fmu
 from tests.simulation.fmu.made import Model, make_fmu
 
@@ -51,15 +51,15 @@ RATES: Mapping[str, Mapping[str, str]] = {
         "temperature_2": "gain_2*heater_2 - loss_2*(temperature_2 - room)",
     },
 }
-"""The equations of ``mkc_torch.challenge.dynamics.naive``, as texts."""
+"""The equations of ``mkc_torch.challenge.dynamics.nominal_models``, as texts."""
 
 NAIVE: Mapping[str, type[Dynamics]] = {
-    "pendulum": naive.Pendulum,
-    "cart_pole": naive.CartPole,
-    "tanks": naive.Tanks,
-    "motor": naive.Motor,
-    "projectile": naive.Projectile,
-    "thermal": naive.Thermal,
+    "pendulum": nominal_models.Pendulum,
+    "cart_pole": nominal_models.CartPole,
+    "tanks": nominal_models.Tanks,
+    "motor": nominal_models.Motor,
+    "projectile": nominal_models.Projectile,
+    "thermal": nominal_models.Thermal,
 }
 
 

@@ -30,9 +30,9 @@ from torch import distributed as dist
 from mkc_torch._support.ranks import Ranks
 from mkc_torch.linear.streaming import MemmapBatches, StreamedMKCRegression, from_memmap
 from mkc_torch.linear.streaming._blocks import Shape
+from mkc_torch.linear.streaming._float32_pass import float32_pass
 from mkc_torch.linear.streaming._reservoir import Reservoir
-from mkc_torch.linear.streaming._rough import rough_pass
-from mkc_torch.linear.streaming._sums import Point, Slopes, range_pass, report_pass, slopes_pass
+from mkc_torch.linear.streaming._sums import StreamPoint, StreamSums, range_pass, report_pass, slopes_pass
 from mkc_torch.linear.streaming._survey import surveyed
 
 COLUMNS = 8
@@ -42,7 +42,7 @@ WRITTEN = 1_000_000
 READ = 65_536
 """Rows that are summed at a time: of the powers of two the one that is fastest."""
 
-POINT = Point(np.ones(COLUMNS), np.array([0.25]), np.array([0.5]))
+POINT = StreamPoint(np.ones(COLUMNS), np.array([0.25]), np.array([0.5]))
 
 
 def write_table(path: Path, rows: int) -> None:
@@ -73,7 +73,7 @@ def read_and_sum(table: np.ndarray) -> float:
 def passes(batches: MemmapBatches) -> dict[str, Callable[[], object]]:
     shape = Shape(1, COLUMNS, True, False)
     return {
-        "gradient in float32": lambda: rough_pass(batches, shape, POINT),
+        "gradient in float32": lambda: float32_pass(batches, shape, POINT),
         "gradient": lambda: slopes_pass(batches, shape, POINT, curvature=False),
         "range of residuals": lambda: range_pass(batches, shape, POINT),
         "gradient and Hessian": lambda: slopes_pass(batches, shape, POINT, curvature=True),
@@ -127,10 +127,10 @@ def rank_main(rank: int, ranks: int, port: int, path: Path, repeats: int, told: 
     dist.init_process_group("gloo", f"tcp://127.0.0.1:{port}", rank=rank, world_size=ranks)
     batches, best = batches_of(path, (rank, ranks)), {}
     shape, group = Shape(1, COLUMNS, True, False), Ranks()
-    length = Slopes.length(shape)
+    length = StreamSums.length(shape)
     # of a pass for the gradient also what its sums cost
     work: dict[str, Callable[[], object]] = {
-        "gradient in float32": lambda: group.sum_of(lambda: rough_pass(batches, shape, POINT), length),
+        "gradient in float32": lambda: group.sum_of(lambda: float32_pass(batches, shape, POINT), length),
         "gradient": lambda: group.sum_of(lambda: slopes_pass(batches, shape, POINT, curvature=False), length),
         "whole fit": lambda: StreamedMKCRegression().fit(batches),
     }

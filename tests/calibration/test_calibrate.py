@@ -13,7 +13,7 @@ from mkc_torch.calibration.file import CalibrationFileError
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.linear import LeastSquares, MKCRegression
 from mkc_torch.recording.demonstration import simulated_recording
-from mkc_torch.recording.disturbance import Interval, disturbed_intervals
+from mkc_torch.recording.disturbance import RejectedInterval, disturbed_intervals
 from mkc_torch.recording.recording import MissingColumnError, Recording, RecordingError
 from tests.shared_data import shared_data
 
@@ -338,8 +338,8 @@ def test_intervals_end_where_the_time_begins_anew():
     rejected = torch.zeros(200, dtype=torch.bool)
     rejected[80:120] = True
     first, second = disturbed_intervals(time, rejected)
-    assert first == pytest.approx(Interval(1.6, 1.98))
-    assert second == pytest.approx(Interval(0.0, 0.38))
+    assert first == pytest.approx(RejectedInterval(1.6, 1.98))
+    assert second == pytest.approx(RejectedInterval(0.0, 0.38))
 
 
 def test_a_few_rejections_at_the_edge_are_no_interval():

@@ -8,7 +8,7 @@ pytest.importorskip("polars")
 pytest.importorskip("matplotlib")
 
 from mkc_torch.cli import calibration_files
-from mkc_torch.cli.calibration_files import Asked, calibrations_of
+from mkc_torch.cli.calibration_files import CalibrationRequest, calibrations_of
 from mkc_torch.recording.formats import read_topics
 from mkc_torch.recording.recording import write_table
 from tests.calibration.test_calibrate import noisy_ellipsoid
@@ -29,7 +29,7 @@ def reads(monkeypatch):
 
 
 def asked(**given):
-    return Asked(**({"columns": {}, "units": {}, "sensor": None, "field_strength": None} | given))
+    return CalibrationRequest(**({"columns": {}, "units": {}, "sensor": None, "field_strength": None} | given))
 
 
 def test_each_sensor_of_a_file_is_told_and_the_file_is_read_once(tmp_path, reads):
@@ -37,7 +37,7 @@ def test_each_sensor_of_a_file_is_told_and_the_file_is_read_once(tmp_path, reads
     columns = {f"mag{n}_{axis}": points[:, k] + n for n in range(2) for k, axis in enumerate("xyz")}
     write_table(tmp_path / "two.csv", {"time": torch.arange(300) / 50.0} | columns)
     outcomes = list(calibrations_of(tmp_path / "two.csv", tmp_path / "o", asked(), force=False, step=stages.append))
-    assert [isinstance(outcome, calibration_files.Found) for _, outcome in outcomes] == [True, True]
+    assert [isinstance(outcome, calibration_files.CalibrationOutcome) for _, outcome in outcomes] == [True, True]
     assert stages == [
         "reading two.csv",
         "calibrating two.csv, sensor mag0 (1 of 2)",

@@ -20,10 +20,10 @@ from typer.testing import CliRunner
 from mkc_torch._support import files as _files
 from mkc_torch.cli import diagnosis_files
 from mkc_torch.cli.app import app
-from mkc_torch.cli.console import Look
+from mkc_torch.cli.console import ConsoleStyle
 from mkc_torch.cli.diagnose import _waited_for
 from mkc_torch.diagnosis import DiagnosedModel
-from mkc_torch.diagnosis.files.diagnosis_json import validate
+from mkc_torch.diagnosis.io.diagnosis_json import validate
 from mkc_torch.recording.recording import Recording, write_table
 from tests.diagnosis.factory import make_diagnosis
 from tests.started import started
@@ -287,7 +287,7 @@ def test_experiments_are_diagnosed_each_on_its_own(tmp_path):
     text = path.read_text(encoding="utf-8").splitlines()
     labels = ["run", *["flight/1"] * 500, *["2"] * 20]
     path.write_text("\n".join(f"{a},{b}" for a, b in zip(text, labels, strict=True)), encoding="utf-8")
-    result = diagnosed(path, "--output", tmp_path / "out", "--experiments", "run")
+    result = diagnosed(path, "--output", tmp_path / "out", "--run-column", "run")
     refused(result, f"{path}, run 2: 20 samples are too few", "1 of 2 recordings", lines=2)
     assert [p.name for p in (tmp_path / "out" / "a").iterdir()] == ["flight_1"]
     assert content_of(tmp_path / "out" / "a" / "flight_1")["recording"] == "a/flight/1"
@@ -352,10 +352,10 @@ def test_usage_errors_exit_with_two(tmp_path):
         ((path, *out, *known, "--noise", "norm=0"), "must be above 0"),
         ((path, *out, *known, "--noise", "norm=inf"), "must be above 0"),
         ((path, *out, *known, "--noise", "norm=1", "--noise", "norm=2"), "given twice"),
-        ((path, *out, *known, "--between", "torque=stepped"), "known: held, linear, smooth"),
+        ((path, *out, *known, "--input-hold", "torque=stepped"), "known: held, linear, smooth"),
         ((path, *out, *known, "--unit", " "), "--unit is empty"),
-        ((path, *out, *known, "--experiments", ""), "--experiments is empty"),
-        ((path, *out, *known, "--columns", "experiment=a", "--experiments", "b"), "different columns"),
+        ((path, *out, *known, "--run-column", ""), "--run-column is empty"),
+        ((path, *out, *known, "--columns", "experiment=a", "--run-column", "b"), "different columns"),
         ((path, *out, *known, "--columns", "mag_x"), "mag_x=mx"),
         ((path, twin, *out, *known), "same folder"),
     ):
@@ -396,7 +396,7 @@ def test_without_a_model_none_is_written_and_an_old_one_goes(tmp_path):
 def test_text_for_a_terminal_is_set_to_its_width(stepped):
     request = diagnosis_files.Request(surrogates=19, force=True, report=False)
     folder = stepped[1].parent / "wide"
-    (outcome,) = diagnosis_files.diagnose_file(stepped[0], folder, request, Look(terminal=True, width=60))
+    (outcome,) = diagnosis_files.diagnose_file(stepped[0], folder, request, ConsoleStyle(terminal=True, width=60))
     assert "\x1b[" in outcome.text
     assert sorted(path.name for path in folder.iterdir()) == WRITTEN[:2]
 

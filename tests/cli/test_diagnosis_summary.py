@@ -9,7 +9,7 @@ pytest.importorskip("rich")
 from rich.console import Console
 
 from mkc_torch.cli.diagnosis_summary import show
-from mkc_torch.diagnosis.result import Parameter, Region, Row, Told
+from mkc_torch.diagnosis.result import EffectParameter, EvidenceResult, Region, Row
 from tests.diagnosis.factory import (
     graded,
     make_diagnosis,
@@ -118,7 +118,7 @@ def test_every_width(width):
 
 
 def test_what_any_test_of_evidence_says_has_a_line():
-    said = Told("my_test", rows=(Row("left over", "white"), Row("in print", "more", in_terminal=False)))
+    said = EvidenceResult("my_test", rows=(Row("left over", "white"), Row("in print", "more", in_terminal=False)))
     made = make_diagnosis(1)
     of_finding = dataclasses.replace(made, findings=(with_evidence(made.findings[0], said),))
     for diagnosis in (with_evidence(made, said), of_finding):
@@ -140,7 +140,7 @@ def test_a_rare_p_value_does_not_stand_beside_nothing_is_missing():
 
 def test_a_list_of_many_numbers_is_told_by_its_largest():
     made = make_diagnosis(1)
-    slopes = Parameter("gradient", (0.1, -0.6, 3.0, 0.2, 0.3, 0.4, 0.5), (0.1,) * 7, "µT/m", tuple("abcdefg"))
+    slopes = EffectParameter("gradient", (0.1, -0.6, 3.0, 0.2, 0.3, 0.4, 0.5), (0.1,) * 7, "µT/m", tuple("abcdefg"))
     text = flat(
         shown(dataclasses.replace(made, findings=(dataclasses.replace(made.findings[0], parameters=(slopes,)),)))
     )

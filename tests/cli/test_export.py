@@ -1,4 +1,4 @@
-"""`mkc calibrate --export`, `--name`, `--against`, and `mkc export`, as a user calls them."""
+"""`mkc calibrate --export`, `--name`, `--compare-with`, and `mkc export`, as a user calls them."""
 
 import json
 import os
@@ -141,7 +141,7 @@ def test_the_new_one_stands_beside_the_old_one(done, tmp_path):
     old = done[0] / "calibration.json"
     before = old.read_bytes()
     other = table(tmp_path / "other.csv", noisy_ellipsoid(300, seed=5) + torch.tensor([0.0, 2.0, 0.0]))
-    result = mkc("calibrate", other, "--output", tmp_path / "out", "--against", old)
+    result = mkc("calibrate", other, "--output", tmp_path / "out", "--compare-with", old)
     assert result.exit_code == 0, result.output
     told = " ".join(result.stdout.split())
     shown = (tmp_path / "out" / "other" / "report.html").read_text(encoding="utf-8")
@@ -158,22 +158,22 @@ def test_what_it_is_set_beside_is_never_replaced(good, tmp_path):
     assert mkc("calibrate", good, "--output", tmp_path).exit_code == 0
     old = tmp_path / "good" / "calibration.json"
     before = old.read_bytes()
-    result = mkc("calibrate", good, "--output", tmp_path, "--against", old, "--field-strength", 48, "--force")
+    result = mkc("calibrate", good, "--output", tmp_path, "--compare-with", old, "--field-strength", 48, "--force")
     refused(result, "is not replaced", "choose another --output")
     assert old.read_bytes() == before
 
 
 def test_an_old_one_that_is_none_ends_before_any_work(good, model, tmp_path):
     out = ("--output", tmp_path / "out")
-    refused(mkc("calibrate", good, *out, "--against", tmp_path / "none.json"), "none.json", "no such file")
-    refused(mkc("calibrate", good, *out, "--against", model), "model.json", "calibration.json of `mkc calibrate`")
+    refused(mkc("calibrate", good, *out, "--compare-with", tmp_path / "none.json"), "none.json", "no such file")
+    refused(mkc("calibrate", good, *out, "--compare-with", model), "model.json", "calibration.json of `mkc calibrate`")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.usefixtures("no_pictures")
 def test_an_old_one_in_units_without_a_size_is_told_and_the_new_one_written(done, good, tmp_path):
     old = done[0] / "calibration.json"
-    result = mkc("calibrate", good, "--output", tmp_path, "--unit", "counts", "--against", old)
+    result = mkc("calibrate", good, "--output", tmp_path, "--unit", "counts", "--compare-with", old)
     refused(result, "cannot be set beside one another", "--unit")
     assert (tmp_path / "good" / "calibration.json").exists()
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from mkc_torch.cli.app import app
 from mkc_torch.diagnosis import DiagnosedModel
-from mkc_torch.diagnosis.files.diagnosis_json import validate
+from mkc_torch.diagnosis.io.diagnosis_json import validate
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.recording.recording import Recording, write_table
 from mkc_torch.simulation import SimulationFileError, load_simulation
@@ -208,7 +208,7 @@ def test_without_a_simulation_columns_decide(thermistor, tmp_path):
     _, table, output = thermistor
     result = mkc("diagnose", table, "--output", output)
     assert result.exit_code == 1
-    assert "give one of --simulation and --simulated" in flat(result.stderr)
+    assert "give one of --simulation and --simulator-output" in flat(result.stderr)
     assert "no magnetometer is recognised among `time`, `temperature`, `current`, `voltage`" in flat(result.stderr)
     assert not output.exists()
     sensor = tmp_path / "sensor.csv"
@@ -260,13 +260,17 @@ def test_noise_and_inputs_are_declared_by_name(thermistor, monkeypatch):
 
     source, table, output = thermistor
     command = ("diagnose", table, "--simulation", source, "--output", output, "--surrogates", 19)
-    result = mkc(*command, "--noise", "voltage=0.01,other=2", "--noise", "third=1e-3", "--between", "temperature=held")
+    result = mkc(
+        *command, "--noise", "voltage=0.01,other=2", "--noise", "third=1e-3", "--input-hold", "temperature=held"
+    )
     assert result.exit_code == 1
     assert "they are `voltage`" in flat(result.stderr)
-    result = mkc(*command, "--noise", "voltage=0.01", "--between", "voltage=held")
+    result = mkc(*command, "--noise", "voltage=0.01", "--input-hold", "voltage=held")
     assert "inputs in the equations of this simulation but got `voltage`; it has none" in flat(result.stderr)
     monkeypatch.setattr("mkc_torch.cli.diagnosis_files.diagnose", told)
-    result = mkc(*command, "--noise", "voltage=0.01, other=2", "--noise", "third=1e-3", "--between", "temperature=held")
+    result = mkc(
+        *command, "--noise", "voltage=0.01, other=2", "--noise", "third=1e-3", "--input-hold", "temperature=held"
+    )
     assert "far enough" in result.stderr
     assert given["noise"] == {"voltage": 0.01, "other": 2.0, "third": 0.001}
     assert given["between"] == {"temperature": "held"}
@@ -285,17 +289,17 @@ def test_what_a_simulator_wrote(tmp_path):
     noise = 0.03 * torch.randn(300, generator=g, dtype=torch.float64)
     write_table(table, {"time": time, "y": 1.1 * signal(time) + noise})
     output = tmp_path / "out"
-    result = mkc("diagnose", table, "--simulated", sim, "--output", output, "--surrogates", 19)
+    result = mkc("diagnose", table, "--simulator-output", sim, "--output", output, "--surrogates", 19)
     assert result.exit_code == 0, result.output
     model = output / "rec" / "model.json"
     assert json.loads((output / "rec" / "diagnosis.json").read_text())["findings"][0]["effect"] == "gain"
     corrected = tmp_path / "corrected.csv"
     refused = mkc("apply", model, table, "--output", corrected)
-    assert "--simulated SIM.csv" in flat(refused.stderr)
-    assert mkc("apply", model, table, "--output", corrected, "--simulated", sim).exit_code == 0
+    assert "--simulator-output SIM.csv" in flat(refused.stderr)
+    assert mkc("apply", model, table, "--output", corrected, "--simulator-output", sim).exit_code == 0
     assert float((Recording.read(corrected)["y"] / signal(time)).median()) == pytest.approx(1.1, abs=0.01)
     write_table(tmp_path / "LATE.csv", {"time": dense + 1000.0, "y": signal(dense)})
-    result = mkc("diagnose", table, "--simulated", tmp_path / "LATE.csv", "--output", output, "--force")
+    result = mkc("diagnose", table, "--simulator-output", tmp_path / "LATE.csv", "--output", output, "--force")
     assert result.exit_code == 1
     assert "do not meet in time: 0 to 14.95 s was recorded, 999 to 1016.95 s simulated" in flat(result.stderr)
 
@@ -325,7 +329,7 @@ def test_code_that_fails_is_told_and_nothing_is_written(tmp_path, text, name, wo
 def test_usage_errors(thermistor):
     source, table, output = thermistor
     for more, words in (
-        (("--simulation", source, "--simulated", table), "give one of --simulation and --simulated"),
+        (("--simulation", source, "--simulator-output", table), "give one of --simulation and --simulator-output"),
         (("--simulation", "bench.py"), "or one of your own as FILE.py:CLASS or MODEL.fmu"),
     ):
         result = mkc("diagnose", table, "--output", output, *more)

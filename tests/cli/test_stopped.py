@@ -17,9 +17,9 @@ from mkc_torch._parallel import deadline
 from mkc_torch._parallel.deadline import Stopped
 from mkc_torch.cli import console, diagnosis_files
 from mkc_torch.cli.console import progress
-from mkc_torch.diagnosis.files.diagnosis_json import validate
+from mkc_torch.diagnosis.io.diagnosis_json import validate
+from mkc_torch.diagnosis.partial_result import PartialResult
 from mkc_torch.diagnosis.stop import Stop
-from mkc_torch.diagnosis.under_way import UnderWay
 from tests.cli.test_cli import mkc
 from tests.cli.test_diagnose import STEPPED, quiet, refused, sensor
 from tests.diagnosis.factory import make_diagnosis
@@ -33,7 +33,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="nothing is forked el
 def stopped_in_the_search(monkeypatch, reason="time limit"):
     """The first diagnosis stops once its search has begun."""
     waiting = []
-    keep = UnderWay.keep_search
+    keep = PartialResult.keep_search
 
     def kept(self, search):
         keep(self, search)
@@ -44,7 +44,7 @@ def stopped_in_the_search(monkeypatch, reason="time limit"):
             waiting.append(None)
             raise Stopped(reason)
 
-    monkeypatch.setattr(UnderWay, "keep_search", kept)
+    monkeypatch.setattr(PartialResult, "keep_search", kept)
     monkeypatch.setattr(deadline.Deadline, "check", check)
 
 
@@ -74,7 +74,7 @@ def test_a_time_limit_before_the_first_fit_writes_nothing_and_exits_with_1(tmp_p
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("how", [("--together",), ("--simulated",)])
+@pytest.mark.parametrize("how", [("--together",), ("--simulator-output",)])
 def test_recordings_together_and_a_simulated_table_are_stopped_alike(tmp_path, monkeypatch, how):
     paths = [quiet(tmp_path / "a.csv"), quiet(tmp_path / "b.csv", **sensor(STEPPED))]
     stopped_in_the_search(monkeypatch)
@@ -82,7 +82,7 @@ def test_recordings_together_and_a_simulated_table_are_stopped_alike(tmp_path, m
     if how == ("--together",):
         result, folder = mkc("diagnose", *paths, "--simulation", "magnetometer", *limit, *how), "together"
     else:
-        result, folder = mkc("diagnose", paths[0], "--simulated", paths[1], *limit), "a"
+        result, folder = mkc("diagnose", paths[0], "--simulator-output", paths[1], *limit), "a"
     assert result.exit_code == 0, result.output
     assert search_of(tmp_path / "out" / folder)["stopped"]["reason"] == "time limit"
 
@@ -144,7 +144,7 @@ WAITING = """
 import sys
 from pathlib import Path
 from mkc_torch._parallel.deadline import check_deadline
-from mkc_torch.diagnosis.under_way import UnderWay
+from mkc_torch.diagnosis.partial_result import UnderWay
 from time import sleep
 keep = UnderWay.keep_search
 

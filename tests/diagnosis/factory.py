@@ -5,24 +5,31 @@ import math
 
 import torch
 
+from mkc_torch.diagnosis.environment import (
+    Curve,
+    DisturbanceEstimate,
+    GoodnessOfFit,
+    NoiseEnvironment,
+    ProcessNoise,
+    ShapeCheck,
+)
 from mkc_torch.diagnosis.evidence import held_out_gain, remaining
 from mkc_torch.diagnosis.findings.advice import advice_of
-from mkc_torch.diagnosis.findings.worth import grade_of
+from mkc_torch.diagnosis.findings.grading import grade_of
 from mkc_torch.diagnosis.result import (
     Alternative,
-    Candidate,
+    CandidateScore,
     Diagnosis,
+    EffectParameter,
     Finding,
     HeldOut,
-    Noise,
-    Parameter,
+    HeldOutScore,
+    NoiseSummary,
     Reference,
     Separability,
     SmoothCorrection,
-    Spread,
     Traces,
 )
-from mkc_torch.diagnosis.world import Curve, Follows, Forcing, Push, Shape, World
 
 CHANNELS = ("norm", "turn_x", "turn_y", "turn_z")
 CATALOGUE = (
@@ -47,7 +54,7 @@ def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candi
         "simulation": "magnetometer",
         "samples": samples,
         "level": 0.05,
-        "noise": Noise(
+        "noise": NoiseSummary(
             "ar",
             {"coefficients": (0.42, -0.08)},
             (2.1,) * channels,
@@ -61,15 +68,15 @@ def make_diagnosis(findings=1, *, channels=1, samples=4500, has_time=True, candi
         "p_value": 0.005 if findings else 0.37,
         "verdict": "explained" if findings else "adequate",
         "findings": tuple(graded(f(names, has_time)) for f in found),
-        "baseline": Spread(-1.2345, before, (1.1,) * channels, (0.52,) * channels),
-        "corrected": Spread(-0.9012, after, (math.inf,) * channels, (0.31,) * channels),
+        "baseline": HeldOutScore(-1.2345, before, (1.1,) * channels, (0.52,) * channels),
+        "corrected": HeldOutScore(-0.9012, after, (math.inf,) * channels, (0.31,) * channels),
         "advice": (),
         "warnings": ("3 samples without a finite value were left out.",),
         "candidates": make_candidates(candidates),
         "separability": make_separability(min(candidates, 8)),
         "traces": traces,
     }
-    ceiling = changes.pop("ceiling", Spread(-0.8951, 0.97 * after, (1.4,) * channels, (0.3,) * channels))
+    ceiling = changes.pop("ceiling", HeldOutScore(-0.8951, 0.97 * after, (1.4,) * channels, (0.3,) * channels))
     smooth = SmoothCorrection(ceiling, changes.pop("remaining", ()))
     content["evidence"] = () if ceiling is None else (remaining.said(smooth),)
     diagnosis = Diagnosis(**content | changes)
@@ -91,7 +98,7 @@ def with_evidence(thing, *said):
 
 def make_follows(output="angle", unit="rad", residual=0.0049, variation=0.35, floor=0.005, **changes):
     """How a simulation follows an output."""
-    made = Follows(
+    made = GoodnessOfFit(
         output, unit, residual, variation, 1.0 - (residual / variation) ** 2, floor, "declared", variation, 0.021
     )
     return dataclasses.replace(made, **changes)
@@ -100,7 +107,7 @@ def make_follows(output="angle", unit="rad", residual=0.0049, variation=0.35, fl
 LOST = (make_follows(residual=0.36, explained=0.12), make_follows("rate", "rad/s", 1.9, 1.4, 0.02))
 """Of two outputs, neither followed."""
 
-PUSHED = Push("rate", at_rate=True, lasting=0.7, size=0.2284, standard_error=0.021, unit="rad/s²", nats=311.0)
+PUSHED = ProcessNoise("rate", at_rate=True, lasting=0.7, size=0.2284, standard_error=0.021, unit="rad/s²", nats=311.0)
 
 
 def make_forcing(samples=1800, push=PUSHED):
@@ -117,13 +124,13 @@ def make_forcing(samples=1800, push=PUSHED):
         "It goes along with none of the inputs, at no lag.",
     )
     band = torch.full_like(value, 0.09)
-    return Forcing(push.place, push.at_rate, push.unit, time, value, band, curves, sentences)
+    return DisturbanceEstimate(push.place, push.at_rate, push.unit, time, value, band, curves, sentences)
 
 
 def make_world(**changes):
     """A pendulum that is followed, whose rate something pushes, and whose torque is held."""
-    world = World(
-        follows=(make_follows(),), pushes=(PUSHED,), between={"torque": "held"}, forcing=(make_forcing(),), starts=12
+    world = NoiseEnvironment(
+        follows=(make_follows(),), pushes=(PUSHED,), input_hold={"torque": "held"}, forcing=(make_forcing(),), starts=12
     )
     return dataclasses.replace(world, **changes)
 
@@ -134,13 +141,13 @@ def make_unfit(**changes):
         "Another start reaches 0.006 rad: `gravity` = −9.81 with the other sign.",
         "`damping` ends at its bound, 0.",
     )
-    world = World(follows=LOST, reasons=reasons, starts=12)
+    world = NoiseEnvironment(follows=LOST, reasons=reasons, starts=12)
     return make_diagnosis(0, **{"simulation": "Pendulum", "samples": 400, "verdict": "unfit", "world": world} | changes)
 
 
 def nearest(finding, gain=163.0, formula="0.0071 |x|^1.52 sign(x)", curve=None):
     """A finding whose name's shape is not the recording's."""
-    shape = Shape(gain, 0.002, curve or finding.curve, formula)
+    shape = ShapeCheck(gain, 0.002, curve or finding.curve, formula)
     return dataclasses.replace(finding, grade="nearest in the catalogue", shape=shape)
 
 
@@ -179,7 +186,7 @@ def make_traces(findings, channels, samples, has_time):
 def make_candidates(count):
     gains = [900.0 * 0.6**i for i in range(count)]
     return tuple(
-        Candidate(
+        CandidateScore(
             CATALOGUE[i % len(CATALOGUE)] if i < len(CATALOGUE) else "driver_offset",
             () if i == 0 else ("current",) if i < len(CATALOGUE) else (f"column_{i}",),
             "step at 41.3 s" if i == 0 else "",
@@ -209,8 +216,8 @@ def _step(channels, has_time):
         equation="B = A (m − b − Δb·1[t > t₀])",
         explanation="The sensor's offset changes at one moment, as when a magnetised part comes near and stays.",
         parameters=(
-            Parameter("offset change", (3.2137, -1.1042, 0.3251), (0.0812, 0.0774, 0.0921), "µT"),
-            Parameter("onset", 41.32, 0.14, "s"),
+            EffectParameter("offset change", (3.2137, -1.1042, 0.3251), (0.0812, 0.0774, 0.0921), "µT"),
+            EffectParameter("onset", 41.32, 0.14, "s"),
         ),
         p_value=0.005,
         evidence=(held_out_gain.said(HeldOut(0.3124, (0.2811, 0.3502), 0.912, 0.521, "µT"), ""),),
@@ -222,7 +229,7 @@ def _step(channels, has_time):
         plausibility="3.4 µT; steps of 1 to 50 µT occur.",
         curve=_curve("time", "s" if has_time else "", channels, lambda x: (x > 0.45).double()),
         advice="Look for what changed at that time; use the calibration from after the step.",
-        again="a step does not come at the same moment again",
+        recurrence="a step does not come at the same moment again",
     )
 
 
@@ -236,8 +243,8 @@ def _current(channels, has_time):
         equation="δB = k (I − Ī)",
         explanation="A current near the sensor adds a field in proportion to it.",
         parameters=(
-            Parameter("k", (-0.1702, 0.3311, 0.0298), (0.0123, 0.0119, 0.0131), "µT/A"),
-            Parameter("α", 4.02e-6, 1.1e-7, "1/µT²"),
+            EffectParameter("k", (-0.1702, 0.3311, 0.0298), (0.0123, 0.0119, 0.0131), "µT/A"),
+            EffectParameter("α", 4.02e-6, 1.1e-7, "1/µT²"),
         ),
         p_value=0.01,
         evidence=(held_out_gain.said(None, "The event has no second occurrence to be held out."),),
@@ -259,7 +266,7 @@ def _unknown(channels, _has_time):
         onset=None,
         equation="residual = f(temperature)",
         explanation="The residual depends on this column in a way that no effect in the catalogue has.",
-        parameters=(Parameter("knots", tuple(0.1 * i for i in range(20)), None, "µT"),),
+        parameters=(EffectParameter("knots", tuple(0.1 * i for i in range(20)), None, "µT"),),
         p_value=0.045,
         evidence=(
             held_out_gain.said(

@@ -9,13 +9,13 @@ import torch
 from mkc_torch import Recording
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.grid import candidate_terms
-from mkc_torch.diagnosis.model.in_the_world import at_liberty, between_samples, simulation_in_the_world
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.process_noise import choose_input_hold, fit_baseline, open_loop
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.simulation import Dynamics, Parameter
-from mkc_torch.simulation.dynamics.disturbances import observer_of
 from mkc_torch.simulation.dynamics.first_fit import strong_observer
 from mkc_torch.simulation.dynamics.flow import flow_of
+from mkc_torch.simulation.dynamics.noise_selection import observer_of
 from mkc_torch.simulation.dynamics.observer import Disturbance
 
 STEP, FINE, NOISE = 0.05, 4, 0.004
@@ -29,7 +29,7 @@ class Pendulum(Dynamics):
     outputs = ("angle",)
     units = {"angle": "rad", "rate": "rad/s"}  # noqa: RUF012
     parameters = {"stiffness": Parameter(7.0, lower=0.0), "damping": Parameter(0.3, lower=0.0)}  # noqa: RUF012
-    between = "held"
+    input_hold = "held"
 
     def derivative(self, time, x, u, p):  # noqa: ARG002
         return {"angle": x.rate, "rate": u.torque - p.stiffness * torch.sin(x.angle) - p.damping * x.rate}
@@ -92,8 +92,8 @@ def swung(push="none", seed=0, N=500, drag=0.0, effect=1.0, late=0):
 def in_the_world(recording, system=Pendulum):
     """A simulation alone, fitted under the likeliest noise of the world."""
     prepared = system().prepare(recording).holding({"torque": "held"})
-    world = simulation_in_the_world(prepared, {}, NoiseSettings())
-    return between_samples(world, {}, {"torque": "held"}, NoiseSettings())
+    world = fit_baseline(prepared, {}, NoiseSettings())
+    return choose_input_hold(world, {}, {"torque": "held"}, NoiseSettings())
 
 
 @functools.cache
@@ -121,4 +121,4 @@ def at_the_truth(push="white", seed=0):
 
 def candidates(fit, effects):
     """Terms for a search beside a fit."""
-    return candidate_terms(at_liberty(fit.model.prepared), (), effects)
+    return candidate_terms(open_loop(fit.model.prepared), (), effects)

@@ -24,7 +24,7 @@ def diagnosed(recording, simulation, between=None):
     path, (file, name) = shared_case(recording), simulation.split(":")
     system = load_simulation(f"{shared_case(file)}:{name}")
     if between is not None:
-        system.between = between
+        system.input_hold = between
     return diagnose(system, Recording.read(path))
 
 
@@ -61,7 +61,7 @@ def confirmed(diagnosis):
 def test_what_an_input_does_between_samples_is_found_whatever_the_simulation_says_and_is_no_physics(name, between):
     diagnosis = pendulum(name, between)
     assert (diagnosis.verdict, diagnosis.findings, diagnosis.world.pushes) == ("adequate", (), ())
-    assert diagnosis.world.between == {INPUT: name.removesuffix("_input")}
+    assert diagnosis.world.input_hold == {INPUT: name.removesuffix("_input")}
     (angle,) = diagnosis.world.follows
     assert angle.residual == pytest.approx(0.005, rel=0.1)
 

@@ -8,8 +8,8 @@ import torch
 
 from mkc_torch import diagnose
 from mkc_torch.diagnosis import DiagnosedModel
-from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
-from mkc_torch.diagnosis.files.model import ModelFileError
+from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
+from mkc_torch.diagnosis.io.model import ModelFileError
 from mkc_torch.effects import GainEffect
 from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
 from mkc_torch.recording.recording import MissingColumnError, Recording

@@ -109,7 +109,7 @@ class Tanks(Dynamics):
     inputs = ("pump",)
     parameters = {"inflow": Parameter(1.0, lower=0.0), "drain": Parameter(0.3, lower=0.0)}  # noqa: RUF012
     units = {"upper": "m", "lower": "m"}  # noqa: RUF012
-    between = "held"
+    input_hold = "held"
 
     def derivative(self, time, x, u, p):  # noqa: ARG002
         return {"upper": p.inflow * u.pump - p.drain * x.upper, "lower": -p.drain * x.lower}
@@ -299,7 +299,7 @@ def test_water_that_carries_leads_the_search_of_all_effects():
     base = fitted(JointModel(simulation), simulation.start())
     terms = candidate_terms(simulation, (), DYNAMICS)
     tangents = tangents_of(base.model, base.parameters, NoiseSettings(), terms)
-    search = linearise(base.model, base.parameters, *base.pseudo(NoiseSettings()), tangents, white=True, wander=False)
+    search = linearise(base.model, base.parameters, *base.pseudo(NoiseSettings()), tangents, white=True, drift=False)
     order = search.search.gains(search.series.unsqueeze(-1)).log_p[:, 0].argsort().tolist()
     assert terms[order[0]].effect.id == "buoyancy"
     lift, _ = search.search.estimate(order[0], search.series)

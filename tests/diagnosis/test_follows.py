@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mkc_torch import Recording, diagnose
-from mkc_torch.diagnosis.follows import follows_of, misses, pooled, size_of
+from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit, pooled, poor_fits, size_of
 from mkc_torch.simulation import Magnetometer, Static
 from mkc_torch.simulation.protocol import Port
 from tests.diagnosis.factory import make_follows
@@ -26,7 +26,7 @@ def simulating(measured, channels=("angle",), unit="rad"):
 
 
 def followed(measured, residual, declared=None, floor=None, **more):
-    return follows_of(simulating(measured, **more), residual, declared or {}, floor)
+    return goodness_of_fit(simulating(measured, **more), residual, declared or {}, floor)
 
 
 def test_the_size_of_normal_noise_is_its_standard_deviation():
@@ -66,12 +66,12 @@ def test_each_output_has_sizes_of_its_own_and_its_unit():
     port = Port(("angle", "speed"), "", carries=("angle", "speed"), parts={k: k for k in parts}, part_units=parts)
     prepared = simulating(torch.cat([WAVE, 100.0 * WAVE], -1), ("angle", "speed"), "")
     prepared.ports = {"output": port}
-    one, other = follows_of(prepared, torch.cat([0.7 * WAVE, 10.0 * WAVE], -1), {}, None)
+    one, other = goodness_of_fit(prepared, torch.cat([0.7 * WAVE, 10.0 * WAVE], -1), {}, None)
     assert (one.output, one.unit, other.output, other.unit) == ("angle", "rad", "speed", "rad/s")
     assert one.explained == pytest.approx(0.51, abs=0.01)
     assert other.explained == pytest.approx(0.99, abs=0.01)
     assert other.residual == pytest.approx(10.0 * 0.5**0.5, rel=0.02)
-    assert misses((one, other), 0.6) == (one,)
+    assert poor_fits((one, other), 0.6) == (one,)
 
 
 def test_the_floor_is_what_is_new_from_sample_to_sample():
@@ -137,14 +137,14 @@ def test_of_a_length_varies_what_scattered_readings_would_leave():
 
 
 def test_a_simulation_without_a_recording_of_its_outputs_is_told_nothing_of():
-    assert follows_of(SimpleNamespace(channels=("gap",), unit="", ports={}), randn(N, 1), {}, None) == ()
+    assert goodness_of_fit(SimpleNamespace(channels=("gap",), unit="", ports={}), randn(N, 1), {}, None) == ()
     assert followed(randn(N, 3), randn(N, 2), channels=("a", "b")) == ()
 
 
 def test_an_output_of_unknown_share_is_missed():
     known = make_follows(explained=0.95)
-    assert misses((known, make_follows(explained=torch.nan)), 0.5)[0] is not known
-    assert misses((known,), 0.95) == ()
+    assert poor_fits((known, make_follows(explained=torch.nan)), 0.5)[0] is not known
+    assert poor_fits((known,), 0.95) == ()
 
 
 def test_a_floor_is_never_below_the_quantum_of_the_numbers_of_the_file():

@@ -12,7 +12,7 @@ from mkc_torch.effects import CATALOGUE
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation import Dynamics
 
-rounds = importlib.import_module("mkc_torch.diagnosis.rounds")
+rounds = importlib.import_module("mkc_torch.diagnosis.stepwise")
 
 
 ANYWAY = replace(Settings(), evidence=replace(Settings().evidence, followed=0.0))

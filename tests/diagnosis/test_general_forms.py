@@ -20,7 +20,7 @@ class Body(Dynamics):
     inputs = ("power", "room")
     parameters = {"capacity": Parameter(40.0, lower=1.0), "loss": Parameter(0.4, lower=0.0)}  # noqa: RUF012
     units = {"temp": "°C"}  # noqa: RUF012
-    between = "held"
+    input_hold = "held"
 
     def derivative(self, time, x, u, p):  # noqa: ARG002
         return {"temp": (u.power - p.loss * (x.temp - u.room)) / p.capacity}

@@ -11,7 +11,7 @@ from mkc_torch import diagnose
 from mkc_torch._parallel import deadline
 from mkc_torch._parallel.deadline import Stopped
 from mkc_torch._parallel.pool import allow_copies
-from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
+from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
 from mkc_torch.diagnosis.search.quick import pays, price
 from mkc_torch.diagnosis.stop import Stop, notices
 from mkc_torch.recording.demonstration import concealed_recording
@@ -124,8 +124,8 @@ def test_a_quick_look_finds_the_same_without_draws_and_says_so(monkeypatch, case
     def none(*_, **__):
         raise AssertionError("noise was drawn")
 
-    monkeypatch.setattr("mkc_torch.diagnosis.search.locate.judged", none)
-    monkeypatch.setattr("mkc_torch.diagnosis.search.first_look.judged", none)
+    monkeypatch.setattr("mkc_torch.diagnosis.search.run.judged", none)
+    monkeypatch.setattr("mkc_torch.diagnosis.search.screening.judged", none)
     monkeypatch.setattr("mkc_torch.diagnosis.search.joint_likelihood._drawn", none)
     result = diagnose(*case(), quick=True)
     (finding,) = result.findings

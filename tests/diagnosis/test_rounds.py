@@ -10,7 +10,7 @@ from mkc_torch.diagnosis.evidence.held_out import blocks_of
 from mkc_torch.diagnosis.noise.innovations import innovation_gain
 from mkc_torch.diagnosis.settings import ConfirmationSettings
 
-holds = importlib.import_module("mkc_torch.diagnosis.rounds")._holds
+holds = importlib.import_module("mkc_torch.diagnosis.stepwise")._holds
 N = 2000
 BLOCKS = blocks_of(N, 1, ConfirmationSettings())
 
@@ -57,11 +57,11 @@ def test_blocks_only_veto_where_noise_and_physics_were_chosen_together(mean, cou
 def walks(step):
     """Evidence a little against it, and a residual that wanders, with a fast course and without."""
     draws = torch.randn(N, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    wander = draws[:, 0].cumsum(0) + 0.1 * draws[:, 1]
+    drift = draws[:, 0].cumsum(0) + 0.1 * draws[:, 1]
     course = step * torch.sin(torch.arange(N, dtype=torch.float64))
     below = torch.full((N,), -0.01, dtype=torch.float64)
-    before = SimpleNamespace(log_likelihood=torch.zeros_like(below), residual=(wander + course).unsqueeze(-1))
-    return before, SimpleNamespace(log_likelihood=below, residual=wander.unsqueeze(-1))
+    before = SimpleNamespace(log_likelihood=torch.zeros_like(below), residual=(drift + course).unsqueeze(-1))
+    return before, SimpleNamespace(log_likelihood=below, residual=drift.unsqueeze(-1))
 
 
 def test_what_is_plain_beside_a_wander_counts_though_blocks_see_the_wander_alone():

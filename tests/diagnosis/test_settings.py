@@ -31,7 +31,7 @@ from tests.simulation.tumbling import tumbling
 ROOT = Path(mkc_torch.diagnosis.__file__).parent
 SOURCES = sorted(ROOT.rglob("*.py"))
 STAGES = [field.default.__class__ for field in fields(Settings)]
-holds = importlib.import_module("mkc_torch.diagnosis.rounds")._holds
+holds = importlib.import_module("mkc_torch.diagnosis.stepwise")._holds
 
 
 def is_number(node):
@@ -153,7 +153,7 @@ def test_rivals_nearer_than_asked_for_are_inseparable(usual):
     far = 2.0 * usual.findings[0].alternatives[0].log_likelihood_gap
     (finding,) = diagnosis(Settings(naming=NamingSettings(separable=far))).findings
     assert (finding.effect, finding.alternatives[0].separable) == ("current_field", False)
-    assert finding.alternatives[0].told_by
+    assert finding.alternatives[0].distinguishing_state
 
 
 @pytest.mark.e2e

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from mkc_torch import Recording, diagnose
-from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
+from mkc_torch.diagnosis.environment import Run
 from mkc_torch.diagnosis.findings.recordings import runs_of
+from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
 from mkc_torch.diagnosis.joined import joined, with_own_offsets
-from mkc_torch.diagnosis.world import Run
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.recording.recording import RecordingError
 from mkc_torch.report.diagnosis.findings import shares_of_runs

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.settings import EvidenceSettings
-from mkc_torch.diagnosis.verdict import Around, verdict_of
-from mkc_torch.simulation.dynamics.disturbances import Disturbed
-from mkc_torch.simulation.dynamics.noise import NoiseOfTheWorld
+from mkc_torch.diagnosis.verdict import FitAssessment, verdict_of
+from mkc_torch.simulation.dynamics.noise import StateSpaceNoise
+from mkc_torch.simulation.dynamics.noise_selection import SelectedNoise
 from mkc_torch.simulation.dynamics.observer import Disturbance
 from tests.diagnosis.factory import make_follows
 
@@ -19,14 +19,14 @@ FIRST, SMALL = SimpleNamespace(grade="left out"), SimpleNamespace(grade="real bu
 
 
 def noise(*pushes):
-    return NoiseOfTheWorld(Disturbed(pushes, (), (), torch.tensor([0.005]).double(), 0.0, (False,)), None)
+    return StateSpaceNoise(SelectedNoise(pushes, (), (), torch.tensor([0.005]).double(), 0.0, (False,)), None)
 
 
 PUSHED = noise(Disturbance("rate", True, 1.0, 0.3))
 
 
 def around(*follows, corrected=(), noise=None):
-    return Around(follows, corrected, noise)
+    return FitAssessment(follows, corrected, noise)
 
 
 def verdict(known, *findings, structure=False, white=True, **settings):

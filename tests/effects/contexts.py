@@ -5,7 +5,7 @@ import torch
 from mkc_torch.effects import DYNAMICS, PAIRED, Context
 from mkc_torch.effects.paired.alike import SEVERAL
 from mkc_torch.simulation.outputs import ALL, output_ports
-from mkc_torch.simulation.protocol import Sizes
+from mkc_torch.simulation.protocol import SignalSizes
 
 UNITS = {"temperature": ("°C",), "current": ("A",), "position": ("m", "m", "m"), "any": ("V",), "spin": ("rad/s",)}
 
@@ -89,7 +89,7 @@ def within(effect, shape, context):
     for name, (part, which) in effect.relative.items():
         if which in ("lowest", "highest"):
             values = context.part("own") - context.part(part) if part == "surroundings" else context.part(part)
-            shape[name] *= getattr(Sizes.of(values), which)
+            shape[name] *= getattr(SignalSizes.of(values), which)
     return shape
 
 

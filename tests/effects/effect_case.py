@@ -13,7 +13,7 @@ import torch
 from mkc_torch.effects import Effect, beyond, curve_within, lagged, played, shifted, soft_clip
 from mkc_torch.effects.courses import gained
 from mkc_torch.simulation.dynamics.ports import memory_at
-from mkc_torch.simulation.protocol import Sizes
+from mkc_torch.simulation.protocol import SignalSizes
 from tests.effects.contexts import contexts_of, kinds_of_shapes, size_of
 
 BENT = ("delay", "clock_drift", "backlash")
@@ -36,7 +36,7 @@ def cases(effects):
     for effect in effects:
         for place, context in enumerate(contexts_of(effect)):
             for k, shape in enumerate(kinds_of_shapes(effect, context)):
-                yield pytest.param(effect, shape, context, id=f"{type(effect).__name__}-{effect.along}-{place}-{k}")
+                yield pytest.param(effect, shape, context, id=f"{type(effect).__name__}-{effect.plot_axis}-{place}-{k}")
 
 
 def asked_of(cases):
@@ -91,25 +91,25 @@ class OfEveryEffect:
         assert effect.plausible > 0.0
 
     def test_its_name_in_words_is_a_name(self, effect):
-        assert effect.words.strip() == effect.words != ""
-        assert "_" not in effect.words
+        assert effect.display_name.strip() == effect.display_name != ""
+        assert "_" not in effect.display_name
 
     def test_what_another_recording_shows_is_a_clause(self, effect):
-        assert effect.again == "" or (effect.again[0].islower() and not effect.again.endswith("."))
+        assert effect.recurrence == "" or (effect.recurrence[0].islower() and not effect.recurrence.endswith("."))
 
     def test_its_bounds_hold_nothing(self, effect):
-        assert effect.least < effect.most
-        assert effect.least <= 0.0 <= effect.most
-        assert effect.one_sided == (effect.least == 0.0)
+        assert effect.lower < effect.upper
+        assert effect.lower <= 0.0 <= effect.upper
+        assert effect.one_sided == (effect.lower == 0.0)
 
     def test_what_it_says_of_its_shapes_is_of_its_shapes(self, effect):
         # of a recording of one second, shares of its length are times
         shapes = effect.shapes(torch.linspace(0.0, 1.0, 100).double())
         assert shapes
         numbers = {name for shape in shapes for name in shape}
-        for said in (effect.relative, effect.continuous, effect.fitted_shape, effect.choices):
+        for said in (effect.relative, effect.continuous, effect.fitted_shape, effect.form_parameters):
             assert set(said) <= numbers
-        assert all(which in Sizes._fields for _, which in effect.relative.values())
+        assert all(which in SignalSizes._fields for _, which in effect.relative.values())
         assert all(low < high for low, high in effect.continuous.values())
         for name, (low, high) in effect.fitted_shape.items():
             grid = [shape[name] for shape in shapes]
@@ -122,7 +122,7 @@ class OfEveryEffect:
         if simpler is None:
             assert type(effect).simpler is Effect.simpler
             return
-        assert (simpler.id, simpler.words, simpler.port) == (effect.id, effect.words, effect.port)
+        assert (simpler.id, simpler.display_name, simpler.port) == (effect.id, effect.display_name, effect.port)
         for context in contexts_of(effect):
             assert simpler.shapes(context.time) == effect.shapes(context.time)
             for shape in effect.shapes(context.time):
@@ -219,7 +219,7 @@ class OfEveryShape:
         told = effect.equation_of(shape, context)
         assert told.startswith(effect.equation.partition("=")[0])
         assert not any(word in told for word in ("terms", "degree", "radius", "power", "order", "width =", "nan"))
-        assert all(effect.reports(name) == (name not in effect.choices) for name in shape)
+        assert all(effect.reports(name) == (name not in effect.form_parameters) for name in shape)
 
     def test_its_moments_ascend_within_the_recording(self, effect, shape, context):  # noqa: ARG002
         moments = effect.moments(context)
@@ -228,8 +228,8 @@ class OfEveryShape:
         assert bool(moments) == (type(effect).moments is not Effect.moments)
 
     def test_its_shape_is_anchored_once(self, effect, shape, context):
-        anchored = effect.anchored(shape, context)
-        assert effect.anchored(anchored, context) == anchored
+        anchored = effect.bind(shape, context)
+        assert effect.bind(anchored, context) == anchored
         assert anchored.items() >= shape.items()
         gamma = random_gammas(1, size_of(effect, shape, context))[0]
         torch.testing.assert_close(effect.change(gamma, anchored, context), effect.change(gamma, shape, context))
@@ -243,11 +243,11 @@ class OfEveryShape:
             with pytest.raises(NotImplementedError, match="`basis`"):
                 effect.basis(shape, context)
         if effect.has_course:
-            assert torch.equal(gained(effect.course(shape, context), gamma), change)
+            assert torch.equal(gained(effect.waveform(shape, context), gamma), change)
 
     def test_what_lasts_is_nothing_without_an_amplitude(self, effect, shape, context):
         gamma = random_gammas(1, size_of(effect, shape, context))[0]
-        if not effect.lasts:
+        if not effect.persistent_change:
             with pytest.raises(NotImplementedError, match="`lasting`"):
                 effect.lasting(gamma, context)
             return

@@ -49,7 +49,7 @@ DRIFTS = DRIFT.shapes(TIME)
 
 @pytest.mark.parametrize("shape", DRIFTS, ids=str)
 def test_a_drift_runs_once_from_nothing_to_all(shape):
-    course = DRIFT.course(shape, timed())
+    course = DRIFT.waveform(shape, timed())
     assert float(course[0]) == pytest.approx(0.0, abs=1e-12)
     assert float(course[-1]) == pytest.approx(1.0, abs=1e-12)
     assert bool((course.diff() >= 0).all())
@@ -66,8 +66,8 @@ def test_drifts_are_those_of_their_formulas():
     shapes = [{}, {"power": 0.5}, {"time_constant": 9.0}]
     for shape in shapes:
         assert shape in [{k: pytest.approx(v) for k, v in s.items()} for s in DRIFTS]
-        np.testing.assert_allclose(DRIFT.course(shape, timed()), expected[tuple(shape)], atol=1e-12)
-    middle = DRIFT.course({"middle": 45.0, "width": 4.5}, timed())
+        np.testing.assert_allclose(DRIFT.waveform(shape, timed()), expected[tuple(shape)], atol=1e-12)
+    middle = DRIFT.waveform({"middle": 45.0, "width": 4.5}, timed())
     assert float(middle[450]) == pytest.approx(0.5, abs=1e-9)
     logistic = 1.0 / (1.0 + np.exp(-(t - 45.0) / 4.5))
     np.testing.assert_allclose(np.corrcoef(middle, logistic)[0, 1], 1.0, rtol=1e-12)
@@ -100,13 +100,13 @@ def test_a_temperature_can_be_lagged_and_bent():
     context = driven([0.0, 10.0, 10.0, -5.0], "°C")
     shapes = TEMPERATURE.shapes(context.time)
     assert [dict(s) for s in shapes] == [{}, {"lag": 1.0}, {"lag": 5.0}, {"curvature": 0.02}, {"curvature": -0.02}]
-    bent = TEMPERATURE.course({"curvature": 0.02}, context)
+    bent = TEMPERATURE.waveform({"curvature": 0.02}, context)
     np.testing.assert_allclose(bent, [0.0, 12.0, 12.0, -4.5])
     a = np.exp(-0.1)  # of samples 0.1 s apart, between which the temperature goes straight
     first = 10.0 * (1.0 - (1.0 - a) / 0.1)
     second = a * first + 10.0 * (1.0 - a)
     third = a * second + 10.0 * ((1.0 - a) / 0.1 - a) - 5.0 * (1.0 - (1.0 - a) / 0.1)
-    np.testing.assert_allclose(TEMPERATURE.course({"lag": 1.0}, context), [0.0, first, second, third])
+    np.testing.assert_allclose(TEMPERATURE.waveform({"lag": 1.0}, context), [0.0, first, second, third])
 
 
 def test_the_cubic_bends_each_axis_by_its_own_field():
@@ -132,7 +132,7 @@ def test_a_curve_is_a_legendre_series_in_its_own_range():
 def test_a_curve_keeps_its_range_on_another_recording():
     context = driven(np.linspace(-3.0, 5.0, 41), "V")
     gamma = torch.arange(9, dtype=torch.float64) - 4.0
-    shape = UNKNOWN.anchored({}, context)
+    shape = UNKNOWN.bind({}, context)
     assert shape == {"low": -3.0, "high": 5.0}
     original = UNKNOWN.change(gamma, {}, context)
     other = UNKNOWN.change(gamma, shape, driven([-9.0, -3.0, 1.0, 5.0, 9.0], "V"))

@@ -36,7 +36,7 @@ class SupplyOffset(GainEffect):
     plausible = 1.0
     source = "our bench"
 
-    def course(self, shape, context):  # noqa: ARG002
+    def waveform(self, shape, context):  # noqa: ARG002
         return context.drivers[:, 0]
 
 
@@ -60,7 +60,7 @@ class Square(Effect):
 ALL = (*CATALOGUE, SupplyOffset(), Square())
 
 
-@asked_of(lambda: [pytest.param(effect, id=f"{type(effect).__name__}-{effect.along}") for effect in ALL])
+@asked_of(lambda: [pytest.param(effect, id=f"{type(effect).__name__}-{effect.plot_axis}") for effect in ALL])
 class TestEveryEffect(OfEveryEffect):
     pass
 
@@ -117,14 +117,14 @@ def test_ids_are_the_contract():
 
 
 def test_what_effects_can_do_beside():
-    assert {e.id for e in CATALOGUE if e.lasts} == {"hard_iron_step", "offset_drift"}
-    assert {e.id for e in CATALOGUE if type(e).anchored is not Effect.anchored} == {"unknown"}
+    assert {e.id for e in CATALOGUE if e.persistent_change} == {"hard_iron_step", "offset_drift"}
+    assert {e.id for e in CATALOGUE if type(e).bind is not Effect.bind} == {"unknown"}
     assert {type(e) for e in CATALOGUE if e.has_basis} == {FieldGradient, MagneticPole}
     assert {e.id for e in CATALOGUE if e.has_code} == {e.id for e in DYNAMICS} | {"output_saturation"}
     assert {e.id for e in CATALOGUE if e.simpler} == {"coupling", "sensor_lag", "delay"}
     assert {e.id: e.reduces_to.id for e in CATALOGUE if e.reduces_to} == {"stribeck_friction": "coulomb_friction"}
     assert {e.id for e in CATALOGUE if e.is_curve} == {"unknown"}
-    assert {e.id for e in CATALOGUE if e.general} == {
+    assert {e.id for e in CATALOGUE if e.is_generalisation} == {
         "power_law", "hidden_lag", "hidden_mode", "gravity_sag", "driver_linear", "driver_quadratic",
     }  # fmt: skip
     assert {e.id for e in SENSOR if e.continuous} == {"hard_iron_step", "offset_drift", "temperature_offset"}
@@ -132,19 +132,19 @@ def test_what_effects_can_do_beside():
 
 
 def test_what_belongs_to_a_place_or_an_attitude_says_so():
-    assert {e.id for e in CATALOGUE if e.placed} == {"field_gradient", "heading_reset"}
-    assert {e.port for e in CATALOGUE if e.placed} == {"field", "heading"}
+    assert {e.id for e in CATALOGUE if e.location_specific} == {"field_gradient", "heading_reset"}
+    assert {e.port for e in CATALOGUE if e.location_specific} == {"field", "heading"}
 
 
 def test_names_in_words_are_one_for_each_id():
-    words = {effect.id: {e.words for e in CATALOGUE if e.id == effect.id} for effect in CATALOGUE}
+    words = {effect.id: {e.display_name for e in CATALOGUE if e.id == effect.id} for effect in CATALOGUE}
     assert all(len(told) == 1 for told in words.values())
     assert len({told for each in words.values() for told in each}) == len(words)
     assert all({words_of(effect_id)} == told for effect_id, told in words.items())
     assert words_of("bouc_wen_hysteresis") == "Bouc Wen hysteresis"
     assert words_of("driver_linear") == "linear dependence"
     assert words_of("temperature_offset") == "temperature offset"
-    assert words_of("supply_offset") == SupplyOffset().words == "supply offset"
+    assert words_of("supply_offset") == SupplyOffset().display_name == "supply offset"
 
 
 def test_an_id_says_whether_it_is_a_curve():
@@ -162,7 +162,7 @@ def test_an_effect_has_to_say_what_it_changes():
     class Empty(GainEffect):
         id = "empty"
 
-    with pytest.raises(NotImplementedError, match="the effect empty to have a method `course`; give it one"):
+    with pytest.raises(NotImplementedError, match="the effect empty to have a method `waveform`; give it one"):
         Empty().change(torch.ones(3, dtype=torch.float64), {}, make_context(Empty()))
 
     class Silent(Effect):

@@ -125,7 +125,7 @@ def test_an_excess_says_what_it_is_counted_from():
     signal = context.signal.clone()
     signal[:, context.carries.index("x")] = largest
     torch.testing.assert_close(
-        effect.course(shape, replace(context, signal=signal)), -torch.ones_like(largest), rtol=1e-5, atol=0
+        effect.waveform(shape, replace(context, signal=signal)), -torch.ones_like(largest), rtol=1e-5, atol=0
     )
 
 

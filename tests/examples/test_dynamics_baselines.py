@@ -97,7 +97,7 @@ def test_windows_share_their_edges_and_end_with_their_run(load):
 @pytest.mark.parametrize("between", ["held", "linear", "smooth"])
 def test_inputs_between_samples(load, between):
     system = load("systems").Silverbox()
-    system.between = between
+    system.input_hold = between
     time = torch.arange(0.0, 4.0, 0.2, dtype=torch.float64)
     found = load("free_run").stations(system, Recording({"time": time, "input": time**2}), 2)
     assert found.shape == (19, 5, 1)

@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from mkc_torch._support.files import write_atomically
+from mkc_torch.challenge.dynamics.scenarios import dynamics_worlds
 from mkc_torch.challenge.dynamics.subject import dynamics, simulation_class
-from mkc_torch.challenge.dynamics.worlds import dynamics_worlds
 from mkc_torch.challenge.key import Key
+from mkc_torch.challenge.magnetometer.scenarios import magnetometer_worlds
 from mkc_torch.challenge.magnetometer.subject import magnetometer
-from mkc_torch.challenge.magnetometer.worlds import magnetometer_worlds
 from mkc_torch.challenge.pool import Pool, every, silent
+from mkc_torch.challenge.scenario import ScenarioCase, ScenarioKey, Scenarios
+from mkc_torch.challenge.scenarios.score import score_worlds
 from mkc_torch.challenge.score import score
 from mkc_torch.challenge.subject import Case
-from mkc_torch.challenge.world import WorldCase, WorldKey, Worlds
-from mkc_torch.challenge.worlds.score import score_worlds
 from mkc_torch.cli.diagnosis_request import MAGNETOMETER, Request
 from mkc_torch.recording.recording import write_table
 from tests.gate.work import Job
@@ -57,7 +57,7 @@ class _Address:
     """A recording to be drawn: its name in the run, and the function that draws it."""
 
     name: str
-    draw: Callable[[], Case | WorldCase]
+    draw: Callable[[], Case | ScenarioCase]
     simulation: str = ""
 
 
@@ -99,15 +99,15 @@ def _written(addresses: Sequence[_Address], folder: Path, workers: int) -> tuple
     return [job for job, _ in drawn], {job.name: key for job, key in drawn}
 
 
-def _write(folder: Path, address: _Address) -> tuple[Job, Key | WorldKey]:
+def _write(folder: Path, address: _Address) -> tuple[Job, Key | ScenarioKey]:
     case = address.draw()
     recording = folder / f"{case.key.name}.csv"
     write_table(recording, case.recording.columns, overwrite=True)
-    simulation = case.simulation if isinstance(case, WorldCase) else address.simulation
+    simulation = case.simulation if isinstance(case, ScenarioCase) else address.simulation
     return Job(address.name, recording, _request(recording, simulation)), case.key
 
 
-def _of_worlds(family: Worlds, jobs: Sequence[Job], keys: Mapping[str, WorldKey]) -> Drawn:
+def _of_worlds(family: Scenarios, jobs: Sequence[Job], keys: Mapping[str, ScenarioKey]) -> Drawn:
     def scored(rows: Rows) -> Any:
         return score_worlds(family, list(keys.values()), _by_key(rows, {n: key.name for n, key in keys.items()}))
 
@@ -187,5 +187,5 @@ def _truth(key: Key) -> dict[str, Any]:
     return {"kind": key.kind, "hidden": effects}
 
 
-def _pushed(key: WorldKey) -> dict[str, Any]:
+def _pushed(key: ScenarioKey) -> dict[str, Any]:
     return {"push": asdict(key.push) if key.push else None, "useless": key.useless}

@@ -21,7 +21,7 @@ from mkc_torch.challenge import draws
 from mkc_torch.challenge.dynamics.generator import SYSTEMS, System, case_of
 from mkc_torch.challenge.dynamics.integrate import simulate
 from mkc_torch.challenge.dynamics.oracle import can_be_named, names
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.scene import SystemScene
 from mkc_torch.challenge.dynamics.subject import dynamics
 from mkc_torch.challenge.key import Key
 from mkc_torch.challenge.pool import content_of
@@ -61,7 +61,7 @@ def strong_cases(effect: str, seed: int, most: int) -> Iterator[Case]:
 def _hiding(effect: str, system: System, stream: Callable[[str], Generator]) -> System | None:
     """The system with nothing else to hide; None where it does not have the effect, or does not show it."""
     setting = system.draw(stream("setting"))
-    scene = Scene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
+    scene = SystemScene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
     having = [draw for draw in system.inside if draw(stream("effect"), scene).effect == effect]
     if having:
         known = names(scene)

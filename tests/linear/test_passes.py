@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from mkc_torch.linear._blocks import Block, triangle
-from mkc_torch.linear._implicit.at_rest import Point, Rest
-from mkc_torch.linear._passes import Place, _newton_move
+from mkc_torch.linear._implicit.stationary import FlatStationaryPoint, StationaryPoint
+from mkc_torch.linear._passes import EvaluatedPoint, _newton_move
 
 GRADIENTS = {
     "inside": [1.0, 0.1, -0.3],
@@ -24,8 +24,8 @@ def double(*values: float) -> torch.Tensor:
 @pytest.mark.parametrize("gradient", GRADIENTS.values(), ids=GRADIENTS)
 def test_a_step_is_newtons_in_the_unknowns_that_no_limit_stops(gradient):
     """κ = 0.5 may fall to 0, log d = 0 to -1 and rise to 2."""
-    point = Point(double(3.0), double(0.5), double(0.0))
-    rest = Rest(
+    point = FlatStationaryPoint(double(3.0), double(0.5), double(0.0))
+    rest = StationaryPoint(
         point.beta,
         point.kappa,
         point.log_d,
@@ -37,7 +37,7 @@ def test_a_step_is_newtons_in_the_unknowns_that_no_limit_stops(gradient):
     )
     slope = double(*gradient)
     hessian = torch.tensor([[[2.0, 0.5, 0.3], [0.5, 1.0, 0.2], [0.3, 0.2, 1.0]]], dtype=torch.float64)
-    move = _newton_move(rest, Place(point, 0.0, torch.tensor(0.0), slope, hessian, None))
+    move = _newton_move(rest, EvaluatedPoint(point, 0.0, torch.tensor(0.0), slope, hessian, None))
     low, high = double(-torch.inf, -0.5, -1.0), double(torch.inf, 399.5, 2.0)
     assert bool(((move >= low) & (move <= high)).all())
     stopped = (move == low) | (move == high)

@@ -11,10 +11,10 @@ from torch.utils.data import DataLoader, TensorDataset
 
 from mkc_torch.linear import MKCRegression, NotFittedError, RankDeficientError
 from mkc_torch.linear.streaming import StreamChangedError, StreamedMKCRegression, _blocks, from_memmap, regression
-from mkc_torch.linear.streaming._blocks import Block, Shape
+from mkc_torch.linear.streaming._blocks import Shape, StreamBlock
+from mkc_torch.linear.streaming._float32_pass import float32_pass
 from mkc_torch.linear.streaming._reservoir import Reservoir, merged
-from mkc_torch.linear.streaming._rough import rough_pass
-from mkc_torch.linear.streaming._sums import Point, Slopes, slopes_pass
+from mkc_torch.linear.streaming._sums import StreamPoint, StreamSums, slopes_pass
 
 
 def problem(
@@ -153,9 +153,9 @@ def test_a_pass_in_float32_is_good_to_six_digits(weighted):
     X, Y = problem(0, N=2000, m=2)
     arrays = [t.float() for t in (X, Y, *([torch.rand(2000).double()] if weighted else []))]
     shape = Shape(2, 3, False, weighted)
-    point = Point(np.array([1.1, 0.9, 1.0]), np.array([0.2, 0.3]), np.array([0.6, 0.5]))
-    rough = Slopes.of(rough_pass(cut(*arrays, rows=300), shape, point), shape)
-    exact = Slopes.of(slopes_pass(cut(*arrays), shape, point, curvature=False), shape)
+    point = StreamPoint(np.array([1.1, 0.9, 1.0]), np.array([0.2, 0.3]), np.array([0.6, 0.5]))
+    rough = StreamSums.of(float32_pass(cut(*arrays, rows=300), shape, point), shape)
+    exact = StreamSums.of(slopes_pass(cut(*arrays), shape, point, curvature=False), shape)
     assert rough.rows == exact.rows
     for name in ("residual", "energy", "first", "qw", "score"):
         one, other = getattr(rough, name), getattr(exact, name)
@@ -165,7 +165,7 @@ def test_a_pass_in_float32_is_good_to_six_digits(weighted):
 def test_the_first_steps_of_float32_data_are_made_in_float32(monkeypatch):
     X, Y = (t.float() for t in problem(1, N=6000))
     calls = []
-    monkeypatch.setattr(regression, "rough_pass", lambda *given: calls.append(given) or rough_pass(*given))
+    monkeypatch.setattr(regression, "rough_pass", lambda *given: calls.append(given) or float32_pass(*given))
     fit = StreamedMKCRegression(pilot=1000).fit(cut(X, Y, rows=1000))
     assert calls
     assert_same(fit, in_memory(X.double(), Y.double(), bound=fit.bound_))
@@ -211,7 +211,7 @@ def test_every_row_of_a_reservoir_is_as_likely():
     for seed in range(500):
         sample = Reservoir(10, seed)
         for part in np.split(rows, [3, 25]):
-            sample.add(Block(np.stack([part, part])[None], None))
+            sample.add(StreamBlock(np.stack([part, part])[None], None))
         drawn = sample.drawn()
         assert (np.diff(drawn.numbers) > 0).all()
         assert (drawn.rows[:, 0] == drawn.numbers).all()
@@ -223,12 +223,12 @@ def test_every_row_of_a_reservoir_is_as_likely():
 def test_samples_of_parts_are_the_sample_of_all():
     rows = np.arange(100.0)
     whole = Reservoir(20, seed=1)
-    whole.add(Block(np.stack([rows, rows])[None], None))
+    whole.add(StreamBlock(np.stack([rows, rows])[None], None))
     parts = []
     for first in (0, 30):
         part = rows[first : 30 if first == 0 else None]
         sample = Reservoir(20, seed=1, first=first)
-        sample.add(Block(np.stack([part, part])[None], None))
+        sample.add(StreamBlock(np.stack([part, part])[None], None))
         parts.append(sample.drawn())
     assert (merged(parts, 20).numbers == whole.drawn().numbers).all()
 

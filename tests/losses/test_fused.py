@@ -8,7 +8,7 @@ import torch
 from mkc_torch.losses import _fused as module
 from mkc_torch.losses._fused import LARGE_BATCH, SMALL_BATCH, fused_loss
 from mkc_torch.losses._parameters import ChannelState
-from mkc_torch.losses._terms import Batch, Settings, loss_value
+from mkc_torch.losses._terms import Batch, LossSettings, loss_value
 
 KAPPA = torch.tensor([0.0, 1e-6, 0.1, 4.0], dtype=torch.float64)
 RAW_KAPPA = torch.tensor([-19.0, -8.0, -3.0, 1.0], dtype=torch.float64)
@@ -38,7 +38,7 @@ def numbers(mode, m=4, dtype=torch.float64, reduction="mean"):
         mode not in ("fixed", "normalised", "d"),
         mode not in ("fixed", "normalised", "sigma", "scale"),
     )
-    settings = Settings(
+    settings = LossSettings(
         fixed_kappa=None if learns_kappa else kappa,
         fixed_d=None if learns_d or follows else d,
         state=state,
@@ -176,8 +176,8 @@ def test_single_precision_keeps_the_gradient_of_large_bandwidths(sigma):
     rows = 20_000 if module.SMALL_STATE else 2000
     raw = torch.logit(torch.tensor([sigma**-2.0 / 400.0], dtype=torch.float64)).float()
     state = ChannelState(bound=torch.tensor([100.0]), floor=torch.tensor([0.001]))
-    error, settings = 1.5 * randn(rows, 1).float(), Settings(None, torch.ones(1), state, False, False, "mean")
-    double = Settings(
+    error, settings = 1.5 * randn(rows, 1).float(), LossSettings(None, torch.ones(1), state, False, False, "mean")
+    double = LossSettings(
         None, torch.ones(1).double(), ChannelState(*(s and s.double() for s in state)), False, False, "mean"
     )
     zeros = torch.zeros_like(error)
@@ -190,7 +190,7 @@ def test_single_precision_keeps_the_gradient_of_large_bandwidths(sigma):
 def gaussian(m=1, reduction="sum", d=1.0):
     """The settings of channels that are Gaussian, in single precision."""
     ones = torch.ones(m)
-    return Settings(0.0 * ones, d * ones, ChannelState(100.0 * ones, 1e-3 * ones), False, False, reduction)
+    return LossSettings(0.0 * ones, d * ones, ChannelState(100.0 * ones, 1e-3 * ones), False, False, reduction)
 
 
 @pytest.mark.usefixtures("arithmetic")
@@ -231,7 +231,9 @@ def test_a_gaussian_channel_is_so_as_far_as_single_precision_holds_the_square(si
 def test_a_square_that_overflows_is_infinite_and_pulls_as_it_should(weighted, learned):
     settings = gaussian()
     raw_d = torch.zeros(1) if learned else None
-    settings = Settings(settings.fixed_kappa, None if learned else torch.ones(1), settings.state, False, False, "sum")
+    settings = LossSettings(
+        settings.fixed_kappa, None if learned else torch.ones(1), settings.state, False, False, "sum"
+    )
     error = torch.tensor([[1e30], [2.0]])
     weight = torch.ones(2, 1) if weighted else None
     value, slope, *_ = differentiated(fused_loss, error, torch.zeros(2, 1), None, raw_d, settings, weight)
@@ -245,7 +247,7 @@ def test_a_square_that_overflows_is_infinite_and_pulls_as_it_should(weighted, le
 def test_an_error_whose_square_overflows_does_not_pull_and_leaves_gradients_finite(size):
     error = torch.tensor([[0.5], [size]])
     state = ChannelState(torch.tensor([2.0]), torch.tensor([0.0]))
-    settings = Settings(None, None, state, False, False, "sum")
+    settings = LossSettings(None, None, state, False, False, "sum")
     raw_kappa, raw_d = torch.logit(torch.tensor([0.1 / 400.0])), torch.zeros(1)
     found = differentiated(fused_loss, error, torch.zeros(2, 1), raw_kappa, raw_d, settings)
     assert found[0].item() == pytest.approx(10.0 * (1.0 - math.exp(-0.0125)) + 10.0, rel=1e-5)

@@ -429,7 +429,7 @@ def test_d_setter_refuses_what_is_no_scale(value):
 @pytest.mark.parametrize("value", [0.01, 0.005, 40.0, 50.0])
 def test_d_setter_refuses_what_is_not_between_its_bounds(value):
     loss = made(bound=40.0, d_min=0.01)
-    with pytest.raises(ValueError, match="Expected `d` between `d_min`"):
+    with pytest.raises(ValueError, match="Expected `d` input_hold `d_min`"):
         loss.d = value
     torch.testing.assert_close(loss.d, torch.tensor(D, dtype=torch.float64))
 

@@ -13,7 +13,7 @@ from scipy.optimize import minimize as scipy_minimize
 from torch import Tensor
 
 from mkc_torch.linear import MKCRegression
-from mkc_torch.nonlinear import GaussianPrior, beside, fit, minimise
+from mkc_torch.nonlinear import GaussianPrior, fit, make_dual, minimise
 
 
 def sample(seed: int, *shape: int) -> Tensor:
@@ -715,9 +715,9 @@ def test_a_narrow_bound_is_refused():
 def test_a_constant_beside_what_moves_keeps_its_value_and_has_no_slope():
     constant = torch.tensor([1.0, torch.inf, -2.0], dtype=torch.float64)
     theta = torch.tensor([3.0, 4.0], dtype=torch.float64)
-    assert beside(constant, theta[0]) is constant
-    value, slope = torch.func.jvp(lambda t: beside(constant, t[0]), (theta,), (torch.ones_like(theta),))
+    assert make_dual(constant, theta[0]) is constant
+    value, slope = torch.func.jvp(lambda t: make_dual(constant, t[0]), (theta,), (torch.ones_like(theta),))
     assert torch.equal(value, constant)
     assert torch.equal(slope, torch.zeros_like(constant))
-    both = torch.func.jacfwd(lambda t: beside(constant, t[0])[[0, 2]] * t)(theta)
+    both = torch.func.jacfwd(lambda t: make_dual(constant, t[0])[[0, 2]] * t)(theta)
     assert torch.equal(both, torch.diag(constant[[0, 2]]))

@@ -5,10 +5,10 @@ import polars as pl
 import pytest
 
 from mkc_torch.recording import formats
-from mkc_torch.recording.beside import interpolated
 from mkc_torch.recording.clock import ClockError, clock_of
 from mkc_torch.recording.column_names import is_about_magnetometer, meaning
 from mkc_torch.recording.formats.base import FileFormat, Table, Topic
+from mkc_torch.recording.join_topics import interpolated
 from mkc_torch.recording.px4 import is_px4_magnetometer
 from mkc_torch.recording.recognise import recognised
 from mkc_torch.recording.recording import MissingColumnError, Recording, RecordingError

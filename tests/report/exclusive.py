@@ -15,10 +15,10 @@ from rich.console import Console
 
 from mkc_torch._words.terms import term
 from mkc_torch.cli.diagnosis_summary import show
-from mkc_torch.diagnosis.findings.worth import carries_over, sizeless, worth_correcting
+from mkc_torch.diagnosis.findings.grading import is_zero_within_error, transfers, worth_correcting
 from mkc_torch.diagnosis.result import Diagnosis, Finding
-from mkc_torch.report.diagnosis.lead import lead
 from mkc_torch.report.diagnosis.page import diagnosis_report
+from mkc_torch.report.diagnosis.summary import summary
 from mkc_torch.report.diagnosis.verdict import headline, to_do, warned
 
 Where = Literal["row", "finding", "report"]
@@ -133,7 +133,7 @@ def _two_residuals(d: Diagnosis) -> bool:
 RULES: dict[str, Rule] = {
     "an interval or onset outside of the recording": _outside,
     "an interval that ends before it begins": lambda d: any(a > b for f in d.findings for a, b in f.intervals),
-    "a claim whose size is 0 within its error": lambda d: any(sizeless(f) for f in _claims(d)),
+    "a claim whose size is 0 within its error": lambda d: any(is_zero_within_error(f) for f in _claims(d)),
     "a claim above the level": lambda d: any(f.p_value > d.level for f in _claims(d)),
     "a claim that is worse in the free run": lambda d: any(
         f.held_out is not None
@@ -165,9 +165,9 @@ RULES: dict[str, Rule] = {
     "reasons why it does not follow where it does": lambda d: d.verdict != "unfit" and bool(d.world.reasons),
     "to be corrected and not to be": _claimed_and_refused,
     "a model to apply that nothing is worth": lambda d: (
-        bool(_advised(d, "The model found here")) and not any(carries_over(f) for f in d.findings)
+        bool(_advised(d, "The model found here")) and not any(transfers(f) for f in d.findings)
     ),
-    "not plausible, and to be corrected": lambda d: any(carries_over(f) and not f.plausible for f in d.findings),
+    "not plausible, and to be corrected": lambda d: any(transfers(f) and not f.plausible for f in d.findings),
     "not to be told apart from itself": lambda d: any(
         (a.effect, a.drivers, a.at) == (f.effect, f.drivers, "") for f in d.findings for a in f.alternatives
     ),
@@ -244,7 +244,7 @@ def terminal_rows(diagnosis: Diagnosis) -> list[str]:
 
 def box_rows(diagnosis: Diagnosis) -> list[str]:
     """The box at the top of a page, with what to do and the warnings."""
-    rows = [headline(diagnosis), *(f"{question} {' '.join(lines)}" for question, lines in lead(diagnosis))]
+    rows = [headline(diagnosis), *(f"{question} {' '.join(lines)}" for question, lines in summary(diagnosis))]
     return [row.replace("`", "") for row in [*rows, *to_do(diagnosis), *warned(diagnosis)]]
 
 

@@ -30,7 +30,7 @@ class Tags(HTMLParser):
 
     def __init__(self):
         super().__init__()
-        self.open, self.ids, self.words = [], [], []
+        self.open, self.ids, self.display_name = [], [], []
 
     def handle_starttag(self, tag, attributes):
         self.ids += [value for name, value in attributes if name == "id"]
@@ -44,7 +44,7 @@ class Tags(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        self.words.append(data)
+        self.display_name.append(data)
 
 
 def parsed(page):
@@ -55,7 +55,7 @@ def parsed(page):
 
 
 def text_of(page):
-    return " ".join(" ".join(parsed(page).words).split())
+    return " ".join(" ".join(parsed(page).display_name).split())
 
 
 @pytest.fixture(scope="module")

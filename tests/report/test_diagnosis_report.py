@@ -9,24 +9,32 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
 from mkc_torch.density import ChannelTails
-from mkc_torch.diagnosis.evidence import density, driver_shift, extrapolation, held_out_gain, onset, remaining, switched
+from mkc_torch.diagnosis.evidence import (
+    density,
+    driver_shift,
+    extrapolation,
+    held_out_gain,
+    intermittency,
+    onset,
+    remaining,
+)
 from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import (
-    Candidate,
+    CandidateScore,
     DensityCheck,
     DriverShift,
+    EffectParameter,
+    EvidenceResult,
     Extrapolation,
     HeldOut,
-    Parameter,
     Region,
     Row,
     Separability,
     SmoothCorrection,
     StateMap,
     Table,
-    Told,
 )
 from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.effects import CATALOGUE
@@ -153,7 +161,7 @@ def test_names_and_texts_from_files_are_escaped_everywhere():
     hostile = dataclasses.replace(
         diagnosis, recording=bad, simulation=bad, warnings=(bad,), advice=(bad,), traces=traces,
         noise=dataclasses.replace(diagnosis.noise, description=bad, parameters={bad: 1.0}),
-        candidates=(Candidate("driver_offset", (bad,), bad, 3.0, 2.4),),
+        candidates=(CandidateScore("driver_offset", (bad,), bad, 3.0, 2.4),),
         separability=Separability((bad,), torch.zeros(1, 1), torch.ones(1)),
     )  # fmt: skip
     first = hostile.findings[0]
@@ -161,7 +169,7 @@ def test_names_and_texts_from_files_are_escaped_everywhere():
     (rival, *_) = first.alternatives
     hostile = first_changed(
         hostile, held_out_gain.said(None, bad),
-        Told("bad", rows=(Row(bad, bad),), table=Table(bad, (bad,), ((bad,),), bad)),
+        EvidenceResult("bad", rows=(Row(bad, bad),), table=Table(bad, (bad,), ((bad,),), bad)),
         drivers=(bad,), channels=(bad,), equation=bad, explanation=bad, plausibility=bad,
         parameters=(dataclasses.replace(parameter, name=bad, unit=bad),),
         alternatives=(dataclasses.replace(rival, drivers=(bad,), separable=False),),
@@ -190,9 +198,9 @@ def test_of_many_candidates_the_best_twelve_are_shown():
 
 
 def test_bars_are_in_proportion_and_never_negative():
-    shown = bars((Candidate("a", (), "", 10.0, 4.5), Candidate("b", (), "", -1.0, 0.0)))
+    shown = bars((CandidateScore("a", (), "", 10.0, 4.5), CandidateScore("b", (), "", -1.0, 0.0)))
     assert [b.percent for b in shown] == [100.0, 0.0]
-    assert [b.percent for b in bars((Candidate("a", (), "", 0.0, 0.0),))] == [0.0]
+    assert [b.percent for b in bars((CandidateScore("a", (), "", 0.0, 0.0),))] == [0.0]
 
 
 def test_heat_map_colours_run_from_inseparable_to_clear():
@@ -310,18 +318,20 @@ def test_structure_without_a_finding_is_not_called_nothing():
     ("simulation", "command"),
     [
         ("magnetometer", "mkc apply model.json NEW.csv --output corrected.csv"),
-        ("simulated", "mkc apply model.json NEW.csv --simulated NEW_SIM.csv --output corrected.csv"),
+        ("simulated", "mkc apply model.json NEW.csv --simulator-output NEW_SIM.csv --output corrected.csv"),
         ("Pendulum", "mkc apply model.json NEW.csv --simulation FILE.py:Pendulum --output simulated.csv"),
     ],
 )
 def test_the_command_is_that_of_the_simulation(simulation, command):
     assert top.apply_command(make_diagnosis(1, samples=50, simulation=simulation)) == command
-    placed = first_changed(make_diagnosis(1, samples=50, simulation=simulation), placed=True)
+    placed = first_changed(make_diagnosis(1, samples=50, simulation=simulation), location_specific=True)
     assert top.apply_command(placed) == ""
 
 
 def test_moments_and_what_each_number_is_are_told():
-    jumps = Parameter("heading_change", (11.2, 5.8, -1.2), (4.4, 3.9, 0.6), "°", ("jump at 61.1 s", "at 77.8 s", "c"))
+    jumps = EffectParameter(
+        "heading_change", (11.2, 5.8, -1.2), (4.4, 3.9, 0.6), "°", ("jump at 61.1 s", "at 77.8 s", "c")
+    )
     changed = first_changed(
         make_diagnosis(1, samples=4500), onset=61.1, moments=(61.1, 77.8), parameters=(jumps,), channels=("heading",)
     )
@@ -334,7 +344,7 @@ def test_moments_and_what_each_number_is_are_told():
 def test_a_step_that_comes_and_goes_says_so():
     intervals = ((8.0, 9.0), (20.0, 22.0), (34.0, 37.3), (50.0, 51.0))
     diagnosis = first_changed(
-        make_diagnosis(1, samples=4500), onset.said((5.9, 6.3)), switched.said(True),
+        make_diagnosis(1, samples=4500), onset.said((5.9, 6.3)), intermittency.said(True),
         onset=6.2, intervals=intervals, alternatives=(),
     )  # fmt: skip
     diagnosis = dataclasses.replace(diagnosis, advice=advice_of(diagnosis))
@@ -353,7 +363,7 @@ def test_what_an_equation_counts_from_stands_with_it():
 
 
 def test_numbers_without_an_error_say_so():
-    lag = (Parameter("lag", 1.5, None, "s"),)
+    lag = (EffectParameter("lag", 1.5, None, "s"),)
     text = text_of(diagnosis_report(first_changed(make_diagnosis(1, samples=240), parameters=lag)))
     assert "lag 1.50 s, standard error not estimated" in text
 
@@ -397,9 +407,9 @@ def test_warnings_name_effects_and_set_their_numbers():
 
 
 def test_candidates_are_in_the_order_of_their_bars():
-    weak = Candidate("current_field", ("current",), "", 253.0, 22.5, behind=0.0)
-    strong = Candidate("driver_offset", ("motor_1",), "", 294.0, 24.2, behind=31.5)
-    never = Candidate("cubic_nonlinearity", (), "", 1.0, 1.4, behind=math.inf)
+    weak = CandidateScore("current_field", ("current",), "", 253.0, 22.5, behind=0.0)
+    strong = CandidateScore("driver_offset", ("motor_1",), "", 294.0, 24.2, behind=31.5)
+    never = CandidateScore("cubic_nonlinearity", (), "", 1.0, 1.4, behind=math.inf)
     text = text_of(diagnosis_report(dataclasses.replace(
         make_diagnosis(1, samples=240), candidates=(weak, strong, never),
     )))  # fmt: skip
@@ -482,7 +492,7 @@ def test_where_in_the_states_and_in_which_experiment_is_told_and_drawn():
 
 
 def test_what_any_test_of_evidence_says_is_shown():
-    said = Told(
+    said = EvidenceResult(
         "my_test",
         rows=(Row("left over", "correlated up to -0.4 s"), Row("in print", "more", in_terminal=False)),
         table=Table("By channel", ("channel", "lag"), (("norm", "0.4 s"),), "As far as -2 errors."),

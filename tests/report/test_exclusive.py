@@ -14,13 +14,13 @@ pytest.importorskip("jinja2")
 pytest.importorskip("rich")
 
 from mkc_torch import diagnose
+from mkc_torch.diagnosis.environment import NoiseEnvironment, ShapeCheck
 from mkc_torch.diagnosis.evidence import held_out_gain
 from mkc_torch.diagnosis.findings.advice import advice_of
-from mkc_torch.diagnosis.findings.worth import grade_of, sizeless
-from mkc_torch.diagnosis.result import Alternative, Diagnosis, HeldOut, Parameter, Sizes
+from mkc_torch.diagnosis.findings.grading import grade_of, is_zero_within_error
+from mkc_torch.diagnosis.result import Alternative, Diagnosis, EffectParameter, HeldOut, ResidualSizes
 from mkc_torch.diagnosis.settings import EvidenceSettings
-from mkc_torch.diagnosis.verdict import Around, verdict_of
-from mkc_torch.diagnosis.world import Shape, World
+from mkc_torch.diagnosis.verdict import FitAssessment, verdict_of
 from mkc_torch.recording import demonstration
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.factory import PUSHED, make_diagnosis, make_follows
@@ -40,9 +40,9 @@ def held_outs(draw, unit="rad"):
     gain = draw(st.floats(-0.5, 0.5))
     low, high = (draw(st.floats(0.001, 0.6)) for _ in range(2))
     before, ratio = draw(st.floats(0.01, 10.0)), draw(sizes)
-    outputs = {"angle": Sizes(before, ratio * before, unit)}
+    outputs = {"angle": ResidualSizes(before, ratio * before, unit)}
     if draw(st.booleans()):
-        outputs["rate"] = Sizes(2.0 * before, 2.0 * draw(sizes) * before, "rad/s")
+        outputs["rate"] = ResidualSizes(2.0 * before, 2.0 * draw(sizes) * before, "rad/s")
     return HeldOut(
         gain, (gain - low, gain + high), before, ratio * before, unit,
         outputs if draw(st.booleans()) else {}, draw(st.sampled_from(("", LEFT))), decides=draw(st.booleans()),
@@ -62,7 +62,9 @@ def findings(draw, place):
         channels=(place,),
         intervals=spans,
         onset=draw(st.none() | st.just(begin)),
-        parameters=(Parameter("size", value, draw(st.none() | st.just(draw(st.floats(0.1, 2.0)) * value)), "m/s²"),),
+        parameters=(
+            EffectParameter("size", value, draw(st.none() | st.just(draw(st.floats(0.1, 2.0)) * value)), "m/s²"),
+        ),
         p_value=draw(st.floats(0.001, LEVEL)),
         alternatives=tuple(
             Alternative("backlash", (), 3.0, draw(st.booleans())) for _ in range(draw(st.integers(0, 1)))
@@ -71,7 +73,7 @@ def findings(draw, place):
         plausibility="such sizes occur",
         evidence=(held_out_gain.said(held, "" if held else "One side of it is too short."),),
     )
-    shape = draw(st.none() | st.just(Shape(40.0, 0.002, finding.curve, "x^1.5")) | st.just(Shape(0.5, 0.4)))
+    shape = draw(st.none() | st.just(ShapeCheck(40.0, 0.002, finding.curve, "x^1.5")) | st.just(ShapeCheck(0.5, 0.4)))
     grade = "nearest in the catalogue" if shape is not None and shape.curve is not None else grade_of(finding)
     return dataclasses.replace(finding, shape=shape, grade=grade)
 
@@ -91,14 +93,14 @@ class Case:
 def diagnoses(draw):
     """A diagnosis put together as ``assembled`` does it: grades, verdict and advice are the project's own."""
     found = [draw(findings(place)) for place in ("rate of rate", "rate of angle", "torque")[: draw(st.integers(0, 3))]]
-    found = [one for one in found if not (one.grade == "not confirmed" and sizeless(one))]
+    found = [one for one in found if not (one.grade == "not confirmed" and is_zero_within_error(one))]
     white = draw(st.booleans())
     pushes = () if draw(st.booleans()) else (dataclasses.replace(PUSHED, at_rate=draw(st.booleans())),)
     noise = 0.005 * draw(st.floats(0.9, 1.2) if white and not pushes else st.floats(1.0, 20.0))
     lost = draw(st.booleans()) and draw(st.booleans())
     source = draw(st.sampled_from(("samples", "declared")))
     one = make_follows(residual=0.36, explained=0.12) if lost else make_follows(residual=noise, floor_source=source)
-    known = Around((one,), (), SimpleNamespace(disturbed=SimpleNamespace(disturbances=pushes)), lost=lost)
+    known = FitAssessment((one,), (), SimpleNamespace(disturbed=SimpleNamespace(disturbances=pushes)), lost=lost)
     if lost:
         found = []
     p_value = found[0].p_value if found else draw(st.floats(0.001, 1.0))
@@ -106,7 +108,7 @@ def diagnoses(draw):
     structure = (p_value <= LEVEL and not found) or bool(remaining)
     verdict = verdict_of(known, found, structure=structure, white=white, settings=EvidenceSettings())
     reasons = ("Another start reaches 0.006 rad.",) if verdict == "unfit" else ()
-    world = World((one,), reasons, pushes, {"torque": "held"})
+    world = NoiseEnvironment((one,), reasons, pushes, {"torque": "held"})
     made = make_diagnosis(
         0, samples=200, simulation="Pendulum", p_value=p_value, verdict=verdict, world=world, remaining=remaining,
         warnings=(),
@@ -171,9 +173,9 @@ SPOILT = {
     "not confirmed": {"grade": "not confirmed"},
     "outside of the recording": {"onset": 99.0},
     "a claim above the level": {"p_value": 0.3},
-    "a claim whose size is 0": {"parameters": (Parameter("size", 0.1, 0.4, "µT"),)},
+    "a claim whose size is 0": {"parameters": (EffectParameter("size", 0.1, 0.4, "µT"),)},
     "an interval that ends before": {"intervals": ((2.0, 1.0),)},
-    "left out, and no form": {"shape": Shape(40.0, 0.002, make_diagnosis(1, samples=20).findings[0].curve)},
+    "left out, and no form": {"shape": ShapeCheck(40.0, 0.002, make_diagnosis(1, samples=20).findings[0].curve)},
     "to be corrected and not to be": {
         "advice": (
             "The model found here corrects for linear_drag: confirm it on a second recording.",

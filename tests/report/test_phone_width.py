@@ -13,8 +13,8 @@ pytest.importorskip("jinja2")
 from mkc_torch.calibration.calibrate import calibrate
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.challenge.page import challenge_page
+from mkc_torch.challenge.scenarios.page import worlds_page
 from mkc_torch.challenge.score import score
-from mkc_torch.challenge.worlds.page import worlds_page
 from mkc_torch.recording.demonstration import simulated_recording
 from mkc_torch.report import Comparison, calibration_report, refusal_report
 from mkc_torch.report.diagnosis.page import diagnosis_report

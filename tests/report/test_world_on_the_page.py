@@ -11,7 +11,7 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
 from mkc_torch.diagnosis.evidence import held_out_gain
-from mkc_torch.diagnosis.result import HeldOut, Sizes
+from mkc_torch.diagnosis.result import HeldOut, ResidualSizes
 from mkc_torch.report.diagnosis import unseen, world
 from mkc_torch.report.diagnosis import verdict as top
 from mkc_torch.report.diagnosis.page import diagnosis_report
@@ -201,7 +201,7 @@ def test_smaller_and_not_shown_to_be_better_never_stand_together_without_the_rea
 def test_each_output_has_its_own_sizes_beside_its_floor():
     held = HeldOut(
         0.3, (0.2, 0.4), 15671.0, 0.661, "",
-        {"angle": Sizes(0.02, 0.0051, "rad"), "rate": Sizes(0.3, 0.1, "rad/s")},
+        {"angle": ResidualSizes(0.02, 0.0051, "rad"), "rate": ResidualSizes(0.3, 0.1, "rad/s")},
         "In 1 of 25 blocks the free run of the simulation alone leaves the recording's range.",
     )  # fmt: skip
     made = make_diagnosis(2, samples=200, channels=2, simulation="Motor", world=make_world(pushes=(), forcing=()))

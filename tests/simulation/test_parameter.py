@@ -20,7 +20,7 @@ from mkc_torch.simulation.parameter import known_parameters
         ({"value": math.inf}, ValueError, "`value` to be in .* but got inf"),
         ({"value": 1.0, "lower": "a"}, TypeError, "`lower` to be a number in .* it is infinite for no bound"),
         ({"value": 1.0, "upper": math.nan}, ValueError, "`upper` to be in .* but got nan"),
-        ({"value": 1.0, "lower": 2.0, "upper": 0.0}, ValueError, "`lower` to be at most `upper` but got 2.0 and 0.0"),
+        ({"value": 1.0, "lower": 2.0, "upper": 0.0}, ValueError, "`lower` to be at upper `upper` but got 2.0 and 0.0"),
         ({"value": -1.0, "lower": 0.1}, ValueError, r"`value` to lie in \[0.1, inf\], its own bounds, but got -1.0"),
         ({"value": 1.0, "unit": 3}, TypeError, "`unit` to be text but got 3; write '1/s' say"),
     ],

@@ -337,7 +337,7 @@ class Problem:
 
     def judged(self, rate: Rate, models: int = 0) -> Tensor:
         """Error of a free run on the part of the training runs that is held out."""
-        begins, absolute = self.case.system.starts_from, self.physics.absolute
+        begins, absolute = self.case.system.initial_window, self.physics.absolute
         since = self.train.since
         held_out = self.train.present & (since > FITTED * since[-1])
         if self.physics.piece:
@@ -350,7 +350,7 @@ class Problem:
 
     def seen(self, rate: Rate) -> float:
         """Error of a free run on all of the training runs."""
-        simulated = self.simulate(rate, self.train, self.case.system.starts_from)
+        simulated = self.simulate(rate, self.train, self.case.system.initial_window)
         return float(error(simulated, self.train, self.train.present, absolute=self.physics.absolute))
 
     def with_drives(self, x: Float[Tensor, "*batch n"], u: Tensor) -> Float[Tensor, "*batch n+d"]:
@@ -369,7 +369,7 @@ class Problem:
         found = []
         for runs in self.tests:
             scored = runs.present & (runs.since > self.case.scored_from)
-            simulated = self.simulate(rate, runs, self.case.system.starts_from)
+            simulated = self.simulate(rate, runs, self.case.system.initial_window)
             found.append(float(error(simulated, runs, scored, absolute=self.physics.absolute)))
         return found
 

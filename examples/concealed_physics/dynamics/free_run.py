@@ -92,9 +92,9 @@ def stations(system: Dynamics, recording: Recording, parts: int) -> Float[Tensor
         return time.new_zeros(len(time) - 1, len(share), 0)
     values = recording.stack(*system.inputs)
     early, late = values[:-1].unsqueeze(1), values[1:].unsqueeze(1)
-    if system.between == "held":
+    if system.input_hold == "held":
         return early.expand(-1, len(share), -1)
-    if system.between == "linear":
+    if system.input_hold == "linear":
         return torch.lerp(early, late, share.unsqueeze(-1))
     at = torch.lerp(time[:-1].unsqueeze(-1), time[1:].unsqueeze(-1), share)
     return torch.from_numpy(make_interp_spline(time.numpy(), values.numpy(), k=_DEGREE)(at.numpy()))

@@ -36,7 +36,7 @@ class Ball(Dynamics):
 
     states = ("height", "speed")
     units = {"height": "m", "speed": "m/s"}
-    starts_from = 1.0
+    initial_window = 1.0
 
     def derivative(self, time, x, u, p):
         return {"height": x.speed, "speed": torch.full_like(x.speed, -9.81)}
@@ -52,7 +52,7 @@ class Heaters(Dynamics):
     states = ("temperature_1", "temperature_2")
     inputs = ("heater_1", "heater_2")
     units = {"temperature_1": "°C", "temperature_2": "°C"}
-    between = "held"
+    input_hold = "held"
     parameters = {
         "loss": Parameter(0.005, lower=0.0, unit="1/s"),
         "gain_1": Parameter(0.005, lower=0.0),
@@ -71,8 +71,8 @@ class Silverbox(Dynamics):
 
     states = ("output", "speed")
     inputs = ("input",)
-    between = "smooth"
-    starts_from = 0.1
+    input_hold = "smooth"
+    initial_window = 0.1
     parameters = {
         "stiffness": Parameter(1.8e5, lower=0.0, unit="1/s²"),
         "damping": Parameter(20.0, lower=0.0, unit="1/s"),
@@ -98,7 +98,7 @@ class Servo(Dynamics):
     inputs = ("goal_position", "kp", "torque_enable")
     outputs = ("position",)
     units = {"position": "rad", "speed": "rad/s"}
-    starts_from = 0.1
+    initial_window = 0.1
     parameters = {
         "drive": Parameter(75.0, lower=0.0, unit="1/s²"),
         "back_emf": Parameter(3.0, lower=0.0, unit="1/s"),
@@ -140,7 +140,7 @@ def balls(data: Path) -> list[Case]:
         for name, drop in Recording.read(data / "falling_balls" / "ball_drops.csv").experiments().items()
     }
     names = [name.removesuffix("/1") for name in drops if name.endswith("/1")]
-    return [Case(b, Ball(), drops[f"{b}/1"], {"other drop": drops[f"{b}/2"]}, Ball.starts_from) for b in names]
+    return [Case(b, Ball(), drops[f"{b}/1"], {"other drop": drops[f"{b}/2"]}, Ball.initial_window) for b in names]
 
 
 def heaters(data: Path) -> Case:
@@ -157,7 +157,7 @@ def silverbox(data: Path) -> Case:
         return Recording({name: table[name][first : first + count] for name in table.names})
 
     tests = {name: rows(*test) for name, test in SILVERBOX_TESTS.items()}
-    return Case("Silverbox", Silverbox(), rows(*SILVERBOX_TRAIN), tests, Silverbox.starts_from)
+    return Case("Silverbox", Silverbox(), rows(*SILVERBOX_TRAIN), tests, Silverbox.initial_window)
 
 
 def servo(data: Path) -> Case:

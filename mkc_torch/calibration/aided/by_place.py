@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.calibration.aided.choose import NAMES, Chosen, rows_of
-from mkc_torch.calibration.aided.evidence import Judged, judged
+from mkc_torch.calibration.aided.choose import NAMES, SelectedResponse, rows_of
+from mkc_torch.calibration.aided.evidence import FittedResponse, judged
 from mkc_torch.calibration.aided.lengths import LEVEL, Circle, LengthModel, circle
-from mkc_torch.calibration.aided.response import ERRORS, SOFT_IRON, Model, Place
+from mkc_torch.calibration.aided.response import ERRORS, SOFT_IRON, Model, PlaceField
 from mkc_torch.calibration.aided.turns import still
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.nonlinear import NoFitError
@@ -39,7 +39,7 @@ _REJECTED_BELOW = 0.5
 """A sample of less than this weight counts as rejected."""
 
 
-def chosen_by_place(measured: Float[Tensor, "N 3"], taken: Tensor, place: Place) -> Chosen:
+def chosen_by_place(measured: Float[Tensor, "N 3"], taken: Tensor, place: PlaceField) -> SelectedResponse:
     """Fit the three responses so that the field has the length of the place's, and keep the one with most evidence.
 
     The turns are taken to be about the vertical, so that the circle of the measurements has the field's horizontal part
@@ -83,7 +83,7 @@ def chosen_by_place(measured: Float[Tensor, "N 3"], taken: Tensor, place: Place)
         with suppress(NoFitError):
             judgements.append(_judged(simpler, start, points, place, best.fit.bound, counted))
     likeliest = max(judgements, key=lambda one: one.evidence - (0.0 if one is full else _CLEARLY))
-    return Chosen(
+    return SelectedResponse(
         likeliest,
         full,
         {one.model.name: one.evidence for one in judgements},
@@ -94,7 +94,7 @@ def chosen_by_place(measured: Float[Tensor, "N 3"], taken: Tensor, place: Place)
     )
 
 
-def _refuse_other_width(drawn: Circle, place: Place) -> None:
+def _refuse_other_width(drawn: Circle, place: PlaceField) -> None:
     """Refuse a circle that is no turn about the vertical in the field of the place."""
     level = place.strength * math.cos(place.inclination)
     leaning = math.hypot(LEVEL, place.inclination_error) * abs(math.sin(place.inclination))
@@ -107,14 +107,14 @@ def _refuse_other_width(drawn: Circle, place: Place) -> None:
     )
 
 
-def _model(drawn: Circle, place: Place, sign: float) -> LengthModel:
+def _model(drawn: Circle, place: PlaceField, sign: float) -> LengthModel:
     """The full matrix, with the field's vertical part to one side of the circle."""
     error = math.hypot(LEVEL, place.inclination_error)
     rises = sign * place.inclination
     return LengthModel("full matrix", place.strength, biased=False, circle=drawn, rises=rises, rises_error=error)
 
 
-def _first(model: LengthModel, points: Tensor, place: Place) -> Judged:
+def _first(model: LengthModel, points: Tensor, place: PlaceField) -> FittedResponse:
     """The full matrix, from the offset alone: a flat response would take disturbances for tilts."""
     offset = model.circle.center - math.sin(model.rises) * model.scale * model.circle.axis
     alone = replace(model, name="offset")
@@ -128,10 +128,10 @@ def _judged(
     model: Model,
     start: Tensor,
     points: Tensor,
-    place: Place,
+    place: PlaceField,
     bound: Tensor | None = None,
     inflation: float | None = None,
-) -> Judged:
+) -> FittedResponse:
     weight = points.new_ones(len(points))
     return judged(model, start, points, still(len(points)), weight, place=place, bound=bound, inflation=inflation)
 
@@ -148,7 +148,7 @@ def _burst(rejected: Bool[Tensor, " N"]) -> float:
     return float(runs.square().sum() / runs.sum()) if len(runs) else 1.0
 
 
-def _either_side(one: Judged, other: Judged) -> Float[Tensor, "p p"]:
+def _either_side(one: FittedResponse, other: FittedResponse) -> Float[Tensor, "p p"]:
     """What it adds to the covariance that the field may stand to the other side of the circle."""
     if one.evidence - other.evidence > _SURE:
         return torch.zeros_like(one.covariance)

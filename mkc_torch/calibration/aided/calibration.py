@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.calibration.aid import Aid
 from mkc_torch.calibration.aided.by_place import chosen_by_place
-from mkc_torch.calibration.aided.choose import Chosen, chosen_response
-from mkc_torch.calibration.aided.evidence import Judged
+from mkc_torch.calibration.aided.choose import SelectedResponse, chosen_response
+from mkc_torch.calibration.aided.evidence import FittedResponse
 from mkc_torch.calibration.aided.heading import heading_errors, turning_axis
 from mkc_torch.calibration.aided.lengths import LengthModel
 from mkc_torch.calibration.aided.misfit import robust_size
 from mkc_torch.calibration.aided.mounting import exchanged, mounting, turned_by
-from mkc_torch.calibration.aided.response import ERRORS, SOFT_IRON, Place
+from mkc_torch.calibration.aided.response import ERRORS, SOFT_IRON, PlaceField
 from mkc_torch.calibration.aided.rotation import from_quaternion
 from mkc_torch.calibration.aided.start import offset_by_turns
 from mkc_torch.calibration.aided.turns import Turns, still, turns_of_attitude, turns_of_gyroscope
+from mkc_torch.calibration.aided_result import AidedResult
 from mkc_torch.calibration.coverage import coverage
 from mkc_torch.calibration.ellipsoid import axes_of
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
@@ -84,7 +84,7 @@ def aids(recording: Recording) -> tuple[str, ...]:
 
 
 def aided_calibration(
-    recording: Recording, by: str, *, field_strength: float | None = None, place: Place | None = None
+    recording: Recording, by: str, *, field_strength: float | None = None, place: PlaceField | None = None
 ) -> Calibration:
     """Calibrate a sensor that hardly tilts by how it turned.
 
@@ -198,7 +198,7 @@ def _refuse_other_turns(points: Tensor, turns: Turns, by: str) -> None:
     )
 
 
-def _heading(chosen: Chosen, points: Tensor, whole: Turns, usable: Recording, by: str) -> tuple[float, float]:
+def _heading(chosen: SelectedResponse, points: Tensor, whole: Turns, usable: Recording, by: str) -> tuple[float, float]:
     best = chosen.full
     theta = best.fit.theta
     if isinstance(best.model, LengthModel):
@@ -213,7 +213,7 @@ def _heading(chosen: Chosen, points: Tensor, whole: Turns, usable: Recording, by
 
 def _result(
     usable: Recording,
-    chosen: Chosen,
+    chosen: SelectedResponse,
     whole: Turns,
     by: str,
     errors: tuple[float, float],
@@ -238,7 +238,7 @@ def _result(
 
     with torch.enable_grad():
         slopes = torch.autograd.functional.jacobian(derived, full.fit.theta)
-    covariance = full.covariance if chosen.between is None else full.covariance + chosen.between
+    covariance = full.covariance if chosen.input_hold is None else full.covariance + chosen.input_hold
     spread = torch.einsum("ip,pq,iq->i", slopes, covariance, slopes).clamp(min=0.0).sqrt()
     unknown = torch.cat([spread[:3] > _OFFSET_KNOWN * radius, spread[3:] > _KNOWN * SOFT_IRON])
     known = torch.where(unknown, torch.inf, spread)
@@ -284,7 +284,7 @@ def _result(
         disturbed_unit="row" if usable.time is None else "s",
         coverage=found,
         warnings=(*usable.warnings, *_misaligned(best, spread, by)),
-        aid=Aid(
+        aid=AidedResult(
             by=by,
             response=best.model.name,
             evidence=tuple((name, value - best.evidence) for name, value in chosen.tried.items()),
@@ -298,7 +298,7 @@ def _result(
     )
 
 
-def _misaligned(best: Judged, spread: Tensor, by: str) -> tuple[str, ...]:
+def _misaligned(best: FittedResponse, spread: Tensor, by: str) -> tuple[str, ...]:
     """Sentences about a magnetometer whose axes are not those of what says how it turns."""
     told, response = exchanged(best.model.response(best.fit.theta), by)
     if told:
@@ -314,7 +314,7 @@ def _misaligned(best: Judged, spread: Tensor, by: str) -> tuple[str, ...]:
     )
 
 
-def _weights(chosen: Chosen, points: Tensor, whole: Turns) -> Float[Tensor, " N"]:
+def _weights(chosen: SelectedResponse, points: Tensor, whole: Turns) -> Float[Tensor, " N"]:
     """Of all samples in the direction of their stretch."""
     theta, model = chosen.best.fit.theta, chosen.best.model
     at = torch.cat([theta[:-ERRORS], torch.zeros(ERRORS, dtype=theta.dtype)]) if model.biased else theta

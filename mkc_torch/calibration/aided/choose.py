@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.calibration.aided.evidence import Judged, judged
-from mkc_torch.calibration.aided.response import ERRORS, Model, ModelName, Place
+from mkc_torch.calibration.aided.evidence import FittedResponse, judged
+from mkc_torch.calibration.aided.response import ERRORS, Model, ModelName, PlaceField
 from mkc_torch.calibration.aided.start import offset_by_turns
 from mkc_torch.calibration.aided.turns import Turns
 from mkc_torch.nonlinear import NoFitError
@@ -20,7 +20,7 @@ from mkc_torch.nonlinear import NoFitError
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["NAMES", "Chosen", "chosen_response", "rows_of"]
+__all__ = ["NAMES", "SelectedResponse", "chosen_response", "rows_of"]
 
 _MOST = 3000
 """Samples that a fit takes, evenly: the offset is known to a hundredth of the noise from these, and what limits it is
@@ -36,7 +36,7 @@ NAMES: tuple[ModelName, ...] = ("offset", "offset and scale", "full matrix")
 
 
 @dataclass(frozen=True)
-class Chosen:
+class SelectedResponse:
     """The response that was chosen, and all that were tried.
 
     Attributes:
@@ -46,17 +46,17 @@ class Chosen:
         turns: with the gyroscope's bias taken off, of the rows.
         rows: which samples the fits took.
         errors: of the gyroscope's rates, bias in rad/s and gains; zero of an attitude.
-        between: what it adds to the covariance of ``full`` that its parameters may be altogether others; they would
+        input_hold: what it adds to the covariance of ``full`` that its parameters may be altogether others; they would
             make the same headings.
     """
 
-    best: Judged
-    full: Judged
+    best: FittedResponse
+    full: FittedResponse
     tried: dict[str, float]
     turns: Turns
     rows: Int[Tensor, " n"]
     errors: Float[Tensor, " 12"]
-    between: Float[Tensor, "p p"] | None = None
+    input_hold: Float[Tensor, "p p"] | None = None
 
 
 def chosen_response(
@@ -64,9 +64,9 @@ def chosen_response(
     turns_at: Callable[[Tensor], Turns],
     taken: Tensor,
     *,
-    place: Place | None = None,
+    place: PlaceField | None = None,
     upwards: Float[Tensor, " 3"] | None = None,
-) -> Chosen:
+) -> SelectedResponse:
     """Fit the three responses and keep the one with the most evidence.
 
     Args:
@@ -124,7 +124,7 @@ def chosen_response(
                 )
             )
     likeliest = max(judgements, key=lambda one: one.evidence)
-    return Chosen(
+    return SelectedResponse(
         likeliest, best, {one.model.name: one.evidence for one in judgements}, turns, rows, errors + _errors(likeliest)
     )
 
@@ -135,5 +135,5 @@ def rows_of(taken: Tensor) -> Int[Tensor, " n"]:
     return rows[:: max(1, -(-len(rows) // _MOST))]
 
 
-def _errors(one: Judged) -> Tensor:
+def _errors(one: FittedResponse) -> Tensor:
     return one.fit.theta[-ERRORS:] if one.model.biased else one.fit.theta.new_zeros(ERRORS)

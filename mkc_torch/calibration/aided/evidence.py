@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.calibration.aided.response import Model, Place
+from mkc_torch.calibration.aided.response import Model, PlaceField
 from mkc_torch.calibration.aided.turns import Turns
 from mkc_torch.nonlinear import GaussianPrior, NonlinearFit
 from mkc_torch.nonlinear import fit as nonlinear_fit
@@ -16,13 +16,13 @@ from mkc_torch.nonlinear import fit as nonlinear_fit
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Judged", "judged"]
+__all__ = ["FittedResponse", "judged"]
 
 _LEAST_INFLATION = 1.0
 
 
 @dataclass(frozen=True)
-class Judged:
+class FittedResponse:
     """A fitted response.
 
     Attributes:
@@ -51,11 +51,11 @@ def judged(
     turns: Turns,
     weight: Float[Tensor, " N"],
     *,
-    place: Place | None = None,
+    place: PlaceField | None = None,
     errors: Float[Tensor, " 12"] | None = None,
     bound: Tensor | None = None,
     inflation: float | None = None,
-) -> Judged:
+) -> FittedResponse:
     """Fit a response and say how likely it is.
 
     Args:
@@ -103,7 +103,7 @@ def judged(
     # what the prior leaves free is as free in every response, and cancels
     volume = torch.linalg.slogdet(precision)[1] - torch.linalg.slogdet(counted)[1]
     evidence = likelihood - 0.5 * float(far @ precision @ far) + 0.5 * float(volume)
-    return Judged(
+    return FittedResponse(
         model,
         fit,
         sampled + times**2 * inverse @ precision @ inverse,

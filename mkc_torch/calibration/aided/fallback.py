@@ -9,7 +9,7 @@ from torch.linalg import LinAlgError  # type: ignore[attr-defined]
 
 from mkc_torch.calibration.aided.calibration import aided_calibration, aids
 from mkc_torch.calibration.aided.place import Field
-from mkc_torch.calibration.aided.response import Place
+from mkc_torch.calibration.aided.response import PlaceField
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.calibration.result import Calibration
 from mkc_torch.nonlinear import NoFitError
@@ -72,14 +72,14 @@ def with_aid(
     raise NotIdentifiableError(" ".join([str(refusal), *tried]), refusal.coverage, refusal.directions)
 
 
-def _known(usable: Recording, earth: Field | None) -> Place | None:
+def _known(usable: Recording, earth: Field | None) -> PlaceField | None:
     """The field in the recording's unit, where that is µT."""
     if earth is None or usable.units["mag_x"] != "µT":
         return None
-    return Place(earth.strength, earth.inclination, _GROUND * earth.strength, _GROUND)
+    return PlaceField(earth.strength, earth.inclination, _GROUND * earth.strength, _GROUND)
 
 
-def _taken(place: Place) -> str:
+def _taken(place: PlaceField) -> str:
     """What a calibration by place and date takes for true."""
     return (
         "The vehicle is taken to turn on level ground, and the sensor's axes for those of the vehicle: lengths do not "

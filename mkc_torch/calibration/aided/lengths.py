@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.calibration.aided.response import Model, Place
+from mkc_torch.calibration.aided.response import Model, PlaceField
 from mkc_torch.calibration.aided.turns import Turns
 from mkc_torch.linear import MKCRegression
 from mkc_torch.nonlinear import GaussianPrior
@@ -78,7 +78,7 @@ class LengthModel(Model):
         """Parameters at an offset and near a response, about a vertical axis."""
         return torch.cat([super().start(offset, response), offset.new_zeros(1)])
 
-    def prior(self, place: Place | None = None, errors: Float[Tensor, " 12"] | None = None) -> GaussianPrior:
+    def prior(self, place: PlaceField | None = None, errors: Float[Tensor, " 12"] | None = None) -> GaussianPrior:
         """As of any response, and an axis that is nearly vertical."""
         known = super().prior(place, errors)
         precision = known.precision.clone()

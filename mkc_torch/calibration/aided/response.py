@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from mkc_torch._support.forward_mode import beside
+from mkc_torch._support.forward_mode import make_dual
 from mkc_torch.calibration.aided.turns import Turns
 from mkc_torch.nonlinear import GaussianPrior
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["ERRORS", "GYRO_BIAS", "SOFT_IRON", "Model", "ModelName", "Place", "steady"]
+__all__ = ["ERRORS", "GYRO_BIAS", "SOFT_IRON", "Model", "ModelName", "PlaceField", "steady"]
 
 ModelName = Literal["offset", "offset and scale", "full matrix"]
 
@@ -39,7 +39,7 @@ ERRORS = 12
 
 
 @dataclass(frozen=True)
-class Place:
+class PlaceField:
     """What is known of the field at a place, in the unit of the measurement.
 
     Attributes:
@@ -95,7 +95,7 @@ class Model:
         found = torch.linalg.lstsq(entries, response.flatten()[:, None] / self.scale).solution[:, 0]
         return torch.cat([offset, found, offset.new_zeros(ERRORS if self.biased else 0)])
 
-    def prior(self, place: Place | None = None, errors: Float[Tensor, " 12"] | None = None) -> GaussianPrior:
+    def prior(self, place: PlaceField | None = None, errors: Float[Tensor, " 12"] | None = None) -> GaussianPrior:
         """A response near a multiple of the identity, an offset and errors of a gyroscope near zero.
 
         ``errors`` are taken off the rates already, so that the parameters are what is left of them.
@@ -141,7 +141,7 @@ class Model:
         if turned is not None:
             direction = direction + torch.linalg.cross(turned, direction)
         body = (turns.to_frame.mT @ direction.unsqueeze(-1)).squeeze(-1)
-        return beside(measured, theta[0]) - theta[:3] - body @ response.mT
+        return make_dual(measured, theta[0]) - theta[:3] - body @ response.mT
 
     def first_weight(
         self, theta: Float[Tensor, " p"], measured: Float[Tensor, "N 3"], turns: Turns
@@ -156,7 +156,7 @@ class Model:
 
     def _along(self, theta: Tensor, measured: Tensor, turns: Turns) -> tuple[Tensor, Tensor | None]:
         """The field in the axes of its stretch, in its own lengths, and what errors of the rates turned it by."""
-        field = torch.linalg.solve(self.response(theta), (beside(measured, theta[0]) - theta[:3]).mT).mT
+        field = torch.linalg.solve(self.response(theta), (make_dual(measured, theta[0]) - theta[:3]).mT).mT
         along = (turns.to_frame @ field.unsqueeze(-1)).squeeze(-1)
         if turns.summed is None:
             return along, None
@@ -169,5 +169,5 @@ def steady(along: Float[Tensor, "N 3"], turns: Turns, weight: Float[Tensor, " N"
     """The weighted mean of each stretch."""
     share = weight.unsqueeze(-1)
     total = share.new_zeros(turns.count, 1).index_add(0, turns.window, share)
-    part = beside(share / total[turns.window], along[0, 0])
-    return beside(along.new_zeros(turns.count, 3), along[0, 0]).index_add(0, turns.window, part * along)
+    part = make_dual(share / total[turns.window], along[0, 0])
+    return make_dual(along.new_zeros(turns.count, 3), along[0, 0]).index_add(0, turns.window, part * along)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mkc_torch.calibration.exports.ardupilot import ARDUPILOT
 from mkc_torch.calibration.exports.base import (
-    CurrentField,
+    CurrentCoefficients,
     Destination,
     Export,
     Exported,
@@ -18,7 +18,7 @@ from mkc_torch.calibration.exports.ros_yaml import ROS_YAML
 
 __all__ = [
     "EXPORTS",
-    "CurrentField",
+    "CurrentCoefficients",
     "Destination",
     "Export",
     "ExportError",

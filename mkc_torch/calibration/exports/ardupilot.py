@@ -6,7 +6,7 @@ AP_Compass_Backend.cpp``, ``accumulate_sample`` and ``correct_field``)::
     field = [DIA, ODI] * (SCALE * (reading + OFS)) + MOT * current
 
 The matrix is symmetric, with ``COMPASS_DIA_X`` … on its diagonal and ``ODI_X`` = xy, ``ODI_Y`` = xz, ``ODI_Z`` = yz.
-Offsets are added. ``SCALE`` counts between 1/1.5 and 1.5 alone (``Compass::have_scale_factor``). ``MOT`` acts where
+Offsets are added. ``SCALE`` counts input_hold 1/1.5 and 1.5 alone (``Compass::have_scale_factor``). ``MOT`` acts where
 ``COMPASS_MOTCT`` is 2, by the battery's current in A, and on the corrected field. ArduPilot finds ``COMPASS_DEV_ID`` by
 itself, so it is not written.
 """

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from mkc_torch.calibration.file import Matrix, Vector
 from mkc_torch.calibration.result import Calibration
 
-__all__ = ["MADE_BY", "CurrentField", "Destination", "Export", "ExportError", "Exported", "SensorCorrection"]
+__all__ = ["MADE_BY", "CurrentCoefficients", "Destination", "Export", "ExportError", "Exported", "SensorCorrection"]
 
 MADE_BY = "Made by mkc_torch"
 """Stands in every file, so that a later run knows it as one that it may replace."""
@@ -20,7 +20,7 @@ class ExportError(ValueError):
 
 
 @dataclass(frozen=True)
-class CurrentField:
+class CurrentCoefficients:
     """The field of a current near the sensor, in proportion to it.
 
     Attributes:
@@ -62,7 +62,7 @@ class SensorCorrection:
     matrix: Matrix
     field_unit: str
     field_strength: float | None = None
-    current: CurrentField | None = None
+    current: CurrentCoefficients | None = None
     left_out: tuple[str, ...] = ()
 
     @staticmethod

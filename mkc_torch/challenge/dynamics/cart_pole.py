@@ -7,7 +7,7 @@ from torch import Generator
 
 from mkc_torch.challenge.draws import uniform, whole
 from mkc_torch.challenge.dynamics import hidden
-from mkc_torch.challenge.dynamics.plant import Array, Plant, Setting, Trial
+from mkc_torch.challenge.dynamics.plant import Array, Plant, RunSet, Setting
 from mkc_torch.challenge.dynamics.signals import excitation, moments, runs_of
 
 STEP = 0.05
@@ -44,14 +44,14 @@ def draw(g: Generator) -> Setting:
     return Setting(plant, trial(g, plant, runs, 300 // runs), trial(g, plant, 1, 180))
 
 
-def trial(g: Generator, plant: Plant, runs: int, samples: int) -> Trial:
+def trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:
     """Forces in N about the pole's own period."""
     time = moments(STEP, samples)
     period = 2.0 * np.pi * np.sqrt(plant.parameters["length"] / GRAVITY)
     pushes = [uniform(g, 4.0, 8.0) * excitation(g, time, period) for _ in range(runs)]
     reach = ((-0.2, 0.2), (-0.3, 0.3), (-0.8, 0.8), (-0.5, 0.5))
     begin = np.array([[uniform(g, *ends) for _ in range(runs)] for ends in reach])
-    return Trial(STEP, runs_of(pushes), begin)
+    return RunSet(STEP, runs_of(pushes), begin)
 
 
 INSIDE = (

@@ -114,7 +114,7 @@ def sample(g: Generator, errors: Errors, samples: int, runs: int) -> Array:
     return values
 
 
-def spoil(g: Generator, errors: Errors, samples: int, runs: int) -> tuple[Array, np.ndarray]:
+def contaminate(g: Generator, errors: Errors, samples: int, runs: int) -> tuple[Array, np.ndarray]:
     """Outliers (m, T, R) and where they are: True in the mask, in each output by itself."""
     mask = np.zeros((len(errors.deviations), samples, runs), dtype=bool)
     bursts = happens(g, 0.5)

@@ -12,12 +12,12 @@ from torch import Generator, Tensor
 
 from mkc_torch.challenge import draws
 from mkc_torch.challenge.dynamics import cart_pole, motor, pendulum, projectile, servo, tanks, thermal
-from mkc_torch.challenge.dynamics.errors import OUTLIERS, Errors, Whitening, draw_errors, sample, spoil
+from mkc_torch.challenge.dynamics.errors import OUTLIERS, Errors, Whitening, contaminate, draw_errors, sample
 from mkc_torch.challenge.dynamics.hidden import Draw
 from mkc_torch.challenge.dynamics.integrate import Course, simulate
-from mkc_torch.challenge.dynamics.oracle import Power, can_be_named, names, power
-from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Setting, Trial
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.oracle import EffectPower, can_be_named, names, power
+from mkc_torch.challenge.dynamics.plant import Array, HiddenTerm, Plant, RunSet, Setting
+from mkc_torch.challenge.dynamics.scene import SystemScene
 from mkc_torch.challenge.dynamics.second import oracle_rms
 from mkc_torch.challenge.dynamics.sizes import draw_size
 from mkc_torch.challenge.key import Key, KeyEffect, KeyRival
@@ -56,7 +56,7 @@ SYSTEMS: Mapping[str, System] = MappingProxyType(
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredColumns:
     """A recording's columns, what its sensors added (m, T, R), and which samples are bad."""
 
     columns: dict[str, Tensor]
@@ -99,7 +99,7 @@ def case_of(
     """
     setting = system.draw(stream("setting"))
     plant = setting.plant
-    scene = Scene(plant, setting.trial, simulate(plant, setting.trial))
+    scene = SystemScene(plant, setting.trial, simulate(plant, setting.trial))
     errors = draw_errors(stream("noise"), scene.course.outputs)
     if empty:
         measured = measured_by(stream, "", plant, setting.trial, scene.course, errors)
@@ -120,10 +120,10 @@ def case_of(
 def hide(
     stream: Callable[[str], Generator],
     system: System,
-    scene: Scene,
+    scene: SystemScene,
     errors: Whitening,
     outside_share: float = OUTSIDE_SHARE,
-) -> tuple[str, Hidden, float, Power]:
+) -> tuple[str, HiddenTerm, float, EffectPower]:
     """An effect: its kind, itself, its size, and how well it can be seen at that size."""
     g = stream("effect")
     outside = draws.happens(g, outside_share)
@@ -137,12 +137,12 @@ def hide(
 
 
 def measured_by(
-    stream: Callable[[str], Generator], when: str, plant: Plant, trial: Trial, course: Course, errors: Errors
-) -> Measured:
+    stream: Callable[[str], Generator], when: str, plant: Plant, trial: RunSet, course: Course, errors: Errors
+) -> MeasuredColumns:
     """What a logger writes: runs below one another, inputs, outputs with errors, and columns that mean nothing."""
     samples, runs = trial.samples, trial.runs
     noise = sample(stream(f"{when}errors"), errors, samples, runs)
-    bad, mask = spoil(stream(f"{when}outliers"), errors, samples, runs)
+    bad, mask = contaminate(stream(f"{when}outliers"), errors, samples, runs)
     seen = course.outputs + noise + bad
     time = torch.arange(samples, dtype=torch.float64).mul(trial.step).round(decimals=6)
     columns = {"time": time.repeat(runs)}
@@ -150,7 +150,7 @@ def measured_by(
         columns["experiment"] = torch.arange(runs, dtype=torch.float64).repeat_interleave(samples)
     columns |= {name: _column(values) for name, values in zip(plant.inputs, trial.inputs, strict=True)}
     columns |= {name: _column(values) for name, values in zip(plant.outputs, seen, strict=True)}
-    return Measured(columns | _decoys(stream(f"{when}decoys"), plant, columns), noise + bad, mask)
+    return MeasuredColumns(columns | _decoys(stream(f"{when}decoys"), plant, columns), noise + bad, mask)
 
 
 def _decoys(g: Generator, plant: Plant, columns: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -175,7 +175,7 @@ def _numbers(mask: np.ndarray) -> tuple[int, ...]:
     return tuple(np.flatnonzero(mask.transpose(0, 2, 1)).tolist())
 
 
-def key_of(name: str, kind: str, plant: Plant, errors: Errors, measured: Measured) -> Key:
+def key_of(name: str, kind: str, plant: Plant, errors: Errors, measured: MeasuredColumns) -> Key:
     return Key(
         name=name,
         kind=kind,
@@ -193,7 +193,7 @@ def key_of(name: str, kind: str, plant: Plant, errors: Errors, measured: Measure
     )
 
 
-def key_effect(hidden: Hidden, size: float, seen: Power) -> KeyEffect:
+def key_effect(hidden: HiddenTerm, size: float, seen: EffectPower) -> KeyEffect:
     told = [KeyRival(rival.effect, (), rival.z_sep, rival.at) for rival in (*seen.rivals, *seen.larger)]
     return KeyEffect(
         effect=hidden.effect,

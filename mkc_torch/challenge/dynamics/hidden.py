@@ -11,10 +11,10 @@ from torch import Generator
 from mkc_torch.challenge.draws import choose, happens, log_uniform, uniform
 from mkc_torch.challenge.dynamics import flows, forces, stores, transducers
 from mkc_torch.challenge.dynamics.friction import bristles, rubber
-from mkc_torch.challenge.dynamics.plant import Array, Hidden
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.plant import Array, HiddenTerm
+from mkc_torch.challenge.dynamics.scene import SystemScene
 
-Draw = Callable[[Generator, Scene], Hidden]
+Draw = Callable[[Generator, SystemScene], HiddenTerm]
 
 Exchange = Callable[[Generator, float], Callable[[Array], Array]]
 """From a difference that is typical, a function of differences of at least 0, in the same unit."""
@@ -26,11 +26,11 @@ def rate_of(state: str) -> str:
 
 
 def dry_friction(speed: str, position: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         form = bristles(
             scene.plant.row(speed), uniform(g, 0.008, 0.015) * scene.largest(position), scene.typical(speed)
         )
-        return Hidden(
+        return HiddenTerm(
             "coulomb_friction", "LuGre without a rise", (rate_of(speed),), 0.5 * scene.pace(speed), form, own=1
         )
 
@@ -38,14 +38,14 @@ def dry_friction(speed: str, position: str) -> Draw:
 
 
 def sticking_friction(speed: str, position: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         form = bristles(
             scene.plant.row(speed),
             uniform(g, 0.008, 0.015) * scene.largest(position),
             uniform(g, 0.3, 0.8) * scene.typical(speed),
             rise=uniform(g, 1.0, 2.5),
         )
-        return Hidden(
+        return HiddenTerm(
             "stribeck_friction", "LuGre with Tustin's rise", (rate_of(speed),), 0.4 * scene.pace(speed), form, own=1
         )
 
@@ -53,39 +53,39 @@ def sticking_friction(speed: str, position: str) -> Draw:
 
 
 def blunt_drag(speed: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         typical = scene.typical(speed)
         form = forces.sphere_drag(scene.plant.row(speed), typical, log_uniform(g, 500.0, 5e4))
         large = 0.7 * scene.pace(speed) / typical
-        return Hidden("quadratic_drag", "drag coefficient of Reynolds' number", (rate_of(speed),), large, form)
+        return HiddenTerm("quadratic_drag", "drag coefficient of Reynolds' number", (rate_of(speed),), large, form)
 
     return draw
 
 
 def hard_spring(speed: str, position: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         reach = scene.largest(position)
         form = forces.hardening(scene.plant.row(speed), scene.plant.row(position), uniform(g, 0.6, 1.2) * reach)
         large = scene.pace(speed) / reach**3
-        return Hidden("cubic_stiffness", "hyperbolic sine", (rate_of(speed),), large, form)
+        return HiddenTerm("cubic_stiffness", "hyperbolic sine", (rate_of(speed),), large, form)
 
     return draw
 
 
 def bumper(speed: str, position: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         x, reach = scene.state(position), scene.largest(position)
         further = 1.0 if x.max() >= -x.min() else -1.0
         ways = (1.0, -1.0) if happens(g, 0.5) else (further,)
         form = forces.contact(scene.plant.row(speed), scene.plant.row(position), uniform(g, 0.55, 0.85) * reach, ways)
         large = 20.0 * scene.pace(speed) / (0.2 * reach) ** 1.5
-        return Hidden("hard_stop", "Hunt and Crossley's contact", (rate_of(speed),), large, form)
+        return HiddenTerm("hard_stop", "Hunt and Crossley's contact", (rate_of(speed),), large, form)
 
     return draw
 
 
 def magnets(speed: str, angle: str, orders: tuple[int, ...]) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         form = forces.cogging(
             scene.plant.row(speed),
             scene.plant.row(angle),
@@ -93,7 +93,7 @@ def magnets(speed: str, angle: str, orders: tuple[int, ...]) -> Draw:
             uniform(g, 0.0, 2.0 * math.pi),
             uniform(g, 0.1, 0.25),
         )
-        return Hidden(
+        return HiddenTerm(
             "position_periodic_force", "cogging, second harmonic", (rate_of(speed),), 0.7 * scene.pace(speed), form
         )
 
@@ -101,26 +101,26 @@ def magnets(speed: str, angle: str, orders: tuple[int, ...]) -> Draw:
 
 
 def steady_wind(speed: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         form = forces.wind(scene.plant.row(speed), uniform(g, 4.0, 10.0) * scene.largest(speed))
-        return Hidden("constant_force", "steady wind", (rate_of(speed),), scene.pace(speed), form)
+        return HiddenTerm("constant_force", "steady wind", (rate_of(speed),), scene.pace(speed), form)
 
     return draw
 
 
 def warm_bias(speed: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         form = forces.warming_bias(scene.plant.row(speed), uniform(g, 0.1, 0.5) * scene.length, uniform(g, 0.0, 0.15))
-        return Hidden("constant_force", "bias that warms up", (rate_of(speed),), scene.pace(speed), form, own=1)
+        return HiddenTerm("constant_force", "bias that warms up", (rate_of(speed),), scene.pace(speed), form, own=1)
 
     return draw
 
 
 def late_actuator(name: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         pipe = happens(g, 0.5)
         change = transducers.transport if pipe else transducers.lags(4)
-        return Hidden(
+        return HiddenTerm(
             "input_delay",
             "transport" if pipe else "four lags in series",
             (f"input {name}",),
@@ -132,8 +132,8 @@ def late_actuator(name: str) -> Draw:
 
 
 def slow_actuator(name: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
-        return Hidden(
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
+        return HiddenTerm(
             "input_lag",
             "two lags, of which one is short",
             (f"input {name}",),
@@ -145,9 +145,9 @@ def slow_actuator(name: str) -> Draw:
 
 
 def squared_actuator(name: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         change = transducers.squared(scene.largest_input(name), uniform(g, 1.8, 2.2))
-        return Hidden(
+        return HiddenTerm(
             "input_square",
             "power near the square",
             (f"input {name}",),
@@ -159,9 +159,9 @@ def squared_actuator(name: str) -> Draw:
 
 
 def weak_actuator(name: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         change = transducers.soft_limit(scene.largest_input(name), uniform(g, 4.0, 10.0))
-        return Hidden(
+        return HiddenTerm(
             "input_saturation",
             "smooth limit",
             (f"input {name}",),
@@ -173,9 +173,9 @@ def weak_actuator(name: str) -> Draw:
 
 
 def lapped_valve(name: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
         change = transducers.soft_gap(scene.largest_input(name))
-        return Hidden(
+        return HiddenTerm(
             "dead_zone",
             "smooth overlap",
             (f"input {name}",),
@@ -187,9 +187,9 @@ def lapped_valve(name: str) -> Draw:
 
 
 def worn_drive(name: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
         change = transducers.worn_linkage(scene.largest_input(name))
-        return Hidden(
+        return HiddenTerm(
             "backlash",
             "several gaps in series",
             (f"input {name}",),
@@ -201,21 +201,21 @@ def worn_drive(name: str) -> Draw:
 
 
 def bushing(speed: str, position: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         reach = scene.largest(position)
         form = rubber(scene.plant.row(speed), tuple(reach * uniform(g, 0.1, 0.5) for _ in range(3)))
         large = 2.0 * scene.pace(speed) / reach
-        return Hidden("bouc_wen_hysteresis", "elements with several yields", (rate_of(speed),), large, form, own=3)
+        return HiddenTerm("bouc_wen_hysteresis", "elements with several yields", (rate_of(speed),), large, form, own=3)
 
     return draw
 
 
 def felt_spring(speed: str, position: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         form = forces.felt(
             scene.plant.row(speed), scene.plant.row(position), scene.largest(position), uniform(g, 1.8, 2.4)
         )
-        return Hidden("power_law", "spring of felt", (rate_of(speed),), 2.0 * scene.pace(speed), form)
+        return HiddenTerm("power_law", "spring of felt", (rate_of(speed),), 2.0 * scene.pace(speed), form)
 
     return draw
 
@@ -229,31 +229,31 @@ def second_store(state: str, exchange: Exchange, name: str) -> Draw:
         name: of what it is.
     """
 
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         constant = log_uniform(g, 0.02, 0.1) * scene.length
         row, x = scene.plant.row(state), scene.state(state)
         away = x - transducers.lagged(x[None], scene.trial.step / scene.plant.fine, constant)[0]
         head = exchange(g, float(np.abs(away).mean()))
         form = stores.second_store(row, lambda there: head(there) / constant)
-        return Hidden("hidden_lag", name, (rate_of(state),), 2.0, form, own=1, begin=stores.like(row))
+        return HiddenTerm("hidden_lag", name, (rate_of(state),), 2.0, form, own=1, begin=stores.like(row))
 
     return draw
 
 
 def second_mass(speed: str, name: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         row = scene.plant.row(speed)
         omega = 2.0 * math.pi / (log_uniform(g, 0.06, 0.25) * scene.length)
         reach = scene.pace(speed) / omega**2
         form = stores.second_mass(row, omega, log_uniform(g, 0.02, 0.1), uniform(g, 0.005, 0.02) / reach**2)
-        return Hidden("hidden_mode", name, (rate_of(speed),), 2.0, form, own=2, begin=stores.unstretched(row))
+        return HiddenTerm("hidden_mode", name, (rate_of(speed),), 2.0, form, own=2, begin=stores.unstretched(row))
 
     return draw
 
 
 def slow_sensor() -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
-        return Hidden(
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
+        return HiddenTerm(
             "sensor_lag",
             "two lags in series",
             scene.plant.outputs,
@@ -265,21 +265,21 @@ def slow_sensor() -> Draw:
 
 
 def full_vessel(level: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         top, power = scene.largest(level), choose(g, (1.5, 2.5))
         form = flows.weir(scene.plant.row(level), uniform(g, 0.55, 0.85) * top, power)
         large = 5.0 * scene.pace(level) / (0.2 * top) ** power
         name = "rectangular weir" if power == 1.5 else "V-notch weir"
-        return Hidden("overflow", name, (rate_of(level),), large, form)
+        return HiddenTerm("overflow", name, (rate_of(level),), large, form)
 
     return draw
 
 
 def gravel_leak(level: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         typical = scene.typical(level)
         form = flows.seepage(scene.plant.row(level), uniform(g, 0.0, 0.3) / typical)
-        return Hidden(
+        return HiddenTerm(
             "linear_drag", "Darcy and Forchheimer's leak", (rate_of(level),), scene.pace(level) / typical, form
         )
 
@@ -287,8 +287,8 @@ def gravel_leak(level: str) -> Draw:
 
 
 def machine_nearby(speed: str) -> Draw:
-    def draw(g: Generator, scene: Scene) -> Hidden:
+    def draw(g: Generator, scene: SystemScene) -> HiddenTerm:
         form = forces.hum(scene.plant.row(speed), uniform(g, 5.0, 30.0) / scene.length)
-        return Hidden("vibration", "sinusoid of time", (rate_of(speed),), scene.pace(speed), form, own=2)
+        return HiddenTerm("vibration", "sinusoid of time", (rate_of(speed),), scene.pace(speed), form, own=2)
 
     return draw

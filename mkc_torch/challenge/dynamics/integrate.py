@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Trial
+from mkc_torch.challenge.dynamics.plant import Array, HiddenTerm, Plant, RunSet
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ def between(values: Array, parts: int) -> Array:
     """Signals (k, T, R) at ``parts`` moments an interval: (k, (T - 1) parts + 1, R), linear between samples.
 
     Example:
-        >>> between(np.array([[[0.0], [1.0]]]), 2)[0, :, 0].tolist()
+        >>> input_hold(np.array([[[0.0], [1.0]]]), 2)[0, :, 0].tolist()
         [0.0, 0.5, 1.0]
     """
     share = np.arange(parts)[None, None, :, None] / parts
@@ -42,7 +42,7 @@ def holding(values: Array, parts: int) -> Array:
 
 
 def simulate(
-    plant: Plant, trial: Trial, hidden: Hidden | None = None, size: float = 0.0, push: Array | None = None
+    plant: Plant, trial: RunSet, hidden: HiddenTerm | None = None, size: float = 0.0, push: Array | None = None
 ) -> Course:
     """The runs of a trial, with something hidden or nothing.
 
@@ -60,7 +60,7 @@ def simulate(
     return Course(states, half[:, ::2], _measured(plant, states, sent[:, ::2], h, hidden, size))
 
 
-def outputs_of_sizes(plant: Plant, trial: Trial, hidden: Hidden, sizes: Array) -> list[Array]:
+def outputs_of_sizes(plant: Plant, trial: RunSet, hidden: HiddenTerm, sizes: Array) -> list[Array]:
     """Outputs (m, T, R) for each of several sizes, which are integrated side by side as so many more runs."""
     h = trial.step / plant.fine
     half = _sent(plant, trial)
@@ -71,7 +71,7 @@ def outputs_of_sizes(plant: Plant, trial: Trial, hidden: Hidden, sizes: Array) -
     return [_measured(plant, part, inputs, h, hidden, size) for part, inputs, size in parts]
 
 
-def _sent(plant: Plant, trial: Trial) -> Array:
+def _sent(plant: Plant, trial: RunSet) -> Array:
     """Inputs (k, 2F - 1, R) at every half fine step."""
     return (holding if trial.held else between)(trial.inputs, 2 * plant.fine)
 
@@ -80,8 +80,8 @@ def _states(
     plant: Plant,
     h: float,
     sent: Array,
-    trial: Trial,
-    hidden: Hidden | None,
+    trial: RunSet,
+    hidden: HiddenTerm | None,
     sizes: Array,
     push: Array | None = None,
 ) -> Array:
@@ -116,7 +116,7 @@ def _states(
     return path.transpose(1, 0, 2)[:n]
 
 
-def _measured(plant: Plant, states: Array, inputs: Array, h: float, hidden: Hidden | None, size: float) -> Array:
+def _measured(plant: Plant, states: Array, inputs: Array, h: float, hidden: HiddenTerm | None, size: float) -> Array:
     """Outputs (m, T, R) of states (n, F, R) and inputs (k, F, R)."""
     found = plant.read(states, inputs)
     return (found if hidden is None else hidden.outputs(found, h, size))[:, :: plant.fine]

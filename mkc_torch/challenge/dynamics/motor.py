@@ -9,8 +9,8 @@ from torch import Generator
 
 from mkc_torch.challenge.draws import uniform, whole
 from mkc_torch.challenge.dynamics import forces, friction, hidden
-from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Setting, Trial
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.plant import Array, HiddenTerm, Plant, RunSet, Setting
+from mkc_torch.challenge.dynamics.scene import SystemScene
 from mkc_torch.challenge.dynamics.signals import excitation, moments, runs_of
 
 STEP = 0.02
@@ -44,20 +44,20 @@ def draw(g: Generator) -> Setting:
     return Setting(plant, trial(g, runs, 320 // runs), trial(g, 1, 200))
 
 
-def trial(g: Generator, runs: int, samples: int) -> Trial:
+def trial(g: Generator, runs: int, samples: int) -> RunSet:
     """Voltages of either sign, from standstill or not."""
     time = moments(STEP, samples)
     voltages = [uniform(g, 6.0, 12.0) * excitation(g, time, uniform(g, 0.8, 2.0)) for _ in range(runs)]
     reach = ((0.0, 6.0), (-3.0, 3.0), (-0.5, 0.5))
     begin = np.array([[uniform(g, *ends) for _ in range(runs)] for ends in reach])
-    return Trial(STEP, runs_of(voltages), begin)
+    return RunSet(STEP, runs_of(voltages), begin)
 
 
-def gear_teeth(g: Generator, scene: Scene) -> Hidden:
+def gear_teeth(g: Generator, scene: SystemScene) -> HiddenTerm:
     """Teeth that rub the more the harder the motor pulls."""
     form = friction.teeth(1, uniform(g, 0.005, 0.015) * scene.largest("angle"), 2, 1.0 / scene.typical("current"))
     large = 0.3 * scene.pace("speed")
-    return Hidden("load_dependent_friction", "teeth by bristles", (hidden.rate_of("speed"),), large, form, own=1)
+    return HiddenTerm("load_dependent_friction", "teeth by bristles", (hidden.rate_of("speed"),), large, form, own=1)
 
 
 def oil(g: Generator, typical: float) -> Callable[[Array], Array]:
@@ -66,11 +66,11 @@ def oil(g: Generator, typical: float) -> Callable[[Array], Array]:
     return lambda slip: slip * (1.0 + share * slip / typical)
 
 
-def hot_windings(g: Generator, scene: Scene) -> Hidden:
+def hot_windings(g: Generator, scene: SystemScene) -> HiddenTerm:
     """Torque that fades as the windings heat up."""
     heat = scene.typical("current") ** 2
     form = forces.fading_drive(1, 2, scene.plant.parameters["torque"], uniform(g, 0.1, 0.5) * scene.length)
-    return Hidden("fading_drive", "hot windings", (hidden.rate_of("speed"),), 1.0 / heat, form, own=1)
+    return HiddenTerm("fading_drive", "hot windings", (hidden.rate_of("speed"),), 1.0 / heat, form, own=1)
 
 
 INSIDE = (

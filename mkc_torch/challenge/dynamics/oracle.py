@@ -18,10 +18,10 @@ import numpy as np
 
 from mkc_torch.challenge.dynamics.errors import OUTLIERS, Whitening
 from mkc_torch.challenge.dynamics.integrate import simulate, variation
-from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Trial
+from mkc_torch.challenge.dynamics.plant import Array, HiddenTerm, Plant, RunSet
 from mkc_torch.challenge.dynamics.readings import readings
-from mkc_torch.challenge.dynamics.rivals import SUPERSETS, Account, accounts
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.rivals import SUPERSETS, RivalModel, accounts
+from mkc_torch.challenge.dynamics.scene import SystemScene
 
 _RANK = 1e-9
 _FLAT = 1e-7
@@ -33,7 +33,7 @@ _KEPT = math.sqrt(1.0 - OUTLIERS)
 
 
 @dataclass(frozen=True)
-class Rival:
+class RivalPower:
     """Another account, and by how many standard deviations the effect's own form goes before it."""
 
     effect: str
@@ -42,7 +42,7 @@ class Rival:
 
 
 @dataclass(frozen=True)
-class Power:
+class EffectPower:
     """Numbers of standard deviations: against nothing, and against the best of ``rivals``, hardest first.
 
     ``missed`` is what the effect's own form leaves; of effects outside the catalogue, all of it. ``larger`` are
@@ -52,19 +52,19 @@ class Power:
     z: float
     z_sep: float
     missed: float
-    rivals: tuple[Rival, ...]
-    larger: tuple[Rival, ...] = ()
+    rivals: tuple[RivalPower, ...]
+    larger: tuple[RivalPower, ...] = ()
 
 
 @dataclass(frozen=True)
-class Tangents:
+class WhitenedTangents:
     """Whitened derivatives of the outputs: by parameters and first states (M, p + nR), and by each account (M, q)."""
 
     known: Array
-    accounts: Sequence[tuple[Account, Array]]
+    accounts: Sequence[tuple[RivalModel, Array]]
 
 
-def tangents(scene: Scene, errors: Whitening, *, rivals: bool) -> Tangents:
+def tangents(scene: SystemScene, errors: Whitening, *, rivals: bool) -> WhitenedTangents:
     """Along the course of a scene, by the variational equation.
 
     Args:
@@ -76,7 +76,7 @@ def tangents(scene: Scene, errors: Whitening, *, rivals: bool) -> Tangents:
     if plant.reads is not None:
         read = readings(scene) if rivals else []
         told = [(one, errors.whitened(one.outputs)) for one in read if one.outputs is not None]
-        return Tangents(errors.whitened(_readings_by_parameters(plant, u)), told)
+        return WhitenedTangents(errors.whitened(_readings_by_parameters(plant, u)), told)
     n, p, runs = len(plant.states), len(plant.parameters), trial.runs
     found = accounts(scene, _by_inputs(plant, x, u)) if rivals else []
     forced = [account.forcing for account in found if account.forcing is not None]
@@ -97,7 +97,7 @@ def tangents(scene: Scene, errors: Whitening, *, rivals: bool) -> Tangents:
             size = account.forcing.shape[-1]
             told.append((account, errors.whitened(traces[..., place : place + size])))
             place += size
-    return Tangents(errors.whitened(known), told)
+    return WhitenedTangents(errors.whitened(known), told)
 
 
 def jacobian_by_states(plant: Plant, x: Array, u: Array) -> Array:
@@ -146,15 +146,15 @@ def _readings_by_parameters(plant: Plant, u: Array) -> Array:
     return np.stack(columns, -1)[:, :: plant.fine]
 
 
-def power(plant: Plant, trial: Trial, hidden: Hidden, size: float, errors: Whitening) -> Power:
+def power(plant: Plant, trial: RunSet, hidden: HiddenTerm, size: float, errors: Whitening) -> EffectPower:
     """Of an effect at its size, about the parameters and first states that follow it best without it."""
     truth = simulate(plant, trial, hidden, size).outputs
-    scene = Scene(plant, trial, simulate(plant, trial))
+    scene = SystemScene(plant, trial, simulate(plant, trial))
     best = scene, errors.whitened(truth - scene.course.outputs)
     for _ in range(_ROUNDS):
         step = least_squares(tangents(scene, errors, rivals=False).known, best[1])
         nearer = moved(scene.plant, scene.trial, step)
-        scene = Scene(*nearer, simulate(*nearer))
+        scene = SystemScene(*nearer, simulate(*nearer))
         left = errors.whitened(truth - scene.course.outputs)
         if not np.isfinite(left).all() or np.square(left).sum() >= 0.999 * np.square(best[1]).sum():
             break
@@ -162,7 +162,7 @@ def power(plant: Plant, trial: Trial, hidden: Hidden, size: float, errors: White
     return Judge(tangents(best[0], errors, rivals=True)).power(best[1], hidden)
 
 
-def moved(plant: Plant, trial: Trial, step: Array) -> tuple[Plant, Trial]:
+def moved(plant: Plant, trial: RunSet, step: Array) -> tuple[Plant, RunSet]:
     """Parameters and first states (p + nR,) further by a step."""
     p = len(plant.parameters)
     values = dict(zip(plant.parameters, (plant.values + step[:p]).tolist(), strict=True))
@@ -173,7 +173,7 @@ def moved(plant: Plant, trial: Trial, step: Array) -> tuple[Plant, Trial]:
 class Judge:
     """Accounts with the known parameters projected out, ready to be compared with whatever a hidden effect leaves."""
 
-    def __init__(self, found: Tangents) -> None:
+    def __init__(self, found: WhitenedTangents) -> None:
         self._basis = range_of(found.known)
         self._accounts = [
             ((account.effect, account.at), Cone(self._beside(columns), positive=account.positive))
@@ -183,7 +183,7 @@ class Judge:
     def _beside(self, columns: Array) -> Array:
         return columns - self._basis @ (self._basis.T @ columns)
 
-    def power(self, left: Array, hidden: Hidden) -> Power:
+    def power(self, left: Array, hidden: HiddenTerm) -> EffectPower:
         """Of an effect that leaves so much (M,)."""
         left = self._beside(left)
         total = float(left @ left)
@@ -192,22 +192,22 @@ class Judge:
             missed[key] = min(missed.get(key, total), max(total - cone.explained(left), 0.0))
         own = min((value for key, value in missed.items() if _is_own(key, hidden)), default=0.0)
         told = [
-            Rival(*key, _KEPT * math.sqrt(max(value - own, 0.0)))
+            RivalPower(*key, _KEPT * math.sqrt(max(value - own, 0.0)))
             for key, value in missed.items()
             if not _is_own(key, hidden) and not _contains(key, hidden) and key[0] not in hidden.twins
         ]
         told.sort(key=lambda rival: rival.z_sep)
-        larger = [Rival(*key, 0.0) for key in missed if _contains(key, hidden) and own - missed[key] > _CLEARLY]
-        larger += [Rival(*key, 0.0) for key in missed if key[0] in hidden.twins]
+        larger = [RivalPower(*key, 0.0) for key in missed if _contains(key, hidden) and own - missed[key] > _CLEARLY]
+        larger += [RivalPower(*key, 0.0) for key in missed if key[0] in hidden.twins]
         z = _KEPT * math.sqrt(total)
-        return Power(z, min([z, *(r.z_sep for r in told)]), _KEPT * math.sqrt(own), tuple(told), tuple(larger))
+        return EffectPower(z, min([z, *(r.z_sep for r in told)]), _KEPT * math.sqrt(own), tuple(told), tuple(larger))
 
 
 Key = tuple[str, tuple[str, ...]]
 """An effect and where it acts."""
 
 
-def names(scene: Scene) -> frozenset[Key]:
+def names(scene: SystemScene) -> frozenset[Key]:
     """All that a diagnosis could say: dry friction, say, it could not at speeds that never reverse."""
     if scene.plant.reads is not None:
         found = readings(scene)
@@ -216,16 +216,16 @@ def names(scene: Scene) -> frozenset[Key]:
     return frozenset((account.effect, account.at) for account in found)
 
 
-def can_be_named(hidden: Hidden, known: frozenset[Key]) -> bool:
+def can_be_named(hidden: HiddenTerm, known: frozenset[Key]) -> bool:
     """Whether one of the names is that of the effect, at one of its places."""
     return any(_is_own(key, hidden) for key in known)
 
 
-def _is_own(key: Key, hidden: Hidden) -> bool:
+def _is_own(key: Key, hidden: HiddenTerm) -> bool:
     return key[0] == hidden.effect and bool(set(key[1]) & set(hidden.at))
 
 
-def _contains(key: Key, hidden: Hidden) -> bool:
+def _contains(key: Key, hidden: HiddenTerm) -> bool:
     return key[0] in SUPERSETS.get(hidden.effect, ()) and bool(set(key[1]) & set(hidden.at))
 
 

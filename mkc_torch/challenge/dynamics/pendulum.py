@@ -7,7 +7,7 @@ from torch import Generator
 
 from mkc_torch.challenge.draws import uniform, whole
 from mkc_torch.challenge.dynamics import hidden
-from mkc_torch.challenge.dynamics.plant import Array, Plant, Setting, Trial
+from mkc_torch.challenge.dynamics.plant import Array, Plant, RunSet, Setting
 from mkc_torch.challenge.dynamics.signals import excitation, moments, runs_of
 
 STEP = 0.05
@@ -35,13 +35,13 @@ def draw(g: Generator) -> Setting:
     return Setting(plant, trial(g, plant, runs, 360 // runs), trial(g, plant, 1, 200))
 
 
-def trial(g: Generator, plant: Plant, runs: int, samples: int) -> Trial:
+def trial(g: Generator, plant: Plant, runs: int, samples: int) -> RunSet:
     """Swings from a deflection, driven by torques in N m about the pendulum's own period."""
     time = moments(STEP, samples)
     period = 2.0 * np.pi / np.sqrt(plant.parameters["stiffness"])
     torques = [uniform(g, 2.0, 5.0) * excitation(g, time, period) for _ in range(runs)]
     begin = np.array([[uniform(g, -1.2, 1.2) for _ in range(runs)], [uniform(g, -1.0, 1.0) for _ in range(runs)]])
-    return Trial(STEP, runs_of(torques), begin)
+    return RunSet(STEP, runs_of(torques), begin)
 
 
 INSIDE = (

@@ -56,7 +56,7 @@ class Plant:
 
 
 @dataclass(frozen=True)
-class Trial:
+class RunSet:
     """Runs of one length: inputs (k, T, R) at the samples, and first states (n, R).
 
     Between samples inputs are linear, or ``held`` at what they were at the sample before.
@@ -90,7 +90,7 @@ def _unchanged(values: Array, step: float, size: float) -> Array:  # noqa: ARG00
 
 
 @dataclass(frozen=True)
-class Hidden:
+class HiddenTerm:
     """An effect before its size is known; of size 0 it is not there.
 
     Attributes:
@@ -122,5 +122,5 @@ class Setting:
     """A plant, its runs, and those of the second recording."""
 
     plant: Plant
-    trial: Trial
-    later: Trial
+    trial: RunSet
+    later: RunSet

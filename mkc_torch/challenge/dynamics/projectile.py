@@ -7,8 +7,8 @@ from torch import Generator
 
 from mkc_torch.challenge.draws import choose, log_uniform, uniform
 from mkc_torch.challenge.dynamics import forces, hidden
-from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Setting, Trial
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.plant import Array, HiddenTerm, Plant, RunSet, Setting
+from mkc_torch.challenge.dynamics.scene import SystemScene
 
 STEP = 0.02
 """s."""
@@ -37,57 +37,57 @@ def draw(g: Generator) -> Setting:
     return Setting(plant, trial(g, RUNS), trial(g, 1))
 
 
-def trial(g: Generator, runs: int) -> Trial:
+def trial(g: Generator, runs: int) -> RunSet:
     """Throws at 20 to 75 degrees, either way."""
     begin = []
     for _ in range(runs):
         pace, rise, way = uniform(g, 9.0, 18.0), np.radians(uniform(g, 20.0, 75.0)), choose(g, (-1.0, 1.0))
         begin.append([0.0, uniform(g, 0.5, 2.0), way * pace * np.cos(rise), pace * np.sin(rise)])
-    return Trial(STEP, np.zeros((0, SAMPLES, runs)), np.array(begin).T)
+    return RunSet(STEP, np.zeros((0, SAMPLES, runs)), np.array(begin).T)
 
 
 PLACES = (hidden.rate_of("speed"), hidden.rate_of("climb"))
 
 
-def air(g: Generator, scene: Scene) -> Hidden:
+def air(g: Generator, scene: SystemScene) -> HiddenTerm:
     """Drag along the velocity, which is more than the catalogue's along each axis."""
     typical = float(np.median(np.hypot(scene.state("speed"), scene.state("climb"))))
     form = forces.flight_drag((2, 3), typical, log_uniform(g, 1e3, 1e5))
-    return Hidden("quadratic_drag", "drag of a sphere along its velocity", PLACES, 0.5, form)
+    return HiddenTerm("quadratic_drag", "drag of a sphere along its velocity", PLACES, 0.5, form)
 
 
-def syrup(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+def syrup(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
     """Viscous drag along the velocity."""
     typical = float(np.median(np.hypot(scene.state("speed"), scene.state("climb"))))
-    return Hidden("linear_drag", "Oseen's drag", PLACES, 0.5, forces.creeping_drag((2, 3), typical))
+    return HiddenTerm("linear_drag", "Oseen's drag", PLACES, 0.5, forces.creeping_drag((2, 3), typical))
 
 
-def tilted_camera(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+def tilted_camera(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
     """The camera is not level: both axes turn, and gravity has a part along the first."""
 
     def turned(values: Array, step: float, size: float) -> Array:  # noqa: ARG001
         one, other = values
         return np.array([np.cos(size) * one + np.sin(size) * other, np.cos(size) * other - np.sin(size) * one])
 
-    return Hidden("constant_force", "tilted camera", (hidden.rate_of("speed"),), 0.5, outputs=turned)
+    return HiddenTerm("constant_force", "tilted camera", (hidden.rate_of("speed"),), 0.5, outputs=turned)
 
 
-def fading_gust(g: Generator, scene: Scene) -> Hidden:
+def fading_gust(g: Generator, scene: SystemScene) -> HiddenTerm:
     """A push from the side that fades a little."""
     form = forces.warming_bias(2, uniform(g, 0.1, 0.5) * scene.length, uniform(g, 0.0, 0.15))
-    return Hidden("constant_force", "push that fades", (hidden.rate_of("speed"),), 5.0, form, own=1)
+    return HiddenTerm("constant_force", "push that fades", (hidden.rate_of("speed"),), 5.0, form, own=1)
 
 
-def spin(g: Generator, scene: Scene) -> Hidden:
+def spin(g: Generator, scene: SystemScene) -> HiddenTerm:
     """A ball thrown with spin, which fades."""
     form = forces.lift((2, 3), uniform(g, 3.0, 10.0) * scene.length)
-    return Hidden("magnus_lift", "lift of a fading spin", PLACES, 0.5, form, own=1)
+    return HiddenTerm("magnus_lift", "lift of a fading spin", PLACES, 0.5, form, own=1)
 
 
-def gusts(g: Generator, scene: Scene) -> Hidden:
+def gusts(g: Generator, scene: SystemScene) -> HiddenTerm:
     """Gusts from the side that come and go."""
     form = forces.hum(2, uniform(g, 2.0, 6.0) / scene.length)
-    return Hidden("vibration", "sinusoid of time", (hidden.rate_of("speed"),), 30.0, form, own=2)
+    return HiddenTerm("vibration", "sinusoid of time", (hidden.rate_of("speed"),), 30.0, form, own=2)
 
 
 INSIDE = (air, air, syrup, spin, tilted_camera, fading_gust, hidden.slow_sensor())

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from mkc_torch.challenge.dynamics.plant import Array
-from mkc_torch.challenge.dynamics.rivals import SHIFTS, Account, input_forms
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.rivals import SHIFTS, RivalModel, input_forms
+from mkc_torch.challenge.dynamics.scene import SystemScene
 from mkc_torch.challenge.dynamics.transducers import lagged_each, play, transport
 
 
-def readings(scene: Scene) -> list[Account]:
+def readings(scene: SystemScene) -> list[RivalModel]:
     """All forms at all outputs and inputs of a plant that is read at once."""
     plant, step = scene.plant, scene.trial.step / scene.plant.fine
     assert plant.reads is not None
@@ -23,13 +23,13 @@ def readings(scene: Scene) -> list[Account]:
         for effect, columns, positive in output_forms(outputs[[row]], step, scene.length):
             traces = np.zeros((len(outputs), *columns.shape))
             traces[row] = columns
-            found.append(Account(effect, (name,), None, traces[:, :: plant.fine], positive))
+            found.append(RivalModel(effect, (name,), None, traces[:, :: plant.fine], positive))
     for row, name in enumerate(plant.inputs):
         for effect, course in input_forms(inputs[[row]], step, scene.length):
             changed = inputs.copy()
             changed[row] += course
             traces = (plant.reads(changed, plant.values) - outputs)[..., None]
-            found.append(Account(effect, (f"input {name}",), None, traces[:, :: plant.fine], True))
+            found.append(RivalModel(effect, (f"input {name}",), None, traces[:, :: plant.fine], True))
     return found
 
 

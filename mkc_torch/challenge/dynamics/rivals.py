@@ -13,7 +13,7 @@ import numpy as np
 
 from mkc_torch.challenge.dynamics.hidden import rate_of
 from mkc_torch.challenge.dynamics.plant import Array
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.scene import SystemScene
 from mkc_torch.challenge.dynamics.stores import swung
 from mkc_torch.challenge.dynamics.transducers import lagged_each, play, transport
 
@@ -33,7 +33,7 @@ SUPERSETS = {
 
 
 @dataclass(frozen=True)
-class Account:
+class RivalModel:
     """One form: what it adds to the rates (n, F, R, q), or to the outputs (m, T, R, q), for amplitudes of one.
 
     ``positive`` says that amplitudes of the other sign are not physics.
@@ -46,7 +46,7 @@ class Account:
     positive: bool
 
 
-def accounts(scene: Scene, gains: Array) -> list[Account]:
+def accounts(scene: SystemScene, gains: Array) -> list[RivalModel]:
     """All forms at all places.
 
     Args:
@@ -54,25 +54,25 @@ def accounts(scene: Scene, gains: Array) -> list[Account]:
         gains: derivative of the rates by the inputs (n, k, F, R).
     """
     plant = scene.plant
-    found: list[Account] = []
+    found: list[RivalModel] = []
     for row, state in enumerate(plant.states):
         if state in plant.speeds:
             continue
         for effect, columns, positive in rate_forms(scene, state):
             forcing = np.zeros((len(plant.states), *columns.shape))
             forcing[row] = columns
-            found.append(Account(effect, (rate_of(state),), forcing, None, positive))
+            found.append(RivalModel(effect, (rate_of(state),), forcing, None, positive))
     found += _exchanges(scene)
     for k, name in enumerate(plant.inputs):
         step = scene.trial.step / plant.fine
         for effect, course in input_forms(scene.course.inputs[[k]], step, scene.length):
             forcing = gains[:, k] * course
-            found.append(Account(effect, (f"input {name}",), forcing[..., None], None, True))
+            found.append(RivalModel(effect, (f"input {name}",), forcing[..., None], None, True))
     found += _lags(scene)
     return found
 
 
-def rate_forms(scene: Scene, state: str) -> Iterator[tuple[str, Array, bool]]:
+def rate_forms(scene: SystemScene, state: str) -> Iterator[tuple[str, Array, bool]]:
     """Forms on the rate of one state: effect, columns (F, R, q), and whether amplitudes are positive."""
     plant, v = scene.plant, scene.state(state)
     heat, step = plant.units[state] == "°C", scene.trial.step / plant.fine
@@ -121,7 +121,7 @@ def _memories(v: Array, step: float, length: float, *, swings: bool) -> Iterator
                 yield "hidden_mode", pull[..., None], True
 
 
-def _load(scene: Scene, state: str, position: str | None) -> Array | None:
+def _load(scene: SystemScene, state: str, position: str | None) -> Array | None:
     """What drives a speed against what holds it, both at standstill (F, R); None without inputs or a position."""
     plant, course = scene.plant, scene.course
     if position is None or not plant.inputs:
@@ -188,7 +188,7 @@ def input_forms(u: Array, step: float, length: float) -> Iterator[tuple[str, Arr
         yield "backlash", (play(u, share * largest) - u)[0]
 
 
-def _exchanges(scene: Scene) -> list[Account]:
+def _exchanges(scene: SystemScene) -> list[RivalModel]:
     plant, found = scene.plant, []
     free = [state for state in plant.states if state not in plant.speeds]
     for one, other in combinations(free, 2):
@@ -199,16 +199,16 @@ def _exchanges(scene: Scene) -> list[Account]:
         forcing[plant.row(one), ..., 0] = away
         forcing[plant.row(other), ..., 1] = -away
         places = (rate_of(one), rate_of(other))
-        found.append(Account("coupling", places, forcing, None, True))
+        found.append(RivalModel("coupling", places, forcing, None, True))
         if plant.units[one] == "m/s":
             turned = np.zeros((len(plant.states), *away.shape, 1))
             turned[plant.row(one), ..., 0] = -scene.state(other)
             turned[plant.row(other), ..., 0] = scene.state(one)
-            found.append(Account("magnus_lift", places, turned, None, False))
+            found.append(RivalModel("magnus_lift", places, turned, None, False))
     return found
 
 
-def _lags(scene: Scene) -> list[Account]:
+def _lags(scene: SystemScene) -> list[RivalModel]:
     plant, step = scene.plant, scene.trial.step / scene.plant.fine
     measured = scene.course.states[[plant.row(name) for name in plant.outputs]]
     found = []
@@ -217,7 +217,7 @@ def _lags(scene: Scene) -> list[Account]:
         traces = np.zeros((*behind.shape, len(behind)))
         for k, one in enumerate(behind):
             traces[k, ..., k] = one
-        found.append(Account("sensor_lag", plant.outputs, None, traces, True))
+        found.append(RivalModel("sensor_lag", plant.outputs, None, traces, True))
     return found
 
 

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from mkc_torch.challenge.dynamics.integrate import Course
-from mkc_torch.challenge.dynamics.plant import Array, Plant, Trial
+from mkc_torch.challenge.dynamics.plant import Array, Plant, RunSet
 
 
 @dataclass(frozen=True)
-class Scene:
+class SystemScene:
     """A plant and its course with nothing hidden."""
 
     plant: Plant
-    trial: Trial
+    trial: RunSet
     course: Course
 
     def state(self, name: str) -> Array:

@@ -12,13 +12,13 @@ from torch import Tensor
 from mkc_torch.challenge.dynamics.errors import Errors
 from mkc_torch.challenge.dynamics.integrate import simulate
 from mkc_torch.challenge.dynamics.oracle import least_squares
-from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Trial
+from mkc_torch.challenge.dynamics.plant import Array, HiddenTerm, Plant, RunSet
 from mkc_torch.challenge.key import Key
 from mkc_torch.recording.recording import Recording
 
 
 def oracle_rms(
-    plant: Plant, trial: Trial, hidden: Hidden, size: float, errors: Errors, left: Array, good: np.ndarray
+    plant: Plant, trial: RunSet, hidden: HiddenTerm, size: float, errors: Errors, left: Array, good: np.ndarray
 ) -> float:
     """Root mean square of what the true system leaves on good samples, its first state estimated from them.
 

@@ -10,8 +10,8 @@ from torch import Generator
 
 from mkc_torch.challenge.draws import happens, uniform
 from mkc_torch.challenge.dynamics import hidden, transducers
-from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Setting, Trial
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.plant import Array, HiddenTerm, Plant, RunSet, Setting
+from mkc_torch.challenge.dynamics.scene import SystemScene
 from mkc_torch.challenge.dynamics.signals import excitation, moments, runs_of
 
 STEP = 0.02
@@ -44,55 +44,55 @@ def draw(g: Generator) -> Setting:
     return Setting(plant, trial(g, 1, 320), trial(g, 1, 200))
 
 
-def trial(g: Generator, runs: int, samples: int) -> Trial:
+def trial(g: Generator, runs: int, samples: int) -> RunSet:
     """Commands of either sign in rad, as a planner sends them, without jumps."""
     time = moments(STEP, samples)
     wanted = runs_of([uniform(g, 0.7, 1.4) * excitation(g, time, uniform(g, 0.8, 2.0)) for _ in range(runs)])
-    return Trial(
+    return RunSet(
         STEP, transducers.lagged(transducers.lagged(wanted, STEP, PLANNED), STEP, PLANNED), np.zeros((0, runs))
     )
 
 
-def late(g: Generator, scene: Scene) -> Hidden:
+def late(g: Generator, scene: SystemScene) -> HiddenTerm:
     """The bus and the loop of the servo take their time."""
     pipe = happens(g, 0.5)
     form = "transport" if pipe else "four lags in series"
     change = transducers.transport if pipe else transducers.lags(4)
-    return Hidden("delay", form, AT, 0.03 * scene.length, outputs=change, twins=("input_delay",))
+    return HiddenTerm("delay", form, AT, 0.03 * scene.length, outputs=change, twins=("input_delay",))
 
 
-def worn(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+def worn(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
     """Play of the gear; what is behind the command and what is before the angle is the same here."""
     large = 0.3 * scene.largest_input("command")
-    return Hidden("backlash", "uneven teeth", (*AT, "input command"), large, outputs=transducers.worn_gear)
+    return HiddenTerm("backlash", "uneven teeth", (*AT, "input command"), large, outputs=transducers.worn_gear)
 
 
-def wrong_zero(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+def wrong_zero(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
     """A horn that sits a tooth off, on a shaft that is not quite round."""
     change = transducers.wrong_zero(uniform(g, 0.0, 0.1), uniform(g, 0.0, 2.0 * math.pi))
-    return Hidden("offset", "zero of an eccentric shaft", AT, 0.2, outputs=change)
+    return HiddenTerm("offset", "zero of an eccentric shaft", AT, 0.2, outputs=change)
 
 
-def load(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+def load(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
     """A load that the loop gives way to."""
     change = transducers.sagging(uniform(g, -0.5, 0.5))
-    return Hidden("gravity_sag", "weight on a soft joint", AT, 0.3, outputs=change)
+    return HiddenTerm("gravity_sag", "weight on a soft joint", AT, 0.3, outputs=change)
 
 
-def end_of_range(g: Generator, scene: Scene) -> Hidden:
+def end_of_range(g: Generator, scene: SystemScene) -> HiddenTerm:
     change = transducers.soft_limit(scene.largest_input("command"), uniform(g, 4.0, 10.0))
     twins = ("input_saturation",)
-    return Hidden("output_saturation", "smooth limit", AT, 2.5, outputs=change, twins=twins)
+    return HiddenTerm("output_saturation", "smooth limit", AT, 2.5, outputs=change, twins=twins)
 
 
-def slow_sensor(g: Generator, scene: Scene) -> Hidden:
+def slow_sensor(g: Generator, scene: SystemScene) -> HiddenTerm:
     return replace(hidden.slow_sensor()(g, scene), twins=("input_lag",))
 
 
-def trembling(g: Generator, scene: Scene) -> Hidden:
+def trembling(g: Generator, scene: SystemScene) -> HiddenTerm:
     """A machine nearby."""
     omega = 2.0 * math.pi * uniform(g, 5.0, 30.0) / scene.length
-    return Hidden("vibration", "sinusoid of time", AT, 0.2, outputs=transducers.shaken(omega))
+    return HiddenTerm("vibration", "sinusoid of time", AT, 0.2, outputs=transducers.shaken(omega))
 
 
 INSIDE = (late, worn, wrong_zero, load, end_of_range, slow_sensor)

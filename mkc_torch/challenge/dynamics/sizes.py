@@ -11,8 +11,8 @@ from mkc_torch.challenge.draws import happens, log_uniform
 from mkc_torch.challenge.dynamics.errors import Whitening
 from mkc_torch.challenge.dynamics.integrate import outputs_of_sizes
 from mkc_torch.challenge.dynamics.oracle import Judge, tangents
-from mkc_torch.challenge.dynamics.plant import Hidden
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.plant import HiddenTerm
+from mkc_torch.challenge.dynamics.scene import SystemScene
 
 STRONG_SHARE = 0.7
 """Share of the effects of the catalogue whose size is drawn by z_sep; that of the others by z."""
@@ -27,7 +27,7 @@ _LEAST = 1e-3
 """Smallest size that is tried, as a share of the large one."""
 
 
-def draw_size(g: Generator, hidden: Hidden, scene: Scene, errors: Whitening, *, outside: bool) -> float:
+def draw_size(g: Generator, hidden: HiddenTerm, scene: SystemScene, errors: Whitening, *, outside: bool) -> float:
     """A size between a trifle and ``hidden.large``.
 
     Args:

@@ -9,8 +9,8 @@ from torch import Generator
 
 from mkc_torch.challenge.draws import choose, uniform, whole
 from mkc_torch.challenge.dynamics import flows, forces, hidden
-from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Setting, Trial
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.plant import Array, HiddenTerm, Plant, RunSet, Setting
+from mkc_torch.challenge.dynamics.scene import SystemScene
 from mkc_torch.challenge.dynamics.signals import excitation, moments
 
 STEP = 2.0
@@ -46,7 +46,7 @@ def draw(g: Generator) -> Setting:
     return Setting(plant, trial(g, runs, 320 // runs), trial(g, 1, 200))
 
 
-def trial(g: Generator, runs: int, samples: int) -> Trial:
+def trial(g: Generator, runs: int, samples: int) -> RunSet:
     """Pumps between 0.5 and 9.5 V, from a first level of 0.1 to 0.7 m."""
     time = moments(STEP, samples)
     pumps = [
@@ -54,22 +54,22 @@ def trial(g: Generator, runs: int, samples: int) -> Trial:
         for _ in range(2)
     ]
     begin = np.array([[uniform(g, 0.1, 0.7) for _ in range(runs)] for _ in range(2)])
-    return Trial(STEP, np.stack([np.stack(one, -1) for one in pumps]), begin)
+    return RunSet(STEP, np.stack([np.stack(one, -1) for one in pumps]), begin)
 
 
-def pipe_between(g: Generator, scene: Scene) -> Hidden:
+def pipe_between(g: Generator, scene: SystemScene) -> HiddenTerm:
     """A pipe with a filter in it, by Darcy and Forchheimer."""
     away = np.abs(scene.state("level_1") - scene.state("level_2"))
     typical, bend = float(np.median(away)), uniform(g, 0.0, 0.5)
     form = flows.exchange(0, 1, lambda head: flows.forchheimer(head, bend / typical), uniform(g, 0.7, 1.4))
     places = (hidden.rate_of("level_1"), hidden.rate_of("level_2"))
-    return Hidden("coupling", "Darcy and Forchheimer's pipe", places, scene.pace("level_1") / typical, form)
+    return HiddenTerm("coupling", "Darcy and Forchheimer's pipe", places, scene.pace("level_1") / typical, form)
 
 
 def dripping_tap(level: str) -> hidden.Draw:
-    def draw_tap(g: Generator, scene: Scene) -> Hidden:
+    def draw_tap(g: Generator, scene: SystemScene) -> HiddenTerm:
         form = flows.tap(scene.plant.row(level), uniform(g, 3.0, 8.0) * scene.largest(level))
-        return Hidden("constant_force", "tap on a main", (hidden.rate_of(level),), scene.pace(level), form)
+        return HiddenTerm("constant_force", "tap on a main", (hidden.rate_of(level),), scene.pace(level), form)
 
     return draw_tap
 
@@ -81,17 +81,17 @@ def gravel(g: Generator, typical: float) -> Callable[[Array], Array]:
 
 
 def crack(level: str) -> hidden.Draw:
-    def draw_crack(g: Generator, scene: Scene) -> Hidden:
+    def draw_crack(g: Generator, scene: SystemScene) -> HiddenTerm:
         form = flows.slot(scene.plant.row(level), scene.largest(level), choose(g, (1.5, 2.5)), uniform(g, 0.0, 0.1))
-        return Hidden("power_law", "slot in the wall", (hidden.rate_of(level),), 3.0 * scene.pace(level), form)
+        return HiddenTerm("power_law", "slot in the wall", (hidden.rate_of(level),), 3.0 * scene.pace(level), form)
 
     return draw_crack
 
 
-def wavy_inflow(g: Generator, scene: Scene) -> Hidden:
+def wavy_inflow(g: Generator, scene: SystemScene) -> HiddenTerm:
     """Rain that comes and goes."""
     form = forces.hum(0, uniform(g, 3.0, 15.0) / scene.length)
-    return Hidden("vibration", "sinusoid of time", (hidden.rate_of("level_1"),), scene.pace("level_1"), form, own=2)
+    return HiddenTerm("vibration", "sinusoid of time", (hidden.rate_of("level_1"),), scene.pace("level_1"), form, own=2)
 
 
 INSIDE = (

@@ -9,8 +9,8 @@ from torch import Generator
 
 from mkc_torch.challenge.draws import uniform, whole
 from mkc_torch.challenge.dynamics import flows, hidden
-from mkc_torch.challenge.dynamics.plant import Array, Hidden, Plant, Setting, Trial
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.plant import Array, HiddenTerm, Plant, RunSet, Setting
+from mkc_torch.challenge.dynamics.scene import SystemScene
 from mkc_torch.challenge.dynamics.signals import excitation, moments
 
 STEP = 5.0
@@ -45,7 +45,7 @@ def draw(g: Generator) -> Setting:
     return Setting(plant, trial(g, runs, 320 // runs), trial(g, 1, 200))
 
 
-def trial(g: Generator, runs: int, samples: int) -> Trial:
+def trial(g: Generator, runs: int, samples: int) -> RunSet:
     """Heaters between 0 and 100 W, from a warm or a cold body."""
     time = moments(STEP, samples)
     heaters = [
@@ -53,36 +53,36 @@ def trial(g: Generator, runs: int, samples: int) -> Trial:
         for _ in range(2)
     ]
     begin = np.array([[uniform(g, 20.0, 150.0) for _ in range(runs)] for _ in range(2)])
-    return Trial(STEP, np.stack([np.stack(one, -1) for one in heaters]), begin)
+    return RunSet(STEP, np.stack([np.stack(one, -1) for one in heaters]), begin)
 
 
 def glow(state: str) -> hidden.Draw:
-    def draw_glow(g: Generator, scene: Scene) -> Hidden:
+    def draw_glow(g: Generator, scene: SystemScene) -> HiddenTerm:
         row = scene.plant.row(state)
         form = flows.radiation(row, scene.plant.parameters["room"], uniform(g, 0.0, 1e-3))
-        return Hidden(
+        return HiddenTerm(
             "thermal_loss", "radiation to the walls", (hidden.rate_of(state),), scene.pace(state) / 50.0, form
         )
 
     return draw_glow
 
 
-def air_gap(g: Generator, scene: Scene) -> Hidden:
+def air_gap(g: Generator, scene: SystemScene) -> HiddenTerm:
     """Heat that air carries over, a little more than in proportion, in proportion to how far they are apart."""
     away = np.abs(scene.state("temperature_1") - scene.state("temperature_2"))
     typical, power = float(np.median(away)), uniform(g, 1.0, 1.25)
     form = flows.exchange(0, 1, lambda head: typical * (head / typical) ** power, uniform(g, 0.7, 1.4))
     places = (hidden.rate_of("temperature_1"), hidden.rate_of("temperature_2"))
-    return Hidden("coupling", "convection", places, scene.pace("temperature_1") / typical, form)
+    return HiddenTerm("coupling", "convection", places, scene.pace("temperature_1") / typical, form)
 
 
 def damp(state: str) -> hidden.Draw:
     """Water that evaporates from a wet body."""
 
-    def draw_damp(g: Generator, scene: Scene) -> Hidden:  # noqa: ARG001 - one signature for all
+    def draw_damp(g: Generator, scene: SystemScene) -> HiddenTerm:  # noqa: ARG001 - one signature for all
         room = scene.plant.parameters["room"]
         form = flows.evaporation(scene.plant.row(state), room, scene.largest(state))
-        return Hidden("power_law", "evaporation", (hidden.rate_of(state),), 5.0 * scene.pace(state), form)
+        return HiddenTerm("power_law", "evaporation", (hidden.rate_of(state),), 5.0 * scene.pace(state), form)
 
     return draw_damp
 
@@ -90,10 +90,10 @@ def damp(state: str) -> hidden.Draw:
 def rising_air(state: str) -> hidden.Draw:
     """Natural convection along a plate, laminar or turbulent."""
 
-    def draw_air(g: Generator, scene: Scene) -> Hidden:
+    def draw_air(g: Generator, scene: SystemScene) -> HiddenTerm:
         room, power = scene.plant.parameters["room"], uniform(g, 1.25, 1.4)
         form = flows.natural_convection(scene.plant.row(state), room, scene.largest(state), power)
-        return Hidden("power_law", "natural convection", (hidden.rate_of(state),), 5.0 * scene.pace(state), form)
+        return HiddenTerm("power_law", "natural convection", (hidden.rate_of(state),), 5.0 * scene.pace(state), form)
 
     return draw_air
 
@@ -104,11 +104,11 @@ def plaster(g: Generator, typical: float) -> Callable[[Array], Array]:
     return lambda away: away * (away / typical) ** (power - 1.0)
 
 
-def wax(g: Generator, scene: Scene) -> Hidden:
+def wax(g: Generator, scene: SystemScene) -> HiddenTerm:
     """Wax that melts somewhere in the middle of the temperatures."""
     place = float(np.quantile(scene.state("temperature_1"), uniform(g, 0.3, 0.7)))
     form = flows.melting(0, place, uniform(g, 4.0, 10.0))
-    return Hidden("latent_heat", "melting", (hidden.rate_of("temperature_1"),), 3.0, form)
+    return HiddenTerm("latent_heat", "melting", (hidden.rate_of("temperature_1"),), 3.0, form)
 
 
 INSIDE = (

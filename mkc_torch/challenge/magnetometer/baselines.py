@@ -23,7 +23,7 @@ MOST_FINDINGS = 3
 
 
 @dataclass(frozen=True)
-class Candidate:
+class BaselineCandidate:
     """Columns that an effect would add to the residual of the norm."""
 
     effect: str
@@ -51,27 +51,28 @@ def stepwise_bic(recording: Recording) -> dict[str, Any] | None:
     return {"verdict": "explained" if findings else "adequate", "findings": findings}
 
 
-def candidates(recording: Recording, u: Float[Tensor, "N 3"], field: Float[Tensor, "N 3"]) -> list[Candidate]:
+def candidates(recording: Recording, u: Float[Tensor, "N 3"], field: Float[Tensor, "N 3"]) -> list[BaselineCandidate]:
     """Offsets that follow a column, a trend, an exponential or a step; the cube of the field; a gradient."""
     time = recording["time"]
     x = time - time[0]
     names = [name for name in recording.names if name != "time" and not name.startswith("mag_")]
     found = [
-        Candidate(ROLES.get(name, "driver_offset"), (name,), None, u * _centred(recording[name])) for name in names
+        BaselineCandidate(ROLES.get(name, "driver_offset"), (name,), None, u * _centred(recording[name]))
+        for name in names
     ]
     shapes = (x, *(torch.exp(-x / constant) for constant in TIME_CONSTANTS))
-    found += [Candidate("offset_drift", (), None, u * _centred(shape)) for shape in shapes]
+    found += [BaselineCandidate("offset_drift", (), None, u * _centred(shape)) for shape in shapes]
     for k in range(2, int(float(x[-1]) / ONSET_GRID) - 1):
         onset = float(time[0]) + k * ONSET_GRID
-        found.append(Candidate("hard_iron_step", (), onset, u * (time > onset).double()[:, None]))
-    found.append(Candidate("cubic_nonlinearity", (), None, u * field**3))
+        found.append(BaselineCandidate("hard_iron_step", (), onset, u * (time > onset).double()[:, None]))
+    found.append(BaselineCandidate("cubic_nonlinearity", (), None, u * field**3))
     if all(name in recording for name in POSITION):
         place = recording.stack(*POSITION)
-        found.append(Candidate("field_gradient", POSITION, None, place - place.mean(0)))
+        found.append(BaselineCandidate("field_gradient", POSITION, None, place - place.mean(0)))
     return found
 
 
-def _forward(residual: Tensor, nuisance: Tensor, options: list[Candidate]) -> list[Candidate]:
+def _forward(residual: Tensor, nuisance: Tensor, options: list[BaselineCandidate]) -> list[BaselineCandidate]:
     """Add the candidate that lowers BIC most, until none does."""
     basis = torch.linalg.qr(nuisance).Q
     columns = torch.cat([option.columns for option in options], -1)

@@ -29,7 +29,7 @@ _NO_DRIVER = ("time", "mag_x", "mag_y", "mag_z")
 
 
 @dataclass(frozen=True)
-class Family:
+class EffectFamily:
     """The traces an effect could have, up to linear coefficients; µT in the measurement's axes."""
 
     effect: str
@@ -37,35 +37,37 @@ class Family:
     traces: Float[Tensor, "N 3 p"]
 
 
-def step_family(time: Float[Tensor, " N"], onset: float) -> Family:
-    return Family("hard_iron_step", (), _offset((time > onset).double()))
+def step_family(time: Float[Tensor, " N"], onset: float) -> EffectFamily:
+    return EffectFamily("hard_iron_step", (), _offset((time > onset).double()))
 
 
-def column_family(name: str, values: Float[Tensor, " N"]) -> Family:
+def column_family(name: str, values: Float[Tensor, " N"]) -> EffectFamily:
     """An offset that follows a recorded column."""
-    return Family(ROLES.get(name, "driver_offset"), (name,), _offset(values - values.mean()))
+    return EffectFamily(ROLES.get(name, "driver_offset"), (name,), _offset(values - values.mean()))
 
 
-def drift_families(time: Float[Tensor, " N"]) -> Iterable[Family]:
+def drift_families(time: Float[Tensor, " N"]) -> Iterable[EffectFamily]:
     """Linear and exponential in time."""
     x = time - time[0]
     for shape in (x / x[-1], *(torch.exp(-x / constant) for constant in TIME_CONSTANTS)):
-        yield Family("offset_drift", (), _offset(shape))
+        yield EffectFamily("offset_drift", (), _offset(shape))
 
 
-def cubic_family(scene: Scene, *, about_zero: bool = False) -> Family:
+def cubic_family(scene: Scene, *, about_zero: bool = False) -> EffectFamily:
     """The cube of the field on each axis, or with ``about_zero`` of the field and the hard iron together."""
     core = scene.field @ scene.sensor.soft.mT
-    return Family("cubic_nonlinearity", (), torch.diag_embed((core + scene.sensor.hard if about_zero else core) ** 3))
+    return EffectFamily(
+        "cubic_nonlinearity", (), torch.diag_embed((core + scene.sensor.hard if about_zero else core) ** 3)
+    )
 
 
-def gradient_family(scene: Scene, position: Float[Tensor, "N 3"], *, vector: bool) -> Family:
+def gradient_family(scene: Scene, position: Float[Tensor, "N 3"], *, vector: bool) -> EffectFamily:
     """A field that is linear in position: its length alone (3), or free of curl and divergence (5)."""
     place = position - position.mean(0)
     if not vector:
-        return Family("field_gradient", POSITION, scene.along[:, :, None] * place[:, None])
+        return EffectFamily("field_gradient", POSITION, scene.along[:, :, None] * place[:, None])
     traces = [scene.measured(place @ tensor) for tensor in traceless()]
-    return Family("field_gradient", POSITION, torch.stack(traces, -1))
+    return EffectFamily("field_gradient", POSITION, torch.stack(traces, -1))
 
 
 def traceless() -> Float[Tensor, "5 3 3"]:
@@ -78,7 +80,7 @@ def traceless() -> Float[Tensor, "5 3 3"]:
     return basis
 
 
-def families(scene: Scene, columns: Mapping[str, Float[Tensor, " N"]], *, vector: bool) -> list[Family]:
+def families(scene: Scene, columns: Mapping[str, Float[Tensor, " N"]], *, vector: bool) -> list[EffectFamily]:
     """All that the recorded columns allow.
 
     Args:

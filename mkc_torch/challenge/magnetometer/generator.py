@@ -16,7 +16,7 @@ from mkc_torch.challenge.magnetometer.columns import Plan, draw_columns, draw_pl
 from mkc_torch.challenge.magnetometer.drivers import draw_current, draw_temperature
 from mkc_torch.challenge.magnetometer.families import (
     POSITION,
-    Family,
+    EffectFamily,
     column_family,
     cubic_family,
     families,
@@ -31,9 +31,9 @@ from mkc_torch.challenge.magnetometer.noise import (
     Outliers,
     ambient_errors,
     axis_errors,
+    contaminate,
     draw_noise,
     draw_outliers,
-    spoil,
 )
 from mkc_torch.challenge.magnetometer.oracle import second_residual
 from mkc_torch.challenge.magnetometer.power import Metric, Power, Question, powers
@@ -73,7 +73,7 @@ _TINY = 1e-12
 
 
 @dataclass(frozen=True)
-class Spoilt:
+class Contaminated:
     """A measurement, and what went into it beside the truth: errors of the length in µT, and which samples are bad."""
 
     measured: Float[Tensor, "N 3"]
@@ -207,7 +207,7 @@ def _question(
     scene: Scene,
     plan: Plan,
     columns: Mapping[str, Float[Tensor, " N"]],
-    known: Sequence[Family],
+    known: Sequence[EffectFamily],
     *,
     vector: bool,
 ) -> Question:
@@ -224,7 +224,7 @@ def _question(
 
 def _own_family(
     effect: Hidden, scene: Scene, columns: Mapping[str, Float[Tensor, " N"]], *, vector: bool
-) -> Family | None:
+) -> EffectFamily | None:
     """The linear form of the effect with the true onset and the recorded driver."""
     if effect.effect == "hard_iron_step" and effect.onset is not None:
         return step_family(scene.time, effect.onset)
@@ -237,14 +237,16 @@ def _own_family(
     return None
 
 
-def spoil_scene(g: Generator, scene: Scene, noise: Noise, outliers: Outliers, effect: Float[Tensor, "N 3"]) -> Spoilt:
+def spoil_scene(
+    g: Generator, scene: Scene, noise: Noise, outliers: Outliers, effect: Float[Tensor, "N 3"]
+) -> Contaminated:
     """The measurement of a scene with an effect, noise and outliers, µT."""
     count = len(scene.time)
     errors = axis_errors(g, noise, count) + ambient_errors(g, noise, count)[:, None] * scene.along
     direction = torch.nn.functional.normalize(scene.field, dim=-1)
-    bad, mask = spoil(g, outliers, noise.sigma, direction)
+    bad, mask = contaminate(g, outliers, noise.sigma, direction)
     clean = scene.field @ scene.sensor.soft.mT + scene.sensor.hard
-    return Spoilt(clean + effect + errors + bad, errors, mask)
+    return Contaminated(clean + effect + errors + bad, errors, mask)
 
 
 def total_of(effects: Sequence[Hidden], sizes: Sequence[float], scene: Scene) -> Float[Tensor, "N 3"]:
@@ -270,7 +272,7 @@ def _drivers(effect: Hidden, plan: Plan) -> tuple[str, ...]:
     return POSITION if effect.driver == "position" else (effect.driver,)
 
 
-def recording_of(name: str, scene: Scene, spoilt: Spoilt, columns: Mapping[str, Tensor]) -> Recording:
+def recording_of(name: str, scene: Scene, spoilt: Contaminated, columns: Mapping[str, Tensor]) -> Recording:
     axes = zip(("mag_x", "mag_y", "mag_z"), spoilt.measured.unbind(-1), strict=True)
     return Recording({"time": scene.time.round(decimals=6), **rounded(dict(axes)), **columns}, name=name)
 
@@ -286,7 +288,7 @@ def key_of(
     scene: Scene,
     noise: Noise,
     outliers: Outliers,
-    spoilt: Spoilt,
+    spoilt: Contaminated,
     columns: Mapping[str, Tensor],
 ) -> Key:
     return Key(

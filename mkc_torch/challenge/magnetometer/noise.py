@@ -122,7 +122,7 @@ def draw_outliers(g: Generator) -> Outliers:
     return Outliers(share, burst, happens(g, 0.5), (5.0, log_uniform(g, 10.0, 100.0)))
 
 
-def spoil(
+def contaminate(
     g: Generator, outliers: Outliers, sigma: float, directions: Float[Tensor, "N 3"]
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, " N"]]:
     """What outliers add in µT, and where: True in the mask.

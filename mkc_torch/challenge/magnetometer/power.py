@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.challenge.magnetometer.families import Family
+from mkc_torch.challenge.magnetometer.families import EffectFamily
 from mkc_torch.challenge.magnetometer.noise import Noise
 from mkc_torch.challenge.magnetometer.process import Process
 from mkc_torch.challenge.magnetometer.scene import Scene
@@ -65,8 +65,8 @@ class Question:
     """An effect's trace (N, 3) in the measurement's axes, what it is to be told from, and its own linear family."""
 
     trace: Float[Tensor, "N 3"]
-    rivals: Sequence[Family]
-    own: Family | None = None
+    rivals: Sequence[EffectFamily]
+    own: EffectFamily | None = None
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Sensor:
+class SensorTruth:
     """``measured = soft · field + hard``, µT in the sensor's axes."""
 
     soft: Float[Tensor, "3 3"]
@@ -28,7 +28,7 @@ class Scene:
     """One recording's truth. ``settled``: it was taken later, when all that happens once has happened."""
 
     motion: Motion
-    sensor: Sensor
+    sensor: SensorTruth
     field_world: Float[Tensor, " 3"]  # µT
     temperature: Float[Tensor, " N"]  # °C
     current: Float[Tensor, " N"]  # A
@@ -63,11 +63,11 @@ class Scene:
         return self.motion.into_body(world) @ self.sensor.soft.mT
 
 
-def draw_sensor(g: Generator) -> Sensor:
+def draw_sensor(g: Generator) -> SensorTruth:
     """Hard iron up to 40 µT, soft iron up to ±10 %."""
     a = torch.randn((3, 3), generator=g, dtype=torch.float64).clamp(-2.0, 2.0) / 2.0
     soft = torch.eye(3, dtype=torch.float64) + 0.1 * 0.5 * (a + a.mT)
-    return Sensor(soft, uniform(g, 0.0, 40.0) * direction(g))
+    return SensorTruth(soft, uniform(g, 0.0, 40.0) * direction(g))
 
 
 def draw_field(g: Generator) -> Float[Tensor, " 3"]:

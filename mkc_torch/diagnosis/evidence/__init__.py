@@ -1,6 +1,6 @@
 """Tests of evidence: what speaks for and against a finding, and what is left over; one test a file.
 
-A new one is a file with ``test(case) -> Told`` and a line in :data:`TESTS`. What it says then stands in the report, on
+A new one is a file with ``test(case) -> EvidenceResult`` and a line in :data:`TESTS`. What it says then stands in the report, on
 the terminal and in ``diagnosis.json``, there under ``evidence`` by its id. It informs: verdict and findings stay.
 """
 
@@ -9,12 +9,12 @@ from mkc_torch.diagnosis.evidence import (
     driver_shift,
     extrapolation,
     held_out_gain,
-    one_stretch,
+    intermittency,
+    localised,
     onset,
+    proxy_driver,
     rejected,
     remaining,
-    stand_in,
-    switched,
     whiteness,
 )
 from mkc_torch.diagnosis.evidence.base import EvidenceTest
@@ -24,11 +24,11 @@ __all__ = ["TESTS"]
 TESTS: tuple[EvidenceTest, ...] = (
     EvidenceTest(held_out_gain.test, ahead=held_out_gain.beside_the_others, each_finding=True),
     EvidenceTest(onset.test, ahead=onset.of_finding, each_finding=True),
-    EvidenceTest(switched.test, each_finding=True),
+    EvidenceTest(intermittency.test, each_finding=True),
     EvidenceTest(remaining.test, ahead=remaining.within_reach),
-    EvidenceTest(one_stretch.test),
+    EvidenceTest(localised.test),
     EvidenceTest(rejected.test),
-    EvidenceTest(stand_in.test, ahead=stand_in.goes_on),
+    EvidenceTest(proxy_driver.test, ahead=proxy_driver.goes_on),
     EvidenceTest(driver_shift.test, ahead=driver_shift.of_finding, each_finding=True),
     EvidenceTest(extrapolation.test, ahead=extrapolation.of_finding, each_finding=True),
     EvidenceTest(density.test),

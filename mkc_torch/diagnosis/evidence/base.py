@@ -9,24 +9,24 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, scored
-from mkc_torch.diagnosis.follows import units_of
-from mkc_torch.diagnosis.linearised.estimate import Estimate
+from mkc_torch.diagnosis.goodness_of_fit import units_of
+from mkc_torch.diagnosis.linearised.estimate import FinalEstimate
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.fit import FittedModel, without_term
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.result import Row, SmoothCorrection, Spread, Table, Told
-from mkc_torch.diagnosis.search.locate import Located
+from mkc_torch.diagnosis.result import EvidenceResult, HeldOutScore, Row, SmoothCorrection, Table
+from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Case", "EvidenceTest", "Row", "SmoothCorrection", "Table", "Told", "gain_of"]
+__all__ = ["EvidenceContext", "EvidenceResult", "EvidenceTest", "Row", "SmoothCorrection", "Table", "gain_of"]
 
 
 @dataclass(frozen=True)
-class Case:
+class EvidenceContext:
     """What a test may look at. It changes nothing of it.
 
     Attributes:
@@ -45,15 +45,15 @@ class Case:
     """
 
     base: FittedModel
-    first: Located | None
-    found: tuple[Located, ...]
+    first: SearchResult | None
+    found: tuple[SearchResult, ...]
     held_out: tuple[Evidence, ...]
     blocks: HeldOutBlocks
     drivers: tuple[Driver, ...]
     seed: int
     settings: Settings
     number: int = 0
-    estimate: Estimate | None = None
+    estimate: FinalEstimate | None = None
     ahead: Any = None
     pairs: tuple[tuple[Evidence, Evidence], ...] = ()
 
@@ -76,7 +76,7 @@ class Case:
         return units_of(self.prepared)
 
     @property
-    def final(self) -> Estimate:
+    def final(self) -> FinalEstimate:
         """The final parameters, which a test has and what goes ahead of it has not."""
         assert self.estimate is not None
         return self.estimate
@@ -92,7 +92,7 @@ class Case:
         return self.fits[-1]
 
     @property
-    def located(self) -> Located:
+    def located(self) -> SearchResult:
         """The finding's search."""
         return self.found[self.number]
 
@@ -124,10 +124,10 @@ class Case:
         """Root mean square of a model's held-out residuals over the inliers."""
         return float(model.residual[self.inliers].square().mean().sqrt())
 
-    def spread(self, model: Evidence) -> Spread:
+    def spread(self, model: Evidence) -> HeldOutScore:
         """A model on held-out blocks."""
         mean = float(model.log_likelihood.mean())
-        return Spread(mean, self.rms(model), tuple(model.sigma.tolist()), tuple(model.d.tolist()))
+        return HeldOutScore(mean, self.rms(model), tuple(model.sigma.tolist()), tuple(model.d.tolist()))
 
 
 @dataclass(frozen=True)
@@ -141,12 +141,12 @@ class EvidenceTest:
         each_finding: whether it is asked of each finding, and not once of the whole diagnosis.
     """
 
-    test: Callable[[Case], Told]
-    ahead: Callable[[Case], Any] | None = None
+    test: Callable[[EvidenceContext], EvidenceResult]
+    ahead: Callable[[EvidenceContext], Any] | None = None
     each_finding: bool = False
 
 
-def gain_of(final: Estimate, number: int) -> Float[Tensor, " N"]:
+def gain_of(final: FinalEstimate, number: int) -> Float[Tensor, " N"]:
     """What one effect gains at each sample, in nats, all else as it is."""
     fit = final.fit
     model, parameters = fit.model, fit.parameters.clone()

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from mkc_torch.diagnosis.linearised.drift import DriftStatistics
 from mkc_torch.diagnosis.linearised.linear_search import log_survival
-from mkc_torch.diagnosis.linearised.linearise import Linearised
-from mkc_torch.diagnosis.linearised.tangents import Slow
-from mkc_torch.diagnosis.linearised.wander import SlowPart
+from mkc_torch.diagnosis.linearised.linearise import LinearisedSearch
+from mkc_torch.diagnosis.linearised.tangents import SlowBasis
 from mkc_torch.diagnosis.noise.cosine_basis import course_of
 from mkc_torch.effects.context import Shape
 from mkc_torch.effects.sensor.unrecorded import COURSE
@@ -59,7 +59,7 @@ class CommonCause:
         return replace(self, direction=-self.direction, shape={name: -value for name, value in self.shape.items()})
 
 
-def common_cause(linearised: Linearised, slow: Slow | None) -> CommonCause | None:
+def common_cause(linearised: LinearisedSearch, slow: SlowBasis | None) -> CommonCause | None:
     """The likeliest covariance between the channels of a wander, against one that is diagonal.
 
     A sensor's axes wander for themselves; what moves them together is one cause. Variance components are found by
@@ -97,7 +97,7 @@ def common_cause(linearised: Linearised, slow: Slow | None) -> CommonCause | Non
 
 
 def _likeliest(
-    part: SlowPart, start: Float[Tensor, "c c"], step: Callable[[Tensor, Tensor, Tensor], Tensor]
+    part: DriftStatistics, start: Float[Tensor, "c c"], step: Callable[[Tensor, Tensor, Tensor], Tensor]
 ) -> tuple[Float[Tensor, "c c"], float, Float[Tensor, "K c"]]:
     """Covariance of the channels, over the white part's variance; its log-likelihood; and the courses it predicts."""
     covariance, (value, courses, seen, expected) = start, _at(part, start)
@@ -113,7 +113,7 @@ def _likeliest(
     return covariance, value, courses
 
 
-def _at(part: SlowPart, covariance: Float[Tensor, "c c"]) -> tuple[float, Tensor, Tensor, Tensor]:
+def _at(part: DriftStatistics, covariance: Float[Tensor, "c c"]) -> tuple[float, Tensor, Tensor, Tensor]:
     """Log-likelihood, predicted courses (K, c), and the two sides of its slope: what is seen and what is expected."""
     c, inverse = len(covariance), torch.linalg.inv(covariance)
     K = len(part.inner) // c

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mkc_torch._support.effective_size import effective_size
 from mkc_torch.density.distribution import MKCDistribution
-from mkc_torch.diagnosis.evidence.base import Case, Table, Told
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, Table
 from mkc_torch.diagnosis.result import DensityCheck
 from mkc_torch.diagnosis.settings import EvidenceSettings
 
@@ -45,14 +45,14 @@ _NOTE = (
 )
 
 
-def test(case: Case) -> Told:
+def test(case: EvidenceContext) -> EvidenceResult:
     """How far the density of each channel is off, and a warning where a Student-t is clearly closer."""
     fit = case.final.fit
     channels, settings = case.prepared.channels, case.settings.evidence
     return said(density_checks(fit.residual, fit.sigma, fit.d, fit.bound, channels, settings), settings)
 
 
-def said(checks: Sequence[DensityCheck], settings: EvidenceSettings) -> Told:
+def said(checks: Sequence[DensityCheck], settings: EvidenceSettings) -> EvidenceResult:
     # the tail of Kolmogorov's distribution
     chance = 2.0 * math.exp(-2.0 * settings.density_off**2)
     table = Table(
@@ -68,7 +68,7 @@ def said(checks: Sequence[DensityCheck], settings: EvidenceSettings) -> Told:
         }
         for check in checks
     ]
-    return Told(
+    return EvidenceResult(
         "density",
         tuple(checks),
         keys={"noise": {"density_check": content}},

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.evidence.base import Case, Row, Told
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, Row
 from mkc_torch.diagnosis.linearised.candidates import Candidates
 from mkc_torch.diagnosis.linearised.linearise import linearise
-from mkc_torch.diagnosis.linearised.tangents import Tangents
+from mkc_torch.diagnosis.linearised.tangents import ModelTangents
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import DriverShift
-from mkc_torch.diagnosis.search.locate import Located
+from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import EvidenceSettings
 
 if TYPE_CHECKING:
@@ -37,18 +37,18 @@ _AS_MUCH = 0.999
 """Share of the gain that a copy has to have: those of a ramp are the ramp again, to rounding."""
 
 
-def of_finding(case: Case) -> DriverShift | None:
+def of_finding(case: EvidenceContext) -> DriverShift | None:
     return shifted(case.fits[case.number].model, case.located)
 
 
-def test(case: Case) -> Told:
+def test(case: EvidenceContext) -> EvidenceResult:
     """How many shifted copies of the finding's driver gain as much, and a warning where many do."""
     return said(case.ahead, case.term, case.settings.evidence)
 
 
-def said(shift: DriverShift | None, term: Term, settings: EvidenceSettings) -> Told:
+def said(shift: DriverShift | None, term: Term, settings: EvidenceSettings) -> EvidenceResult:
     if shift is None:
-        return Told("driver_shift")
+        return EvidenceResult("driver_shift")
     some = {0: "none", 1: "one"}.get(shift.as_good, str(shift.as_good))
     gain = "gain" if shift.as_good > 1 else "gains"
     row = Row("driven by", f"{some} of {shift.copies} copies shifted by up to {shift.reach:.3g} s {gain} as much")
@@ -59,10 +59,12 @@ def said(shift: DriverShift | None, term: Term, settings: EvidenceSettings) -> T
         "something else that changes as slowly."
     )
     many = shift.as_good > settings.shift_many * shift.copies
-    return Told("driver_shift", shift, keys={"driver_shift": shift}, warnings=(sentence,) if many else (), rows=(row,))
+    return EvidenceResult(
+        "driver_shift", shift, keys={"driver_shift": shift}, warnings=(sentence,) if many else (), rows=(row,)
+    )
 
 
-def shifted(model: JointModel, located: Located) -> DriverShift | None:
+def shifted(model: JointModel, located: SearchResult) -> DriverShift | None:
     """Compare the gain of an effect with its gains when its driver comes earlier or later.
 
     The motion, the parameters and the noise stay where they are, only the driver moves, and all shifts are judged on
@@ -114,9 +116,9 @@ def _moved(term: Term, by: int) -> Term:
     return replace(term, driver=replace(term.driver, values=values[rows]))
 
 
-def _cut(tangents: Tangents, rows: slice) -> Tangents:
+def _cut(tangents: ModelTangents, rows: slice) -> ModelTangents:
     slow = tangents.slow
-    return Tangents(
+    return ModelTangents(
         tangents.nuisance[rows],
         (),
         {name: None if one is None else one[rows] for name, one in tangents.pointwise.items()},

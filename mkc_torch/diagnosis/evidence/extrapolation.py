@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.evidence.base import Case, Row, Told
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, Row
 from mkc_torch.diagnosis.evidence.held_out import gain_interval, scored
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.term import Term
@@ -20,18 +20,18 @@ _BLOCKS, _FEWEST = 25, 5
 """Blocks of the recording for the interval of the gain, and how many of them the high values have to be in."""
 
 
-def of_finding(case: Case) -> Extrapolation | None:
+def of_finding(case: EvidenceContext) -> Extrapolation | None:
     return extrapolated(*case.without_and_with, case.term, case.seed, case.settings.evidence)
 
 
-def test(case: Case) -> Told:
+def test(case: EvidenceContext) -> EvidenceResult:
     """What the finding is worth where its driver is high, and a warning where it makes it clearly worse."""
     return said(case.ahead, case.term, case.settings.evidence)
 
 
-def said(extrapolation: Extrapolation | None, term: Term, settings: EvidenceSettings) -> Told:
+def said(extrapolation: Extrapolation | None, term: Term, settings: EvidenceSettings) -> EvidenceResult:
     if extrapolation is None:
-        return Told("extrapolation")
+        return EvidenceResult("extrapolation")
     low, high = extrapolation.confidence_interval
     verb = "predicts" if low > 0.0 else "misleads" if high < 0.0 else "says nothing"
     gain = _in_words(extrapolation)
@@ -41,7 +41,7 @@ def said(extrapolation: Extrapolation | None, term: Term, settings: EvidenceSett
         f"{', '.join(term.columns)} is lowest, it predicts the others worse than the model without it. Do not use it "
         "beyond the range recorded."
     )
-    return Told("extrapolation", extrapolation, warnings=(sentence,) if high < 0.0 else (), rows=(row,))
+    return EvidenceResult("extrapolation", extrapolation, warnings=(sentence,) if high < 0.0 else (), rows=(row,))
 
 
 def _in_words(extrapolation: Extrapolation) -> str:

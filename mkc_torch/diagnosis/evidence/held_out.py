@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.parallel import run_parallel
 from mkc_torch.diagnosis.settings import ConfirmationSettings
 from mkc_torch.functional import mkc_nll
 
@@ -109,7 +109,7 @@ def held_out(
         found = fitted(model, start, fit.bound, rows=rows, graduate=False)
         return found.residual, found.sigma, found.d, found.bound, found.parameters
 
-    folds = at_once([partial(without, train) for train in blocks.train], fit.model.prepared, thing="part held out")
+    folds = run_parallel([partial(without, train) for train in blocks.train], fit.model.prepared, thing="part held out")
     for number, (out, *density, _) in enumerate(folds):
         seen = blocks.fold == number
         residual[seen] = out[seen]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from mkc_torch.diagnosis.evidence.base import Case, Told
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult
 from mkc_torch.diagnosis.evidence.held_out import Evidence, gain_interval, held_out
 from mkc_torch.diagnosis.evidence.held_out_sizes import sizes_of
 from mkc_torch.diagnosis.result import HeldOut
@@ -15,21 +15,21 @@ _BESIDE = "Judged beside the other findings: while those are left out, they hide
 _TOO_SHORT = "one side of the step is shorter than two of the held-out blocks"
 
 
-def beside_the_others(case: Case) -> Evidence | None:
+def beside_the_others(case: EvidenceContext) -> Evidence | None:
     """The final model without the finding, on held-out blocks, where what was found later may have hidden its gain."""
     if not case.overlaid or _confirmed(case):
         return None
     return held_out(case.without_and_with[0], case.blocks)
 
 
-def _confirmed(case: Case) -> bool:
+def _confirmed(case: EvidenceContext) -> bool:
     """Whether unseen blocks are surely better with it, before anything else was found."""
     before, after = case.pairs[case.number] if case.pairs else case.held_out[case.number : case.number + 2]
     difference = after.log_likelihood - before.log_likelihood
     return gain_interval(difference, case.blocks.block, torch.Generator().manual_seed(case.seed))[1][0] > 0.0
 
 
-def test(case: Case) -> Told:
+def test(case: EvidenceContext) -> EvidenceResult:
     """The gain in log-likelihood with its interval, and the residuals before and after."""
     if not _long_enough(case, case.number):
         return said(None, _TOO_SHORT)
@@ -47,12 +47,12 @@ def test(case: Case) -> Told:
     return said(held, note)
 
 
-def said(held: HeldOut | None, note: str) -> Told:
+def said(held: HeldOut | None, note: str) -> EvidenceResult:
     """The gain, or why there is none."""
-    return Told("held_out", (held, note), keys={"held_out": held, "held_out_note": note})
+    return EvidenceResult("held_out", (held, note), keys={"held_out": held, "held_out_note": note})
 
 
-def _long_enough(case: Case, number: int) -> bool:
+def _long_enough(case: EvidenceContext, number: int) -> bool:
     """Whether both sides of a finding that sets in can be held out."""
     onset, time = case.found[number].term.shape.get("onset"), case.prepared.time
     if onset is None:
@@ -61,7 +61,7 @@ def _long_enough(case: Case, number: int) -> bool:
     return shorter >= 2 * len(time) // (int(case.blocks.block.max()) + 1)
 
 
-def _draws(case: Case) -> torch.Generator:
+def _draws(case: EvidenceContext) -> torch.Generator:
     """Draws of blocks that go on where those of the findings before stopped."""
     generator = torch.Generator().manual_seed(case.seed)
     for number in range(case.number):

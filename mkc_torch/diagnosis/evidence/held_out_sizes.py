@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks
-from mkc_torch.diagnosis.follows import size_of
-from mkc_torch.diagnosis.result import Sizes
+from mkc_torch.diagnosis.goodness_of_fit import size_of
+from mkc_torch.diagnosis.result import ResidualSizes
 from mkc_torch.simulation.protocol import PreparedSimulation
 
 if TYPE_CHECKING:
@@ -48,14 +48,16 @@ def kept_blocks(
 
 def sizes_of(
     prepared: PreparedSimulation, units: Sequence[str], before: Evidence, after: Evidence, blocks: HeldOutBlocks
-) -> tuple[dict[str, Sizes], str]:
+) -> tuple[dict[str, ResidualSizes], str]:
     """Each output's residual before and after, in its own unit; and what is to be said of blocks that were lost."""
     kept, lost = kept_blocks(prepared, (before, after), blocks)
     told = left_in_words(lost, int(blocks.block.max()) + 1)
     if not bool(kept.any()):
         return {}, told
     one, other = size_of(before.residual[kept]), size_of(after.residual[kept])
-    return {name: Sizes(float(one[k]), float(other[k]), units[k]) for k, name in enumerate(prepared.channels)}, told
+    return {
+        name: ResidualSizes(float(one[k]), float(other[k]), units[k]) for k, name in enumerate(prepared.channels)
+    }, told
 
 
 def left_in_words(lost: Sequence[int], count: int) -> str:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from mkc_torch.diagnosis.evidence import held_out_gain, one_stretch, rejected, whiteness
-from mkc_torch.diagnosis.evidence.base import Case, EvidenceTest, Told
+from mkc_torch.diagnosis.evidence import held_out_gain, localised, rejected, whiteness
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, EvidenceTest
 
 __all__ = ["in_short"]
 
@@ -17,11 +17,11 @@ def in_short(*, held_out: bool) -> tuple[EvidenceTest, ...]:
     blocks = held_out_gain.test if held_out else _not_judged
     return (
         EvidenceTest(blocks, each_finding=True),
-        EvidenceTest(one_stretch.test),
+        EvidenceTest(localised.test),
         EvidenceTest(rejected.test),
         EvidenceTest(whiteness.test),
     )
 
 
-def _not_judged(_: Case) -> Told:
+def _not_judged(_: EvidenceContext) -> EvidenceResult:
     return held_out_gain.said(None, "nobody asked unseen blocks, in a quick look or before the search was stopped")

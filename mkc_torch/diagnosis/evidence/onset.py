@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.evidence.base import Case, Told
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult
 from mkc_torch.diagnosis.linearised.candidates import Candidates
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.search.locate import Located
+from mkc_torch.diagnosis.search.run import SearchResult
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -33,20 +33,20 @@ _BETWEEN = 12
 """Samples that are tried between the last one within and the first one beyond."""
 
 
-def of_finding(case: Case) -> tuple[float, float] | None:
+def of_finding(case: EvidenceContext) -> tuple[float, float] | None:
     return onset_interval(case.fits[case.number].model, case.located)
 
 
-def test(case: Case) -> Told:
+def test(case: EvidenceContext) -> EvidenceResult:
     """The interval of the finding's onset."""
     return said(case.ahead)
 
 
-def said(interval: tuple[float, float] | None) -> Told:
-    return Told("onset", interval, keys={} if interval is None else {"onset_interval": interval})
+def said(interval: tuple[float, float] | None) -> EvidenceResult:
+    return EvidenceResult("onset", interval, keys={} if interval is None else {"onset_interval": interval})
 
 
-def onset_interval(model: JointModel, located: Located) -> tuple[float, float] | None:
+def onset_interval(model: JointModel, located: SearchResult) -> tuple[float, float] | None:
     """The 95 % confidence interval of an effect's onset, in s.
 
     The likelihood ratio of a change point is no chi-square: it is the larger of two exponential variables, one for each

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from mkc_torch.diagnosis.evidence.base import Case, Told
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult
 from mkc_torch.diagnosis.settings import Settings
-from mkc_torch.recording.disturbance import Interval, disturbed_intervals
+from mkc_torch.recording.disturbance import RejectedInterval, disturbed_intervals
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -19,11 +19,13 @@ _TOLD = 3
 """Stretches that are told by their times, the longest ones."""
 
 
-def test(case: Case) -> Told:
+def test(case: EvidenceContext) -> EvidenceResult:
     """A warning that names them; of a recording without times there is none."""
     if case.prepared.recording.time is None:
-        return Told("rejected")
-    return Told("rejected", warnings=rejected_warning(case.prepared.time, case.final.fit.weights, case.settings))
+        return EvidenceResult("rejected")
+    return EvidenceResult(
+        "rejected", warnings=rejected_warning(case.prepared.time, case.final.fit.weights, case.settings)
+    )
 
 
 def rejected_warning(time: Float[Tensor, " N"], weights: Float[Tensor, "N m"], settings: Settings) -> tuple[str, ...]:
@@ -54,5 +56,5 @@ def rejected_warning(time: Float[Tensor, " N"], weights: Float[Tensor, "N m"], s
     )
 
 
-def _length(interval: Interval) -> float:
+def _length(interval: RejectedInterval) -> float:
     return interval.end - interval.start

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from mkc_torch.diagnosis.evidence.base import Case, SmoothCorrection, Told
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, SmoothCorrection
 from mkc_torch.diagnosis.evidence.ceiling import Ceiling, ceiling
 from mkc_torch.diagnosis.evidence.held_out import Evidence, HeldOutBlocks, gain_interval
 from mkc_torch.diagnosis.model.drivers import Driver
@@ -19,7 +19,7 @@ _RUNS_AWAY = 100.0
 """Half-widths of the domain of residuals beyond which a simulation is lost."""
 
 
-def within_reach(case: Case) -> tuple[Ceiling, tuple[str, ...]]:
+def within_reach(case: EvidenceContext) -> tuple[Ceiling, tuple[str, ...]]:
     """The ceiling of any fit, and the columns along which something smooth remains."""
     base, fit = case.base, case.fit
     reach = ceiling(base.model, _answerable(base, fit), case.drivers, case.blocks)
@@ -28,14 +28,16 @@ def within_reach(case: Case) -> tuple[Ceiling, tuple[str, ...]]:
     return reach, remaining(reach, case.held_out[-1], fit, case.drivers, case.blocks, case.seed, case.settings.evidence)
 
 
-def test(case: Case) -> Told:
+def test(case: EvidenceContext) -> EvidenceResult:
     """How far a smooth correction comes, and a warning of the columns along which something remains."""
     reach, columns = case.ahead
     return said(SmoothCorrection(case.spread(reach.evidence), columns))
 
 
-def said(smooth: SmoothCorrection) -> Told:
-    return Told("remaining", smooth, keys={"ceiling": smooth.reached}, warnings=remaining_warning(smooth.columns))
+def said(smooth: SmoothCorrection) -> EvidenceResult:
+    return EvidenceResult(
+        "remaining", smooth, keys={"ceiling": smooth.reached}, warnings=remaining_warning(smooth.columns)
+    )
 
 
 def nameless(fit: FittedModel) -> bool:

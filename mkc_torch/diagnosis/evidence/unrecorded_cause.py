@@ -13,8 +13,8 @@ from mkc_torch.diagnosis.linearised.linearise import linearise
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.search.locate import Located
 from mkc_torch.diagnosis.search.ranking import Ranked
+from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.effects.context import Shape
 from mkc_torch.effects.sensor.unrecorded import Unrecorded
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["course_without", "located_cause"]
 
 
-def located_cause(base: FittedModel, located: Located, level: float, surrogates: int) -> Located | None:
+def located_cause(base: FittedModel, located: SearchResult, level: float, surrogates: int) -> SearchResult | None:
     """A search that found nothing, with the cause that moves the channels of the wander together; None without one.
 
     Args:
@@ -54,7 +54,7 @@ def located_cause(base: FittedModel, located: Located, level: float, surrogates:
 
 
 def course_without(
-    base: FittedModel, located: Located, train: Bool[Tensor, " N"]
+    base: FittedModel, located: SearchResult, train: Bool[Tensor, " N"]
 ) -> tuple[JointModel, Float[Tensor, " p"]]:
     """The model with the course as these samples alone tell it, and where to begin.
 
@@ -70,7 +70,7 @@ def course_without(
         counts * located.scene.values,
         counts,
         located.scene.tangents.bare,
-        colour=located.look.linearised.colour,
+        spectrum=located.look.linearised.spectrum,
     )
     direction = -located.fit.model.gammas(located.fit.parameters)[-1]
     cause = common_cause(known, located.scene.tangents.slow)

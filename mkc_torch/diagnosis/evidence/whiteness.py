@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.evidence.base import Case, Row, Table, Told
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, Row, Table
 from mkc_torch.diagnosis.settings import EvidenceSettings
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class Whiteness:
     lags: int
 
 
-def test(case: Case) -> Told:
+def test(case: EvidenceContext) -> EvidenceResult:
     """The channels of the final fit's pseudo-residual, each by itself."""
     settings = case.settings.evidence
     values, counts = case.final.fit.pseudo(case.settings.noise)
@@ -74,7 +74,7 @@ def test(case: Case) -> Told:
         rows,
         _NOTE.format(lags=next(iter(channels.values())).lags, level=settings.white_level),
     )
-    return Told(
+    return EvidenceResult(
         "whiteness",
         channels,
         content={"unit": unit, "channels": content},

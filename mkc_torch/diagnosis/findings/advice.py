@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from mkc_torch._support.unit_text import tidy
-from mkc_torch.diagnosis.findings.following import follows_all
-from mkc_torch.diagnosis.findings.worth import carries_over, change, worth_correcting
+from mkc_torch.diagnosis.environment import ProcessNoise
+from mkc_torch.diagnosis.findings.grading import change, transfers, worth_correcting
+from mkc_torch.diagnosis.findings.misfit import follows_all
 from mkc_torch.diagnosis.result import Alternative, Diagnosis, Finding
-from mkc_torch.diagnosis.world import Push
 from mkc_torch.effects import is_curve
 from mkc_torch.effects.kinds import MOTION
 
@@ -40,7 +40,7 @@ def _after_the_search(diagnosis: Diagnosis) -> tuple[str, ...]:
         return (_USE, *(_hold_back(f, d) for f in d.findings))
     advice = [sentence for finding in d.findings for sentence in _of(finding, d)]
     advice += _of_what_remains(d)
-    use = [_called(f, d) for f in d.findings if carries_over(f)]
+    use = [_called(f, d) for f in d.findings if transfers(f)]
     if use:
         advice.append(f"The model found here corrects for {', '.join(use)}: confirm it on a second recording.")
     return tuple(dict.fromkeys(advice))
@@ -71,7 +71,7 @@ def _of_what_remains(diagnosis: Diagnosis) -> Iterator[str]:
         )
 
 
-def _find_what_pushes(push: Push) -> str:
+def _find_what_pushes(push: ProcessNoise) -> str:
     size = f"{push.size:.2g} {tidy(push.unit)}".rstrip()
     return (
         f"Look for what drives the rate of `{push.place}`, in the picture of what pushes it, and record it. Until then "
@@ -157,7 +157,7 @@ def _called(finding: Finding, d: Diagnosis) -> str:
 def _tell_apart(finding: Finding, near: Sequence[Alternative]) -> str:
     told = ", ".join(dict.fromkeys(f"{a.effect} ({', '.join(a.drivers)})" if a.drivers else a.effect for a in near))
     asked = f"To tell {finding.effect} from {told}, record again{_how(finding, near)}."
-    return f"{asked} {near[0].told_by}".rstrip()
+    return f"{asked} {near[0].distinguishing_state}".rstrip()
 
 
 def _how(finding: Finding, near: Sequence[Alternative]) -> str:
@@ -167,7 +167,7 @@ def _how(finding: Finding, near: Sequence[Alternative]) -> str:
         if len(columns) == 1:
             return f" with {columns[0]} over a wider range"
         return " while they go different ways: change one and hold the other"
-    clauses = list(dict.fromkeys(one.again for one in every if one.again and not one.drivers))
+    clauses = list(dict.fromkeys(one.recurrence for one in every if one.recurrence and not one.drivers))
     if columns:
         clauses.append(f"what follows {', '.join(columns)} goes along with it, so let that change at other times")
     return f": {'; '.join(clauses)}" if clauses else _OTHERWISE.get(finding.kind, " with other inputs and amplitudes")

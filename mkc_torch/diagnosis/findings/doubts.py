@@ -42,7 +42,7 @@ def far_from_plausible(term: Term, gamma: Tensor, context: Context) -> str:
         context: what the effect sees.
     """
     first = term.effect.quantities(term.shape, context)[0]
-    largest, most = float(gamma[: first.size].abs().max()), term.effect.most
+    largest, most = float(gamma[: first.size].abs().max()), term.effect.upper
     name = first.name.replace("_", " ")
     # a share of one is all of it, and as good a value as any
     if 1.0 < most < math.inf and _near(largest, most):

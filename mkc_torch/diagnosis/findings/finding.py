@@ -11,19 +11,19 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.unit_text import ratio, tidy
+from mkc_torch.diagnosis.environment import Curve
 from mkc_torch.diagnosis.evidence.base import gain_of
 from mkc_torch.diagnosis.findings.doubts import far_from_plausible, shape_at_ends
+from mkc_torch.diagnosis.findings.experiment_design import SAME, distinguishing_state
 from mkc_torch.diagnosis.findings.formula import formulas
 from mkc_torch.diagnosis.findings.regions import attributed, map_of, region_of, shares_of_runs
-from mkc_torch.diagnosis.findings.what_to_record import SAME, told_by
-from mkc_torch.diagnosis.linearised.estimate import Estimate
+from mkc_torch.diagnosis.linearised.estimate import FinalEstimate
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.result import Alternative, Finding, Number, Parameter, Reference
-from mkc_torch.diagnosis.search.locate import Located
-from mkc_torch.diagnosis.world import Curve
+from mkc_torch.diagnosis.result import Alternative, EffectParameter, Finding, Number, Reference
+from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.effects.context import Context
 from mkc_torch.effects.kinds import kind_at
-from mkc_torch.nonlinear import beside
+from mkc_torch.nonlinear import make_dual
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -47,7 +47,7 @@ _NORMAL_95 = 1.959964
 """Standard errors to either side that a 95 % interval of a normal variable reaches."""
 
 
-def finding_of(located: Located, final: Estimate, number: int, *, quick: bool = False) -> Finding:
+def finding_of(located: SearchResult, final: FinalEstimate, number: int, *, quick: bool = False) -> Finding:
     """The finding for the effect ``number`` of the final model, without its evidence.
 
     Args:
@@ -90,8 +90,8 @@ def finding_of(located: Located, final: Estimate, number: int, *, quick: bool = 
         moments=moments,
         references=_references(term),
         advice=term.effect.advised(gamma.tolist(), term.shape, context),
-        again=term.effect.again,
-        placed=term.effect.placed,
+        recurrence=term.effect.recurrence,
+        location_specific=term.effect.location_specific,
         kind=kind_at(context),
     )
 
@@ -110,7 +110,7 @@ def places_of(term: Term, channels: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"input {name}" for name in channels) if term.at.startswith("input ") else tuple(channels)
 
 
-def _own(final: Estimate, number: int) -> tuple[Tensor, Tensor]:
+def _own(final: FinalEstimate, number: int) -> tuple[Tensor, Tensor]:
     """γ of one effect and its covariance."""
     model = final.fit.model
     start = model.base + sum(model.sizes[:number])
@@ -118,14 +118,14 @@ def _own(final: Estimate, number: int) -> tuple[Tensor, Tensor]:
     return final.fit.parameters[mine], final.covariance[mine, mine]
 
 
-def _context(final: Estimate, term: Term) -> Context:
+def _context(final: FinalEstimate, term: Term) -> Context:
     model = final.fit.model
     return term.context(model.prepared, model.signals(final.fit.parameters).get(term.port))
 
 
 def parameters_of(
     term: Term, gamma: Float[Tensor, " q"], covariance: Float[Tensor, "q q"], context: Context
-) -> tuple[Parameter, ...]:
+) -> tuple[EffectParameter, ...]:
     """γ as named quantities with units and standard errors."""
     error = covariance.diagonal().clamp(min=0.0).sqrt()
     parameters, start = [], 0
@@ -134,7 +134,9 @@ def parameters_of(
         value, spread = gamma[mine], error[mine]
         start += quantity.size
         components = _components(term, quantity.name, quantity.size, context)
-        parameters.append(Parameter(quantity.name, _numbers(value), _numbers(spread), tidy(quantity.unit), components))
+        parameters.append(
+            EffectParameter(quantity.name, _numbers(value), _numbers(spread), tidy(quantity.unit), components)
+        )
     return tuple(parameters)
 
 
@@ -146,9 +148,9 @@ def _components(term: Term, quantity: str, size: int, context: Context) -> tuple
     return own or (tuple(context.channels) if size == len(context.channels) else ())
 
 
-def _shape_parameters(term: Term, context: Context, errors: Mapping[str, float]) -> tuple[Parameter, ...]:
+def _shape_parameters(term: Term, context: Context, errors: Mapping[str, float]) -> tuple[EffectParameter, ...]:
     return tuple(
-        Parameter(name, value, errors.get(name), term.effect.unit_of_shape(name, context))
+        EffectParameter(name, value, errors.get(name), term.effect.unit_of_shape(name, context))
         for name, value in term.shape.items()
         if name != "onset" and term.effect.reports(name)
     )
@@ -178,12 +180,13 @@ def _plausibility(term: Term, gamma: Tensor, context: Context) -> tuple[bool, st
     return False, f"{told} beyond the {limit:g}{unit} that is plausible ({term.effect.source}): doubt it."
 
 
-def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
+def _alternatives(located: SearchResult, term: Term) -> tuple[Alternative, ...]:
     """Rivals of the search, nearest first: all that the data do not tell apart, and the next few."""
     found = []
     if term.driver is not None:
         found += [
-            Alternative(term.effect.id, (copy,), 0.0, False, term.at, told_by=SAME) for copy in term.driver.copies
+            Alternative(term.effect.id, (copy,), 0.0, False, term.at, distinguishing_state=SAME)
+            for copy in term.driver.copies
         ]
     separable = located.scene.settings.naming.separable
     own = [ranked.number for ranked in located.ranking if located.scene.terms[ranked.number].key == term.key]
@@ -192,9 +195,9 @@ def _alternatives(located: Located, term: Term) -> tuple[Alternative, ...]:
         if rival.key == term.key or ranked.gap > _FARTHEST:
             continue
         gap = max(ranked.gap, 0.0)
-        again, told = rival.effect.again, ""
+        again, told = rival.effect.recurrence, ""
         if own and gap < separable:
-            told = told_by(located, own[0], ranked.number)
+            told = distinguishing_state(located, own[0], ranked.number)
         found.append(Alternative(rival.effect.id, rival.columns, gap, gap >= separable, rival.at, again, told))
     near = [a for a in found if not a.separable]
     return tuple(near + [a for a in found if a.separable][: max(0, _MOST_ALTERNATIVES - len(near))])
@@ -237,7 +240,7 @@ def _curve(term: Term, gamma: Tensor, covariance: Tensor, context: Context) -> C
     shape = {name: value for name, value in term.shape.items() if name != "lag"}
 
     def change(gamma: Tensor) -> Tensor:
-        return term.effect.change(gamma, shape, replace(synthetic, signal=beside(synthetic.signal, gamma[0])))
+        return term.effect.change(gamma, shape, replace(synthetic, signal=make_dual(synthetic.signal, gamma[0])))
 
     slope = torch.func.jacfwd(change)(gamma)
     variance = torch.einsum("ncq,qr,ncr->nc", slope, covariance, slope).clamp(min=0.0)
@@ -278,7 +281,7 @@ def _along(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | N
 
 def _along_part(term: Term, context: Context) -> tuple[str, str, Tensor, Context] | None:
     """Over the range of the part of the signal that the effect mainly follows, the others at their medians."""
-    part = term.effect.along
+    part = term.effect.plot_axis
     if part not in context.parts:
         return None
     name = context.parts[part]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.world import Curve
+from mkc_torch.diagnosis.environment import Curve
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 from mkc_torch.density.tails import time_series_tails
-from mkc_torch.diagnosis.linearised.estimate import Estimate
-from mkc_torch.diagnosis.result import Noise, Number
+from mkc_torch.diagnosis.linearised.estimate import FinalEstimate
+from mkc_torch.diagnosis.result import NoiseSummary, Number
 from mkc_torch.diagnosis.settings import NoiseSettings
 
 __all__ = ["noise_summary"]
 
 
-def noise_summary(final: Estimate, settings: NoiseSettings) -> Noise:
+def noise_summary(final: FinalEstimate, settings: NoiseSettings) -> NoiseSummary:
     """White, autoregressive, or wandering like a random walk, with its numbers."""
-    fit, wander = final.fit, final.noise
+    fit, drift = final.fit, final.noise
     prepared = fit.model.prepared
-    orders = final.colour.coefficients
+    orders = final.spectrum.coefficients
     coloured = any(float(phi.square().sum()) > settings.told_colour for phi in orders)
     parameters: dict[str, Number] = {}
     units: dict[str, str] = {}
-    clear = wander.size > 0 and wander.gain > settings.told_wander
+    clear = drift.size > 0 and drift.gain > settings.told_wander
     if clear:
         parameters["wander"] = final.wander_spread
         units["wander"] = next(port.unit for port in prepared.ports.values() if port.wanders)
-        if wander.family > 0:
+        if drift.family > 0:
             length = float(prepared.time[-1] - prepared.time[0])
-            parameters["wander_period"] = 2.0 * length / settings.plateaus[wander.family - 1][0]
+            parameters["wander_period"] = 2.0 * length / settings.plateaus[drift.family - 1][0]
             units["wander_period"] = "s"
     if coloured:
         parameters["autoregression"] = tuple(tuple(phi.tolist()) for phi in orders)
-    if clear and wander.family == 0:
+    if clear and drift.family == 0:
         model = "random_walk"
         size = f"{parameters['wander']:.2g} {units['wander']}"
         told = f"noise around an offset that wanders like a random walk, by {size} in all"
@@ -38,7 +38,7 @@ def noise_summary(final: Estimate, settings: NoiseSettings) -> Noise:
         model, told = "white", "white noise"
     tails = time_series_tails(fit.residual)
     tail = "Gaussian" if all(channel.is_gaussian for channel in tails) else "heavy-tailed"
-    return Noise(
+    return NoiseSummary(
         model,  # type: ignore[arg-type]
         parameters,
         tuple(fit.sigma.tolist()),

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.follows import size_of
-from mkc_torch.diagnosis.model.at_once import at_once
+from mkc_torch.diagnosis.environment import GoodnessOfFit
+from mkc_torch.diagnosis.goodness_of_fit import size_of
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.world import Follows
+from mkc_torch.diagnosis.model.parallel import run_parallel
 from mkc_torch.nonlinear import NoFitError
-from mkc_torch.simulation.dynamics.first_fit import over_short_horizons
+from mkc_torch.simulation.dynamics.first_fit import multiple_shooting_start
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.protocol import PreparedSimulation
 
@@ -70,7 +70,7 @@ def wrong_turns(prepared: PreparedSimulation) -> str:
     return getattr(prepared, "wrong_turns", "")
 
 
-def reasons_of(fits: Sequence[FittedModel], follows: Sequence[Follows]) -> tuple[str, ...]:
+def reasons_of(fits: Sequence[FittedModel], follows: Sequence[GoodnessOfFit]) -> tuple[str, ...]:
     """Sentences, the most likely reason first.
 
     Args:
@@ -118,11 +118,11 @@ def _of_sizes(prepared: PreparedDynamics, fit: FittedModel, ends: Sequence[str])
     return told
 
 
-def _of_trials(prepared: PreparedDynamics, fits: Sequence[FittedModel], follows: Sequence[Follows]) -> list[str]:
+def _of_trials(prepared: PreparedDynamics, fits: Sequence[FittedModel], follows: Sequence[GoodnessOfFit]) -> list[str]:
     """What each trial brings, where it mends the fit; and the inputs that do not matter."""
     now = torch.tensor([one.residual for one in follows], dtype=fits[0].parameters.dtype)
     trials = _trials(prepared)
-    sizes = at_once([partial(_size, trial.prepared, fits, thorough=trial.thorough) for trial in trials], prepared)
+    sizes = run_parallel([partial(_size, trial.prepared, fits, thorough=trial.thorough) for trial in trials], prepared)
     told = []
     shares = [float((size / now).max()) if size is not None else torch.inf for size, _ in sizes]
     for number in sorted(range(len(trials)), key=shares.__getitem__):
@@ -203,7 +203,7 @@ def _size(
         ends, begun = at_ends(fits[0]), prepared.given.clone()
         for number, name in enumerate(prepared.known):
             begun[number] = -begun[number] if name in ends else begun[number]
-        found = [over_short_horizons(prepared, one) for one in (prepared.given, begun)]
+        found = [multiple_shooting_start(prepared, one) for one in (prepared.given, begun)]
         starts = [one for one in found if one is not None] or starts
     best: tuple[Tensor | None, Tensor | None] = None, None
     for start in starts:

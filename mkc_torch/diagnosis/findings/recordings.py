@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from mkc_torch.diagnosis.follows import units_of
-from mkc_torch.diagnosis.linearised.estimate import Estimate
-from mkc_torch.diagnosis.world import Offset, Run
+from mkc_torch.diagnosis.environment import Offset, Run
+from mkc_torch.diagnosis.goodness_of_fit import units_of
+from mkc_torch.diagnosis.linearised.estimate import FinalEstimate
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.own_offsets import OwnOffset
 from mkc_torch.simulation.protocol import PreparedSimulation
@@ -15,7 +15,7 @@ from mkc_torch.simulation.protocol import PreparedSimulation
 __all__ = ["offsets_of", "runs_of"]
 
 
-def offsets_of(final: Estimate, names: Sequence[str]) -> tuple[Offset, ...]:
+def offsets_of(final: FinalEstimate, names: Sequence[str]) -> tuple[Offset, ...]:
     """The offsets of each output in each recording; none of an output that no recording has a fitted one of.
 
     Args:

@@ -6,7 +6,7 @@ import torch
 
 from mkc_torch.diagnosis.findings.finding import labels
 from mkc_torch.diagnosis.result import Separability
-from mkc_torch.diagnosis.search.locate import Located
+from mkc_torch.diagnosis.search.run import SearchResult
 
 __all__ = ["separability"]
 
@@ -14,7 +14,7 @@ _MOST = 8
 """Candidates in the matrix, the leading ones."""
 
 
-def separability(located: Located) -> Separability:
+def separability(located: SearchResult) -> Separability:
     """The matrix of the leading candidates, each at its best shape, in the metric of the noise.
 
     The trace of a candidate is its tangent along the γ that fits best. Its share is the squared length that is left

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.model.at_once import at_once
+from mkc_torch.diagnosis.environment import Curve, ShapeCheck
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.parallel import run_parallel
 from mkc_torch.diagnosis.model.term import Term, continuous
-from mkc_torch.diagnosis.search.preference import schwarz
+from mkc_torch.diagnosis.search.model_prior import schwarz
 from mkc_torch.diagnosis.settings import EvidenceSettings
-from mkc_torch.diagnosis.world import Curve, Shape
 from mkc_torch.nonlinear import NoFitError
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ _NORMAL_95 = 1.96
 """Standard errors to either side that a 95 % interval reaches."""
 
 
-def shape_of(fit: FittedModel, number: int, terms: Sequence[Term], settings: EvidenceSettings) -> Shape | None:
+def shape_of(fit: FittedModel, number: int, terms: Sequence[Term], settings: EvidenceSettings) -> ShapeCheck | None:
     """Of one effect of a fit; None where the name claims no shape that a curve could be set against.
 
     Args:
@@ -45,7 +45,7 @@ def shape_of(fit: FittedModel, number: int, terms: Sequence[Term], settings: Evi
     curves = _curves(term, terms, fit)
     if term.effect.is_curve or not curves:
         return None
-    found = at_once([partial(_instead, fit, number, curve) for curve in curves], fit.model.prepared, curves)
+    found = run_parallel([partial(_instead, fit, number, curve) for curve in curves], fit.model.prepared, curves)
     fits = [one for one in found if one is not None]
     if not fits:
         return None
@@ -57,9 +57,9 @@ def shape_of(fit: FittedModel, number: int, terms: Sequence[Term], settings: Evi
     half, value = torch.tensor(0.5 * more).double(), torch.tensor(max(gain, 0.0)).double()
     chance = float(torch.special.gammaincc(half, value))
     if chance >= settings.shape_level or gain <= settings.shape_nats + schwarz(best) * more:
-        return Shape(gain, chance)
+        return ShapeCheck(gain, chance)
     curve = curve_of(best, number)
-    return Shape(gain, chance, curve, nearest_power(curve))
+    return ShapeCheck(gain, chance, curve, nearest_power(curve))
 
 
 def _curves(term: Term, terms: Sequence[Term], fit: FittedModel) -> list[Term]:
@@ -69,7 +69,7 @@ def _curves(term: Term, terms: Sequence[Term], fit: FittedModel) -> list[Term]:
     for one in terms:
         same = one.columns == term.columns and fit.model.prepared.ports[one.port].channels == channels
         if one.effect.is_curve and same:
-            found.setdefault((one.port, one.effect.along), one)
+            found.setdefault((one.port, one.effect.plot_axis), one)
     return list(found.values())
 
 
@@ -92,7 +92,7 @@ def curve_of(fit: FittedModel, number: int) -> Curve:
     model, term = fit.model, fit.model.terms[number]
     prepared, port = model.prepared, model.prepared.ports[term.port]
     signal = model.signals(fit.parameters)[term.port].detach()
-    part = port.parts[term.effect.along]
+    part = port.parts[term.effect.plot_axis]
     at = signal[:, port.carries.index(part)] if port.carries else signal[:, 0]
     order = at.argsort()[torch.linspace(0, len(at) - 1, _POINTS).long()]
     gamma = model.gammas(fit.parameters)[number].detach()
@@ -104,7 +104,7 @@ def curve_of(fit: FittedModel, number: int) -> Curve:
     start = model.base + sum(model.sizes[:number])
     covariance = _covariance(fit)[start : start + len(gamma), start : start + len(gamma)]
     band = _NORMAL_95 * torch.einsum("ncq,qr,ncr->nc", slope, covariance, slope).clamp(min=0.0).sqrt()
-    unit = port.part_units.get(term.effect.along, "")
+    unit = port.part_units.get(term.effect.plot_axis, "")
     return Curve(part, unit, at[order], value.detach(), band, (f"rate of {port.channels[0]}",), port.unit)
 
 

@@ -110,7 +110,7 @@ class Candidates(Sequence[Tensor]):
         assert known is not None
         if term.effect.has_course and not term.effect.has_basis:
             # a gain on a course: each channel's course is the same
-            moved = known * term.effect.course(term.shape, context)[:, None, None]
+            moved = known * term.effect.waveform(term.shape, context)[:, None, None]
         else:
             moved = torch.einsum("nmc,ncq->nmq", known, directions(term, context))
         return self._usable(term, moved)

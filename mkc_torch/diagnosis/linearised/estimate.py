@@ -9,22 +9,22 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.linearised.beside_wander import Local, beside_wander
+from mkc_torch.diagnosis.linearised.drift import NoiseFit
+from mkc_torch.diagnosis.linearised.drift_residuals import Local, drift_residuals
 from mkc_torch.diagnosis.linearised.linearise import linearise
-from mkc_torch.diagnosis.linearised.tangents import Tangents, tangents_of
-from mkc_torch.diagnosis.linearised.wander import NoiseFit
+from mkc_torch.diagnosis.linearised.tangents import ModelTangents, tangents_of
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.grid import reach_of
 from mkc_torch.diagnosis.model.shaped import ShapedModel
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.noise.colour import Colour
+from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum
 from mkc_torch.diagnosis.settings import NoiseSettings
-from mkc_torch.nonlinear import beside
+from mkc_torch.nonlinear import make_dual
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Estimate", "estimate"]
+__all__ = ["FinalEstimate", "estimate"]
 
 _AT_END = 1e-6
 """Distance from an end of its range, over that end, within which a shape's number is at the end, to rounding."""
@@ -34,7 +34,7 @@ _UNKNOWN = 0.5
 
 
 @dataclass(frozen=True)
-class Estimate:
+class FinalEstimate:
     """A fit with its final parameters, their covariance (p, p), and the noise that is left.
 
     Attributes:
@@ -46,7 +46,7 @@ class Estimate:
     fit: FittedModel
     covariance: Float[Tensor, "p p"]
     noise: NoiseFit
-    colour: Colour
+    spectrum: NoiseSpectrum
     wander_spread: float
     shape_errors: tuple[Mapping[str, float], ...]
 
@@ -54,14 +54,14 @@ class Estimate:
     def standard_error(self) -> Float[Tensor, " p"]:
         return self.covariance.diagonal().clamp(min=0.0).sqrt()
 
-    def at_least(self, error: Float[Tensor, " p"]) -> Estimate:
+    def at_least(self, error: Float[Tensor, " p"]) -> FinalEstimate:
         """The same with standard errors that are nowhere smaller than these; correlations stay."""
         own = self.standard_error
         larger = torch.where(own > 0, torch.maximum(error / own.clamp(min=1e-300), torch.ones_like(own)), 1.0)
         return replace(self, covariance=larger.unsqueeze(-1) * self.covariance * larger)
 
 
-def estimate(fit: FittedModel, settings: NoiseSettings) -> Estimate:
+def estimate(fit: FittedModel, settings: NoiseSettings) -> FinalEstimate:
     """One step of generalised least squares on the pseudo-residuals, with the colour and wander of their noise.
 
     The M-estimate weighs samples as if they were independent; where noise is coloured this step is the more precise
@@ -70,14 +70,14 @@ def estimate(fit: FittedModel, settings: NoiseSettings) -> Estimate:
     """
     model, parameters = fit.model, fit.parameters
     tangents = tangents_of(model, parameters, settings)
-    local = beside_wander(fit, model, parameters, tangents, settings)
+    local = drift_residuals(fit, model, parameters, tangents, settings)
     found = linearise(
         model,
         parameters,
         local.values,
         local.counts,
         replace(tangents, slow=local.slow),
-        colour=local.noise.colour,
+        spectrum=local.noise.spectrum,
         joint=True,
     )
     step, covariance = found.search.estimate(0, found.series)
@@ -93,13 +93,13 @@ def estimate(fit: FittedModel, settings: NoiseSettings) -> Estimate:
             fit = replace(fit, model=moved, parameters=parameters, residual=residual.detach())
     noise = found.search.noise_fit(found.series)
     spread = found.search.wander_spread(noise) if noise.size > 0 else 0.0
-    plain = Estimate(fit, covariance, noise, found.colour, spread, tuple({} for _ in fit.model.terms))
+    plain = FinalEstimate(fit, covariance, noise, found.spectrum, spread, tuple({} for _ in fit.model.terms))
     return _shapes_free(
         plain.at_least(found.search.doubted_error(0, found.series, settings.doubted_family)), tangents, local
     )
 
 
-def _shapes_free(plain: Estimate, tangents: Tangents, local: Local) -> Estimate:
+def _shapes_free(plain: FinalEstimate, tangents: ModelTangents, local: Local) -> FinalEstimate:
     """The same with what the fitted numbers of shapes leave unknown of the parameters, and of themselves.
 
     A number at the end of its range is held there, as it was in the fit.
@@ -112,13 +112,13 @@ def _shapes_free(plain: Estimate, tangents: Tangents, local: Local) -> Estimate:
         return plain
 
     def residual(numbers: Tensor) -> Tensor:
-        return shaped.residual(torch.cat([beside(parameters, numbers[0]), numbers]))
+        return shaped.residual(torch.cat([make_dual(parameters, numbers[0]), numbers]))
 
     columns = torch.func.jacfwd(residual)(start[shaped.joint :])
     if not bool(columns.isfinite().all()):
         return plain
     wide = replace(tangents, nuisance=torch.cat([tangents.nuisance, columns], -1), slow=local.slow)
-    found = linearise(shaped, start, local.values, local.counts, wide, colour=local.noise.colour, joint=True)
+    found = linearise(shaped, start, local.values, local.counts, wide, spectrum=local.noise.spectrum, joint=True)
     error = found.search.estimate(0, found.series)[1].diagonal().clamp(min=0.0).sqrt()
     numbers = [term.shape[name] for term, reach in zip(model.terms, inside, strict=True) for name in reach]
     errors = shaped.per_effect(shaped.spread(numbers, error[shaped.joint :]).tolist())

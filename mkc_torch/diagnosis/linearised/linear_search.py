@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.linearised.wander import NoiseFit, SlowPart, Wander, without_wander
+from mkc_torch.diagnosis.linearised.drift import DriftFamily, DriftStatistics, NoiseFit, without_wander
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-__all__ = ["Gains", "LinearSearch", "log_survival"]
+__all__ = ["LinearSearch", "SearchGains", "log_survival"]
 
 _LEFT = 1e-4
 """A direction of a candidate of which the simulation's own parameters leave a smaller share than this is dropped."""
@@ -37,7 +37,7 @@ _EQUAL = 3.0
 
 
 @dataclass(frozen=True)
-class Gains:
+class SearchGains:
     """Of C candidates on B series: likelihood ratio (twice the gain in nats) and the log of its chi-square p-value."""
 
     ratio: Float[Tensor, "C B"]
@@ -74,16 +74,16 @@ class LinearSearch:
         self,
         nuisance: Float[Tensor, "M p"],
         candidates: Sequence[Float[Tensor, "M q"]],
-        wander: Float[Tensor, "M k"],
+        drift: Float[Tensor, "M k"],
         scales: Float[Tensor, "F k"],
         walk_first: float,
     ) -> None:
         self._basis = torch.linalg.qr(nuisance / torch.linalg.vector_norm(nuisance, dim=0).clamp(min=1e-300)).Q
         self._dof = nuisance.shape[0] - nuisance.shape[1]
-        self._wander = wander
-        self._wander_basis = self._basis.mT @ wander
-        gram = _gram(wander) - _gram(self._wander_basis)
-        self._families = [Wander(scale, gram) for scale in scales] if wander.shape[1] else []
+        self._wander = drift
+        self._wander_basis = self._basis.mT @ drift
+        gram = _gram(drift) - _gram(self._wander_basis)
+        self._families = [DriftFamily(scale, gram) for scale in scales] if drift.shape[1] else []
         self._possible = range(len(self._families))
         self._walk_first = walk_first
         self._try(candidates)
@@ -114,8 +114,8 @@ class LinearSearch:
 
     def scaled(self, factor: Float[Tensor, " M"]) -> LinearSearch:
         """The same with each row times a factor."""
-        nuisance, columns, wander = (factor.unsqueeze(-1) * known for known in (self._basis, self._flat, self._wander))
-        other = LinearSearch(nuisance, columns.split(self._widths, -1), wander, self._scales, self._walk_first)
+        nuisance, columns, drift = (factor.unsqueeze(-1) * known for known in (self._basis, self._flat, self._wander))
+        other = LinearSearch(nuisance, columns.split(self._widths, -1), drift, self._scales, self._walk_first)
         other._possible = self._possible
         return other
 
@@ -132,7 +132,7 @@ class LinearSearch:
         return torch.stack(scales) if scales else self._wander.new_zeros(0, self._wander.shape[1])
 
     @property
-    def _allowed(self) -> list[Wander]:
+    def _allowed(self) -> list[DriftFamily]:
         """The families of wander that the noise may be of."""
         return [self._families[number] for number in self._possible]
 
@@ -172,7 +172,7 @@ class LinearSearch:
         """Draws of the white part, of variance one."""
         return torch.randn(self._basis.shape[0], count, generator=generator, dtype=self._flat.dtype)
 
-    def wander(self, count: int, noise: NoiseFit, generator: torch.Generator) -> Float[Tensor, "M B"]:
+    def drift(self, count: int, noise: NoiseFit, generator: torch.Generator) -> Float[Tensor, "M B"]:
         """Draws of the fitted wander, on the scale on which the white part has variance one."""
         if noise.size == 0:
             return self._wander.new_zeros(self._basis.shape[0], count)
@@ -186,7 +186,7 @@ class LinearSearch:
         distinct = scale.square().sum() / (scale == scale.max()).sum()
         return float((noise.size * noise.variance * distinct).sqrt())
 
-    def gains(self, series: Float[Tensor, "M B"]) -> Gains:
+    def gains(self, series: Float[Tensor, "M B"]) -> SearchGains:
         """The likelihood ratio of each candidate on each series, the noise's sizes profiled out."""
         series = series.to(self._flat.dtype)
         on_basis = self._basis.mT @ series
@@ -197,7 +197,7 @@ class LinearSearch:
         ratio = (2.0 * (best - null)).clamp(min=0.0)
         dof = self.dof
         log_p = log_survival(ratio, dof.clamp(min=1.0).unsqueeze(-1))
-        return Gains(ratio, torch.where(dof.unsqueeze(-1) > 0, log_p, 0.0), dof)
+        return SearchGains(ratio, torch.where(dof.unsqueeze(-1) > 0, log_p, 0.0), dof)
 
     def beside_likeliest(
         self, series: Float[Tensor, "M B"], possible: Bool[Tensor, " C"]
@@ -330,14 +330,14 @@ class LinearSearch:
         rotated = family.axes.mT @ (family.scale * (self._wander.mT @ left))
         return family.scale * (family.axes @ (fit.size / (1.0 + fit.size * family.strength) * rotated))
 
-    def slow_part(self, series: Float[Tensor, " M"]) -> SlowPart:
+    def slow_part(self, series: Float[Tensor, " M"]) -> DriftStatistics:
         """What a series says of the likeliest wander."""
         fit = self.noise_fit(series)
         family = self._families[fit.family]
         left = series - self._basis @ (self._basis.mT @ series)
         inner = family.scale * (self._wander.mT @ left)
         gram = (family.axes * family.strength) @ family.axes.mT
-        return SlowPart(float(left.square().sum()), self._dof, inner, gram, family.scale, fit.size)
+        return DriftStatistics(float(left.square().sum()), self._dof, inner, gram, family.scale, fit.size)
 
     def shares(self, series: Float[Tensor, " M"], channels: int) -> Float[Tensor, " c"]:
         """Variance of the wander of each channel over that of the scales given, where the series says so; mean one.
@@ -404,7 +404,7 @@ class LinearSearch:
             best[member] = torch.where(dof.unsqueeze(-1) > 0, found, -torch.inf)
         return null, best
 
-    def _cross_in(self, family: Wander) -> Float[Tensor, "cols k"]:
+    def _cross_in(self, family: DriftFamily) -> Float[Tensor, "cols k"]:
         """Inner products of the candidates' columns with a wander's own axes."""
         return self._cross.double().mT @ (family.scale.unsqueeze(-1) * family.axes)
 

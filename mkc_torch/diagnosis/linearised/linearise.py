@@ -11,25 +11,25 @@ import torch
 from torch import Tensor
 
 from mkc_torch._parallel.pool import shared
-from mkc_torch.diagnosis.linearised.linear_search import Gains, LinearSearch
-from mkc_torch.diagnosis.linearised.seen import FILLED_AT_ONCE, Seen, each
-from mkc_torch.diagnosis.linearised.tangents import Slow, Tangents
+from mkc_torch.diagnosis.linearised.cosine_projection import FILLED_AT_ONCE, CosineProjection, each
+from mkc_torch.diagnosis.linearised.linear_search import LinearSearch, SearchGains
+from mkc_torch.diagnosis.linearised.tangents import ModelTangents, SlowBasis
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.noise.colour import (
-    Colour,
+from mkc_torch.diagnosis.noise.cosine_basis import dct
+from mkc_torch.diagnosis.noise.imputation import Imputation
+from mkc_torch.diagnosis.noise.spectrum import (
+    NoiseSpectrum,
     autoregressive,
     colour_of,
     colour_of_fast,
     enters_at_port,
     port_colour,
 )
-from mkc_torch.diagnosis.noise.cosine_basis import dct
-from mkc_torch.diagnosis.noise.gaps import Filling
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Linearised", "linearise"]
+__all__ = ["LinearisedSearch", "linearise"]
 
 
 _ALTERNATIONS, _SETTLED = 8, 10.0
@@ -47,7 +47,7 @@ _REFILLED = 2
 
 
 @dataclass(frozen=True)
-class Linearised:
+class LinearisedSearch:
     """A search and the series it is about.
 
     Attributes:
@@ -62,74 +62,74 @@ class Linearised:
 
     search: LinearSearch
     series: Float[Tensor, " M"]
-    colour: Colour
+    spectrum: NoiseSpectrum
     entrance: tuple[Tensor, Tensor] | None
-    filling: Filling
-    others: tuple[Linearised, ...] = ()
+    filling: Imputation
+    others: tuple[LinearisedSearch, ...] = ()
 
-    def plausible(self, within: float) -> list[Colour]:
+    def plausible(self, within: float) -> list[NoiseSpectrum]:
         """Other colours that the noise may have: as likely ones, within some nats.
 
         The alternation comes to them from elsewhere: a spectrum of twenty numbers that a wander hides in part has
         several.
         """
         settled = [_settled(one) for one in self.others]
-        return [one.colour for one in settled if one.evidence > self.evidence - within]
+        return [one.spectrum for one in settled if one.evidence > self.evidence - within]
 
-    def colour_beside(self) -> Colour:
+    def colour_beside(self) -> NoiseSpectrum:
         """The colour of what is left beside the wander."""
-        K, m = self.colour.root.shape
+        K, m = self.spectrum.root.shape
         power = self.search.stationary(self.series)[: K * m].unflatten(0, (K, m))
-        return colour_of(power * self.colour.root.square())
+        return colour_of(power * self.spectrum.root.square())
 
     @property
     def wanders(self) -> bool:
         """Whether a wander makes the noise likelier."""
         return self.search.noise_fit(self.series).gain > 0
 
-    def colour_ahead(self) -> Colour:
+    def colour_ahead(self) -> NoiseSpectrum:
         """Twice as far from the present colour as :meth:`colour_beside`: that goes slowly where a wander is strong.
 
         Salakhutdinov & Roweis, "Adaptive overrelaxed bound optimization methods", ICML (2003).
         """
         step = self.colour_beside()
-        beyond = (step.root / self.colour.root).clamp(1.0 / _FARTHEST, _FARTHEST)
+        beyond = (step.root / self.spectrum.root).clamp(1.0 / _FARTHEST, _FARTHEST)
         return replace(step, root=step.root * beyond)
 
-    def recoloured(self, colour: Colour) -> Linearised:
+    def recoloured(self, spectrum: NoiseSpectrum) -> LinearisedSearch:
         """The same beside noise of another colour, with what stands in for rejected samples as it is."""
-        factor = (self.colour.root / colour.root).flatten()
+        factor = (self.spectrum.root / spectrum.root).flatten()
         own, rows = self.series[: len(factor)], len(self.series) - len(factor)
         # what the prior pulls at is on the scale of the residuals
         scale = (factor * own).std() / own.std()
         factor = torch.cat([factor, scale.expand(rows)])
-        return replace(self, search=self.search.scaled(factor), series=factor * self.series, colour=colour)
+        return replace(self, search=self.search.scaled(factor), series=factor * self.series, spectrum=spectrum)
 
     @property
     def evidence(self) -> float:
         """Log-likelihood of the residuals by their own noise, up to a constant that all noise of a recording shares."""
-        log_det = float(self.colour.root.log().sum()) + 0.5 * self.filling.log_det
+        log_det = float(self.spectrum.root.log().sum()) + 0.5 * self.filling.log_det
         return self.search.noise_fit(self.series).log_likelihood - log_det
 
-    def gains_of(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> Gains:
+    def gains_of(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> SearchGains:
         """The likelihood ratios of other candidates on the series."""
         return self.search.with_candidates(self._columns(tangents, counts)).gains(self.series.unsqueeze(-1))
 
-    def with_more(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> Linearised:
+    def with_more(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> LinearisedSearch:
         """The same with other candidates after its own."""
         return replace(self, search=self.search.with_more(self._columns(tangents, counts)))
 
-    def without(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> Linearised:
+    def without(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> LinearisedSearch:
         """The same with these tangents taken out of everything too."""
         return replace(self, search=self.search.without(torch.cat(self._columns(tangents, counts), -1)))
 
     def _columns(self, tangents: Sequence[Float[Tensor, "N m q"]], counts: Float[Tensor, "N m"]) -> list[Tensor]:
-        rows = len(self.series) - self.colour.root.numel()
+        rows = len(self.series) - self.spectrum.root.numel()
         columns = each(lambda joined: self._whitened(counts.unsqueeze(-1) * joined), tangents)
         return [torch.cat([c, c.new_zeros(rows, c.shape[1])]) for c in columns]
 
     def _whitened(self, values: Float[Tensor, "N m c"]) -> Float[Tensor, "Km c"]:
-        return self.colour.scaled(self.filling(dct(values, len(self.colour.root))))
+        return self.spectrum.scaled(self.filling(dct(values, len(self.spectrum.root))))
 
     def entering(self, count: int, generator: torch.Generator) -> Float[Tensor, "M B"] | None:
         """Draws of coloured noise that enters at the port, of variance one once whitened."""
@@ -150,15 +150,15 @@ def linearise(
     parameters: Float[Tensor, " p"],
     pseudo: Float[Tensor, "N m"],
     counts: Float[Tensor, "N m"],
-    tangents: Tangents,
+    tangents: ModelTangents,
     *,
-    colour: Colour | None = None,
-    near: Colour | None = None,
+    spectrum: NoiseSpectrum | None = None,
+    near: NoiseSpectrum | None = None,
     white: bool = False,
-    wander: bool = True,
+    drift: bool = True,
     joint: bool = False,
-    seen: Seen | None = None,
-) -> Linearised:
+    seen: CosineProjection | None = None,
+) -> LinearisedSearch:
     """A search around a fit.
 
     Args:
@@ -171,56 +171,62 @@ def linearise(
         white: beside the wander, noise counts as white.
         wander: allow for noise that wanders at the ports.
         joint: the one candidate is all of the parameters, to be estimated together.
-        seen: what :meth:`Seen.of` gives of the same, where it is known.
+        seen: what :meth:`CosineProjection.of` gives of the same, where it is known.
     """
     m = pseudo.shape[1]
     pull = _Pull.of(model, parameters)
-    slow = tangents.slow if wander else None
-    seen = Seen.of(pseudo, counts, tangents, slow) if seen is None else seen
+    slow = tangents.slow if drift else None
+    seen = CosineProjection.of(pseudo, counts, tangents, slow) if seen is None else seen
     level = pseudo.new_ones(seen.kept, m) * _level(pseudo)
-    plain = Colour(tuple(pseudo.new_zeros(0) for _ in range(m)), level)
+    plain = NoiseSpectrum(tuple(pseudo.new_zeros(0) for _ in range(m)), level)
     if white:
         return _searching(plain, pull, seen, slow)
     bare = replace(seen, candidates=())
     if joint:
-        own = _coloured(plain, near, pull, bare, slow).colour if colour is None else colour
+        own = _coloured(plain, near, pull, bare, slow).spectrum if spectrum is None else spectrum
         return _searching(own, pull, seen, slow, joint=True)
-    found = _coloured(plain, near, pull, bare, slow) if colour is None else _searching(colour, pull, bare, slow)
-    candidates = [pull.below(found.colour.scaled(one)) for one in each(found.filling, seen.candidates, FILLED_AT_ONCE)]
+    found = _coloured(plain, near, pull, bare, slow) if spectrum is None else _searching(spectrum, pull, bare, slow)
+    candidates = [
+        pull.below(found.spectrum.scaled(one)) for one in each(found.filling, seen.candidates, FILLED_AT_ONCE)
+    ]
     found = replace(found, search=found.search.with_candidates(candidates))
     pointwise = None if slow is None else tangents.pointwise[slow.port]
     if slow is None or pointwise is None or not tangents.candidates:
         return found
     block = counts.unsqueeze(-1) * pointwise
     # the wander is drawn for itself
-    beside = pseudo - counts * slow.course(found.search.courses(found.series))
+    beside = pseudo - counts * slow.waveform(found.search.courses(found.series))
     if not enters_at_port(beside, block):
         return found
     return replace(found, entrance=(block, port_colour(beside, block)))
 
 
-def _searching(colour: Colour, pull: _Pull, seen: Seen, slow: Slow | None, *, joint: bool = False) -> Linearised:
+def _searching(
+    spectrum: NoiseSpectrum, pull: _Pull, seen: CosineProjection, slow: SlowBasis | None, *, joint: bool = False
+) -> LinearisedSearch:
     """A search of what has its rejected samples filled."""
-    filling = seen.gaps.filling(colour)
+    filling = seen.gaps.filling(spectrum)
     seen = seen.filled(filling)
-    flat = colour.scaled(seen.pseudo)
-    parameters = pull.under(colour.scaled(seen.nuisance), flat)
-    candidates = [pull.below(colour.scaled(one)) for one in seen.candidates]
+    flat = spectrum.scaled(seen.pseudo)
+    parameters = pull.under(spectrum.scaled(seen.nuisance), flat)
+    candidates = [pull.below(spectrum.scaled(one)) for one in seen.candidates]
     search = LinearSearch(
         parameters[:, :0] if joint else parameters,
         [parameters] if joint else candidates,
-        pull.below(colour.scaled(seen.slow)),
+        pull.below(spectrum.scaled(seen.slow)),
         flat.new_zeros(0, 0) if slow is None else slow.scales,
         0.0 if slow is None else slow.walk_first,
     )
-    return Linearised(search, pull.beside(flat), colour, None, filling)
+    return LinearisedSearch(search, pull.beside(flat), spectrum, None, filling)
 
 
-def _coloured(plain: Colour, near: Colour | None, pull: _Pull, seen: Seen, slow: Slow | None) -> Linearised:
+def _coloured(
+    plain: NoiseSpectrum, near: NoiseSpectrum | None, pull: _Pull, seen: CosineProjection, slow: SlowBasis | None
+) -> LinearisedSearch:
     """With the likeliest colour of the noise beside a wander at the port, by alternating between the two."""
     alone = replace(seen, slow=seen.slow[..., :0])
 
-    def beside_nothing() -> Colour:
+    def beside_nothing() -> NoiseSpectrum:
         best = _searching(plain, pull, alone, None).colour_beside()
         for _ in range(_REFILLED):
             found = _searching(best, pull, alone, None)
@@ -232,38 +238,38 @@ def _coloured(plain: Colour, near: Colour | None, pull: _Pull, seen: Seen, slow:
     if slow is None:
         return _searching(beside_nothing(), pull, seen, None)
 
-    def beside_wander() -> Colour:
+    def beside_wander() -> NoiseSpectrum:
         return _searching(plain, pull, seen, slow).colour_beside() if near is None else near
 
-    def tried(colour: Callable[[], Colour]) -> Linearised:
-        return _searching(colour(), pull, seen, slow)
+    def tried(spectrum: Callable[[], NoiseSpectrum]) -> LinearisedSearch:
+        return _searching(spectrum(), pull, seen, slow)
 
-    def beyond_wander() -> Colour:
+    def beyond_wander() -> NoiseSpectrum:
         spread = (seen.slow.square() * slow.scales[0].square()).sum(-1)
         return colour_of_fast(seen.pseudo.square(), ((spread.cumsum(0) / spread.sum(0)) < _REACHED).sum(0))
 
     # from the side of no wander, from that of no colour, and from where there is no wander: each could pass for another
     colours = (beside_nothing, beside_wander, beyond_wander)
-    starts = shared([partial(tried, colour) for colour in colours], [slow, slow.tangents, slow.scales])
+    starts = shared([partial(tried, spectrum) for spectrum in colours], [slow, slow.tangents, slow.scales])
     best = max(starts, key=lambda found: found.evidence)
     return replace(_settled(best), others=tuple(one for one in starts if one is not best))
 
 
-def _settled(found: Linearised) -> Linearised:
+def _settled(found: LinearisedSearch) -> LinearisedSearch:
     """With the colour that alternating between it and the wander comes to.
 
     What stands in for rejected samples stays: it follows any colour, and would lead it on. The family of the wander
     stays too until the colour has settled, and is asked for again then: each is decomposed anew for every colour.
     """
     tried: set[int] = set()
-    while (wander := found.search.noise_fit(found.series)).gain > 0 and wander.family not in tried:
-        tried.add(wander.family)
-        found = _settled_in(replace(found, search=found.search.of_family(wander.family)))
+    while (drift := found.search.noise_fit(found.series)).gain > 0 and drift.family not in tried:
+        tried.add(drift.family)
+        found = _settled_in(replace(found, search=found.search.of_family(drift.family)))
         found = replace(found, search=found.search.of_family(None))
     return found
 
 
-def _settled_in(found: Linearised) -> Linearised:
+def _settled_in(found: LinearisedSearch) -> LinearisedSearch:
     for _ in range(_ALTERNATIONS):
         step = found.recoloured(found.colour_ahead())
         if step.evidence <= found.evidence + _SETTLED:

@@ -20,11 +20,11 @@ from mkc_torch.nonlinear import NoFitError
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Slow", "Tangents", "tangents_of"]
+__all__ = ["ModelTangents", "SlowBasis", "tangents_of"]
 
 
 @dataclass(frozen=True)
-class Tangents:
+class ModelTangents:
     """How the residual moves.
 
     Attributes:
@@ -37,7 +37,7 @@ class Tangents:
     nuisance: Float[Tensor, "N m p"]
     candidates: Sequence[Float[Tensor, "N m q"]]
     pointwise: dict[str, Tensor | None]
-    slow: Slow | None
+    slow: SlowBasis | None
 
     @property
     def parts(self) -> tuple[object, ...]:
@@ -51,16 +51,16 @@ class Tangents:
         )
 
     @property
-    def bare(self) -> Tangents:
+    def bare(self) -> ModelTangents:
         """The same without candidates."""
         return replace(self, candidates=())
 
 
 @dataclass(frozen=True)
-class Slow:
+class SlowBasis:
     """Slow courses of a port's channels, and their standard deviations in each family of wander (F, k).
 
-    ``tangents`` are those of each course of each channel, (N, m, k), or, where the port is ``pointwise``, those of the
+    ``tangents`` are those of each waveform of each channel, (N, m, k), or, where the port is ``pointwise``, those of the
     channels, (N, m, c), which the courses modulate. Another family than the first has to gain ``walk_first`` nats more.
     """
 
@@ -81,25 +81,25 @@ class Slow:
         moved = counts.unsqueeze(-1) * self.tangents
         return dct_of_courses(moved, self.count, kept) if self.pointwise else dct(moved, kept)
 
-    def course(self, amplitudes: Float[Tensor, " k"]) -> Float[Tensor, "N m"]:
+    def waveform(self, amplitudes: Float[Tensor, " k"]) -> Float[Tensor, "N m"]:
         """What courses of these amplitudes add to the residual."""
         if not self.pointwise:
             return self.tangents @ amplitudes
-        wander = course_of(amplitudes.unflatten(0, (-1, self.channels)), len(self.tangents))
-        return torch.einsum("nmc,nc->nm", self.tangents, wander)
+        drift = course_of(amplitudes.unflatten(0, (-1, self.channels)), len(self.tangents))
+        return torch.einsum("nmc,nc->nm", self.tangents, drift)
 
-    def with_shares(self, shares: Float[Tensor, " c"]) -> Slow:
+    def with_shares(self, shares: Float[Tensor, " c"]) -> SlowBasis:
         """The same with so many times the variance in each channel."""
         return replace(self, scales=self.scales * shares.sqrt().repeat(self.scales.shape[1] // len(shares)))
 
-    def of_family(self, number: int) -> Slow:
+    def of_family(self, number: int) -> SlowBasis:
         """The same with one family of wander only."""
         return replace(self, scales=self.scales[number : number + 1])
 
 
 def tangents_of(
     model: JointModel, parameters: Float[Tensor, " p"], settings: NoiseSettings, terms: Sequence[Term] = ()
-) -> Tangents:
+) -> ModelTangents:
     """The tangents at these parameters, by forward mode.
 
     Args:
@@ -135,12 +135,12 @@ def tangents_of(
             nuisance[..., start : start + size] *= independent[:, None]
         start += size
     slow = _slow_courses(model, parameters, pointwise, settings)
-    return Tangents(nuisance, Candidates(model, parameters, terms, pointwise), pointwise, slow)
+    return ModelTangents(nuisance, Candidates(model, parameters, terms, pointwise), pointwise, slow)
 
 
 def _slow_courses(
     model: JointModel, parameters: Tensor, pointwise: dict[str, Tensor | None], settings: NoiseSettings
-) -> Slow | None:
+) -> SlowBasis | None:
     N = len(model.prepared.time)
     count = min(settings.slow_courses, N // 10)
     wandering = [name for name, port in model.prepared.ports.items() if port.wanders]
@@ -153,8 +153,8 @@ def _slow_courses(
     scales = torch.stack([1.0 / k, *(square.sqrt() for square in others)])
     known = pointwise[name]
     if known is not None:
-        return Slow(name, c, known, True, scales, settings.walk_first)
+        return SlowBasis(name, c, known, True, scales, settings.walk_first)
     courses = cosines(count, N)
     eye = torch.eye(c, dtype=courses.dtype)
     spread = (courses[:, None, :, None] * eye[:, None, :]).reshape(N, c, count * c)
-    return Slow(name, c, through_port(model, parameters, name, spread, None), False, scales, settings.walk_first)
+    return SlowBasis(name, c, through_port(model, parameters, name, spread, None), False, scales, settings.walk_first)

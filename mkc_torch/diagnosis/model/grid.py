@@ -13,7 +13,7 @@ from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Shape
-from mkc_torch.simulation.protocol import Port, PreparedSimulation, Sizes
+from mkc_torch.simulation.protocol import Port, PreparedSimulation, SignalSizes
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -63,7 +63,7 @@ def absolute(effect: Effect, shape: Shape, port: Port, driver: Driver | None = N
         return shape
     known = dict(port.sizes)
     if driver is not None:
-        known["driver"] = Sizes.of(torch.linalg.vector_norm(driver.values, dim=-1))
+        known["driver"] = SignalSizes.of(torch.linalg.vector_norm(driver.values, dim=-1))
     sizes = {part: values._asdict() for part, values in known.items()}
     return {**shape} | {name: shape[name] * sizes[part][which] for name, (part, which) in effect.relative.items()}
 

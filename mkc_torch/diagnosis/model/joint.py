@@ -16,7 +16,7 @@ from mkc_torch._support.forward_mode import forward_jacobian
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.effects.context import Context, Shape
 from mkc_torch.effects.courses import combined, gained
-from mkc_torch.nonlinear import GaussianPrior, beside
+from mkc_torch.nonlinear import GaussianPrior, make_dual
 from mkc_torch.simulation.continuation import CompiledResidual, Continuation, compiled_residual, is_plain
 from mkc_torch.simulation.protocol import Answer, Change, Clocked, FreeChange, Nearby, PreparedSimulation
 
@@ -82,7 +82,7 @@ class JointModel:
     def bounds(self) -> tuple[Float[Tensor, " p"], Float[Tensor, " p"]] | None:
         """Least and greatest values; None if all are free."""
         known = self.prepared.bounds
-        reach = [(term.effect.least, term.effect.most) for term in self.terms]
+        reach = [(term.effect.lower, term.effect.upper) for term in self.terms]
         if known is None and all(one == (-torch.inf, torch.inf) for one in reach):
             return None
         free = self.prepared.time.new_full((self.base,), torch.inf)
@@ -205,7 +205,7 @@ def port_jacobian(model: JointModel, parameters: Float[Tensor, " p"], port: str)
     zero = parameters.new_zeros(N, len(known.channels))
 
     def residual(change: Tensor) -> Tensor:
-        return model.pushed(beside(parameters, change[0, 0]), port, change)
+        return model.pushed(make_dual(parameters, change[0, 0]), port, change)
 
     columns = []
     for k in range(len(known.channels)):
@@ -220,7 +220,7 @@ def courses_of(term: Term, context: Context) -> Callable[[Tensor], Tensor] | Non
     if term.effect.has_basis:
         return partial(combined, term.effect.basis(term.shape, context))
     if term.effect.has_course:
-        return partial(gained, term.effect.course(term.shape, context))
+        return partial(gained, term.effect.waveform(term.shape, context))
     return None
 
 
@@ -266,10 +266,10 @@ def directions(term: Term, context: Context) -> Float[Tensor, "N c q"]:
     if term.effect.has_course:
         # a gain on a course: the derivative is the course, channel by channel
         eye = torch.eye(len(context.channels), dtype=context.signal.dtype)
-        return term.effect.course(term.shape, context)[:, None, None] * eye
+        return term.effect.waveform(term.shape, context)[:, None, None] * eye
 
     def change(gamma: Tensor) -> Tensor:
-        return term.effect.change(gamma, term.shape, replace(context, signal=beside(context.signal, gamma[0])))
+        return term.effect.change(gamma, term.shape, replace(context, signal=make_dual(context.signal, gamma[0])))
 
     return forward_jacobian(change, context.signal.new_zeros(term.size(context)), context.signal.numel())
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.order_statistic import robust_scale
-from mkc_torch.diagnosis.noise.colour import autoregression, filtered
 from mkc_torch.diagnosis.noise.running_median import running_median
+from mkc_torch.diagnosis.noise.spectrum import autoregression, filtered
 
 if TYPE_CHECKING:
     from jaxtyping import Float

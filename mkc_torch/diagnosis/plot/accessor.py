@@ -9,7 +9,8 @@ from mkc_torch._support.drawing import BLUE, GREY, ORANGE, array, axes_or_new
 from mkc_torch._support.unit_text import tidy
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital, plain
-from mkc_torch.diagnosis.parts import Candidate, Finding, Separability, Traces
+from mkc_torch.diagnosis.environment import NoiseEnvironment
+from mkc_torch.diagnosis.parts import CandidateScore, Finding, Separability, Traces
 from mkc_torch.diagnosis.plot.curves import MOST_LETTERS, draw_course, draw_curve, draw_map, named, of_time, short
 from mkc_torch.diagnosis.plot.residual import (
     MOMENTS,
@@ -19,7 +20,6 @@ from mkc_torch.diagnosis.plot.residual import (
     mark_findings,
     of_channel,
 )
-from mkc_torch.diagnosis.world import World
 from mkc_torch.effects import words_of
 
 __all__ = ["DiagnosisPlot"]
@@ -53,9 +53,9 @@ class DiagnosisPlot:
         self,
         traces: Traces,
         findings: tuple[Finding, ...],
-        candidates: tuple[Candidate, ...],
+        candidates: tuple[CandidateScore, ...],
         separability: Separability,
-        world: World,
+        world: NoiseEnvironment,
     ) -> None:
         self._traces, self._findings, self._candidates = traces, findings, candidates
         self._separability, self._world = separability, world
@@ -182,10 +182,10 @@ class DiagnosisPlot:
             ax: axes of matplotlib.
 
         Raises:
-            ValueError: there are no candidates, or ``most`` is less than one.
+            ValueError: there are no candidates, or ``upper`` is less than one.
         """
         if isinstance(most, bool) or most < 1:
-            raise ValueError(f"Expected argument `most` to be at least 1 but got {most}; 12 is what the report shows.")
+            raise ValueError(f"Expected argument `upper` to be at least 1 but got {most}; 12 is what the report shows.")
         if not self._candidates:
             raise ValueError("There are no candidates to draw: none was tried.")
         shown = sorted(self._candidates[:most], key=lambda one: -one.log_likelihood_gain)
@@ -207,10 +207,10 @@ class DiagnosisPlot:
             ax: axes of matplotlib.
 
         Raises:
-            ValueError: there are no candidates to compare, or ``most`` is less than one.
+            ValueError: there are no candidates to compare, or ``upper`` is less than one.
         """
         if isinstance(most, bool) or most < 1:
-            raise ValueError(f"Expected argument `most` to be at least 1 but got {most}; 12 is what the report shows.")
+            raise ValueError(f"Expected argument `upper` to be at least 1 but got {most}; 12 is what the report shows.")
         labels = [_label(one) for one in self._separability.labels[:most]]
         if not labels:
             raise ValueError("There are no candidates to compare.")

@@ -10,8 +10,8 @@ from mkc_torch._support.drawing import BLUE, GREY, INK, ORANGE, array
 from mkc_torch._support.unit_text import tidy
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain
+from mkc_torch.diagnosis.environment import Curve, DisturbanceEstimate
 from mkc_torch.diagnosis.parts import StateMap
-from mkc_torch.diagnosis.world import Curve, Forcing
 
 __all__ = ["CURVE_COLORS", "MOST_LETTERS", "draw_course", "draw_curve", "draw_map", "named", "of_time", "short"]
 
@@ -44,7 +44,7 @@ def draw_curve(ax: Any, curve: Curve, has_time: bool, most: int = MOST_LETTERS) 
     ax.locator_params(axis="y", nbins=5)
 
 
-def draw_course(ax: Any, forcing: Forcing, has_time: bool) -> None:
+def draw_course(ax: Any, forcing: DisturbanceEstimate, has_time: bool) -> None:
     """What pushes a rate, or is added to an output, over time with its band."""
     course = array(forcing.time)
     time, value, band = (_joined(course, array(one)) for one in (forcing.time, forcing.value, forcing.band))

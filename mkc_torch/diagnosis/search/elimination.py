@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from functools import partial
 
-from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted, without_term
+from mkc_torch.diagnosis.model.parallel import run_parallel
 from mkc_torch.diagnosis.search.own_noise import priced, with_own_noise
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
@@ -30,7 +30,7 @@ def needless_term(fit: FittedModel, declared: Mapping[str, float], settings: Set
     if count < 2:
         return None
     works = [partial(_loss, fit, number, declared, settings) for number in range(count)]
-    losses = at_once(works, fit.model.prepared, fit.model.terms)
+    losses = run_parallel(works, fit.model.prepared, fit.model.terms)
     weakest = min(range(count), key=losses.__getitem__)
     return weakest if losses[weakest] < settings.naming.separable else None
 

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
-from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted_beside
+from mkc_torch.diagnosis.model.parallel import run_parallel
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.model.term import Key, Term
 from mkc_torch.diagnosis.settings import Settings
@@ -54,13 +54,13 @@ def free_runs(free: FittedModel, terms: Sequence[Term], settings: Settings) -> l
     known = free.model.prepared, [terms[number] for number in chosen]
     works = [partial(_fit, free, terms[number], sizes[number]) for number in chosen]
     best: dict[Key, tuple[int, FittedModel]] = {}
-    for number, fit in zip(chosen, at_once(works, *known), strict=True):
+    for number, fit in zip(chosen, run_parallel(works, *known), strict=True):
         key = terms[number].key
         if key not in best or fit.log_likelihood > best[key][1].log_likelihood:
             best[key] = number, fit
     kept = _near([fit.log_likelihood - free.log_likelihood for _, fit in best.values()])
     leading = [one for one, near in zip(best.values(), kept, strict=True) if near]
-    shaped = at_once([partial(shape_fitted, fit) for _, fit in leading], *known)
+    shaped = run_parallel([partial(shape_fitted, fit) for _, fit in leading], *known)
     return [(number, fit) for (number, _), fit in zip(leading, shaped, strict=True)]
 
 
@@ -90,7 +90,7 @@ def linear_gains(
         moved = moved - own @ (own.mT @ moved)
         scale = moved.norm(dim=0).clamp(min=1e-300)
         size = -torch.linalg.lstsq(moved / scale, y.unsqueeze(-1), driver="gelsd").solution[:, 0] / scale
-        within = size.clamp(term.effect.least, term.effect.most)
+        within = size.clamp(term.effect.lower, term.effect.upper)
         left = float((y + moved @ within).square().sum())
         better = math.isfinite(left) and left < power
         gains.append(0.5 * samples * math.log(power / max(left, 1e-300)) if better else 0.0)

@@ -16,16 +16,16 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.quantum import rounding_of
-from mkc_torch.diagnosis.linearised.tangents import Tangents
+from mkc_torch.diagnosis.linearised.tangents import ModelTangents
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.search.likelihoods import Columns, LogLikelihoods, log_likelihoods
 from mkc_torch.diagnosis.search.quick import COUNTS, COUNTS_NOT, price
-from mkc_torch.simulation.dynamics.disturbances import observer_of
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid, key_of
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel, filter_models
+from mkc_torch.simulation.dynamics.noise_selection import observer_of
 from mkc_torch.simulation.dynamics.observer import Observable, Observer, clipped_slope
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.dynamics.whitening import SeriesAlong, gains_of, joined, relative_to, whitened
@@ -33,7 +33,7 @@ from mkc_torch.simulation.dynamics.whitening import SeriesAlong, gains_of, joine
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["JointLikelihood", "Start", "joint_likelihood"]
+__all__ = ["JointLikelihood", "JointStart", "joint_likelihood"]
 
 _STEPS = (0.5, 0.5, 0.25, 0.25, 0.125)
 """Decades by which sizes and times of the leading models of the noise are varied, round after round."""
@@ -61,7 +61,7 @@ _FIRST_DRAWS, _ENOUGH = 19, 6
 
 
 @dataclass(frozen=True)
-class Start:
+class JointStart:
     """Where the joint fit of a candidate begins: its sizes, how far the parameters move, and its noise's observer."""
 
     gamma: Float[Tensor, " q"]
@@ -90,7 +90,7 @@ class JointLikelihood:
     needed: Float[Tensor, " C"]
     noise: tuple[NoiseModel, ...]
     without: NoiseModel
-    scene: _Scene
+    scene: _LinearisedRecording
 
     @property
     def longer(self) -> float:
@@ -99,13 +99,13 @@ class JointLikelihood:
         gain, needed = float(self.gain[number]), float(self.needed[number])
         return needed / gain if gain > 0.0 else torch.inf
 
-    def start(self, number: int) -> Start:
+    def start(self, number: int) -> JointStart:
         """Where the joint fit of a candidate begins."""
         return self.scene.start(number, self.noise[number])
 
 
 @dataclass(frozen=True)
-class _Scene:
+class _LinearisedRecording:
     """The linearised recording: its flow, with all samples and with those that count, its series, the columns."""
 
     prepared: Observable
@@ -134,7 +134,7 @@ class _Scene:
         left[used] = y - both / norm @ solved
         return left, -(solved / norm)[p:], -(solved / norm)[:p]
 
-    def start(self, number: int, model: NoiseModel) -> Start:
+    def start(self, number: int, model: NoiseModel) -> JointStart:
         left, gamma, shift = self.residual(number, model)
         used = self.counted.counts > 0
         scale = 1.0 if any(model.known) else max(float(np.sqrt(np.square(left[used]).mean())), model.least_scale)
@@ -143,13 +143,13 @@ class _Scene:
         disturbances = model.disturbances(names, channels, scale)
         sensor = like.new_tensor([scale * one for one in model.sensor])
         observer = observer_of(self.flow, disturbances, sensor, names, channels)
-        return Start(like.new_tensor(gamma), like.new_tensor(shift), observer)
+        return JointStart(like.new_tensor(gamma), like.new_tensor(shift), observer)
 
 
 def joint_likelihood(
     base: FittedModel,
     terms: Sequence[Term],
-    tangents: Tangents,
+    tangents: ModelTangents,
     counts: Float[Tensor, "N m"],
     draws: int,
     generator: torch.Generator,
@@ -217,7 +217,9 @@ def joint_likelihood(
     )
 
 
-def _scene(base: FittedModel, terms: Sequence[Term], tangents: Tangents, counts: Tensor) -> _Scene | None:
+def _scene(
+    base: FittedModel, terms: Sequence[Term], tangents: ModelTangents, counts: Tensor
+) -> _LinearisedRecording | None:
     prepared, model = base.model.prepared, base.model
     assert isinstance(prepared, PreparedDynamics)
     flow = flow_of(prepared, base.parameters[: model.base], model.changes(base.parameters), model.near)
@@ -234,7 +236,7 @@ def _scene(base: FittedModel, terms: Sequence[Term], tangents: Tangents, counts:
     )
     theta, changes = base.parameters[: model.base], model.changes(base.parameters)
     largest = plausible_sizes(prepared, theta, changes, model.near)
-    return _Scene(prepared, flow, counted, series, columns, largest)
+    return _LinearisedRecording(prepared, flow, counted, series, columns, largest)
 
 
 def _along(flow: Flow, prepared: PreparedDynamics, residual: Tensor, moved: Float[np.ndarray, "N m K"]) -> SeriesAlong:
@@ -256,7 +258,9 @@ def _along(flow: Flow, prepared: PreparedDynamics, residual: Tensor, moved: Floa
     )
 
 
-def _refined(scene: _Scene, grid: NoiseGrid, more: Sequence[NoiseModel], keys: Sequence[object]) -> LogLikelihoods:
+def _refined(
+    scene: _LinearisedRecording, grid: NoiseGrid, more: Sequence[NoiseModel], keys: Sequence[object]
+) -> LogLikelihoods:
     """Over the grid, and around the likeliest noise of the simulation alone and beside each leading candidate."""
     singles = grid.singles()
     found = scene.likelihoods([*singles, *more])
@@ -314,7 +318,7 @@ def _kinds(found: LogLikelihoods) -> list[int]:
 
 
 def _judged(
-    scene: _Scene,
+    scene: _LinearisedRecording,
     found: LogLikelihoods,
     kind: int,
     left: Float[np.ndarray, "N m"],
@@ -346,7 +350,11 @@ def _judged(
 
 
 def _drawn(
-    scene: _Scene, model: NoiseModel, left: Float[np.ndarray, "N m"], count: int, generator: torch.Generator
+    scene: _LinearisedRecording,
+    model: NoiseModel,
+    left: Float[np.ndarray, "N m"],
+    count: int,
+    generator: torch.Generator,
 ) -> SeriesAlong:
     flow, used = scene.counted, scene.counted.counts > 0
     gains = gains_of(flow, filter_models(flow, [model]))

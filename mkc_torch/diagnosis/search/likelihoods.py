@@ -18,7 +18,14 @@ from mkc_torch._parallel.deadline import check_deadline
 from mkc_torch._parallel.progress import counted
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel, filter_models
-from mkc_torch.simulation.dynamics.whitening import Gains, SeriesAlong, gains_of, joined, whitened, whitened_in_blocks
+from mkc_torch.simulation.dynamics.whitening import (
+    FilterGains,
+    SeriesAlong,
+    gains_of,
+    joined,
+    whitened,
+    whitened_in_blocks,
+)
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -152,7 +159,7 @@ def log_likelihoods(
 
 def _under_each(
     flow: Flow, models: Sequence[NoiseModel], series: SeriesAlong
-) -> Iterator[tuple[int, Gains, int, Float[np.ndarray, "N m K"]]]:
+) -> Iterator[tuple[int, FilterGains, int, Float[np.ndarray, "N m K"]]]:
     """The whitened series under each model: its number, gains of some models, its number among these, the series."""
     states = flow.carried.shape[1] + max(len(one.pushes) for one in models)
     block = max(1, _COVARIANCES // (len(flow.new) * states**2))
@@ -212,7 +219,7 @@ def _split(columns: Columns, groups: Sequence[tuple[np.ndarray, np.ndarray]]) ->
 
 def _products(
     flow: Flow,
-    gains: Gains,
+    gains: FilterGains,
     number: int,
     candidates: SeriesAlong,
     basis: Float[np.ndarray, "M k"],

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
-from mkc_torch.diagnosis.model.in_the_world import noise_around
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.process_noise import estimate_noise
 from mkc_torch.diagnosis.model.shaped import shape_fitted
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
-from mkc_torch.simulation.dynamics.noise import NoiseOfTheWorld, noise_of
+from mkc_torch.simulation.dynamics.noise import StateSpaceNoise, noise_of
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
 __all__ = ["noise_of_fit", "priced", "with_own_noise"]
@@ -18,7 +18,7 @@ __all__ = ["noise_of_fit", "priced", "with_own_noise"]
 
 def with_own_noise(fit: FittedModel, declared: Mapping[str, float], settings: Settings) -> FittedModel:
     """The joint fit of a candidate with the noise that is left beside it at its likeliest sizes, and its shape too."""
-    noise = noise_around(fit, declared, settings.noise, noise_of_fit(fit, declared))
+    noise = estimate_noise(fit, declared, settings.noise, noise_of_fit(fit, declared))
     prepared = fit.model.prepared
     if noise is None or not isinstance(prepared, PreparedDynamics):
         return shape_fitted(fit)
@@ -37,7 +37,7 @@ def priced(fit: FittedModel, settings: Settings) -> float:
     return fit.log_likelihood - settings.noise.pushed * (0 if observer is None else len(observer.disturbances))
 
 
-def noise_of_fit(fit: FittedModel, declared: Mapping[str, float]) -> NoiseOfTheWorld | None:
+def noise_of_fit(fit: FittedModel, declared: Mapping[str, float]) -> StateSpaceNoise | None:
     """The noise that a fit is under."""
     prepared = fit.model.prepared
     return noise_of(prepared, declared) if isinstance(prepared, PreparedDynamics) else None

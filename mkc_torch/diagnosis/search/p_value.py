@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.linearised.linear_search import Gains, log_survival
-from mkc_torch.diagnosis.linearised.linearise import Linearised
-from mkc_torch.diagnosis.linearised.wander import NoiseFit
-from mkc_torch.diagnosis.search.own_colour import own_colour_gains
+from mkc_torch.diagnosis.linearised.drift import NoiseFit
+from mkc_torch.diagnosis.linearised.linear_search import SearchGains, log_survival
+from mkc_torch.diagnosis.linearised.linearise import LinearisedSearch
+from mkc_torch.diagnosis.search.whittle_gain import own_colour_gains
 from mkc_torch.diagnosis.settings import NoiseSettings
 
 if TYPE_CHECKING:
@@ -20,9 +20,9 @@ __all__ = ["either", "judged"]
 
 
 def judged(
-    linearised: Linearised,
+    linearised: LinearisedSearch,
     noise: NoiseFit,
-    found: Gains,
+    found: SearchGains,
     possible: Bool[Tensor, " tried"],
     count: int,
     generator: torch.Generator,
@@ -43,7 +43,7 @@ def judged(
     if stationary is None:
         stationary = linearised.search.white(count, generator)
     if noise.gain > settings.wander_drawn:
-        stationary = stationary + linearised.search.wander(count, noise, generator)
+        stationary = stationary + linearised.search.drift(count, noise, generator)
     drawn = linearised.search.gains(stationary)
     dof = found.dof.clamp(min=1.0)
     excess = (drawn.ratio.mean(-1) / dof).clamp(min=1.0).unsqueeze(-1)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.diagnosis.search.look import Look
+from mkc_torch.diagnosis.search.linearized import LinearizedSearch
 
 if TYPE_CHECKING:
     from jaxtyping import Bool
@@ -47,7 +47,7 @@ def pays(gain: float, numbers: float, samples: int, candidates: int) -> bool:
     return gain > price(numbers, samples, candidates)
 
 
-def any_pays(look: Look, possible: Bool[Tensor, " tried"]) -> float:
+def any_pays(look: LinearizedSearch, possible: Bool[Tensor, " tried"]) -> float:
     """:data:`COUNTS` if one of the first candidates of a look gains more than its price, else the other.
 
     Args:

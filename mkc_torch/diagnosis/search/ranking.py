@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 
 from mkc_torch.diagnosis.model.term import Key, continuous
-from mkc_torch.diagnosis.search.look import Look
-from mkc_torch.diagnosis.search.preference import Preference
+from mkc_torch.diagnosis.search.linearized import LinearizedSearch
+from mkc_torch.diagnosis.search.model_prior import ModelPrior
 from mkc_torch.diagnosis.search.ties import in_order
 
 __all__ = ["Ranked", "ranked"]
@@ -23,14 +23,14 @@ class Ranked:
     gap: float
 
 
-def ranked(look: Look, prefer: Preference) -> tuple[Ranked, ...]:
+def ranked(look: LinearizedSearch, prefer: ModelPrior) -> tuple[Ranked, ...]:
     """By gain in nats less one for each parameter and each number of the shape (Akaike's criterion), each physics at
     its best possible shape."""
     terms, found = look.scene.terms, look.gains
     gain = 0.5 * found.ratio[:, 0]
     numbers = gain.new_tensor([float(len(continuous(term))) for term in terms])
-    handicap = [prefer.handicap(term, float(one)) for term, one in zip(terms, gain, strict=True)]
-    score = gain - found.dof - numbers - gain.new_tensor(handicap)
+    penalty = [prefer.penalty(term, float(one)) for term, one in zip(terms, gain, strict=True)]
+    score = gain - found.dof - numbers - gain.new_tensor(penalty)
     score = torch.where((found.dof > 0) & look.possible, score, -torch.inf)
     best: dict[Key, int] = {}
     for number in in_order(score.tolist(), terms):

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
-from mkc_torch.diagnosis.model.at_once import at_once
 from mkc_torch.diagnosis.model.fit import FittedModel
+from mkc_torch.diagnosis.model.parallel import run_parallel
 from mkc_torch.diagnosis.model.term import Key, Term
-from mkc_torch.diagnosis.search.closing_in import refined
-from mkc_torch.diagnosis.search.look import Look
-from mkc_torch.diagnosis.search.preference import Preference, schwarz
+from mkc_torch.diagnosis.search.joint_refits import refitted
+from mkc_torch.diagnosis.search.linearized import LinearizedSearch
+from mkc_torch.diagnosis.search.model_prior import ModelPrior, schwarz
 from mkc_torch.diagnosis.search.ranking import Ranked
-from mkc_torch.diagnosis.search.strongest import refitted
+from mkc_torch.diagnosis.search.shape_refinement import refined
 
 __all__ = ["by_joint_fits"]
 
@@ -21,8 +21,8 @@ __all__ = ["by_joint_fits"]
 def by_joint_fits(
     best: FittedModel,
     ranking: tuple[Ranked, ...],
-    look: Look,
-    prefer: Preference,
+    look: LinearizedSearch,
+    prefer: ModelPrior,
     known: Sequence[FittedModel],
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
     """The fit, or a simpler one that is no worse; and the ranking, with rivals that lose much of their gain put back.
@@ -43,7 +43,7 @@ def by_joint_fits(
     fitted = {fit.model.terms[-1].key: fit for fit in reversed(known) if prefer.score(fit, base) >= naming.kept * won}
     new = [one for one in near if terms[one.number].key not in fitted]
     works = [partial(_tried, best, terms[one.number], look, one.number) for one in new]
-    for fit in at_once(works, base.model.prepared, [terms[one.number] for one in new]):
+    for fit in run_parallel(works, base.model.prepared, [terms[one.number] for one in new]):
         fitted[fit.model.terms[-1].key] = fit
     fits = [fitted[terms[one.number].key] for one in near]
     scores = [prefer.score(fit, base) for fit in fits]
@@ -67,7 +67,7 @@ def _by_innovations(
     best: FittedModel,
     ranking: tuple[Ranked, ...],
     terms: tuple[Term, ...],
-    prefer: Preference,
+    prefer: ModelPrior,
     fits: Sequence[FittedModel],
     separable: float,
 ) -> tuple[FittedModel, tuple[Ranked, ...]]:
@@ -95,7 +95,7 @@ def _by_innovations(
     return best, tuple(sorted(told, key=_gap))
 
 
-def _tried(best: FittedModel, term: Term, look: Look, number: int) -> FittedModel:
+def _tried(best: FittedModel, term: Term, look: LinearizedSearch, number: int) -> FittedModel:
     return refined(refitted(best, term, look, number), look.scene.base)
 
 

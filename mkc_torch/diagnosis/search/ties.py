@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.search.preference import Preference
+from mkc_torch.diagnosis.search.model_prior import ModelPrior
 
 __all__ = ["best_first", "in_order"]
 
@@ -32,7 +32,7 @@ def in_order(scores: Sequence[float], terms: Sequence[Term]) -> list[int]:
     return sorted(range(len(terms)), key=key)
 
 
-def best_first(fits: Sequence[FittedModel], base: FittedModel, prefer: Preference) -> list[FittedModel]:
+def best_first(fits: Sequence[FittedModel], base: FittedModel, prefer: ModelPrior) -> list[FittedModel]:
     """Joint fits in the order of their scores."""
     scores = [prefer.score(fit, base) for fit in fits]
     return [fits[place] for place in in_order(scores, [fit.model.terms[-1] for fit in fits])]

@@ -30,10 +30,10 @@ class AddedMass(RateEffect):
 
     id = "added_mass"
     needs = ("position", "rate")
-    most = 1.0
+    upper = 1.0
     plausible = 0.9
     gain = "share"
-    along = "rate"
+    plot_axis = "rate"
     equation = "δv̇ = −γ f,  γ = m_a / (m + m_a)"
     explanation = "Everything that accelerates the body does so too much: fluid that moves along adds to its mass."
     advice = "Add the mass of the fluid that moves along, this share of all the mass."
@@ -42,7 +42,7 @@ class AddedMass(RateEffect):
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity(self.gain, 1, ""),)
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
         return -context.part("rate")
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002

@@ -47,7 +47,7 @@ class Backlash(ShareEffect):
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return tuple({"half_gap": gap} for gap in GAPS)
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         own = context.part("own")
         return played(own, context.time, shape["half_gap"], context.runs) - own
 

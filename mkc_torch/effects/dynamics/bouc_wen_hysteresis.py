@@ -44,7 +44,7 @@ class BoucWenHysteresis(RateEffect):
     fitted_shape: Mapping[str, tuple[float, float]] = {"yield_deflection": (0.02, 2.0)}
     needs = ("position", "reversing")  # without a reversal it is a spring that yields
     gain = "stiffness"
-    along = "position"
+    plot_axis = "position"
     equation = "δv̇ = −γ z,  ż = v − (|v| z + v |z|) / (2 z₀)"
     explanation = "The restoring force depends on the way it came by: it yields, and goes round a loop."
     advice = "Add a hysteretic spring that yields at this deflection."

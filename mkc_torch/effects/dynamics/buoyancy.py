@@ -37,7 +37,7 @@ class Buoyancy(RateEffect):
     relative: Mapping[str, tuple[str, str]] = {"surface": ("position", "largest"), "draught": ("position", "largest")}
     needs = ("height", "deflection")  # heights that are measured from about where the surface is
     gain = "lift"
-    along = "position"
+    plot_axis = "position"
     equation = "δv̇ = γ clip((c − x) / h, 0, 1)"
     explanation = "Something carries the body upwards, below a height: it dips into a fluid."
     advice = "Add the weight of the fluid that is displaced."
@@ -46,7 +46,7 @@ class Buoyancy(RateEffect):
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return tuple({"surface": surface, "draught": draught} for surface, draught in DIPS)
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return ((shape["surface"] - context.part("position")) / shape["draught"]).clamp(0.0, 1.0)
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:

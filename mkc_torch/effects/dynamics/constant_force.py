@@ -27,9 +27,9 @@ class ConstantForce(RateEffect):
     """
 
     id = "constant_force"
-    least = -math.inf
+    lower = -math.inf
     gain = "push"
-    along = ""
+    plot_axis = ""
     equation = "δẋ = γ"
     explanation = "Something pushes all the time."
     advice = "Look for a bias of the actuator, a tilted base, an unbalanced weight or buoyancy."
@@ -62,7 +62,7 @@ class ConstantForce(RateEffect):
     }
     source = "Newton's second law"
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
         return torch.ones_like(context.time)
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002

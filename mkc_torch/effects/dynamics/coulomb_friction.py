@@ -38,7 +38,7 @@ class CoulombFriction(RateEffect):
     equation = "δv̇ = −γ tanh(v / w)"
     explanation = "Dry friction holds against the motion with a force that does not depend on its speed."
     advice = "Add dry friction of this size."
-    choices = ("width",)
+    form_parameters = ("width",)
     source = "Coulomb's law of friction; Andersson et al., Tribology International 40 (2007), for the smoothing"
 
     def equation_of(self, shape: Shape, context: Context) -> str:
@@ -48,7 +48,7 @@ class CoulombFriction(RateEffect):
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return tuple({"width": width} for width in WIDTHS)
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return -torch.tanh(context.part("own") / shape["width"])
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:

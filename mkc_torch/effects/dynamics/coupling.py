@@ -31,7 +31,7 @@ class Coupling(RateEffect):
     port = "exchange"
     needs = ("own", "other")
     gain = "exchange"
-    along = "other"
+    plot_axis = "other"
     power = 1.0
     equation = "δẋ = γ₁ (y − x),  δẏ = γ₂ (x − y)"
     explanation = "The state exchanges with another one: the larger their difference, the faster they even out."

@@ -27,16 +27,16 @@ class CubicStiffness(RateEffect):
 
     id = "cubic_stiffness"
     needs = ("position", "deflection")
-    least = -math.inf
+    lower = -math.inf
     gain = "stiffness"
     power = 3.0
-    along = "position"
+    plot_axis = "position"
     equation = "δv̇ = −γ x³"
     explanation = "The restoring force bends: the spring is harder, or softer, at large deflections."
     advice = "Add a cubic spring with this coefficient."
     source = "Duffing's oscillator"
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
         return -context.part("position").pow(3)
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:  # noqa: ARG002

@@ -34,7 +34,7 @@ class DeadZone(ShareEffect):
     id = "dead_zone"
     relative: Mapping[str, tuple[str, str]] = {"width": ("own", "largest")}
     fitted_shape: Mapping[str, tuple[float, float]] = {"width": (0.01, 0.7), "softness": SOFTNESS}
-    along = "own"
+    plot_axis = "own"
     equation = "δu = −γ clip(u, ±c)"
     explanation = "Small commands have no effect: the actuator has a dead zone."
     advice = "Take this much off every command."
@@ -43,7 +43,7 @@ class DeadZone(ShareEffect):
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return tuple({"width": width, "softness": CORNER} for width in WIDTHS)
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return -soft_clip(context.part("own"), shape["width"], shape["softness"])
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:

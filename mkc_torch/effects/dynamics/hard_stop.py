@@ -38,7 +38,7 @@ class HardStop(RateEffect):
     natural_ends: Mapping[str, tuple[str, ...]] = {"exponent": ("least",)}
     needs = ("position",)
     gain = "stiffness"
-    along = "position"
+    plot_axis = "position"
     power = 1.0
     equation = "δv̇ = −γ₁ h (h/c)ⁿ⁻¹ + γ₂ h' (h'/c)ⁿ⁻¹,  h = max(x − c, 0), h' = max(−c − x, 0)"
     explanation = "The motion runs into a stop: beyond a place something pushes back."

@@ -43,12 +43,12 @@ class HiddenLag(RateEffect):
 
     id = "hidden_lag"
     port = "lagged rate"
-    general = True
+    is_generalisation = True
     continuous: Mapping[str, tuple[float, float]] = {"time_constant": (0.001, 0.4)}
     fitted_shape: Mapping[str, tuple[float, float]] = {"time_constant": (0.001, 0.4)}
-    most = 30.0
+    upper = 30.0
     gain = "share"
-    along = ""
+    plot_axis = ""
     equation = "δẋ = γ (z − x) / τ,  τ ż = x − z"
     explanation = "The state exchanges with something that is not in the equations and follows it late."
     advice = "Add a second store with this time constant, such as a wall behind a resistance."

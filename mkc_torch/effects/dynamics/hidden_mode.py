@@ -75,14 +75,14 @@ class HiddenMode(RateEffect):
 
     id = "hidden_mode"
     port = "resonant rate"
-    general = True
+    is_generalisation = True
     needs = ("own", "flowing")  # heat has no inertia
     continuous: Mapping[str, tuple[float, float]] = {"period": (0.0005, 0.6)}
     fitted_shape: Mapping[str, tuple[float, float]] = {"period": (0.0005, 0.6), "damping": (0.002, 0.9)}
     shape_units: Mapping[str, str] = {"period": "s"}
-    most = 10.0
+    upper = 10.0
     gain = "share"
-    along = ""
+    plot_axis = ""
     equation = "δv̇ = γ (ω² s + 2 ζ ω ṡ),  ṡ = w − v,  ẇ = −ω² s − 2 ζ ω ṡ,  ω = 2π / period"
     explanation = "Something swings along that is not in the equations, with a period of its own."
     advice = "Add a second mass on a spring of this period, as of a flexible joint or of a liquid that sloshes."

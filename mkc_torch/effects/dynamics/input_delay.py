@@ -35,7 +35,7 @@ class InputDelay(ShareEffect):
     equation = "δu = γ (u(t − τ) − u(t))"
     explanation = "The system answers to its input late."
     advice = "Delay the input by this time."
-    again = "a delay shifts fast changes of its input and leaves their size"
+    recurrence = "a delay shifts fast changes of its input and leaves their size"
     source = "transport delays; Åström & Murray, Feedback Systems (2008), 3.4"
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
@@ -45,7 +45,7 @@ class InputDelay(ShareEffect):
     def within_a_sample(self, shape: Shape, step: float) -> bool:
         return shape["delay"] <= step
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         own = context.part("own")
         return shifted(own, context.time, -shape["delay"], context.runs) - own
 

@@ -39,7 +39,7 @@ class InputLag(ShareEffect):
     equation = "δu = γ (u_τ − u),  τ u̇_τ = u − u_τ"
     explanation = "The actuator follows its command through a first-order lag."
     advice = "Put a first-order lag of this time constant behind the input."
-    again = "a lag makes fast changes of its input smaller"
+    recurrence = "a lag makes fast changes of its input smaller"
     source = "actuator dynamics; Ogata, Modern Control Engineering (2010), 5.2"
 
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:
@@ -49,7 +49,7 @@ class InputLag(ShareEffect):
     def within_a_sample(self, shape: Shape, step: float) -> bool:
         return shape["lag"] <= step
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         own = context.part("own")
         return lagged(own, context.time, shape["lag"], context.runs) - own
 

@@ -35,7 +35,7 @@ class InputSaturation(Saturation):
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return tuple({"limit": limit, "softness": CORNER} for limit in self.limits)
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         own = context.part("own")
         return soft_clip(own, shape["limit"], shape["softness"]) - own
 

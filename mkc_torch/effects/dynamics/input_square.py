@@ -36,13 +36,13 @@ class InputSquare(ShareEffect):
     """
 
     id = "input_square"
-    choices = (_SCALE,)
+    form_parameters = (_SCALE,)
     relative: Mapping[str, tuple[str, str]] = {_SCALE: ("own", "largest")}
-    along = "own"
+    plot_axis = "own"
     equation = "δu = γ (u |u| / c − u)"
     explanation = "The input acts by its square, as a voltage does on a propeller's thrust or on a heater."
     advice = "Replace the input by its square, u |u|, and fit its gain again."
-    again = "an input that acts by its square does little while it is small"
+    recurrence = "an input that acts by its square does little while it is small"
     source = (
         "Leishman, Principles of Helicopter Aerodynamics (2006), 2.3; Joule's law; Ljung, System Identification, 5.1"
     )
@@ -53,7 +53,7 @@ class InputSquare(ShareEffect):
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return ({_SCALE: 1.0},)
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         own = context.part("own")
         return own * own.abs() / shape[_SCALE] - own
 

@@ -63,16 +63,16 @@ class LinearDrag(RateEffect):
 
     def __init__(self, *, beside: bool = False) -> None:
         if beside:
-            self.needs, self.choices = ("own", SURROUNDINGS), (SURROUNDINGS,)
+            self.needs, self.form_parameters = ("own", SURROUNDINGS), (SURROUNDINGS,)
             self.equation = "δẋ = −γ (x − u)"
             self.explanation = "The state evens out with its surroundings, in proportion to its difference to them."
             self.advice = "Add a loss to the surroundings with this coefficient."
             self.by_kind = {}
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
-        return (dict.fromkeys(self.choices, 1.0),)
+        return (dict.fromkeys(self.form_parameters, 1.0),)
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return -(context.part("own") - context.part(SURROUNDINGS) if SURROUNDINGS in shape else context.part("own"))
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:

@@ -38,7 +38,7 @@ class LoadDependentFriction(RateEffect):
     equation = "δv̇ = −(γ₁ + γ₂ |a − h|) tanh(v / w)"
     explanation = "Dry friction holds against the motion, the more the harder the drive works against its load."
     advice = "Add dry friction with a part in proportion to the load."
-    choices = ("width",)
+    form_parameters = ("width",)
     source = "Duclusaud et al., Extended Friction Models for the Physics Simulation of Servo Actuators, ICRA 2025"
 
     def equation_of(self, shape: Shape, context: Context) -> str:

@@ -35,9 +35,9 @@ class MagnusLift(RateEffect):
     roles = ("spin",)
     driver_optional = True
     needs = ("own", "other", "sideways")
-    least = -math.inf
+    lower = -math.inf
     gain = "turning"
-    along = "other"
+    plot_axis = "other"
     equation = "δv̇_x = −γ v_y,  δv̇_y = γ v_x"
     explanation = "Something drives the motion across its way, in proportion to its speed, as air does a spinning ball."
     advice = "Add a force across the way with this coefficient, and record the spin."

@@ -33,13 +33,13 @@ class PositionPeriodicForce(RateEffect):
 
     id = "position_periodic_force"
     needs = ("angle",)
-    least = -math.inf
+    lower = -math.inf
     gain = "amplitude"
-    along = "angle"
+    plot_axis = "angle"
     equation = "δv̇ = γ₁ sin(k x) + γ₂ cos(k x)"
     explanation = "A force repeats with the position, as the cogging of a motor or an eccentric weight does."
     advice = "Add a force with this period."
-    choices = ("order",)
+    form_parameters = ("order",)
     source = "Hanselman, Brushless Permanent Magnet Motor Design (2003)"
 
     def equation_of(self, shape: Shape, context: Context) -> str:  # noqa: ARG002

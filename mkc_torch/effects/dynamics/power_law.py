@@ -55,7 +55,7 @@ class PowerLaw(RateEffect):
     """
 
     id = "power_law"
-    general = True
+    is_generalisation = True
     fitted_shape: Mapping[str, tuple[float, float]] = {"exponent": (0.3, 6.0)}
     explanation = "Something drives the state back by a power of its size, as natural convection or an orifice does."
     advice = "Add a term with this exponent, and look for physics that has it."
@@ -86,11 +86,11 @@ class PowerLaw(RateEffect):
     def __init__(self, of: str = "own") -> None:
         self.of = of
         part = SURROUNDINGS if of == "difference" else of
-        self.along = "position" if of == "position" else "own"
+        self.plot_axis = "position" if of == "position" else "own"
         # of a temperature in °C a power is no physics
         needs = {"own": ("own", "flowing"), "position": ("position", "deflection"), "excess": ("own", "temperature")}
         self.needs = needs.get(of, ("own", part))
-        self.least = -math.inf if of == "position" else 0.0
+        self.lower = -math.inf if of == "position" else 0.0
         self.gain = "stiffness" if of == "position" else "loss"
         self._scale = f"scale_of_{of}"
         self.relative: Mapping[str, tuple[str, str]] = {self._scale: (part, "largest")}
@@ -99,7 +99,7 @@ class PowerLaw(RateEffect):
             self.relative = {_LOWEST: ("own", "lowest"), _HIGHEST: ("own", "highest")}
         elif of == "position":
             self.by_kind, self.explanation, self.advice = {}, _SPRING[0], _SPRING[1]
-        self.choices = tuple(self.relative)
+        self.form_parameters = tuple(self.relative)
         self.equation = f"δ{'v̇' if of == 'position' else 'ẋ'} = −γ |({_OF[of]})/c|ᵖ sign({_OF[of]})"
 
     def equation_of(self, shape: Shape, context: Context) -> str:
@@ -107,7 +107,7 @@ class PowerLaw(RateEffect):
             low, high = float(shape[_LOWEST]), float(shape[_HIGHEST])
             lowest = sized(low, context.unit_of("own"))
             return f"{self.equation},  x₀ = {lowest}, the lowest of the recording,  c = {sized(high - low, 'K')}"
-        scale = sized(float(shape[self._scale]), context.unit_of(self.along))
+        scale = sized(float(shape[self._scale]), context.unit_of(self.plot_axis))
         beside = f",  u = {context.parts[SURROUNDINGS]}" if self.of == "difference" else ""
         return f"{self.equation},  c = {scale}, the largest of the recording{beside}"
 
@@ -127,8 +127,8 @@ class PowerLaw(RateEffect):
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
         return tuple({**dict.fromkeys(self.relative, 1.0), "exponent": exponent} for exponent in EXPONENTS)
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
-        y = context.part(self.along)
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+        y = context.part(self.plot_axis)
         if self.of == "difference":
             y = y - context.part(SURROUNDINGS)
         t = (y - shape[_LOWEST]) / self._reach(shape) if self.of == "excess" else y / shape[self._scale]
@@ -139,7 +139,7 @@ class PowerLaw(RateEffect):
         return (shape[_HIGHEST] - shape[_LOWEST]) or 1.0
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
-        y = names[self.along]
+        y = names[self.plot_axis]
         if self.of == "difference":
             y = f"({y} - {names[SURROUNDINGS]})"
         raised = round(0.5 * (shape["exponent"] - 1.0), 12)

@@ -51,7 +51,7 @@ class QuadraticDrag(RateEffect):
     }
     source = "Rayleigh's drag equation"
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
         own = context.part("own")
         return -own * own.abs()
 

@@ -23,7 +23,7 @@ _LEAST = 1e-30
 
 
 class RateEffect(GainEffect):
-    """An effect that adds ``γ · course`` to the rate of one state. Give it a ``course``, a function of the signal.
+    """An effect that adds ``γ · waveform`` to the rate of one state. Give it a ``waveform``, a function of the signal.
 
     The signal at such a port is all states and inputs; the state whose rate it is, is its part "own", and what that
     state is the speed of, if anything, its part "position"; an input that is its surroundings, such as the temperature
@@ -36,14 +36,14 @@ class RateEffect(GainEffect):
     port = "rate"
     follows_signal = True
     needs: tuple[str, ...] = ("own",)
-    least = 0.0
-    along = "own"
+    lower = 0.0
+    plot_axis = "own"
     power: float = 0.0
 
     def unit(self, context: Context) -> str:
         if not self.power:
             return context.signal_unit
-        return quotient(context.signal_unit, context.unit_of(self.along), int(self.power)) or "1/s"
+        return quotient(context.signal_unit, context.unit_of(self.plot_axis), int(self.power)) or "1/s"
 
     def equation_of(self, shape: Shape, context: Context) -> str:
         beside = f",  u = {context.parts[SURROUNDINGS]}" if SURROUNDINGS in shape else ""

@@ -40,7 +40,7 @@ class StribeckFriction(RateEffect):
     equation = "δv̇ = −(γ₁ + γ₂ exp(−(v/v_s)²)) tanh(v / w)"
     explanation = "Dry friction holds against the motion, more of it at small speeds than at large ones."
     advice = "Add dry friction with a rise towards standstill."
-    choices = ("width",)
+    form_parameters = ("width",)
     source = "Stribeck (1902); Armstrong-Hélouvry, Control of Machines with Friction (1991)"
 
     def equation_of(self, shape: Shape, context: Context) -> str:

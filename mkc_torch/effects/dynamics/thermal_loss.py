@@ -44,17 +44,17 @@ class ThermalLoss(RateEffect):
 
     def __init__(self, *, beside: bool = False) -> None:
         if beside:
-            self.needs, self.choices = ("own", "temperature", SURROUNDINGS), (SURROUNDINGS,)
+            self.needs, self.form_parameters = ("own", "temperature", SURROUNDINGS), (SURROUNDINGS,)
             self.excludes = ()
             self.equation = "δṪ = −γ (T⁴ − u⁴) / (4 T₀³)"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
-        return (dict.fromkeys(self.choices, 1.0),)
+        return (dict.fromkeys(self.form_parameters, 1.0),)
 
     def unit(self, context: Context) -> str:  # noqa: ARG002
         return "1/s"
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         offset = zero_of(context.unit_of("own"))
         around = (context.part(SURROUNDINGS) + offset).pow(4) if SURROUNDINGS in shape else ROOM**4
         return -((context.part("own") + offset).pow(4) - around) / (4.0 * ROOM**3)

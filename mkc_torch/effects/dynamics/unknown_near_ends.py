@@ -47,14 +47,14 @@ class UnknownNearEnds(UnknownRate):
     def __init__(self) -> None:
         super().__init__("position")
         self._lowest, self._highest = "lowest_of_position", "highest_of_position"
-        self.choices = self._lowest, self._highest
+        self.form_parameters = self._lowest, self._highest
         self.relative: Mapping[str, tuple[str, str]] = {
             self._lowest: ("position", "lowest"),
             self._highest: ("position", "highest"),
         }
 
     def equation_of(self, shape: Shape, context: Context) -> str:
-        ends = [sized(float(shape[name]), context.unit_of(self.along)) for name in self.choices]
+        ends = [sized(float(shape[name]), context.unit_of(self.plot_axis)) for name in self.form_parameters]
         return f"{self.equation} over {' to '.join(ends)}, with breaks near the ends"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002
@@ -68,7 +68,7 @@ class UnknownNearEnds(UnknownRate):
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
         ends = f"{shape[self._lowest]!r}, {shape[self._highest]!r}"
-        return (f"curve_within({names[self.along]}, {ends}, [{', '.join(map(repr, gamma))}])",)
+        return (f"curve_within({names[self.plot_axis]}, {ends}, [{', '.join(map(repr, gamma))}])",)
 
 
 def curve_within(

@@ -36,9 +36,9 @@ class UnknownRate(RateEffect):
     """
 
     id = "unknown"
-    words = "an effect outside the catalogue"
+    display_name = "an effect outside the catalogue"
     is_curve = True
-    least = -math.inf
+    lower = -math.inf
     gain = "legendre"
     equation = "δẋ = f(x), a smooth curve"
     explanation = "The rate follows a curve that no effect of the catalogue describes."
@@ -48,14 +48,14 @@ class UnknownRate(RateEffect):
     def __init__(self, of: str = "own") -> None:
         self.of = of
         part = SURROUNDINGS if of == "difference" else of
-        self.along = "position" if of == "position" else "own"
+        self.plot_axis = "position" if of == "position" else "own"
         self.needs = ("own", part)
         self._reach = f"reach_of_{of}"
-        self.choices: tuple[str, ...] = (self._reach,)
+        self.form_parameters: tuple[str, ...] = (self._reach,)
         self.relative: Mapping[str, tuple[str, str]] = {self._reach: (part, "largest")}
 
     def equation_of(self, shape: Shape, context: Context) -> str:
-        reach = sized(float(shape[self._reach]), context.unit_of(self.along))
+        reach = sized(float(shape[self._reach]), context.unit_of(self.plot_axis))
         of, beside = "x", ""
         if self.of == "difference":
             of, beside = "(x − u)", f",  u = {context.parts[SURROUNDINGS]}"
@@ -70,7 +70,7 @@ class UnknownRate(RateEffect):
 
     def over(self, context: Context) -> Float[Tensor, " N"]:
         """What the curve is over."""
-        y = context.part(self.along)
+        y = context.part(self.plot_axis)
         return y - context.part(SURROUNDINGS) if self.of == "difference" else y
 
     def change(self, gamma: Float[Tensor, " q"], shape: Shape, context: Context) -> Float[Tensor, "N 1"]:
@@ -81,7 +81,7 @@ class UnknownRate(RateEffect):
         return (curves @ gamma).unsqueeze(-1)
 
     def code(self, gamma: Sequence[float], shape: Mapping[str, float], names: Mapping[str, str]) -> tuple[str, ...]:
-        y = f"({names['own']} - {names[SURROUNDINGS]})" if self.of == "difference" else names[self.along]
+        y = f"({names['own']} - {names[SURROUNDINGS]})" if self.of == "difference" else names[self.plot_axis]
         t = f"torch.clamp({y} / {shape[self._reach]!r}, -1.0, 1.0)"
         curves = (t, f"(1.5 * {t} ** 2 - 0.5)", f"(2.5 * {t} ** 3 - 1.5 * {t})")
         fourth = f"(35.0 * {t} ** 4 - 30.0 * {t} ** 2 + 3.0) / 8.0"

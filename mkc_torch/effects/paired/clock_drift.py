@@ -35,7 +35,7 @@ class ClockDrift(Effect):
     equation = "δy = y(t + γ (t − t₀)) − y(t)"
     explanation = "The recording's clock and the simulator's run at different rates."
     advice = "Take both times from one clock, or rescale one of them."
-    again = "clocks that drift apart do so the farther, the longer a recording is"
+    recurrence = "clocks that drift apart do so the farther, the longer a recording is"
     source = "Mills, RFC 5905 (2010)"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002

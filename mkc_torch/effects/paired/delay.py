@@ -36,7 +36,7 @@ class Delay(Effect):
     equation = "δy = y(t − γ) − y(t)"
     explanation = "What is measured comes later than what is simulated, or earlier."
     advice = "Look for filters and transport on the way to the recording, and for how its clock was set."
-    again = "a delay is as long in a longer recording"
+    recurrence = "a delay is as long in a longer recording"
     source = "transport delays; Åström & Murray, Feedback Systems (2008), 3.4"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002

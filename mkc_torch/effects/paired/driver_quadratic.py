@@ -16,7 +16,7 @@ class DriverQuadratic(DriverLinear):
     """
 
     id = "driver_quadratic"
-    words = "quadratic dependence"
+    display_name = "quadratic dependence"
     equation = "δy = b + k₁ (x − x̄) + k₂ (x − x̄)²"
     explanation = "What is measured follows this column along a bend."
     advice = "Find out how the column acts on the sensor or the system; correct with the fitted curve until then."

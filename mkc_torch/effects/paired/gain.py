@@ -28,17 +28,17 @@ class Gain(GainEffect):
     port = "output"
     needs = ("own", "compared")
     follows_signal = True
-    along = "own"
+    plot_axis = "own"
     gain = "gain_error"
     plausible = 0.5
     equation = "δy = γ y"
     explanation = "What is measured is a constant share larger, or smaller, than what is simulated."
     advice = "Check the sensor's scale and units, and what the simulator takes for its own."
-    again = "an error of scale grows with the signal"
+    recurrence = "an error of scale grows with the signal"
     source = "Doebelin, Measurement Systems (2003), 3.2"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002
         return (Quantity(self.gain, 1, ""),)
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
         return context.part("own")

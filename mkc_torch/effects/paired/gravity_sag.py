@@ -40,7 +40,7 @@ class GravitySag(Effect):
     port = "output"
     needs: tuple[str, ...] = ("own", "compared", "angle")
     follows_signal = True
-    general = True
+    is_generalisation = True
     fitted_shape: Mapping[str, tuple[float, float]] = {"phase": (-1.0, 1.0)}
     natural_ends: Mapping[str, tuple[str, ...]] = {"phase": ("least", "greatest")}
     shape_units: Mapping[str, str] = {"phase": "rad"}
@@ -49,7 +49,7 @@ class GravitySag(Effect):
     equation = "δy = γ cos(y − φ)"
     explanation = "Gravity pulls the joint aside, by how far depends on its angle: it sags under its load."
     advice = "Add the load's torque over the joint's stiffness, or feed gravity forward in its controller."
-    again = "a sag changes over a wide range of angles and with the load, an offset does not"
+    recurrence = "a sag changes over a wide range of angles and with the load, an offset does not"
     source = "Spong, Hutchinson & Vidyasagar, Robot Modeling and Control (2006), 8.1"
 
     def shapes(self, time: object) -> Sequence[Shape]:  # noqa: ARG002

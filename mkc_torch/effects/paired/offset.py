@@ -40,10 +40,10 @@ class Offset(GainEffect):
             "load's torque over the joint's stiffness.",
         ),
     }
-    again = "an offset is there without a signal too"
+    recurrence = "an offset is there without a signal too"
     source = "Doebelin, Measurement Systems (2003), 3.2"
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:  # noqa: ARG002
         return torch.ones_like(context.time)
 
 

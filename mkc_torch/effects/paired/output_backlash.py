@@ -43,11 +43,11 @@ class OutputBacklash(Effect):
     needs: tuple[str, ...] = ("own", "compared")
     follows_signal = True
     remembers = True
-    least = 0.0
+    lower = 0.0
     equation = "δy = p − y,  p = max(y − γ, min(y + γ, p before))"
     explanation = "After each reversal what is measured stands still until a gap is crossed: there is play."
     advice = "Put play of this width behind the simulated output; preload or tighten the drive to be rid of it."
-    again = "play is as wide at any amplitude and speed"
+    recurrence = "play is as wide at any amplitude and speed"
     source = "Visintin, Differential Models of Hysteresis (1994), III.2; Nordin & Gutman, Automatica 38 (2002)"
 
     def quantities(self, shape: Shape, context: Context) -> Sequence[Quantity]:  # noqa: ARG002

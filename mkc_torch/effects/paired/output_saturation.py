@@ -23,4 +23,4 @@ class OutputSaturation(Saturation):
     equation = "δy = −γ (y − clip(y, ±c))"
     explanation = "The sensor reaches the end of its range: beyond it, it shows no more."
     advice = "Use a sensor of a wider range, or clip what is simulated there."
-    again = "a range ends at the same value again"
+    recurrence = "a range ends at the same value again"

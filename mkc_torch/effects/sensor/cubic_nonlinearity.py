@@ -39,8 +39,8 @@ class CubicNonlinearity(Effect):
     equation = "δB_i = α_i B_i³ (+ β_i B_i²)"
     explanation = "The sensor's response is not a straight line: it bends at large fields."
     advice = "Correct with the fitted coefficients; check the sensor's range setting."
-    again = "a response that bends is there at all times, wherever the field along an axis is large"
-    choices = ("terms",)
+    recurrence = "a response that bends is there at all times, wherever the field along an axis is large"
+    form_parameters = ("terms",)
     plausible = 4e-5
     plausible_unit = "1/µT²"
     source = (

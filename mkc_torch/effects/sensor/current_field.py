@@ -27,7 +27,7 @@ class CurrentField(DriverOffset):
     """
 
     id = "current_field"
-    words = "current field"
+    display_name = "current field"
     roles = ("current",)
     gain = "field_per_ampere"
     equation = "δB = k (I − Ī)"

@@ -40,7 +40,7 @@ class DriverOffset(GainEffect):
     """
 
     id = "driver_offset"
-    words = "offset dependence"
+    display_name = "offset dependence"
     roles: tuple[str, ...] = ("any",)
     gain = "offset_per_unit"
     equation = "δB = k (x − x̄)"
@@ -52,5 +52,5 @@ class DriverOffset(GainEffect):
     def shapes(self, time: Float[Tensor, " N"]) -> Sequence[Shape]:  # noqa: ARG002
         return tuple({"lag": lag} if lag else {} for lag in self.lags)
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return lagged(context.drivers[:, 0], context.time, shape.get("lag", 0.0), context.runs)

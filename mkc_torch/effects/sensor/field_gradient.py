@@ -42,9 +42,9 @@ class FieldGradient(Effect):
     equation = "B(p) = B₀ + G p + …,  ∇·B = 0, ∇×B = 0"
     explanation = "The ambient field is not the same everywhere: iron nearby bends it."
     advice = "Record in the open, or turn the sensor on the spot."
-    again = "what belongs to a place comes again at that place, and is gone in the open"
-    choices = ("degree",)
-    placed = True
+    recurrence = "what belongs to a place comes again at that place, and is gone in the open"
+    form_parameters = ("degree",)
+    location_specific = True
     plausible = 200.0
     plausible_unit = "µT/m"
     source = "indoor gradients of up to some µT/cm near steel; BROAD trial 21 (Laidig et al., Data 6(7):72, 2021)"

@@ -39,7 +39,7 @@ class HardIronStep(GainEffect):
     equation = "δB = Δb · 1[t ≥ t₀]"
     explanation = "The sensor's offset jumped: something magnetic that moves with the sensor was attached or taken off."
     advice = "Look for what changed at that time; use the calibration from after the step."
-    again = "a step does not come at the same moment again"
+    recurrence = "a step does not come at the same moment again"
     plausible = 200.0
     plausible_unit = "µT"
     source = "sizes of 1-50 µT as seen when parts are mounted; BROAD trials 34-36 (Laidig et al., Data 6(7):72, 2021)"
@@ -53,7 +53,7 @@ class HardIronStep(GainEffect):
         # a shorter side could not be held out in blocks, nor told from a burst of outliers
         return tuple({"onset": first + length * k / count} for k in range(8, count - 7))
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         return after(context.time, shape["onset"])
 
     def lasting(self, gamma: Float[Tensor, " q"], context: Context) -> Float[Tensor, "N c"]:

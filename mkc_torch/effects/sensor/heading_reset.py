@@ -40,8 +40,8 @@ class HeadingReset(Effect):
     equation = "B = R_z(Σ φ_k · 1[t > t_k]) B₀"
     explanation = "The recorded heading was set anew: the attitude turned about the vertical and the sensor did not."
     advice = "Use an attitude that this sensor does not steer, or the samples from between two of the jumps."
-    again = "an attitude that this sensor does not steer is not set anew"
-    placed = True
+    recurrence = "an attitude that this sensor does not steer is not set anew"
+    location_specific = True
     follows_signal = False  # what passes here is known and has no noise
     plausible = 180.0
     plausible_unit = "°"

@@ -13,7 +13,7 @@ from mkc_torch._support.unit_text import sized
 from mkc_torch.effects.base import Effect
 from mkc_torch.effects.context import Context, Quantity, Shape
 from mkc_torch.effects.courses import combined
-from mkc_torch.nonlinear import beside
+from mkc_torch.nonlinear import make_dual
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -57,9 +57,9 @@ class MagneticPole(Effect):
         "from the middle of the path."
     )
     advice = "Record in the open, or turn the sensor on the spot."
-    again = "what belongs to a place comes again at that place, and is gone in the open"
-    choices = ("radius",)
-    placed = True
+    recurrence = "what belongs to a place comes again at that place, and is gone in the open"
+    form_parameters = ("radius",)
+    location_specific = True
     plausible = 100.0
     plausible_unit = "µT·m²"
     source = "a beam of 0.01 m² magnetised to 10⁵ A/m; Telford et al., Applied Geophysics (1990), 3.6"
@@ -89,7 +89,7 @@ class MagneticPole(Effect):
     def basis(self, shape: Shape, context: Context) -> Float[Tensor, "N c q"]:
         p = context.drivers
         place = torch.stack([torch.as_tensor(shape[f"place_{a}"], dtype=p.dtype, device=p.device) for a in "xyz"])
-        away, least = beside(p, place[0]) - place, beside(p.new_tensor(shape["radius"] ** 2), place[0])
+        away, least = make_dual(p, place[0]) - place, make_dual(p.new_tensor(shape["radius"] ** 2), place[0])
         field = away * (away.square().sum(-1, keepdim=True) + least) ** -1.5
         return field.unsqueeze(1 if len(context.channels) == 1 else -1)
 

@@ -52,8 +52,8 @@ class OffsetDrift(GainEffect):
     equation = "δB = Δb s(t),  s from 0 to 1 over the recording"
     explanation = "The sensor's offset drifted slowly over the recording, as it does while electronics warm up."
     advice = "Let the sensor warm up before calibrating, or record its temperature beside it."
-    again = "a warm-up comes again after a cold start"
-    choices = ("power",)
+    recurrence = "a warm-up comes again after a cold start"
+    form_parameters = ("power",)
     plausible = 50.0
     plausible_unit = "µT"
     source = "warm-up of first order; diffusion of heat into a half-space goes with the root of time"
@@ -75,7 +75,7 @@ class OffsetDrift(GainEffect):
         length = sized(float(context.time[-1] - context.time[0]), "s")
         return f"δB = Δb s(t),  s(t) = {course},  t from the recording's start,  T = {length}"
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         elapsed = context.time - context.time[0]
         length = elapsed[-1]
         if "time_constant" in shape:

@@ -37,7 +37,7 @@ class TemperatureOffset(DriverOffset):
     """
 
     id = "temperature_offset"
-    words = "temperature offset"
+    display_name = "temperature offset"
     roles = ("temperature",)
     gain = "offset_per_kelvin"
     equation = "δB = k (T − T̄) (1 + c (T − T̄))"
@@ -62,6 +62,6 @@ class TemperatureOffset(DriverOffset):
     def unit_of_shape(self, name: str, context: Context) -> str:
         return per("1", context.units[0]) if name == "curvature" else super().unit_of_shape(name, context)
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
-        follows = super().course(shape, context)
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+        follows = super().waveform(shape, context)
         return follows * (1.0 + shape.get("curvature", 0.0) * follows)

@@ -38,7 +38,7 @@ class Unknown(Effect):
     """
 
     id = "unknown"
-    words = "an effect outside the catalogue"
+    display_name = "an effect outside the catalogue"
     is_curve = True
     roles = ("temperature", "current", "any")
     equation = "δB = f(x), a smooth curve"
@@ -66,7 +66,7 @@ class Unknown(Effect):
         polynomials = torch.stack([t, 1.5 * t**2 - 0.5, 2.5 * t**3 - 1.5 * t], -1)
         return polynomials @ gamma.reshape(DEGREE, -1)
 
-    def anchored(self, shape: Shape, context: Context) -> Shape:
+    def bind(self, shape: Shape, context: Context) -> Shape:
         """The shape with the column's range in this recording, for use on another one."""
         x = context.drivers[:, 0]
         return {**shape, "low": float(x.min()), "high": float(x.max())}

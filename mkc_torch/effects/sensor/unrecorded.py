@@ -35,12 +35,12 @@ class Unrecorded(GainEffect):
         >>> from mkc_torch.effects import Context
         >>> time = torch.arange(4.0)
         >>> context = Context(time, torch.zeros(4, 0), (), torch.zeros(4, 1), "µT", ("mag_x",))
-        >>> Unrecorded().course({"course_1": 0.5}, context)
+        >>> Unrecorded().waveform({"course_1": 0.5}, context)
         tensor([0.9239, 0.6533, 0.2706, 0.0000])
     """
 
     id = "unknown"
-    words = "an effect outside the catalogue"
+    display_name = "an effect outside the catalogue"
     is_curve = True
     unrecorded = True
     gain = "offset_change"
@@ -61,7 +61,7 @@ class Unrecorded(GainEffect):
         # its course is read off the noise, and none can be tried before
         return ()
 
-    def course(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
+    def waveform(self, shape: Shape, context: Context) -> Float[Tensor, " N"]:
         time = context.time
         phase = math.pi * (torch.arange(len(time), dtype=time.dtype, device=time.device) + 0.5) / len(time)
         course = torch.zeros_like(time)

@@ -24,8 +24,8 @@ from torch.autograd import forward_ad
 from mkc_torch._support.torch_internals import functorch_is_active
 from mkc_torch.density.energy import energy, inverse_square
 from mkc_torch.density.normalizer import log_partition
-from mkc_torch.linear._implicit.at_rest import FitData, Rest, at_rest
 from mkc_torch.linear._implicit.refusal import Refusing
+from mkc_torch.linear._implicit.stationary import FitData, StationaryPoint, stationary
 from mkc_torch.linear._mkc import coefficient_covariance
 from mkc_torch.linear._problem import CanonicalShapes, LinearProblem, laid_out, linear_problem
 from mkc_torch.linear.covariance import CovarianceKind
@@ -81,7 +81,7 @@ def fit_layer(
     X: Float[Tensor, "*batch N m n"],
     Y: Float[Tensor, "*batch N m"],
     sample_weight: Float[Tensor, "*batch N"] | None,
-    solve: Callable[[LinearProblem, Given], Rest],
+    solve: Callable[[LinearProblem, Given], StationaryPoint],
     *,
     sigma: float | Tensor | None,
     d: float | Tensor | None,
@@ -140,14 +140,14 @@ class _Found(NamedTuple):
 
 
 class _Search(NamedTuple):
-    solve: Callable[[LinearProblem, Given], Rest]
+    solve: Callable[[LinearProblem, Given], StationaryPoint]
     covariance: tuple[CovarianceKind, float | None]
 
     @torch.no_grad()
     def run(self, X: Tensor, Y: Tensor, weight: Tensor | None, given: Given) -> tuple[Tensor, ...]:
         problem = linear_problem(X, Y, weight)
         rest = self.solve(problem, given)
-        at = at_rest(problem, rest)
+        at = stationary(problem, rest)
         shared = problem.to_coef.shape[0] == 1
         lead = (1,) * len(problem.batch) if shared else tuple(problem.batch)
         covariance = coefficient_covariance(problem, at.beta, at.kappa, torch.exp(at.log_d), *self.covariance)

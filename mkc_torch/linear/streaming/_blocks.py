@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mkc_torch._support.arguments import told
+from mkc_torch._support.arguments import format_value
 from mkc_torch._support.arrays import as_tensor, is_array
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ _LEAST_ROWS = 64
 
 
 @dataclass(frozen=True)
-class Block:
+class StreamBlock:
     """Rows of one batch in float64: where they stand, its number and the first row's in it, and whether they are
     of float32.
 
@@ -70,18 +70,18 @@ def checked_source(batches: object) -> Iterable[Any]:
     if isinstance(batches, Iterator):
         raise TypeError(
             f"Expected argument `batches` to be an iterable that begins anew in every pass but got "
-            f"{told(batches)}, which is used up by one; pass a DataLoader, a list, from_memmap(X, Y), or an object "
+            f"{format_value(batches)}, which is used up by one; pass a DataLoader, a list, from_memmap(X, Y), or an object "
             "whose __iter__ is a generator function."
         )
     if not hasattr(batches, "__iter__"):
         raise TypeError(
-            f"Expected argument `batches` to be an iterable of (X, Y) but got {told(batches)}; a DataLoader or a list "
+            f"Expected argument `batches` to be an iterable of (X, Y) but got {format_value(batches)}; a DataLoader or a list "
             "of batches is one."
         )
     return batches
 
 
-def blocks(batches: Iterable[Any], shape: Shape | None = None) -> Iterator[tuple[Shape, Block]]:
+def blocks(batches: Iterable[Any], shape: Shape | None = None) -> Iterator[tuple[Shape, StreamBlock]]:
     """One pass over the batches, in blocks; a block's memory is used again for the next.
 
     Args:
@@ -103,7 +103,7 @@ def blocks(batches: Iterable[Any], shape: Shape | None = None) -> Iterator[tuple
             part = slice(first, first + rows)
             joined = _filled(buffer, X[part], Y[part], shape)
             single = X.dtype == Y.dtype == np.float32
-            yield shape, Block(joined, _weights(weight, part, shape), number, first, single)
+            yield shape, StreamBlock(joined, _weights(weight, part, shape), number, first, single)
 
 
 def pieces(
@@ -129,7 +129,9 @@ def pieces(
 
 def _arrays(batch: Any, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     if not isinstance(batch, (tuple, list)) or len(batch) not in (2, 3):
-        kind = f"{type(batch).__name__} of {len(batch)}" if isinstance(batch, (tuple, list, dict)) else told(batch)
+        kind = (
+            f"{type(batch).__name__} of {len(batch)}" if isinstance(batch, (tuple, list, dict)) else format_value(batch)
+        )
         raise TypeError(f"Expected every batch to be (X, Y) or (X, Y, weight) but got {kind} as batch {number}.")
     names = ("X", "Y", "weight")
     x, y, *rest = (_array(f"{name} of batch {number}", value) for name, value in zip(names, batch, strict=False))

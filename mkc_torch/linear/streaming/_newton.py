@@ -14,13 +14,13 @@ from torch import Tensor
 
 from mkc_torch.density.energy import KAPPA_MAX
 from mkc_torch.density.likelihood import normaliser_derivatives
-from mkc_torch.linear.streaming._rough import LEAST_KAPPA_OF_ROUGH
-from mkc_torch.linear.streaming._sums import Slopes
+from mkc_torch.linear.streaming._float32_pass import LEAST_KAPPA_OF_ROUGH
+from mkc_torch.linear.streaming._sums import StreamSums
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float64
 
-__all__ = ["NEAR", "Climb", "Likelihood", "Place"]
+__all__ = ["NEAR", "Likelihood", "NewtonState", "StreamParameters"]
 
 _KAPPA_OFFSET, _LONGEST, _FURTHEST_DOWN = 0.02, 2.0, 0.1353352832366127
 """A step in κ is measured in shares of κ and the first; it and one in log d have the length of the second at most; the
@@ -38,7 +38,7 @@ _FAST = 1e-2
 
 
 @dataclass(frozen=True)
-class Place:
+class StreamParameters:
     """Coefficients in the basis, 1/σ² and log d."""
 
     beta: Float64[Tensor, " n"]
@@ -68,14 +68,14 @@ class Likelihood:
     largest: float
     single: bool
 
-    def channels(self, place: Place, sums: Slopes) -> Float64[Tensor, " m"]:
+    def channels(self, place: StreamParameters, sums: StreamSums) -> Float64[Tensor, " m"]:
         """The mean of each channel."""
         return sums.energy / self.weight + normaliser_derivatives(place.kappa, place.log_d, self.log_bound).value
 
-    def value(self, place: Place, sums: Slopes) -> float:
+    def value(self, place: StreamParameters, sums: StreamSums) -> float:
         return float((self.weight * self.channels(place, sums)).sum() / self.weight.sum())
 
-    def gradient(self, place: Place, sums: Slopes) -> Float64[Tensor, " p"]:
+    def gradient(self, place: StreamParameters, sums: StreamSums) -> Float64[Tensor, " p"]:
         """By the coefficients in units of the smallest d, κ and log d."""
         norm = normaliser_derivatives(place.kappa, place.log_d, self.log_bound)
         unit, precision = torch.exp(place.log_d.min()), torch.exp(-2.0 * place.log_d)
@@ -84,7 +84,7 @@ class Likelihood:
         by_log_d = self.weight * norm.log_d - 2.0 * sums.qw
         return torch.cat([by_beta, by_kappa, by_log_d]) / self.weight.sum()
 
-    def hessian(self, place: Place, sums: Slopes) -> Float64[Tensor, "p p"]:
+    def hessian(self, place: StreamParameters, sums: StreamSums) -> Float64[Tensor, "p p"]:
         """By the same unknowns."""
         norm = normaliser_derivatives(place.kappa, place.log_d, self.log_bound)
         unit, precision = torch.exp(place.log_d.min()), torch.exp(-2.0 * place.log_d)
@@ -103,7 +103,7 @@ class Likelihood:
         )
         return torch.cat(rows, -2) / self.weight.sum()
 
-    def free(self, place: Place, gradient: Float64[Tensor, " p"]) -> Bool[Tensor, " p"]:
+    def free(self, place: StreamParameters, gradient: Float64[Tensor, " p"]) -> Bool[Tensor, " p"]:
         """The unknowns that follow the data: not those given, nor those that a limit holds back."""
         n, m = place.beta.shape[0], place.kappa.shape[0]
         g_kappa, g_log_d = gradient[n : n + m], gradient[n + m :]
@@ -111,18 +111,18 @@ class Likelihood:
         held_d = ((place.log_d <= self.log_d_min) & (g_log_d >= 0)) | ((place.log_d >= self.log_bound) & (g_log_d <= 0))
         return torch.cat([torch.ones(n, dtype=torch.bool), ~held_kappa & self.free_kappa, ~held_d & self.free_d])
 
-    def allows_rough(self, place: Place) -> bool:
+    def allows_rough(self, place: StreamParameters) -> bool:
         """Whether a pass in float32 is good to six digits there: not where residuals are digits of large numbers."""
         far = self.largest > 1e3 * float(torch.exp(place.log_d.min()))
         return self.single and not far and float(place.kappa.min()) >= LEAST_KAPPA_OF_ROUGH
 
-    def moved(self, place: Place, step: Float64[Tensor, " p"]) -> Place:
+    def moved(self, place: StreamParameters, step: Float64[Tensor, " p"]) -> StreamParameters:
         """The place a step away, the step in κ in shares of it, within the limits."""
         n, m = place.beta.shape[0], place.kappa.shape[0]
         chain = place.kappa + _KAPPA_OFFSET
         kappa = chain * (1.0 + step[n : n + m]).clamp(min=_FURTHEST_DOWN) - _KAPPA_OFFSET
         log_d = torch.minimum(torch.maximum(place.log_d + step[n + m :], self.log_d_min), self.log_bound)
-        return Place(
+        return StreamParameters(
             beta=place.beta + torch.exp(place.log_d.min()) * step[:n],
             kappa=kappa.clamp(0.0, KAPPA_MAX) if self.free_kappa else place.kappa,
             log_d=log_d if self.free_d else place.log_d,
@@ -130,7 +130,7 @@ class Likelihood:
 
 
 @dataclass(frozen=True)
-class Climb:
+class NewtonState:
     """Where the method stands between two passes.
 
     Attributes:
@@ -146,10 +146,10 @@ class Climb:
         history: sum over channels of the mean negative log-likelihood, at every pass.
     """
 
-    trial: Place
+    trial: StreamParameters
     curvature: bool = True
     rough: bool = False
-    place: Place | None = None
+    place: StreamParameters | None = None
     value: float = float("inf")
     gradient: Float64[Tensor, " p"] | None = None
     hessian: Float64[Tensor, "p p"] | None = None
@@ -160,7 +160,7 @@ class Climb:
     near: bool = False
     history: tuple[float, ...] = ()
 
-    def after(self, likelihood: Likelihood, sums: Slopes) -> Climb:
+    def after(self, likelihood: Likelihood, sums: StreamSums) -> NewtonState:
         """Where it stands after the pass at the trial."""
         value = likelihood.value(self.trial, sums)
         history = (*self.history, float(likelihood.channels(self.trial, sums).sum()))
@@ -202,7 +202,7 @@ class Climb:
         # close to the maximum the value is rounding, and the gradient alone tells
         return max(1e-13 * (1.0 + abs(value)), 1e-3 * self.gain if self.gain < 1e-10 else 0.0)
 
-    def _back(self, likelihood: Likelihood, history: tuple[float, ...]) -> Climb:
+    def _back(self, likelihood: Likelihood, history: tuple[float, ...]) -> NewtonState:
         """The step was too long: a shorter one from the place before, whose own Hessian is worked out first."""
         assert self.place is not None
         back = replace(self, history=history, damping=max(10.0 * self.damping, 1e-2))

@@ -13,12 +13,12 @@ from mkc_torch.linear._problem import RankDeficientError
 from mkc_torch.linear.em import MKCRegression
 from mkc_torch.linear.streaming._blocks import Shape
 from mkc_torch.linear.streaming._reservoir import Drawn
-from mkc_torch.linear.streaming._sums import Point, Slopes, slopes_pass
+from mkc_torch.linear.streaming._sums import StreamPoint, StreamSums, slopes_pass
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-__all__ = ["Begun", "begun_from"]
+__all__ = ["PilotFit", "begun_from"]
 
 _LEAST_D = 0.1
 """d of all rows in d of the sample, at least: a scale that samples of a few hundred rows know to a tenth."""
@@ -28,7 +28,7 @@ _HELD = 1e-3
 
 
 @dataclass(frozen=True)
-class Begun:
+class PilotFit:
     """What a sample says of where the maximum is sought.
 
     Attributes:
@@ -38,7 +38,7 @@ class Begun:
         exact: most values lie on the fit to rounding.
         rows: of the sample.
         weight: sums of its weights, (m,).
-        sums: of :class:`Slopes` over it at its maximum, flat.
+        sums: of :class:`StreamSums` over it at its maximum, flat.
     """
 
     coef: Float64[Tensor, " n"]
@@ -56,7 +56,7 @@ class Begun:
 
 def begun_from(
     drawn: Drawn, shape: Shape, estimator: MKCRegression, to_basis: Float64[Tensor, "n n"] | None = None
-) -> Begun:
+) -> PilotFit:
     """The fit of :class:`MKCRegression` to a sample.
 
     Args:
@@ -79,12 +79,12 @@ def begun_from(
         ) from None
     coef, kappa, log_d, log_bound = fit.coef_, fit.sigma_.pow(-2), torch.log(fit.d_), torch.log(fit.bound_)
     turned = coef if to_basis is None else torch.linalg.solve(to_basis, coef.unsqueeze(-1)).squeeze(-1)
-    point = Point(turned.numpy(), kappa.numpy(), fit.d_.numpy(), None if to_basis is None else to_basis.numpy())
+    point = StreamPoint(turned.numpy(), kappa.numpy(), fit.d_.numpy(), None if to_basis is None else to_basis.numpy())
     flat = slopes_pass([(x, y) if weight is None else (x, y, weight)], shape, point, curvature=True)
     total = _total_weight(weight, len(x), shape.m)
     exact = bool(fit.exact_fit_)
-    slope = normaliser_derivatives(kappa, log_d, log_bound).log_d - 2.0 * Slopes.of(flat, shape).qw / total
-    return Begun(
+    slope = normaliser_derivatives(kappa, log_d, log_bound).log_d - 2.0 * StreamSums.of(flat, shape).qw / total
+    return PilotFit(
         coef=coef,
         kappa=kappa,
         log_d=log_d,

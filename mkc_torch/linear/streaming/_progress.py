@@ -17,15 +17,15 @@ from mkc_torch.density.likelihood import normaliser_derivatives
 from mkc_torch.linear._problem import solve_gram
 from mkc_torch.linear._scale_search import relative_precision
 from mkc_torch.linear.streaming._blocks import Shape
-from mkc_torch.linear.streaming._newton import NEAR, Climb, Likelihood, Place
-from mkc_torch.linear.streaming._pilot import Begun
-from mkc_torch.linear.streaming._sums import Extremes, Point, Slopes
+from mkc_torch.linear.streaming._newton import NEAR, Likelihood, NewtonState, StreamParameters
+from mkc_torch.linear.streaming._pilot import PilotFit
+from mkc_torch.linear.streaming._sums import Extremes, StreamPoint, StreamSums
 from mkc_torch.linear.streaming._survey import Survey
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
 
-__all__ = ["Phase", "Progress", "StreamChangedError"]
+__all__ = ["Phase", "StreamChangedError", "StreamProgress"]
 
 Phase = Literal["range", "climb", "report", "done"]
 
@@ -42,7 +42,7 @@ class StreamChangedError(ValueError):
 
 
 @dataclass(frozen=True)
-class Progress:
+class StreamProgress:
     """A fit between two passes.
 
     Attributes:
@@ -59,19 +59,19 @@ class Progress:
 
     settings: dict[str, Any]
     survey: Survey
-    begun: Begun
+    begun: PilotFit
     phase: Phase
     passes: int
     log_bound: Float64[Tensor, " m"]
-    climb: Climb | None = None
+    climb: NewtonState | None = None
     gaussian: bool = False
     converged: bool = False
 
     @staticmethod
-    def begin(settings: dict[str, Any], survey: Survey, begun: Begun) -> Progress:
+    def begin(settings: dict[str, Any], survey: Survey, begun: PilotFit) -> StreamProgress:
         # a sample of all rows has had their range
         known = settings["bound"] is not None or begun.rows == survey.rows
-        progress = Progress(settings, survey, begun, "range", 1, begun.log_bound)
+        progress = StreamProgress(settings, survey, begun, "range", 1, begun.log_bound)
         return progress._climbing(begun.log_bound) if known else progress
 
     def likelihood(self) -> Likelihood:
@@ -89,21 +89,21 @@ class Progress:
             single=self.survey.single and not self.survey.is_turned(),
         )
 
-    def point(self) -> Point:
+    def point(self) -> StreamPoint:
         """Where the next pass is made."""
         if self.climb is None:
             beta, kappa, log_d = self._in_basis(self.begun.coef), self.begun.kappa, self.begun.log_d
         else:
             beta, kappa, log_d = self.climb.trial.beta, self.climb.trial.kappa, self.climb.trial.log_d
         to_coef, turned = self.survey.to_coef(), self.survey.is_turned()
-        return Point(
+        return StreamPoint(
             coef=(beta if turned else to_coef @ beta).numpy(),
             kappa=kappa.numpy(),
             d=torch.exp(log_d).numpy(),
             to_basis=to_coef.numpy() if turned else None,
         )
 
-    def after_range(self, parts: list[Extremes]) -> Progress:
+    def after_range(self, parts: list[Extremes]) -> StreamProgress:
         """The domain is half the range of all rows' residuals, and no less than the sample's: its ten d are in that.
 
         Args:
@@ -118,7 +118,7 @@ class Progress:
         bound = torch.maximum(torch.exp(self.begun.log_bound), half)
         return replace(self, passes=self.passes + 1)._climbing(torch.log(bound))
 
-    def after_slopes(self, sums: Slopes, max_passes: int) -> Progress:
+    def after_slopes(self, sums: StreamSums, max_passes: int) -> StreamProgress:
         """One step nearer to the maximum.
 
         Raises:
@@ -137,12 +137,12 @@ class Progress:
         if near and not self.gaussian and self.begun.free_kappa and self.begun.free_d:
             place, value = self._gaussian(likelihood)
             if value < climb.history[-1]:
-                return replace(now, climb=Climb(place, history=climb.history), gaussian=True)
+                return replace(now, climb=NewtonState(place, history=climb.history), gaussian=True)
         if not near and climb.place is not None:
             climb = replace(climb, trial=climb.place)
         return replace(now, climb=replace(climb, curvature=True, rough=False), phase="report", gaussian=True)
 
-    def after_report(self, sums: Slopes, max_passes: int) -> Progress:
+    def after_report(self, sums: StreamSums, max_passes: int) -> StreamProgress:
         """A last step, by the Hessian that the report has with it; on with the climb where that is too long a one.
 
         Raises:
@@ -158,7 +158,7 @@ class Progress:
             return replace(now, phase="done", converged=rested)
         return replace(now, phase="climb")
 
-    def _refuse_other_sums(self, sums: Slopes, climb: Climb) -> None:
+    def _refuse_other_sums(self, sums: StreamSums, climb: NewtonState) -> None:
         coef = self.survey.to_coef() @ climb.trial.beta
         self.refuse_other_rows(int(sums.rows), sums.residual, coef, _SAME_OF_ROUGH if climb.rough else _SAME)
 
@@ -195,20 +195,20 @@ class Progress:
                 "state."
             )
 
-    def _climbing(self, log_bound: Float64[Tensor, " m"]) -> Progress:
+    def _climbing(self, log_bound: Float64[Tensor, " m"]) -> StreamProgress:
         begun = self.begun
         # the density of the tail stays as it is on a longer domain: exp(-1/κ) / bound
         longer = torch.where(begun.kappa > 0, begun.kappa, 1.0).reciprocal() + log_bound - begun.log_bound
         kappa = torch.where(begun.kappa > 0, longer.reciprocal(), 0.0) if begun.free_kappa else begun.kappa
-        place = Place(self._in_basis(begun.coef), kappa, begun.log_d)
+        place = StreamParameters(self._in_basis(begun.coef), kappa, begun.log_d)
         now = replace(self, phase="climb", log_bound=log_bound)
         likelihood = now.likelihood()
         of_sample = replace(likelihood, weight=begun.weight)
-        hessian = of_sample.hessian(place, Slopes.of(begun.sums, self.survey.shape))
+        hessian = of_sample.hessian(place, StreamSums.of(begun.sums, self.survey.shape))
         rough = likelihood.allows_rough(place) and begun.rows < self.survey.rows
-        return replace(now, climb=Climb(place, curvature=False, rough=rough, hessian=hessian, stale=True))
+        return replace(now, climb=NewtonState(place, curvature=False, rough=rough, hessian=hessian, stale=True))
 
-    def _gaussian(self, likelihood: Likelihood) -> tuple[Place, float]:
+    def _gaussian(self, likelihood: Likelihood) -> tuple[StreamParameters, float]:
         """The Gaussian density at weighted least squares, as in memory, and its mean negative log-likelihood."""
         n = self.survey.shape.n
         triangle = self.survey.triangle.clone()
@@ -225,7 +225,7 @@ class Progress:
         for _ in range(2 if self.survey.shape.m > 1 else 0):
             beta, d = solved(relative_precision(d))
         mean_square = (targets - rows @ beta).square().sum(-1) / self.survey.weight
-        place = Place(beta, torch.zeros_like(d), torch.log(d))
+        place = StreamParameters(beta, torch.zeros_like(d), torch.log(d))
         norm = normaliser_derivatives(place.kappa, place.log_d, likelihood.log_bound).value
         return place, float((0.5 * mean_square / d.square() + norm).sum())
 
@@ -237,7 +237,7 @@ class Progress:
         return {"format": FORMAT, **asdict(self)}
 
     @staticmethod
-    def of(state: dict[str, Any]) -> Progress:
+    def of(state: dict[str, Any]) -> StreamProgress:
         """From :meth:`state_dict`.
 
         Raises:
@@ -250,11 +250,13 @@ class Progress:
         fields = {key: value for key, value in state.items() if key != "format"}
         survey, climb = dict(fields["survey"]), fields["climb"]
         fields["survey"] = Survey(**{**survey, "shape": Shape(**survey["shape"])})
-        fields["begun"] = Begun(**fields["begun"])
+        fields["begun"] = PilotFit(**fields["begun"])
         if climb is not None:
-            places = {name: None if climb[name] is None else Place(**climb[name]) for name in ("trial", "place")}
-            fields["climb"] = Climb(**{**climb, **places, "history": tuple(climb["history"])})
-        return Progress(**fields)
+            places = {
+                name: None if climb[name] is None else StreamParameters(**climb[name]) for name in ("trial", "place")
+            }
+            fields["climb"] = NewtonState(**{**climb, **places, "history": tuple(climb["history"])})
+        return StreamProgress(**fields)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the state to a file, whole or not at all."""
@@ -263,7 +265,7 @@ class Progress:
         write_atomically(path, buffer.getvalue(), overwrite=True)
 
     @staticmethod
-    def load(path: str | os.PathLike[str]) -> Progress | None:
+    def load(path: str | os.PathLike[str]) -> StreamProgress | None:
         """The state in a file; None where there is no file.
 
         Raises:
@@ -280,7 +282,7 @@ class Progress:
                 f"Expected argument `checkpoint` to be a file of a streamed fit but {path} is none, or a damaged one; "
                 "choose another name."
             ) from error
-        return Progress.of(state)
+        return StreamProgress.of(state)
 
     def refuse_other_settings(self, settings: dict[str, Any]) -> None:
         """Refuse to go on with a fit that was asked for with other parameters.

@@ -14,7 +14,7 @@ import numpy as np
 if TYPE_CHECKING:
     from jaxtyping import Float64, Int64
 
-    from mkc_torch.linear.streaming._blocks import Block
+    from mkc_torch.linear.streaming._blocks import StreamBlock
 
 __all__ = ["Drawn", "Reservoir", "merged"]
 
@@ -45,11 +45,11 @@ class Reservoir:
         rank: stands for it where it is not.
 
     Example:
-        >>> from mkc_torch.linear.streaming._blocks import Block
+        >>> from mkc_torch.linear.streaming._blocks import StreamBlock
         >>> sample = Reservoir(3, seed=0)
         >>> for start in (0, 5):
         ...     rows = np.arange(start, start + 5.0)
-        ...     sample.add(Block(np.stack([rows, rows])[None], None))
+        ...     sample.add(StreamBlock(np.stack([rows, rows])[None], None))
         >>> sample.drawn().numbers
         array([1, 2, 3])
     """
@@ -63,7 +63,7 @@ class Reservoir:
         self._parts: list[Drawn] = []
         self._held = 0
 
-    def add(self, block: Block) -> None:
+    def add(self, block: StreamBlock) -> None:
         """Look at the rows of a block."""
         count = block.Y.shape[-1]
         keys = self._random.random((count,))

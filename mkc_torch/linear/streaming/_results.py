@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from mkc_torch.linear.streaming._progress import Progress
+from mkc_torch.linear.streaming._progress import StreamProgress
 from mkc_torch.linear.streaming._sums import Report
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["results"]
 
 
-def results(before: Progress, progress: Progress, report: Report) -> dict[str, Any]:
+def results(before: StreamProgress, progress: StreamProgress, report: Report) -> dict[str, Any]:
     """The attributes of a fitted estimator by name.
 
     Args:
@@ -47,7 +47,7 @@ def results(before: Progress, progress: Progress, report: Report) -> dict[str, A
     }
 
 
-def covariance(before: Progress, report: Report) -> Float64[Tensor, "n n"]:
+def covariance(before: StreamProgress, report: Report) -> Float64[Tensor, "n n"]:
     """Sandwich covariance of the coefficients for independent rows, with N / (N - n) for what the fit has used."""
     assert before.climb is not None
     survey, turn = before.survey, before.likelihood().to_basis

@@ -15,14 +15,14 @@ import numpy as np
 import torch
 
 from mkc_torch.density.likelihood import energy_derivatives
-from mkc_torch.linear.streaming._blocks import Block, Shape, blocks
+from mkc_torch.linear.streaming._blocks import Shape, StreamBlock, blocks
 from mkc_torch.linear.summary import LIGHT
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
     from torch import Tensor
 
-__all__ = ["Extremes", "Point", "Report", "Slopes", "range_pass", "report_pass", "slopes_pass"]
+__all__ = ["Extremes", "Report", "StreamPoint", "StreamSums", "range_pass", "report_pass", "slopes_pass"]
 
 LEAST_KAPPA = 1e-3
 """1/σ² below which the derivatives by it are taken term by term: as differences of sums they would lose more than six
@@ -30,7 +30,7 @@ of sixteen digits."""
 
 
 @dataclass(frozen=True)
-class Point:
+class StreamPoint:
     """Where a pass is made: coefficients, κ = 1/σ² and d of each channel.
 
     ``to_basis`` turns the columns, block by block, where they are so nearly dependent that sums of their products
@@ -44,7 +44,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Slopes:
+class StreamSums:
     """Sums over rows at a point, of each channel, as views of one flat tensor.
 
     Attributes:
@@ -73,11 +73,11 @@ class Slopes:
         return 1 + shape.m * (6 + 2 * shape.n + shape.n**2)
 
     @staticmethod
-    def of(flat: Float64[Tensor, " k"], shape: Shape) -> Slopes:
+    def of(flat: Float64[Tensor, " k"], shape: Shape) -> StreamSums:
         m, n = shape.m, shape.n
         rows, channels, score, cubed, gram = flat.split([1, 6 * m, m * n, m * n, m * n * n])
         residual, energy, first, second, qw, q2w = channels.view(6, m).unbind()
-        return Slopes(
+        return StreamSums(
             rows=rows[0],
             residual=residual,
             energy=energy,
@@ -91,8 +91,8 @@ class Slopes:
         )
 
 
-def slopes_pass(batches: Iterable[Any], shape: Shape, point: Point, *, curvature: bool) -> Float64[Tensor, " k"]:
-    """The sums of :class:`Slopes` over this rank's rows, flat.
+def slopes_pass(batches: Iterable[Any], shape: Shape, point: StreamPoint, *, curvature: bool) -> Float64[Tensor, " k"]:
+    """The sums of :class:`StreamSums` over this rank's rows, flat.
 
     Args:
         batches: of this rank.
@@ -100,26 +100,26 @@ def slopes_pass(batches: Iterable[Any], shape: Shape, point: Point, *, curvature
         point: where.
         curvature: work out also what the Hessian is made of, which takes two to three times as long.
     """
-    adding = _Adding(shape, point, curvature=curvature)
+    adding = _GrowingSums(shape, point, curvature=curvature)
     for block in _in_basis(batches, shape, point):
         adding.add(block)
     return torch.from_numpy(adding.flat)
 
 
-class _Adding:
+class _GrowingSums:
     """The sums of a pass while they grow, and memory for what is worked out of a block: new memory for each operation
     would take as long as the operations."""
 
-    def __init__(self, shape: Shape, point: Point, *, curvature: bool, report: bool = False) -> None:
-        self.flat = np.zeros(Slopes.length(shape))
+    def __init__(self, shape: Shape, point: StreamPoint, *, curvature: bool, report: bool = False) -> None:
+        self.flat = np.zeros(StreamSums.length(shape))
         self.meat, self.light, self._report = np.zeros((shape.n, shape.n)), 0, report
-        into = Slopes.of(torch.from_numpy(self.flat), shape)
+        into = StreamSums.of(torch.from_numpy(self.flat), shape)
         self._channels = self.flat[1 : 1 + 6 * shape.m].reshape(6, shape.m)
         self._score, self._cubed, self._gram = (one.numpy() for one in (into.score, into.cubed, into.gram))
         self._point, self._curvature = point, curvature
         self._space = np.empty((5 + 2 * shape.n, 0))
 
-    def add(self, block: Block) -> None:
+    def add(self, block: StreamBlock) -> None:
         m, n, count = block.X.shape
         if count > self._space.shape[1]:
             self._space = np.empty((5 + 2 * n, count))
@@ -219,7 +219,7 @@ def _all_terms(
     return energy, first, second
 
 
-def _in_basis(batches: Iterable[Any], shape: Shape, point: Point) -> Iterator[Block]:
+def _in_basis(batches: Iterable[Any], shape: Shape, point: StreamPoint) -> Iterator[StreamBlock]:
     """The blocks of a pass, their columns turned where the point says so."""
     for _, block in blocks(batches, shape):
         if point.to_basis is not None:
@@ -251,7 +251,7 @@ class Extremes:
         )
 
 
-def range_pass(batches: Iterable[Any], shape: Shape, point: Point) -> Extremes:
+def range_pass(batches: Iterable[Any], shape: Shape, point: StreamPoint) -> Extremes:
     """The extremes of this rank's residuals; ``kappa`` and ``d`` of the point are of no use here."""
     nothing = np.full(shape.m, np.inf)
     found = Extremes(0, np.zeros(shape.m), -nothing, nothing)
@@ -274,23 +274,23 @@ class Report:
         light: values of a weight below 0.1, a scalar.
     """
 
-    slopes: Slopes
+    slopes: StreamSums
     meat: Tensor
     light: Tensor
 
     @staticmethod
     def length(shape: Shape) -> int:
-        return Slopes.length(shape) + shape.n**2 + 1
+        return StreamSums.length(shape) + shape.n**2 + 1
 
     @staticmethod
     def of(flat: Float64[Tensor, " k"], shape: Shape) -> Report:
-        slopes, meat, light = flat.split([Slopes.length(shape), shape.n**2, 1])
-        return Report(Slopes.of(slopes, shape), meat.view(shape.n, shape.n), light[0])
+        slopes, meat, light = flat.split([StreamSums.length(shape), shape.n**2, 1])
+        return Report(StreamSums.of(slopes, shape), meat.view(shape.n, shape.n), light[0])
 
 
-def report_pass(batches: Iterable[Any], shape: Shape, point: Point) -> Float64[Tensor, " k"]:
+def report_pass(batches: Iterable[Any], shape: Shape, point: StreamPoint) -> Float64[Tensor, " k"]:
     """The sums of :class:`Report` over this rank's rows, flat."""
-    adding = _Adding(shape, point, curvature=True, report=True)
+    adding = _GrowingSums(shape, point, curvature=True, report=True)
     for block in _in_basis(batches, shape, point):
         adding.add(block)
     return torch.from_numpy(np.concatenate([adding.flat, adding.meat.reshape(-1), [adding.light]]))

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.linear._problem import refuse_dependent, refuse_magnitude
-from mkc_torch.linear.streaming._blocks import Block, Shape, blocks
+from mkc_torch.linear.streaming._blocks import Shape, StreamBlock, blocks
 from mkc_torch.linear.streaming._reservoir import Reservoir
 
 if TYPE_CHECKING:
@@ -130,15 +130,15 @@ def surveyed(batches: Iterable[Any], reservoir: Reservoir) -> Survey | None:
     Raises:
         TypeError, ValueError: a batch is not like the first, a value is not finite, a weight is negative.
     """
-    adding: _Adding | None = None
+    adding: _GrowingSurvey | None = None
     for shape, block in blocks(batches):
-        adding = _Adding(shape) if adding is None else adding
+        adding = _GrowingSurvey(shape) if adding is None else adding
         adding.add(block)
         reservoir.add(block)
     return None if adding is None else adding.survey()
 
 
-class _Adding:
+class _GrowingSurvey:
     """The sums of a survey while they grow."""
 
     def __init__(self, shape: Shape) -> None:
@@ -150,7 +150,7 @@ class _Adding:
         self._triangle, self._gram = torch.zeros(m, k, k, dtype=torch.float64), np.zeros((m, k, k))
         self._space = np.empty(0)
 
-    def add(self, block: Block) -> None:
+    def add(self, block: StreamBlock) -> None:
         joined = block.joined
         m, _, count = joined.shape
         if self._space.size < joined.size:
@@ -196,7 +196,7 @@ def _is_good(gram: Float64[np.ndarray, "m k k"]) -> bool:
     return bool(np.diagonal(factor, axis1=-2, axis2=-1).min() > LEAST_PIVOT)
 
 
-def refuse_bad_values(block: Block) -> None:
+def refuse_bad_values(block: StreamBlock) -> None:
     """Name the first value that is NaN or infinite, or the first negative weight.
 
     Raises:

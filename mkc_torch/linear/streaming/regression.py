@@ -18,12 +18,12 @@ from mkc_torch.linear._inference import Inference
 from mkc_torch.linear._robust_start import Start
 from mkc_torch.linear.em import MKCRegression
 from mkc_torch.linear.streaming._blocks import checked_source
+from mkc_torch.linear.streaming._float32_pass import float32_pass
 from mkc_torch.linear.streaming._pilot import begun_from
-from mkc_torch.linear.streaming._progress import Progress, StreamChangedError
+from mkc_torch.linear.streaming._progress import StreamChangedError, StreamProgress
 from mkc_torch.linear.streaming._reservoir import Drawn, Reservoir, merged
 from mkc_torch.linear.streaming._results import results
-from mkc_torch.linear.streaming._rough import rough_pass
-from mkc_torch.linear.streaming._sums import Report, Slopes, range_pass, report_pass, slopes_pass
+from mkc_torch.linear.streaming._sums import Report, StreamSums, range_pass, report_pass, slopes_pass
 from mkc_torch.linear.streaming._survey import Survey, surveyed
 
 if TYPE_CHECKING:
@@ -113,8 +113,8 @@ class StreamedMKCRegression(Inference):
         self.max_passes = checked_whole("max_passes", max_passes, 4, "60 is ample")
         self.seed = checked_whole("seed", seed, 0)
         self._of_sample()
-        self._progress: Progress | None = None
-        self._resume_from: Progress | None = None
+        self._progress: StreamProgress | None = None
+        self._resume_from: StreamProgress | None = None
 
     def __getattr__(self, name: str) -> Any:
         if name == "weights_":
@@ -199,7 +199,7 @@ class StreamedMKCRegression(Inference):
         Raises:
             ValueError: no such state, or one of a fit with other parameters.
         """
-        progress = Progress.of(state)
+        progress = StreamProgress.of(state)
         progress.refuse_other_settings(self._settings())
         self._resume_from = progress
 
@@ -214,9 +214,11 @@ class StreamedMKCRegression(Inference):
         values = {name: getattr(self, name) for name in names}
         return {name: v.tolist() if isinstance(v, Tensor) else v for name, v in values.items()}
 
-    def _resumed(self, given: Progress | None, checkpoint: str | os.PathLike[str] | None) -> Progress | None:
+    def _resumed(
+        self, given: StreamProgress | None, checkpoint: str | os.PathLike[str] | None
+    ) -> StreamProgress | None:
         """Where to go on from: a checkpoint that is there, or a state that was given."""
-        progress = None if checkpoint is None else Progress.load(checkpoint)
+        progress = None if checkpoint is None else StreamProgress.load(checkpoint)
         progress = given if progress is None else progress
         if progress is not None:
             progress.refuse_other_settings(self._settings())
@@ -228,7 +230,7 @@ class StreamedMKCRegression(Inference):
         batches: Iterable[Any],
         counts: list[int | None],
         checkpoint: str | os.PathLike[str] | None,
-    ) -> Progress:
+    ) -> StreamProgress:
         """After the first pass."""
         before = [count for count in counts[: ranks.rank] if count is not None]
         known = ranks.alone or None not in counts
@@ -237,26 +239,28 @@ class StreamedMKCRegression(Inference):
         surveys = [survey for survey in found if survey is not None]
         drawn = ranks.gathered(lambda: _likely(reservoir.drawn(), self.pilot, sum(one.rows for one in surveys)))
 
-        def begin() -> Progress:
+        def begin() -> StreamProgress:
             survey = Survey.of_all(surveys)
             sample = merged([part for part in drawn if part is not None], self.pilot)
             to_basis = survey.to_coef() if survey.is_turned() else None
             begun = begun_from(sample, survey.shape, self._of_sample(), to_basis)
-            return Progress.begin(self._settings(), survey, begun)
+            return StreamProgress.begin(self._settings(), survey, begun)
 
         return self._kept(ranks, begin, checkpoint)
 
     def _ranged(
-        self, ranks: Ranks, batches: Iterable[Any], progress: Progress, checkpoint: str | os.PathLike[str] | None
-    ) -> Progress:
+        self, ranks: Ranks, batches: Iterable[Any], progress: StreamProgress, checkpoint: str | os.PathLike[str] | None
+    ) -> StreamProgress:
         """After the pass for the domain."""
         parts = ranks.gathered(lambda: range_pass(batches, progress.survey.shape, progress.point()))
         return self._kept(ranks, lambda: progress.after_range(parts), checkpoint)
 
-    def _kept(self, ranks: Ranks, work: Callable[[], Progress], checkpoint: str | os.PathLike[str] | None) -> Progress:
+    def _kept(
+        self, ranks: Ranks, work: Callable[[], StreamProgress], checkpoint: str | os.PathLike[str] | None
+    ) -> StreamProgress:
         """What rank 0 works out, once it is written where it is to be."""
 
-        def written() -> Progress:
+        def written() -> StreamProgress:
             progress = work()
             if checkpoint is not None and progress.phase != "done":
                 progress.save(checkpoint)
@@ -278,22 +282,22 @@ class StreamedMKCRegression(Inference):
             self.feature_names_in_ = names
 
 
-def _pass(batches: Iterable[Any], progress: Progress) -> tuple[Callable[[], Float64[Tensor, " k"]], int]:
+def _pass(batches: Iterable[Any], progress: StreamProgress) -> tuple[Callable[[], Float64[Tensor, " k"]], int]:
     """What the next pass is, and how many sums it gives."""
     assert progress.climb is not None
     shape, point, climb = progress.survey.shape, progress.point(), progress.climb
     if progress.phase == "report":
         return lambda: report_pass(batches, shape, point), Report.length(shape)
     if climb.rough:
-        return lambda: rough_pass(batches, shape, point), Slopes.length(shape)
-    return lambda: slopes_pass(batches, shape, point, curvature=climb.curvature), Slopes.length(shape)
+        return lambda: float32_pass(batches, shape, point), StreamSums.length(shape)
+    return lambda: slopes_pass(batches, shape, point, curvature=climb.curvature), StreamSums.length(shape)
 
 
-def _after(progress: Progress, flat: Float64[Tensor, " k"], max_passes: int) -> Progress:
+def _after(progress: StreamProgress, flat: Float64[Tensor, " k"], max_passes: int) -> StreamProgress:
     """Where the fit stands after a pass."""
     if progress.phase == "report":
         return progress.after_report(Report.of(flat, progress.survey.shape).slopes, max_passes)
-    return progress.after_slopes(Slopes.of(flat, progress.survey.shape), max_passes)
+    return progress.after_slopes(StreamSums.of(flat, progress.survey.shape), max_passes)
 
 
 def _likely(drawn: Drawn | None, size: int, rows: int) -> Drawn | None:

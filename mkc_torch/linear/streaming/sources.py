@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mkc_torch._support.arguments import checked_whole, refuse_text, told
+from mkc_torch._support.arguments import checked_whole, format_value, refuse_text
 
 if TYPE_CHECKING:
     from jaxtyping import Shaped
@@ -45,7 +45,7 @@ class MemmapBatches:
         for name, array in zip(("X", "Y", "weight"), self._arrays, strict=False):
             if not isinstance(array, np.ndarray) or array.ndim == 0:
                 raise TypeError(
-                    f"Expected argument `{name}` to be a NumPy array or memmap but got {told(array)}; "
+                    f"Expected argument `{name}` to be a NumPy array or memmap but got {format_value(array)}; "
                     "np.load(path, mmap_mode='r') opens one on disk."
                 )
             if len(array) != len(X):
@@ -228,7 +228,7 @@ def _checked_columns(inputs: Any, targets: Any) -> list[list[str]]:
         if isinstance(inputs, str) or not all(isinstance(one, (list, tuple)) for one in inputs):
             raise TypeError(
                 f"Expected argument `inputs` to be a list of names for each of the {len(targets)} targets but got "
-                f"{told(inputs)}; one target is a name, targets={targets[0]!r}."
+                f"{format_value(inputs)}; one target is a name, targets={targets[0]!r}."
             )
         channels = [list(one) for one in inputs]
         if len(channels) != len(targets) or len({len(one) for one in channels}) > 1:
@@ -248,7 +248,7 @@ def _share(count: int, shard: tuple[int, int] | None) -> tuple[int, int]:
     good = isinstance(shard, (tuple, list)) and len(shard) == 2 and all(isinstance(one, int) for one in shard)
     if not good or not 0 <= shard[0] < shard[1]:
         raise ValueError(
-            f"Expected argument `shard` to be (rank, ranks) with 0 <= rank < ranks but got {told(shard)}; it is "
+            f"Expected argument `shard` to be (rank, ranks) with 0 <= rank < ranks but got {format_value(shard)}; it is "
             "(dist.get_rank(), dist.get_world_size())."
         )
     rank, ranks = shard

@@ -9,13 +9,11 @@ from torch import Tensor
 
 from mkc_torch._support.torch_internals import is_transformed
 from mkc_torch.losses._checks import checked_weight
-from mkc_torch.losses.kernels.label_loss import EachLabel, ReducedLabels, arranged_labels
-from mkc_torch.losses.kernels.label_loss import Work as LabelWork
+from mkc_torch.losses.kernels.label_loss import EachLabel, LabelPass, ReducedLabels, arranged_labels
 from mkc_torch.losses.kernels.label_operators import operator_label_loss
 from mkc_torch.losses.kernels.loss import EachFunction, ReducedFunction, prepared
 from mkc_torch.losses.kernels.operators import operator_loss
-from mkc_torch.losses.kernels.sample_loss import EachSample, ReducedSamples, arranged_samples
-from mkc_torch.losses.kernels.sample_loss import Work as SampleWork
+from mkc_torch.losses.kernels.sample_loss import EachSample, ReducedSamples, SamplePass, arranged_samples
 from mkc_torch.losses.kernels.sample_operators import operator_sample_loss
 
 __all__ = ["kernel_loss", "label_loss", "sample_loss", "takes_labels"]
@@ -69,7 +67,7 @@ def sample_loss(loss: Any, input: Tensor, target: Tensor, sigma: Tensor, d: Tens
             input.detach(), target.detach(), sigma.detach(), d.detach(), own_weight, loss.bound, axis
         )
     function: Any = EachSample if loss.reduction == "none" else ReducedSamples
-    value: Tensor = function.apply(input, target, sigma, d, SampleWork(loss, batch, weight))
+    value: Tensor = function.apply(input, target, sigma, d, SamplePass(loss, batch, weight))
     return value
 
 
@@ -96,5 +94,5 @@ def label_loss(loss: Any, input: Tensor, target: Tensor) -> Tensor:
     with torch.no_grad():
         batch = arranged_labels(input.detach(), target, loss.kappa, loss.weight, loss.ignore_index)
     function: Any = EachLabel if loss.reduction == "none" else ReducedLabels
-    value: Tensor = function.apply(input, target, LabelWork(loss, batch))
+    value: Tensor = function.apply(input, target, LabelPass(loss, batch))
     return value

@@ -15,7 +15,15 @@ from mkc_torch.losses.kernels.cached import CachedKernel
 from mkc_torch.losses.kernels.labels import count_kernel, labels_kernel
 from mkc_torch.losses.kernels.launch import WARPS, multiprocessors, rescale
 
-__all__ = ["EachLabel", "ReducedLabels", "Work", "arranged_labels", "label_slopes", "label_values", "reduce_labels"]
+__all__ = [
+    "EachLabel",
+    "LabelPass",
+    "ReducedLabels",
+    "arranged_labels",
+    "label_slopes",
+    "label_values",
+    "reduce_labels",
+]
 
 TILE = 1024
 """Logits of a tile of several rows."""
@@ -155,7 +163,7 @@ def label_slopes(batch: Labels, mean: bool, upstream: Tensor) -> Tensor:
     return slopes
 
 
-class Work(NamedTuple):
+class LabelPass(NamedTuple):
     """One forward pass: the loss, and the batch."""
 
     loss: Any
@@ -167,7 +175,7 @@ class ReducedLabels(torch.autograd.Function):
     underflows before a gradient scaler multiplies, is made in the backward pass."""
 
     @staticmethod
-    def forward(ctx: Any, input: Tensor, target: Tensor, work: Work) -> Tensor:
+    def forward(ctx: Any, input: Tensor, target: Tensor, work: LabelPass) -> Tensor:
         ctx.stores = ctx.needs_input_grad[0] and input.dtype != torch.float16
         ctx.save_for_backward(input, target, work.batch.kappa)
         ctx.work = work
@@ -189,7 +197,7 @@ class EachLabel(torch.autograd.Function):
     """The loss of each row. The gradient is made in the backward pass, which has to read the upstream gradient."""
 
     @staticmethod
-    def forward(ctx: Any, input: Tensor, target: Tensor, work: Work) -> Tensor:
+    def forward(ctx: Any, input: Tensor, target: Tensor, work: LabelPass) -> Tensor:
         ctx.save_for_backward(input, target, work.batch.kappa)
         ctx.work = work
         return label_values(work.batch)

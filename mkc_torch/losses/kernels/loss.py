@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mkc_torch._support.torch_internals import in_backward
 from mkc_torch.losses._parameters import ChannelState
-from mkc_torch.losses._terms import Batch, Settings, loss_value
+from mkc_torch.losses._terms import Batch, LossSettings, loss_value
 from mkc_torch.losses.kernels.channels import TABLE
 from mkc_torch.losses.kernels.launch import (
     Arranged,
@@ -27,7 +27,7 @@ from mkc_torch.losses.residual_scale import ScaleState, alike_in_all_processes, 
 __all__ = ["gradients_of_each", "options_of", "prepared", "request_of", "updated_table"]
 
 
-class Work(NamedTuple):
+class ChannelPass(NamedTuple):
     """What one forward pass leaves for the backward pass beside the saved tensors."""
 
     weight: Tensor | None
@@ -38,7 +38,7 @@ class Work(NamedTuple):
     fixed_d: Tensor | None
     reduction: str
 
-    def settings(self) -> Settings:
+    def settings(self) -> LossSettings:
         """What the differentiable formulas need, from the table."""
         rows = dict(zip(TABLE, self.table, strict=True))
         robust, has_scale = self.options.robust, self.options.has_scale
@@ -50,7 +50,9 @@ class Work(NamedTuple):
             rows["share"] if robust else None,
         )
         reduction: Any = self.reduction
-        return Settings(self.fixed_kappa, self.fixed_d, state, self.options.follows, self.options.normalize, reduction)
+        return LossSettings(
+            self.fixed_kappa, self.fixed_d, state, self.options.follows, self.options.normalize, reduction
+        )
 
     def value_by_formulas(
         self, input: Tensor, target: Tensor, raw_kappa: Tensor | None, raw_d: Tensor | None
@@ -83,17 +85,19 @@ def options_of(loss: Any) -> Options:
 
 
 @torch.no_grad()
-def prepared(loss: Any, input: Tensor, target: Tensor, weight: Tensor | None, axis: int) -> tuple[Arranged, Work]:
+def prepared(
+    loss: Any, input: Tensor, target: Tensor, weight: Tensor | None, axis: int
+) -> tuple[Arranged, ChannelPass]:
     """Update the running state in training, and make the table."""
     options, batch = options_of(loss), arranged(input.detach(), target.detach(), weight, axis)
     request = request_of(loss, input.device)
     table = updated_table(batch, request, options, updates=request.updates and not in_backward())
     buffers = loss._buffers
     fixed = (buffers.get("fixed_kappa"), buffers.get("fixed_d"))
-    return batch, Work(weight, axis, table, options, *fixed, loss.reduction)
+    return batch, ChannelPass(weight, axis, table, options, *fixed, loss.reduction)
 
 
-class Request(NamedTuple):
+class KernelRequest(NamedTuple):
     """What a loss asks the channel kernel for."""
 
     kappa: Tensor
@@ -106,7 +110,7 @@ class Request(NamedTuple):
     anneal_step: float
 
 
-def request_of(loss: Any, device: torch.device) -> Request:
+def request_of(loss: Any, device: torch.device) -> KernelRequest:
     """The parameters and buffers of a loss."""
     scale, schedule = loss._running()
     parameters, buffers = loss._parameters, loss._buffers
@@ -127,10 +131,10 @@ def request_of(loss: Any, device: torch.device) -> Request:
             running = Running(*running[:6], *(others[name] for name in Running._fields[6:]))
             pace = (schedule.warmup_steps, schedule.anneal_step)
     given = (kappa, d, buffers.get("fixed_bound"), buffers.get("fixed_d_min"))
-    return Request(*given, running, scale is not None and loss.training, *pace)
+    return KernelRequest(*given, running, scale is not None and loss.training, *pace)
 
 
-def updated_table(batch: Arranged, request: Request, options: Options, *, updates: bool) -> Tensor:
+def updated_table(batch: Arranged, request: KernelRequest, options: Options, *, updates: bool) -> Tensor:
     """The table of the numbers of each channel, after an update of the running state where that is asked for."""
     running, numbers, pace = request.running, request[:4], request[-2:]
     scheduled = updates and running.share is not None
@@ -160,7 +164,7 @@ class ReducedFunction(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, input: Tensor, target: Tensor, raw_kappa: Any, raw_d: Any, batch: Arranged, work: Work
+        ctx: Any, input: Tensor, target: Tensor, raw_kappa: Any, raw_d: Any, batch: Arranged, work: ChannelPass
     ) -> Tensor:
         wants = ctx.needs_input_grad
         ctx.stores = (wants[0] or wants[1]) and input.dtype != torch.float16
@@ -194,7 +198,7 @@ class EachFunction(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, input: Tensor, target: Tensor, raw_kappa: Any, raw_d: Any, batch: Arranged, work: Work
+        ctx: Any, input: Tensor, target: Tensor, raw_kappa: Any, raw_d: Any, batch: Arranged, work: ChannelPass
     ) -> Tensor:
         ctx.save_for_backward(input, target, raw_kappa, raw_d)
         ctx.work = work
@@ -206,7 +210,7 @@ class EachFunction(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
             return (*_by_formulas(ctx, grad), None, None)
-        work: Work = ctx.work
+        work: ChannelPass = ctx.work
         slopes, by_kappa, by_d = gradients_of_each(_again(ctx), work.table, work.options, grad)
         return (*_handed_out(ctx, slopes), by_kappa, by_d, None, None)
 

@@ -22,7 +22,7 @@ from mkc_torch.losses.kernels.launch import (
     reduce_batch,
     weight_sums,
 )
-from mkc_torch.losses.kernels.loss import Request, gradients_of_each, options_of, request_of, updated_table
+from mkc_torch.losses.kernels.loss import KernelRequest, gradients_of_each, options_of, request_of, updated_table
 
 __all__ = ["operator_loss"]
 
@@ -56,7 +56,7 @@ def channel_table(
 ) -> None:
     """Update the running state and fill the table of the numbers of each channel, (14, m)."""
     running = Running(recent, position, batches, log_scale, half_range, floor, steps, log_bandwidth, share)
-    request = Request(kappa, d, bound, least, running, updates, warmup_steps, anneal_step)
+    request = KernelRequest(kappa, d, bound, least, running, updates, warmup_steps, anneal_step)
     table.copy_(updated_table(arranged(input, target, weight, axis), request, Options(*options), updates=updates))
 
 

@@ -15,7 +15,7 @@ from mkc_torch.losses.kernels.cached import CachedKernel
 from mkc_torch.losses.kernels.launch import RESCALED, WARPS, multiprocessors
 from mkc_torch.losses.kernels.samples import rescale_samples_kernel, samples_kernel
 
-__all__ = ["EachSample", "ReducedSamples", "Work", "arranged_samples"]
+__all__ = ["EachSample", "ReducedSamples", "SamplePass", "arranged_samples"]
 
 BLOCK = 512
 """Elements of a block; a thread holds four, which are one load."""
@@ -192,7 +192,7 @@ def has_float16(*given: Tensor) -> bool:
     return any(one.dtype == torch.float16 for one in given)
 
 
-class Work(NamedTuple):
+class SamplePass(NamedTuple):
     """One forward pass: the loss, the batch, and the weights as they were given."""
 
     loss: Any
@@ -204,7 +204,7 @@ class ReducedSamples(torch.autograd.Function):
     """A sum or mean, whose gradients are made in the forward pass; those of float16 in the backward pass."""
 
     @staticmethod
-    def forward(ctx: Any, input: Tensor, target: Tensor, sigma: Tensor, d: Tensor, work: Work) -> Tensor:
+    def forward(ctx: Any, input: Tensor, target: Tensor, sigma: Tensor, d: Tensor, work: SamplePass) -> Tensor:
         wants = ctx.needs_input_grad
         ctx.wanted = (wants[0] or wants[1], wants[2], wants[3])
         ctx.stores = not has_float16(input, sigma, d)
@@ -218,7 +218,7 @@ class ReducedSamples(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():
             return _by_formulas(ctx, grad)
-        work: Work = ctx.work
+        work: SamplePass = ctx.work
         found, ctx.found = ctx.found, None
         if found is None or not ctx.stores:  # a second backward pass of one graph, or float16
             found = samples_slopes(work.batch, work.loss.reduction == "mean", ctx.wanted, grad)
@@ -231,7 +231,7 @@ class EachSample(torch.autograd.Function):
     """Each element's loss. The gradients are made in the backward pass, which has to read the upstream gradient."""
 
     @staticmethod
-    def forward(ctx: Any, input: Tensor, target: Tensor, sigma: Tensor, d: Tensor, work: Work) -> Tensor:
+    def forward(ctx: Any, input: Tensor, target: Tensor, sigma: Tensor, d: Tensor, work: SamplePass) -> Tensor:
         wants = ctx.needs_input_grad
         ctx.wanted = (wants[0] or wants[1], wants[2], wants[3])
         ctx.save_for_backward(input, target, sigma, d)

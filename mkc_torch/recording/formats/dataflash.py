@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic
-from mkc_torch.recording.formats.begins import begins_with, foreign
 from mkc_torch.recording.formats.damage import guarded, no_rows, with_warnings
 from mkc_torch.recording.formats.dataflash_binary import read_binary
 from mkc_torch.recording.formats.dataflash_text import read_text
+from mkc_torch.recording.formats.magic_numbers import begins_with, wrong_format_error
 
 __all__ = ["DATAFLASH"]
 
@@ -51,7 +51,7 @@ def _no_log(path: Path) -> RecordingError:
             f"{path}: this is no {_WHAT}: no line near its beginning defines a message (FMT, …); "
             "if it is a table, rename it to end in .csv."
         )
-    return foreign(path, _WHAT)
+    return wrong_format_error(path, _WHAT)
 
 
 DATAFLASH = FileFormat((".bin", ".log"), read)

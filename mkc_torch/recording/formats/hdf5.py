@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from mkc_torch.recording.formats.base import FileFormat, Topic
-from mkc_torch.recording.formats.begins import foreign
 from mkc_torch.recording.formats.damage import guarded, no_rows
 from mkc_torch.recording.formats.groups import Group, group_topics
 from mkc_torch.recording.formats.hdf5_objects import hdf5_group
-from mkc_torch.recording.formats.trial import broken, survives
+from mkc_torch.recording.formats.magic_numbers import wrong_format_error
+from mkc_torch.recording.formats.sandbox import broken, reads_without_crash
 
 __all__ = ["HDF5", "h5py", "hdf5_root"]
 
@@ -41,7 +41,7 @@ def read(path: Path) -> list[Topic]:
     """
     package = h5py("hdf5")
     if not package.is_hdf5(str(path)):
-        raise foreign(path, "HDF5 file")
+        raise wrong_format_error(path, "HDF5 file")
     topics = group_topics(hdf5_root(path, package, "HDF5 file", upright=True))
     if not topics:
         raise no_rows(path, "HDF5 file")
@@ -54,7 +54,7 @@ def hdf5_root(path: Path, package: Any, what: str, *, upright: bool) -> Group:
     Raises:
         RecordingError: a damaged file.
     """
-    if not survives(path, _TRIAL):
+    if not reads_without_crash(path, _TRIAL):
         raise broken(path, what)
     with guarded(path, what), package.File(str(path), "r") as file:
         root: Group = hdf5_group(package, Group, file, "", upright=upright, count=[0])

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from mkc_torch.recording.formats.base import FileFormat, Topic
-from mkc_torch.recording.formats.begins import begins_with, foreign
 from mkc_torch.recording.formats.damage import guarded, no_rows
 from mkc_torch.recording.formats.groups import Group, group_topics
 from mkc_torch.recording.formats.hdf5 import h5py, hdf5_root
+from mkc_torch.recording.formats.magic_numbers import begins_with, wrong_format_error
 
 __all__ = ["MAT"]
 
@@ -74,12 +74,12 @@ def _of_scipy(path: Path) -> Group:
     with path.open("rb") as file:
         head = file.read(128)
     if head[124:128] not in (b"\x00\x01IM", b"\x01\x00MI") and not _is_version_4(head):
-        raise foreign(path, "MATLAB file")
+        raise wrong_format_error(path, "MATLAB file")
     with guarded(path, "MATLAB file"):
         try:
             matfile_version(str(path))
         except Exception as error:  # ValueError, MatReadError, …
-            raise foreign(path, "MATLAB file") from error
+            raise wrong_format_error(path, "MATLAB file") from error
         found = loadmat(str(path), chars_as_strings=True, struct_as_record=True)
         return _group("", {name: value for name, value in found.items() if not name.startswith("__")}, 0)
 

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic
-from mkc_torch.recording.formats.begins import check_begins
 from mkc_torch.recording.formats.compression import inflated
 from mkc_torch.recording.formats.damage import guarded, lost_warning, no_rows, with_warnings
+from mkc_torch.recording.formats.magic_numbers import check_begins
 from mkc_torch.recording.formats.message_decoders import json_values, protobuf_reader
 from mkc_torch.recording.formats.message_log import MessageLog
 from mkc_torch.recording.formats.message_rows import Cell

@@ -24,8 +24,8 @@ from typing import IO, Any
 import numpy as np
 
 from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic
-from mkc_torch.recording.formats.begins import begins_with, check_begins
 from mkc_torch.recording.formats.damage import no_rows, with_warnings
+from mkc_torch.recording.formats.magic_numbers import begins_with, check_begins
 from mkc_torch.recording.formats.topics import MOST_ELEMENTS, spread, topic_of
 
 __all__ = ["MDF"]

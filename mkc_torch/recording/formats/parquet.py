@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from mkc_torch.recording.formats.base import FileFormat, RecordingError, Table, Topic, polars
-from mkc_torch.recording.formats.begins import begins_with, foreign
 from mkc_torch.recording.formats.damage import quiet_terminal
-from mkc_torch.recording.formats.trial import broken, survives
+from mkc_torch.recording.formats.magic_numbers import begins_with, wrong_format_error
+from mkc_torch.recording.formats.sandbox import broken, reads_without_crash
 
 __all__ = ["PARQUET"]
 
@@ -25,8 +25,8 @@ def read(path: Path) -> Table:
     """The table in a Parquet file."""
     package = polars()
     if not begins_with(path, b"PAR1"):
-        raise foreign(path, "Parquet file")
-    if not survives(path, _TRIAL):
+        raise wrong_format_error(path, "Parquet file")
+    if not reads_without_crash(path, _TRIAL):
         raise broken(path, "Parquet file")
     try:
         with quiet_terminal():

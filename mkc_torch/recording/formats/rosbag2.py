@@ -15,9 +15,9 @@ from typing import Any
 from urllib.parse import quote
 
 from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic, listed
-from mkc_torch.recording.formats.begins import begins_with, check_begins
 from mkc_torch.recording.formats.compression import inflated
 from mkc_torch.recording.formats.damage import guarded, no_rows, with_warnings
+from mkc_torch.recording.formats.magic_numbers import begins_with, check_begins
 from mkc_torch.recording.formats.mcap import gather_mcap
 from mkc_torch.recording.formats.message_log import MessageLog
 from mkc_torch.recording.formats.message_rows import LARGEST_MESSAGE

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mkc_torch.recording.formats.base import RecordingError, counted
-from mkc_torch.recording.formats.begins import foreign, is_of_another_kind
+from mkc_torch.recording.formats.magic_numbers import is_of_another_kind, wrong_format_error
 
 __all__ = ["Line", "lines_of"]
 
@@ -40,7 +40,7 @@ def lines_of(path: Path) -> tuple[list[Line], list[str]]:
     """
     data = path.read_bytes()
     if is_of_another_kind(data):
-        raise foreign(path, "text")
+        raise wrong_format_error(path, "text")
     text, warnings = _decoded(path, data)
     if "\u2212" in text:
         text = text.replace("\u2212", "-")

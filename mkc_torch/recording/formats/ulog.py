@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from mkc_torch.recording.formats.base import FileFormat, RecordingError, Topic, counted
-from mkc_torch.recording.formats.begins import check_begins
 from mkc_torch.recording.formats.damage import guarded, lost_warning, no_rows, with_warnings
+from mkc_torch.recording.formats.magic_numbers import check_begins
 from mkc_torch.recording.formats.px4_units import px4_units
 from mkc_torch.recording.formats.topics import topic_of
 

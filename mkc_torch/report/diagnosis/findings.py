@@ -8,11 +8,11 @@ from collections.abc import Collection, Mapping, Sequence
 
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain, several, typeset
-from mkc_torch.diagnosis.result import Alternative, Candidate, Finding, Region
-from mkc_torch.diagnosis.world import Grade, Run
+from mkc_torch.diagnosis.environment import Grade, Run
+from mkc_torch.diagnosis.result import Alternative, CandidateScore, Finding, Region
 from mkc_torch.effects import is_curve, words_of
 from mkc_torch.report.diagnosis.evidence import of_driver
-from mkc_torch.report.diagnosis.numbers import Clock, probability
+from mkc_torch.report.diagnosis.numbers import TimeFormat, probability
 from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
 
@@ -138,14 +138,14 @@ def counted_from(finding: Finding) -> str:
     return term(key, symbol=symbol, columns=names, values=values)
 
 
-def where(finding: Finding, clock: Clock) -> str:
+def where(finding: Finding, clock: TimeFormat) -> str:
     """When the finding acts.
 
     Example:
         >>> from dataclasses import replace
         >>> from mkc_torch.diagnosis.result import Told
         >>> finding = Finding("offset_drift", (), ("mag_x",), (), None, "", "", (), 0.01, (), True, "")
-        >>> clock = Clock(1, has_time=True)
+        >>> clock = TimeFormat(1, has_time=True)
         >>> where(finding, clock), where(replace(finding, onset=41.32), clock)
         ('throughout the recording', 'from 41.3 s on')
         >>> where(replace(finding, onset=41.32, evidence=(Told("onset", (41.24, 41.5)),)), clock)
@@ -255,7 +255,7 @@ def shape(finding: Finding) -> str:
     """Whether the shape that a name claims is the recording's; empty where that was not asked.
 
     Example:
-        >>> from mkc_torch.diagnosis.world import Shape
+        >>> from mkc_torch.diagnosis.environment import Shape
         >>> right = Finding("linear_drag", (), (), (), None, "", "", (), 0.01, (), True, "", shape=Shape(1.2, 0.4))
         >>> shape(right)
         'a free curve of the same variables is not clearly better (p = 0.4)'
@@ -299,7 +299,7 @@ def _at(place: str, finding: Finding) -> bool:
     return not place or own in finding.channels or both == finding.channels
 
 
-def role(candidate: Candidate, findings: Sequence[Finding]) -> str:
+def role(candidate: CandidateScore, findings: Sequence[Finding]) -> str:
     """What became of a candidate: the number of its finding, or whether it can be told from one."""
     own = candidate.effect, candidate.drivers
     for i, finding in enumerate(findings, 1):

@@ -7,10 +7,10 @@ from typing import Any
 from mkc_torch._support.drawing import ORANGE, array, style
 from mkc_torch._support.unit_text import tidy
 from mkc_torch._words.terms import term
+from mkc_torch.diagnosis.environment import Curve
 from mkc_torch.diagnosis.plot.curves import MOST_LETTERS, draw_course, draw_curve, named, short
 from mkc_torch.diagnosis.result import Diagnosis
-from mkc_torch.diagnosis.world import Curve
-from mkc_torch.report.diagnosis.panels import Grid, title
+from mkc_torch.report.diagnosis.panels import PanelGrid, title
 from mkc_torch.report.drawing import svg
 
 __all__ = ["of_forcing", "of_shape"]
@@ -24,7 +24,7 @@ def of_forcing(diagnosis: Diagnosis, index: int) -> str:
     forcing, has_time = diagnosis.world.forcing[index], diagnosis.traces.has_time
     curves = forcing.curves[:_MOST_CURVES]
     rows = 1 + -(-len(curves) // _IN_A_ROW)
-    grid = Grid(rows, _IN_A_ROW, top=0.35, below=0.72, own_axes=True)
+    grid = PanelGrid(rows, _IN_A_ROW, top=0.35, below=0.72, own_axes=True)
     with style():
         figure = grid.figure()
         draw_course(grid.axes(figure, 0, 0, wide=True), forcing, has_time)
@@ -52,7 +52,7 @@ def of_shape(diagnosis: Diagnosis, index: int) -> str | None:
     if free is None:
         return None
     form = finding.curve if finding.curve is not None and _comparable(free, finding.curve) else None
-    grid = Grid(1, 1, top=0.35, below=0.0)
+    grid = PanelGrid(1, 1, top=0.35, below=0.0)
     with style():
         figure = grid.figure()
         ax = grid.axes(figure, 0, 0, wide=True)

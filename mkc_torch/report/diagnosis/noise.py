@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain, several
-from mkc_torch.diagnosis.result import Diagnosis, Noise, Number
+from mkc_torch.diagnosis.result import Diagnosis, NoiseSummary, Number
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.words.numbers import bandwidth, number, size
 
@@ -31,7 +31,7 @@ _CHANNELS = {
 }
 
 
-def noise_model(noise: Noise) -> str:
+def noise_model(noise: NoiseSummary) -> str:
     """The noise in words."""
     kind = term(_KINDS[noise.model])
     described = noise.description.strip()
@@ -42,7 +42,7 @@ def noise_model(noise: Noise) -> str:
     )
 
 
-def noise_parameters(noise: Noise, channels: Sequence[str]) -> list[tuple[str, str]]:
+def noise_parameters(noise: NoiseSummary, channels: Sequence[str]) -> list[tuple[str, str]]:
     """The numbers of the noise model in words, those of the density once a channel."""
     rows: list[tuple[str, str]] = []
     for name, value in noise.parameters.items():

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain, superscript
-from mkc_torch.diagnosis.result import Candidate, HeldOut, Number, Parameter, Traces
+from mkc_torch.diagnosis.result import CandidateScore, EffectParameter, HeldOut, Number, Traces
 from mkc_torch.report.words.numbers import decimals, number, share, size
 
 __all__ = [
-    "Clock",
+    "TimeFormat",
     "behind",
     "clock_of",
     "evidence",
@@ -33,7 +33,7 @@ _LONG = 4  # numbers from which a list is told by its largest
 
 
 @dataclass(frozen=True)
-class Clock:
+class TimeFormat:
     """How moments are written: to so many decimals, in s, or as numbers of samples."""
 
     places: int
@@ -43,7 +43,7 @@ class Clock:
         """One moment.
 
         Example:
-            >>> Clock(1, has_time=True).moment(41.32), Clock(0, has_time=False).moment(812.0)
+            >>> TimeFormat(1, has_time=True).moment(41.32), TimeFormat(0, has_time=False).moment(812.0)
             ('41.3 s', 'sample 812')
         """
         if self.has_time:
@@ -54,7 +54,7 @@ class Clock:
         """From one moment to another.
 
         Example:
-            >>> Clock(1, has_time=True).interval(12.0, 18.44), Clock(0, has_time=False).interval(3.0, 9.0)
+            >>> TimeFormat(1, has_time=True).interval(12.0, 18.44), TimeFormat(0, has_time=False).interval(3.0, 9.0)
             ('12.0 to 18.4 s', 'sample 3 to 9')
         """
         if self.has_time:
@@ -62,12 +62,12 @@ class Clock:
         return term("where.interval_of_samples", start=number(start, 0), end=number(end, 0))
 
 
-def clock_of(traces: Traces) -> Clock:
+def clock_of(traces: Traces) -> TimeFormat:
     """A clock that tells moments apart to about a thousandth of the recording."""
     known = traces.time[traces.time.isfinite()]
     span = float(known.max() - known.min()) if traces.has_time and len(known) else 0.0
     digits = max(2 - math.floor(math.log10(span)), int(span < 1000.0)) if span > 0 else 1
-    return Clock(min(max(digits, 0), 6), traces.has_time)
+    return TimeFormat(min(max(digits, 0), 6), traces.has_time)
 
 
 def measured(value: Number, error: Number | None, unit: str) -> list[str]:
@@ -141,11 +141,11 @@ def _rows(value: Number | None) -> Iterator[list[float]]:
         yield [cell for v in value for row in _rows(v) for cell in row]
 
 
-def parameter_name(parameter: Parameter) -> str:
+def parameter_name(parameter: EffectParameter) -> str:
     """A parameter's name in words.
 
     Example:
-        >>> parameter_name(Parameter("field_per_ampere", 1.0, None, "µT/A"))
+        >>> parameter_name(EffectParameter("field_per_ampere", 1.0, None, "µT/A"))
         'field per ampere'
     """
     name = plain(parameter.name)
@@ -157,17 +157,17 @@ def _lowered(digits: str) -> str:
     return digits.translate(str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉"))
 
 
-def parameter_lines(parameter: Parameter, channels: Sequence[str]) -> list[str]:
+def parameter_lines(parameter: EffectParameter, channels: Sequence[str]) -> list[str]:
     """A parameter as :func:`measured` has it; of one whose numbers are not one for each channel, one line a number.
 
     Example:
-        >>> parameter_lines(Parameter("k", (1.0, 2.0), (0.1, 0.1), "µT", ("x", "y")), ("x", "y"))
+        >>> parameter_lines(EffectParameter("k", (1.0, 2.0), (0.1, 0.1), "µT", ("x", "y")), ("x", "y"))
         ['(1.00 ± 0.10, 2.00 ± 0.10) µT']
         >>> parameter_lines(
-        ...     Parameter("jumps", (11.2, -1.2), (4.4, 0.6), "°", ("at 61.1 s", "at 103.2 s")), ("heading",)
+        ...     EffectParameter("jumps", (11.2, -1.2), (4.4, 0.6), "°", ("at 61.1 s", "at 103.2 s")), ("heading",)
         ... )
         ['at 61.1 s: 11.2 ± 4.4 °', 'at 103.2 s: −1.2 ± 0.6 °']
-        >>> parameter_lines(Parameter("lag", 1.5, None, "s"), ("x",))
+        >>> parameter_lines(EffectParameter("lag", 1.5, None, "s"), ("x",))
         ['1.50 s, standard error not estimated']
     """
     p = parameter
@@ -178,7 +178,7 @@ def parameter_lines(parameter: Parameter, channels: Sequence[str]) -> list[str]:
     return each if _known(p.standard_error) else [*each, term("number.no_error")]
 
 
-def _listed(parameter: Parameter) -> list[str]:
+def _listed(parameter: EffectParameter) -> list[str]:
     """What each number of a list is, and the number, with the digits and the power of ten of all."""
     p = parameter
     (values,) = _rows(p.value)
@@ -195,19 +195,19 @@ def _known(error: Number | None) -> bool:
     return any(math.isfinite(e) for row in _rows(error) for e in row)
 
 
-def named_lines(parameter: Parameter, channels: Sequence[str]) -> list[str]:
+def named_lines(parameter: EffectParameter, channels: Sequence[str]) -> list[str]:
     """The same with the parameter's name before the first."""
     first, *rest = parameter_lines(parameter, channels)
     own = parameter.components and tuple(parameter.components) != tuple(channels)
     return [f"{parameter_name(parameter)}{',' if own else ''} {first}", *rest]
 
 
-def largest(parameter: Parameter) -> str:
+def largest(parameter: EffectParameter) -> str:
     """How large a parameter is, in short: of a long list its largest number.
 
     Example:
         >>> names = ("∂B_x/∂x", "∂B_x/∂y", "∂B_x/∂z", "∂B_z/∂z")
-        >>> largest(Parameter("gradient", (0.1, 0.2, 0.3, -1.06), (0.6, 0.3, 0.3, 0.25), "µT/m", names))
+        >>> largest(EffectParameter("gradient", (0.1, 0.2, 0.3, -1.06), (0.6, 0.3, 0.3, 0.25), "µT/m", names))
         'gradient up to ∂B_z/∂z: −1.06 ± 0.25 µT/m'
     """
     p = parameter
@@ -282,11 +282,11 @@ def improvement(before: float, after: float, unit: str) -> str:
     return f"{sizes} ({told})"
 
 
-def behind(candidate: Candidate) -> str:
+def behind(candidate: CandidateScore) -> str:
     """How far a candidate is behind the first one, in nats.
 
     Example:
-        >>> behind(Candidate("hard_iron_step", (), "", 72.3, 12.0, behind=30.25))
+        >>> behind(CandidateScore("hard_iron_step", (), "", 72.3, 12.0, behind=30.25))
         '30.2'
     """
     return size(candidate.behind) if math.isfinite(candidate.behind) else term("evidence.not_possible")

@@ -12,15 +12,15 @@ from markupsafe import Markup
 from mkc_torch._parallel.pool import shared
 from mkc_torch._words.typesetting import several, typeset
 from mkc_torch.diagnosis.plot.curves import CURVE_COLORS
-from mkc_torch.diagnosis.result import Candidate, Diagnosis, Separability
+from mkc_torch.diagnosis.result import CandidateScore, Diagnosis, Separability
 from mkc_torch.report.diagnosis import (
     evidence,
     findings,
     forcing_pictures,
-    lead,
     noise,
     numbers,
     pictures,
+    summary,
     unseen,
     verdict,
     world,
@@ -39,7 +39,7 @@ class Bar(NamedTuple):
     """A candidate with its rank and the length of its bar in per cent."""
 
     rank: int
-    candidate: Candidate
+    candidate: CandidateScore
     percent: float
 
 
@@ -79,7 +79,7 @@ def diagnosis_report(diagnosis: Diagnosis, *, note: str = "") -> str:
         numbers=numbers,
         noise=noise,
         top=verdict,
-        lead=lead.lead(d),
+        lead=summary.summary(d),
         unseen=unseen,
         world=world,
         several=several,
@@ -107,7 +107,7 @@ def _markup(svg: str | None) -> Markup | None:
     return None if svg is None else Markup(svg)
 
 
-def bars(candidates: tuple[Candidate, ...]) -> list[Bar]:
+def bars(candidates: tuple[CandidateScore, ...]) -> list[Bar]:
     """The best candidates in the order of their gains, with bars in proportion to those."""
     shown = sorted(candidates[:_MOST_SHOWN], key=lambda c: -c.log_likelihood_gain)
     best = max((c.log_likelihood_gain for c in shown), default=0.0)

@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-__all__ = ["BETWEEN", "LEFT", "RIGHT", "ROW", "WIDTH", "Grid", "title"]
+__all__ = ["BETWEEN", "LEFT", "RIGHT", "ROW", "WIDTH", "PanelGrid", "title"]
 
 WIDTH = 10.0  # inches, as wide as the page
 ROW, LEFT, RIGHT, BETWEEN = 1.75, 0.72, 0.1, 0.3  # inches
@@ -15,7 +15,7 @@ _OWN_AXIS = 0.45
 
 
 @dataclass(frozen=True)
-class Grid:
+class PanelGrid:
     """Panels placed by hand, in inches: an automatic layout takes longer than all of the drawing.
 
     ``own_axes`` says that each panel has numbers and a name of its own.

@@ -21,7 +21,7 @@ from mkc_torch.diagnosis.plot.residual import (
     onsets,
 )
 from mkc_torch.diagnosis.result import Diagnosis, Finding
-from mkc_torch.report.diagnosis.panels import LEFT, Grid, title
+from mkc_torch.report.diagnosis.panels import LEFT, PanelGrid, title
 from mkc_torch.report.drawing import svg
 
 __all__ = ["Panel", "driver_panels", "floors", "numbered", "of_finding", "over_states", "over_time"]
@@ -48,7 +48,7 @@ def over_time(diagnosis: Diagnosis) -> str:
     t, findings = diagnosis.traces, diagnosis.findings
     rows, columns = min(len(t.channels), _MOST_ROWS), 2 if findings else 1
     above, known = numbered(diagnosis), floors(diagnosis)
-    grid = Grid(rows, columns, top=0.55 if above else 0.35, below=0.42)
+    grid = PanelGrid(rows, columns, top=0.55 if above else 0.35, below=0.42)
     with style():
         figure = grid.figure()
         for row in range(rows):
@@ -89,7 +89,7 @@ def of_finding(diagnosis: Diagnosis, index: int) -> str | None:
         return None
     beside = curve is not None and len(panels) == 1
     above = int(curve is not None and not beside)
-    grid = Grid(len(panels) + above, 3 if beside else 2, top=0.3, below=0.72)
+    grid = PanelGrid(len(panels) + above, 3 if beside else 2, top=0.3, below=0.72)
     with style():
         figure = grid.figure()
         for row, panel in enumerate(panels, above):

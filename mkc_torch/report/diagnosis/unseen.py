@@ -6,9 +6,9 @@ import math
 
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain
-from mkc_torch.diagnosis.findings.worth import SMALL, Confirmation, change, confirmation, vetoed
-from mkc_torch.diagnosis.result import Diagnosis, HeldOut, Sizes
-from mkc_torch.diagnosis.world import World
+from mkc_torch.diagnosis.environment import NoiseEnvironment
+from mkc_torch.diagnosis.findings.grading import SMALL, Confirmation, change, confirmation, vetoed
+from mkc_torch.diagnosis.result import Diagnosis, HeldOut, ResidualSizes
 from mkc_torch.report.diagnosis.numbers import improvement
 from mkc_torch.report.words.numbers import size
 
@@ -72,14 +72,14 @@ def left(held_out: HeldOut) -> str:
     return "" if not held_out.left or _within(held_out.left) in better(held_out) else held_out.left
 
 
-def residuals(held_out: HeldOut, world: World) -> list[str]:
+def residuals(held_out: HeldOut, world: NoiseEnvironment) -> list[str]:
     """The residual before and after, an output a line, each in its own unit and beside its noise floor.
 
     Example:
-        >>> each = {"angle": Sizes(0.02, 0.01, "rad"), "rate": Sizes(0.3, 0.3, "rad/s")}
-        >>> residuals(HeldOut(0.3, (0.2, 0.4), 0.3, 0.3, "", each), World())
+        >>> each = {"angle": ResidualSizes(0.02, 0.01, "rad"), "rate": ResidualSizes(0.3, 0.3, "rad/s")}
+        >>> residuals(HeldOut(0.3, (0.2, 0.4), 0.3, 0.3, "", each), NoiseEnvironment())
         ['angle 0.0200 → 0.0100 rad (50 % less)', 'rate 0.300 → 0.300 rad/s (no change)']
-        >>> residuals(HeldOut(0.3, (0.2, 0.4), 0.9, 0.5, "µT"), World())
+        >>> residuals(HeldOut(0.3, (0.2, 0.4), 0.9, 0.5, "µT"), NoiseEnvironment())
         ['residual 0.900 → 0.500 µT (44 % less)']
     """
     if not held_out.outputs:
@@ -88,7 +88,7 @@ def residuals(held_out: HeldOut, world: World) -> list[str]:
     return [_of_output(name, sizes, world) for name, sizes in held_out.outputs.items()]
 
 
-def _of_output(name: str, sizes: Sizes, world: World) -> str:
+def _of_output(name: str, sizes: ResidualSizes, world: NoiseEnvironment) -> str:
     told = improvement(sizes.before, sizes.after, sizes.unit)
     floor = next((one.noise_floor for one in world.follows if one.output == name), math.nan)
     if math.isfinite(floor):
@@ -103,7 +103,9 @@ def residual_of_all(diagnosis: Diagnosis) -> list[str]:
     if len(held) == len(d.findings) and all(one.outputs for one in held) and held:
         first, last = held[0].outputs, held[-1].outputs
         both = {
-            name: Sizes(sizes.before, last[name].after, sizes.unit) for name, sizes in first.items() if name in last
+            name: ResidualSizes(sizes.before, last[name].after, sizes.unit)
+            for name, sizes in first.items()
+            if name in last
         }
         return [_of_output(name, sizes, d.world) for name, sizes in both.items()]
     if len(d.traces.channels) > 1 and not d.traces.unit:

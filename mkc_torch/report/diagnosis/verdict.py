@@ -10,8 +10,8 @@ from typing import Literal
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import capital, plain, several
 from mkc_torch.diagnosis.findings.advice import nothing_shows
-from mkc_torch.diagnosis.findings.following import follows_all
-from mkc_torch.diagnosis.findings.worth import carries_over, small, worth_correcting
+from mkc_torch.diagnosis.findings.grading import small, transfers, worth_correcting
+from mkc_torch.diagnosis.findings.misfit import follows_all
 from mkc_torch.diagnosis.result import Diagnosis, Finding
 from mkc_torch.diagnosis.stop import notices
 from mkc_torch.report.diagnosis.findings import finding_name, inseparable, rivals, unrecorded, with_names
@@ -187,10 +187,10 @@ def _ids(diagnosis: Diagnosis) -> set[str]:
 def apply_command(diagnosis: Diagnosis) -> str:
     """The command that uses on another recording what was found; empty where nothing found is of use there."""
     d = diagnosis
-    if not any(carries_over(f) for f in d.findings):
+    if not any(transfers(f) for f in d.findings):
         return ""
     own = {
         "magnetometer": " --output corrected.csv",
-        "simulated": " --simulated NEW_SIM.csv --output corrected.csv",
+        "simulated": " --simulator-output NEW_SIM.csv --output corrected.csv",
     }.get(d.simulation, f" --simulation FILE.py:{plain(d.simulation) or 'CLASS'} --output simulated.csv")
     return f"mkc apply model.json NEW.csv{own}"

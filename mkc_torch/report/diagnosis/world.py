@@ -7,8 +7,8 @@ import math
 from mkc_torch._support.unit_text import tidy
 from mkc_torch._words.terms import term
 from mkc_torch._words.typesetting import plain
+from mkc_torch.diagnosis.environment import GoodnessOfFit, NoiseEnvironment, ProcessNoise
 from mkc_torch.diagnosis.result import Diagnosis, Table
-from mkc_torch.diagnosis.world import Follows, Push, World
 from mkc_torch.report.diagnosis.numbers import measured
 from mkc_torch.report.diagnosis.recordings import recording_called
 from mkc_torch.report.words.numbers import number, size
@@ -55,11 +55,11 @@ def output_lines(diagnosis: Diagnosis) -> list[str]:
     return [*told, *([term("world.more_outputs", count=more)] if more else []), *beside]
 
 
-def _followed(one: Follows, *, lost: bool) -> str:
+def _followed(one: GoodnessOfFit, *, lost: bool) -> str:
     """How an output is followed; of one that is not, what a trivial prediction reaches.
 
     Example:
-        >>> one = Follows("angle", "rad", 0.0049, 0.35, 0.9998, 0.005, "declared", 0.35, 0.02)
+        >>> one = GoodnessOfFit("angle", "rad", 0.0049, 0.35, 0.9998, 0.005, "declared", 0.35, 0.02)
         >>> _followed(one, lost=False)
         'angle follows to 0.00490 rad; noise floor 0.00500 rad (declared); explains 99.98 % of its variation'
     """
@@ -77,7 +77,7 @@ def _followed(one: Follows, *, lost: bool) -> str:
     return term(key, output=plain(one.output), residual=_sized(one.residual, one.unit), floor=_floor(one), share=share)
 
 
-def _floor(one: Follows) -> str:
+def _floor(one: GoodnessOfFit) -> str:
     if not math.isfinite(one.noise_floor):
         return term("world.floor_unknown")
     return term("world.floor", size=_sized(one.noise_floor, one.unit), source=term(_SOURCES[one.floor_source]))
@@ -89,7 +89,7 @@ def _sized(value: float, unit: str) -> str:
     return f"{size(value)} {plain(unit)}".rstrip()
 
 
-def follows_table(world: World) -> Table | None:
+def follows_table(world: NoiseEnvironment) -> Table | None:
     """The numbers of how each output is followed; None where that was not asked."""
     if not world.follows:
         return None
@@ -121,15 +121,15 @@ _FOLLOWS_COLUMNS = (
 )
 
 
-def push_sentence(push: Push) -> str:
+def push_sentence(push: ProcessNoise) -> str:
     """What pushes a state, or is added to an output, in plain words.
 
     Example:
-        >>> push_sentence(Push("rate", True, 0.7, 0.2284, 0.021, "rad/s²", 300.0))
+        >>> push_sentence(ProcessNoise("rate", True, 0.7, 0.2284, 0.021, "rad/s²", 300.0))
         'Something unrecorded pushes the rate of `rate`: 0.228 ± 0.021 rad/s², for about 0.7 s at a time.'
-        >>> push_sentence(Push("rate", True, 0.0, 0.2284, 0.021, "rad/s²", 300.0))
+        >>> push_sentence(ProcessNoise("rate", True, 0.0, 0.2284, 0.021, "rad/s²", 300.0))
         'Something unrecorded pushes the rate of `rate`: 0.228 ± 0.021 rad/s², anew at each sample.'
-        >>> push_sentence(Push("angle", False, 30.0, 0.01, 0.002, "rad", 12.0))
+        >>> push_sentence(ProcessNoise("angle", False, 30.0, 0.01, 0.002, "rad", 12.0))
         'Something slow is added to `angle` beside its noise: 0.0100 ± 0.0020 rad, for about 30 s at a time.'
     """
     told = measured(push.size, push.standard_error, tidy(push.unit))[0]
@@ -137,7 +137,7 @@ def push_sentence(push: Push) -> str:
     return term("world.push" if push.at_rate else "world.slow", place=plain(push.place), size=told, lasts=lasts)
 
 
-def pushes_table(world: World) -> Table | None:
+def pushes_table(world: NoiseEnvironment) -> Table | None:
     """The statistician's numbers of the pushes; None where there are none."""
     if not world.pushes:
         return None
@@ -154,23 +154,23 @@ def pushes_table(world: World) -> Table | None:
     return Table(term("section.pushes"), columns, rows, term("world.pushes_note"))
 
 
-def between_sentence(world: World) -> str:
+def between_sentence(world: NoiseEnvironment) -> str:
     """What inputs do between samples; empty where that was not asked.
 
     Example:
-        >>> between_sentence(World(between={"torque": "held", "force": "linear"}))
+        >>> between_sentence(NoiseEnvironment(input_hold={"torque": "held", "force": "linear"}))
         'Between samples `torque` is held, `force` goes straight.'
     """
-    each = [term(_BETWEEN[how], input=plain(name)) for name, how in world.between.items()]
+    each = [term(_BETWEEN[how], input=plain(name)) for name, how in world.input_hold.items()]
     return term("world.between", inputs=", ".join(each)) if each else ""
 
 
-def offset_sentences(world: World) -> list[str]:
+def offset_sentences(world: NoiseEnvironment) -> list[str]:
     """The offsets of each output in several recordings.
 
     Example:
-        >>> from mkc_torch.diagnosis.world import Offset
-        >>> offset_sentences(World(offsets=(Offset("speed", "m/s", 1, "a.csv", 0.3, 0.001),)))
+        >>> from mkc_torch.diagnosis.environment import Offset
+        >>> offset_sentences(NoiseEnvironment(offsets=(Offset("speed", "m/s", 1, "a.csv", 0.3, 0.001),)))
         ['Offset of speed in each recording: recording 1 (a.csv): 0.3000 ± 0.0010 m/s.']
     """
     told: dict[str, list[str]] = {}

@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 
 from mkc_torch._words.terms import term
-from mkc_torch.calibration.result import Calibration, RestBias, Spread
+from mkc_torch.calibration.result import Calibration, ResidualSpread, RestBias
 from mkc_torch.density.tails import percent_with_error
-from mkc_torch.recording.disturbance import Interval
+from mkc_torch.recording.disturbance import RejectedInterval
 
 _MOST_DECIMALS = 9
 _LEAST, _MOST = 0.01, 1e6
@@ -134,7 +134,7 @@ def share(value: float) -> str:
     return f"{100 * value:.{1 if 0 < value < 0.0995 or 0.99 < value < 1 else 0}f} %"
 
 
-def change(before: Spread, after: Spread, unit: str) -> str:
+def change(before: ResidualSpread, after: ResidualSpread, unit: str) -> str:
     """The robust residual before and after."""
     return f"{size(before.robust)} → {size(after.robust)} {unit}".rstrip()
 
@@ -160,15 +160,15 @@ def noise(calibration: Calibration) -> str:
     return term("noise.along_the_field", size=f"{size(0.5 * c.radius * c.d)} {c.unit}", kind=kind)
 
 
-def when(intervals: Sequence[Interval], unit: str = "s") -> str:
+def when(intervals: Sequence[RejectedInterval], unit: str = "s") -> str:
     """Intervals of time, or of rows, as one phrase; empty where there are none.
 
     Example:
-        >>> when([Interval(12.13, 15.3)]), when([Interval(0, 1), Interval(5, 5.5)])
+        >>> when([RejectedInterval(12.13, 15.3)]), when([RejectedInterval(0, 1), RejectedInterval(5, 5.5)])
         ('between 12.1 s and 15.3 s', 'from 0.0 to 1.0 s and from 5.0 to 5.5 s')
-        >>> when([Interval(0, 1), Interval(5, 5.5), Interval(9, 9.5), Interval(20, 24)])
+        >>> when([RejectedInterval(0, 1), RejectedInterval(5, 5.5), RejectedInterval(9, 9.5), RejectedInterval(20, 24)])
         'in 4 intervals, the longest from 20.0 to 24.0 s'
-        >>> when([Interval(101, 140)], "row")
+        >>> when([RejectedInterval(101, 140)], "row")
         'between row 101 and row 140'
     """
     rows = unit == "row"

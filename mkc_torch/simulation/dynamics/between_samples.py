@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from mkc_torch.simulation.protocol import Clock
+from mkc_torch.simulation.protocol import SignalTimes
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -18,7 +18,7 @@ _POINTS = 6
 
 
 def inputs_between(
-    values: Float[Tensor, "N u"], how: str, time: Float[Tensor, " N"], begins: Bool[Tensor, " N"], clock: Clock
+    values: Float[Tensor, "N u"], how: str, time: Float[Tensor, " N"], begins: Bool[Tensor, " N"], clock: SignalTimes
 ) -> Float[Tensor, "S u"]:
     """Values at the moments of a clock: "held" at the sample before, "linear", or "smooth".
 
@@ -34,7 +34,7 @@ def inputs_between(
 
 
 def smooth_between(
-    values: Float[Tensor, "N u"], time: Float[Tensor, " N"], begins: Bool[Tensor, " N"], clock: Clock
+    values: Float[Tensor, "N u"], time: Float[Tensor, " N"], begins: Bool[Tensor, " N"], clock: SignalTimes
 ) -> Float[Tensor, "S u"]:
     """Values at the moments of a clock, by the polynomial through the six nearest samples of the same run.
 
@@ -48,7 +48,7 @@ def smooth_between(
 
     Example:
         >>> time = torch.arange(0.0, 10.0, dtype=torch.float64)
-        >>> clock = Clock(time[:-1] + 0.5, torch.arange(9), torch.arange(1, 10), torch.full((9,), 0.5).double())
+        >>> clock = SignalTimes(time[:-1] + 0.5, torch.arange(9), torch.arange(1, 10), torch.full((9,), 0.5).double())
         >>> found = smooth_between(torch.sin(time).unsqueeze(-1), time, time == 0.0, clock)
         >>> bool((found[3:6, 0] - torch.sin(time[3:6] + 0.5)).abs().max() < 5e-3)
         True

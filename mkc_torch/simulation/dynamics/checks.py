@@ -15,10 +15,10 @@ from mkc_torch.simulation.parameter import SimulationError
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["Moments", "check_functions"]
+__all__ = ["SampledStates", "check_functions"]
 
 
-class Moments(NamedTuple):
+class SampledStates(NamedTuple):
     """Times in s with the states, the inputs and the runs then."""
 
     time: Float[Tensor, " S"]
@@ -28,7 +28,7 @@ class Moments(NamedTuple):
 
 
 def check_functions(
-    system: Equations, p: Names, stations: Moments, samples: Moments, channels: tuple[str, ...]
+    system: Equations, p: Names, stations: SampledStates, samples: SampledStates, channels: tuple[str, ...]
 ) -> None:
     """Refuse functions that do not fit the names of the system.
 
@@ -57,7 +57,7 @@ def check_functions(
     values = [found[s] for s in system.states] if isinstance(found, Mapping) else list(found)
     for state, value in zip(system.states, values, strict=True):
         check_value(f"{system.name}.derivative: the rate of `{state}`", value, stations.time, x, p)
-    acting = system.actuated(stations.time, u, p, stations.run)
+    acting = system.actuator(stations.time, u, p, stations.run)
     for name in system.inputs:
         if name not in acting:
             raise SimulationError(

@@ -33,7 +33,7 @@ class DynamicsCorrection:
 
     def __init__(self, prepared: PreparedDynamics, first: float | None = None) -> None:
         self.prepared = prepared
-        self.first = prepared.system.starts_from if first is None else first
+        self.first = prepared.system.initial_window if first is None else first
         self.time = self.prepared.time
         self.ports = self.prepared.ports
 

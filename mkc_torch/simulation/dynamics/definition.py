@@ -29,9 +29,9 @@ class Dynamics:
         parameters: name to value to start from, or :class:`Parameter`.
         initial: of states that are not measured, a guess of their first value; default 0.
         units: of states and inputs.
-        between: what an input does between two samples: "held" at the earlier one, "linear", or "smooth", a polynomial
+        input_hold: what an input does between two samples: "held" at the earlier one, "linear", or "smooth", a polynomial
             of fifth degree through six neighbours, for signals that were sampled a few times a period.
-        segment: in s, after which a trajectory may begin anew, for systems so unstable or chaotic that their start does
+        restart_after: in s, after which a trajectory may begin anew, for systems so unstable or chaotic that their start does
             not determine them; None for never.
         step: greatest step of the computation in s; None for what the recording's samples ask for.
         starts_from: in s, how much of each run of a new recording its first states are estimated from, so that what
@@ -61,10 +61,10 @@ class Dynamics:
     parameters: Mapping[str, float | Parameter] = {}
     initial: Mapping[str, float] = {}
     units: Mapping[str, str] = {}
-    between: str = "linear"
-    segment: float | None = None
+    input_hold: str = "linear"
+    restart_after: float | None = None
     step: float | None = None
-    starts_from: float | None = None
+    initial_window: float | None = None
     joins_experiments: bool = True
 
     def derivative(self, time: Tensor, x: Any, u: Any, p: Any) -> Mapping[str, Tensor] | Sequence[Tensor]:
@@ -85,7 +85,7 @@ class Dynamics:
         """What is measured, by the columns' names; by default the states themselves."""
         return vars(x)
 
-    def actuated(self, time: Tensor, u: Any, p: Any, run: Tensor) -> Mapping[str, Tensor]:  # noqa: ARG002
+    def actuator(self, time: Tensor, u: Any, p: Any, run: Tensor) -> Mapping[str, Tensor]:  # noqa: ARG002
         """What becomes of the inputs before they act, by their names; by default nothing.
 
         Args:
@@ -96,7 +96,7 @@ class Dynamics:
         """
         return vars(u)
 
-    def sensed(self, time: Tensor, y: Mapping[str, Tensor], p: Any, run: Tensor) -> Mapping[str, Tensor]:  # noqa: ARG002
+    def sensor(self, time: Tensor, y: Mapping[str, Tensor], p: Any, run: Tensor) -> Mapping[str, Tensor]:  # noqa: ARG002
         """What sensors make of the outputs, by the columns' names; by default nothing.
 
         Args:

@@ -17,9 +17,9 @@ from torch import Tensor
 from mkc_torch._support.order_statistic import robust_scale
 from mkc_torch.nonlinear import NoFitError, fit
 from mkc_torch.simulation.continuation import Continuation
-from mkc_torch.simulation.dynamics.disturbances import observer_of, usual_size
 from mkc_torch.simulation.dynamics.flow import flow_along
 from mkc_torch.simulation.dynamics.kalman import Flow
+from mkc_torch.simulation.dynamics.noise_selection import observer_of, usual_size
 from mkc_torch.simulation.dynamics.observer import Disturbance, Observable, Observer
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 
-__all__ = ["floor_of", "over_short_horizons", "strong_observer", "strongly_observed", "without_noise"]
+__all__ = ["floor_of", "multiple_shooting_start", "strong_observer", "strongly_observed", "without_noise"]
 
 _CORRECTIONS = (100.0, 10.0)
 """Sizes of the pushes that the corrections are for, over that at which they move an output by its noise."""
@@ -44,7 +44,7 @@ _LOST = 1e6
 _STEPS = 60
 
 
-def over_short_horizons(
+def multiple_shooting_start(
     prepared: Observable, theta: Float[Tensor, " p"], *, shortest: bool = False
 ) -> Float[Tensor, " p"] | None:
     """Parameters that predict over short horizons, from a guess that may be ten times off; None where there are none.

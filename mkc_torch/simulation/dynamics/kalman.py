@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 __all__ = [
-    "End",
+    "FilterEnd",
+    "FilterStart",
     "Filtered",
     "Flow",
     "Models",
     "Parts",
-    "Start",
     "filtered",
     "robust_likelihood",
     "run",
@@ -177,7 +177,7 @@ class Models:
 
 
 @dataclass(frozen=True)
-class Start:
+class FilterStart:
     """What is known at one end of each stretch: states and lasting disturbances, and their covariance."""
 
     state: Float[np.ndarray, "G B k"]
@@ -185,7 +185,7 @@ class Start:
 
 
 @dataclass(frozen=True)
-class End(Start):
+class FilterEnd(FilterStart):
     """What is known after the last sample of each stretch.
 
     Attributes:
@@ -213,7 +213,7 @@ class Filtered:
     posterior: Float[np.ndarray, "L G B k k"]
 
 
-def start_of(spread: Float[np.ndarray, "G B n"], models: Models) -> Start:
+def start_of(spread: Float[np.ndarray, "G B n"], models: Models) -> FilterStart:
     """States about where the trajectory has them, and disturbances as they are without any sample."""
     G, B, n = spread.shape
     D = models.place.shape[1]
@@ -221,7 +221,7 @@ def start_of(spread: Float[np.ndarray, "G B n"], models: Models) -> Start:
     own, index = np.arange(n), n + np.arange(D)
     P[..., own, own] = spread**2
     P[..., index, index] = models.size**2
-    return Start(np.zeros((G, B, n + D)), P)
+    return FilterStart(np.zeros((G, B, n + D)), P)
 
 
 def filtered(flow: Parts, models: Models, *, keep: bool = False) -> Filtered:
@@ -229,7 +229,9 @@ def filtered(flow: Parts, models: Models, *, keep: bool = False) -> Filtered:
     return run(flow, models, keep=keep)[0]
 
 
-def run(flow: Parts, models: Models, *, keep: bool = False, start: Start | None = None) -> tuple[Filtered, End]:
+def run(
+    flow: Parts, models: Models, *, keep: bool = False, start: FilterStart | None = None
+) -> tuple[Filtered, FilterEnd]:
     """What the filters leave, and what is known after the last sample of each stretch.
 
     Args:
@@ -246,7 +248,7 @@ def run(flow: Parts, models: Models, *, keep: bool = False, start: Start | None 
     return _run(flow, models, start, keep=keep, through=True)
 
 
-def _run(flow: Parts, models: Models, start: Start, *, keep: bool, through: bool) -> tuple[Filtered, End]:
+def _run(flow: Parts, models: Models, start: FilterStart, *, keep: bool, through: bool) -> tuple[Filtered, FilterEnd]:
     N, G, m = flow.new.shape
     B, k = len(models), start.state.shape[-1]
     step = flow.step[:, :, None, None]
@@ -261,7 +263,7 @@ def _run(flow: Parts, models: Models, start: Start, *, keep: bool, through: bool
     if compiled is None:
         end = _sample_by_sample(flow, models, start, phi, renewed, found, keep=keep, through=through)
     else:
-        end = End(start.state.copy(), start.covariance.copy(), np.tile(np.eye(k), (G if through else 0, B, 1, 1)))
+        end = FilterEnd(start.state.copy(), start.covariance.copy(), np.tile(np.eye(k), (G if through else 0, B, 1, 1)))
         whole = [
             flow.carried, flow.pushed, flow.shift, phi, renewed, flow.seen, flow.new, flow.counts, models.white,
             models.place, models.sensor**2,
@@ -277,14 +279,14 @@ def _run(flow: Parts, models: Models, start: Start, *, keep: bool, through: bool
 def _sample_by_sample(
     flow: Parts,
     models: Models,
-    start: Start,
+    start: FilterStart,
     phi: Float[np.ndarray, "L-1 G B D"],
     renewed: Float[np.ndarray, "L-1 G B D"],
     found: Filtered,
     *,
     keep: bool,
     through: bool,
-) -> End:
+) -> FilterEnd:
     """What :func:`filter_samples` does, all stretches and models at once in NumPy; writes into ``found``."""
     N, G, m = flow.new.shape
     n, p, B = flow.carried.shape[2], flow.pushed.shape[-1], len(models)
@@ -337,7 +339,7 @@ def _sample_by_sample(
                 left = left - gain[..., None] * (c[..., None, :] @ left)
         if keep:
             found.after[row], found.posterior[row] = state, P
-    return End(state, P, left)
+    return FilterEnd(state, P, left)
 
 
 def robust_likelihood(
@@ -358,7 +360,7 @@ def robust_likelihood(
         counts: which innovations count.
         reach: how far from what is predicted an outlier may be.
         free: whether the scale is profiled out.
-        least: scale of each model at least, where it is.
+        lower: scale of each model at least, where it is.
     """
     B = found.standard.shape[2]
     used = counts > 0

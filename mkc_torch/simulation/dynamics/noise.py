@@ -11,25 +11,31 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.quantum import rounding_of
-from mkc_torch.simulation.dynamics.disturbances import Disturbed, disturbed, models_of, observer_of, resized
 from mkc_torch.simulation.dynamics.first_fit import floor_of, without_noise
 from mkc_torch.simulation.dynamics.flow import flow_of, plausible_sizes
 from mkc_torch.simulation.dynamics.kalman import smoothed
+from mkc_torch.simulation.dynamics.noise_selection import (
+    SelectedNoise,
+    models_of,
+    observer_of,
+    rescale_noise_model,
+    select_noise_model,
+)
 from mkc_torch.simulation.dynamics.observer import Observable, Observer
-from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
+from mkc_torch.simulation.dynamics.parallel_filter import filtered_whole
 from mkc_torch.simulation.protocol import Changes, Nearby
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["NoiseOfTheWorld", "Pushed", "likeliest_noise", "noise_of", "pushes_over_time"]
+__all__ = ["DisturbancePath", "StateSpaceNoise", "likeliest_noise", "noise_of", "pushes_over_time"]
 
 
 @dataclass(frozen=True)
-class NoiseOfTheWorld:
+class StateSpaceNoise:
     """What is known of it, and the observer for it; None where the sensors' white noise is enough."""
 
-    disturbed: Disturbed
+    disturbed: SelectedNoise
     observer: Observer | None
 
 
@@ -42,8 +48,8 @@ def likeliest_noise(
     declared: Mapping[str, float],
     least: float,
     most: int,
-    known: Disturbed | None = None,
-) -> NoiseOfTheWorld | None:
+    known: SelectedNoise | None = None,
+) -> StateSpaceNoise | None:
     """The likeliest noise along a simulation's trajectory; None where there is no trajectory.
 
     White noise that is not declared is nowhere smaller than what the recording's steps add.
@@ -62,29 +68,29 @@ def likeliest_noise(
     largest = plausible_sizes(prepared, theta, changes, near)
     rounding = rounding_of(prepared.measured).tolist()
     if known is not None and known.disturbances:
-        found = resized(flow, names, channels, known, least, largest, rounding)
-        return NoiseOfTheWorld(found, observer_of(flow, found.disturbances, found.sensor, names, channels))
+        found = rescale_noise_model(flow, names, channels, known, least, largest, rounding)
+        return StateSpaceNoise(found, observer_of(flow, found.disturbances, found.sensor, names, channels))
     floor = floor_of(prepared)
     if without_noise(floor):
         return None
     given = [name in declared for name in prepared.channels]
     white = [max(size, step) for size, step in zip(floor.tolist(), rounding, strict=True)]
     sensor = floor.new_tensor([declared.get(name, one) for name, one in zip(channels, white, strict=True)])
-    found = disturbed(flow, names, channels, sensor, given, least, most, largest, rounding)
-    return NoiseOfTheWorld(found, observer_of(flow, found.disturbances, found.sensor, names, channels))
+    found = select_noise_model(flow, names, channels, sensor, given, least, most, largest, rounding)
+    return StateSpaceNoise(found, observer_of(flow, found.disturbances, found.sensor, names, channels))
 
 
-def noise_of(prepared: Observable, declared: Mapping[str, float]) -> NoiseOfTheWorld | None:
+def noise_of(prepared: Observable, declared: Mapping[str, float]) -> StateSpaceNoise | None:
     """The noise that an observed simulation is under; None of one that runs freely."""
     observer = prepared.observer
     if observer is None:
         return None
     given = tuple(name in declared for name in prepared.channels)
-    return NoiseOfTheWorld(Disturbed(observer.disturbances, (), (), observer.sensor, 0.0, given), observer)
+    return StateSpaceNoise(SelectedNoise(observer.disturbances, (), (), observer.sensor, 0.0, given), observer)
 
 
 @dataclass(frozen=True)
-class Pushed:
+class DisturbancePath:
     """The course of one disturbance by all samples, (N,), and its standard error."""
 
     value: Float[Tensor, " N"]
@@ -92,8 +98,8 @@ class Pushed:
 
 
 def pushes_over_time(
-    prepared: Observable, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None, found: Disturbed
-) -> tuple[Pushed, ...]:
+    prepared: Observable, theta: Float[Tensor, " p"], changes: Changes, near: Nearby | None, found: SelectedNoise
+) -> tuple[DisturbancePath, ...]:
     """The courses of disturbances, in their order; none where there is no trajectory.
 
     What is new at each sample is given a short memory, of a sample's length, for its course to be seen.
@@ -109,5 +115,7 @@ def pushes_over_time(
     courses = []
     for number in range(len(lasting)):
         variance = np.maximum(covariance[:, n + number, n + number], 0.0)
-        courses.append(Pushed(torch.from_numpy(state[:, n + number].copy()), torch.from_numpy(np.sqrt(variance))))
+        courses.append(
+            DisturbancePath(torch.from_numpy(state[:, n + number].copy()), torch.from_numpy(np.sqrt(variance)))
+        )
     return tuple(courses)

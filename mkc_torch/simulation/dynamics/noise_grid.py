@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mkc_torch.simulation.dynamics.disturbances import usual_size
 from mkc_torch.simulation.dynamics.kalman import Flow
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel, longest_run
+from mkc_torch.simulation.dynamics.noise_selection import usual_size
 
 __all__ = ["NoiseGrid", "key_of"]
 

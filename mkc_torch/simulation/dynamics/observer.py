@@ -22,7 +22,7 @@ from mkc_torch.simulation.protocol import Answer, Changes, Nearby
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["CLIP", "Correcting", "Disturbance", "Observable", "Observer", "clipped", "clipped_slope"]
+__all__ = ["CLIP", "Disturbance", "Observable", "Observer", "ObserverJump", "clipped", "clipped_slope"]
 
 CLIP = 4.0
 """Standard deviations of what is new in a sample beyond which it moves the states no further: it may be an outlier."""
@@ -92,7 +92,7 @@ def clipped_slope(new: Float[Tensor, "N m"], spread: Float[Tensor, "N m"]) -> Fl
 
 
 @dataclass(frozen=True)
-class Correcting:
+class ObserverJump:
     """The jump of a trajectory's states at the samples.
 
     Attributes:
@@ -168,6 +168,6 @@ class Observable(Protocol):
     def trajectory(self, theta: Tensor, changes: Changes, near: Nearby | None = None) -> Trajectory: ...
     def answer(self, theta: Tensor, changes: Changes, near: Nearby | None = None) -> Answer: ...
     def rate(self, theta: Tensor, changes: Changes) -> Callable[[Tensor], Tensor]: ...
-    def jump(self, theta: Tensor, changes: Changes) -> Correcting | None: ...
+    def jump(self, theta: Tensor, changes: Changes) -> ObserverJump | None: ...
     def seen(self, theta: Tensor, changes: Changes) -> Tensor: ...
     def predicted(self, theta: Tensor) -> Callable[[Tensor], Tensor]: ...

@@ -41,9 +41,9 @@ class _Offset:
             raise AttributeError(name)
         return getattr(self.system, name)
 
-    def sensed(self, time: Tensor, y: Mapping[str, Tensor], p: Any, run: Tensor) -> Mapping[str, Tensor]:
+    def sensor(self, time: Tensor, y: Mapping[str, Tensor], p: Any, run: Tensor) -> Mapping[str, Tensor]:
         """What the system's sensors make of the outputs, and the offset of each recording."""
-        shown = dict(self.system.sensed(time, y, p, run))
+        shown = dict(self.system.sensor(time, y, p, run))
         recording = self.of_run[run]
         for one in self.own_offsets:
             there = (recording == one.recording).to(time.dtype)

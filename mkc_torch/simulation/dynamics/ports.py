@@ -14,12 +14,12 @@ from mkc_torch.effects.kinds import CELSIUS, kind_of
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.surroundings import surroundings
-from mkc_torch.simulation.protocol import Clock, Port, Sizes
+from mkc_torch.simulation.protocol import Port, SignalSizes, SignalTimes
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-__all__ = ["RATES", "Places", "common_unit", "memory_at"]
+__all__ = ["RATES", "PortContext", "common_unit", "memory_at"]
 
 _MEMORIES: Mapping[str, Mapping[str, bool]] = {
     "hysteretic rate": {"memory_of": False},
@@ -38,7 +38,7 @@ _HEIGHTS = ("height", "altitude", "elevation", "heave", "z")
 
 
 @dataclass(frozen=True)
-class Places:
+class PortContext:
     """A system on a recording, as far as its ports depend on it.
 
     Attributes:
@@ -54,7 +54,7 @@ class Places:
     channels: tuple[str, ...]
     kinematic: Mapping[str, str]
     guess: Float[Tensor, "N n"]
-    clock: Clock
+    clock: SignalTimes
     run: Int[Tensor, " N"]
 
     def ports(self) -> dict[str, Port]:
@@ -89,7 +89,7 @@ class Places:
                 kind="input",
                 parts={"own": name},
                 part_units={"own": self._unit_of(name)},
-                sizes={"own": Sizes.of(self.recording[name])},
+                sizes={"own": SignalSizes.of(self.recording[name])},
                 clock=self.clock,
                 run=self.run[self.clock.before],
             )
@@ -101,7 +101,7 @@ class Places:
 
     def _remembering(self, parts: Mapping[str, str]) -> tuple[str, ...]:
         """Kinds of ports with internal states that the rate of a state with these parts has."""
-        if self.system.segment is not None:
+        if self.system.restart_after is not None:
             return ()  # segments of one run would each begin without what the one before remembers
         needs = {"hysteretic rate": "position", "lagged rate": "own", "resonant rate": "flowing"}
         return tuple(kind for kind, part in needs.items() if part in parts)
@@ -157,12 +157,12 @@ class Places:
     def _surroundings(self) -> dict[str, str]:
         return surroundings(self.system)
 
-    def _sizes(self, state: str, parts: Mapping[str, str]) -> dict[str, Sizes]:
+    def _sizes(self, state: str, parts: Mapping[str, str]) -> dict[str, SignalSizes]:
         """Of the parts that are states, and of the surroundings how far the state is from them."""
         values = dict(zip(self.system.states, self.guess.unbind(-1), strict=True))
-        sizes = {part: Sizes.of(values[name]) for part, name in parts.items() if name in values}
+        sizes = {part: SignalSizes.of(values[name]) for part, name in parts.items() if name in values}
         if "surroundings" in parts:
-            sizes["surroundings"] = Sizes.of(values[state] - self.recording[parts["surroundings"]])
+            sizes["surroundings"] = SignalSizes.of(values[state] - self.recording[parts["surroundings"]])
         return sizes
 
     def _unit_of(self, name: str) -> str:

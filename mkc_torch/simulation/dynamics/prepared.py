@@ -16,23 +16,23 @@ from mkc_torch.nonlinear import GaussianPrior, load_forward_mode
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.continuation import Meaning, is_plain
 from mkc_torch.simulation.dynamics.between_samples import inputs_between
-from mkc_torch.simulation.dynamics.checks import Moments, check_functions
+from mkc_torch.simulation.dynamics.checks import SampledStates, check_functions
 from mkc_torch.simulation.dynamics.compiled.faithful import is_faithful
 from mkc_torch.simulation.dynamics.compiled.residual import CompiledDynamics, compiled_dynamics
 from mkc_torch.simulation.dynamics.equations import Equations
 from mkc_torch.simulation.dynamics.first_guess import despiked, first_guess
 from mkc_torch.simulation.dynamics.first_parameters import first_parameters
+from mkc_torch.simulation.dynamics.observed import ObservedDynamics
 from mkc_torch.simulation.dynamics.observer import Observer
-from mkc_torch.simulation.dynamics.ports import RATES, Places, common_unit
+from mkc_torch.simulation.dynamics.ports import RATES, PortContext, common_unit
 from mkc_torch.simulation.dynamics.refinement import FINEST, enough_parts
 from mkc_torch.simulation.dynamics.segments import beginnings, refuse_few
 from mkc_torch.simulation.dynamics.settings import HORIZON
 from mkc_torch.simulation.dynamics.trajectory import Grid, Trajectory, marched, solve, stations
 from mkc_torch.simulation.dynamics.user_functions import kinematic, namespace
-from mkc_torch.simulation.dynamics.watched import Watched
 from mkc_torch.simulation.names import Names
 from mkc_torch.simulation.parameter import Parameter
-from mkc_torch.simulation.protocol import Answer, Changes, Clock, FreeChange, Nearby, Port
+from mkc_torch.simulation.protocol import Answer, Changes, FreeChange, Nearby, Port, SignalTimes
 from mkc_torch.simulation.runs import experiment_runs
 from mkc_torch.simulation.undetermined import undetermined
 
@@ -47,7 +47,7 @@ _PATIENT = 2
 _NOUGHT = 1e-3
 
 
-class PreparedDynamics(Watched):
+class PreparedDynamics(ObservedDynamics):
     """A system of differential equations with the recording that answers it."""
 
     prior: GaussianPrior | None = None
@@ -66,7 +66,7 @@ class PreparedDynamics(Watched):
         }
         self.begins, self.labels = beginnings(recording, system)
         self.run = experiment_runs(recording)
-        self.between = dict.fromkeys(system.inputs, system.between)
+        self.input_hold = dict.fromkeys(system.inputs, system.input_hold)
         refuse_few(self.begins, system.name)
         self.kinematic = kinematic(system, self.known)
         self._lay_out(1)
@@ -103,7 +103,7 @@ class PreparedDynamics(Watched):
         self.grid = Grid(time, begins)
         early = before.repeat_interleave(3)
         at = torch.lerp(self.time[early], self.time[early + 1], share.flatten())
-        self.clock = Clock(at, early, early + 1, share.flatten())
+        self.clock = SignalTimes(at, early, early + 1, share.flatten())
         inputs = self.recording.stack(*self.system.inputs) if self.system.inputs else self.time.new_zeros(N, 0)
         self.inputs = self._between(inputs)
         self.inputs_at_rows = inputs
@@ -116,14 +116,14 @@ class PreparedDynamics(Watched):
         """Inputs at the stations."""
         columns = [
             inputs_between(inputs[:, [k]], how, self.time, self.begins, self.clock)
-            for k, how in enumerate(self.between.values())
+            for k, how in enumerate(self.input_hold.values())
         ]
         return torch.cat(columns, -1) if columns else inputs.new_zeros(len(self.clock.time), 0)
 
     def holding(self, between: Mapping[str, str]) -> PreparedDynamics:
         """The same with inputs that do something else between samples: "held", "linear" or "smooth", by their names."""
         other = copy.copy(self)
-        other.between = {**self.between, **between}
+        other.input_hold = {**self.input_hold, **between}
         other.inputs = other._between(self.inputs_at_rows)
         for known in ("_start", "warnings"):
             other.__dict__.pop(known, None)
@@ -159,7 +159,7 @@ class PreparedDynamics(Watched):
     @cached_property
     def ports(self) -> dict[str, Port]:
         """The rate of each state, exchange between two of the same unit, each input, and the outputs."""
-        places = Places(
+        places = PortContext(
             self.system, self.recording, self.channels, self.kinematic, self.guess[self.rows], self.clock, self.run
         )
         return places.ports()
@@ -412,14 +412,14 @@ class PreparedDynamics(Watched):
             for k, name in enumerate(self.system.inputs)
         }
         run = self.run[self.clock.before]
-        acting = self.system.actuated(self.clock.time, Names(**columns), self.parameters_of(theta), run)
+        acting = self.system.actuator(self.clock.time, Names(**columns), self.parameters_of(theta), run)
         return torch.stack([acting[name] for name in self.system.inputs], -1)
 
     def _outputs(self, theta: Tensor, states: Float[Tensor, "N w"]) -> Float[Tensor, "N m"]:
         p = self.parameters_of(theta)
         x = namespace(self.system.states, states[:, : len(self.system.states)])
         u = namespace(self.system.inputs, self.inputs_at_rows)
-        values = self.system.sensed(self.time, self.system.output(self.time, x, u, p), p, self.run)
+        values = self.system.sensor(self.time, self.system.output(self.time, x, u, p), p, self.run)
         return torch.stack([values[name] for name in self.channels], -1)
 
     def parameters_of(self, theta: Tensor) -> Names:
@@ -429,8 +429,8 @@ class PreparedDynamics(Watched):
         theta = self.time.new_tensor([one.value for one in self.known.values()])
         at = self.grid.spread(self.guess)
         first = at[::3][:1].expand(len(self.time), -1)
-        stations = Moments(self.clock.time, at, self.inputs, self.run[self.clock.before])
-        samples = Moments(self.time, first, self.inputs_at_rows, self.run)
+        stations = SampledStates(self.clock.time, at, self.inputs, self.run[self.clock.before])
+        samples = SampledStates(self.time, first, self.inputs_at_rows, self.run)
         check_functions(self.system, self.parameters_of(theta), stations, samples, self.channels)
 
     def _refine(self) -> None:

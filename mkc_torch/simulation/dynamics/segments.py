@@ -28,9 +28,9 @@ def beginnings(recording: Recording, system: Equations) -> tuple[Tensor, list[st
     if many:
         group = recording["experiment"]
         begins[1:] |= group[1:] != group[:-1]
-    if system.segment is not None:
+    if system.restart_after is not None:
         first = torch.where(begins, torch.arange(len(time)), 0).cummax(0).values
-        number = ((time - time[first]) / system.segment).floor()
+        number = ((time - time[first]) / system.restart_after).floor()
         begins[1:] |= number[1:] != number[:-1]
         begins &= ~_short_ends(begins, first)
     labels = []
@@ -40,7 +40,7 @@ def beginnings(recording: Recording, system: Equations) -> tuple[Tensor, list[st
             names = recording.labels.get("experiment")
             value = int(recording["experiment"][row])
             label = f" of {names[value] if names else value}"
-        if system.segment is not None:
+        if system.restart_after is not None:
             label += f", {float(time[row]):.4g} s"
         labels.append(label)
     return begins, labels

@@ -25,9 +25,9 @@ def check_names(system: Equations) -> None:
                 f"{system.name}: `{what}` should hold names but is the text {given!r}; write ({given!r},)."
             )
     names = [*system.states, *system.inputs, *system.parameters]
-    if system.between not in ("held", "linear", "smooth"):
+    if system.input_hold not in ("held", "linear", "smooth"):
         raise SimulationError(
-            f'{system.name}: `between` should be "held", "linear" or "smooth" but is {system.between!r}.'
+            f'{system.name}: `input_hold` should be "held", "linear" or "smooth" but is {system.input_hold!r}.'
         )
     if not system.states:
         raise SimulationError(f"{system.name} has no `states`; name them.")

@@ -17,12 +17,12 @@ import numpy as np
 from mkc_torch.simulation.dynamics.kalman import Flow, Models
 from mkc_torch.simulation.dynamics.loops.machine_code import machine_code
 from mkc_torch.simulation.dynamics.loops.whiten import whiten_samples
-from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
+from mkc_torch.simulation.dynamics.parallel_filter import filtered_whole
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-__all__ = ["Gains", "SeriesAlong", "gains_of", "joined", "relative_to", "whitened", "whitened_in_blocks"]
+__all__ = ["FilterGains", "SeriesAlong", "gains_of", "joined", "relative_to", "whitened", "whitened_in_blocks"]
 
 _CELLS = 24_000_000
 """Numbers of whitened series that are held at once: 192 MB."""
@@ -53,7 +53,7 @@ class SeriesAlong:
 
 
 @dataclass(frozen=True)
-class Gains:
+class FilterGains:
     """The filters of B models of the noise.
 
     Attributes:
@@ -76,7 +76,7 @@ def joined(*series: SeriesAlong) -> SeriesAlong:
     )
 
 
-def gains_of(flow: Flow, models: Models) -> Gains:
+def gains_of(flow: Flow, models: Models) -> FilterGains:
     """The gains of filters along a flow.
 
     Args:
@@ -101,7 +101,7 @@ def gains_of(flow: Flow, models: Models) -> Gains:
     L = np.linalg.cholesky(S)
     white = _lower_inverse(L) * used[:, None, :, None]
     spread = np.log(np.diagonal(L, axis1=-2, axis2=-1)) * used[:, None]
-    return Gains(models, gain, white, spread.sum((0, 2)))
+    return FilterGains(models, gain, white, spread.sum((0, 2)))
 
 
 def _lower_inverse(L: Float[np.ndarray, "*b m m"]) -> Float[np.ndarray, "*b m m"]:
@@ -115,7 +115,7 @@ def _lower_inverse(L: Float[np.ndarray, "*b m m"]) -> Float[np.ndarray, "*b m m"
     return inverse
 
 
-def whitened(flow: Flow, gains: Gains, series: SeriesAlong) -> Iterator[tuple[int, Float[np.ndarray, "N m K"]]]:
+def whitened(flow: Flow, gains: FilterGains, series: SeriesAlong) -> Iterator[tuple[int, Float[np.ndarray, "N m K"]]]:
     """The series under each model of the noise: the number of the model, and its innovations, of variance 1.
 
     Args:
@@ -134,7 +134,7 @@ def whitened(flow: Flow, gains: Gains, series: SeriesAlong) -> Iterator[tuple[in
 
 
 def whitened_in_blocks(
-    flow: Flow, gains: Gains, number: int, series: SeriesAlong, length: int
+    flow: Flow, gains: FilterGains, number: int, series: SeriesAlong, length: int
 ) -> Iterator[tuple[slice, Float[np.ndarray, "L m K"]]]:
     """The series under one model of the noise, some samples at a time: which samples, and their innovations.
 
@@ -220,7 +220,7 @@ def _seen(flow: Flow, models: Models) -> Float[np.ndarray, "N B m k"]:
     return C
 
 
-def _filtered(flow: Flow, gains: Gains, part: slice, series: SeriesAlong) -> Float[np.ndarray, "N B m K"]:
+def _filtered(flow: Flow, gains: FilterGains, part: slice, series: SeriesAlong) -> Float[np.ndarray, "N B m K"]:
     """Whiten in one stretch, or in stretches side by side: from states of 0, then from where the one before it ends."""
     N, m, K = series.new.shape
     compiled = machine_code(whiten_samples)
@@ -238,7 +238,7 @@ def _filtered(flow: Flow, gains: Gains, part: slice, series: SeriesAlong) -> Flo
 
 
 def _by_machine_code(
-    compiled: Callable[..., object], flow: Flow, gains: Gains, part: slice, series: SeriesAlong
+    compiled: Callable[..., object], flow: Flow, gains: FilterGains, part: slice, series: SeriesAlong
 ) -> Float[np.ndarray, "N B m K"]:
     models, (N, m, K) = gains.models.part(part), series.new.shape
     out = np.empty((len(models), N, m, K))
@@ -270,7 +270,7 @@ class _Stretches:
     shift: Float[np.ndarray, "L G n K"]
 
     @classmethod
-    def of(cls, flow: Flow, gains: Gains, part: slice, series: SeriesAlong, count: int) -> _Stretches:
+    def of(cls, flow: Flow, gains: FilterGains, part: slice, series: SeriesAlong, count: int) -> _Stretches:
         N = len(flow.new)
         models = gains.models.part(part)
         length = -(-N // count)

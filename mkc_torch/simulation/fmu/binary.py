@@ -282,7 +282,7 @@ class Binary:
             if jumped or ended:
                 raise self._failed(
                     f"{'resets its states' if jumped else 'ends its simulation'} at an event, which a diagnosis cannot "
-                    "follow: let its tool simulate the recording, and give what it wrote with `--simulated SIM.csv`"
+                    "follow: let its tool simulate the recording, and give what it wrote with `--simulator-output SIM.csv`"
                 )
             if not again:
                 break

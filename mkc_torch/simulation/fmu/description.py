@@ -14,7 +14,7 @@ from typing import Any
 from mkc_torch.simulation.fmu.units import unit_of
 from mkc_torch.simulation.parameter import Parameter
 
-__all__ = ["Description", "FmuError", "Quantity", "read_description", "the_library"]
+__all__ = ["Description", "FmuError", "FmuVariable", "read_description", "the_library"]
 
 _REAL = ("Real", "Float64")
 _EXTRA = 'FMUs are read by FMPy, which is not installed; install it with `pip install "mkc-torch[fmu]"`.'
@@ -25,7 +25,7 @@ class FmuError(ValueError):
 
 
 @dataclass(frozen=True)
-class Quantity:
+class FmuVariable:
     """A real number of the FMU.
 
     Attributes:
@@ -64,11 +64,11 @@ class Description:
     token: str
     identifier: str
     exchange: bool
-    states: tuple[Quantity, ...]
-    rates: tuple[Quantity, ...]
-    inputs: tuple[Quantity, ...]
-    outputs: tuple[Quantity, ...]
-    parameters: Mapping[Quantity, Parameter]
+    states: tuple[FmuVariable, ...]
+    rates: tuple[FmuVariable, ...]
+    inputs: tuple[FmuVariable, ...]
+    outputs: tuple[FmuVariable, ...]
+    parameters: Mapping[FmuVariable, Parameter]
     events: int
     derivatives: bool
     timeless: bool
@@ -110,7 +110,7 @@ def read_description(path: Path) -> Description:
     if exchange and not states:
         raise FmuError(
             f"{path}: this FMU has no continuous states, so there is no differential equation in it; let its tool "
-            "simulate the recording, and give what it wrote with `--simulated SIM.csv`."
+            "simulate the recording, and give what it wrote with `--simulator-output SIM.csv`."
         )
     if any(one is None or one.dimensions or one.type not in _REAL for one in [*rates, *states]):
         raise FmuError(f"{path}: a state of this FMU is no single real number; export its states one by one.")
@@ -145,7 +145,7 @@ def _read(path: Path) -> Any:
         if version not in ("2", "3"):
             raise FmuError(
                 f"{path}: this FMU is of FMI {version}; FMI 2.0 and 3.0 are read. Export it as one of these, or let "
-                "its tool simulate the recording, and give what it wrote with `--simulated SIM.csv`."
+                "its tool simulate the recording, and give what it wrote with `--simulator-output SIM.csv`."
             )
         # from a folder: of an archive that it fails to read it leaves the file open
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(path) as archive:
@@ -201,8 +201,8 @@ def _names(variables: Sequence[Any]) -> dict[int, str]:
     return found
 
 
-def _quantities(variables: Sequence[Any], names: Mapping[int, str]) -> tuple[Quantity, ...]:
-    return tuple(Quantity(names[id(one)], one.name, one.valueReference, _told(one, "unit")) for one in variables)
+def _quantities(variables: Sequence[Any], names: Mapping[int, str]) -> tuple[FmuVariable, ...]:
+    return tuple(FmuVariable(names[id(one)], one.name, one.valueReference, _told(one, "unit")) for one in variables)
 
 
 def _told(variable: Any, what: str) -> str:
@@ -210,7 +210,9 @@ def _told(variable: Any, what: str) -> str:
     return unit_of(value) if what == "unit" else value or ""
 
 
-def _parameters(path: Path, variables: Sequence[Any], names: Mapping[int, str]) -> Iterable[tuple[Quantity, Parameter]]:
+def _parameters(
+    path: Path, variables: Sequence[Any], names: Mapping[int, str]
+) -> Iterable[tuple[FmuVariable, Parameter]]:
     for one in variables:
         if one.causality != "parameter" or one.variability not in ("fixed", "tunable") or not _single(one):
             continue

@@ -14,8 +14,8 @@ from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.dynamics.definition import Dynamics
 from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
 from mkc_torch.simulation.fmu.cosimulation import Simulated
-from mkc_torch.simulation.fmu.description import Description, FmuError, Quantity, read_description
-from mkc_torch.simulation.fmu.evaluation import Evaluation, Moments
+from mkc_torch.simulation.fmu.description import Description, FmuError, FmuVariable, read_description
+from mkc_torch.simulation.fmu.evaluation import Evaluation, EvaluationPoints
 from mkc_torch.simulation.fmu.function import evaluated
 from mkc_torch.simulation.parameter import SimulationError
 
@@ -188,14 +188,14 @@ def _class_of(described: Description) -> type[FmuDynamics]:
     return type(described.name, (FmuDynamics,), body)
 
 
-def _probes(evaluation: Evaluation, first: NDArray[np.float64]) -> Moments:
+def _probes(evaluation: Evaluation, first: NDArray[np.float64]) -> EvaluationPoints:
     """A few moments about where the FMU starts; the same ones each time."""
     described = evaluation.description
     scattered = np.random.default_rng(0).uniform(0.1, 1.0, (_PROBES, len(first) + len(described.inputs)))
     n = len(first)
     states = first * (1.0 + 0.1 * scattered[:, :n]) + np.where(first == 0.0, scattered[:, :n], 0.0)
     values = np.array([one.value for one in described.parameters.values()])
-    return Moments(np.arange(_PROBES, dtype=np.float64), states, scattered[:, n:], values)
+    return EvaluationPoints(np.arange(_PROBES, dtype=np.float64), states, scattered[:, n:], values)
 
 
 def _is_timeless(evaluation: Evaluation, first: NDArray[np.float64]) -> bool:
@@ -204,13 +204,15 @@ def _is_timeless(evaluation: Evaluation, first: NDArray[np.float64]) -> bool:
         return False
     time, states, inputs, parameters = _probes(evaluation, first).parts
     for outputs in (False, True):
-        one, other = (evaluation.values(outputs, Moments(time + more, states, inputs, parameters)) for more in (0, 0.7))
+        one, other = (
+            evaluation.values(outputs, EvaluationPoints(time + more, states, inputs, parameters)) for more in (0, 0.7)
+        )
         if not np.array_equal(one, other, equal_nan=True):
             return False
     return True
 
 
-def _names_of_states(evaluation: Evaluation, first: NDArray[np.float64]) -> dict[Quantity, str]:
+def _names_of_states(evaluation: Evaluation, first: NDArray[np.float64]) -> dict[FmuVariable, str]:
     """Names of the states: that of an output which is nothing but the state, else its own."""
     described = evaluation.description
     names = {one: one.name for one in described.states}
@@ -232,10 +234,10 @@ def _refuse_memory(evaluation: Evaluation, first: NDArray[np.float64]) -> None:
     at = _probes(evaluation, first)
     time, states, inputs, parameters = at.parts
     plain = evaluation.values(False, at)
-    back = evaluation.values(False, Moments(time[::-1], states[::-1], inputs[::-1], parameters))[::-1]
+    back = evaluation.values(False, EvaluationPoints(time[::-1], states[::-1], inputs[::-1], parameters))[::-1]
     if not np.array_equal(plain, back, equal_nan=True):
         raise FmuError(
             f"{evaluation.description.path}: the FMU's rates depend on events before, as of a hysteresis or a clock, "
             "which a diagnosis cannot follow: let its tool simulate the recording, and give what it wrote with "
-            "`--simulated SIM.csv`."
+            "`--simulator-output SIM.csv`."
         )

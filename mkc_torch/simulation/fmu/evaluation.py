@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-__all__ = ["GROUPS", "Evaluation", "Group", "Moments"]
+__all__ = ["GROUPS", "Evaluation", "EvaluationPoints", "Group"]
 
 Group = Literal["states", "inputs", "parameters"]
 GROUPS: tuple[Group, ...] = ("states", "inputs", "parameters")
@@ -34,14 +34,14 @@ _AGREE = 1e-4
 """Share by which a directional derivative may be off a difference before it is not trusted."""
 
 
-class Moments:
+class EvaluationPoints:
     """Times (S,), states (S, n), inputs (S, m) and parameters (p,), in one piece each."""
 
     def __init__(self, time: Array, states: Array, inputs: Array, parameters: Array) -> None:
         self.parts = tuple(np.ascontiguousarray(one, np.float64) for one in (time, states, inputs, parameters))
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Moments) and all(map(np.array_equal, self.parts, other.parts))
+        return isinstance(other, EvaluationPoints) and all(map(np.array_equal, self.parts, other.parts))
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -52,7 +52,7 @@ class Moments:
         new[1:] = (table[1:] != table[:-1]).any(1)
         return new
 
-    def same(self, other: Moments) -> NDArray[np.bool_]:
+    def same(self, other: EvaluationPoints) -> NDArray[np.bool_]:
         """(S,), which of these are the same in another: the ends of intervals, where their middles have moved."""
         if len(other.parts[0]) != len(self.parts[0]) or not np.array_equal(self.parts[3], other.parts[3]):
             return np.zeros(len(self.parts[0]), np.bool_)
@@ -78,8 +78,8 @@ class Evaluation:
         self._binary: Binary | None = None
         self._trusted: dict[tuple[bool, int], bool] = {}
         self._affine: dict[tuple[bool, int], bool] = {}
-        self._last: dict[bool, tuple[Moments, Array]] = {}
-        self._known: deque[tuple[Any, Moments, Array]] = deque(maxlen=_REMEMBERED)
+        self._last: dict[bool, tuple[EvaluationPoints, Array]] = {}
+        self._known: deque[tuple[Any, EvaluationPoints, Array]] = deque(maxlen=_REMEMBERED)
 
     def __getstate__(self) -> Description:
         return self.description
@@ -93,7 +93,7 @@ class Evaluation:
             self._binary = Binary(self.description)
         return self._binary
 
-    def values(self, outputs: bool, at: Moments) -> Array:
+    def values(self, outputs: bool, at: EvaluationPoints) -> Array:
         """Rates of the states, or outputs, (S, k); NaN where the FMU has none."""
 
         def computed() -> Array:
@@ -112,7 +112,7 @@ class Evaluation:
 
         return self._remembered(("values", outputs), at, computed)
 
-    def slopes(self, outputs: bool, at: Moments, group: Group) -> Array:
+    def slopes(self, outputs: bool, at: EvaluationPoints, group: Group) -> Array:
         """Of rates or outputs by each of a group, (S, k, size of the group)."""
 
         def computed() -> Array:
@@ -124,7 +124,7 @@ class Evaluation:
 
         return self._remembered(("slopes", outputs, group), at, computed)
 
-    def _remembered(self, what: Any, at: Moments, compute: Any) -> Array:
+    def _remembered(self, what: Any, at: EvaluationPoints, compute: Any) -> Array:
         for known, moments, answer in self._known:
             if known == what and moments == at:
                 return answer

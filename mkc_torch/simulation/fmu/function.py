@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch._support.torch_internals import is_wrapped
-from mkc_torch.simulation.fmu.evaluation import GROUPS, Evaluation, Group, Moments
+from mkc_torch.simulation.fmu.evaluation import GROUPS, Evaluation, EvaluationPoints, Group
 
 __all__ = ["evaluated"]
 
@@ -143,8 +143,8 @@ def _over_batch(info: Any, in_dims: Any, function: Any, parts: tuple[Tensor, ...
     return found
 
 
-def _moments(time: Tensor, states: Tensor, inputs: Tensor, parameters: Tensor) -> Moments:
-    return Moments(*(one.detach().cpu().double().numpy() for one in (time, states, inputs, parameters)))
+def _moments(time: Tensor, states: Tensor, inputs: Tensor, parameters: Tensor) -> EvaluationPoints:
+    return EvaluationPoints(*(one.detach().cpu().double().numpy() for one in (time, states, inputs, parameters)))
 
 
 def _tensor(values: Any, like: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from mkc_torch.calibration.ellipsoid_fit import MIN_INFORMATION
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
 from mkc_torch.linear import LeastTrimmedSquares
 from mkc_torch.linear._problem import RankDeficientError
-from mkc_torch.nonlinear import GaussianPrior, NoFitError, beside
+from mkc_torch.nonlinear import GaussianPrior, NoFitError, make_dual
 from mkc_torch.recording.recording import Recording, RecordingError
 from mkc_torch.simulation.magnetometer.heading import HeadingJump, heading_jumps
 from mkc_torch.simulation.magnetometer.matrix import SOFT_IRON
@@ -82,7 +82,7 @@ class AttitudeView(View):
 
     def ambient(self, theta: Float[Tensor, " p"]) -> Float[Tensor, " 3"]:
         """The world's field."""
-        direction = beside(self._ahead, theta[0]) + theta[12:14] @ self._across
+        direction = make_dual(self._ahead, theta[0]) + theta[12:14] @ self._across
         return self._strength(theta) * direction / torch.linalg.vector_norm(direction)
 
     def start(self, rows: Bool[Tensor, " N"] | None = None) -> Tensor:

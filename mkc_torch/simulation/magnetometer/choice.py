@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 
 from torch import Tensor
 
-from mkc_torch.calibration.aided.mend import LAG, Mend, mend_of_attitude, mend_of_gyroscope
+from mkc_torch.calibration.aided.fault import LAG, Fault, mend_of_attitude, mend_of_gyroscope
 from mkc_torch.calibration.aided.misfit import left_by_attitude, left_by_gyroscope, robust_size, stretches
 from mkc_torch.calibration.calibrate import prepared
 from mkc_torch.calibration.not_identifiable import NotIdentifiableError
@@ -18,7 +18,7 @@ from mkc_torch.simulation.magnetometer.gyro import GyroView
 from mkc_torch.simulation.magnetometer.norm import NormView
 from mkc_torch.simulation.magnetometer.view import GYRO, QUATERNION, View
 
-__all__ = ["asked_view", "chosen_view"]
+__all__ = ["chosen_view", "requested_view"]
 
 V = TypeVar("V", bound=View)
 
@@ -52,7 +52,7 @@ def chosen_view(recording: Recording) -> NormView | AttitudeView | GyroView:
     return _length_or_gyroscope(recording)
 
 
-def asked_view(recording: Recording, use: str) -> NormView | AttitudeView | GyroView:
+def requested_view(recording: Recording, use: str) -> NormView | AttitudeView | GyroView:
     """The attitude's view, the gyroscope's or the length's, as it is asked for.
 
     Turns that leave far more of the field than its length does are told in the view's ``wrong_turns``.
@@ -104,7 +104,7 @@ class _Compared(Generic[V]):
     view: V
     length: NormView | None
     left: float
-    mend: Callable[[], Mend | None]
+    mend: Callable[[], Fault | None]
 
     def settled(self) -> V | NormView:
         """The view, or the length where the view's turns are wrong; with a warning of turns that are."""
@@ -147,7 +147,7 @@ def _compared_by_attitude(usable: Recording, view: AttitudeView, length: NormVie
     unbent = view.measured @ _matrix(view, length).mT
     left = min(_left(view), left_by_attitude(unbent, view.to_world, stretches(view.time)))
 
-    def mend() -> Mend | None:
+    def mend() -> Fault | None:
         return mend_of_attitude(_calibrated(view, length), view.time, usable.stack(*QUATERNION), left)
 
     return _Compared("attitude", view, length, left, mend)
@@ -157,7 +157,7 @@ def _compared_by_gyroscope(usable: Recording, view: GyroView, length: NormView |
     unbent = view.measured @ _matrix(view, length).mT
     left = min(_left(view), left_by_gyroscope(unbent, view.turned, view.window, stretches(view.time)))
 
-    def mend() -> Mend | None:
+    def mend() -> Fault | None:
         rate = usable.stack(*GYRO)
         return mend_of_gyroscope(_calibrated(view, length), view.time, rate, view.window, view.first, left)
 
@@ -197,7 +197,7 @@ _TRIED = {
 }
 
 
-def _reason(what: str, mend: Mend | None, unit: str) -> str:
+def _reason(what: str, mend: Fault | None, unit: str) -> str:
     if mend is None:
         return (
             f"{_TRIED[what]} nor a shift in time of up to {LAG:g} s mends it; see that it is of this recording and of "

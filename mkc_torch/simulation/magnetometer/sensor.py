@@ -8,7 +8,7 @@ from typing import Any
 
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.attitude import AttitudeView
-from mkc_torch.simulation.magnetometer.choice import asked_view, chosen_view
+from mkc_torch.simulation.magnetometer.choice import chosen_view, requested_view
 from mkc_torch.simulation.magnetometer.correction import MagnetometerCorrection
 from mkc_torch.simulation.magnetometer.gyro import GyroView
 from mkc_torch.simulation.magnetometer.norm import NormView
@@ -69,7 +69,7 @@ class Magnetometer:
             return chosen_view(recording)
         if self.use == "gyro":
             recording["time"]
-        return asked_view(recording, self.use)
+        return requested_view(recording, self.use)
 
     def correction(self, state: Mapping[str, Any], recording: Recording) -> MagnetometerCorrection:
         """The calibrated sensor on a new recording; see :class:`mkc_torch.simulation.Correction`."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from mkc_torch.calibration.ellipsoid_fit import EllipsoidFit
 from mkc_torch.calibration.turning import refuse_at_rest, thin_at_rest, turning
 from mkc_torch.linear import LeastTrimmedSquares
-from mkc_torch.nonlinear import NoFitError, beside
+from mkc_torch.nonlinear import NoFitError, make_dual
 from mkc_torch.recording.recording import Recording
 from mkc_torch.simulation.magnetometer.matrix import MATRIX_OF_VIEW
 from mkc_torch.simulation.protocol import Changes, ClosedForm, FreeChange, Nearby, Port
@@ -96,7 +96,7 @@ class View(ClosedForm):
 
     def _away(self, theta: Float[Tensor, " p"], changes: Changes) -> Float[Tensor, "N 3"]:
         """The measurement from the offset, with what changes the sensor taken off it."""
-        away = beside(self.measured, theta[0])
+        away = make_dual(self.measured, theta[0])
         if "sensor" in changes:
             change = changes["sensor"]
             away = away - change(
@@ -110,7 +110,7 @@ class View(ClosedForm):
 
     def _strength(self, theta: Float[Tensor, " p"]) -> Float[Tensor, ""]:
         """Length of the field."""
-        return beside(self.measured.new_tensor(self.strength), theta[0])
+        return make_dual(self.measured.new_tensor(self.strength), theta[0])
 
     def _ellipsoid(self, rows: Bool[Tensor, " N"] | None) -> EllipsoidFit:
         chosen = thinned(self.thin if rows is None else self.thin & rows)

@@ -10,7 +10,7 @@ from mkc_torch.calibration import Calibration, NotIdentifiableError, calibrate
 from mkc_torch.calibration.aided import by_place, choose, lengths
 from mkc_torch.calibration.aided.lengths import Circle, LengthModel
 from mkc_torch.calibration.aided.place import Field
-from mkc_torch.calibration.aided.response import Place
+from mkc_torch.calibration.aided.response import PlaceField
 from mkc_torch.report.words.numbers import aided
 from tests.calibration.aided.vehicle import changed, example
 
@@ -142,7 +142,7 @@ def test_residuals_are_distances_from_the_ellipsoid_and_along_it_from_the_circle
 def test_a_turn_without_tilts_is_as_likely_on_either_side(rises):
     """Mirrored at the plane of the circle, offset and all, nothing changes: the noise of lengths decides nothing."""
     recording = level()
-    points, place = recording.magnetometer(), Place(EARTH.strength, EARTH.inclination, 0.5, 0.01)
+    points, place = recording.magnetometer(), PlaceField(EARTH.strength, EARTH.inclination, 0.5, 0.01)
     first = by_place._judged(*_mirrored(points, rises, place))
     other = by_place._judged(*_mirrored(points, -rises, place))
     assert float(first.fit.log_likelihood) == pytest.approx(float(other.fit.log_likelihood), abs=2.0 / len(points))

@@ -4,7 +4,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from mkc_torch.calibration.exports import EXPORTS, CurrentField, Destination, SensorCorrection
+from mkc_torch.calibration.exports import EXPORTS, CurrentCoefficients, Destination, SensorCorrection
 
 COMPILER = next((found for name in ("cc", "gcc", "clang") if (found := shutil.which(name))), None)
 MATRIX = ((0.95, -0.03, 0.019), (-0.03, 1.06, -0.016), (0.02, -0.016, 0.997))
@@ -52,7 +52,7 @@ def test_the_compiled_function_gives_the_field(tmp_path, unit):
 def test_the_compiled_function_takes_off_the_field_of_a_current(tmp_path):
     k, mean = (3.1, -2.2, 4.7), 12.5
     rows = np.random.default_rng(1).normal(size=(40, 4)) * np.array([500.0, 500.0, 500.0, 20.0])
-    correction = SensorCorrection("mast", "mG", OFFSET, MATRIX, "mG", None, CurrentField(k, mean, "current"))
+    correction = SensorCorrection("mast", "mG", OFFSET, MATRIX, "mG", None, CurrentCoefficients(k, mean, "current"))
     found = run(correction, rows, tmp_path, "v[3],")
     away = rows[:, :3] - np.array(OFFSET) - (rows[:, 3:] - mean) * np.array(k)
     assert np.abs(found - away @ np.array(MATRIX).T).max() < 0.1 * 0.01

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mkc_torch.calibration.calibrate import calibrate
-from mkc_torch.calibration.exports import EXPORTS, CurrentField, Destination, ExportError, SensorCorrection
+from mkc_torch.calibration.exports import EXPORTS, CurrentCoefficients, Destination, ExportError, SensorCorrection
 from mkc_torch.calibration.exports.numbers import single
 from mkc_torch.cli.export_options import KINDS
 from mkc_torch.recording.recording import Recording
@@ -17,7 +17,7 @@ from tests.calibration.test_calibrate import noisy_ellipsoid, recorded
 
 CLOSE = 0.01e-6  # T
 EYE = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-CABLE = CurrentField((0.3, -0.2, 0.4), 3.0, "current")
+CABLE = CurrentCoefficients((0.3, -0.2, 0.4), 3.0, "current")
 
 size = st.floats(-1.0, 1.0)
 
@@ -127,7 +127,13 @@ def test_the_field_of_a_current_goes_into_each_autopilot(fitted, k, mean, most, 
     center, k = np.array([30.0, -12.0, 55.0]) * in_unit, np.array(k) * in_unit
     matrix, current = np.array(fitted.matrix), np.linspace(0.0, most, 50)
     correction = SensorCorrection(
-        "cable", unit, tuple(center.tolist()), fitted.matrix, unit, None, CurrentField(tuple(k.tolist()), mean, "amps")
+        "cable",
+        unit,
+        tuple(center.tolist()),
+        fitted.matrix,
+        unit,
+        None,
+        CurrentCoefficients(tuple(k.tolist()), mean, "amps"),
     )
     readings = 50.0 * in_unit * np.random.default_rng(0).normal(size=(50, 3))
     expected = (readings - center - (current - mean)[:, None] * k) @ matrix.T * formulas.TESLA[unit]
@@ -216,7 +222,7 @@ def test_the_scale_of_ardupilot_counts_within_its_limits_alone():
         ({"matrix": ((6.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.5))}, "DIA outside 0.2 to 5"),
         ({"matrix": ((2.0, 1.2, 0.0), (1.2, 1.5, 0.0), (0.0, 0.0, 0.8))}, "ODI of 1"),
         ({"field_strength": 95.0}, "does not arm in a field"),
-        ({"current": CurrentField((150.0, 0.0, 0.0), 0.0, "I")}, "COMPASS_MOT goes to"),
+        ({"current": CurrentCoefficients((150.0, 0.0, 0.0), 0.0, "I")}, "COMPASS_MOT goes to"),
     ],
 )
 def test_what_ardupilot_takes_for_a_mistake_is_told(change, words):

@@ -11,16 +11,16 @@ from mkc_torch.challenge.dynamics.friction import bristles, rubber, teeth
 from mkc_torch.challenge.dynamics.generator import SYSTEMS
 from mkc_torch.challenge.dynamics.integrate import outputs_of_sizes, simulate
 from mkc_torch.challenge.dynamics.oracle import can_be_named, names
-from mkc_torch.challenge.dynamics.plant import Trial
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.plant import RunSet
+from mkc_torch.challenge.dynamics.scene import SystemScene
 from mkc_torch.effects import DYNAMICS, PAIRED
 
 
 @pytest.fixture(scope="module", params=SYSTEMS)
 def case(request):
     setting = SYSTEMS[request.param].draw(generator(2, request.param))
-    trial = Trial(setting.trial.step, setting.trial.inputs[:, :80], setting.trial.begin)
-    return SYSTEMS[request.param], Scene(setting.plant, trial, simulate(setting.plant, trial))
+    trial = RunSet(setting.trial.step, setting.trial.inputs[:, :80], setting.trial.begin)
+    return SYSTEMS[request.param], SystemScene(setting.plant, trial, simulate(setting.plant, trial))
 
 
 def added(form, x, z=None, size=1.0):
@@ -72,8 +72,8 @@ def test_all_of_the_catalogue_is_hidden_that_a_plant_can_show():
     hidden = set()
     for name, system in SYSTEMS.items():
         setting = system.draw(generator(2, name))
-        trial = Trial(setting.trial.step, setting.trial.inputs[:, :20], setting.trial.begin)
-        scene = Scene(setting.plant, trial, simulate(setting.plant, trial))
+        trial = RunSet(setting.trial.step, setting.trial.inputs[:, :20], setting.trial.begin)
+        scene = SystemScene(setting.plant, trial, simulate(setting.plant, trial))
         hidden |= {draw(generator(0), scene).effect for draw in system.inside}
     known = {effect.id for effect in (*DYNAMICS, *PAIRED) if not effect.is_curve}
     assert known - hidden == set(UNSEEN)

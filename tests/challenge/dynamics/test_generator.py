@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mkc_torch.challenge.draws import generator
-from mkc_torch.challenge.dynamics.errors import OUTLIERS, Errors, Slow, sample, spoil
+from mkc_torch.challenge.dynamics.errors import OUTLIERS, Errors, Slow, contaminate, sample
 from mkc_torch.challenge.dynamics.generator import SYSTEMS, draw
 from mkc_torch.challenge.dynamics.second import ratio_to_oracle
 from mkc_torch.challenge.dynamics.subject import dynamics, simulation_class
@@ -119,7 +119,7 @@ def test_errors_have_the_size_and_correlation_they_say():
 
 def test_outliers_are_far_and_few():
     errors = Errors((0.5,), 0.0, "gaussian")
-    bad, mask = spoil(generator(6), errors, 400, 2)
+    bad, mask = contaminate(generator(6), errors, 400, 2)
     assert mask.sum() == 2 * round(OUTLIERS * 400)
     assert (np.abs(bad[mask]) >= 2.5).all()
     assert not bad[~mask].any()

@@ -6,7 +6,7 @@ from mkc_torch.challenge.draws import generator
 from mkc_torch.challenge.dynamics import cart_pole, motor, pendulum, projectile, tanks, thermal
 from mkc_torch.challenge.dynamics.friction import bristles
 from mkc_torch.challenge.dynamics.integrate import between, outputs_of_sizes, simulate, variation
-from mkc_torch.challenge.dynamics.plant import Hidden, Trial
+from mkc_torch.challenge.dynamics.plant import HiddenTerm, RunSet
 
 DRAWS = {
     "pendulum": pendulum.draw,
@@ -19,7 +19,7 @@ DRAWS = {
 
 
 def short(trial, samples=60):
-    return Trial(trial.step, trial.inputs[:, :samples], trial.begin)
+    return RunSet(trial.step, trial.inputs[:, :samples], trial.begin)
 
 
 @pytest.mark.parametrize("name", DRAWS)
@@ -42,7 +42,7 @@ def test_agrees_with_an_adaptive_method(name):
 def test_sizes_side_by_side_are_those_one_by_one():
     setting = pendulum.draw(generator(2))
     trial = short(setting.trial)
-    hidden = Hidden("coulomb_friction", "", ("rate of speed",), 1.0, bristles(1, 0.02, 1.0), own=1)
+    hidden = HiddenTerm("coulomb_friction", "", ("rate of speed",), 1.0, bristles(1, 0.02, 1.0), own=1)
     sizes = np.array([0.0, 0.1, 0.4])
     together = outputs_of_sizes(setting.plant, trial, hidden, sizes)
     for size, found in zip(sizes, together, strict=True):
@@ -51,7 +51,7 @@ def test_sizes_side_by_side_are_those_one_by_one():
 
 def test_nothing_hidden_is_size_zero():
     setting = pendulum.draw(generator(3))
-    hidden = Hidden("coulomb_friction", "", ("rate of speed",), 1.0, bristles(1, 0.02, 1.0), own=1)
+    hidden = HiddenTerm("coulomb_friction", "", ("rate of speed",), 1.0, bristles(1, 0.02, 1.0), own=1)
     there = simulate(setting.plant, setting.trial, hidden, 0.0).outputs
     np.testing.assert_array_equal(there, simulate(setting.plant, setting.trial).outputs)
 

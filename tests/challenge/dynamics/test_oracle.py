@@ -11,14 +11,14 @@ from mkc_torch.challenge.dynamics.forces import added
 from mkc_torch.challenge.dynamics.hidden import rate_of
 from mkc_torch.challenge.dynamics.integrate import simulate
 from mkc_torch.challenge.dynamics.oracle import Cone, Judge, moved, power, tangents
-from mkc_torch.challenge.dynamics.plant import Hidden, Trial
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.plant import HiddenTerm, RunSet
+from mkc_torch.challenge.dynamics.scene import SystemScene
 
 
 def short_scene(system, seed):
     setting = system.draw(generator(seed))
-    trial = Trial(setting.trial.step, setting.trial.inputs[:, :70], setting.trial.begin)
-    return Scene(setting.plant, trial, simulate(setting.plant, trial))
+    trial = RunSet(setting.trial.step, setting.trial.inputs[:, :70], setting.trial.begin)
+    return SystemScene(setting.plant, trial, simulate(setting.plant, trial))
 
 
 @pytest.fixture(scope="module", params=[pendulum, tanks])
@@ -76,7 +76,7 @@ def test_accounts_are_finite_differences_of_the_simulation_with_them():
     forms = {"constant_force": lambda x, _: np.ones_like(x[1]), "quadratic_drag": lambda x, _: -x[1] * np.abs(x[1]),
              "cubic_stiffness": lambda x, _: -x[0] ** 3}  # fmt: skip
     for effect, form in forms.items():
-        hidden = Hidden(effect, "", (rate_of("speed"),), 1.0, added(1, form))
+        hidden = HiddenTerm(effect, "", (rate_of("speed"),), 1.0, added(1, form))
         expected = errors.whitened(by_differences(lambda s, h=hidden: simulate(scene.plant, scene.trial, h, s).outputs))
         np.testing.assert_allclose(
             found[effect, (rate_of("speed"),)][:, 0], expected, atol=2e-3 * np.abs(expected).max()
@@ -88,7 +88,7 @@ def test_z_is_that_of_a_dense_projection(scene):
     errors = errors_of(scene)
     row = scene.plant.states.index("speed") if "speed" in scene.plant.states else 0
     place = rate_of(scene.plant.states[row])
-    hidden = Hidden("constant_force", "", (place,), 1.0, added(row, lambda x, _: np.ones_like(x[row])))
+    hidden = HiddenTerm("constant_force", "", (place,), 1.0, added(row, lambda x, _: np.ones_like(x[row])))
     size = 0.02 * scene.pace(scene.plant.states[row])
     root = dense(errors, scene.course.outputs.shape)
     delta = root @ (simulate(scene.plant, scene.trial, hidden, size).outputs - scene.course.outputs).ravel()
@@ -104,7 +104,7 @@ def test_z_is_that_of_a_dense_projection(scene):
 
 def test_what_a_refit_absorbs_is_invisible():
     scene = short_scene(pendulum, 6)
-    hidden = Hidden("linear_drag", "", (rate_of("speed"),), 1.0, added(1, lambda x, _: -x[1]))
+    hidden = HiddenTerm("linear_drag", "", (rate_of("speed"),), 1.0, added(1, lambda x, _: -x[1]))
     found = power(scene.plant, scene.trial, hidden, 0.05, errors_of(scene))
     assert found.z < 1e-2
 
@@ -112,7 +112,7 @@ def test_what_a_refit_absorbs_is_invisible():
 def test_an_account_that_contains_the_own_form_is_no_rival():
     scene = short_scene(pendulum, 7)
     width = 0.1 * scene.typical("speed")
-    hidden = Hidden("coulomb_friction", "", (rate_of("speed"),), 1.0, added(1, lambda x, _: -np.tanh(x[1] / width)))
+    hidden = HiddenTerm("coulomb_friction", "", (rate_of("speed"),), 1.0, added(1, lambda x, _: -np.tanh(x[1] / width)))
     found = power(scene.plant, scene.trial, hidden, 0.2, errors_of(scene))
     assert {r.effect for r in found.rivals}.isdisjoint({"stribeck_friction", "load_dependent_friction"})
     assert found.z_sep > 1.0
@@ -121,7 +121,7 @@ def test_an_account_that_contains_the_own_form_is_no_rival():
 def test_linear_accounts_are_judged_to_first_order():
     scene = short_scene(tanks, 8)
     errors = errors_of(scene)
-    hidden = Hidden("overflow", "", (rate_of("level_1"),), 1.0, weir(0, 0.7 * scene.largest("level_1"), 1.5))
+    hidden = HiddenTerm("overflow", "", (rate_of("level_1"),), 1.0, weir(0, 0.7 * scene.largest("level_1"), 1.5))
     judge = Judge(tangents(scene, errors, rivals=True))
     one, two = (
         judge.power(

@@ -8,16 +8,16 @@ from mkc_torch.challenge.dynamics import servo
 from mkc_torch.challenge.dynamics.errors import Errors
 from mkc_torch.challenge.dynamics.integrate import outputs_of_sizes, simulate
 from mkc_torch.challenge.dynamics.oracle import names, power, tangents
-from mkc_torch.challenge.dynamics.plant import Hidden
+from mkc_torch.challenge.dynamics.plant import HiddenTerm
 from mkc_torch.challenge.dynamics.readings import readings
-from mkc_torch.challenge.dynamics.scene import Scene
+from mkc_torch.challenge.dynamics.scene import SystemScene
 from mkc_torch.challenge.dynamics.second import oracle_rms
 
 
 @pytest.fixture(scope="module")
 def scene():
     setting = servo.draw(generator(4, "servo"))
-    return Scene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
+    return SystemScene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
 
 
 def errors_of(scene):
@@ -35,8 +35,8 @@ def test_what_is_hidden_at_an_input_or_an_output_reaches_the_angle(scene):
     def shifted(values, step, size):  # noqa: ARG001
         return values + size
 
-    at_input = Hidden("offset", "", (), 1.0, inputs=shifted)
-    at_output = Hidden("offset", "", (), 1.0, outputs=shifted)
+    at_input = HiddenTerm("offset", "", (), 1.0, inputs=shifted)
+    at_output = HiddenTerm("offset", "", (), 1.0, outputs=shifted)
     scale = scene.plant.parameters["scale"]
     for hidden, factor in ((at_input, scale), (at_output, 1.0)):
         (found,) = outputs_of_sizes(scene.plant, scene.trial, hidden, np.array([0.5]))

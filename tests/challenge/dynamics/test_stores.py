@@ -5,7 +5,7 @@ import pytest
 
 from mkc_torch.challenge.dynamics import stores
 from mkc_torch.challenge.dynamics.integrate import outputs_of_sizes, simulate
-from mkc_torch.challenge.dynamics.plant import Hidden, Plant, Trial
+from mkc_torch.challenge.dynamics.plant import HiddenTerm, Plant, RunSet
 
 NONE = np.zeros((0, 1))
 
@@ -16,17 +16,17 @@ def free():
 
 
 def trial(push, begin=0.0, step=0.02):
-    return Trial(step, np.asarray(push, dtype=float)[None, :, None], np.array([[begin]]))
+    return RunSet(step, np.asarray(push, dtype=float)[None, :, None], np.array([[begin]]))
 
 
 def store(constant=0.5):
     form = stores.second_store(0, lambda head: head / constant)
-    return Hidden("hidden_lag", "", ("rate of x",), 1.0, form, own=1, begin=stores.like(0))
+    return HiddenTerm("hidden_lag", "", ("rate of x",), 1.0, form, own=1, begin=stores.like(0))
 
 
 def mass(omega=20.0, damping=0.05, bend=0.0):
     form = stores.second_mass(0, omega, damping, bend)
-    return Hidden("hidden_mode", "", ("rate of x",), 1.0, form, own=2, begin=stores.unstretched(0))
+    return HiddenTerm("hidden_mode", "", ("rate of x",), 1.0, form, own=2, begin=stores.unstretched(0))
 
 
 @pytest.mark.parametrize("hidden", [store(), mass()])

@@ -11,9 +11,9 @@ from mkc_torch.challenge.magnetometer.noise import (
     MOST_OUTLIERS,
     Outliers,
     axis_errors,
+    contaminate,
     draw_noise,
     draw_outliers,
-    spoil,
 )
 
 
@@ -54,7 +54,7 @@ def test_a_walk_goes_half_to_five_sigmas():
 def test_outliers_have_their_share_and_side():
     up = torch.tensor([0.0, 0.0, 1.0]).double().expand(4000, 3)
     for burst in (1.0, 20.0):
-        bad, mask = spoil(generator(5), Outliers(0.15, burst, True, (5.0, 50.0)), 0.5, up)
+        bad, mask = contaminate(generator(5), Outliers(0.15, burst, True, (5.0, 50.0)), 0.5, up)
         assert int(mask.sum()) == 600
         sizes = bad[mask].norm(dim=-1) / 0.5
         assert float(sizes.min()) * (1 + 1e-9) >= 5.0
@@ -65,7 +65,9 @@ def test_outliers_have_their_share_and_side():
 
 def test_bursts_are_longer_than_isolated_outliers():
     def runs(burst):
-        _, mask = spoil(generator(6), Outliers(0.1, burst, False, (5.0, 50.0)), 0.5, torch.zeros(4000, 3).double())
+        _, mask = contaminate(
+            generator(6), Outliers(0.1, burst, False, (5.0, 50.0)), 0.5, torch.zeros(4000, 3).double()
+        )
         return int((mask[1:] & ~mask[:-1]).sum())
 
     assert runs(20.0) < 0.3 * runs(1.0)

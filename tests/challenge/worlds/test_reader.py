@@ -1,6 +1,6 @@
 import pytest
 
-from mkc_torch.challenge.worlds.reader import driven_state
+from mkc_torch.challenge.scenarios.reader import driven_state
 
 ANGLE, SPEED = {"size": 0.5, "standard_error": 0.4, "unit": "rad/s"}, {"size": 0.3, "standard_error": 0.01, "unit": ""}
 

@@ -8,11 +8,11 @@ import pytest
 pytest.importorskip("polars")
 pytest.importorskip("jinja2")
 
-from mkc_torch.challenge.dynamics.worlds import dynamics_worlds
+from mkc_torch.challenge.dynamics.scenarios import dynamics_worlds
 from mkc_torch.challenge.key import digest
-from mkc_torch.challenge.magnetometer.worlds import magnetometer_worlds
-from mkc_torch.challenge.worlds import run_worlds
-from mkc_torch.challenge.worlds.run import count
+from mkc_torch.challenge.magnetometer.scenarios import magnetometer_worlds
+from mkc_torch.challenge.scenarios import run_worlds
+from mkc_torch.challenge.scenarios.run import count
 
 
 def cheap(paths, folder):

@@ -8,9 +8,9 @@ import pytest
 
 from mkc_torch.challenge import aims
 from mkc_torch.challenge.key import KeyEffect, KeyRival
-from mkc_torch.challenge.world import KeyPush, World, WorldKey, Worlds
-from mkc_torch.challenge.worlds.page import held, worlds_page, worlds_summary
-from mkc_torch.challenge.worlds.score import LEAST_PUSH, score_worlds
+from mkc_torch.challenge.scenario import KeyDisturbance, Scenario, ScenarioKey, Scenarios
+from mkc_torch.challenge.scenarios.page import held, worlds_page, worlds_summary
+from mkc_torch.challenge.scenarios.score import LEAST_PUSH, score_worlds
 from tests.challenge.test_key import example
 
 SETTINGS = {"family": "dynamics", "seed": 1, "key_sha256": "0" * 64, "empty_per_world": 1, "hidden_per_world": 1}
@@ -20,13 +20,13 @@ def never(*_):
     raise AssertionError
 
 
-WORLDS = Worlds(
+WORLDS = Scenarios(
     "dynamics",
     (
-        World("white", "white noise", never, aims.WHITE),
-        World("pushed_white", "white force noise", never, aims.PUSHED),
-        World("lasting", "one run", never, aims.LASTING, right_to_say="unexplained", half=True, apart=True),
-        World("useless", "of no use", never, aims.USELESS, hides=False),
+        Scenario("white", "white noise", never, aims.WHITE),
+        Scenario("pushed_white", "white force noise", never, aims.PUSHED),
+        Scenario("lasting", "one run", never, aims.LASTING, right_to_say="unexplained", half=True, apart=True),
+        Scenario("useless", "of no use", never, aims.USELESS, hides=False),
     ),
     aims.TOTALS,
 )
@@ -38,8 +38,8 @@ def key(name, world="white", *, push=0.0, useless="", kind="empty", effect="back
     plain = dataclasses.replace(
         example(name), kind="useless" if useless else kind, effects=() if kind == "empty" else (truth,)
     )
-    told = KeyPush("pushed_white", "speed", 0.1, "m/s²·√s", push) if push else None
-    return WorldKey(world, 0, plain, told, useless)
+    told = KeyDisturbance("pushed_white", "speed", 0.1, "m/s²·√s", push) if push else None
+    return ScenarioKey(world, 0, plain, told, useless)
 
 
 def says(verdict, *findings, driven=None):
@@ -109,7 +109,7 @@ def test_pushed_states_are_located_by_process_noise_forcing_or_a_finding():
 
 
 def test_disturbances_of_a_sensor_have_no_state_to_be_located_in():
-    disturbed = dataclasses.replace(key("a", "pushed_white"), push=KeyPush("wander", "sensor", 1.0, "µT", 4.0))
+    disturbed = dataclasses.replace(key("a", "pushed_white"), push=KeyDisturbance("wander", "sensor", 1.0, "µT", 4.0))
     scored = world(score_worlds(WORLDS, [disturbed], {"a": says("unexplained")}), "pushed_white")
     assert scored.unexplained_located.total == 0
 
@@ -213,7 +213,9 @@ def test_a_sensor_that_errs_slowly_is_told_by_its_own_noise():
         "small": says("adequate"),
     }
     keys = [
-        dataclasses.replace(key(name), push=KeyPush("slow_sensor", "sensor", 1.0, "m", 1.5 if name == "small" else 4.0))
+        dataclasses.replace(
+            key(name), push=KeyDisturbance("slow_sensor", "sensor", 1.0, "m", 1.5 if name == "small" else 4.0)
+        )
         for name in answers
     ]
     assert counts(world(score_worlds(WORLDS, keys, answers), "white").sensor_told) == (1, 2)
@@ -223,8 +225,8 @@ def test_a_sensor_that_errs_slowly_is_told_by_its_own_noise():
     ("half", "asked", "hidden"), [(False, None, 20), (True, None, 60), (True, 6, 6), (False, 6, 6)]
 )
 def test_how_many_hide_something(half, asked, hidden):
-    assert World("white", "", never, (), half=half).hidden(60, asked) == hidden
-    assert World("useless", "", never, (), hides=False).hidden(60, asked) == 0
+    assert Scenario("white", "", never, (), half=half).hidden(60, asked) == hidden
+    assert Scenario("useless", "", never, (), hides=False).hidden(60, asked) == 0
 
 
 def all_kinds():

@@ -9,10 +9,10 @@ import torch
 
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.evidence.common_cause import common_cause
-from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json, validate
-from mkc_torch.diagnosis.files.model import DiagnosedModel
+from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json, validate
+from mkc_torch.diagnosis.io.model import DiagnosedModel
 from mkc_torch.diagnosis.linearised.linear_search import LinearSearch
-from mkc_torch.diagnosis.linearised.tangents import Slow
+from mkc_torch.diagnosis.linearised.tangents import SlowBasis
 from mkc_torch.diagnosis.noise.cosine_basis import cosines
 from mkc_torch.diagnosis.settings import NoiseSettings
 from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
@@ -44,7 +44,7 @@ def searching(covariance, seed, size=3.0):
     k = torch.arange(1, K + 1, dtype=torch.float64).repeat_interleave(C)
     scales = (1.0 / k).unsqueeze(0)
     channels = torch.randn(SAMPLES, 1, C, generator=generator, dtype=torch.float64)
-    slow = Slow("sensor", C, channels, True, scales, NoiseSettings().walk_first)
+    slow = SlowBasis("sensor", C, channels, True, scales, NoiseSettings().walk_first)
     tangents = (cosines(K, SAMPLES)[:, :, None] * channels).reshape(SAMPLES, K * C)
     root = torch.linalg.cholesky(torch.as_tensor(covariance) + 1e-9 * torch.eye(C, dtype=torch.float64))
     drawn = size * (torch.randn(K, C, generator=generator, dtype=torch.float64) @ root.mT).flatten() / k
@@ -63,7 +63,7 @@ def test_one_direction_is_found_with_its_course():
     amplitudes = torch.zeros(K, dtype=torch.float64)
     for name, value in cause.shape.items():
         amplitudes[int(name.removeprefix(COURSE)) - 1] = value / 2.0**0.5
-    predicted = slow.course((amplitudes[:, None] * cause.direction).flatten()).squeeze(-1)
+    predicted = slow.waveform((amplitudes[:, None] * cause.direction).flatten()).squeeze(-1)
     assert float(torch.corrcoef(torch.stack([predicted, truth]))[0, 1]) > 0.95
 
 
@@ -167,7 +167,7 @@ def test_axes_that_wander_for_themselves_are_noise(seed):
 
 def test_the_course_spans_one_and_ends_at_zero():
     context = make_context(Unrecorded(), N=200)
-    course = Unrecorded().course({f"{COURSE}1": 0.3, f"{COURSE}4": -0.2}, context)
+    course = Unrecorded().waveform({f"{COURSE}1": 0.3, f"{COURSE}4": -0.2}, context)
     phase = torch.pi * (torch.arange(200, dtype=torch.float64) + 0.5) / 200
     known = 0.3 * torch.cos(phase) - 0.2 * torch.cos(4.0 * phase)
     torch.testing.assert_close(course, known - known[-1])

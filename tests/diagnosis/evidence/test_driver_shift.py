@@ -12,7 +12,7 @@ from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import DriverShift
-from mkc_torch.diagnosis.search.locate import locate
+from mkc_torch.diagnosis.search.run import run_search
 from mkc_torch.diagnosis.settings import DriverSettings, EvidenceSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
@@ -35,7 +35,7 @@ def found(N, driver, effect="current_field", *, searched=None, **columns):
     drivers = find_drivers(prepared.recording, simulation.columns, DriverSettings(), roles).drivers
     base = fitted(JointModel(prepared), prepared.start())
     terms = candidate_terms(prepared, drivers, [one for one in CATALOGUE if one.id == (searched or effect)])
-    located = locate(
+    located = run_search(
         base, terms, level=0.05, surrogates=19, generator=torch.Generator().manual_seed(0), settings=Settings()
     )
     return shifted(base.model, located)

@@ -9,16 +9,16 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.evidence import TESTS
-from mkc_torch.diagnosis.evidence.after_the_search import answers_of, parts_ahead
-from mkc_torch.diagnosis.evidence.base import Case, EvidenceTest, Told
+from mkc_torch.diagnosis.evidence.base import EvidenceContext, EvidenceResult, EvidenceTest
 from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
-from mkc_torch.diagnosis.files.diagnosis_json import _json, json_schema
+from mkc_torch.diagnosis.evidence.run import precompute, run_tests
+from mkc_torch.diagnosis.io.diagnosis_json import _json, json_schema
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.rounds import Asked, begun, continued
 from mkc_torch.diagnosis.settings import ConfirmationSettings, DriverSettings, Settings
+from mkc_torch.diagnosis.stepwise import SearchOptions, first_step, next_step
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.diagnosis.line import Line
@@ -32,7 +32,7 @@ def without_findings():
     line = Line(300)
     base = fitted(JointModel(line), line.start())
     blocks = blocks_of(300, 1, ConfirmationSettings())
-    return Case(base, None, (), (held_out(base, blocks),), blocks, (), 0, Settings())
+    return EvidenceContext(base, None, (), (held_out(base, blocks),), blocks, (), 0, Settings())
 
 
 def with_findings():
@@ -45,11 +45,11 @@ def with_findings():
     roles = frozenset(role for effect in effects for role in effect.roles)
     drivers = find_drivers(prepared.recording, simulation.columns, DriverSettings(), roles).drivers
     base = fitted(JointModel(prepared), prepared.start())
-    asked, generator = Asked(0.05, 19, 2, 0, Settings()), torch.Generator().manual_seed(0)
-    search = begun(base, candidate_terms(prepared, drivers, effects), asked, generator)
-    search = continued(search, asked, generator)
+    asked, generator = SearchOptions(0.05, 19, 2, 0, Settings()), torch.Generator().manual_seed(0)
+    search = first_step(base, candidate_terms(prepared, drivers, effects), asked, generator)
+    search = next_step(search, asked, generator)
     assert len(search.found) == 2
-    return Case(base, search.first, search.found, search.evidence, search.blocks, drivers, 0, Settings())
+    return EvidenceContext(base, search.first, search.found, search.evidence, search.blocks, drivers, 0, Settings())
 
 
 @pytest.fixture(scope="module", params=[without_findings, pytest.param(with_findings, marks=pytest.mark.e2e)])
@@ -59,12 +59,12 @@ def case(request):
 
 @pytest.fixture(scope="module")
 def done(case):
-    return [work() for work in parts_ahead(case)]
+    return [work() for work in precompute(case)]
 
 
 @pytest.fixture(scope="module")
 def answers(case, done):
-    return answers_of(case, done)
+    return run_tests(case, done)
 
 
 def everything(answers):
@@ -136,7 +136,7 @@ def test_warnings_are_in_the_order_of_the_tests(answers):
 def test_nothing_is_changed_and_nothing_else_is_drawn(case, done, answers):
     before = [(one, one.clone()) for one in tensors((case, done), {})]
     random = torch.random.get_rng_state()
-    again = answers_of(case, done)
+    again = run_tests(case, done)
     assert [told.rows for told in everything(again)] == [told.rows for told in everything(answers)]
     assert [_json(told.keys) for told in everything(again)] == [_json(told.keys) for told in everything(answers)]
     assert again.warnings == answers.warnings
@@ -146,9 +146,9 @@ def test_nothing_is_changed_and_nothing_else_is_drawn(case, done, answers):
 
 
 def test_the_order_of_the_parts_makes_no_difference(case, answers):
-    works = parts_ahead(case)
+    works = precompute(case)
     backwards = [work() for work in reversed(works)][::-1]
-    again = answers_of(case, backwards)
+    again = run_tests(case, backwards)
     assert [_json([told.content, told.keys]) for told in everything(again)] == [
         _json([told.content, told.keys]) for told in everything(answers)
     ]
@@ -161,10 +161,10 @@ def test_a_test_has_what_went_ahead_of_it_and_the_final_parameters(case):
         return case.seed, case.number
 
     def test(case):
-        return Told("mine", (case.ahead, case.number, float(case.final.fit.residual.sum())))
+        return EvidenceResult("mine", (case.ahead, case.number, float(case.final.fit.residual.sum())))
 
     mine = [EvidenceTest(test, ahead), EvidenceTest(test, ahead, each_finding=True), EvidenceTest(test)]
-    works = parts_ahead(replace(case, seed=3), mine)
-    answers = answers_of(replace(case, seed=3), [work() for work in works], mine)
+    works = precompute(replace(case, seed=3), mine)
+    answers = run_tests(replace(case, seed=3), [work() for work in works], mine)
     assert [told.value[:2] for told in answers.of_all] == [((3, 0), 0), (None, 0)]
     assert [told.value[:2] for (told,) in answers.of_findings] == [((3, k), k) for k in range(len(case.found))]

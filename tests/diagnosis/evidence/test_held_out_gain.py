@@ -8,7 +8,7 @@ import torch
 
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.evidence import held_out_gain
-from mkc_torch.diagnosis.evidence.base import Case
+from mkc_torch.diagnosis.evidence.base import EvidenceContext
 from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import fitted, fitted_beside
@@ -53,7 +53,7 @@ def beside(fits):
     found = SimpleNamespace(fit=small), SimpleNamespace(fit=both)
 
     def without(*evidence):
-        return held_out_gain.beside_the_others(Case(none, None, found, evidence, blocks, (), 0, Settings()))
+        return held_out_gain.beside_the_others(EvidenceContext(none, None, found, evidence, blocks, (), 0, Settings()))
 
     return without, [held_out(fit, blocks) for fit in fits]
 

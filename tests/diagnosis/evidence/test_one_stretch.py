@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.diagnosis.evidence import one_stretch
-from mkc_torch.diagnosis.evidence.base import Case
+from mkc_torch.diagnosis.evidence import localised
+from mkc_torch.diagnosis.evidence.base import EvidenceContext
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.settings import Settings
@@ -16,11 +16,11 @@ from mkc_torch.effects import CATALOGUE
 EFFECTS = {effect.id: effect for effect in CATALOGUE}
 LOAD = Driver(("load",), "any", torch.zeros(5, 1), torch.zeros(1), ("A",))
 PREPARED = SimpleNamespace(time=torch.arange(100) / 10.0)
-CASE = Case(SimpleNamespace(model=SimpleNamespace(prepared=PREPARED)), None, (), (), None, (), 0, Settings())
+CASE = EvidenceContext(SimpleNamespace(model=SimpleNamespace(prepared=PREPARED)), None, (), (), None, (), 0, Settings())
 
 
 def said(term, stretch):
-    return one_stretch.test(replace(CASE, first=SimpleNamespace(term=term, stretch=stretch)))
+    return localised.test(replace(CASE, first=SimpleNamespace(term=term, stretch=stretch)))
 
 
 @pytest.mark.parametrize(
@@ -35,4 +35,4 @@ def test_it_is_named_with_its_times(effect, driver, name):
 
 def test_of_what_is_everywhere_and_of_nothing_there_is_no_warning():
     assert said(Term(EFFECTS["offset_drift"], None, {}), None).warnings == ()
-    assert one_stretch.test(CASE).warnings == ()
+    assert localised.test(CASE).warnings == ()

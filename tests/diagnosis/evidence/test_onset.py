@@ -9,12 +9,12 @@ import pytest
 
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.evidence.onset import _CRITICAL, onset_interval
-from mkc_torch.diagnosis.files.diagnosis_json import diagnosis_to_json
+from mkc_torch.diagnosis.io.diagnosis_json import diagnosis_to_json
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import fitted, fitted_beside
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.search.look import Scene
+from mkc_torch.diagnosis.search.linearized import SearchProblem
 from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
@@ -42,7 +42,7 @@ def interval(size, seed, *, spoilt=(0, 0), effect=STEP, shape=None):
     tangents = dataclasses.replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
     pseudo, counts = best.pseudo(NoiseSettings())
     without = pseudo - counts * (tangents.candidates[0] @ best.parameters[base.model.size :])
-    scene = Scene(base, best, best.model.terms, tangents, without, counts, Settings())
+    scene = SearchProblem(base, best, best.model.terms, tangents, without, counts, Settings())
     return onset_interval(base.model, SimpleNamespace(fit=best, scene=scene, look=scene.under()))
 
 

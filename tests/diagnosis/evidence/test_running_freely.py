@@ -7,13 +7,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from mkc_torch.diagnosis.evidence import running_freely as module
+from mkc_torch.diagnosis.evidence import open_loop_evidence as module
 from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
-from mkc_torch.diagnosis.evidence.running_freely import running_freely
+from mkc_torch.diagnosis.evidence.open_loop import open_loop_evidence
 from mkc_torch.diagnosis.model.fit import fitted
-from mkc_torch.diagnosis.model.in_the_world import freed, pushed
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.search.locate import Located
+from mkc_torch.diagnosis.model.process_noise import refit_open_loop, with_noise_of_fit
+from mkc_torch.diagnosis.search.run import SearchResult
 from mkc_torch.diagnosis.settings import ConfirmationSettings
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from tests.diagnosis.line import Line
@@ -26,7 +26,7 @@ KEPT = SimpleNamespace()
 
 def located(fit):
     """Of a search, its fit alone."""
-    return Located(fit.model.terms[-1] if fit.model.terms else None, fit, 0.01, 9.0, (), None, None, None)
+    return SearchResult(fit.model.terms[-1] if fit.model.terms else None, fit, 0.01, 9.0, (), None, None, None)
 
 
 @functools.cache
@@ -43,7 +43,7 @@ def test_what_runs_freely_already_stays_the_same():
     line = Line(500)
     base = fitted(JointModel(line), line.start())
     found = (located(base),)
-    again = running_freely(base, base, found, (KEPT,), BLOCKS)
+    again = open_loop_evidence(base, base, found, (KEPT,), BLOCKS)
     assert again.base is base
     assert again.found is found
     assert again.held_out == (KEPT,)
@@ -52,12 +52,12 @@ def test_what_runs_freely_already_stays_the_same():
 @pytest.mark.e2e
 def test_fits_under_pushes_are_fitted_to_their_free_runs_and_judged_by_these():
     base, one = under_pushes()
-    alone = freed(base)
-    again = running_freely(base, alone, (one,), (KEPT, KEPT), BLOCKS)
+    alone = refit_open_loop(base)
+    again = open_loop_evidence(base, alone, (one,), (KEPT, KEPT), BLOCKS)
     assert again.base is alone
     (found,) = again.found
-    assert pushed(one.fit)
-    assert not pushed(found.fit)
+    assert with_noise_of_fit(one.fit)
+    assert not with_noise_of_fit(found.fit)
     # all else that is known of it is kept
     assert (found.term, found.p_value, found.beyond) == (one.term, one.p_value, one.beyond)
     assert found.fit.log_likelihood >= alone.log_likelihood - 1.0
@@ -76,13 +76,13 @@ def as_it_is(again, base, found):
 def test_where_the_simulation_alone_loses_the_recording_all_is_told_under_pushes():
     base, one = under_pushes()
     found = (one,)
-    as_it_is(running_freely(base, None, found, (KEPT, KEPT), BLOCKS), base, found)
+    as_it_is(open_loop_evidence(base, None, found, (KEPT, KEPT), BLOCKS), base, found)
 
 
 @pytest.mark.parametrize("lost", [("freed", "_from_alone"), ("_judged",)])
 def test_where_a_finding_loses_the_recording_or_an_unseen_block_all_is_told_under_pushes(monkeypatch, lost):
     base, one = under_pushes()
-    alone, found = freed(base), (one,)
+    alone, found = refit_open_loop(base), (one,)
     for name in lost:
         monkeypatch.setattr(module, name, lambda *_: None)
-    as_it_is(running_freely(base, alone, found, (KEPT, KEPT), BLOCKS), base, found)
+    as_it_is(open_loop_evidence(base, alone, found, (KEPT, KEPT), BLOCKS), base, found)

@@ -8,7 +8,7 @@ import torch
 from mkc_torch import Recording
 from mkc_torch.diagnosis.evidence.held_out import blocks_of, held_out
 from mkc_torch.diagnosis.evidence.simpler_form import simplified
-from mkc_torch.diagnosis.files.model import DiagnosedModel, model_of
+from mkc_torch.diagnosis.io.model import DiagnosedModel, model_of
 from mkc_torch.diagnosis.linearised.estimate import estimate
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms
@@ -28,7 +28,7 @@ class Bodies(Dynamics):
     inputs = ("heat",)
     parameters = {"loss": Parameter(0.5, lower=0.0), "gain": Parameter(1.0, lower=0.0)}  # noqa: RUF012
     units = {"left": "K", "right": "K"}  # noqa: RUF012
-    between = "held"
+    input_hold = "held"
 
     def derivative(self, time, x, u, p):  # noqa: ARG002
         return {"left": p.gain * u.heat - p.loss * x.left, "right": 0.5 * p.gain * u.heat - p.loss * x.right}

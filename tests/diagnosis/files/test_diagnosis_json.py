@@ -9,19 +9,19 @@ import torch
 pytest.importorskip("jsonschema")
 
 from mkc_torch.density import ChannelTails
-from mkc_torch.diagnosis.evidence import density, driver_shift, extrapolation, held_out_gain, onset, switched
-from mkc_torch.diagnosis.files.diagnosis_json import DiagnosisFileError, diagnosis_to_json, json_schema, validate
+from mkc_torch.diagnosis.evidence import density, driver_shift, extrapolation, held_out_gain, intermittency, onset
+from mkc_torch.diagnosis.io.diagnosis_json import DiagnosisFileError, diagnosis_to_json, json_schema, validate
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.diagnosis.result import (
     DensityCheck,
     DriverShift,
+    EffectParameter,
+    EvidenceResult,
     Extrapolation,
     HeldOut,
-    Parameter,
     Reference,
     Region,
-    Told,
 )
 from mkc_torch.diagnosis.settings import EvidenceSettings
 from mkc_torch.diagnosis.stop import Stop
@@ -102,12 +102,12 @@ def test_what_shifted_copies_of_a_driver_gain_is_written():
 
 
 def test_what_an_equation_needs_is_written():
-    parameter = Parameter("gradient", (1.0, -2.0), (0.1, 0.2), "µT/m", ("∂B_x/∂y", "∂B_x/∂z"))
+    parameter = EffectParameter("gradient", (1.0, -2.0), (0.1, 0.2), "µT/m", ("∂B_x/∂y", "∂B_x/∂z"))
     changes = {
         "parameters": (parameter,), "moments": (61.1, 77.8), "advice": "Do it.",
         "references": (Reference("current", 10.5, "A"),),
     }  # fmt: skip
-    said = switched.said(True), onset.said((60.9, 61.2))
+    said = intermittency.said(True), onset.said((60.9, 61.2))
     (finding,) = written(with_finding(make_diagnosis(1), *said, **changes))["findings"]
     assert finding["parameters"][0]["components"] == ["∂B_x/∂y", "∂B_x/∂z"]
     assert finding["moments"] == [61.1, 77.8]
@@ -140,11 +140,11 @@ def test_the_noise_s_units_and_its_density_s_distances_are_written():
 
 
 def test_what_a_new_test_says_stands_under_its_id_and_the_keys_keep_their_order():
-    said = Told(
+    said = EvidenceResult(
         "my_test",
         content={"lag": 0.4, "by": ({"channel": "norm", "held_out": HeldOut(0.1, (0.0, 0.2), 1.0, 0.9, "µT")},)},
     )
-    made = with_evidence(with_finding(make_diagnosis(1), said, onset.said((1.0, 2.0)), switched.said(True)), said)
+    made = with_evidence(with_finding(make_diagnosis(1), said, onset.said((1.0, 2.0)), intermittency.said(True)), said)
     content = written(made)
     held_out = {
         "log_likelihood_gain": 0.1,
@@ -170,7 +170,7 @@ def test_evidence_of_another_form_is_refused(content, evidence):
 
 
 def test_components_are_as_many_as_the_numbers():
-    parameter = Parameter("gradient", (1.0, -2.0, 3.0), None, "µT/m", ("a", "b"))
+    parameter = EffectParameter("gradient", (1.0, -2.0, 3.0), None, "µT/m", ("a", "b"))
     with pytest.raises(DiagnosisFileError, match=r"parameters\.0\.components` are not as many as the numbers"):
         diagnosis_to_json(with_finding(make_diagnosis(1), parameters=(parameter,)))
 
@@ -184,7 +184,7 @@ def test_a_region_of_another_kind_is_refused(content):
 def test_numbers_round_trip_exactly():
     values = (0.1 + 0.2, 1e-300, -math.pi)
     errors = ((1 / 3, 2 / 3), (1e22, 5e-324))
-    parameters = (Parameter("a", values, None, ""), Parameter("b", ((1.5, 2.5), (3.5, 4.5)), errors, "µT"))
+    parameters = (EffectParameter("a", values, None, ""), EffectParameter("b", ((1.5, 2.5), (3.5, 4.5)), errors, "µT"))
     content = written(with_finding(make_diagnosis(1), parameters=parameters, onset=0.1 + 0.7))
     first, second = content["findings"][0]["parameters"]
     assert first["value"] == list(values)
@@ -194,7 +194,7 @@ def test_numbers_round_trip_exactly():
 
 
 def test_numpy_numbers_are_numbers():
-    parameter = Parameter("a", np.float64(0.3), np.float64("nan"), "")
+    parameter = EffectParameter("a", np.float64(0.3), np.float64("nan"), "")
     (told,) = written(with_finding(make_diagnosis(1), parameters=(parameter,)))["findings"][0]["parameters"]
     assert told["value"] == 0.3
     assert told["standard_error"] is None
@@ -205,7 +205,7 @@ def test_what_is_not_known_is_null_and_a_gaussian_bandwidth_is_inf(content):
     assert content["findings"][1]["held_out"] is None
     assert content["findings"][1]["held_out_note"].startswith("The event")
     diagnosis = make_diagnosis(1, ceiling=None)
-    errors = Parameter("a", (1.0, 2.0), (math.nan, 0.1), "")
+    errors = EffectParameter("a", (1.0, 2.0), (math.nan, 0.1), "")
     held_out = HeldOut(0.1, (-math.inf, 0.2), 1.0, 0.9, "µT")
     (rival, *_) = diagnosis.findings[0].alternatives
     gap = dataclasses.replace(rival, log_likelihood_gap=math.inf)
@@ -219,7 +219,7 @@ def test_what_is_not_known_is_null_and_a_gaussian_bandwidth_is_inf(content):
 
 
 def test_numbers_that_are_not_finite_are_refused_with_their_place():
-    bad = Parameter("a", (1.0, math.nan), None, "")
+    bad = EffectParameter("a", (1.0, math.nan), None, "")
     with pytest.raises(DiagnosisFileError, match=r"`findings\.0\.parameters\.0\.value\.1` is nan"):
         diagnosis_to_json(with_finding(make_diagnosis(1), parameters=(bad,)))
     with pytest.raises(DiagnosisFileError, match="`p_value` is nan"):

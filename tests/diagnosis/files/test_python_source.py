@@ -5,7 +5,7 @@ import torch
 
 from mkc_torch import Recording
 from mkc_torch.diagnosis import DiagnosedModel
-from mkc_torch.diagnosis.files.python_source import SourceError
+from mkc_torch.diagnosis.io.python_source import SourceError
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term

@@ -8,10 +8,10 @@ import pytest
 
 pytest.importorskip("jsonschema")
 
+from mkc_torch.diagnosis.environment import NoiseEnvironment
 from mkc_torch.diagnosis.evidence import held_out_gain
-from mkc_torch.diagnosis.files.diagnosis_json import DiagnosisFileError, diagnosis_to_json, json_schema, validate
-from mkc_torch.diagnosis.result import HeldOut, Sizes, Told
-from mkc_torch.diagnosis.world import World
+from mkc_torch.diagnosis.io.diagnosis_json import DiagnosisFileError, diagnosis_to_json, json_schema, validate
+from mkc_torch.diagnosis.result import EvidenceResult, HeldOut, ResidualSizes
 from tests.diagnosis.factory import (
     PUSHED,
     graded,
@@ -24,7 +24,7 @@ from tests.diagnosis.factory import (
     with_evidence,
 )
 
-WHITENESS = Told(
+WHITENESS = EvidenceResult(
     "whiteness",
     content={
         "unit": "s",
@@ -77,7 +77,7 @@ def test_both_schemas_are_schemas():
 
 
 def test_a_diagnosis_that_knows_nothing_of_the_world_is_written():
-    content = written(make_diagnosis(1, world=World()))
+    content = written(make_diagnosis(1, world=NoiseEnvironment()))
     assert content["follows"] == {}
     assert content["forcing"] == content["reasons"] == []
     assert {key: content["noise"][key] for key in ("process", "sensor", "between")} == {
@@ -152,7 +152,7 @@ def test_an_adequate_simulation_lacks_nothing_that_counts():
 
 def test_grades_shapes_and_sizes_of_each_output_are_written():
     held = HeldOut(
-        0.3, (0.2, 0.4), 0.9, 0.5, "", {"angle": Sizes(0.2, 0.1, "rad"), "speed": Sizes(math.inf, 2.0, "rad/s")},
+        0.3, (0.2, 0.4), 0.9, 0.5, "", {"angle": ResidualSizes(0.2, 0.1, "rad"), "speed": ResidualSizes(math.inf, 2.0, "rad/s")},
         "In 1 of 25 blocks the simulation alone leaves the recording's range.",
     )  # fmt: skip
     made = make_diagnosis(1, samples=200)

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from mkc_torch.diagnosis.evidence import switched
+from mkc_torch.diagnosis.evidence import intermittency
 from mkc_torch.diagnosis.findings.advice import advice_of
 from mkc_torch.diagnosis.result import Alternative
 from mkc_torch.effects.sensor.hard_iron_step import HardIronStep
@@ -33,20 +33,20 @@ def test_each_effect_s_own_advice_is_told_and_nothing_against_it():
 
 def test_what_belongs_to_the_place_is_not_for_other_recordings():
     made = make_diagnosis(1, samples=50)
-    placed = dataclasses.replace(made.findings[0], placed=True, alternatives=())
+    placed = dataclasses.replace(made.findings[0], location_specific=True, alternatives=())
     (only,) = advice_of(dataclasses.replace(made, findings=(placed,)))
     assert "model found here" not in only
 
 
 def test_what_comes_and_goes_is_to_be_looked_for_and_not_corrected():
     made = make_diagnosis(1, samples=50)
-    step = dataclasses.replace(with_evidence(made.findings[0], switched.said(True)), alternatives=())
+    step = dataclasses.replace(with_evidence(made.findings[0], intermittency.said(True)), alternatives=())
     (only,) = advice_of(dataclasses.replace(made, findings=(step,)))
     assert only.startswith("Look for something that is switched on and off")
 
 
 def test_what_a_rival_could_be_instead_is_done_only_once_it_is_told_apart():
-    drift = Alternative("offset_drift", (), 0.4, False, again=OffsetDrift.again)
+    drift = Alternative("offset_drift", (), 0.4, False, recurrence=OffsetDrift.recurrence)
     apart, do, _model = advised(1, alternatives=(drift,))
     assert apart.startswith("To tell hard_iron_step from offset_drift")
     assert do.startswith("If it is hard_iron_step: look for what changed at that time")
@@ -96,7 +96,7 @@ def test_what_pushes_a_state_is_looked_for_and_counted_on():
 
 
 def test_a_step_and_a_drift_are_told_apart_by_another_recording():
-    drift = Alternative("offset_drift", (), 0.4, False, again=OffsetDrift.again)
+    drift = Alternative("offset_drift", (), 0.4, False, recurrence=OffsetDrift.recurrence)
     sentence = advised(1, alternatives=(drift,))[0]
     assert sentence == (
         "To tell hard_iron_step from offset_drift, record again: a step does not come at the same moment again; a "
@@ -138,7 +138,9 @@ def test_two_columns_are_told_apart_by_changing_one(rival, how):
 def test_rivals_are_told_apart_by_what_the_kind_of_state_can_do(kind, how):
     made = make_diagnosis(1, samples=50)
     rival = Alternative("stribeck_friction", (), 0.4, False, "rate of speed")
-    first = dataclasses.replace(made.findings[0], effect="coulomb_friction", again="", alternatives=(rival,), kind=kind)
+    first = dataclasses.replace(
+        made.findings[0], effect="coulomb_friction", recurrence="", alternatives=(rival,), kind=kind
+    )
     assert advice_of(dataclasses.replace(made, findings=(first,)))[0] == (
         f"To tell coulomb_friction from stribeck_friction, record again {how}."
     )
@@ -170,7 +172,7 @@ def test_where_something_shows_it_is_not(changes, told):
 
 
 def test_effects_of_the_catalogue_say_what_another_recording_shows():
-    assert HardIronStep.again != OffsetDrift.again
+    assert HardIronStep.recurrence != OffsetDrift.recurrence
 
 
 def test_two_findings_of_one_name_are_told_apart_by_their_place():

@@ -6,12 +6,12 @@ import math
 import pytest
 import torch
 
-from mkc_torch.diagnosis.findings.pushes import forcing_of, pushes_of
+from mkc_torch.diagnosis.findings.disturbances import forcing_of, pushes_of
 from mkc_torch.diagnosis.model.fit import FittedModel
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.simulation.dynamics.disturbances import Disturbed
 from mkc_torch.simulation.dynamics.first_fit import strong_observer
-from mkc_torch.simulation.dynamics.noise import NoiseOfTheWorld
+from mkc_torch.simulation.dynamics.noise import StateSpaceNoise
+from mkc_torch.simulation.dynamics.noise_selection import SelectedNoise
 from mkc_torch.simulation.dynamics.observer import Disturbance
 from tests.diagnosis.pushed import NOISE, Pendulum, swung, swung_in_the_world
 
@@ -23,8 +23,8 @@ WANDER = Disturbance("angle", False, 2.0, 0.01)
 def noise_of(*pushes, errors=None, gains=None):
     sensor = torch.tensor([NOISE], dtype=torch.float64)
     many = len(pushes)
-    known = Disturbed(pushes, errors or (0.1,) * many, gains or (50.0,) * many, sensor, 0.0, (False,))
-    return NoiseOfTheWorld(known, None)
+    known = SelectedNoise(pushes, errors or (0.1,) * many, gains or (50.0,) * many, sensor, 0.0, (False,))
+    return StateSpaceNoise(known, None)
 
 
 @functools.cache

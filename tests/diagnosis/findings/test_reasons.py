@@ -7,7 +7,7 @@ import torch
 
 from mkc_torch.diagnosis.findings import reasons
 from mkc_torch.diagnosis.findings.reasons import at_ends, reasons_of
-from mkc_torch.diagnosis.follows import follows_of
+from mkc_torch.diagnosis.goodness_of_fit import goodness_of_fit
 from mkc_torch.diagnosis.model.fit import FittedModel, fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from tests.diagnosis.factory import make_follows
@@ -36,7 +36,7 @@ def at(recording, stiffness=9.0, damping=0.15, system=Pendulum):
 
 def told_of(fit):
     """Reasons, and the residual that the first of them says is reached."""
-    known = follows_of(fit.model.prepared, fit.residual, {}, None)
+    known = goodness_of_fit(fit.model.prepared, fit.residual, {}, None)
     return reasons_of([fit], known)
 
 

@@ -9,12 +9,12 @@ import torch
 from scipy.integrate import solve_ivp
 
 from mkc_torch import Recording
+from mkc_torch.diagnosis.environment import Curve
 from mkc_torch.diagnosis.findings.shape import nearest_power, shape_of
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.settings import EvidenceSettings
-from mkc_torch.diagnosis.world import Curve
 from mkc_torch.effects.dynamics.linear_drag import LinearDrag
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
 from mkc_torch.effects.dynamics.unknown_rate import UnknownRate
@@ -32,7 +32,7 @@ class Boat(Dynamics):
     outputs = ("speed",)
     units = {"speed": "m/s", "thrust": "m/s²"}  # noqa: RUF012
     parameters = {"gain": Parameter(1.0, lower=0.0)}  # noqa: RUF012
-    between = "held"
+    input_hold = "held"
 
     def derivative(self, time, x, u, p):  # noqa: ARG002
         return {"speed": p.gain * u.thrust}

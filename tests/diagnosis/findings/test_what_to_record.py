@@ -5,7 +5,7 @@ import pytest
 
 from mkc_torch import diagnose
 from mkc_torch.diagnosis.findings.advice import advice_of
-from mkc_torch.diagnosis.findings.what_to_record import SAME
+from mkc_torch.diagnosis.findings.experiment_design import SAME
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling
@@ -36,15 +36,15 @@ def test_the_state_in_which_they_part_is_told():
     current = 1.5 * np.sin(2.0 * np.pi * TIME / 9.0) ** 3
     result, rival = diagnosed(np.minimum(current, 1.1), current)
     assert not rival.separable
-    assert "those while temperature is above 20.3" in rival.told_by
-    assert "°C do it best" in rival.told_by
-    assert more(rival.told_by) > 1.0
-    assert any(rival.told_by in sentence for sentence in advice_of(result))
+    assert "those while temperature is above 20.3" in rival.distinguishing_state
+    assert "°C do it best" in rival.distinguishing_state
+    assert more(rival.distinguishing_state) > 1.0
+    assert any(rival.distinguishing_state in sentence for sentence in advice_of(result))
 
 
 def test_what_goes_the_same_way_cannot_be_told_by_more_of_it():
     result, rival = diagnosed(2.0 * CURRENT)
-    assert (rival.separable, rival.told_by) == (False, SAME)
+    assert (rival.separable, rival.distinguishing_state) == (False, SAME)
     assert any(SAME in sentence for sentence in result.advice)
 
 
@@ -53,9 +53,9 @@ def test_the_less_they_part_the_more_it_takes():
     assert not far.separable
     assert not near.separable
     # what tells them apart goes with the square of how far they part
-    assert more(near.told_by) / more(far.told_by) == pytest.approx(6.25, rel=0.35)
+    assert more(near.distinguishing_state) / more(far.distinguishing_state) == pytest.approx(6.25, rel=0.35)
 
 
 def test_of_what_is_told_apart_nothing_is_to_be_recorded():
     _, rival = diagnosed(CURRENT + 0.6 * np.sin(2.0 * np.pi * TIME / 4.3))
-    assert (rival.separable, rival.told_by) == (True, "")
+    assert (rival.separable, rival.distinguishing_state) == (True, "")

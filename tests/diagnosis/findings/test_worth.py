@@ -3,14 +3,14 @@
 import pytest
 import torch
 
-from mkc_torch.diagnosis.findings.worth import grade_of, sizeless
-from mkc_torch.diagnosis.result import Finding, HeldOut, Parameter, Told
+from mkc_torch.diagnosis.findings.grading import grade_of, is_zero_within_error
+from mkc_torch.diagnosis.result import EffectParameter, EvidenceResult, Finding, HeldOut
 
-SURE = (Told("held_out", (HeldOut(0.3, (0.2, 0.4), 2.0, 1.0, "µT"), "")),)
+SURE = (EvidenceResult("held_out", (HeldOut(0.3, (0.2, 0.4), 2.0, 1.0, "µT"), "")),)
 
 
 def finding(*numbers):
-    parameters = tuple(Parameter(f"number {k}", value, error, "") for k, (value, error) in enumerate(numbers))
+    parameters = tuple(EffectParameter(f"number {k}", value, error, "") for k, (value, error) in enumerate(numbers))
     return Finding("coupling", (), (), (), None, "", "", parameters, 0.01, (), True, "", evidence=SURE)
 
 
@@ -28,5 +28,5 @@ def finding(*numbers):
 )
 def test_what_has_no_size_is_not_confirmed_whatever_blocks_show(numbers, none):
     found = finding(*numbers)
-    assert sizeless(found) is none
+    assert is_zero_within_error(found) is none
     assert grade_of(found) == ("not confirmed" if none else "left out")

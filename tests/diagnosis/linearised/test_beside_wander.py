@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mkc_torch.diagnosis.linearised.beside_wander import beside_wander
+from mkc_torch.diagnosis.linearised.drift_residuals import drift_residuals
 from mkc_torch.diagnosis.linearised.linearise import linearise
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import fitted
@@ -32,7 +32,7 @@ def local_of(sensor, use, noise=0.3):
     model = JointModel(prepared)
     fit = fitted(model, prepared.start())
     tangents = tangents_of(model, fit.parameters, NoiseSettings())
-    return fit, tangents, beside_wander(fit, model, fit.parameters, tangents, NoiseSettings())
+    return fit, tangents, drift_residuals(fit, model, fit.parameters, tangents, NoiseSettings())
 
 
 @pytest.mark.parametrize("use", ["norm", "attitude"])
@@ -158,9 +158,9 @@ def test_the_colour_beside_a_wander_is_the_likeliest(seed):
     fit, tangents, local = local_of(walk([0.05] * 3, seed) + slow_in_the_world(seed), "attitude")
     found = local.noise
     beside = replace(tangents.bare, slow=local.slow)
-    step = linearise(fit.model, fit.parameters, local.values, local.counts, beside, colour=found.colour_beside())
+    step = linearise(fit.model, fit.parameters, local.values, local.counts, beside, spectrum=found.colour_beside())
     assert step.evidence < found.evidence + 10.0
-    slow = found.colour.root.square()
+    slow = found.spectrum.root.square()
     assert float((slow[2:6, 1:].mean(0) / slow[-200:, 1:].mean(0)).min()) > 30.0
 
 
@@ -188,7 +188,9 @@ def test_the_noise_is_that_of_what_is_left():
     fit, tangents, local = local_of(walk([0.05, 0.05, 0.05]), "norm")
     noise = local.noise.search.noise_fit(local.noise.series)
     assert noise.size > 0
-    again = linearise(fit.model, fit.parameters, local.values, local.counts, tangents.bare, colour=local.noise.colour)
+    again = linearise(
+        fit.model, fit.parameters, local.values, local.counts, tangents.bare, spectrum=local.noise.spectrum
+    )
     torch.testing.assert_close(again.series, local.noise.series)
 
 
@@ -203,9 +205,9 @@ def test_another_colour_is_the_search_that_begins_with_it():
         torch.ones_like(fit.residual),
     )
     found = linearise(model, fit.parameters, values, counts, tangents, white=True)
-    colour = found.colour_beside()
-    built = linearise(model, fit.parameters, values, counts, tangents, colour=colour)
-    told = found.recoloured(colour)
+    spectrum = found.colour_beside()
+    built = linearise(model, fit.parameters, values, counts, tangents, spectrum=spectrum)
+    told = found.recoloured(spectrum)
     torch.testing.assert_close(told.series, built.series)
     assert told.evidence == pytest.approx(built.evidence)
     assert told.evidence > found.evidence + 10.0
@@ -224,7 +226,7 @@ def test_a_simulation_of_two_channels_is_served_alike():
     line = Line(600)
     model = JointModel(line)
     fit = fitted(model, line.start())
-    local = beside_wander(
+    local = drift_residuals(
         fit, model, fit.parameters, tangents_of(model, fit.parameters, NoiseSettings()), NoiseSettings()
     )
     assert local.values.shape == (600, 2)

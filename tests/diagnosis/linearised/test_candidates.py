@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from mkc_torch.diagnosis.linearised import candidates, seen
+from mkc_torch.diagnosis.linearised import candidates, cosine_projection
 from mkc_torch.diagnosis.linearised.candidates import Candidates, one_after_the_other, parts_of
 from mkc_torch.diagnosis.linearised.linearise import linearise
 from mkc_torch.diagnosis.linearised.tangents import tangents_of
@@ -117,7 +117,7 @@ def test_no_tensor_holds_all_candidates_of_a_long_recording(monkeypatch):
     monkeypatch.setattr(candidates, "_CELLS", 1_000_000)
     with Largest() as largest:
         tangents = tangents_of(model, parameters, Settings().noise, terms)
-        found = seen.Seen.of(pseudo, torch.ones_like(pseudo), tangents, None)
+        found = cosine_projection.CosineProjection.of(pseudo, torch.ones_like(pseudo), tangents, None)
     widths = sum(one.shape[-1] for one in found.candidates)
     assert widths == sum(one.shape[-1] for one in tangents.candidates) >= 60
     assert found.kept < N // 20

@@ -203,7 +203,7 @@ def test_p_values_of_draws_with_wander_are_not_too_small(search):
     """Where the noise wanders and its size is fitted with each candidate, slow candidates raise no false alarms."""
     noise = search.noise_fit(wandering(100.0, 0, seed=40))
     generator = torch.Generator().manual_seed(0)
-    drawn = search.white(2000, generator) + search.wander(2000, noise, generator)
+    drawn = search.white(2000, generator) + search.drift(2000, noise, generator)
     p = search.gains(drawn).log_p.exp()
     share = (p < 0.05).double().mean(-1)
     assert float(share.max()) < 0.09
@@ -214,13 +214,13 @@ def test_p_values_of_draws_with_wander_are_not_too_small(search):
 
 def test_drawn_wander_has_its_covariance(search):
     noise = search.noise_fit(wandering(100.0, 0, seed=40))
-    drawn = search.wander(20_000, noise, torch.Generator().manual_seed(0))
+    drawn = search.drift(20_000, noise, torch.Generator().manual_seed(0))
     courses = WANDER * SCALES[noise.family]
     expected = noise.size * courses @ courses.mT
     assert float((drawn @ drawn.mT / 20_000 - expected).abs().max()) < 0.05 * float(expected.max())
     still = search.noise_fit(randn(M, seed=3))
     if still.size == 0:
-        assert not bool(search.wander(3, still, torch.Generator()).any())
+        assert not bool(search.drift(3, still, torch.Generator()).any())
 
 
 def test_the_nuisance_is_taken_out_of_everything(search):

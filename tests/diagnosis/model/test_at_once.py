@@ -2,11 +2,11 @@
 
 import torch
 
-from mkc_torch._parallel.pool import Parcels
-from mkc_torch.diagnosis.model.at_once import common_parts
+from mkc_torch._parallel.pool import Serializer
 from mkc_torch.diagnosis.model.drivers import Driver
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.parallel import common_parts
 from mkc_torch.diagnosis.model.term import Term
 from mkc_torch.effects import GainEffect
 from mkc_torch.recording import Recording
@@ -24,7 +24,7 @@ class Along(GainEffect):
     def __init__(self, number):
         self.number = number
 
-    def course(self, shape, context):
+    def waveform(self, shape, context):
         return shape[self.number] * context.drivers[:, 0]
 
 
@@ -37,7 +37,7 @@ class Decay(Dynamics):
 
 
 def sent(fits, known):
-    parcels = Parcels(known)
+    parcels = Serializer(known)
     return parcels.unpacked(parcels.packed(fits))
 
 

@@ -7,10 +7,10 @@ import torch
 
 from mkc_torch import Recording, diagnose
 from mkc_torch._support.order_statistic import robust_scale
-from mkc_torch.diagnosis.model import in_the_world
+from mkc_torch.diagnosis.model import process_noise
 from mkc_torch.diagnosis.model.fit import fitted
-from mkc_torch.diagnosis.model.in_the_world import simulation_in_the_world
 from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.process_noise import fit_baseline
 from mkc_torch.diagnosis.settings import Settings
 from mkc_torch.nonlinear import NoFitError
 from mkc_torch.simulation import Dynamics
@@ -81,7 +81,7 @@ def room():
 )
 def test_a_first_fit_that_diverges_begins_elsewhere(simulation, recording, expected):
     prepared = simulation.prepare(recording)
-    found = simulation_in_the_world(prepared, {}, Settings().noise)
+    found = fit_baseline(prepared, {}, Settings().noise)
     assert found.fit.parameters[:2].tolist() == pytest.approx(expected, rel=0.2)
 
 
@@ -93,7 +93,7 @@ def test_a_domain_that_the_residual_does_not_fit_in_is_made_wider():
     narrow = replace(free, bound=1e-3 * free.bound)
     with pytest.raises(NoFitError):
         fitted(free.model, free.parameters, narrow.bound, graduate=False)
-    wider = in_the_world._wider(narrow, Settings().noise)
+    wider = process_noise._wider(narrow, Settings().noise)
     assert float(wider.bound) >= 2.9 * float(robust_scale(free.residual))
 
 

@@ -19,7 +19,7 @@ class Mixed(GainEffect):
     port = "mixed"
     roles = ("any",)
 
-    def course(self, shape, context):
+    def waveform(self, shape, context):
         return context.drivers[:, 0] + shape.get("more", 0.0)
 
 
@@ -35,7 +35,7 @@ class Summed(GainEffect):
     id = "leak"
     port = "summed"
 
-    def course(self, shape, context):  # noqa: ARG002
+    def waveform(self, shape, context):  # noqa: ARG002
         return context.time
 
 

@@ -8,7 +8,7 @@ import torch
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.search.strongest import refitted
+from mkc_torch.diagnosis.search.joint_refits import refitted
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
 from tests.simulation.tumbling import tumbling

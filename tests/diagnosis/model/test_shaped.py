@@ -111,8 +111,8 @@ def test_an_effect_without_such_numbers_stays_as_it_is():
 class Broken(type(OF["input_saturation"])):
     """An effect that has no value but at the limits of its grid."""
 
-    def course(self, shape, context):
-        course = super().course(shape, context)
+    def waveform(self, shape, context):
+        course = super().waveform(shape, context)
         return course if isinstance(shape["limit"], float) else course * torch.nan
 
 

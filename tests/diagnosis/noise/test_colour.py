@@ -10,9 +10,16 @@ import torch
 from scipy import signal, stats
 
 from mkc_torch.density.fit import fit_density
-from mkc_torch.diagnosis.noise.colour import Colour, _levinson, autoregressive, colour_of, enters_at_port, port_colour
 from mkc_torch.diagnosis.noise.cosine_basis import cosines, dct, dct_of_courses, inverse_dct
 from mkc_torch.diagnosis.noise.pseudo_residual import pseudo_residual
+from mkc_torch.diagnosis.noise.spectrum import (
+    NoiseSpectrum,
+    _levinson,
+    autoregressive,
+    colour_of,
+    enters_at_port,
+    port_colour,
+)
 from mkc_torch.functional import mkc_energy
 from tests.simulation.tumbling import turns
 
@@ -109,8 +116,8 @@ def test_draws_do_not_close_in_a_circle():
 @pytest.mark.parametrize("phi", [[], [0.8], [0.97], [1.2, -0.5]])
 def test_the_colour_makes_an_autoregression_white(phi):
     noise = torch.stack([coloured(phi, 4000, seed) for seed in (1, 2)], -1)
-    colour = colour_of(dct(noise).square())
-    white = colour.whiten(noise).unflatten(0, (4000, 2))
+    noise_spectrum = colour_of(dct(noise).square())
+    white = noise_spectrum.whiten(noise).unflatten(0, (4000, 2))
     assert float(white.square().mean()) == pytest.approx(1.0, abs=0.03)
     # the periodogram is flat in eight bands, the slowest of them narrow
     edges = [0, 40, 100, 250, 500, 1000, 2000, 3000, 4000]
@@ -131,9 +138,9 @@ def test_the_colour_knows_the_autoregression():
 
 def test_channels_have_a_colour_each():
     noise = torch.stack([coloured([0.9], 4000), 5.0 * randn(4000, seed=3)], -1)
-    colour = colour_of(dct(noise).square())
-    assert [len(phi) for phi in colour.coefficients] == [1, 0]
-    white = colour.whiten(noise).unflatten(0, (4000, 2))
+    noise_spectrum = colour_of(dct(noise).square())
+    assert [len(phi) for phi in noise_spectrum.coefficients] == [1, 0]
+    white = noise_spectrum.whiten(noise).unflatten(0, (4000, 2))
     torch.testing.assert_close(white.square().mean(0), torch.ones(2, dtype=torch.float64), rtol=0.0, atol=0.05)
 
 
@@ -159,16 +166,16 @@ def test_the_slowest_noise_is_followed_too(whitened_walks):
 
 
 def test_a_silent_channel_has_no_colour():
-    colour = colour_of(torch.zeros(500, 1, dtype=torch.float64))
-    assert colour.order == 0
+    noise_spectrum = colour_of(torch.zeros(500, 1, dtype=torch.float64))
+    assert noise_spectrum.order == 0
 
 
 def test_whitening_keeps_the_slowest_coefficients_and_stacks_channels():
     values = randn(50, 2, 3)
     root = torch.arange(1.0, 21.0, dtype=torch.float64).reshape(10, 2)
-    white = Colour((AR2, AR2[:0]), root).whiten(values)
+    white = NoiseSpectrum((AR2, AR2[:0]), root).whiten(values)
     torch.testing.assert_close(white, (dct(values)[:10] / root.unsqueeze(-1)).reshape(20, 3))
-    assert Colour((AR2, AR2[:0]), root).order == 2
+    assert NoiseSpectrum((AR2, AR2[:0]), root).order == 2
 
 
 def turning(rate, N=12_000):

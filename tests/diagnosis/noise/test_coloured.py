@@ -11,9 +11,8 @@ from mkc_torch.diagnosis.linearised.tangents import tangents_of
 from mkc_torch.diagnosis.model.fit import fitted, fitted_beside
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.search import closing_in
-from mkc_torch.diagnosis.search.closing_in import coloured, middle
-from mkc_torch.diagnosis.search.look import Scene
+from mkc_torch.diagnosis.search.linearized import SearchProblem
+from mkc_torch.diagnosis.search.shape_refinement import middle, with_spectrum
 from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
@@ -46,7 +45,9 @@ def with_shape(base, effect, shape):
     tangents = dataclasses.replace(tangents, nuisance=tangents.nuisance[..., : base.model.size])
     pseudo, counts = best.pseudo(NoiseSettings())
     moved = tangents.candidates[0] @ best.parameters[base.model.size :]
-    return best, Scene(base, best, best.model.terms, tangents, pseudo - counts * moved, counts, Settings()).under()
+    return best, SearchProblem(
+        base, best, best.model.terms, tangents, pseudo - counts * moved, counts, Settings()
+    ).under()
 
 
 @pytest.mark.e2e
@@ -54,7 +55,7 @@ def with_shape(base, effect, shape):
 def test_an_onset_in_a_burst_of_outliers_is_taken_from_its_middle(burst, onset):
     best, look = with_shape(burst, STEP, {"onset": onset})
     assert float(look.scene.counts[FIRST:LAST].mean()) == 0.0
-    moved = coloured(best, look)
+    moved = with_spectrum(best, look)
     assert moved.model.terms[-1].shape["onset"] == pytest.approx(TRUE, abs=0.15)
     assert moved.converged
 
@@ -63,7 +64,7 @@ def test_an_onset_in_a_burst_of_outliers_is_taken_from_its_middle(burst, onset):
 def test_an_onset_that_the_search_clearly_prefers_is_taken(burst):
     best, *_ = with_shape(burst, STEP, {"onset": TRUE - 4.0})
     _, look = with_shape(burst, STEP, {"onset": TRUE})
-    moved = coloured(best, look)
+    moved = with_spectrum(best, look)
     assert abs(moved.model.terms[-1].shape["onset"] - TRUE) < 1.0
     assert moved.log_likelihood > best.log_likelihood + 10.0
 
@@ -71,14 +72,14 @@ def test_an_onset_that_the_search_clearly_prefers_is_taken(burst):
 @pytest.mark.e2e
 def test_what_has_no_shape_or_does_not_converge_stays(burst, monkeypatch):
     best, look = with_shape(burst, CUBIC, {})
-    assert coloured(best, look) is best
+    assert with_spectrum(best, look) is best
     best, look = with_shape(burst, STEP, {"onset": FIRST / RATE + 0.02})
 
     def lost(*args, **kwargs):
         return dataclasses.replace(fitted_beside(*args, **kwargs), converged=False)
 
     monkeypatch.setattr(closing_in, "fitted_beside", lost)
-    assert coloured(best, look) is best
+    assert with_spectrum(best, look) is best
 
 
 @given(st.lists(st.floats(-5.0, 5.0), min_size=1, max_size=20), st.data())

@@ -7,10 +7,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mkc_torch.diagnosis.noise import gaps
-from mkc_torch.diagnosis.noise.colour import Colour
 from mkc_torch.diagnosis.noise.cosine_basis import dct
-from mkc_torch.diagnosis.noise.gaps import Gaps
+from mkc_torch.diagnosis.noise.imputation import MissingSamples
+from mkc_torch.diagnosis.noise.spectrum import NoiseSpectrum
 
 N = 60
 
@@ -20,9 +19,9 @@ def basis(size, kept):
     return dct(torch.eye(size, dtype=torch.float64))[:kept]
 
 
-def colour(*spectra):
+def noise_spectrum(*spectra):
     root = torch.stack(spectra, -1).sqrt()
-    return Colour(tuple(root.new_zeros(0) for _ in spectra), root)
+    return NoiseSpectrum(tuple(root.new_zeros(0) for _ in spectra), root)
 
 
 def falling(size, kept=None):
@@ -55,7 +54,7 @@ def test_it_is_the_conditional_expectation(seed, share):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gaps, "_PLAIN", 0.0)
         patch.setattr(gaps, "_END", N)  # the level of the last frequency alone
-        filling = Gaps(counts, N).filling(colour(*spectra))
+        filling = MissingSamples(counts, N).filling(noise_spectrum(*spectra))
     found = filling(dct(values))
     total = 0.0
     for channel, spectrum in enumerate(spectra):
@@ -69,7 +68,7 @@ def test_it_is_the_conditional_expectation(seed, share):
 @pytest.mark.parametrize("share", [0.1, 0.7])
 def test_solving_for_samples_or_for_frequencies_is_the_same(share, level):
     counts = mask(11, share=share)
-    known, rows = Gaps(counts, N), torch.arange(0, N, 2)
+    known, rows = MissingSamples(counts, N), torch.arange(0, N, 2)
     excess = (level / falling(N) - 1.0)[rows]
     assert bool((excess < 0).all()) == (level == 1.0)
     one, other = known._by_sample(0, rows, excess), known._by_frequency(0, rows, excess)
@@ -83,7 +82,7 @@ def test_frequencies_that_are_left_out_count_as_white():
     counts = mask(1)
     values = counts * torch.randn(N, 1, generator=torch.Generator().manual_seed(2)).double()
     kept = 30
-    found = Gaps(counts, kept).filling(colour(falling(N, kept)))(dct(values, kept))
+    found = MissingSamples(counts, kept).filling(noise_spectrum(falling(N, kept)))(dct(values, kept))
     spectrum = falling(N, kept)
     end = spectrum[-1]
     whole = torch.cat([torch.where((end / spectrum - 1.0).abs() > 0.3, spectrum, end), end.expand(N - kept)])
@@ -96,7 +95,7 @@ def test_frequencies_that_are_left_out_count_as_white():
 )
 def test_white_noise_and_a_whole_recording_are_left_as_they_are(counts, spectrum):
     values = dct(counts * torch.randn(N, 1, generator=torch.Generator().manual_seed(4)).double())
-    filling = Gaps(counts, N).filling(colour(spectrum))
+    filling = MissingSamples(counts, N).filling(noise_spectrum(spectrum))
     assert filling(values) is values
     assert filling.log_det == 0.0
 
@@ -104,7 +103,7 @@ def test_white_noise_and_a_whole_recording_are_left_as_they_are(counts, spectrum
 def test_amplitudes_are_left_what_they_are():
     counts, course = mask(5), torch.randn(N, 1, 2, generator=torch.Generator().manual_seed(6)).double()
     gamma = torch.tensor([2.0, -3.0], dtype=torch.float64)
-    filling = Gaps(counts, N).filling(colour(falling(N)))
+    filling = MissingSamples(counts, N).filling(noise_spectrum(falling(N)))
     masked = counts.unsqueeze(-1) * course
     torch.testing.assert_close(filling(dct(masked @ gamma)), filling(dct(masked)) @ gamma)
 
@@ -114,7 +113,7 @@ def test_many_frequencies_are_reduced_to_those_that_matter_most(limit, value, mo
     counts = mask(7)
     values = counts * torch.randn(N, 1, generator=torch.Generator().manual_seed(8)).double()
     monkeypatch.setattr(gaps, limit, value)
-    found = Gaps(counts, N).filling(colour(falling(N)))(dct(values))
+    found = MissingSamples(counts, N).filling(noise_spectrum(falling(N)))(dct(values))
     end = falling(N)[-3:].mean()
     series, _ = expected(values[:, 0], counts[:, 0], torch.where(torch.arange(N) < 12, falling(N), end) / end)
     torch.testing.assert_close(found[:, 0], dct(series))
@@ -132,14 +131,14 @@ def test_holes_in_a_walk_do_not_look_like_an_effect():
     noise += step * torch.randn(size, draws, generator=generator).double().cumsum(0)
     k = torch.arange(size, dtype=torch.float64)
     spectrum = 1.0 + (0.5 * step / torch.sin(0.5 * math.pi * k.clamp(min=0.5) / size)).square()
-    known = colour(spectrum)
+    known = noise_spectrum(spectrum)
     slow = torch.sin(
         torch.linspace(0.0, 1.0, size, dtype=torch.float64).unsqueeze(-1) * torch.tensor([5.0, 11.0, 23.0])
     )
     counts = mask(9, size, share=0.15)
 
     def ratio(filled):
-        filling = Gaps(counts, size).filling(known) if filled else lambda c: c
+        filling = MissingSamples(counts, size).filling(known) if filled else lambda c: c
         series = known.scaled(filling(dct((counts * noise).unsqueeze(1))))
         columns = known.scaled(filling(dct((counts * slow).unsqueeze(1))))
         explained = torch.linalg.qr(columns).Q.mT @ series

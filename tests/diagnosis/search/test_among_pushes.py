@@ -7,7 +7,7 @@ import types
 import pytest
 import torch
 
-from mkc_torch.diagnosis.search.among_pushes import _needless, _plain, _within_reach, located_among_pushes
+from mkc_torch.diagnosis.search.with_process_noise import _needless, _plain, _within_reach, search_with_process_noise
 from mkc_torch.diagnosis.settings import SearchSettings, Settings
 from mkc_torch.effects import DYNAMICS
 from mkc_torch.nonlinear import NoFitError
@@ -18,7 +18,7 @@ FEW = Settings(search=dataclasses.replace(SearchSettings(), own_noise=2))
 
 
 def located(fit, draws=39, level=0.05):
-    return located_among_pushes(
+    return search_with_process_noise(
         fit,
         candidates(fit, DYNAMICS),
         level=level,
@@ -60,7 +60,7 @@ def test_beside_pushes_from_which_nothing_is_missing_nothing_is_compared(seed):
 
 
 def test_a_lost_trajectory_is_told(monkeypatch):
-    monkeypatch.setattr("mkc_torch.diagnosis.search.among_pushes.joint_likelihood", lambda *_, **__: None)
+    monkeypatch.setattr("mkc_torch.diagnosis.search.with_process_noise.joint_likelihood", lambda *_, **__: None)
     with pytest.raises(NoFitError, match="trajectory is lost"):
         located(at_the_truth("white", 1))
 
@@ -77,7 +77,7 @@ def test_what_is_far_behind_at_first_is_not_fitted_any_further():
 def test_the_one_that_is_left_out_is_still_in_the_ranking():
     base = swung_in_the_world("slow", drag=0.4).fit
     strict = dataclasses.replace(FEW, search=dataclasses.replace(FEW.search, behind=0.0, behind_share=0.0))
-    found = located_among_pushes(
+    found = search_with_process_noise(
         base, candidates(base, DYNAMICS), level=0.05, surrogates=39, generator=torch.Generator().manual_seed(0),
         declared={}, fixed={}, settings=strict,
     )  # fmt: skip
@@ -106,7 +106,7 @@ def test_without_draws_a_free_run_has_to_be_likelier_than_the_simulation_under_t
     bare, counts, monkeypatch
 ):
     base, run = of_likelihood(1000.0, 3), of_likelihood(1100.0, 4)
-    module = "mkc_torch.diagnosis.search.among_pushes"
+    module = "mkc_torch.diagnosis.search.with_process_noise"
     monkeypatch.setattr(f"{module}.with_own_noise", lambda fit, *_: fit)
     monkeypatch.setattr(f"{module}._under_own_noise", lambda fit, *_: fit)
     monkeypatch.setattr(f"{module}.at_once", lambda works, *_: [work() for work in works])

@@ -12,8 +12,8 @@ from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
-from mkc_torch.diagnosis.search.first_look import p_value_beside
-from mkc_torch.diagnosis.search.locate import locate
+from mkc_torch.diagnosis.search.run import run_search
+from mkc_torch.diagnosis.search.screening import p_value_beside
 from mkc_torch.diagnosis.settings import DriverSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Magnetometer
@@ -21,7 +21,7 @@ from tests.simulation.tumbling import RATE, tumbling
 
 pytestmark = pytest.mark.e2e
 
-rounds = importlib.import_module("mkc_torch.diagnosis.rounds")
+rounds = importlib.import_module("mkc_torch.diagnosis.stepwise")
 
 N = 2000
 TIME = np.arange(N) / RATE
@@ -42,7 +42,7 @@ def located(*effects, seed=0):
     drivers = find_drivers(prepared.recording, simulation.columns, DriverSettings(), roles).drivers
     base = fitted(JointModel(prepared), prepared.start())
     terms = candidate_terms(prepared, drivers, CATALOGUE)
-    found = locate(
+    found = run_search(
         base, terms, level=0.05, surrogates=99, generator=torch.Generator().manual_seed(0), settings=Settings()
     )
     assert found.term.effect.id == "current_field"
@@ -87,11 +87,11 @@ def test_trajectories_are_for_the_search_itself():
     ((ALONG_CURRENT, STEP), 2, ["current_field", "hard_iron_step"]),
 ])  # fmt: skip
 def test_a_search_beside_a_finding_is_made_where_a_first_look_shows_something(monkeypatch, effects, searches, names):
-    locate, begun, seen = rounds.locate, [], []
+    run_search, begun, seen = rounds.locate, [], []
 
     def counted(*arguments, **options):
         begun.append(1)
-        return locate(*arguments, **options)
+        return run_search(*arguments, **options)
 
     def looked(*arguments, **options):
         seen.append(p_value_beside(*arguments, **options))

@@ -80,7 +80,7 @@ def test_gains_are_those_of_least_squares_within_the_range_of_the_physics():
     assert len(gains) == len(sizes) == len(terms)
     for term, gain, size in zip(terms, gains, sizes, strict=True):
         assert gain >= 0.0
-        assert bool(((size >= term.effect.least) & (size <= term.effect.most)).all())
+        assert bool(((size >= term.effect.lower) & (size <= term.effect.upper)).all())
     place = [term.effect.id for term in terms].index("linear_drag")
     model = fit.model.with_term(terms[place])
     start = torch.cat([fit.parameters, torch.zeros(1, dtype=torch.float64)])

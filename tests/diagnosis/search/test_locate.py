@@ -13,8 +13,8 @@ from mkc_torch.diagnosis.model.fit import fitted
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term
-from mkc_torch.diagnosis.search.locate import _settled, _with_tangents, locate
-from mkc_torch.diagnosis.search.strongest import _first_start
+from mkc_torch.diagnosis.search.joint_refits import _first_start
+from mkc_torch.diagnosis.search.run import _settled, _with_tangents, run_search
 from mkc_torch.diagnosis.settings import NoiseSettings, Settings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.nonlinear import NoFitError
@@ -37,7 +37,7 @@ def found():
     base = fitted(JointModel(prepared), prepared.start())
     terms = candidate_terms(prepared, (), TIMED)
     generator = torch.Generator().manual_seed(0)
-    return prepared, terms, locate(base, terms, level=0.05, surrogates=19, generator=generator, settings=Settings())
+    return prepared, terms, run_search(base, terms, level=0.05, surrogates=19, generator=generator, settings=Settings())
 
 
 @pytest.mark.e2e
@@ -71,7 +71,7 @@ def test_a_fit_without_slopes_gives_way_to_the_next(monkeypatch):
             raise NoFitError("no finite slope")
         return known
 
-    monkeypatch.setattr("mkc_torch.diagnosis.search.locate.tangents_of", tangents)
+    monkeypatch.setattr("mkc_torch.diagnosis.search.run.tangents_of", tangents)
     assert _with_tangents(fits, terms, Settings()) == (fits[1], terms, known)
     with pytest.raises(NoFitError, match="no finite slope"):
         _with_tangents(fits[:1], terms, Settings())
@@ -86,7 +86,7 @@ def test_gains_of_other_candidates_are_those_of_a_search_with_them():
     values = values * counts
     tangents = tangents_of(model, fit.parameters, NoiseSettings(), STEPS)
     whole = linearise(model, fit.parameters, values, counts, tangents)
-    bare = linearise(model, fit.parameters, values, counts, tangents.bare, colour=whole.colour)
+    bare = linearise(model, fit.parameters, values, counts, tangents.bare, spectrum=whole.spectrum)
     beside = Candidates(model, fit.parameters, STEPS, tangents.pointwise)
     assert len(beside) == 3
     torch.testing.assert_close(
@@ -108,8 +108,8 @@ def test_a_joint_fit_at_another_moment_gives_way_to_that_of_the_search(monkeypat
         fit = fitted(model, torch.cat([base.parameters, torch.zeros(3)]), base.bound)
         return [fit], tangents_of(base.model, base.parameters, NoiseSettings(), terms)
 
-    monkeypatch.setattr("mkc_torch.diagnosis.search.locate.strongest", strongest)
-    located = locate(
+    monkeypatch.setattr("mkc_torch.diagnosis.search.run.strongest", strongest)
+    located = run_search(
         base, terms, level=0.05, surrogates=19, generator=torch.Generator().manual_seed(0), settings=Settings()
     )
     assert located.p_value <= 0.05

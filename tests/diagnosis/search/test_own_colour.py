@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.linearised.linear_search import LinearSearch
-from mkc_torch.diagnosis.linearised.linearise import Linearised
-from mkc_torch.diagnosis.noise.colour import colour_of, whittle
-from mkc_torch.diagnosis.noise.gaps import Filling
-from mkc_torch.diagnosis.search.own_colour import own_colour_gains
+from mkc_torch.diagnosis.linearised.linearise import LinearisedSearch
+from mkc_torch.diagnosis.noise.imputation import Imputation
+from mkc_torch.diagnosis.noise.spectrum import colour_of, whittle
+from mkc_torch.diagnosis.search.whittle_gain import own_colour_gains
 from mkc_torch.diagnosis.settings import NoiseSettings
 
 N, M = 800, 2
@@ -36,14 +36,16 @@ SCALE = torch.tensor([1.0, 30.0]).double()
 
 def searching(size, seed=3):
     values = SCALE * (randn(N, M, seed=seed) + size * EFFECT)
-    colour = colour_of(values.square())
+    spectrum = colour_of(values.square())
     nuisance, effect, rival = (
-        colour.scaled(SCALE.unsqueeze(-1) * one) for one in (OFFSET, EFFECT.unsqueeze(-1), RIVAL.unsqueeze(-1))
+        spectrum.scaled(SCALE.unsqueeze(-1) * one) for one in (OFFSET, EFFECT.unsqueeze(-1), RIVAL.unsqueeze(-1))
     )
     search = LinearSearch(
         nuisance, [rival, effect], nuisance[:, :0], nuisance.new_zeros(0, 0), NoiseSettings().walk_first
     )
-    return Linearised(search, colour.scaled(values.unsqueeze(-1)).squeeze(-1), colour, None, Filling((None,) * M, 0.0))
+    return LinearisedSearch(
+        search, spectrum.scaled(values.unsqueeze(-1)).squeeze(-1), spectrum, None, Imputation((None,) * M, 0.0)
+    )
 
 
 BOTH = torch.ones(2, dtype=torch.bool)
@@ -63,8 +65,8 @@ def test_an_effect_that_hides_in_the_colour_is_seen_beside_its_own(seed):
 
 def test_the_gain_is_the_ratio_of_the_likelihoods_with_colours_of_their_own():
     linearised = searching(0.5)
-    values = linearised.series.unflatten(0, (N, M)) * linearised.colour.root
-    level = linearised.colour.root.square().mean(0).sqrt()
+    values = linearised.series.unflatten(0, (N, M)) * linearised.spectrum.root
+    level = linearised.spectrum.root.square().mean(0).sqrt()
     values, columns = values / level, EFFECT * SCALE / level
     values[0], columns[0] = 0.0, 0.0  # the offset takes the constant
     size = (values * columns).sum() / columns.square().sum()

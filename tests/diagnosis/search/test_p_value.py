@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mkc_torch.diagnosis.linearised.linear_search import Gains, log_survival
+from mkc_torch.diagnosis.linearised.linear_search import SearchGains, log_survival
 from mkc_torch.diagnosis.search import p_value as judge
 from mkc_torch.diagnosis.search.p_value import either
 from mkc_torch.diagnosis.settings import NoiseSettings
@@ -19,7 +19,7 @@ DOF = torch.tensor([3.0, 3.0]).double()
 
 def gains(ratio):
     ratio = torch.as_tensor(ratio, dtype=torch.float64)
-    return Gains(ratio, log_survival(ratio, DOF.unsqueeze(-1)), DOF)
+    return SearchGains(ratio, log_survival(ratio, DOF.unsqueeze(-1)), DOF)
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +34,7 @@ def judged(own, tried, possible=None, *, gain=0.0, wandering=None):
     noise = drawn.sample((2, DRAWS))
     search = SimpleNamespace(
         white=lambda count, _: torch.zeros(1, count),
-        wander=lambda count, _noise, _generator: torch.ones(1, count),
+        drift=lambda count, _noise, _generator: torch.ones(1, count),
         gains=lambda series: gains(noise if wandering is None or not bool(series.any()) else wandering),
     )
     linearised = SimpleNamespace(entering=lambda _count, _generator: None, search=search, series=torch.zeros(1))

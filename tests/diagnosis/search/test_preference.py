@@ -6,7 +6,7 @@ import torch
 from mkc_torch import Recording
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.grid import candidate_terms
-from mkc_torch.diagnosis.search.preference import Preference
+from mkc_torch.diagnosis.search.model_prior import ModelPrior
 from mkc_torch.diagnosis.settings import DriverSettings, NamingSettings
 from mkc_torch.effects import CATALOGUE
 from mkc_torch.simulation import Dynamics
@@ -30,18 +30,18 @@ def search():
     terms = candidate_terms(
         prepared, find_drivers(prepared.recording, Swing().columns, DriverSettings(), roles).drivers, CATALOGUE
     )
-    return Preference(terms, prepared, NamingSettings()), terms
+    return ModelPrior(terms, prepared, NamingSettings()), terms
 
 
 def test_a_named_force_gives_nothing(search):
     prefer, terms = search
     drag = next(term for term in terms if term.effect.id == "linear_drag")
-    assert prefer.handicap(drag, 100.0) == 0.0
+    assert prefer.penalty(drag, 100.0) == 0.0
 
 
 def test_a_form_that_has_others_as_special_cases_gives_five_nats(search):
     prefer, terms = search
-    forms = {term.effect.id: prefer.handicap(term, 100.0) for term in terms if term.effect.general}
+    forms = {term.effect.id: prefer.penalty(term, 100.0) for term in terms if term.effect.is_generalisation}
     assert forms == {"power_law": 5.0, "hidden_lag": 5.0, "hidden_mode": 5.0}
 
 
@@ -49,5 +49,5 @@ def test_a_curve_over_the_motion_gives_half_of_its_gain_and_ten_nats(search):
     prefer, terms = search
     curves = [term for term in terms if term.effect.is_curve and term.driver is None]
     assert curves
-    assert all(prefer.handicap(term, 100.0) == pytest.approx(60.0) for term in curves)
-    assert all(prefer.handicap(term, -5.0) == pytest.approx(10.0) for term in curves)
+    assert all(prefer.penalty(term, 100.0) == pytest.approx(60.0) for term in curves)
+    assert all(prefer.penalty(term, -5.0) == pytest.approx(10.0) for term in curves)

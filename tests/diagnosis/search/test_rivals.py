@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mkc_torch.diagnosis.search import rivals
-from mkc_torch.diagnosis.search.preference import Preference
+from mkc_torch.diagnosis.search.model_prior import ModelPrior
 from mkc_torch.diagnosis.search.ranking import Ranked
 from mkc_torch.diagnosis.search.rivals import by_joint_fits
 from mkc_torch.diagnosis.settings import Settings
@@ -14,13 +14,13 @@ from mkc_torch.diagnosis.settings import Settings
 BENT, POINTWISE = "rate", "sensor"
 
 
-class Indifferent(Preference):
+class Indifferent(ModelPrior):
     """No handicaps; in coloured noise a fit gains so much more than one that is not named."""
 
     def __init__(self, **new):
         self.new = new
 
-    def handicap(self, _term, _gain):
+    def penalty(self, _term, _gain):
         return 0.0
 
     def by_innovations(self, one, other, _price=1.0):

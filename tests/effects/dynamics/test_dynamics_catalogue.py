@@ -46,13 +46,13 @@ def test_what_brakes_takes_energy_out(name):
             power = effect.change(gamma, shape, context)[:, 0] * context.part("own")
             assert float(power.max()) <= 0.0
             assert float(power.min()) < -1e-3
-    assert (effect.least, effect.most) == (0.0, math.inf)
+    assert (effect.lower, effect.upper) == (0.0, math.inf)
 
 
 def test_signs_of_amplitudes():
-    assert {e.id for e in DYNAMICS if e.least == -math.inf} >= set(EITHER_SIGN)
-    assert {e.id: e.most for e in DYNAMICS if 1.0 < e.most < math.inf} == {"hidden_lag": 30.0, "hidden_mode": 10.0}
-    assert {e.id for e in DYNAMICS if (e.least, e.most) == (0.0, 1.0)} >= set(SHARES)
+    assert {e.id for e in DYNAMICS if e.lower == -math.inf} >= set(EITHER_SIGN)
+    assert {e.id: e.upper for e in DYNAMICS if 1.0 < e.upper < math.inf} == {"hidden_lag": 30.0, "hidden_mode": 10.0}
+    assert {e.id for e in DYNAMICS if (e.lower, e.upper) == (0.0, 1.0)} >= set(SHARES)
     for effect in DYNAMICS:
         assert effect.one_sided or effect.id in EITHER_SIGN or effect.id not in IDS
 
@@ -62,7 +62,7 @@ def test_what_acts_on_equations_follows_their_states_or_inputs_alone():
         assert effect.follows_signal
         assert effect.roles == () or effect.driver_optional
         assert all(low > 0.0 for low, _ in effect.fitted_shape.values())
-        assert effect.along in ("", *dynamic_context(effect).parts)
+        assert effect.plot_axis in ("", *dynamic_context(effect).parts)
         assert effect.equation.startswith("δ")
 
 
@@ -114,7 +114,7 @@ class TestPhysics:
     @pytest.mark.parametrize("sign", [1.0, -1.0])
     def test_a_whole_power_is_a_drag_or_a_spring(self, sign):
         """γ is what there is at the scale; near 0, a thousandth of it, the curve is straight."""
-        of = {(e.id, e.along, "surroundings" in e.needs): e for e in DYNAMICS}
+        of = {(e.id, e.plot_axis, "surroundings" in e.needs): e for e in DYNAMICS}
         context = dynamic_context(OF["power_law"])
         speed, angle, wind = (sign * context.component(name) for name in ("speed", "angle", "other"))
         context = replace(context, signal=sign * context.signal)
@@ -405,7 +405,7 @@ class TestNeeds:
 
     def test_segments_of_a_run_remember_nothing_of_each_other(self):
         class Pieces(Pendulum):
-            segment = 2.0
+            restart_after = 2.0
 
         assert set(prepared(Pieces, angle=torch.cos(3.0 * TIME)).ports) == {"rate of speed", "output"}
 

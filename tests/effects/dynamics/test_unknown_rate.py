@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.files.model import DiagnosedModel
+from mkc_torch.diagnosis.io.model import DiagnosedModel
 from mkc_torch.effects.context import Context
 from mkc_torch.effects.dynamics.linear_drag import LinearDrag
 from mkc_torch.effects.dynamics.quadratic_drag import QuadraticDrag
@@ -75,5 +75,5 @@ def test_a_force_that_is_in_no_catalogue_is_found_without_a_name(diagnosis):
 @pytest.mark.e2e
 def test_its_model_comes_back_with_the_same_curve(diagnosis):
     again = DiagnosedModel.from_json(diagnosis.model.to_json(), simulation=Pendulum())
-    assert again.terms[0].effect.along == diagnosis.model.terms[0].effect.along
+    assert again.terms[0].effect.plot_axis == diagnosis.model.terms[0].effect.plot_axis
     assert again.terms[0].shape == diagnosis.model.terms[0].shape

@@ -30,4 +30,4 @@ def test_a_delay_is_a_shift_within_its_run():
 
 def test_only_one_sided_effects_are_bounded():
     assert {e.id for e in PAIRED if e.one_sided} == {"output_saturation", "backlash"}
-    assert {e.id for e in PAIRED if e.most < math.inf} == {"output_saturation"}
+    assert {e.id for e in PAIRED if e.upper < math.inf} == {"output_saturation"}

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mkc_torch import Recording
-from mkc_torch.diagnosis.files.model import DiagnosedModel
+from mkc_torch.diagnosis.io.model import DiagnosedModel
 from mkc_torch.diagnosis.model.grid import candidate_terms
 from mkc_torch.diagnosis.model.joint import JointModel
 from mkc_torch.diagnosis.model.term import Term

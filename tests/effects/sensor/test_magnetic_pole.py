@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mkc_torch import diagnose
-from mkc_torch.diagnosis.files.model import DiagnosedModel
+from mkc_torch.diagnosis.io.model import DiagnosedModel
 from mkc_torch.diagnosis.model.drivers import find_drivers
 from mkc_torch.diagnosis.model.grid import candidate_terms, reach_of
 from mkc_torch.diagnosis.settings import DriverSettings
@@ -98,7 +98,7 @@ def test_a_pole_beside_the_path_is_found_where_it_is():
     assert f"s = {diagnosis.model.terms[0].shape['radius']:.4g} m, chosen" in finding.equation
     assert [(one.column, one.unit) for one in finding.references] == [(name, "m") for name in finding.drivers]
     assert [one.value for one in finding.references] == pytest.approx(middle.tolist())
-    assert finding.placed
+    assert finding.location_specific
     size = math.hypot(*known["pole"].value)
     assert size == pytest.approx(4.0, rel=0.3)
     # the file knows which of the two forms it is

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("polars")
 
-from mkc_torch.recording.formats import RecordingError, read_topics, trial
+from mkc_torch.recording.formats import RecordingError, read_topics
 from tests.recording.formats import writers
 from tests.recording.formats.test_same_samples import KINDS, numbers
 from tests.recording.formats.writers import samples

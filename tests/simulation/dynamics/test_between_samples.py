@@ -7,14 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mkc_torch.simulation.dynamics.between_samples import inputs_between, smooth_between
-from mkc_torch.simulation.protocol import Clock
+from mkc_torch.simulation.protocol import SignalTimes
 
 
 def clock_of(time, begins, share):
     """A moment in each interval of a run, so far from its beginning."""
     before = torch.arange(len(time) - 1)[~begins[1:]]
     shares = torch.full((len(before),), share, dtype=torch.float64)
-    return Clock(torch.lerp(time[before], time[before + 1], shares), before, before + 1, shares)
+    return SignalTimes(torch.lerp(time[before], time[before + 1], shares), before, before + 1, shares)
 
 
 def runs_of(*lengths, seed=0):

@@ -7,10 +7,17 @@ import pytest
 import torch
 from scipy.linalg import solve_discrete_are
 
-from mkc_torch.simulation.dynamics.disturbances import Disturbed, disturbed, models_of, observer_of, resized, usual_size
 from mkc_torch.simulation.dynamics.kalman import filtered, robust_likelihood
+from mkc_torch.simulation.dynamics.noise_selection import (
+    SelectedNoise,
+    models_of,
+    observer_of,
+    rescale_noise_model,
+    select_noise_model,
+    usual_size,
+)
 from mkc_torch.simulation.dynamics.observer import Disturbance
-from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
+from mkc_torch.simulation.dynamics.parallel_filter import filtered_whole
 from tests.simulation.dynamics.oscillating import STEP, answering, course, flow, pushed
 
 NOISE, PUSH, WANDER, LASTING = 0.01, 1.0, 0.05, 0.6
@@ -41,12 +48,12 @@ def tensor(*values):
 
 
 def sought(along, *, floor=(NOISE,), known=(False,), least=LEAST, most=2, outputs=OUTPUTS):
-    return disturbed(along, RATES, outputs, tensor(*floor), known, least, most)
+    return select_noise_model(along, RATES, outputs, tensor(*floor), known, least, most)
 
 
 def known(*disturbances, declared=False):
     """A noise that was found elsewhere."""
-    return Disturbed(disturbances, (), (), tensor(NOISE), 0.0, (declared,))
+    return SelectedNoise(disturbances, (), (), tensor(NOISE), 0.0, (declared,))
 
 
 def value_of(along, disturbance, sensor):
@@ -184,23 +191,23 @@ class TestResized:
     @pytest.mark.parametrize("truth", [WHITE, SLOW, SENSOR], ids=["white push", "slow push", "slow sensor"])
     def test_a_disturbance_has_its_size_there(self, truth):
         before = replace(truth, size=20.0 * truth.size)
-        found = resized(world(truth), RATES, OUTPUTS, known(before), LEAST)
+        found = rescale_noise_model(world(truth), RATES, OUTPUTS, known(before), LEAST)
         (one,) = found.disturbances
         assert (one.place, one.at_rate) == (truth.place, truth.at_rate)
         assert abs(np.log(one.size / truth.size)) < 3.0 * found.errors[0]
         assert found.gains[0] > 50.0
 
     def test_what_is_needless_there_is_dropped(self):
-        found = resized(world(WHITE), RATES, OUTPUTS, known(WHITE, SENSOR), LEAST)
+        found = rescale_noise_model(world(WHITE), RATES, OUTPUTS, known(WHITE, SENSOR), LEAST)
         assert [(one.place, one.at_rate) for one in found.disturbances] == [("speed", True)]
         assert len(found.gains) == len(found.errors) == 1
-        nothing = resized(world(), RATES, OUTPUTS, known(WHITE, SENSOR), LEAST)
+        nothing = rescale_noise_model(world(), RATES, OUTPUTS, known(WHITE, SENSOR), LEAST)
         assert (nothing.disturbances, nothing.gains, nothing.errors) == ((), (), ())
         assert nothing.sensor.item() == pytest.approx(NOISE, rel=0.1)
 
     def test_declared_noise_is_kept(self):
         for truth in ((), (SLOW,)):
-            found = resized(world(*truth), RATES, OUTPUTS, known(SLOW, declared=True), LEAST)
+            found = rescale_noise_model(world(*truth), RATES, OUTPUTS, known(SLOW, declared=True), LEAST)
             assert found.sensor.tolist() == [NOISE]
             assert found.declared == (True,)
             assert len(found.disturbances) == len(truth)

@@ -620,11 +620,11 @@ class TestOnTheWay:
     def test_they_see_the_runs(self):
         seen = {}
 
-        def actuated(self, time, u, p, run):  # noqa: ARG001
+        def actuator(self, time, u, p, run):  # noqa: ARG001
             seen["run"] = run
             return {"torque": 2.0 * u.torque}
 
-        def sensed(self, time, y, p, run):  # noqa: ARG001
+        def sensor(self, time, y, p, run):  # noqa: ARG001
             assert run.tolist() == [0] * 50 + [1] * 50
             return {"angle": y["angle"] + 0.5}
 
@@ -632,14 +632,14 @@ class TestOnTheWay:
         recording = table(time=time, angle=0.0 * time, torque=np.sin(time), experiment=np.repeat([3.0, 5.0], 50))
         theta = torch.tensor([STIFFNESS, DAMPING, 0.1, 0.0, 0.2, 0.0], dtype=torch.float64)
         plain = made(Driven, step=0.02).prepare(recording)
-        own = made(Driven, step=0.02, actuated=actuated, sensed=sensed).prepare(recording)
+        own = made(Driven, step=0.02, actuator=actuator, sensor=sensor).prepare(recording)
         doubled = plain.simulated(theta, {"input torque": lambda s: s})
         torch.testing.assert_close(own.simulated(theta, {}), doubled + 0.5)
         assert set(seen["run"].tolist()) == {0, 1}
 
     def test_an_actuator_that_forgets_an_input_is_refused(self):
         with pytest.raises(SimulationError, match=r"actuated does not return `torque`, which is one of its inputs"):
-            made(Driven, actuated=lambda *_: {}).prepare(table(**GOOD, torque=0.0 * TIME))
+            made(Driven, actuator=lambda *_: {}).prepare(table(**GOOD, torque=0.0 * TIME))
 
 
 # what cannot be simulated
@@ -704,7 +704,11 @@ BAD = {
         r"a run of 2 samples is too short",
     ),
     "short segments": ({"segment": 0.03}, GOOD, r"too short .* or use longer segments"),
-    "between": ({"between": "cubic"}, GOOD, r"`between` should be \"held\", \"linear\" or \"smooth\" but is 'cubic'"),
+    "between": (
+        {"between": "cubic"},
+        GOOD,
+        r"`input_hold` should be \"held\", \"linear\" or \"smooth\" but is 'cubic'",
+    ),
     "twice": (
         {"parameters": {"angle": 1.0}},
         GOOD,

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from mkc_torch.simulation import Dynamics, Parameter
-from mkc_torch.simulation.dynamics.first_fit import floor_of, over_short_horizons, strong_observer
+from mkc_torch.simulation.dynamics.first_fit import floor_of, multiple_shooting_start, strong_observer
 from tests.simulation.dynamics.oscillating import flow, oscillator, recorded, theta_of
 from tests.simulation.dynamics.runge_kutta import runge_kutta
 
@@ -38,7 +38,7 @@ def pendulum():
 @pytest.mark.parametrize(("stiffness", "damping"), [(90.0, 1.5), (90.0, 0.015), (0.9, 1.5)])
 def test_parameters_ten_times_off_are_brought_home(pendulum, stiffness, damping):
     guess = torch.cat([torch.tensor([stiffness, damping], dtype=torch.float64), pendulum.given[2:]])
-    found = over_short_horizons(pendulum, guess)
+    found = multiple_shooting_start(pendulum, guess)
     assert float(found[0]) == pytest.approx(STIFFNESS, rel=0.05)
     assert float(found[1]) == pytest.approx(DAMPING, abs=0.1)
     assert found[2:].tolist() == pytest.approx(FIRST, abs=0.15)
@@ -54,7 +54,7 @@ def test_bounds_are_kept(pendulum):
     bounds[0][1], bounds[1][0] = 0.3, 8.0
     held = copy.copy(pendulum)
     held.bounds = bounds
-    found = over_short_horizons(held, torch.cat([torch.tensor([2.0, 1.0]).double(), pendulum.given[2:]]))
+    found = multiple_shooting_start(held, torch.cat([torch.tensor([2.0, 1.0]).double(), pendulum.given[2:]]))
     assert float(found[0]) <= 8.0
     assert float(found[1]) >= 0.3
 
@@ -64,14 +64,14 @@ def test_there_is_none_where_no_rate_moves_an_output():
         return {"position": 0.0 * x.position + p.stiffness}
 
     prepared = oscillator(output=output).prepare(recorded(flow(30), position=np.sin(np.arange(30.0))))
-    assert over_short_horizons(prepared, theta_of(prepared)) is None
+    assert multiple_shooting_start(prepared, theta_of(prepared)) is None
     assert strong_observer(prepared, theta_of(prepared), 10.0) is None
 
 
 def test_there_is_none_where_the_equations_cannot_be_looked_at(pendulum):
     nowhere = torch.tensor([np.nan, 1.0, *FIRST], dtype=torch.float64)
     assert strong_observer(pendulum, nowhere, 10.0) is None
-    assert over_short_horizons(pendulum, nowhere) is None
+    assert multiple_shooting_start(pendulum, nowhere) is None
 
 
 def test_a_stronger_observer_follows_a_recording_closer(pendulum):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from mkc_torch.simulation.dynamics.disturbances import models_of, observer_of
 from mkc_torch.simulation.dynamics.flow import flow_along, flow_of
 from mkc_torch.simulation.dynamics.kalman import filtered
+from mkc_torch.simulation.dynamics.noise_selection import models_of, observer_of
 from mkc_torch.simulation.dynamics.observer import Disturbance
 from tests.simulation.dynamics.oscillating import course, flow, oscillator, pushed, recorded, theta_of
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mkc_torch.simulation.dynamics.likeliest_sizes import likeliest_sizes
+from mkc_torch.simulation.dynamics.most_likely_sizes import most_likely_sizes
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel
 from mkc_torch.simulation.dynamics.peak import peak
 from tests.simulation.dynamics.test_disturbances import LASTING, NOISE, PUSH, SLOW, WHITE, world
@@ -22,7 +22,7 @@ def test_a_narrow_ridge_that_bends_is_followed_to_its_end():
 def test_a_start_that_is_off_ends_where_a_true_one_does(truth, time):
     along = world(truth, count=2000)
     ends = [
-        likeliest_sizes(along, NoiseModel((by * NOISE,), ((0, 1.4 * by * PUSH, time),), (False,)), None)
+        most_likely_sizes(along, NoiseModel((by * NOISE,), ((0, 1.4 * by * PUSH, time),), (False,)), None)
         for by in (1.0, 0.8)
     ]
     sizes = [(noise.pushes[0][1], noise.sensor[0], *error) for noise, error in ends]
@@ -33,16 +33,16 @@ def test_a_start_that_is_off_ends_where_a_true_one_does(truth, time):
 
 def test_declared_noise_is_held_and_nothing_is_fitted_without_a_push():
     along = world(WHITE, count=2000)
-    noise, (error,) = likeliest_sizes(along, NoiseModel((1.3 * NOISE,), ((0, PUSH, 0.0),), (True,)), None)
+    noise, (error,) = most_likely_sizes(along, NoiseModel((1.3 * NOISE,), ((0, PUSH, 0.0),), (True,)), None)
     assert noise.sensor == (1.3 * NOISE,)
     assert error < 0.1
     alone = NoiseModel((NOISE,))
-    assert likeliest_sizes(along, alone, None) == (alone, ())
+    assert most_likely_sizes(along, alone, None) == (alone, ())
 
 
 def test_an_implausible_size_stays_as_it_was_and_has_an_error():
     along = world(WHITE, count=2000)
     before = NoiseModel((NOISE,), ((0, 0.8 * PUSH, 0.0),), (False,))
-    noise, (error,) = likeliest_sizes(along, before, np.array([0.9 * PUSH, 1.0]))
+    noise, (error,) = most_likely_sizes(along, before, np.array([0.9 * PUSH, 1.0]))
     assert noise == before
     assert 0.0 < error < 0.1

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from mkc_torch.simulation.dynamics.disturbances import Disturbed
 from mkc_torch.simulation.dynamics.noise import likeliest_noise, noise_of, pushes_over_time
+from mkc_torch.simulation.dynamics.noise_selection import SelectedNoise
 from mkc_torch.simulation.dynamics.observer import Disturbance
 from tests.simulation.dynamics.oscillating import course, flow, oscillator, pushed, recorded, theta_of
 
@@ -26,7 +26,7 @@ def world(*disturbances, count=300, runs=1, seed=0):
 
 
 def known(theta, *disturbances):
-    return Disturbed(disturbances, (), (), theta.new_tensor([NOISE]), 0.0, (False,))
+    return SelectedNoise(disturbances, (), (), theta.new_tensor([NOISE]), 0.0, (False,))
 
 
 def likeliest(prepared, theta, declared=None, **settings):

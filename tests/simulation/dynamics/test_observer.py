@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mkc_torch.simulation.dynamics.observer import Correcting, Disturbance, Observer
+from mkc_torch.simulation.dynamics.observer import Disturbance, Observer, ObserverJump
 from mkc_torch.simulation.dynamics.trajectory import Grid, carried, marched, solve, stations
 from tests.simulation.dynamics.runge_kutta import runge_kutta
 
@@ -40,7 +40,7 @@ def correcting(samples, m=1, seed=0, spread=0.05, places=(0, 1)):
         return torch.stack([torch.sin(states[:, places[0]]), states[:, places[1]]], -1)[:, :m]
 
     measured = tensor(0.5 * random.standard_normal((samples, m)))
-    return Correcting(observer, EVERY * torch.arange(samples), places, measured, predict)
+    return ObserverJump(observer, EVERY * torch.arange(samples), places, measured, predict)
 
 
 def one(samples, end=2.0):
@@ -109,7 +109,7 @@ def test_two_trajectories_with_jumps_are_each_as_by_itself():
         both[0].observer.sensor,
         *(torch.cat([getattr(one.observer, name) for one in both]) for name in ("gain", "white", "spread")),
     )
-    jump = Correcting(
+    jump = ObserverJump(
         observer,
         torch.cat([both[0].rows, 41 + both[1].rows]),
         (0, 1),
@@ -130,7 +130,7 @@ def test_its_derivative_is_finite_differences(mode):
         def predict(x):
             return theta[1] * plain.predict(x)
 
-        jump = Correcting(plain.observer, plain.rows, plain.places, plain.measured * theta[2], predict)
+        jump = ObserverJump(plain.observer, plain.rows, plain.places, plain.measured * theta[2], predict)
         begin = torch.stack([theta[3], 0.0 * theta[3]]).unsqueeze(0)
         guess = torch.zeros(len(grid.time), 2, dtype=torch.float64)
         return solve(lambda x: theta[0] * pendulum(x), grid, begin, guess, jump=jump).states[::8]

@@ -9,12 +9,12 @@ import torch
 from mkc_torch import Recording
 from mkc_torch._support.quantum import quanta_of
 from mkc_torch.simulation import Dynamics
-from mkc_torch.simulation.dynamics.disturbances import filter_models
 from mkc_torch.simulation.dynamics.flow import flow_of
 from mkc_torch.simulation.dynamics.kalman import filtered, robust_likelihood
 from mkc_torch.simulation.dynamics.noise import likeliest_noise
 from mkc_torch.simulation.dynamics.noise_grid import NoiseGrid
 from mkc_torch.simulation.dynamics.noise_model import NoiseModel
+from mkc_torch.simulation.dynamics.noise_selection import filter_models
 
 STEP = 0.01
 LEAST = STEP / 12.0**0.5

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mkc_torch.simulation.dynamics import side_by_side
+from mkc_torch.simulation.dynamics import parallel_filter
 from mkc_torch.simulation.dynamics.kalman import filtered
-from mkc_torch.simulation.dynamics.side_by_side import filtered_whole
+from mkc_torch.simulation.dynamics.parallel_filter import filtered_whole
 from tests.simulation.dynamics.oscillating import answering, course, flow, pushed
 from tests.simulation.dynamics.test_kalman import BOTH, MODELS, model, together
 
@@ -113,4 +113,4 @@ def test_runs_that_hang_together_are_not_taken_apart():
     along = recorded(flow(150, runs=3))
     assert along.shift[149].any()
     assert along.step[149] == 0
-    assert len(side_by_side._runs(along)[0]) == 1
+    assert len(parallel_filter._runs(along)[0]) == 1

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from mkc_torch.simulation.dynamics.disturbances import observer_of
 from mkc_torch.simulation.dynamics.flow import flow_of
-from mkc_torch.simulation.dynamics.observer import Correcting, Disturbance
+from mkc_torch.simulation.dynamics.noise_selection import observer_of
+from mkc_torch.simulation.dynamics.observer import Disturbance, ObserverJump
 from tests.simulation.dynamics.oscillating import course, flow, oscillator, pushed, recorded, theta_of
 from tests.simulation.dynamics.runge_kutta import runge_kutta
 
@@ -68,7 +68,7 @@ class TestHolding:
         prepared, theta = world(random=0.0, parameters={"stiffness": 2.0, "damping": 5.0})
         before, start = prepared.simulated(theta, {}), prepared.start()
         other = prepared.holding({"force": "held"})
-        assert (prepared.between, other.between) == ({"force": "linear"}, {"force": "held"})
+        assert (prepared.input_hold, other.input_hold) == ({"force": "linear"}, {"force": "held"})
         assert float((other.simulated(theta, {}) - before).abs().max()) > 1e-3
         assert torch.equal(prepared.simulated(theta, {}), before)
         assert torch.equal(prepared.start(), start)
@@ -94,7 +94,7 @@ class TestObserved:
         assert (prepared.observer, prepared.lasting, prepared.jump(theta, {})) == (None, (), None)
         assert watched.observer is observer
         assert watched.lasting == (PUSHES[0], PUSHES[2])
-        assert isinstance(watched.jump(theta, {}), Correcting)
+        assert isinstance(watched.jump(theta, {}), ObserverJump)
         assert watched.observed(observer) is watched
         assert prepared.observed(None) is prepared
         free = watched.observed(None)
@@ -177,10 +177,10 @@ class TestWatched:
         assert torch.equal(prepared.pushed_outputs(states), torch.zeros(5, 1).double())
 
     def test_what_a_sensor_makes_of_an_output_is_taken_off_the_recording(self):
-        def sensed(self, time, y, p, run):  # noqa: ARG001
+        def sensor(self, time, y, p, run):  # noqa: ARG001
             return {"position": y["position"] + 0.2 * time + 0.1 * y["position"] ** 2}
 
-        prepared, theta = world(sensed=sensed)
+        prepared, theta = world(sensor=sensor)
         at = prepared.trajectory(theta, {}).states[prepared.rows]
         torch.testing.assert_close(prepared.predicted(theta)(at), at[:, :1])
         clean = prepared.clean
@@ -193,12 +193,12 @@ class TestWatched:
     def test_a_gain_of_the_sensor_is_no_error_of_the_states(self):
         """States are corrected by what the sensor would have seen of them."""
 
-        def sensed(self, time, y, p, run):  # noqa: ARG001
+        def sensor(self, time, y, p, run):  # noqa: ARG001
             return {"position": y["position"] + 3.0 * torch.sin(time)}
 
         prepared, theta = world()
         along = recorded(flow(N), position=prepared.measured[:, 0] + 3.0 * prepared.time.sin(), force=FORCE)
-        shifted = oscillator(inputs=("force",), derivative=driven, step=0.01, sensed=sensed).prepare(along)
+        shifted = oscillator(inputs=("force",), derivative=driven, step=0.01, sensor=sensor).prepare(along)
         observer = observer_for(prepared, theta, *PUSHES)
         torch.testing.assert_close(
             shifted.observed(observer).residual(theta, {}), prepared.observed(observer).residual(theta, {})

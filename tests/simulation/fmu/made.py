@@ -28,8 +28,8 @@ STATES, RATES, INPUTS, OUTPUTS, PARAMETERS, EVENTS = 100, 200, 300, 400, 500, 90
 class Model:
     """Equations as texts that SymPy and C both understand, by the names of states, inputs and parameters.
 
-    ``parameters`` are (start, least, greatest, unit), ``events`` expressions that are event indicators. An ``if``
-    in an equation is written ``Piecewise``; one that is frozen between events is a ``relation``, an event indicator's
+    ``parameters`` are (start, lower, greatest, unit), ``events`` expressions that are event indicators. An ``if``
+    in an equation is written ``Piecewise``; one that is frozen input_hold events is a ``relation``, an event indicator's
     number, in the texts ``r0``, ``r1`` and so on: 1 where the indicator was positive at the last event.
     """
 

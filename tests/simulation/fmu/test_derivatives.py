@@ -10,7 +10,7 @@ pytest.importorskip("fmpy")
 
 from mkc_torch._support.forward_mode import _trusted, twice_reverse_tangents
 from mkc_torch.simulation import load_fmu
-from mkc_torch.simulation.fmu.evaluation import Moments
+from mkc_torch.simulation.fmu.evaluation import EvaluationPoints
 from mkc_torch.simulation.fmu.function import evaluated
 from tests.simulation.fmu.made import COMPILER, PENDULUM, Model, make_fmu
 
@@ -151,7 +151,7 @@ def test_a_wrong_derivative_of_the_fmu_is_not_trusted(tmp_path):
     evaluation.binary.slopes = lambda *how: 1.01 * plain(*how)
     at = moments(PENDULUM)
     _, (expected, _, _) = by_sympy(PENDULUM, list(PENDULUM.rates.values()), at)
-    found = evaluation.slopes(False, Moments(*(one.numpy() for one in at)), "states")
+    found = evaluation.slopes(False, EvaluationPoints(*(one.numpy() for one in at)), "states")
     np.testing.assert_allclose(found, expected, rtol=1e-8)
     assert not any(evaluation._trusted.values())
 

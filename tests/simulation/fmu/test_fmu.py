@@ -116,9 +116,9 @@ def test_what_switches_is_looked_at_in_each_moment(tmp_path, version):
 @pytest.mark.parametrize("version", [2, 3])
 def test_jumps_and_memory_are_refused(tmp_path, version):
     bouncing = replace(STOP, reset={"level": "-0.8*level"})
-    with pytest.raises(SimulationError, match=r"resets its states at an event.*`--simulated SIM.csv`"):
+    with pytest.raises(SimulationError, match=r"resets its states at an event.*`--simulator-output SIM.csv`"):
         load_fmu(make_fmu(tmp_path / "b.fmu", bouncing, version))
-    with pytest.raises(FmuError, match=r"depend on events before.*`--simulated SIM.csv`"):
+    with pytest.raises(FmuError, match=r"depend on events before.*`--simulator-output SIM.csv`"):
         load_fmu(make_fmu(tmp_path / "m.fmu", replace(STOP, memory=True), version))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mkc_torch.diagnosis.files.model import correction_of
+from mkc_torch.diagnosis.io.model import correction_of
 from mkc_torch.recording.recording import MissingColumnError, RecordingError
 from mkc_torch.simulation import Magnetometer
 from mkc_torch.simulation.magnetometer import MagnetometerCorrection

@@ -24,11 +24,11 @@ from mkc_torch.simulation.dynamics.settings import (
 
 __all__ = [
     "ArrayGrid",
+    "CollocationSolution",
     "Factor",
-    "Found",
     "Functions",
     "JumpFunctions",
-    "Linearised",
+    "LinearisedCollocation",
     "linearised",
     "marched",
     "solved",
@@ -98,7 +98,7 @@ class Factor:
 
 
 @dataclass(frozen=True)
-class Linearised:
+class LinearisedCollocation:
     """Equations linearised at states.
 
     Attributes:
@@ -116,14 +116,14 @@ class Linearised:
 
 
 @dataclass(frozen=True)
-class Found:
+class CollocationSolution:
     """A trajectory, (w, G), and the linearised equations that it was found with."""
 
     states: Array
     factor: Factor
 
 
-class _Point:
+class _Iterate:
     """States on the way to a solution, with their defects, the scale of each state, and the size of the defects."""
 
     def __init__(self, functions: Functions, grid: ArrayGrid, states: Array) -> None:
@@ -145,12 +145,12 @@ def _defect(functions: Functions, grid: ArrayGrid, states: Array) -> tuple[Array
     return ends, middle, gone - h / 6.0 * simpson
 
 
-def linearised(functions: Functions, grid: ArrayGrid, states: Array) -> Linearised:
+def linearised(functions: Functions, grid: ArrayGrid, states: Array) -> LinearisedCollocation:
     """The equations linearised at states (w, G)."""
-    return _linearised(functions, grid, _Point(functions, grid, states))
+    return _linearised(functions, grid, _Iterate(functions, grid, states))
 
 
-def _linearised(functions: Functions, grid: ArrayGrid, at: _Point) -> Linearised:
+def _linearised(functions: Functions, grid: ArrayGrid, at: _Iterate) -> LinearisedCollocation:
     h, eye = grid.step, np.eye(len(at.states))[..., None]
     slope, middle = functions.ends_slope(at.ends), functions.middle_slope(at.middle)
     left, right = slope[:, :, 0], slope[:, :, 1]
@@ -161,16 +161,18 @@ def _linearised(functions: Functions, grid: ArrayGrid, at: _Point) -> Linearised
     if functions.jump is not None:
         carries = multiplied(carries, functions.jump.slope(at.states)[..., :-1])
     carries = np.concatenate([np.zeros_like(carries[..., :1]), carries], -1)
-    return Linearised(Factor(Affine.of(carries, grid.longest), inverse), at.ends, at.middle, behind, middle)
+    return LinearisedCollocation(Factor(Affine.of(carries, grid.longest), inverse), at.ends, at.middle, behind, middle)
 
 
-def solved(functions: Functions, grid: ArrayGrid, guess: Array, factor: Factor | None = None) -> Found | None:
+def solved(
+    functions: Functions, grid: ArrayGrid, guess: Array, factor: Factor | None = None
+) -> CollocationSolution | None:
     """The trajectories near a guess (w, G), whose states where they begin are kept; None where none is found.
 
     As :func:`mkc_torch.simulation.dynamics.trajectory.solve` step for step; a factor of a trajectory nearby serves as
     long as it brings the equations to rest quickly. Warnings of NumPy are the caller's to silence.
     """
-    at = _Point(functions, grid, guess)
+    at = _Iterate(functions, grid, guess)
     fresh = factor is None
     if factor is None:
         factor = _linearised(functions, grid, at).factor
@@ -179,11 +181,11 @@ def solved(functions: Functions, grid: ArrayGrid, guess: Array, factor: Factor |
         change = factor.solved(at.defect[:, None])[:, 0]
         size = float(np.abs(change / at.scale).max())
         if size < SETTLED:
-            return Found(at.states + change, factor)
+            return CollocationSolution(at.states + change, factor)
         after, part = at, 1.0
         if size < np.inf:
             for _ in range(HALVINGS if fresh else 1):
-                after = _Point(functions, grid, at.states + part * change)
+                after = _Iterate(functions, grid, at.states + part * change)
                 if after.norm <= at.norm:
                     break
                 part *= 0.5
@@ -234,7 +236,7 @@ def _solved_to(
 ) -> tuple[Array | None, bool]:
     """States solved roughly at the moments inside, None where they are lost; and whether they came to rest."""
     for _ in range(MOST_STEPS):
-        at = _Point(functions, grid, states)
+        at = _Iterate(functions, grid, states)
         left = np.where(inside[1:], at.defect, 0.0)
         change = np.where(inside, _linearised(functions, grid, at).factor.solved(left[:, None])[:, 0], 0.0)
         size = float(np.abs(change / at.scale).max())

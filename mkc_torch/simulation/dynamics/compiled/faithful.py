@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mkc_torch.nonlinear import load_forward_mode
-from mkc_torch.simulation.dynamics.compiled.functions import Block
+from mkc_torch.simulation.dynamics.compiled.functions import CompiledBlock
 from mkc_torch.simulation.dynamics.compiled.traced import Traceable, traced
 
 if TYPE_CHECKING:
@@ -67,7 +67,13 @@ def _ends(values: Tensor) -> Tensor:
 
 
 def _agrees(
-    block: Block, parameters: Sequence[float], along: Tensor, at: Tensor, moved: Tensor, values: Tensor, slopes: Tensor
+    block: CompiledBlock,
+    parameters: Sequence[float],
+    along: Tensor,
+    at: Tensor,
+    moved: Tensor,
+    values: Tensor,
+    slopes: Tensor,
 ) -> bool:
     """Whether values (k, *) and their derivatives along a direction are those of a block, where they are finite."""
     states = at.numpy()

@@ -14,10 +14,10 @@ from mkc_torch.simulation.dynamics.compiled.collocation import dense
 from mkc_torch.simulation.dynamics.compiled.expressions import Array, Expressions
 from mkc_torch.simulation.dynamics.compiled.tape import Evaluation, Tape
 
-__all__ = ["Block", "Correction", "Slopes"]
+__all__ = ["CompiledBlock", "CompiledObserverJump", "Derivatives"]
 
 
-class Slopes:
+class Derivatives:
     """Derivatives of several nodes by several leaves, those that are not 0.
 
     Args:
@@ -51,7 +51,7 @@ class Slopes:
 
 
 @dataclass(frozen=True)
-class Block:
+class CompiledBlock:
     """Nodes as functions of states and parameters at fixed moments.
 
     Attributes:
@@ -72,9 +72,9 @@ class Block:
         return Tape(self.expressions, self.nodes, self.arranged)
 
     @cached_property
-    def by_states(self) -> Slopes:
+    def by_states(self) -> Derivatives:
         """Derivatives by the states."""
-        return Slopes(self.expressions, self.nodes, self.states, self.arranged)
+        return Derivatives(self.expressions, self.nodes, self.states, self.arranged)
 
     @cached_property
     def moving(self) -> list[int]:
@@ -83,9 +83,9 @@ class Block:
         return [k for k, leaf in enumerate(self.parameters) if leaf in leaves]
 
     @cached_property
-    def by_parameters(self) -> Slopes:
+    def by_parameters(self) -> Derivatives:
         """Derivatives by the parameters in ``moving``."""
-        return Slopes(self.expressions, self.nodes, [self.parameters[k] for k in self.moving], self.arranged)
+        return Derivatives(self.expressions, self.nodes, [self.parameters[k] for k in self.moving], self.arranged)
 
     def values(self, parameters: Sequence[float]) -> Callable[[Array], Array]:
         """The values (nodes, *) by the states (w, *)."""
@@ -101,8 +101,8 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Correction:
-    """An observer's jump at given parameters; see :class:`mkc_torch.simulation.dynamics.observer.Correcting`.
+class CompiledObserverJump:
+    """An observer's jump at given parameters; see :class:`mkc_torch.simulation.dynamics.observer.ObserverJump`.
 
     Attributes:
         rows: (N,), the moment of each sample.

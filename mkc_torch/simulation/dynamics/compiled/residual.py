@@ -12,19 +12,19 @@ import torch
 from torch import Tensor
 
 from mkc_torch.nonlinear import load_forward_mode
-from mkc_torch.simulation.continuation import Meaning, Tangents
+from mkc_torch.simulation.continuation import Meaning, ResidualTangents
 from mkc_torch.simulation.dynamics.compiled.affine import multiplied
 from mkc_torch.simulation.dynamics.compiled.collocation import (
     ArrayGrid,
     Factor,
     Functions,
-    Linearised,
+    LinearisedCollocation,
     linearised,
     marched,
     solved,
 )
 from mkc_torch.simulation.dynamics.compiled.expressions import Array
-from mkc_torch.simulation.dynamics.compiled.functions import Correction
+from mkc_torch.simulation.dynamics.compiled.functions import CompiledObserverJump
 from mkc_torch.simulation.dynamics.compiled.traced import Traceable, Traced, traced
 from mkc_torch.simulation.dynamics.observer import CLIP
 from mkc_torch.simulation.dynamics.trajectory import Jump, Rate, Trajectory, linearised_later
@@ -102,7 +102,7 @@ class CompiledDynamics:
         guess = self._system.with_memories(states.detach(), self._traced.memories)
         return np.where(self._grid.begins, first[:, self._places], guess.numpy().T)
 
-    def tangents(self, parameters: Float[Tensor, " p"], near: Nearby | None) -> Tangents | None:
+    def tangents(self, parameters: Float[Tensor, " p"], near: Nearby | None) -> ResidualTangents | None:
         """Derivatives of the residual at parameters whose answer is known; None where it is of another system."""
         if not isinstance(near, Trajectory) or near.states.shape[1] != self._traced.width:
             return None
@@ -112,7 +112,7 @@ class CompiledDynamics:
             linear = linearised(functions, self._grid, states)
             rows = self._whitened(-self._output_tangents(parameters, states, functions, linear))
         tangents = torch.from_numpy(np.ascontiguousarray(np.moveaxis(rows, 0, -1)))
-        return Tangents(tangents, self._nearby(parameters, states, linear.factor))
+        return ResidualTangents(tangents, self._nearby(parameters, states, linear.factor))
 
     def _outputs(self, parameters: Tensor, states: Array) -> Array:
         """(m, N), by the states at the samples."""
@@ -124,7 +124,9 @@ class CompiledDynamics:
         """(N, m), by the states at the samples (N, w)."""
         return self._system.outputs_by_states(*self._meaning(parameters), states)
 
-    def _output_tangents(self, parameters: Tensor, states: Array, functions: Functions, linear: Linearised) -> Array:
+    def _output_tangents(
+        self, parameters: Tensor, states: Array, functions: Functions, linear: LinearisedCollocation
+    ) -> Array:
         """Derivatives of the outputs by all parameters, (m, p, N)."""
         values = parameters.tolist()
         moved, at = self._state_tangents(values, states, functions, linear), states[:, self._rows]
@@ -144,7 +146,7 @@ class CompiledDynamics:
         return np.ascontiguousarray(found.numpy().transpose(2, 0, 1))
 
     def _state_tangents(
-        self, values: Sequence[float], states: Array, functions: Functions, linear: Linearised
+        self, values: Sequence[float], states: Array, functions: Functions, linear: LinearisedCollocation
     ) -> Array:
         """Derivatives of the states at the samples by all parameters, (w, p, N)."""
         own = self._own(values, states, functions, linear)
@@ -163,7 +165,9 @@ class CompiledDynamics:
             rows[:, first.moving[k], inside] += slope[run, state, k] * by_first[:, state, inside]
         return rows
 
-    def _own(self, values: Sequence[float], states: Array, functions: Functions, linear: Linearised) -> _Defects:
+    def _own(
+        self, values: Sequence[float], states: Array, functions: Functions, linear: LinearisedCollocation
+    ) -> _Defects:
         """How the defects change with parameters at fixed states."""
         ends, middle, new = self._traced.ends, self._traced.middle, self._traced.new
         h, rated = self._grid.step, ends.moving
@@ -176,7 +180,7 @@ class CompiledDynamics:
         by_middle = middle.by_parameters.at(values)(linear.middle)
         defects[:, : len(rated)] = -h / 6.0 * (left + 4.0 * (by_middle + moved) + right)
         if new is not None and new.moving:
-            assert isinstance(functions.jump, Correction)
+            assert isinstance(functions.jump, CompiledObserverJump)
             by_new = new.by_parameters.at(values)(states[:, self._rows])
             after = functions.jump.by_parameters(states, by_new)[..., :-1]
             places = [parameters.index(k) for k in new.moving]
@@ -188,7 +192,7 @@ class CompiledDynamics:
         if known.new is not None:
             gain, limit = self._observed
             new, new_slope = known.new.values(values), known.new.by_states.at(values)
-            jump = Correction(self._rows, known.places, gain, limit, new, new_slope)
+            jump = CompiledObserverJump(self._rows, known.places, gain, limit, new, new_slope)
         return Functions(
             known.ends.values(values),
             known.middle.values(values),

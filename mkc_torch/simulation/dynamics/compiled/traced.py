@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mkc_torch.simulation.continuation import Meaning
 from mkc_torch.simulation.dynamics.compiled.expressions import Array, Expressions
-from mkc_torch.simulation.dynamics.compiled.functions import Block
+from mkc_torch.simulation.dynamics.compiled.functions import CompiledBlock
 from mkc_torch.simulation.dynamics.compiled.operations import OPERATIONS
 from mkc_torch.simulation.dynamics.compiled.symbol import (
     Symbol,
@@ -22,7 +22,7 @@ from mkc_torch.simulation.dynamics.compiled.symbol import (
     parameter_symbol,
     state_symbol,
 )
-from mkc_torch.simulation.dynamics.observer import Correcting, Observer
+from mkc_torch.simulation.dynamics.observer import Observer, ObserverJump
 from mkc_torch.simulation.dynamics.trajectory import Grid
 from mkc_torch.simulation.protocol import Changes
 
@@ -56,7 +56,7 @@ class Traceable(Protocol):
     def first_states(self, theta: Tensor, changes: Changes) -> tuple[Tensor, list[str]]: ...
     def with_memories(self, states: Tensor, memories: Sequence[str]) -> Tensor: ...
     def rate(self, theta: Tensor, changes: Changes) -> Callable[[Tensor], Tensor]: ...
-    def jump(self, theta: Tensor, changes: Changes) -> Correcting | None: ...
+    def jump(self, theta: Tensor, changes: Changes) -> ObserverJump | None: ...
     def outputs_by_states(self, theta: Tensor, changes: Changes, states: Tensor) -> Tensor: ...
 
 
@@ -74,11 +74,11 @@ class Traced:
     """
 
     memories: Sequence[str]
-    first: Block
-    ends: Block
-    middle: Block
-    new: Block | None
-    outputs: Block | None
+    first: CompiledBlock
+    ends: CompiledBlock
+    middle: CompiledBlock
+    new: CompiledBlock | None
+    outputs: CompiledBlock | None
     places: Sequence[int]
 
     @property
@@ -114,11 +114,11 @@ def _traced(system: Traceable, meaning: Meaning, size: int, stations: int, sampl
     width = begin.shape[1]
     leaves = [e.leaf("state", k) for k in range(width)], [e.leaf("parameter", k) for k in range(size)]
 
-    def block(value: Tensor, length: int, arranged: Callable[[Array], Array]) -> Block:
+    def block(value: Tensor, length: int, arranged: Callable[[Array], Array]) -> CompiledBlock:
         nodes, shape, moments = as_nodes(value, trace)
         if len(shape) != 2 or shape[0] != length or moments != 0:
             raise UntraceableError(f"a result of shape {shape}")
-        return Block(e, nodes[0].tolist(), *leaves, arranged)
+        return CompiledBlock(e, nodes[0].tolist(), *leaves, arranged)
 
     def at_samples() -> Symbol:
         return state_symbol(trace, samples, width)
@@ -132,7 +132,7 @@ def _traced(system: Traceable, meaning: Meaning, size: int, stations: int, sampl
         outputs = None
     return Traced(
         memories,
-        Block(e, as_nodes(begin, trace).nodes.reshape(-1).tolist(), *leaves, _as_is),
+        CompiledBlock(e, as_nodes(begin, trace).nodes.reshape(-1).tolist(), *leaves, _as_is),
         block(rates, stations, _at_ends),
         block(rates, stations, _in_the_middle),
         new,

@@ -9,13 +9,13 @@ import torch
 from mkc_torch.challenge.draws import generator
 from mkc_torch.challenge.dynamics.generator import SYSTEMS
 from mkc_torch.challenge.dynamics.integrate import between, holding, simulate
-from mkc_torch.challenge.dynamics.plant import Plant, Trial
-from mkc_torch.challenge.dynamics.worlds import dynamics_worlds
-from mkc_torch.challenge.dynamics.worlds.draw import LEAST_SLOW, MOST_FOLLOWED, SLOW_SIZE, SLOW_TIME, draw_useless
-from mkc_torch.challenge.dynamics.worlds.follows import best_shares
-from mkc_torch.challenge.dynamics.worlds.pushes import KINDS, LASTING
-from mkc_torch.challenge.dynamics.worlds.simulations import right_source
-from mkc_torch.challenge.dynamics.worlds.wrong import right, wrong
+from mkc_torch.challenge.dynamics.plant import Plant, RunSet
+from mkc_torch.challenge.dynamics.scenarios import dynamics_worlds
+from mkc_torch.challenge.dynamics.scenarios.disturbances import KINDS, LASTING
+from mkc_torch.challenge.dynamics.scenarios.draw import LEAST_SLOW, MOST_FOLLOWED, SLOW_SIZE, SLOW_TIME, draw_useless
+from mkc_torch.challenge.dynamics.scenarios.follows import best_shares
+from mkc_torch.challenge.dynamics.scenarios.simulations import right_source
+from mkc_torch.challenge.dynamics.scenarios.wrong import right, wrong
 from mkc_torch.challenge.key import canonical
 from mkc_torch.simulation.load import load_simulation
 
@@ -74,18 +74,18 @@ def test_a_push_makes_a_hidden_effect_harder_to_see():
     """z is that of the noise that is there: with the same effect and size it falls when a push is added."""
     from mkc_torch.challenge.dynamics.errors import draw_errors
     from mkc_torch.challenge.dynamics.oracle import power
-    from mkc_torch.challenge.dynamics.scene import Scene
-    from mkc_torch.challenge.dynamics.worlds.noise import PushedErrors, draw_push
+    from mkc_torch.challenge.dynamics.scenarios.noise import DisturbedErrors, draw_push
+    from mkc_torch.challenge.dynamics.scene import SystemScene
 
     setting = SYSTEMS["thermal"].draw(generator(2))
-    scene = Scene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
+    scene = SystemScene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
     errors = draw_errors(generator(3), scene.course.outputs)
     pushes = (draw_push(generator(seed), "pushed_slowly", scene, errors) for seed in range(20))
     push = next(push for push in pushes if push.state == "temperature_1")
     effect = SYSTEMS["thermal"].inside[0](generator(5), scene)  # in the same body
     alone, beside = (
         power(scene.plant, scene.trial, effect, effect.large, noise)
-        for noise in (errors, PushedErrors(scene, errors, push))
+        for noise in (errors, DisturbedErrors(scene, errors, push))
     )
     assert beside.z < 0.8 * alone.z
 
@@ -97,7 +97,7 @@ def integrator():
 @pytest.mark.parametrize("held", [True, False])
 def test_a_held_input_is_held_in_the_integration(held):
     inputs = torch.randn(1, 9, 2, dtype=torch.float64, generator=generator(1)).numpy()
-    course = simulate(integrator(), Trial(0.5, inputs, np.zeros((1, 2)), held=held))
+    course = simulate(integrator(), RunSet(0.5, inputs, np.zeros((1, 2)), held=held))
     steps = 0.5 * (inputs[:, :-1] if held else 0.5 * (inputs[:, :-1] + inputs[:, 1:]))
     np.testing.assert_allclose(np.diff(course.outputs, axis=1), steps, atol=1e-14)
     at = (holding if held else between)(inputs, 12)
@@ -194,7 +194,7 @@ def test_a_useless_simulation_follows_no_output_of_the_recording(index):
 
     outputs = signals(plant.outputs)
     inputs = signals(plant.inputs) if plant.inputs else np.zeros((0, *outputs.shape[1:]))
-    trial = Trial(float(table["time"][1] - table["time"][0]), inputs, np.zeros((len(plant.states), runs)))
+    trial = RunSet(float(table["time"][1] - table["time"][0]), inputs, np.zeros((len(plant.states), runs)))
     guess = right(plant) if case.key.useless == "unrelated output" else wrong(plant, case.key.useless)
     assert max(best_shares(generator(77), guess, trial, outputs)) <= MOST_FOLLOWED + 0.02
 
@@ -222,7 +222,7 @@ class Names:
 @pytest.mark.parametrize("kind", ["wrong sign", "another system"])
 @pytest.mark.parametrize("system", sorted({*SYSTEMS} - {"servo"}))
 def test_what_the_diagnosis_is_given_is_what_the_generator_tried(system, kind, tmp_path):
-    from mkc_torch.challenge.dynamics.worlds.simulations import wrong_source
+    from mkc_torch.challenge.dynamics.scenarios.simulations import wrong_source
 
     setting = SYSTEMS[system].draw(generator(3, system))
     guess = wrong(setting.plant, kind)

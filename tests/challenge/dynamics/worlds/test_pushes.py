@@ -10,21 +10,21 @@ from mkc_torch.challenge.dynamics.errors import draw_errors
 from mkc_torch.challenge.dynamics.generator import SYSTEMS
 from mkc_torch.challenge.dynamics.integrate import simulate
 from mkc_torch.challenge.dynamics.oracle import range_of, tangents
-from mkc_torch.challenge.dynamics.plant import Trial
-from mkc_torch.challenge.dynamics.scene import Scene
-from mkc_torch.challenge.dynamics.worlds.noise import OVER_NOISE, PushedErrors, draw_push, responses
-from mkc_torch.challenge.dynamics.worlds.pushes import GUSTS, KINDS, LASTING, SLOW, gusts, slow, white
+from mkc_torch.challenge.dynamics.plant import RunSet
+from mkc_torch.challenge.dynamics.scenarios.disturbances import GUSTS, KINDS, LASTING, SLOW, gusts, slow, white
+from mkc_torch.challenge.dynamics.scenarios.noise import OVER_NOISE, DisturbedErrors, draw_push, responses
+from mkc_torch.challenge.dynamics.scene import SystemScene
 
 STEP, FINE = 0.05, 8
 
 
 def trial(samples, runs=2):
-    return Trial(STEP, np.zeros((0, samples, runs)), np.zeros((1, runs)))
+    return RunSet(STEP, np.zeros((0, samples, runs)), np.zeros((1, runs)))
 
 
 def scene_of(system, seed=3):
     setting = SYSTEMS[system].draw(generator(seed, system))
-    scene = Scene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
+    scene = SystemScene(setting.plant, setting.trial, simulate(setting.plant, setting.trial))
     return scene, draw_errors(generator(seed, system, "noise"), scene.course.outputs)
 
 
@@ -126,7 +126,7 @@ def test_under_a_push_traces_that_look_like_it_weigh_less():
     scene, errors = scene_of("tanks")
     errors = dataclasses.replace(errors, correlation=0.0, family="gaussian")
     push = draw_push(generator(7), "pushed_slowly", scene, errors)
-    weighing = PushedErrors(scene, errors, push)
+    weighing = DisturbedErrors(scene, errors, push)
     moved = simulate(scene.plant, scene.trial, push=push.rates).outputs - scene.course.outputs
     assert np.square(weighing.whitened(moved)).sum() < 0.5 * np.square(errors.whitened(moved)).sum()
     draws = generator(8)
@@ -135,7 +135,7 @@ def test_under_a_push_traces_that_look_like_it_weigh_less():
         again = slow(draws, scene.trial, scene.plant.fine)
         if not squares:
             covariance = push.size**2 * again.covariance
-            weighing = PushedErrors(scene, errors, dataclasses.replace(push, covariance=covariance))
+            weighing = DisturbedErrors(scene, errors, dataclasses.replace(push, covariance=covariance))
         rates = push.size * again.at(scene.plant, push.state)
         noise = np.reshape(errors.deviations, (-1, 1, 1)) * np.random.default_rng(len(squares)).standard_normal(
             moved.shape

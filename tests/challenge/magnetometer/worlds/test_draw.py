@@ -9,9 +9,9 @@ from mkc_torch.challenge.draws import generator
 from mkc_torch.challenge.key import canonical
 from mkc_torch.challenge.magnetometer import rotation
 from mkc_torch.challenge.magnetometer.noise import axis_errors, draw_noise
-from mkc_torch.challenge.magnetometer.worlds import magnetometer_worlds
-from mkc_torch.challenge.magnetometer.worlds.disturbances import BURSTS, HEIGHT, bursts, wandering
-from mkc_torch.challenge.magnetometer.worlds.poses import POSES, poses
+from mkc_torch.challenge.magnetometer.scenarios import magnetometer_worlds
+from mkc_torch.challenge.magnetometer.scenarios.disturbances import BURSTS, HEIGHT, bursts, wandering
+from mkc_torch.challenge.magnetometer.scenarios.poses import POSES, poses
 from mkc_torch.simulation.load import load_simulation
 
 WORLDS = {world.name: world for world in magnetometer_worlds(30.0).worlds}

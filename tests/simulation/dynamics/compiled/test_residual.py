@@ -17,9 +17,9 @@ from mkc_torch.recording import Recording
 from mkc_torch.simulation import Dynamics, Parameter
 from mkc_torch.simulation.continuation import Continuation
 from mkc_torch.simulation.dynamics.compiled.collocation import marched
-from mkc_torch.simulation.dynamics.disturbances import observer_of
 from mkc_torch.simulation.dynamics.first_fit import floor_of
 from mkc_torch.simulation.dynamics.flow import flow_along
+from mkc_torch.simulation.dynamics.noise_selection import observer_of
 from mkc_torch.simulation.dynamics.observer import Disturbance
 from mkc_torch.simulation.dynamics.trajectory import marched as torch_marched
 
@@ -50,10 +50,10 @@ class Driven(Dynamics):
 class Turned(Driven):
     """The same, with an actuator and a sensor."""
 
-    def actuated(self, time, u, p, run):  # noqa: ARG002
+    def actuator(self, time, u, p, run):  # noqa: ARG002
         return {"torque": p.gain * u.torque}
 
-    def sensed(self, time, y, p, run):  # noqa: ARG002
+    def sensor(self, time, y, p, run):  # noqa: ARG002
         return {**y, "warmth": p.loss * y["warmth"]}
 
 
@@ -200,7 +200,7 @@ class Warming(GainEffect):
     id = "warming"
     port = "output"
 
-    def course(self, shape, context):  # noqa: ARG002
+    def waveform(self, shape, context):  # noqa: ARG002
         return 0.1 * context.time
 
 

@@ -1,0 +1,81 @@
+"""What helped to calibrate a sensor that hardly tilts, and what it did and did not determine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from mkc_torch.calibration.file import CheckedValues, Vector, finite_or_none
+
+__all__ = ["AidedResult", "aid_from_json", "aid_to_json"]
+
+
+@dataclass(frozen=True)
+class AidedResult:
+    """How a calibration came about that the ellipsoid alone does not determine.
+
+    Attributes:
+        by: "gyroscope", "attitude" or "place".
+        response: what of the sensor is free: "offset", "offset and scale" or "full matrix".
+        evidence: of each response, in nats, less that of the one taken: the likeliest, but by place and date the full
+            matrix unless another one is clearly likelier.
+        undetermined: offsets and entries of the matrix, as "offset_z" or "matrix_zz", that the recording says little or
+            nothing of; they are what was likely beforehand, no offset and the unit matrix, and have no standard error.
+        heading_error: standard error in ° of how the heading changes as the vehicle turns as it did.
+        constant_error: of a constant of the heading, in °, which only tilting shows; infinite by place and date, for no
+            length tells how a sensor is turned.
+        gyro_bias, gyro_bias_se: of the gyroscope in rad/s; None without one.
+    """
+
+    by: str
+    response: str
+    evidence: tuple[tuple[str, float], ...]
+    undetermined: tuple[str, ...]
+    heading_error: float
+    constant_error: float
+    gyro_bias: Vector | None
+    gyro_bias_se: Vector | None
+
+
+def aid_to_json(aid: AidedResult) -> Mapping[str, Any]:
+    """The part "aided" of calibration.json."""
+    content: dict[str, Any] = {
+        "by": aid.by,
+        "response": aid.response,
+        "evidence": dict(aid.evidence),
+        "undetermined": aid.undetermined,
+        "heading": {
+            "standard_error": aid.heading_error,
+            "constant": {"standard_error": finite_or_none([aid.constant_error])[0]},
+            "unit": "°",
+        },
+    }
+    if aid.gyro_bias is not None and aid.gyro_bias_se is not None:
+        content["gyro_bias"] = {
+            "value": aid.gyro_bias,
+            "standard_error": finite_or_none(aid.gyro_bias_se),
+            "unit": "rad/s",
+        }
+    return content
+
+
+def aid_from_json(c: CheckedValues) -> AidedResult | None:
+    """What stands under "aided"; None where nothing does, as in files of an ellipsoid."""
+    if not c.has("aided"):
+        return None
+    biased = c.has("aided", "gyro_bias")
+    unknown = not c.has("aided", "heading", "constant", "standard_error") or (
+        c.content["aided"]["heading"]["constant"]["standard_error"] is None
+    )
+    return AidedResult(
+        by=c.text("aided", "by"),
+        response=c.text("aided", "response"),
+        evidence=tuple((name, c.number("aided", "evidence", name)) for name in c.names("aided", "evidence")),
+        undetermined=tuple(c.text("aided", "undetermined", i) for i in c.each("aided", "undetermined")),
+        heading_error=c.number("aided", "heading", "standard_error"),
+        constant_error=math.inf if unknown else c.number("aided", "heading", "constant", "standard_error"),
+        gyro_bias=c.vector("aided", "gyro_bias", "value") if biased else None,
+        gyro_bias_se=c.vector("aided", "gyro_bias", "standard_error", unknown=True) if biased else None,
+    )

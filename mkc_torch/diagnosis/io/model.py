@@ -1,0 +1,368 @@
+"""A simulation's model with the findings in it: a module, its file model.json, and the correction of new recordings."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from mkc_torch.diagnosis.correcting_model import CorrectingModel
+from mkc_torch.diagnosis.io.python_source import SourceError, python_source
+from mkc_torch.diagnosis.linearised.estimate import FinalEstimate
+from mkc_torch.diagnosis.model.drivers import Driver
+from mkc_torch.diagnosis.model.joint import in_order_of_the_chain, summed
+from mkc_torch.diagnosis.model.term import Term, context_at
+from mkc_torch.effects import CATALOGUE
+from mkc_torch.effects.base import Effect
+from mkc_torch.effects.context import Context
+from mkc_torch.effects.sensor.unrecorded import COURSE, Unrecorded
+from mkc_torch.recording.recording import MissingColumnError, Recording
+from mkc_torch.simulation.dynamics import Dynamics
+from mkc_torch.simulation.magnetometer import Magnetometer
+from mkc_torch.simulation.paired import Paired
+from mkc_torch.simulation.protocol import Change, CorrectableSimulation, Correction, Simulation
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+__all__ = ["SCHEMA", "DiagnosedModel", "ModelFileError", "correction_of", "model_of", "refuse_unknown"]
+
+SCHEMA = "mkc-model/1"
+
+
+class ModelFileError(ValueError):
+    """A text that is no model; the sentence says why."""
+
+
+class DiagnosedModel(CorrectingModel):
+    """What a diagnosis found, ready for other recordings of the same sensor or system.
+
+    Args:
+        simulation: its name.
+        state: constants that the simulation needs to correct a recording.
+        parameters: the simulation's own, (p,).
+        terms: the effects, each with its driver's columns, their reference and units, and its shape.
+        gammas: their γ.
+        source: a simulation of the user's own, which files do not hold.
+
+    Attributes:
+        theta: the simulation's parameters.
+        gammas: a parameter list, one γ an effect.
+
+    Example:
+        >>> from mkc_torch import diagnose
+        >>> from mkc_torch.recording.demonstration import simulated_recording
+        >>> from mkc_torch.simulation import Magnetometer
+        >>> recording, _ = simulated_recording()
+        >>> model = diagnose(Magnetometer(), recording).model
+        >>> columns, left_out = DiagnosedModel.from_json(model.to_json()).correct(recording)
+        >>> list(columns)
+        ['time', 'field_x', 'field_y', 'field_z']
+    """
+
+    def __init__(
+        self,
+        simulation: str,
+        state: Mapping[str, Any],
+        parameters: Float[Tensor, " p"],
+        terms: Sequence[Term],
+        gammas: Sequence[Float[Tensor, " q"]],
+        source: Simulation | None = None,
+    ) -> None:
+        super().__init__()
+        self.simulation = simulation
+        self.state = dict(state)
+        self.theta = nn.Parameter(parameters.detach().clone(), requires_grad=False)
+        self.gammas = nn.ParameterList(nn.Parameter(g.detach().clone(), requires_grad=False) for g in gammas)
+        self.terms = tuple(terms)
+        self.source = source
+
+    def correct(self, recording: Recording) -> tuple[dict[str, Float[Tensor, " N"]], tuple[str, ...]]:
+        """The corrected signal of a recording, row by row, and sentences about effects that do not carry over.
+
+        Of an effect that is bound to the time of the diagnosed recording what is left at its end is taken off, such as
+        the offset after the last step; one that is bound to its place is left out.
+
+        Raises:
+            MissingColumnError: a column of the simulation, or an effect's driver, is not there.
+        """
+        correction = correction_of(self.simulation, self.state, recording, self.source)
+        changes: dict[str, Change] = {}
+        notes = []
+        for number in in_order_of_the_chain(self.terms, range(len(self.terms))):
+            term, gamma = self.terms[number], self.gammas[number]
+            port = term.port
+            if port not in correction.ports:
+                notes.append(f"{term.effect.id} belongs to the place of the diagnosed recording and is left out.")
+                continue
+            series = correction.ports[port].in_series(port)
+            change = self._change(term, gamma, correction, recording)
+            changes[port] = summed(changes.get(port), change, series=series)
+            if term.effect.persistent_change:
+                notes.append(
+                    f"{term.effect.id} is bound to the time of the diagnosed recording: its offset at the end is taken "
+                    "off all of this one."
+                )
+        return correction.corrected(self.theta, changes), tuple(notes)
+
+    def forward(self, recording: Recording) -> dict[str, Float[Tensor, " N"]]:
+        """The corrected signal alone, see :meth:`correct`."""
+        return self.correct(recording)[0]
+
+    def _change(self, term: Term, gamma: Tensor, correction: Correction, recording: Recording) -> Change:
+        effect, shape = term.effect, term.shape
+        bare = _context(term, correction, recording)
+
+        def change(signal: Tensor) -> Tensor:
+            context = replace(bare, signal=signal)
+            return effect.lasting(gamma, context) if effect.persistent_change else effect.change(gamma, shape, context)
+
+        return change
+
+    def to_json(self) -> str:
+        """The model as JSON of the schema "mkc-model/1"; numbers round-trip exactly."""
+        terms = [
+            {
+                "effect": term.effect.id,
+                "drivers": [
+                    {"column": column, "reference": float(reference), "unit": unit}
+                    for column, reference, unit in zip(*_columns(term), strict=True)
+                ],
+                "shape": dict(term.shape),
+                **({"port": term.at} if term.at else {}),
+                "parameters": gamma.tolist(),
+                "equation": term.effect.equation,
+            }
+            for term, gamma in zip(self.terms, self.gammas, strict=True)
+        ]
+        content = {
+            "schema": SCHEMA,
+            "simulation": self.simulation,
+            "state": self.state,
+            "parameters": self.theta.tolist(),
+            "effects": terms,
+        }
+        return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+    def to_python(self, module: str | None = None, folder: Path | None = None) -> str:
+        """The simulation with what was found as Python: a class derived from the diagnosed one.
+
+        Its parameters have the fitted values, and each effect is a line of torch, so that a person can read, keep and
+        change it. It is a :class:`mkc_torch.simulation.Dynamics` like the one it comes from, without the first states
+        of the recording. Numbers are written to nine digits.
+
+        Args:
+            module: to import the diagnosed class from; default the one it was defined in.
+            folder: where the text will be written: a class that was loaded from a file is then loaded from it again,
+                by the way from there.
+
+        Raises:
+            SourceError: no differential equations, or an effect that has no line of its own.
+        """
+        system = self.source
+        if not isinstance(system, Dynamics):
+            raise SourceError(
+                f'Only differential equations are written out as Python, but the model is of "{self.simulation}"'
+                f"{'' if system else '; give its simulation with `simulation=`'}."
+            )
+        measured = tuple(map(str, self.state.get("outputs", system.outputs or system.states)))
+        return python_source(system, self.theta.tolist(), self.terms, tuple(self.gammas), measured, module, folder)
+
+    @staticmethod
+    def from_json(
+        text: str, effects: Sequence[Effect] = CATALOGUE, simulation: Simulation | None = None
+    ) -> DiagnosedModel:
+        """The model of a JSON text.
+
+        Args:
+            text: of model.json.
+            effects: where the effects are looked up by their id; a user's own go in here too.
+            simulation: the user's own that was diagnosed; None for one of the package's.
+
+        Raises:
+            ModelFileError: not JSON, of another schema, an effect that is not known, or a value of the wrong kind.
+
+        Example:
+            >>> DiagnosedModel.from_json("{}")
+            Traceback (most recent call last):
+            mkc_torch.diagnosis.io.model.ModelFileError: this is no model: its schema is missing ...
+        """
+        try:
+            content = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ModelFileError(f"this is no model: it is not JSON ({error}).") from None
+        schema = content.get("schema") if isinstance(content, dict) else None
+        if schema != SCHEMA:
+            found = "missing" if schema is None else json.dumps(schema)
+            raise ModelFileError(f'this is no model: its schema is {found} and not "{SCHEMA}".')
+        try:
+            return _read(content, effects, simulation)
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, ModelFileError):
+                raise
+            raise ModelFileError(f"this model is damaged: {type(error).__name__} {error}.") from None
+
+
+def model_of(final: FinalEstimate, simulation: Simulation) -> DiagnosedModel:
+    """The model of a final fit."""
+    model = final.fit.model
+    signals = model.signals(final.fit.parameters)
+    terms = []
+    for term in model.terms:
+        context = term.context(model.prepared, signals.get(term.port))
+        terms.append(replace(term, shape=term.effect.bind(term.shape, context)))
+    parameters = final.fit.parameters
+    of_recordings = {one.name for one in getattr(model.prepared, "own_offsets", ())}
+    own = [k for k, name in enumerate(model.prepared.parameter_names) if name not in of_recordings]
+    return DiagnosedModel(
+        model.prepared.name,
+        model.prepared.state,
+        parameters[own],
+        terms,
+        model.gammas(parameters),
+        simulation,
+    )
+
+
+def _columns(term: Term) -> tuple[Sequence[str], Sequence[float], Sequence[str]]:
+    if term.driver is None:
+        return (), (), ()
+    return term.driver.columns, term.driver.reference.tolist(), term.driver.units
+
+
+def _read(content: Mapping[str, Any], known: Sequence[Effect], simulation: Simulation | None) -> DiagnosedModel:
+    terms, gammas = [], []
+    for entry in content["effects"]:
+        columns = entry["drivers"]
+        driver = None
+        if columns:
+            reference = torch.tensor([_finite(c["reference"]) for c in columns], dtype=torch.float64)
+            names, units = tuple(c["column"] for c in columns), tuple(c["unit"] for c in columns)
+            driver = Driver(names, "", reference.new_zeros(0, len(columns)), reference, units)
+        shape = {name: _finite(value) for name, value in entry["shape"].items()}
+        terms.append(Term(_effect(entry, known), driver, shape, entry.get("port", "")))
+        gammas.append(_vector(entry["parameters"]))
+    return DiagnosedModel(
+        content["simulation"], content["state"], _vector(content["parameters"]), terms, gammas, simulation
+    )
+
+
+def _effect(entry: Mapping[str, Any], known: Sequence[Effect]) -> Effect:
+    """The one of that id; of several forms, that with these numbers in its shape."""
+    if entry["effect"] == Unrecorded.id and any(name.startswith(COURSE) for name in entry["shape"]):
+        return Unrecorded()
+    same = [effect for effect in reversed(known) if effect.id == entry["effect"]]
+    if not same:
+        names = ", ".join(dict.fromkeys(effect.id for effect in known))
+        raise ModelFileError(
+            f'its effect "{entry["effect"]}" is not known; register it with `effects=` (known: {names}).'
+        )
+    numbers = set(entry["shape"])
+    of_shape = [one for one in same if set(one.relative) <= numbers]
+
+    def fitting(one: Effect) -> tuple[int, int, int, bool]:
+        own, at = {*one.fitted_shape, *one.relative}, str(entry.get("port", "")).partition(" ")[0]
+        choices = set(one.form_parameters)
+        return -len(choices - numbers), len(choices & numbers), len(own & numbers), one.port == at
+
+    effect = max(of_shape or same, key=fitting)
+    lost = sorted({*effect.fitted_shape, *effect.relative} - numbers)
+    if lost:
+        raise ModelFileError(
+            f'the shape of its effect "{effect.id}" lacks {", ".join(lost)}; it may be of another version: diagnose '
+            "the recording again."
+        )
+    return effect
+
+
+def _vector(values: Sequence[float]) -> Tensor:
+    return torch.tensor([_finite(v) for v in values], dtype=torch.float64)
+
+
+def _finite(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ModelFileError(f"this model is damaged: {value!r} is no finite number.")
+    return float(value)
+
+
+def _context(term: Term, correction: Correction, recording: Recording) -> Context:
+    port, time = correction.ports[term.port], correction.time
+    drivers = time.new_zeros(len(time), 0)
+    units: tuple[str, ...] = ()
+    if term.driver is not None:
+        for column in term.driver.columns:
+            if column not in recording:
+                raise missing_driver(column, term.effect.id)
+        drivers, units = recording.stack(*term.driver.columns) - term.driver.reference, term.driver.units
+    drivers = port.at(drivers)
+    time = time if port.clock is None else port.clock.time
+    nothing = time.new_zeros(len(time), len(port.channels))
+    return context_at(port, time, drivers, units, nothing)
+
+
+def missing_driver(column: str, effect: str) -> MissingColumnError:
+    """The error for a recording without an effect's driver."""
+    return MissingColumnError(
+        f"The model corrects {effect} by the column `{column}`, which the recording does not have; "
+        f"rename it with `--columns {column}=NAME`, or record it."
+    )
+
+
+def correction_of(
+    name: str, state: Mapping[str, Any], recording: Recording, simulation: Simulation | None = None
+) -> Correction:
+    """How a simulation corrects a recording.
+
+    Args:
+        name: of the simulation.
+        state: of the one that was fitted.
+        recording: to correct.
+        simulation: a user's own.
+
+    Raises:
+        ValueError: no simulation of this name corrects recordings, or the one that is given has another.
+        MissingColumnError: the recording lacks a column.
+    """
+    refuse_unknown(name, simulation)
+    known = Magnetometer() if simulation is None else simulation
+    if not isinstance(known, CorrectableSimulation):
+        raise ValueError(
+            f'The simulation "{name}" corrects no recordings; derive it from mkc_torch.simulation.Dynamics or Static.'
+        )
+    return known.correction(state, recording)
+
+
+def refuse_unknown(name: str, simulation: Simulation | None) -> None:
+    """Refuses a model whose simulation is not at hand: a file of a model never says what code is run.
+
+    Args:
+        name: of the model's simulation.
+        simulation: what was given.
+
+    Raises:
+        ValueError: nothing was given for a simulation of the user's own, or another one.
+
+    Example:
+        >>> refuse_unknown("Pendulum", None)
+        Traceback (most recent call last):
+        ValueError: the model is of the simulation "Pendulum", which is not this package's own: ...
+    """
+    if simulation is None and name == Paired.name:
+        raise ValueError(
+            "the model is of a simulator's output: give what it wrote for this recording with `--simulator-output SIM.csv` "
+            "(in Python `simulation=Paired(...)`)."
+        )
+    if simulation is None and name != Magnetometer.name:
+        raise ValueError(
+            f'the model is of the simulation "{name}", which is not this package\'s own: no code is run because a '
+            f"model's file names it. Give it with `--simulation FILE.py:{name}`, or the FMU that was diagnosed "
+            "(in Python `simulation=`)."
+        )
+    if simulation is not None and simulation.name != name:
+        raise ValueError(f'the model is of the simulation "{name}" but "{simulation.name}" was given.')

@@ -1,0 +1,261 @@
+"""A simulation with what it lacked as Python that a person can read and keep."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mkc_torch.diagnosis.model.joint import in_order_of_the_chain
+from mkc_torch.effects.kinds import zero_of
+from mkc_torch.recording.recording import DEFAULT_UNITS
+from mkc_torch.simulation.dynamics.definition import Dynamics
+from mkc_torch.simulation.dynamics.ports import memory_at
+from mkc_torch.simulation.dynamics.surroundings import surroundings
+from mkc_torch.simulation.dynamics.user_functions import kinematic
+from mkc_torch.simulation.fmu import is_of_an_fmu
+from mkc_torch.simulation.load import file_of
+from mkc_torch.simulation.parameter import Parameter
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from mkc_torch.diagnosis.model.term import Term
+
+__all__ = ["SourceError", "python_source"]
+
+_DIGITS = 9
+"""Significant digits of a number in the source."""
+_FROM_HERE: Mapping[str, str] = {
+    "lagged(": "from mkc_torch.effects import lagged",
+    "played(": "from mkc_torch.effects import played",
+    "shifted(": "from mkc_torch.effects import shifted",
+    "soft_clip(": "from mkc_torch.effects import soft_clip",
+    "curve_within(": "from mkc_torch.effects import curve_within",
+    "beyond(": "from mkc_torch.effects import beyond",
+    "SimpleNamespace(": "from types import SimpleNamespace",
+    "Parameter(": "from mkc_torch.simulation import Parameter",
+}
+
+
+class SourceError(ValueError):
+    """A model that cannot be written out; the sentence says why."""
+
+
+def python_source(
+    system: Dynamics,
+    theta: Sequence[float],
+    terms: Sequence[Term],
+    gammas: Sequence[Tensor],
+    measured: Sequence[str],
+    module: str | None = None,
+    folder: Path | None = None,
+) -> str:
+    """The text of a module with a class derived from the diagnosed one, see :meth:`DiagnosedModel.to_python`.
+
+    Args:
+        system: the diagnosed one.
+        theta: its parameters, then the first states; these are left out, but for guesses of internal states.
+        terms, gammas: the effects.
+        measured: the outputs that were compared.
+        module: to import the diagnosed class from.
+        folder: where the text will be, if that is known.
+    """
+    kind = type(system)
+    rates: list[str] = []
+    memories = {name: like for term in terms for name, like in _memories(term).items()}
+    inputs: list[str] = []
+    outputs: list[str] = []
+    for number in in_order_of_the_chain(terms, range(len(terms))):
+        term, gamma = terms[number], gammas[number]
+        lines = _lines(term, [_rounded(float(one)) for one in gamma], system, measured)
+        place = outputs if term.port == "output" else inputs if term.port.startswith("input ") else rates
+        if place is outputs and outputs:
+            place.append("y = dict(shown)")  # the next one acts on what this one shows
+        place += [f"# {term.effect.id}: {term.effect.equation}", *lines]
+    told = ", ".join(term.effect.display_name for term in terms) or "nothing more"
+    body = [
+        f"class Corrected{kind.__name__}({kind.__name__}):",
+        f'    """{kind.__name__} with the parameters that a recording gave it, and {told}."""',
+        "",
+        "    parameters = {",
+        *(f"        {line}" for line in _parameters(system, theta)),
+        "    }",
+        *_states(system, memories, theta),
+        *_actuated(inputs),
+        *_derivative(memories, rates),
+        *_sensed(outputs),
+    ]
+    text = "\n".join(body)
+    loaded = None if module else _loaded(kind, folder)
+    base = loaded or f"from {module or kind.__module__.removeprefix('_simulation_')} import {kind.__name__}"
+    # in the order of standard library, torch, the package, the user's own file
+    used = [line for name, line in _FROM_HERE.items() if name in text]
+    first = [line for line in used if "mkc_torch" not in line]
+    own = sorted([line for line in used if "mkc_torch" in line] + [_of_class(loaded)] * bool(loaded))
+    torch = ["import torch"] if "torch." in text else []
+    groups = [first, [*torch, *own], [base]]
+    imports = "\n\n".join("\n".join(group) for group in groups if group)
+    return (
+        f'"""{kind.__name__}, corrected by what `mkc diagnose` found; every number is of that recording."""\n\n'
+        f"{imports}\n\n\n{text}\n"
+    )
+
+
+def _of_class(line: str | None) -> str:
+    return f"from mkc_torch.simulation import {'fmu_class' if ' = fmu_class(' in (line or '') else 'base_class'}"
+
+
+def _loaded(kind: type, folder: Path | None) -> str | None:
+    """A line that loads a class from its own file, by the way from a folder; None where there is no such file or way.
+
+    A way within one tree says nothing of the machine, and both can be moved together.
+    """
+    fmu = kind.evaluation.description.path if is_of_an_fmu(kind) else None
+    file = fmu or file_of(kind)
+    if file is None or (folder is None and fmu is None):
+        return None
+    try:
+        way = Path(file.name if folder is None else os.path.relpath(file.resolve(), folder.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return None
+    if fmu is not None:
+        return f"{kind.__name__} = fmu_class({json.dumps(way, ensure_ascii=False)}, __file__)"
+    return f"{kind.__name__} = base_class({json.dumps(f'{way}:{kind.__name__}', ensure_ascii=False)}, __file__)"
+
+
+def _parameters(system: Dynamics, theta: Sequence[float]) -> list[str]:
+    lines = []
+    for (name, one), value in zip(system.parameters.items(), theta, strict=False):
+        number = repr(_rounded(value))
+        if isinstance(one, Parameter):
+            told = [
+                f"{key}={json.dumps(known, ensure_ascii=False)}"
+                for key, known, free in (
+                    ("lower", one.lower, -float("inf")),
+                    ("upper", one.upper, float("inf")),
+                    ("unit", one.unit, ""),
+                )
+                if known != free
+            ]
+            number = f"Parameter({', '.join([number, *told])})"
+        lines.append(f'"{name}": {number},')
+    return lines
+
+
+def _states(system: Dynamics, memories: Mapping[str, str], theta: Sequence[float]) -> list[str]:
+    """The states with the internal ones that effects bring; one that begins like another state begins about there."""
+    base, first = type(system).__name__, theta[len(system.parameters) :]
+    guesses: dict[str, float] = {}
+    for name, like in memories.items():
+        begun = first[system.states.index(like) :: len(system.states)] if like else ()
+        guesses |= {name: sum(begun) / len(begun)} if begun else {}
+    told = ", ".join(json.dumps(name) for name in memories)
+    lines = [f"    states = (*{base}.states, {told})"] if memories else []
+    guessed = ", ".join(f"{json.dumps(name)}: {_rounded(value)!r}" for name, value in guesses.items())
+    return [*lines, f"    initial = {{**{base}.initial, {guessed}}}"] if guessed else lines
+
+
+def _actuated(inputs: list[str]) -> list[str]:
+    if not inputs:
+        return []
+    lines = ["acting = SimpleNamespace(**vars(u))", *inputs, "return super().actuated(time, acting, p, run)"]
+    return ["", "    def actuated(self, time, u, p, run):", *(f"        {line}" for line in lines)]
+
+
+def _derivative(memories: Mapping[str, str], rates: list[str]) -> list[str]:
+    if not rates:
+        return []
+    still = [f'rates["{name}"] = torch.zeros_like(x.{name})' for name in memories]
+    return [
+        "",
+        "    def derivative(self, time, x, u, p):",
+        *(f"        {line}" for line in ["rates = self.plain_rates(time, x, u, p)", *still, *rates, "return rates"]),
+        "",
+        "    def plain_rates(self, time, x, u, p):",
+        "        rates = super().derivative(time, x, u, p)",
+        '        return dict(rates) if hasattr(rates, "keys") else dict(zip(self.states, rates))',
+    ]
+
+
+def _sensed(outputs: list[str]) -> list[str]:
+    if not outputs:
+        return []
+    lines = ["y = super().sensed(time, y, p, run)", "shown = dict(y)", *outputs, "return shown"]
+    return ["", "    def sensed(self, time, y, p, run):", *(f"        {line}" for line in lines)]
+
+
+def _memories(term: Term) -> dict[str, str]:
+    """The internal states that an effect brings, and the state that each begins like; empty for 0."""
+    kind, _, state = term.port.rpartition(" of ")
+    return memory_at(kind, state)
+
+
+def _lines(term: Term, gamma: Sequence[float], system: Dynamics, measured: Sequence[str]) -> list[str]:
+    """Assignments that add an effect to what it acts on."""
+    if term.driver is not None or not term.effect.has_code:
+        raise SourceError(
+            f"{term.effect.id} cannot be written out as Python: "
+            + ("it is driven by a recorded column." if term.driver else "it has no `code` method.")
+        )
+    shape = {name: _rounded(value) for name, value in term.shape.items()}
+    before: list[str] = []
+    if "rate of " in term.port:
+        state = term.port.rpartition("rate of ")[2]
+        memories = _memories(term)
+        targets = [f'rates["{name}"]' for name in (state, *memories)]
+        names = _parts(state, system) | _numbered([f"x.{name}" for name in memories])
+        before = _load(state) if term.port.startswith("loaded") else []
+    elif term.port.startswith("exchange of "):
+        one, _, other = term.port.removeprefix("exchange of ").partition(" and ")
+        targets = [f'rates["{one}"]', f'rates["{other}"]']
+        names = {"own": f"x.{one}", "other": f"x.{other}"}
+    elif term.port.startswith("input "):
+        name = term.port.removeprefix("input ")
+        targets, names = [f"acting.{name}"], {"own": f"acting.{name}"}
+    else:
+        targets, names = [f'shown["{name}"]' for name in measured], {name: f'y["{name}"]' for name in measured}
+    added = term.effect.code(gamma, shape, names)
+    each = zip(targets, added, strict=False)
+    return [*before, *(f"{target} = {target} {_signed(expression)}" for target, expression in each)]
+
+
+def _signed(expression: str) -> str:
+    return f"- {expression[1:]}" if expression.startswith("-") else f"+ {expression}"
+
+
+def _parts(state: str, system: Dynamics) -> dict[str, str]:
+    """Expressions of what an effect on the rate of a state refers to."""
+    known = {name: one if isinstance(one, Parameter) else Parameter(one) for name, one in system.parameters.items()}
+    position = next((name for name, rate in kinematic(system, known).items() if rate == state), state)
+    zero = zero_of(system.units.get(state, DEFAULT_UNITS.get(state, "")))
+    return {
+        "own": f"x.{state}",
+        **dict.fromkeys(("position", "angle", "deflection"), f"x.{position}"),
+        "surroundings": f"u.{surroundings(system).get(state, '')}",
+        "load": "load",
+        "rate": f'self.plain_rates(time, x, u, p)["{state}"]',
+        "zero": repr(zero),
+    }
+
+
+def _numbered(memories: Sequence[str]) -> dict[str, str]:
+    """Expressions of internal states: memory, memory_2 and so on."""
+    return {"memory" if k == 0 else f"memory_{k + 1}": one for k, one in enumerate(memories)}
+
+
+def _load(state: str) -> list[str]:
+    """Lines that compute how hard the inputs work, at this speed, against what acts at standstill without them."""
+    return [
+        f'still = SimpleNamespace(**{{**vars(x), "{state}": torch.zeros_like(x.{state})}})',
+        "idle = SimpleNamespace(**{name: torch.zeros_like(one) for name, one in vars(u).items()})",
+        f'coasting = self.plain_rates(time, x, idle, p)["{state}"]',
+        f'held = self.plain_rates(time, still, idle, p)["{state}"]',
+        f'load = (self.plain_rates(time, x, u, p)["{state}"] - coasting - held).abs()',
+    ]
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{_DIGITS}g}")

@@ -1,0 +1,221 @@
+"""The candidates that a joint refit makes the most of, from starts that a bad first fit cannot hide."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from mkc_torch._support.order_statistic import robust_scale
+from mkc_torch.diagnosis.linearised.linearise import linearise
+from mkc_torch.diagnosis.linearised.tangents import ModelTangents, tangents_of
+from mkc_torch.diagnosis.model.fit import FittedModel, clipped_residual, fitted_beside
+from mkc_torch.diagnosis.model.parallel import run_parallel
+from mkc_torch.diagnosis.model.term import Key, Term
+from mkc_torch.diagnosis.search.linearized import LinearizedSearch
+from mkc_torch.diagnosis.search.model_prior import ModelPrior
+from mkc_torch.diagnosis.search.shape_refinement import refined
+from mkc_torch.diagnosis.search.ties import best_first, in_order
+from mkc_torch.diagnosis.settings import SearchSettings, Settings
+from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation.protocol import Beginning
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+T = TypeVar("T")
+
+__all__ = ["refitted", "strongest"]
+
+Start = tuple[Tensor, tuple[Tensor, Tensor]]
+"""Parameters to linearise around, and the pseudo-residual there with what counts of it."""
+
+Listed = tuple[Term, Tensor]
+"""A candidate worth a joint refit, with the parameters to start from, its γ the last ones."""
+
+
+def strongest(
+    base: FittedModel, terms: tuple[Term, ...], prefer: ModelPrior, settings: Settings, *, parts: bool
+) -> tuple[list[FittedModel], ModelTangents]:
+    """The joint refits, the likeliest first; the leading ones each at its best shape, and behind them the others.
+
+    Beside them the tangents at the fit that they are beside.
+
+    Candidates are ranked by the likelihood's own score and by a clipped one, which still sees a stretch of samples that
+    the fit rejects; and, where one model over all of the recording runs away, around fits to parts of it, and around
+    where its fit began.
+    """
+    around = base.parameters
+    noise, search = settings.noise, settings.search
+    tangents = tangents_of(base.model, around, noise, terms)
+    looks = [
+        ((around, base.pseudo(noise)), search.refitted),
+        ((around, clipped_residual(base.residual)), search.refitted_elsewhere),
+    ]
+    works = [partial(_short_list, base, terms, start, tangents, most) for start, most in looks]
+    lists = run_parallel(works, base.model.prepared, terms)
+    fits: dict[Key, FittedModel] = {}
+    fitted_parts = _part_fits(base, search.parts) if parts else []
+    listed: dict[Key, Listed] = {}
+    for one in chain(*(chosen for chosen, _ in lists)):
+        listed.setdefault(one[0].key, one)
+    starts = _refit_all(fits, base, list(listed.values()), prefer, fitted_parts)
+    if parts:
+        least = torch.stack([fit.d for fit in fits.values()]).amin(0)
+        started = [
+            one.start for one in starts if one is not None and bool((one.scale < search.part_better * least).any())
+        ]
+        more = [
+            _short_list(base, terms, start, tangents_of(base.model, start[0], noise, terms), search.refitted_elsewhere)
+            for start in (*started, *_first_start(base, search.ran_away))
+        ]
+        _refit_all(fits, base, [*chain(*(chosen for chosen, _ in more))], prefer)
+        lists += more
+    likeliest = torch.stack([log_p for _, log_p in lists]).amin(0)
+    order = [terms[number] for number in in_order((-likeliest).tolist(), terms)]
+    leading = _at_best_shapes(_leading(list(fits.values()), base, prefer, search), base, order, prefer, search.shapes)
+    shaped = run_parallel(
+        [partial(refined, fit, base) for fit in leading], base.model.prepared, terms, "leading candidate"
+    )
+    keys = {fit.model.terms[-1].key for fit in shaped}
+    parted = shaped, [fit for key, fit in fits.items() if key not in keys]
+    fitted = [fit for part in parted for fit in best_first(part, base, prefer)]
+    return fitted, tangents
+
+
+def _short_list(
+    base: FittedModel, terms: tuple[Term, ...], start: Start, tangents: ModelTangents, most: int
+) -> tuple[list[Listed], Float[Tensor, " C"]]:
+    """The strongest candidates, noise taken for white, and the log of each one's p."""
+    parameters, (pseudo, counts) = start
+    plain = linearise(base.model, parameters, pseudo, counts, tangents, white=True, drift=False)
+    log_p = plain.search.gains(plain.series.unsqueeze(-1)).log_p[:, 0]
+    chosen: dict[Key, Listed] = {}
+    for number in in_order((-log_p).tolist(), terms):
+        term = terms[number]
+        if term.key not in chosen:
+            gamma, _ = plain.search.estimate(number, plain.series)
+            if term.effect.one_sided:
+                gamma = gamma.clamp(max=0.0)
+                if not bool(gamma.any()):
+                    continue
+            chosen[term.key] = term, torch.cat([parameters, -gamma])
+        if len(chosen) >= most:
+            break
+    if not chosen:
+        # none has a size of a sign that its physics allows; one of them is still to be told to be nothing
+        size = base.model.with_term(terms[0]).sizes[-1]
+        chosen[terms[0].key] = terms[0], torch.cat([parameters, parameters.new_zeros(size)])
+    return list(chosen.values()), log_p
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A fit to a part of the recording, as a start, and the robust scale of its residuals there."""
+
+    start: Start
+    scale: Float[Tensor, " m"]
+
+
+def _part_fits(base: FittedModel, parts: int) -> list[Callable[[], _Part | None]]:
+    """Works that fit parts of the recording; None where one cannot be fitted alone."""
+    N = len(base.model.prepared.time)
+
+    def fit_to(rows: Bool[Tensor, " N"]) -> _Part | None:
+        try:
+            theta = base.model.prepared.start(rows)
+        except NoFitError:
+            return None
+        parameters = torch.cat([theta, base.parameters[base.model.base :]])
+        residual = base.model.residual(parameters)
+        return _Part((parameters, clipped_residual(residual)), robust_scale(residual[rows]))
+
+    part = torch.arange(N) * parts // N
+    return [partial(fit_to, part == number) for number in range(parts)]
+
+
+def _first_start(base: FittedModel, away: float) -> list[Start]:
+    """Around where the fit began, if a parameter of the equations went far from there: what they lack can drive it."""
+    prepared = base.model.prepared
+    if not isinstance(prepared, Beginning):
+        return []
+    theta, own = prepared.start(), base.model.base - prepared.beginnings
+    sizes = torch.stack([theta[:own], base.parameters[:own]]).abs()
+    if not bool((sizes.amax(0) > away * sizes.amin(0)).any()):
+        return []
+    parameters = torch.cat([theta, base.parameters[base.model.base :]])
+    residual = base.model.residual(parameters)
+    return [(parameters, clipped_residual(residual))] if bool(residual.isfinite().all()) else []
+
+
+def _refit_all(
+    fits: dict[Key, FittedModel],
+    base: FittedModel,
+    listed: Sequence[Listed],
+    prefer: ModelPrior,
+    beside: Sequence[Callable[[], T]] = (),
+) -> list[T]:
+    """Put the joint refit of each into ``fits``, where it is the better one of its physics; others go on beside."""
+    works = [partial(fitted_beside, base, base.model.with_term(term), start) for term, start in listed]
+    done: list[Any] = run_parallel(
+        [*works, *beside], base.model.prepared, [term for term, _ in listed], "fit of a candidate"
+    )
+    for (term, _), fit in zip(listed, done, strict=False):
+        if term.key not in fits or prefer.score(fit, base) > prefer.score(fits[term.key], base):
+            fits[term.key] = fit
+    return done[len(works) :]
+
+
+def _leading(
+    fits: Sequence[FittedModel], base: FittedModel, prefer: ModelPrior, settings: SearchSettings
+) -> list[FittedModel]:
+    """The first ones, and another that is close behind."""
+    leading = settings.leading
+    first = best_first(fits, base, prefer)[: leading + 1]
+    close = max(settings.third_share * prefer.score(first[0], base), settings.third_nats)
+    return [fit for place, fit in enumerate(first) if place < leading or prefer.score(fit, base) > close]
+
+
+def _at_best_shapes(
+    fits: Sequence[FittedModel], base: FittedModel, terms: Sequence[Term], prefer: ModelPrior, most: int
+) -> list[FittedModel]:
+    """Each fit, or a better one with another shape of the same effect, of so many of ``terms`` the likeliest first.
+
+    Onsets are many, and closed in on later.
+    """
+    tried = []
+    for place, fit in enumerate(fits):
+        own = fit.model.terms[-1]
+        others = [t for t in terms if t.key == own.key and t.shape != own.shape]
+        tried += [(place, other) for other in others[:most] if "onset" not in own.shape]
+    works = [partial(_reshaped, fits[k], base, other) for k, other in tried]
+    refits = run_parallel(works, base.model.prepared, terms, "shape of a leading candidate")
+    best = list(fits)
+    for (place, _), refit in zip(tried, refits, strict=True):
+        best[place] = max(best[place], refit, key=lambda fit: prefer.score(fit, base))
+    return best
+
+
+def _reshaped(fit: FittedModel, base: FittedModel, term: Term) -> FittedModel:
+    model = fit.model.with_last(term)
+    kept = fit.parameters[: model.size]
+    more = kept.new_zeros(model.size - len(kept))
+    return fitted_beside(base, model, torch.cat([kept, more]), graduate=False)
+
+
+def refitted(best: FittedModel, term: Term, look: LinearizedSearch, number: int) -> FittedModel:
+    """The joint fit of a candidate in the place of another one's, from the size that the search has for it."""
+    base, gamma = look.scene.base, look.estimate(number)
+    gamma = gamma.clamp(max=0.0) if term.effect.one_sided else gamma
+    beside = best.model.with_last(term) if len(best.model.terms) > len(base.model.terms) else best.model.with_term(term)
+    found = fitted_beside(base, beside, torch.cat([best.parameters[: base.model.size], -gamma]))
+    if found.log_likelihood >= base.log_likelihood:
+        return found
+    # it went astray from there: from nothing it only climbs
+    model = base.model.with_term(term)
+    return fitted_beside(base, model, torch.cat([base.parameters, torch.zeros_like(gamma)]), graduate=False)

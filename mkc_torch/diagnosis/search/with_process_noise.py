@@ -1,0 +1,390 @@
+"""Locate and name beside pushes: by candidates' gains at their own size of the pushes, then by fits of each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from mkc_torch.diagnosis.goodness_of_fit import size_of
+from mkc_torch.diagnosis.linearised.tangents import tangents_of
+from mkc_torch.diagnosis.model.fit import FittedModel, fitted, fitted_beside
+from mkc_torch.diagnosis.model.joint import JointModel
+from mkc_torch.diagnosis.model.parallel import run_parallel
+from mkc_torch.diagnosis.model.process_noise import (
+    estimate_noise,
+    refit_input_hold,
+    refit_noise,
+    refit_open_loop,
+    with_noise_of_fit,
+)
+from mkc_torch.diagnosis.model.shaped import shape_fitted
+from mkc_torch.diagnosis.model.term import Key, Term, continuous
+from mkc_torch.diagnosis.search.free_runs import free_runs
+from mkc_torch.diagnosis.search.joint_likelihood import JointLikelihood, joint_likelihood
+from mkc_torch.diagnosis.search.linearized import SearchProblem
+from mkc_torch.diagnosis.search.model_prior import ModelPrior
+from mkc_torch.diagnosis.search.own_noise import noise_of_fit, priced, with_own_noise
+from mkc_torch.diagnosis.search.quick import price
+from mkc_torch.diagnosis.search.ranking import Ranked
+from mkc_torch.diagnosis.search.run import SearchResult
+from mkc_torch.diagnosis.search.ties import in_order
+from mkc_torch.diagnosis.settings import Settings
+from mkc_torch.nonlinear import NoFitError
+from mkc_torch.simulation.dynamics.prepared import PreparedDynamics
+
+__all__ = ["search_with_process_noise"]
+
+_CURVES = 2
+"""Free curves that are fitted beside the leading candidates."""
+
+_PART = 0.3
+"""Share of the largest gain below which a candidate is not fitted."""
+
+_CLOSER = 0.95
+"""Times the residual of a free run that a rival's has to be, for the rival to go first."""
+
+_DOUBT = 10.0
+"""Nats beyond its price that a candidate has to gain to count without draws."""
+
+_FIT = "fit of a leading candidate"
+"""What progress counts."""
+
+Kind = tuple[Key, str]
+"""Of a candidate, and for a curve what it is over."""
+
+
+def search_with_process_noise(
+    base: FittedModel,
+    terms: Sequence[Term],
+    *,
+    level: float,
+    surrogates: int,
+    generator: torch.Generator,
+    declared: Mapping[str, float],
+    fixed: Mapping[str, str],
+    free: FittedModel | None = None,
+    settings: Settings,
+    quick: bool = False,
+    keep: Callable[[SearchResult], object] = lambda _: None,
+) -> SearchResult:
+    """The strongest candidate beside a fit under pushes.
+
+    Args:
+        base: the fit.
+        terms: candidates.
+        level: below which p-value candidates are fitted and compared.
+        surrogates: draws of noise.
+        generator: of the draws.
+        declared: standard deviation of the white noise of outputs that it is known of.
+        fixed: what inputs do between samples that it is known of.
+        free: the same as it runs freely; None where that loses the recording.
+        settings: the numbers that decide.
+        quick: draw no noise, and refit each leading candidate from one start.
+        keep: called with what is known before the leading candidates are refitted.
+
+    Raises:
+        NoFitError: the fit's trajectory is lost.
+    """
+    terms = tuple(terms)
+    tangents = tangents_of(base.model, base.parameters, settings.noise, terms)
+    values, counts = base.pseudo(settings.noise)
+    channels = base.model.prepared.channels
+    found = joint_likelihood(
+        base,
+        terms,
+        tangents,
+        counts,
+        surrogates,
+        generator,
+        level=level,
+        declared=[name in declared for name in channels],
+        quick=quick,
+    )
+    if found is None:
+        raise NoFitError("The simulation's trajectory is lost at the fitted values.")
+    prefer = ModelPrior(terms, base.model.prepared, settings.naming)
+    look = SearchProblem(base, base, terms, tangents, values, counts, settings).under()
+    ranking = _ranked(found, terms, prefer)
+    best = _fit_of(base, terms[ranking[0].number], found, ranking[0].number)
+    located = SearchResult(
+        best.model.terms[-1],
+        best,
+        found.p_value,
+        found.beyond,
+        ranking,
+        look.noise,
+        look,
+        look.linearised,
+        longer=found.longer,
+        with_noise=True,
+    )
+    keep(located)
+    fits: Sequence[FittedModel] = ()
+    p_value = found.p_value
+    runs = [] if quick or free is None else free_runs(free, terms, settings)
+    if p_value > level and _plain(base, [fit for _, fit in runs], terms, declared, settings):
+        p_value = 1.0 / (1.0 + surrogates)
+    if p_value <= level:
+        chosen = _chosen(found, ranking, terms, settings.search.own_noise)
+        common = base.model.prepared, [terms[number] for number in chosen]
+        first = run_parallel([partial(_fit_of, base, terms[number], found, number) for number in chosen], *common, _FIT)
+        chosen, first = _within_reach(chosen, first, [prefer.score_with_shape(fit, base) for fit in first], settings)
+        known = {terms[number].key: fit for number, fit in runs}
+        works = []
+        for number, fit in zip(chosen, first, strict=True):
+            gamma, running = found.start(number).gamma, known.pop(terms[number].key, None)
+            works.append(
+                partial(_likelier, base, free, terms[number], fit, gamma, declared, settings, running, quick=quick)
+            )
+        more = [(number, fit) for number, fit in runs if terms[number].key in known]
+        works += [partial(_under_own_noise, fit, base, declared, settings) for _, fit in more]
+        chosen += [number for number, _ in more]
+        fits = run_parallel(works, base.model.prepared, [terms[number] for number in chosen], _FIT)
+        best, ranking = _by_own_noise(base, ranking, chosen, fits, terms, prefer, settings)
+        best, ranking = _by_free_run(best, ranking, fits, terms, settings)
+        best = refit_noise(best, noise_of_fit(best, declared), declared, settings.noise)
+        best = best if quick else refit_input_hold(best, declared, fixed, settings.noise)
+    bare = _without(base, best, declared, settings) if fits and with_noise_of_fit(best) else None
+    likelier = bare is not None and priced(bare, settings) > priced(base, settings) + settings.noise.pushed
+    needless = bare is not None and _needless(best, bare, settings, drawn=not likelier)
+    return replace(
+        located,
+        term=best.model.terms[-1],
+        fit=best,
+        p_value=1.0 if needless else p_value,
+        ranking=ranking,
+        compared=fits,
+        alone=bare if needless and likelier else None,
+    )
+
+
+def _ranked(found: JointLikelihood, terms: tuple[Term, ...], prefer: ModelPrior) -> tuple[Ranked, ...]:
+    """By gain less Akaike's price of the numbers and the handicap, each physics at its best shape."""
+    numbers = found.gain.new_tensor([float(len(continuous(term))) for term in terms])
+    penalty = [prefer.penalty(term, float(one)) for term, one in zip(terms, found.gain, strict=True)]
+    score = found.gain - found.dof - numbers - found.gain.new_tensor(penalty)
+    score = torch.where(found.dof > 0, score, -torch.inf)
+    best: dict[Key, int] = {}
+    for number in in_order(score.tolist(), terms):
+        best.setdefault(terms[number].key, number)
+    return tuple(Ranked(n, float(found.gain[n]), float(score.max() - score[n])) for n in best.values())
+
+
+def _chosen(found: JointLikelihood, ranking: Sequence[Ranked], terms: tuple[Term, ...], most: int) -> list[int]:
+    """The leading candidates, each at its best shape, and the curve that gains most over each thing at their places."""
+    chosen: dict[Kind, int] = {}
+    least = _PART * max(one.gain for one in ranking[:most])
+    for one in ranking[:most]:
+        if one.gain >= least:
+            chosen[_kind(terms[one.number])] = one.number
+    places = {terms[number].port for number in chosen.values()}
+    curves = [n for n, term in enumerate(terms) if term.effect.is_curve and term.port in places]
+    for number in sorted(curves, key=lambda n: -float(found.gain[n]))[:_CURVES]:
+        if found.gain[number] >= least:
+            chosen.setdefault(_kind(terms[number]), number)
+    return list(chosen.values())
+
+
+def _kind(term: Term) -> Kind:
+    return term.key, term.effect.plot_axis if term.effect.is_curve else ""
+
+
+def _fit_of(base: FittedModel, term: Term, found: JointLikelihood, number: int) -> FittedModel:
+    """The joint fit of a candidate, under the pushes that it leaves by the search."""
+    prepared = base.model.prepared
+    assert isinstance(prepared, PreparedDynamics)
+    begin = found.start(number)
+    smaller = prepared.observed(begin.observer)
+    start = torch.cat([_inside(base, base.parameters + begin.shift), begin.gamma])
+    model = JointModel(smaller, (*base.model.terms, term), base.model.near)
+    none = torch.cat([base.parameters, torch.zeros_like(begin.gamma)])
+    # far along the tangents there may be no trajectory
+    for one in (start, none):
+        there = fitted_beside(base, model, one, graduate=False)
+        if there.model.prepared is smaller:
+            return there
+    return fitted_beside(base, base.model.with_term(term), start, graduate=False)
+
+
+def _inside(base: FittedModel, parameters: Tensor) -> Tensor:
+    """Within the bounds, and where they are free no farther than what is nearly linear."""
+    bounds = base.model.bounds
+    if bounds is not None:
+        parameters = parameters.clamp(*bounds)
+    own = base.model.base
+    far = (parameters - base.parameters).abs() > base.parameters.abs().clamp(min=1e-12)
+    return torch.where(far & (torch.arange(len(parameters)) < own), base.parameters, parameters)
+
+
+def _within_reach(
+    chosen: Sequence[int], fits: Sequence[FittedModel], scores: Sequence[float], settings: Settings
+) -> tuple[list[int], list[FittedModel]]:
+    """Candidates, with their first fits, that are not so far behind the best that they could not come near it."""
+    least = max(scores) - settings.search.behind - settings.search.behind_share * max(max(scores), 0.0)
+    kept = [place for place, score in enumerate(scores) if score >= least]
+    return [chosen[place] for place in kept], [fits[place] for place in kept]
+
+
+def _likelier(
+    base: FittedModel,
+    free: FittedModel | None,
+    term: Term,
+    fit: FittedModel,
+    gamma: Tensor,
+    declared: Mapping[str, float],
+    settings: Settings,
+    running: FittedModel | None = None,
+    *,
+    quick: bool = False,
+) -> FittedModel:
+    """The joint fit of a candidate under the noise that it leaves, begun with its first fit or from the free run.
+
+    Process noise that the first fit began with has taken over what the effect does, and not all of it is given back.
+    A quick look begins from the free run only where the first fit is no likelier than the simulation alone.
+    ``running`` is the candidate's free run where it is fitted already.
+    """
+    under = with_own_noise(fit, declared, settings)
+    if free is None or not with_noise_of_fit(under):
+        return under
+    if quick and priced(under, settings) > priced(base, settings):
+        return under
+    if running is None:
+        model = free.model.with_term(term)
+        starts = (torch.cat([free.parameters, gamma]), torch.cat([free.parameters, torch.zeros_like(gamma)]))
+        works = [partial(fitted_beside, free, model, one, graduate=False) for one in starts]
+        tried = run_parallel(works, model.prepared, [term])
+        running = shape_fitted(max(tried, key=lambda one: one.log_likelihood))
+    running = _under_own_noise(running, base, declared, settings)
+    return running if priced(running, settings) > priced(under, settings) else under
+
+
+def _under_own_noise(
+    running: FittedModel, base: FittedModel, declared: Mapping[str, float], settings: Settings
+) -> FittedModel:
+    """A free run under the noise that is around it; as it is, where that loses the recording."""
+    noise = estimate_noise(running, declared, settings.noise)
+    if noise is not None and noise.observer is not None:
+        prepared = running.model.prepared
+        assert isinstance(prepared, PreparedDynamics)
+        observed = JointModel(prepared.observed(noise.observer), running.model.terms, running.model.near)
+        try:
+            running = fitted(observed, running.parameters, base.bound, graduate=False, anew=True)
+        except NoFitError:
+            return running
+    return with_own_noise(running, declared, settings)
+
+
+def _plain(
+    base: FittedModel,
+    runs: Sequence[FittedModel],
+    terms: Sequence[Term],
+    declared: Mapping[str, float],
+    settings: Settings,
+) -> bool:
+    """Whether a candidate's fit is so much likelier than the simulation under any noise that no draws are needed.
+
+    A likelihood ratio exceeds k with a probability of at most 1/k without the effect (Markov's inequality; Wasserman,
+    Ramdas & Balakrishnan, PNAS 117 (2020), 16880), where the simulation alone has its likeliest noise too: that which
+    its own fit leads to, or that which is found beside the effect. What the fit of the effect's numbers and the choice
+    among the candidates gain is taken off.
+    """
+    if not runs:
+        return False
+    works = [partial(with_own_noise, base, declared, settings)]
+    works += [partial(_under_own_noise, fit, base, declared, settings) for fit in runs]
+    alone, *others = run_parallel(works, base.model.prepared, [fit.model.terms[-1] for fit in runs])
+    samples, kinds = int(alone.residual.numel()), len({term.key for term in terms})
+    for fit in others:
+        least = _DOUBT + price(_numbers(fit), samples, kinds)
+        if priced(fit, settings) - priced(alone, settings) > least:
+            bare = _without(base, fit, declared, settings)
+            if bare is not None and priced(fit, settings) - priced(bare, settings) > least:
+                return True
+    return False
+
+
+def _without(
+    base: FittedModel, fit: FittedModel, declared: Mapping[str, float], settings: Settings
+) -> FittedModel | None:
+    """The simulation without a candidate, begun with the noise that is found beside it; None where it has no fit."""
+    model = JointModel(fit.model.prepared, base.model.terms, base.model.near)
+    try:
+        without = fitted(model, base.parameters, base.bound, graduate=False, anew=True)
+    except NoFitError:
+        return None
+    return with_own_noise(without, declared, settings)
+
+
+def _needless(best: FittedModel, bare: FittedModel, settings: Settings, *, drawn: bool) -> bool:
+    """Whether the noise that was found beside an effect does as much without it.
+
+    A candidate that only led to a likelier noise is no finding: its size is nothing, or anything. Its numbers are
+    priced as by Schwarz; as by Akaike where the draws were of that noise, for then the p-value counts the search.
+    """
+    numbers = best.model.size - bare.model.size + len(best.model.terms[-1].effect.fitted_shape)
+    price_of_one = 1.0 if drawn else 0.5 * math.log(len(best.residual))
+    return priced(best, settings) - priced(bare, settings) < numbers * price_of_one
+
+
+def _by_free_run(
+    best: FittedModel,
+    ranking: tuple[Ranked, ...],
+    fits: Sequence[FittedModel],
+    terms: tuple[Term, ...],
+    settings: Settings,
+) -> tuple[FittedModel, tuple[Ranked, ...]]:
+    """Of candidates that the likelihood does not tell apart the one whose free run follows the recording best.
+
+    One with more numbers than the likeliest always follows better, and does not go first for that.
+    """
+    gaps = {terms[one.number].key: one.gap for one in ranking}
+    alike = [fit for fit in fits if gaps[fit.model.terms[-1].key] < settings.naming.separable]
+    near = [fit for fit in alike if fit is best or _numbers(fit) <= _numbers(best)]
+    keys = list(dict.fromkeys(fit.model.terms[-1].key for fit in near))
+    if len(keys) < 2:
+        return best, ranking
+    runs = run_parallel(
+        [partial(refit_open_loop, fit) for fit in near], best.model.prepared, [fit.model.terms[-1] for fit in near]
+    )
+    sizes = [math.inf if run is None else float(size_of(run.residual).log().sum()) for run in runs]
+    first = min(range(len(near)), key=sizes.__getitem__)
+    own = next(size for fit, size in zip(near, sizes, strict=True) if fit is best)
+    if not sizes[first] < own + len(best.d) * math.log(_CLOSER):
+        return best, ranking
+    key = near[first].model.terms[-1].key
+    return near[first], tuple(sorted(ranking, key=lambda one: (terms[one.number].key != key, one.gap)))
+
+
+def _numbers(fit: FittedModel) -> int:
+    """Of the last effect and its shape."""
+    return fit.model.sizes[-1] + len(fit.model.terms[-1].effect.fitted_shape)
+
+
+def _by_own_noise(
+    base: FittedModel,
+    ranking: tuple[Ranked, ...],
+    chosen: Sequence[int],
+    fits: Sequence[FittedModel],
+    terms: tuple[Term, ...],
+    prefer: ModelPrior,
+    settings: Settings,
+) -> tuple[FittedModel, tuple[Ranked, ...]]:
+    """The likeliest of the fits, and the ranking with how far each is behind it; others are behind all of them."""
+    scores = [prefer.score_with_shape(fit, base) + (priced(fit, settings) - fit.log_likelihood) for fit in fits]
+    best = in_order(scores, [fit.model.terms[-1] for fit in fits])[0]
+    behind: dict[Key, tuple[float, int]] = {}
+    for number, score in zip(chosen, scores, strict=True):
+        key, gap = terms[number].key, scores[best] - score
+        behind[key] = min((gap, number), behind.get(key, (gap, number)))
+    last = max(gap for gap, _ in behind.values())
+    told = []
+    for one in ranking:
+        key = terms[one.number].key
+        gap, number = behind.get(key, (max(last, one.gap), one.number))
+        told.append(replace(one, number=number, gap=gap))
+    return fits[best], tuple(sorted(told, key=lambda one: one.gap))

@@ -1,0 +1,220 @@
+"""A fixed point polished to rest, and the curvature of its objective there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mkc_torch.density.energy import KAPPA_MAX, energy, energy_dkappa, energy_dz
+from mkc_torch.density.likelihood import energy_derivatives, normaliser_derivatives
+from mkc_torch.density.normalizer import _log_partition_and_slopes
+from mkc_torch.linear._implicit.refusal import _NO_MINIMUM, _NOT_AT_REST
+from mkc_torch.linear._problem import LinearProblem
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+__all__ = ["FlatStationaryPoint", "StationaryPoint", "free_unknowns", "inverse_where", "moved"]
+
+_POLISHING_STEPS = 12
+
+
+@dataclass(frozen=True)
+class StationaryPoint:
+    """Where a fit came to rest, in the basis of its problem and flat batch dimensions.
+
+    With ``log_bound`` the objective is the negative log-likelihood, in which κ and log d are free where the flags say
+    so; without, it is the loss (13) at the given κ and d. ``extras`` are results that the fit passes on.
+    """
+
+    beta: Float[Tensor, "B n"]
+    kappa: Float[Tensor, "B m"]
+    log_d: Float[Tensor, "B m"]
+    converged: Bool[Tensor, " B"]
+    log_bound: Float[Tensor, "B m"] | None = None
+    log_d_min: Float[Tensor, "B m"] | None = None
+    free_kappa: bool = False
+    free_d: bool = False
+    extras: tuple[Tensor, ...] = ()
+
+
+@dataclass(frozen=True)
+class FitData:
+    """What the gradient of the objective depends on; rows are one (K, n) for all problems where they share X."""
+
+    rows: Float[Tensor, "*#batch K n"]
+    Y: Float[Tensor, "*batch N m"]
+    weight: Float[Tensor, "*batch N m"] | None
+    log_bound: Float[Tensor, "*batch m"] | None
+    unit: Float[Tensor, "*batch 1"]
+    total: Float[Tensor, "*batch 1"]
+
+    def residual(self, beta: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch N m"]:
+        if self.rows.dim() == 2:
+            fitted = torch.matmul(beta, self.rows.mT)
+        else:
+            fitted = torch.matmul(self.rows, beta.unsqueeze(-1)).squeeze(-1)
+        return self.Y - fitted.unflatten(-1, self.Y.shape[-2:])
+
+    def summed(self, values: Float[Tensor, "*batch N m"]) -> Float[Tensor, "*batch m"]:
+        return (values if self.weight is None else self.weight * values).sum(-2)
+
+    def gradient(self, beta: Tensor, kappa: Tensor, log_d: Tensor) -> Float[Tensor, "*batch p"]:
+        """Of the mean objective, by the coefficients in units of ``unit`` and, for a likelihood, κ and log d."""
+        precision = torch.exp(-log_d)
+        z, k = self.residual(beta) * precision.unsqueeze(-2), kappa.unsqueeze(-2)
+        influence = energy_dz(z, k)
+        score = influence * (self.unit * precision).unsqueeze(-2)
+        score = (score if self.weight is None else self.weight * score).flatten(-2)
+        if self.rows.dim() == 2:
+            by_beta = torch.matmul(score, self.rows)
+        else:
+            by_beta = torch.matmul(score.unsqueeze(-2), self.rows).squeeze(-2)
+        if self.log_bound is None:
+            return -by_beta / self.total
+        counted = self.Y.shape[-2] if self.weight is None else self.weight.sum(-2)
+        length = torch.exp(self.log_bound - log_d)
+        _, by_kappa, by_length = _log_partition_and_slopes(kappa, length, energy)
+        of_kappa = self.summed(energy_dkappa(z, k)) + counted * by_kappa
+        of_log_d = counted * (1.0 - length * by_length) - self.summed(z * influence)
+        return torch.cat([-by_beta, of_kappa, of_log_d], -1) / self.total
+
+
+@dataclass(frozen=True)
+class FlatStationaryPoint:
+    beta: Float[Tensor, "B n"]
+    kappa: Float[Tensor, "B m"]
+    log_d: Float[Tensor, "B m"]
+
+
+@dataclass(frozen=True)
+class _AtRest(FlatStationaryPoint):
+    unit: Float[Tensor, "B 1"]
+    total: Float[Tensor, "B 1"]
+    inverse: Float[Tensor, "B p p"]
+    cause: Int[Tensor, " B"]
+
+
+def stationary(problem: LinearProblem, rest: StationaryPoint) -> _AtRest:
+    """Newton steps to where the gradient is rounding, with the inverse Hessian there; as it was where that fails."""
+    size, m = rest.kappa.shape
+    rows = problem.basis.flatten(-3, -2)
+    unit = torch.exp(rest.log_d.amin(-1, keepdim=True))
+    data = FitData(
+        rows=rows[0] if rows.shape[0] == 1 else rows,
+        Y=problem.Y,
+        weight=problem.sample_weight,
+        log_bound=rest.log_bound,
+        unit=unit,
+        total=problem.total_weight().sum(-1, keepdim=True),
+    )
+    eps = torch.finfo(unit.dtype).eps
+    point = FlatStationaryPoint(rest.beta, rest.kappa, rest.log_d)
+    rounding = (10 * eps * problem.Y.abs().amax((-2, -1)) / unit.squeeze(-1)).square()
+    before = rounding.new_full((size,), torch.inf)
+    for step in range(_POLISHING_STEPS + 1):
+        gradient = data.gradient(point.beta, point.kappa, point.log_d)
+        hessian, head = _hessian(problem, data, point)
+        keep = free_unknowns(rest, point, gradient)
+        inverse, strict = inverse_where(hessian, keep)
+        move = -torch.matmul(inverse, torch.where(keep, gradient, 0.0).unsqueeze(-1)).squeeze(-1)
+        # what a step would still gain, in mean squares of the fitted values in d
+        gain = -(move * gradient).sum(-1)
+        near = gain <= eps * head + rounding
+        done = ~strict | (near & ((gain <= (1e4 * eps) ** 2 * head) | (gain >= 0.25 * before)))
+        if bool(done.all()) or step == _POLISHING_STEPS:
+            break
+        point, before = moved(rest, point, torch.where(done.unsqueeze(-1), 0.0, move), unit, m), gain
+    cause = torch.where(strict | ~rest.converged, torch.where(near & rest.converged, 0, _NOT_AT_REST), _NO_MINIMUM)
+    refused = (cause != 0).unsqueeze(-1)
+    return _AtRest(
+        beta=torch.where(refused, rest.beta, point.beta),
+        kappa=torch.where(refused, rest.kappa, point.kappa),
+        log_d=torch.where(refused, rest.log_d, point.log_d),
+        unit=unit,
+        total=data.total,
+        inverse=torch.where(refused.unsqueeze(-1), 0.0, inverse),
+        cause=cause,
+    )
+
+
+def _hessian(
+    problem: LinearProblem, data: FitData, point: FlatStationaryPoint
+) -> tuple[Float[Tensor, "B p p"], Float[Tensor, " B"]]:
+    """Of the objective whose gradient :class:`FitData` gives, and the mean square of z under the kernel's weights."""
+    kappa, log_d = point.kappa, point.log_d
+    error = data.residual(point.beta)
+    precision = torch.exp(-log_d)
+    ratio = (data.unit * precision).unsqueeze(-2)
+    z, k = error * precision.unsqueeze(-2), kappa.unsqueeze(-2)
+    w = torch.exp(-0.5 * k * z * z)
+    wz2 = w * z * z
+    head = data.summed(wz2).sum(-1) / data.total.squeeze(-1)
+    gram, _ = problem.normal_equations((w - k * wz2) * ratio.square())
+    total = data.total.unsqueeze(-1)
+    if data.log_bound is None:
+        return gram / total, head
+
+    def cross(values: Tensor) -> Float[Tensor, "B n m"]:
+        weighted = values if data.weight is None else data.weight * values
+        return torch.einsum("bkm,bkmn->bnm", weighted * ratio, problem.basis) / total
+
+    by_kappa, by_log_d = cross(0.5 * wz2 * z), cross(2.0 * w * z - k * wz2 * z)
+    share = problem.total_weight() / data.total
+    normalised = None if data.weight is None else data.weight / data.weight.sum(-2, keepdim=True)
+    fit = energy_derivatives(error, normalised, kappa, log_d)
+    norm = normaliser_derivatives(kappa, log_d, data.log_bound)
+    kk = torch.diag_embed(share * (fit.kappa_kappa + norm.kappa_kappa))
+    kl = torch.diag_embed(share * (fit.kappa_log_d + norm.kappa_log_d))
+    ll = torch.diag_embed(share * (fit.log_d_log_d + norm.log_d_log_d))
+    rows = (
+        torch.cat([gram / total, by_kappa, by_log_d], -1),
+        torch.cat([by_kappa.mT, kk, kl], -1),
+        torch.cat([by_log_d.mT, kl, ll], -1),
+    )
+    return torch.cat(rows, -2), head
+
+
+def free_unknowns(
+    rest: StationaryPoint, point: FlatStationaryPoint, gradient: Float[Tensor, "B p"]
+) -> Bool[Tensor, "B p"]:
+    """The unknowns that follow the data: not those given, nor those that a bound holds back."""
+    coefficients = torch.ones_like(point.beta, dtype=torch.bool)
+    if rest.log_bound is None or rest.log_d_min is None:
+        return coefficients
+    n, m = point.beta.shape[-1], point.kappa.shape[-1]
+    g_kappa, g_log_d = gradient[:, n : n + m], gradient[:, n + m :]
+    held_kappa = ((point.kappa <= 0) & (g_kappa >= 0)) | ((point.kappa >= KAPPA_MAX) & (g_kappa <= 0))
+    held_d = ((point.log_d <= rest.log_d_min) & (g_log_d >= 0)) | ((point.log_d >= rest.log_bound) & (g_log_d <= 0))
+    return torch.cat([coefficients, ~held_kappa & rest.free_kappa, ~held_d & rest.free_d], -1)
+
+
+def inverse_where(hessian: Tensor, keep: Tensor) -> tuple[Float[Tensor, "B p p"], Bool[Tensor, " B"]]:
+    """Inverse of the Hessian of the unknowns kept, 0 for the others, and whether it is safely positive definite."""
+    both = keep.unsqueeze(-1) & keep.unsqueeze(-2)
+    hessian = torch.where(both, hessian, torch.diag_embed((~keep).to(hessian.dtype)))
+    diagonal = hessian.diagonal(dim1=-2, dim2=-1)
+    root = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
+    outer = root.unsqueeze(-1) * root.unsqueeze(-2)
+    factor, info = torch.linalg.cholesky_ex(outer * hessian)
+    pivots = factor.diagonal(dim1=-2, dim2=-1).square().amin(-1)
+    strict = (info == 0) & (pivots > 1e2 * hessian.shape[-1] * torch.finfo(hessian.dtype).eps)
+    safe = torch.where(strict[:, None, None], factor, torch.eye(factor.shape[-1]).to(factor))
+    inverse = outer * torch.cholesky_inverse(safe)
+    return torch.where(both & strict[:, None, None], inverse, 0.0), strict
+
+
+def moved(
+    rest: StationaryPoint, point: FlatStationaryPoint, move: Float[Tensor, "B p"], unit: Tensor, m: int
+) -> FlatStationaryPoint:
+    n = point.beta.shape[-1]
+    beta = point.beta + unit * move[:, :n]
+    if rest.log_bound is None or rest.log_d_min is None:
+        return FlatStationaryPoint(beta, point.kappa, point.log_d)
+    kappa = (point.kappa + move[:, n : n + m]).clamp(0.0, KAPPA_MAX) if rest.free_kappa else point.kappa
+    log_d = point.log_d + move[:, n + m :]
+    bounded = torch.minimum(torch.maximum(log_d, rest.log_d_min), rest.log_bound)
+    return FlatStationaryPoint(beta, kappa, bounded if rest.free_d else point.log_d)

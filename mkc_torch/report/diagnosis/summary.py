@@ -1,0 +1,131 @@
+"""The box at the top of a page: does it follow, what is missing, where, how large, how sure, and by how much better."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from mkc_torch._words.terms import term
+from mkc_torch._words.typesetting import capital, plain
+from mkc_torch.diagnosis.result import Diagnosis, Finding
+from mkc_torch.effects import is_curve
+from mkc_torch.report.diagnosis.findings import acts_on, finding_name, grade, inseparable, rivals, where
+from mkc_torch.report.diagnosis.noise import noise_model, smooth_fit
+from mkc_torch.report.diagnosis.numbers import clock_of, evidence, gain, largest, probability
+from mkc_torch.report.diagnosis.unseen import better, left, residual_of_all, residuals
+from mkc_torch.report.diagnosis.verdict import reasons
+from mkc_torch.report.diagnosis.world import noise_lines, output_lines
+from mkc_torch.report.words.numbers import share, size
+
+__all__ = ["Row", "chance", "residual_alone", "summary"]
+
+Row = tuple[str, tuple[str, ...]]
+"""A question with its answer, a line each; what stands between backticks is code."""
+
+
+def summary(diagnosis: Diagnosis) -> list[Row]:
+    """The questions with their answers, however many findings there are."""
+    d = diagnosis
+    follows = output_lines(d)
+    rows = [_row("label.follows", *follows)] if follows else []
+    if d.verdict == "unfit":
+        return [*rows, *([_row("label.why", *reasons(d))] if d.world.reasons else [])]
+    noise = _row("label.noise", *(noise_lines(d) or [f"{capital(noise_model(d.noise))}."]))
+    rows += [noise, *_of_findings(d)] if follows else [*_of_findings(d), noise]
+    beside = "" if d.findings else smooth_fit(d)
+    if beside:
+        rows.append(_row("label.for_comparison", f"{capital(beside)}."))
+    return rows
+
+
+def _row(key: str, *lines: str) -> Row:
+    return capital(term(key)), lines
+
+
+def _of_findings(diagnosis: Diagnosis) -> Iterator[Row]:
+    d = diagnosis
+    if not d.findings:
+        if not d.world.follows:
+            yield _row("label.residual", residual_alone(d))
+        yield _row("label.how_sure", *_sure_of_pushes(d), chance(d.p_value, d))
+        return
+    if len(d.findings) > 1:
+        for number, f in enumerate(d.findings, 1):
+            yield f"{number} · {capital(finding_name(f))}", tuple(_in_short(f, d))
+        together = residual_of_all(d)
+        if together:
+            yield _row("label.together", *(term("evidence.on_unseen", change=one) for one in together))
+        yield _row("label.how_sure", chance(d.findings[0].p_value, d))
+        return
+    (f,) = d.findings
+    told = _sizes(f, 2)
+    if told:
+        yield _row("label.how_large", f"{told}.")
+    yield _row("label.where", f"{_place(f, d)}.")
+    yield _row("label.how_sure", chance(f.p_value, d))
+    if f.held_out is None:
+        yield _row("label.how_much_better", f"{capital(term('evidence.not_measured'))}: {_closed(f.held_out_note)}")
+        return
+    sure = f"{capital(better(f.held_out))}; {gain(f.held_out)}."
+    sizes = [term("evidence.on_unseen", change=one) for one in residuals(f.held_out, d.world)]
+    yield _row("label.how_much_better", *sizes, sure, *filter(None, [left(f.held_out)]))
+
+
+def _sure_of_pushes(diagnosis: Diagnosis) -> Iterator[str]:
+    """How much less likely the noise is without what pushes; nothing where physics is what is asked about."""
+    known = [push for push in diagnosis.world.pushes if math.isfinite(push.nats)]
+    if known:
+        yield term("world.less_likely", nats=size(known[0].nats), place=plain(known[0].place))
+        if diagnosis.p_value is not None and diagnosis.p_value > diagnosis.level:
+            yield term("world.no_physics")
+
+
+def _in_short(finding: Finding, diagnosis: Diagnosis) -> Iterator[str]:
+    """One of several findings: what it is worth, how large, where, and how sure."""
+    f = finding
+    rival = f"; {term('evidence.rivals', rivals=rivals(f))}" if inseparable(f) else ""
+    yield f"{capital(grade(f))}{rival}."
+    told = _sizes(f, 1)
+    if told:
+        yield f"{told}."
+    yield f"{_place(f, diagnosis)}."
+    sure = evidence(None, 0) if f.p_value is None else probability(f.p_value)
+    if f.held_out is None:
+        yield f"{sure}; {term('evidence.not_measured')}: {_closed(f.held_out_note)}"
+        return
+    yield f"{sure}; {better(f.held_out)}: {'; '.join(residuals(f.held_out, diagnosis.world))}."
+
+
+def _sizes(finding: Finding, most: int) -> str:
+    """How large it is; of a curve, which has no size of its own, its picture says so."""
+    return "" if is_curve(finding.effect) else "; ".join(largest(p) for p in finding.parameters[:most])
+
+
+def _closed(sentence: str) -> str:
+    return sentence if sentence.endswith(".") else f"{sentence}."
+
+
+def _place(finding: Finding, diagnosis: Diagnosis) -> str:
+    acts = f"; {acts_on(finding)}" if finding.channels else ""
+    return f"{capital(where(finding, clock_of(diagnosis.traces)))}{acts}"
+
+
+def residual_alone(diagnosis: Diagnosis) -> str:
+    """The residual of the simulation as it is."""
+    d = diagnosis
+    return term("verdict.residual", residual=f"{size(d.baseline.rmse)} {plain(d.traces.unit)}".rstrip())
+
+
+def chance(p_value: float | None, diagnosis: Diagnosis) -> str:
+    """What a p-value means, in a sentence; None where no noise was drawn."""
+    d = diagnosis
+    if p_value is None:
+        return f"{capital(evidence(None, 0))}."
+    told = share(p_value)
+    return term(
+        "verdict.chance",
+        candidates=f"{d.candidates_tried:,}",
+        share=term("verdict.at_most", share=told) if p_value <= (1.0 + 1e-9) / (1 + d.surrogates) else told,
+        evidence=evidence(p_value, d.surrogates),
+        level=f"{d.level:g}",
+    )
